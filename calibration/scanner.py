@@ -1,0 +1,150 @@
+"""From mirror command to light plane (n, d), n.X = d, |n| = 1: a sampled table, or a mirror that turns about an axis.
+
+The command is what the calibration was made with: a galvo's normalised drive (-1 to 1), or the column of a bare cube.
+(n, d) and (-n, -d) are the same plane; results come with n_x > 0 wherever the plane crosses the rows.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.errors import CalibrationError
+
+Array = NDArray[np.float64]
+
+
+class Scanner(Protocol):
+    """What the rest of the project needs of a scanner model."""
+
+    @property
+    def command_range(self) -> tuple[float, float]:
+        """Smallest and largest command the model was made for."""
+        ...
+
+    def planes(self, commands: ArrayLike) -> Array:
+        """Planes (..., 4) = nx, ny, nz, d (metres) for commands (...). Raises CalibrationError outside the range."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneTable:
+    """Planes sampled at increasing commands, linear in between (n and d together, then renormalised).
+
+    command: (n,) float64, strictly increasing. rows: (n, 4) float64 nx, ny, nz, d in metres, any sign, any length of n.
+    """
+
+    command: Array
+    rows: Array
+
+    def __post_init__(self) -> None:
+        """Check, normalise and give neighbouring planes the same sign."""
+        command = np.array(self.command, dtype=np.float64)
+        rows = np.array(self.rows, dtype=np.float64)
+        if rows.ndim != 2 or rows.shape[1] != 4 or len(rows) == 0:
+            raise CalibrationError(f"plane table has shape {rows.shape}; it must be (columns, 4): nx, ny, nz, d")
+        if command.shape != (len(rows),):
+            raise CalibrationError(
+                f"plane table has {len(rows)} planes for {command.size} commands; they must be as many"
+            )
+        length = np.linalg.norm(rows[:, :3], axis=1)
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1) | (length == 0))
+        if bad.size:
+            first = rows[bad[0]].tolist()
+            raise CalibrationError(f"plane {bad[0]} of the table is {first}; it needs a finite, non-zero normal")
+        if not np.all(np.isfinite(command)) or np.any(np.diff(command) <= 0):
+            at = int(np.argmax(~(np.diff(command) > 0))) if len(command) > 1 else 0
+            raise CalibrationError(f"plane table's commands must increase; not so after row {at} ({command[at]:g})")
+        rows /= length[:, None]
+        turned = np.sum(rows[1:, :3] * rows[:-1, :3], axis=1) < 0
+        rows[1:][np.cumsum(turned) % 2 == 1] *= -1
+        if np.sum(rows[:, 0]) < 0:
+            rows *= -1
+        command.flags.writeable = False
+        rows.flags.writeable = False
+        object.__setattr__(self, "command", command)
+        object.__setattr__(self, "rows", rows)
+
+    @property
+    def command_range(self) -> tuple[float, float]:
+        """First and last sampled command."""
+        return float(self.command[0]), float(self.command[-1])
+
+    def planes(self, commands: ArrayLike) -> Array:
+        """Planes (..., 4) for commands (...). Raises CalibrationError outside the table."""
+        at = _inside(commands, self.command_range)
+        between = np.stack([np.interp(at, self.command, self.rows[:, i]) for i in range(4)], axis=-1)
+        result: Array = between / np.linalg.norm(between[..., :3], axis=-1, keepdims=True)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class PivotScanner:
+    """A line turned about a fixed axis: n(a) = n0 cos a + (axis x n0) sin a, d = n . axis_point.
+
+    axis_point_m, axis_direction, zero_normal: (3,) float64. angle_rad: (terms,) float64, the optical angle as a
+    polynomial in the command, constant term first. The part of zero_normal along the axis is dropped.
+    """
+
+    axis_point_m: Array
+    axis_direction: Array
+    zero_normal: Array
+    angle_rad: Array
+    command_range: tuple[float, float] = (-1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        """Check and normalise."""
+        point = _vector(self.axis_point_m, "axis_point_m")
+        axis = _unit(_vector(self.axis_direction, "axis_direction"), "axis_direction")
+        normal = _vector(self.zero_normal, "zero_normal")
+        normal = _unit(normal - axis * (axis @ normal), "zero_normal (across the axis)")
+        angle = np.array(self.angle_rad, dtype=np.float64)
+        if angle.ndim != 1 or angle.size == 0 or not np.all(np.isfinite(angle)):
+            raise CalibrationError("pivot scanner's angle_rad must be finite polynomial terms, constant first")
+        low, high = self.command_range
+        if not (np.isfinite(low) and np.isfinite(high) and low < high):
+            raise CalibrationError(f"scanner command_range is [{low:g}, {high:g}]; the first must be the smaller one")
+        parts = {"axis_point_m": point, "axis_direction": axis, "zero_normal": normal, "angle_rad": angle}
+        for name, value in parts.items():
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "command_range", (float(low), float(high)))
+
+    def planes(self, commands: ArrayLike) -> Array:
+        """Planes (..., 4) for commands (...). Raises CalibrationError outside command_range."""
+        at = _inside(commands, self.command_range)
+        angle = np.polynomial.polynomial.polyval(at, self.angle_rad)[..., None]
+        normal = self.zero_normal * np.cos(angle) + np.cross(self.axis_direction, self.zero_normal) * np.sin(angle)
+        planes = np.concatenate([normal, np.sum(normal * self.axis_point_m, axis=-1, keepdims=True)], axis=-1)
+        result: Array = np.where(planes[..., :1] < 0, -planes, planes)
+        return result
+
+
+def _inside(commands: ArrayLike, limits: tuple[float, float]) -> Array:
+    at = np.asarray(commands, dtype=np.float64)
+    low, high = limits
+    slack = 1e-9 * max(1.0, abs(low), abs(high))  # rounding of a sweep that ends exactly at the limit
+    wrong = ~((at >= low - slack) & (at <= high + slack))
+    if np.any(wrong):
+        raise CalibrationError(
+            f"scanner command {at[wrong].flat[0]:g} lies outside the calibrated range [{low:g}, {high:g}]; "
+            "narrow the sweep or calibrate over the wider range"
+        )
+    clipped: Array = np.clip(at, low, high)
+    return clipped
+
+
+def _vector(value: ArrayLike, name: str) -> Array:
+    vector = np.array(value, dtype=np.float64)
+    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+        raise CalibrationError(f"pivot scanner's {name} is {vector.tolist()}; it must be three finite numbers")
+    return vector
+
+
+def _unit(vector: Array, name: str) -> Array:
+    length = float(np.linalg.norm(vector))
+    if length < 1e-9:
+        raise CalibrationError(f"pivot scanner's {name} has length zero")
+    result: Array = vector / length
+    return result

@@ -1,0 +1,63 @@
+"""The clock that devices and the application share: real time, or a virtual time that tests and simulation advance."""
+
+import threading
+import time
+from fractions import Fraction
+from typing import Protocol, runtime_checkable
+
+NS_PER_S = 1_000_000_000
+
+
+@runtime_checkable
+class Clock(Protocol):
+    """Monotonic time and waiting. Passed in everywhere, so that code about time is tested in no time."""
+
+    def now_ns(self) -> int:
+        """Nanoseconds since an arbitrary start; never decreases."""
+        ...
+
+    def sleep(self, seconds: float) -> None:
+        """Wait for `seconds`; zero and negative values return at once."""
+        ...
+
+
+class SystemClock:
+    """The host's monotonic clock."""
+
+    def now_ns(self) -> int:
+        """Nanoseconds of `time.monotonic_ns`."""
+        return time.monotonic_ns()
+
+    def sleep(self, seconds: float) -> None:
+        """Block this thread for `seconds`."""
+        if seconds > 0:
+            time.sleep(seconds)
+
+
+class VirtualClock:
+    """A clock that stands still until somebody advances it. Thread-safe; waiting costs no real time."""
+
+    def __init__(self, start_ns: int = 0) -> None:
+        self._lock = threading.Lock()
+        self._now_ns = start_ns
+
+    def now_ns(self) -> int:
+        """The present virtual time."""
+        with self._lock:
+            return self._now_ns
+
+    def sleep(self, seconds: float) -> None:
+        """Advance by `seconds`, rounded to the nanosecond."""
+        if seconds > 0:
+            with self._lock:
+                self._now_ns += round(seconds * NS_PER_S)
+
+    def advance_to_ns(self, t_ns: int) -> None:
+        """Advance to `t_ns`; a time already passed changes nothing, since the clock never runs backwards."""
+        with self._lock:
+            self._now_ns = max(self._now_ns, t_ns)
+
+
+def ticks_to_ns(ticks: int, tick_hz: Fraction) -> int:
+    """Nanoseconds (floor) of a device time in ticks. Exact at any length of run: 97.7 kHz is no whole number of ns."""
+    return ticks * NS_PER_S * tick_hz.denominator // tick_hz.numerator

@@ -1,0 +1,129 @@
+"""Binary frames in memory: one record per frame and packed bits, a block of consecutive frames at a time."""
+
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+FRAME_RECORD = np.dtype(
+    [("marks", "<u4"), ("ticks", "<u4"), ("x0", "<u2"), ("y0", "<u2"), ("line", "<u2"), ("sweep", "<u2")]
+)
+"""One frame's record, 16 bytes: marks (`Mark`), ticks since the block's `t0_ticks`, corner of the window in pixels,
+line markers since the last scan marker, scan markers since START (low 16 bits). SPB1 1.0 wire layout."""
+
+ROW_ALIGN_BYTES = 8
+"""Rows are padded to whole 64-bit words, on which the counting runs."""
+
+SUBFRAME_SHIFT = 8
+SUBFRAME_MASK = 0xFF
+"""Bits 8-15 of `marks`: position of the latest edge within the frame, in 1/256 of the frame period."""
+
+
+class Mark(IntFlag):
+    """What happened during a frame's period (bits of `marks`)."""
+
+    GATE_HIGH = 1
+    """The gate was high during the whole exposure: the frame is lit."""
+    GATE_EDGE = 2
+    """The gate changed during the exposure: the frame is partly lit."""
+    LINE = 4
+    SCAN = 8
+    TRIGGER = 16
+    BACKWARD = 32
+    """Level, not edge: the scanner runs backward."""
+    WINDOW_LOST = 64
+    """The device lost the line its window table is at; `x0` is not to be trusted."""
+
+
+class BlockFlag(IntFlag):
+    """Flags of a block (SPB1 1.0 header, offset 8)."""
+
+    FIRST = 1 << 0
+    LAST = 1 << 1
+    LOST_BEFORE = 1 << 2
+    MEMORY_OVERFLOW = 1 << 3
+    TEST_PATTERN = 1 << 4
+    LSB_FIRST = 1 << 5
+    BURST = 1 << 7
+    CLOCK_LOCKED = 1 << 8
+    GATE_FORCED_LOW = 1 << 9
+
+
+class BlockStatus(IntEnum):
+    """How a block ended (SPB1 1.0 trailer, offset 4)."""
+
+    OK = 0
+    TRUNCATED = 1
+    OVERRUN = 2
+    ABORTED = 3
+
+
+def packed_row_bytes(width: int) -> int:
+    """Bytes of one packed row of `width` pixels, padded to `ROW_ALIGN_BYTES`."""
+    return -(-width // (8 * ROW_ALIGN_BYTES)) * ROW_ALIGN_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class BlockHeader:
+    """What holds for every frame of a block. Fields as in the SPB1 1.0 wire layout (docs/spb1.md)."""
+
+    flags: BlockFlag
+    run_id: int
+    """Changes at each START, so that stale data after a re-arm is recognised; 16 bit."""
+    block_seq: int
+    """Counts blocks of the run from 0."""
+    first_frame: int
+    """Number of the first frame; counts *exposed* frames since START, lost ones included."""
+    t0_ticks: int
+    """Start of the first frame's exposure."""
+    lost_before: int
+    """Frames exposed since START that are not in the stream before this block."""
+    tick_hz: Fraction
+    frame_period_ticks: int
+    """Nominal period; 0 = triggered from outside."""
+    exposure_ticks: int
+    sweep: int
+    """Scan markers since START at the first frame."""
+    frame_step: int
+    """1, or k where the device keeps every k-th frame or sums k."""
+    width: int
+    """Pixels of each frame's window; constant within a block."""
+    height: int
+    sensor_width: int
+    sensor_height: int
+    bits_per_px: int = 1
+    payload_type: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class FrameBlock:
+    """Consecutive frames over one piece of memory. Valid until its ring slot is released; copy what must live longer.
+
+    records: (n,) of `FRAME_RECORD`.
+    bits: uint8 (n, height, row bytes), packed along the width, most significant bit first (numpy `packbits` order),
+    pad bits 0, row bytes a multiple of `ROW_ALIGN_BYTES`.
+    """
+
+    header: BlockHeader
+    records: NDArray[np.void]
+    bits: NDArray[np.uint8]
+    status: int = BlockStatus.OK
+
+    @property
+    def n_frames(self) -> int:
+        """Frames in this block."""
+        return len(self.records)
+
+    @property
+    def frame_numbers(self) -> NDArray[np.int64]:
+        """Numbers of the frames since START, int64 (n,)."""
+        return self.header.first_frame + np.arange(self.n_frames, dtype=np.int64) * self.header.frame_step
+
+    @property
+    def start_ticks(self) -> NDArray[np.int64]:
+        """Start of each exposure in ticks of `header.tick_hz`, int64 (n,)."""
+        ticks: NDArray[np.int64] = self.records["ticks"].astype(np.int64)
+        ticks += self.header.t0_ticks
+        return ticks

@@ -1,0 +1,70 @@
+"""Kinds of devices and worlds by name, found through entry points, so that any installed package can add one."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from drivers.clock import Clock
+from drivers.errors import UnknownKind
+from drivers.interfaces import World
+
+SLOTS = ("spad", "scanner", "laser", "sync", "world")
+"""The parts of a rig. The kinds of slot `spad` are the entry points of group `spadrig.spad`, and so on."""
+
+
+class KindConfig(BaseModel):
+    """Base of every kind's config: unknown keys are refused, values cannot change. `kind` names the entry point."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kind: str
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What a device is created in. Real devices take the clock only; simulated ones share the world and the seed."""
+
+    clock: Clock
+    world: World | None
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What an entry point loads: the config model of a kind and the function that creates the opened device.
+
+    `create(config, surroundings)` gets an instance of `config` and returns a device of the slot's interface (or a
+    `World`); it raises a `DeviceError` when the device cannot be opened.
+    """
+
+    config: type[BaseModel]
+    create: Callable[[Any, Surroundings], Any]
+
+
+def kinds(slot: str) -> tuple[str, ...]:
+    """Names of the kinds installed for a slot, sorted. Imports none of them."""
+    return tuple(sorted({entry.name for entry in _entries(slot)}))
+
+
+def lookup(slot: str, kind: str) -> Kind:
+    """Load the kind of a slot. `UnknownKind` lists the choices, or says why the entry cannot be used."""
+    found = {entry.value: entry for entry in _entries(slot) if entry.name == kind}
+    if not found:
+        choices = ", ".join(kinds(slot)) or "none installed"
+        raise UnknownKind(f"{slot}: unknown kind {kind!r}; choose one of: {choices}")
+    if len(found) > 1:
+        raise UnknownKind(f"{slot}: kind {kind!r} is offered twice ({', '.join(sorted(found))}); uninstall one package")
+    entry = next(iter(found.values()))
+    loaded = entry.load()
+    if not isinstance(loaded, Kind):
+        raise UnknownKind(f"{slot}: entry point {entry.value} of kind {kind!r} is no drivers.registry.Kind")
+    return loaded
+
+
+def _entries(slot: str) -> tuple[EntryPoint, ...]:
+    if slot not in SLOTS:
+        raise ValueError(f"no slot {slot!r} in a rig; slots are {', '.join(SLOTS)}")
+    return tuple(entry_points(group=f"spadrig.{slot}"))

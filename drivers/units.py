@@ -1,0 +1,199 @@
+"""Quantities with units in config files: text such as "10 us" on disk, an SI number in code.
+
+A field typed `Seconds` takes "10 us" and nothing else: a bare number is refused, so is another dimension, NaN or an
+infinity. Values written back (`model_dump(mode="json")`) are text again and read back to the very same number.
+"""
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from decimal import Context, Decimal
+from fractions import Fraction
+from typing import Annotated, Any
+
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+_NUMBER = re.compile(
+    r"(?P<mantissa>[+-]?(?:\d+\.?\d*|\.\d+))(?:[eE](?P<exponent>[+-]?\d{1,3}))?(?:/(?P<divisor>\d+))?", re.ASCII
+)
+_MAX_TEXT = 1000
+"""Longest text taken, in characters: exact arithmetic on an endless number would take endless time."""
+
+_FAITHFUL = Context(prec=20)
+"""Decimal digits that pin a 64-bit float (17) with enough to spare for one multiplication by a unit."""
+
+_DEGREE = Fraction(math.pi) / 180
+
+
+@dataclass(frozen=True, slots=True)
+class Dimension:
+    """One physical dimension: its units as multiples of the number in code, the preferred one first."""
+
+    name: str
+    units: Mapping[str, Fraction]
+    example: str
+
+
+_ALL = (
+    Dimension(
+        "time",
+        {
+            "s": Fraction(1),
+            "ms": Fraction(1, 10**3),
+            "us": Fraction(1, 10**6),
+            "\u00b5s": Fraction(1, 10**6),  # the micro sign of keyboards
+            "\u03bcs": Fraction(1, 10**6),  # the Greek letter
+            "ns": Fraction(1, 10**9),
+            "ps": Fraction(1, 10**12),
+        },
+        "10 us",
+    ),
+    Dimension(
+        "frequency",
+        {"Hz": Fraction(1), "kHz": Fraction(10**3), "MHz": Fraction(10**6), "GHz": Fraction(10**9)},
+        "100 kHz",
+    ),
+    Dimension(
+        "length",
+        {
+            "m": Fraction(1),
+            "km": Fraction(10**3),
+            "cm": Fraction(1, 10**2),
+            "mm": Fraction(1, 10**3),
+            "um": Fraction(1, 10**6),
+            "\u00b5m": Fraction(1, 10**6),
+            "\u03bcm": Fraction(1, 10**6),
+            "nm": Fraction(1, 10**9),
+        },
+        "30 m",
+    ),
+    Dimension("power", {"W": Fraction(1), "mW": Fraction(1, 10**3), "uW": Fraction(1, 10**6)}, "50 mW"),
+    Dimension(
+        "inverse length",
+        {"/m": Fraction(1), "1/m": Fraction(1), "/km": Fraction(1, 10**3), "1/km": Fraction(1, 10**3)},
+        "0.05 /m",
+    ),
+    Dimension("angle", {"rad": Fraction(1), "mrad": Fraction(1, 10**3), "deg": _DEGREE}, "3 deg"),
+    Dimension("illuminance", {"lx": Fraction(1), "lux": Fraction(1), "klx": Fraction(10**3)}, "200 lx"),
+    Dimension("ratio", {"ppm": Fraction(1, 10**6), "%": Fraction(1, 100), "ppb": Fraction(1, 10**9)}, "20 ppm"),
+    Dimension("rain rate", {"m/h": Fraction(1), "mm/h": Fraction(1, 10**3)}, "20 mm/h"),
+    Dimension("count rate", {"cps": Fraction(1), "kcps": Fraction(10**3), "Mcps": Fraction(10**6)}, "20 cps"),
+    Dimension("rate", {"/s": Fraction(1), "1/s": Fraction(1), "/ms": Fraction(10**3)}, "5 /s"),
+)
+
+DIMENSIONS: Mapping[str, Dimension] = {dimension.name: dimension for dimension in _ALL}
+"""The dimensions of the project's config files by name."""
+
+
+def parse_quantity(text: object, dimension: str) -> float:
+    """The SI number that a text such as "10 us" means (ratio: 1 for 100 %; rain rate: m/h).
+
+    Correctly rounded: "0.1 us" gives the float 1e-07. ValueError, one line with an example, for anything else.
+    """
+    exact = parse_exact(text, dimension)
+    try:
+        value = float(exact)
+    except OverflowError:
+        raise ValueError(f"{_shown(text)} is too large for a {dimension}") from None
+    if value == 0 and exact != 0:
+        raise ValueError(f"{_shown(text)} is too small for a {dimension}")
+    return value
+
+
+def parse_exact(text: object, dimension: str) -> Fraction:
+    """As `parse_quantity`, with nothing rounded; takes a fraction too ("100000/3 Hz")."""
+    known = DIMENSIONS[dimension]
+    like = f'write a {known.name} like "{known.example}"'
+    if not isinstance(text, str):
+        raise ValueError(f"{_shown(text)} has no unit; {like}")
+    stripped = text.strip()
+    match = _NUMBER.match(stripped) if len(stripped) <= _MAX_TEXT else None
+    if match is None:
+        raise ValueError(f"{_shown(text)} is no number with a unit; {like}")
+    unit = stripped[match.end() :].strip()
+    if not unit:
+        raise ValueError(f"{_shown(text)} has no unit; {like}")
+    if unit not in known.units:
+        raise ValueError(f"{_shown(text)}: {_shown(unit)} is no unit of a {known.name}; use {', '.join(known.units)}")
+    divisor = int(match["divisor"] or 1)
+    if divisor == 0:
+        raise ValueError(f"{_shown(text)} divides by zero; {like}")
+    return Fraction(f"{match['mantissa']}e{match['exponent'] or 0}") / divisor * known.units[unit]
+
+
+def format_quantity(value: float | Fraction, dimension: str) -> str:
+    """A short text with a unit that reads back to exactly `value`. ValueError where `value` is not finite."""
+    known = DIMENSIONS[dimension]
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is no {known.name}")
+    exact = Fraction(value)
+    texts = [f"{_shortest(exact / scale)} {unit}" for unit, scale in known.units.items()]
+    faithful = [text for text in texts if _means(text, value, dimension)]
+    if faithful:
+        return min(faithful, key=lambda text: len(text) - (text is texts[0]))  # a close race goes to the first unit
+    unit, scale = next(iter(known.units.items()))
+    number = exact / scale
+    if isinstance(value, Fraction):
+        return f"{number.numerator}/{number.denominator} {unit}"
+    return f"{_FAITHFUL.divide(Decimal(number.numerator), Decimal(number.denominator)):e} {unit}"
+
+
+def _shortest(number: Fraction) -> str:
+    try:
+        return repr(float(number)).removesuffix(".0")
+    except OverflowError:
+        return "inf"
+
+
+def _means(text: str, value: float | Fraction, dimension: str) -> bool:
+    parse: Callable[[object, str], float | Fraction] = parse_exact if isinstance(value, Fraction) else parse_quantity
+    try:
+        return parse(text, dimension) == value
+    except ValueError:
+        return False
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:36]}...{text[-1]}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Text:
+    """Tells pydantic that a field is such a text in files and a number in code."""
+
+    dimension: str
+    exact: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        def parse(text: object) -> float | Fraction:
+            value = parse_quantity(text, self.dimension)  # also bounds what is taken as an exact value
+            return parse_exact(text, self.dimension) if self.exact else value
+
+        def serialise(value: float | Fraction) -> str:
+            return format_quantity(value, self.dimension)
+
+        serialization = core_schema.plain_serializer_function_ser_schema(serialise, when_used="json")
+        return core_schema.no_info_plain_validator_function(parse, serialization=serialization)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        known = DIMENSIONS[self.dimension]
+        description = f"a {known.name} with its unit ({', '.join(known.units)})"
+        return {"type": "string", "description": description, "examples": [known.example]}
+
+
+Seconds = Annotated[float, _Text("time")]
+Hertz = Annotated[float, _Text("frequency")]
+ExactHertz = Annotated[Fraction, _Text("frequency", exact=True)]
+Metres = Annotated[float, _Text("length")]
+Watts = Annotated[float, _Text("power")]
+PerMetre = Annotated[float, _Text("inverse length")]
+Radians = Annotated[float, _Text("angle")]
+Lux = Annotated[float, _Text("illuminance")]
+Ppm = Annotated[float, _Text("ratio")]
+"""A plain ratio in code: "20 ppm" is 2e-05."""
+MetresPerHour = Annotated[float, _Text("rain rate")]
+CountsPerSecond = Annotated[float, _Text("count rate")]
+PerSecond = Annotated[float, _Text("rate")]

@@ -1,0 +1,1 @@
+"""The application: config, plan, acquisition, reconstruction, command line."""

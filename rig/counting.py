@@ -1,0 +1,121 @@
+"""Counts per column from packed frames: bits are added in bit-sliced form and never unpacked outside the window.
+
+Each 64-bit word of a frame is added to vertical counters (plane i holds bit i of 64 counts), the carry-save way of
+Harley and Seal; only the window of the column is expanded to integers, once per run of frames of that column.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+BIN_DARK = -1
+"""Bin of a frame with the gate low during the whole exposure."""
+BIN_UNUSABLE = -2
+"""Bin of a frame that belongs to no column and is not dark (gate edge inside, outside the sweep)."""
+
+Counts = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True)
+class CountVolume:
+    """Counts of one sweep.
+
+    counts: (columns, rows, window) uint8, uint16 or uint32, 1s of each pixel over the frames of the column.
+    x0: (columns,) int32, first pixel of each column's window.
+    n_frames: (columns,) int32, frames in each column's bin; 0 where none were received.
+    column: (columns,) float64, mean fractional column of those frames, NaN where none.
+    dark_counts: (rows, width) uint32 over n_dark frames with the gate low, None where there are none.
+    width: sensor width in pixels.
+    """
+
+    counts: Counts
+    x0: NDArray[np.int32]
+    n_frames: NDArray[np.int32]
+    column: NDArray[np.float64]
+    dark_counts: NDArray[np.uint32] | None
+    n_dark: int
+    width: int
+
+    def intensity(self) -> NDArray[np.uint32]:
+        """Counts summed over the columns, (rows, width) uint32."""
+        columns, rows, window = self.counts.shape
+        out = np.zeros((rows, max(self.width, int(self.x0.max(initial=0)) + window)), np.uint32)
+        for c in range(columns):
+            out[:, self.x0[c] : self.x0[c] + window] += self.counts[c]
+        return out[:, : self.width]
+
+
+class SweepCounter:
+    """Adds the frames of one sweep to its count volume.
+
+    n_columns columns of `window` pixels from x0 (columns,) on, both multiples of 64, on a sensor of rows x width pixels.
+    The result depends neither on the number of threads nor on how frames are grouped into blocks.
+    """
+
+    def __init__(
+        self, n_columns: int, rows: int, width: int, x0: NDArray[np.int32], window: int, threads: int = 2
+    ) -> None:
+        if window % 64 or np.any(x0 % 64):
+            raise ValueError(f"window {window} and its starts must be multiples of 64 pixels")
+        self._shape = (n_columns, rows, window)
+        self._width = width
+        self._x0 = np.ascontiguousarray(x0, dtype=np.int32)
+        self._threads = max(1, threads)
+        self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="count")
+        self.reset()
+
+    def reset(self) -> None:
+        """Start the next sweep with all counts at zero."""
+        columns, rows, _ = self._shape
+        self._counts: Counts = np.zeros(self._shape, np.uint8)
+        self._n_frames = np.zeros(columns, np.int32)
+        self._column_sum = np.zeros(columns, np.float64)
+        self._dark = np.zeros((rows, -(-self._width // 64) * 64), np.uint32)
+        self._n_dark = 0
+
+    def add(self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64]) -> None:
+        """Add packed frames `bits` (n, rows, row bytes) to the bins (n,); `column` (n,) is each frame's fractional column.
+
+        Row bytes are a multiple of 8; bins are a column index, BIN_DARK or BIN_UNUSABLE.
+        """
+        from rig.counting_kernels import add_runs
+
+        lit = bins >= 0
+        np.add.at(self._n_frames, bins[lit], 1)
+        np.add.at(self._column_sum, bins[lit], column[lit])
+        self._n_dark += int(np.count_nonzero(bins == BIN_DARK))
+        self._make_room()
+        words = bits.view(np.uint64)
+        bins = np.ascontiguousarray(bins, dtype=np.int32)
+        for job in [
+            self._pool.submit(add_runs, words, bins, self._x0, self._counts, self._dark, first, last)
+            for first, last in _pieces(self._shape[1], self._threads)
+        ]:
+            job.result()
+
+    def _make_room(self) -> None:
+        """Widen the counts before they can overflow."""
+        most = int(self._n_frames.max(initial=0))
+        for wider in (np.uint16, np.uint32):
+            if most <= np.iinfo(self._counts.dtype).max:
+                return
+            self._counts = self._counts.astype(wider)
+
+    def finish(self) -> CountVolume:
+        """The counts so far; the counter must be `reset` before the next sweep."""
+        with np.errstate(invalid="ignore"):
+            column = np.where(self._n_frames > 0, self._column_sum / np.maximum(self._n_frames, 1), np.nan)
+        dark = np.ascontiguousarray(self._dark[:, : self._width]) if self._n_dark else None
+        return CountVolume(self._counts, self._x0, self._n_frames, column, dark, self._n_dark, self._width)
+
+    def close(self) -> None:
+        """End the counting threads."""
+        self._pool.shutdown()
+
+
+def _pieces(rows: int, threads: int) -> Sequence[tuple[int, int]]:
+    edges = np.linspace(0, rows, threads + 1).astype(int)
+    return [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]

@@ -1,0 +1,51 @@
+"""What can go wrong above the devices, each with the exit code of the command line it leads to.
+
+A message names the thing, the value, the limit and the next step. Several problems found together are one error with one
+line each, so that nobody repairs a config one key at a time.
+"""
+
+from collections.abc import Iterable
+from typing import ClassVar
+
+
+class RigError(Exception):
+    """Root of the application's errors."""
+
+    exit_code: ClassVar[int] = 1
+
+
+class UsageError(RigError):
+    """The user asked for something that cannot be: a wrong option, config, plan or file."""
+
+    exit_code = 2
+
+    def __init__(self, *problems: str) -> None:
+        super().__init__("\n".join(problems))
+        self.problems: tuple[str, ...] = problems
+
+    @classmethod
+    def of(cls, problems: Iterable[str]) -> "UsageError":
+        """One error for several problems, each on its own line, repeated ones once."""
+        return cls(*dict.fromkeys(problems))
+
+
+class PlanError(UsageError):
+    """The scan that was asked for cannot be done with this scanner, sensor or calibration."""
+
+
+class ResultError(RigError):
+    """The result is there but not to be trusted (gaps, no synchronisation, no calibration)."""
+
+    exit_code = 1
+
+
+class DevicesError(RigError):
+    """One or more devices could not be opened, or failed while they were being stopped; one line per device."""
+
+    exit_code = 3
+
+
+class Aborted(RigError):
+    """The run was ended before its last map, by the user or by the overload policy."""
+
+    exit_code = 4

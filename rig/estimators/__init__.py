@@ -1,0 +1,1 @@
+"""Stripe estimators: argmax, edge, likelihood."""

@@ -1,0 +1,86 @@
+"""Ambient light and dark counts of every pixel, from dark frames, from the quiet side of the stripe and from hot pixels.
+
+Both are constant for a pixel over the columns (the pixel view of the counts): a pixel that fires far more often than its
+neighbours while the laser crosses the whole picture is hot, whatever the scene. Few counts are shrunk to the local mean.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.counting import CountVolume
+from rig.estimators.likelihood_kernels import window_sums
+from rig.geometry import SweepGeometry
+
+NEIGHBOURHOOD_PX = 31
+PRIOR_COUNTS = 4.0
+"""Weight of the local mean, in counts: ambient varies by about half of itself between neighbours (texture)."""
+HOT_SIGMA = 6.0
+"""Excess over the neighbours, in standard deviations, that makes a pixel hot: 1e-9 of good pixels pass."""
+
+
+def ambient_map(
+    volume: CountVolume, geometry: SweepGeometry, quiet: NDArray[np.uint32] | None
+) -> NDArray[np.float32]:
+    """Photons per exposure (rows, width) float32 from dark frames, `quiet` (2, rows, width) counts and hot pixels.
+
+    quiet: ones and exposures of each pixel while clearly behind the stripe; None before any stripe is known.
+    """
+    ones = np.zeros((geometry.rows, geometry.width))
+    exposures = np.zeros_like(ones)
+    if volume.dark_counts is not None:
+        ones += volume.dark_counts
+        exposures += volume.n_dark
+    if quiet is not None:
+        ones += quiet[0]
+        exposures += quiet[1]
+    totals = window_sums(
+        volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.rows, geometry.width
+    )
+    if exposures.sum() < ones.size:
+        level = _lowest_level(totals)
+        base = np.full(ones.shape, level)
+    else:
+        base = _shrunk(ones, exposures)
+    return np.maximum(base, hot_pixels(totals)).astype(np.float32)
+
+
+def _lowest_level(totals: NDArray[np.uint32]) -> float:
+    """A level that hardly any pixel lies below: 2nd percentile of the mean flux over the window."""
+    seen = totals[1] > 0
+    if not seen.any():
+        return 1e-5
+    rate = np.minimum((totals[0][seen] + 0.5) / (totals[1][seen] + 1.0), 0.999)
+    return float(max(-np.log1p(-np.percentile(rate, 2.0)) * 0.5, 1e-5))
+
+
+def _shrunk(ones: NDArray[np.float64], exposures: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Flux per pixel: its own counts where they are many or far above the neighbours, else drawn to the local mean."""
+    # Hot pixels must not lift their neighbourhood: counts above the local expectation are cut for the mean.
+    mean = max(float(ones.sum() / exposures.sum()), 1e-6)
+    for _ in range(2):
+        capped = np.minimum(ones, exposures * mean * 2 + 3)
+        local_ones = cv2.blur(capped, (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), borderType=cv2.BORDER_REFLECT)
+        local_exposures = cv2.blur(exposures, (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), borderType=cv2.BORDER_REFLECT)
+        mean = (local_ones + 1e-6) / (local_exposures + 1.0)
+    expected = mean * exposures
+    rate = (ones + PRIOR_COUNTS) / (exposures + PRIOR_COUNTS / np.maximum(mean, 1e-7))
+    outlier = ones > expected + 4.0 * np.sqrt(expected) + 4.0
+    rate = np.where(outlier, ones / np.maximum(exposures, 1.0), rate)
+    return -np.log1p(-np.minimum(rate, 0.9999))
+
+
+def hot_pixels(totals: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Flux (rows, width) of pixels far above their neighbours over the whole sweep, 0 elsewhere.
+
+    totals: (2, rows, width), ones and exposures of each pixel while inside the search window.
+    """
+    ones, exposures = totals[0].astype(np.float64), totals[1].astype(np.float64)
+    rate = np.minimum(ones / np.maximum(exposures, 1.0), 1.0).astype(np.float32)
+    around = cv2.medianBlur(rate, 5).astype(np.float64)
+    expected = around * exposures
+    excess = ones - expected
+    # A stripe brighter than its neighbours' may cross the pixel once: allow it as much light again as the median pixel.
+    hot = excess > HOT_SIGMA * np.sqrt(expected + 1.0) + 0.5 * expected.clip(max=np.median(expected))
+    excess_rate = np.clip(excess / np.maximum(exposures, 1.0), 0.0, 0.9999)
+    return np.where(hot & (exposures > 0), -np.log1p(-excess_rate), 0.0)

@@ -1,0 +1,233 @@
+"""Learns the row model from the counts of a sweep by expectation-maximisation over a lattice of rows and columns.
+
+Each round the row likelihood says, with its posterior, how much of every pixel's evidence lay before and behind the
+stripe; haze, pedestal, row gains, amplitudes and line width are set to what those weighted counts say. Nothing of the
+medium or the light is assumed beyond 'haze falls with the path length', and that only where data are few.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.counting import CountVolume
+from rig.estimators.ambient import ambient_map
+from rig.estimators.likelihood_kernels import learn_rows
+from rig.estimators.row_kernels import logit_table
+from rig.estimators.row_model import AMPLITUDES, BINS, RowModel, fit_haze, line_profile, stripe_scale
+from rig.geometry import SweepGeometry
+
+LATTICE_LINES = 8192
+"""Rows x columns of a sweep that a learning round reads: about 10^6 pixels."""
+FIRST_ROUNDS = 10
+NEXT_ROUNDS = 1
+PRIOR_PHOTONS = 100.0
+"""Weight of the fitted exponential against each bin's own counts."""
+START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
+TABLE = logit_table()
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """Weighted counts of one round; see `learn_rows`."""
+
+    levels: NDArray[np.float64]
+    rows_seen: NDArray[np.float64]
+    amplitude_mass: NDArray[np.float64]
+    evidence: float
+
+
+def lattice(geometry: SweepGeometry, lines: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """About `lines` (row, column) pairs spread evenly over those with a window: a fixed pattern, no chance in it."""
+    y, c = np.nonzero(geometry.x_lo <= geometry.x_hi)
+    if len(y) <= lines:
+        return y.astype(np.int32), c.astype(np.int32)
+    # Golden-ratio steps cover rows and columns without beating against either.
+    pick = np.unique((np.arange(lines) * (len(y) / lines) + (np.arange(lines) * 0.6180339887) % 1 * (len(y) / lines)).astype(np.int64))
+    return y[pick].astype(np.int32), c[pick].astype(np.int32)
+
+
+def expect(
+    volume: CountVolume, geometry: SweepGeometry, model: RowModel, lines: tuple[NDArray[np.int32], NDArray[np.int32]]
+) -> Expectation:
+    """Expectation step of `model` over the given (rows, columns)."""
+    levels = np.zeros((BINS, 6))
+    rows_seen = np.zeros((geometry.rows, 2))
+    mass = np.zeros(len(model.amplitude) + 1)
+    typical = float(np.median(model.ambient))
+    evidence = learn_rows(
+        volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left, geometry.plane,
+        geometry.u, geometry.v, model.ambient, model.profile, model.w_lo, model.per_w, model.row_gain, model.amplitude,
+        *log_weights(model), line_profile(model.line_sigma_px), TABLE, lines[0], lines[1],
+        5.0 * typical + 1e-3, levels, rows_seen, mass,
+    )  # fmt: skip
+    return Expectation(levels, rows_seen, mass, float(evidence))
+
+
+def log_weights(model: RowModel) -> tuple[NDArray[np.float32], float]:
+    """Log prior of the amplitudes (M,) float32 and of 'no stripe'."""
+    stripe = np.log(np.maximum(model.weight, 1e-6) * (1.0 - model.none_weight)).astype(np.float32)
+    return stripe, float(np.log(model.none_weight))
+
+
+def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: NDArray[np.float32]) -> RowModel:
+    """Row model of a sweep that nothing is known about: several starts, the likeliest one refined."""
+    lines = lattice(geometry, LATTICE_LINES)
+    few = lattice(geometry, LATTICE_LINES // 4)
+    best: tuple[float, RowModel] | None = None
+    for extinction in START_EXTINCTIONS_PER_M:
+        model = _start(volume, geometry, ambient, extinction)
+        for _ in range(2):
+            model = maximise(model, expect(volume, geometry, model, few), spread=True)
+        evidence = expect(volume, geometry, model, few).evidence
+        if best is None or evidence > best[0]:
+            best = evidence, model
+    assert best is not None
+    model = best[1]
+    for round_number in range(FIRST_ROUNDS):
+        model = maximise(model, expect(volume, geometry, model, lines), spread=round_number < 4)
+        model = fit_line_width(volume, geometry, model, few)
+    return model
+
+
+def learn_next(volume: CountVolume, geometry: SweepGeometry, model: RowModel) -> RowModel:
+    """The model carried on by one more sweep."""
+    lines = lattice(geometry, LATTICE_LINES)
+    for _ in range(NEXT_ROUNDS):
+        model = maximise(model, expect(volume, geometry, model, lines), spread=False)
+    return fit_line_width(volume, geometry, model, lattice(geometry, LATTICE_LINES // 4))
+
+
+def fit_line_width(
+    volume: CountVolume, geometry: SweepGeometry, model: RowModel, lines: tuple[NDArray[np.int32], NDArray[np.int32]]
+) -> RowModel:
+    """Move the line width one step up or down where that makes the counts likelier."""
+    tried = [replace(model, line_sigma_px=float(np.clip(model.line_sigma_px * f, 0.25, 2.4))) for f in (0.87, 1.0, 1.15)]
+    evidence = [expect(volume, geometry, m, lines).evidence for m in tried]
+    return tried[int(np.argmax(evidence))]
+
+
+def _bins(geometry: SweepGeometry) -> tuple[float, float]:
+    """First path inverse depth and bins per unit of it, with room for the margins outside the depth range."""
+    near_m, far_m = geometry.depth_range_m
+    # Paths are longer than depths towards the picture's corners: up to a third for the fields of view met here.
+    w_lo, w_hi = 0.6 / far_m, 1.15 / near_m
+    return w_lo, (BINS - 1) / (w_hi - w_lo)
+
+
+def _start(
+    volume: CountVolume, geometry: SweepGeometry, ambient: NDArray[np.float32], extinction_per_m: float
+) -> RowModel:
+    """Row model with haze of a guessed extinction that matches the mean level of the nearest pixels."""
+    w_lo, per_w = _bins(geometry)
+    path_m = 1.0 / (w_lo + np.arange(BINS) / per_w)
+    level = _near_level(volume, geometry)
+    typical = float(np.median(ambient))
+    near_m = geometry.depth_range_m[0] * 1.2
+    haze = max(level - typical, 0.0) * np.exp(-2.0 * extinction_per_m * np.maximum(path_m - near_m, 0.0))
+    profile = np.stack([haze, np.zeros(BINS), stripe_scale(path_m, extinction_per_m)], 1).astype(np.float32)
+    amplitude = np.geomspace(0.03, 30.0, AMPLITUDES).astype(np.float32)
+    return RowModel(
+        profile, w_lo, per_w, np.ones(geometry.rows, np.float32), ambient, amplitude,
+        np.full(AMPLITUDES, 1.0 / AMPLITUDES), 0.02, 0.8, extinction_per_m, np.nan,
+    )  # fmt: skip
+
+
+def _near_level(volume: CountVolume, geometry: SweepGeometry) -> float:
+    """Mean flux of the nearest eighth of the search windows, where hardly any stripe lies."""
+    rows, columns = lattice(geometry, 4096)
+    ones = exposures = 0.0
+    lo, hi = geometry.x_lo[rows, columns], geometry.x_hi[rows, columns]
+    share = np.maximum((hi - lo + 1) // 8, 1)
+    for y, c, a, b, n in zip(rows, columns, lo, hi, share, strict=True):
+        x = slice(a - volume.x0[c], a - volume.x0[c] + n) if geometry.near_is_left else slice(b - n + 1 - volume.x0[c], b + 1 - volume.x0[c])
+        ones += float(volume.counts[c, y, x].sum())
+        exposures += float(volume.n_frames[c]) * n
+    return flux(ones, exposures)
+
+
+def flux(ones: float, exposures: float) -> float:
+    """Photons per exposure from ones among exposures; finite at all-ones, 0 where there are no exposures."""
+    return float(np.log((exposures + 0.5) / (exposures - ones + 0.5))) if exposures > 0 else 0.0
+
+
+def maximise(model: RowModel, seen: Expectation, *, spread: bool) -> RowModel:
+    """Model that explains the weighted counts best; `spread` lets the amplitude grid move."""
+    path_m = model.path_m()
+    typical = float(np.median(model.ambient))
+    haze, haze_variance = _level(seen.levels[:, 0], seen.levels[:, 1], seen.levels[:, 2], typical)
+    fit = fit_haze(path_m, haze, haze_variance)
+    fitted = fit.amplitude * np.exp(-2.0 * fit.extinction_per_m * path_m) if fit else np.zeros(BINS)
+    before = _blend(haze, haze_variance, fitted)
+    rest, rest_variance = _level(seen.levels[:, 3], seen.levels[:, 4], seen.levels[:, 5], typical)
+    rest_fit = fit_haze(path_m, rest, rest_variance)
+    rest_fitted = rest_fit.amplitude * np.exp(-2.0 * rest_fit.extinction_per_m * path_m) if rest_fit else np.zeros(BINS)
+    behind = np.minimum(_blend(rest, rest_variance, rest_fitted), before)
+    resolved = fit is not None and np.isfinite(fit.extinction_sd_per_m)
+    extinction = fit.extinction_per_m if fit is not None and resolved else 0.0
+    profile = np.stack([before, behind, stripe_scale(path_m, extinction)], 1).astype(np.float32)
+    amplitude, weight, none = _amplitudes(model, seen.amplitude_mass, spread)
+    return replace(
+        model, profile=profile, row_gain=_row_gain(model, seen, typical, before), amplitude=amplitude, weight=weight,
+        none_weight=none, extinction_per_m=fit.extinction_per_m if fit else np.nan,
+        extinction_sd_per_m=fit.extinction_sd_per_m if fit and resolved else np.nan,
+    )  # fmt: skip
+
+
+def _level(
+    ones: NDArray[np.float64], exposures: NDArray[np.float64], geometric: NDArray[np.float64], ambient: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Flux above ambient per unit geometry factor and its variance, NaN in bins without data."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        gain = geometric / exposures
+        total = np.log((exposures + 0.5) / (exposures - ones + 0.5))
+        variance = np.expm1(total) / exposures + 1.0 / exposures**2
+        few = exposures < 50
+        return np.where(few, np.nan, (total - ambient) / gain), np.where(few, np.nan, variance / gain**2)
+
+
+def _blend(
+    level: NDArray[np.float64], variance: NDArray[np.float64], fitted: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Each bin's own level where it has many photons, the fitted curve where it has few."""
+    own = np.where(np.isfinite(level), 1.0 / np.maximum(variance, 1e-12), 0.0)
+    prior = PRIOR_PHOTONS / np.maximum(fitted, 1e-4) ** 2
+    return np.maximum((own * np.nan_to_num(level) + prior * fitted) / (own + prior), 0.0)
+
+
+def _amplitudes(
+    model: RowModel, mass: NDArray[np.float64], spread: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float64], float]:
+    total = float(mass.sum())
+    none = float(np.clip(mass[-1] / max(total, 1.0), 0.005, 0.5))
+    weight = (mass[:-1] + 1.0) / (mass[:-1].sum() + len(mass) - 1)
+    if not spread:
+        return model.amplitude, weight, none
+    # Keep the grid on the amplitudes that occur: weighted mean +- 1.8 sd of their logarithm, never narrower than 1.2x.
+    log_q = np.log(model.amplitude.astype(np.float64))
+    mean = float(np.sum(weight * log_q))
+    sd = float(np.sqrt(np.sum(weight * (log_q - mean) ** 2)))
+    step = log_q[1] - log_q[0]
+    half = max(1.8 * max(sd, 0.5 * step), 0.5)
+    amplitude = np.exp(np.linspace(mean - half, mean + half, AMPLITUDES)).astype(np.float32)
+    weight = np.exp(-0.5 * ((np.log(amplitude) - mean) / max(sd, 0.3 * step)) ** 2)
+    return amplitude, weight / weight.sum(), none
+
+
+def _row_gain(model: RowModel, seen: Expectation, ambient: float, before: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Strength of the line per row, smoothed over 65 rows; 1 on average, and everywhere where haze is weak."""
+    expected, ones = (
+        cv2.blur(np.ascontiguousarray(seen.rows_seen[:, i : i + 1]), (1, 65), borderType=cv2.BORDER_REFLECT).ravel()
+        for i in (1, 0)
+    )
+    haze_share = float(before.mean() / (before.mean() + ambient + 1e-9))
+    if haze_share < 0.3 or expected.min() < 100:
+        return model.row_gain
+    gain = model.row_gain * np.clip(ones / expected, 0.5, 2.0)
+    return np.clip(gain / gain.mean(), 0.2, 5.0).astype(np.float32)
+
+
+def first_ambient(volume: CountVolume, geometry: SweepGeometry) -> NDArray[np.float32]:
+    """Ambient and dark flux per pixel before anything else is known."""
+    return ambient_map(volume, geometry, None)

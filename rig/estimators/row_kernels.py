@@ -1,0 +1,242 @@
+"""Compiled row likelihood: 'haze, stripe, then less' for every row and column of a sweep.
+
+Hypothesis j of a row: pixels nearer than the stripe see haze and ambient light (flux B), pixels behind it the pedestal
+and ambient light (flux E), and 2T + 1 pixels around j see q S psi_k on top. With p' = (1 - e)(1 - exp(-flux)) + e/2 the
+log-likelihood of the counts n of K frames is linear in them, sum n logit p' + K log(1 - p'), so that all positions of a
+row cost one cumulative sum plus 2T + 1 taps. The floor e bounds what a single pixel can say.
+Amplitudes q are marginalised over a log grid whose weights are learned; 'no stripe on this row' is a hypothesis too.
+"""
+
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+FLOOR: Final = 1e-3
+"""Probability e of a pixel that does not follow the model (physics of defects: 2-4 % of real pixels are defective)."""
+EXPONENT_LOW: Final = -21
+EXPONENT_HIGH: Final = 8
+CELL_BITS: Final = 8
+TABLE_BASE: Final = np.int32((127 + EXPONENT_LOW) << CELL_BITS)
+TABLE_SHIFT: Final = np.int32(23 - CELL_BITS)
+FLUX_MIN: Final = np.float32(2.0**EXPONENT_LOW)
+FLUX_MAX: Final = np.float32(2.0**EXPONENT_HIGH * 0.999)
+LOST: Final = np.float32(24.0)
+"""Log-likelihood below the best at which a hypothesis no longer counts (exp(-24) = 4e-11)."""
+
+
+def logit_table() -> NDArray[np.float32]:
+    """Table (cells, 2) float32 of logit p' and log(1 - p') over flux: 256 cells an octave, value at the cell's middle.
+
+    The largest error, half a cell, changes a log-likelihood by 0.002 per count: far below its own noise.
+    """
+    cells = (EXPONENT_HIGH - EXPONENT_LOW) << CELL_BITS
+    i = np.arange(cells)
+    mantissa = 1.0 + ((i & ((1 << CELL_BITS) - 1)) + 0.5) / (1 << CELL_BITS)
+    flux = np.ldexp(mantissa, (i >> CELL_BITS) + EXPONENT_LOW)
+    q = (1 - FLOOR) * np.exp(-flux) + FLOOR / 2
+    p = -(1 - FLOOR) * np.expm1(-flux) + FLOOR / 2
+    return np.stack([np.log(p) - np.log(q), np.log(q)], 1).astype(np.float32)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def evidence(n: np.float32, k: np.float32, flux: np.float32, table: NDArray[np.float32]) -> np.float32:
+    """Log-likelihood of n ones in k frames at a flux, which must lie in FLUX_MIN to FLUX_MAX."""
+    i = (np.float32(flux).view(np.int32) >> TABLE_SHIFT) - TABLE_BASE
+    return n * table[i, 0] + k * table[i, 1]
+
+
+@numba.njit(cache=True, nogil=True)
+def load_row(
+    counts: NDArray[np.unsignedinteger],
+    x0: int,
+    y: int,
+    lo: int,
+    hi: int,
+    margin: int,
+    near_is_left: bool,
+    plane: NDArray[np.float64],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    ambient: NDArray[np.float32],
+    profile: NDArray[np.float32],
+    profile_lo: float,
+    profile_per_w: float,
+    row_gain: float,
+    n: NDArray[np.float32],
+    before: NDArray[np.float32],
+    behind: NDArray[np.float32],
+    scale: NDArray[np.float32],
+    cell: NDArray[np.int32],
+    gain_of: NDArray[np.float32],
+) -> tuple[int, int, int]:
+    """Read one row of one column in near-to-far order.
+
+    counts: (window,) of this row and column from pixel x0 on; lo, hi: search interval; profile: (bins, 3) of haze before,
+    level behind and stripe scale over path inverse depth. Fills n, before, behind, scale, cell up to the returned
+    length; returns (length, first hypothesis, x of index 0). Pixel of index t is x + t or x - t.
+    """
+    first = max(lo - margin, x0, 0)
+    last = min(hi + margin, x0 + counts.shape[0] - 1, u.shape[1] - 1)
+    while first < last and np.isnan(u[y, first]):
+        first += 1
+    while last > first and np.isnan(u[y, last]):
+        last -= 1
+    length = last - first + 1
+    start, step = (first, 1) if near_is_left else (last, -1)
+    top = profile.shape[0] - 1.001
+    vy = v[y, (first + last) // 2]
+    # Tangent at which this row meets the plane infinitely far away: the direction of the light in the row.
+    path_u = -(plane[1] * vy + plane[2]) / plane[0]
+    path_p = np.sqrt(1.0 + path_u * path_u + vy * vy)
+    for t in range(length):
+        x = start + step * t
+        ux, vx = u[y, x], v[y, x]
+        path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
+        w = plane[0] * ux + plane[1] * vx + plane[2]
+        b = (w * 2.0 / (path_p + path_c) - profile_lo) * profile_per_w
+        b = min(max(b, 0.0), top)
+        i = int(b)
+        f = np.float32(b - i)
+        gain = row_gain * path_p * path_c
+        a = ambient[y, x]
+        n[t] = counts[x - x0]
+        haze = gain * (profile[i, 0] + f * (profile[i + 1, 0] - profile[i, 0]))
+        rest = gain * (profile[i, 1] + f * (profile[i + 1, 1] - profile[i, 1]))
+        before[t] = min(max(a + haze, FLUX_MIN), FLUX_MAX)
+        behind[t] = min(max(a + rest, FLUX_MIN), FLUX_MAX)
+        scale[t] = profile[i, 2] + f * (profile[i + 1, 2] - profile[i, 2])
+        cell[t] = i
+        gain_of[t] = gain
+    return length, (lo - first if near_is_left else last - hi), start
+
+
+@numba.njit(cache=True, nogil=True)
+def row_scores(
+    n: NDArray[np.float32],
+    k: float,
+    before: NDArray[np.float32],
+    behind: NDArray[np.float32],
+    scale: NDArray[np.float32],
+    length: int,
+    amplitude: NDArray[np.float32],
+    psi: NDArray[np.float32],
+    table: NDArray[np.float32],
+    taps: NDArray[np.float32],
+    edge: NDArray[np.float32],
+    score: NDArray[np.float32],
+) -> None:
+    """Log-likelihood of every position and amplitude against 'everything is behind'.
+
+    psi: (T + 1,) share of the stripe at 0..T px from its centre. Writes score (M, length), edge (length + 1,), the score
+    of a change from before to behind at t without any stripe, and taps (2, length), each pixel's own log-likelihood
+    before and behind.
+    """
+    reach = psi.shape[0] - 1
+    edge[0] = 0.0
+    total = 0.0
+    for t in range(length):
+        taps[0, t] = evidence(n[t], k, before[t], table)
+        taps[1, t] = evidence(n[t], k, behind[t], table)
+        total += taps[0, t] - taps[1, t]
+        edge[t + 1] = total
+    for m in range(amplitude.shape[0]):
+        for t in range(length):
+            base = np.float32(0.5) * (before[t] + behind[t])
+            flux = min(base + amplitude[m] * scale[t] * psi[0], FLUX_MAX)
+            score[m, t] = edge[t] + evidence(n[t], k, flux, table) - taps[1, t]
+        for d in range(1, reach + 1):
+            q = amplitude[m] * psi[d]
+            # The same pixel serves as tap of the stripe d px behind it, then of the one d px nearer.
+            for t in range(length - d):
+                score[m, t + d] += evidence(n[t], k, min(before[t] + q * scale[t], FLUX_MAX), table) - taps[0, t]
+            for t in range(d, length):
+                score[m, t - d] += evidence(n[t], k, min(behind[t] + q * scale[t], FLUX_MAX), table) - taps[1, t]
+
+
+@numba.njit(cache=True, nogil=True)
+def row_posterior(
+    score: NDArray[np.float32],
+    edge: NDArray[np.float32],
+    length: int,
+    first: int,
+    last: int,
+    log_weight: NDArray[np.float32],
+    log_none: float,
+    posterior: NDArray[np.float32],
+    by_amplitude: NDArray[np.float64],
+) -> tuple[float, float]:
+    """Posterior (length,) over positions, summed over amplitudes; by_amplitude (M,) sums the other way.
+
+    Returns (probability of 'no stripe', log evidence of the row). Prior: positions alike, amplitudes by log_weight.
+    """
+    positions = last - first + 1
+    log_uniform = -np.log(np.float32(positions))
+    best = np.float32(-1e30)
+    for m in range(score.shape[0]):
+        top = np.float32(-1e30)
+        for j in range(first, last + 1):
+            top = max(top, score[m, j])
+        best = max(best, top + log_weight[m])
+    for t in range(length + 1):
+        best = max(best, edge[t] + log_none)
+    none = 0.0
+    log_edges = log_none - np.log(np.float32(length + 1)) - log_uniform
+    for t in range(length + 1):
+        s = edge[t] + log_edges - best
+        if s > -LOST:
+            none += np.exp(s)
+    for t in range(length):
+        posterior[t] = 0.0
+    total = none
+    for m in range(score.shape[0]):
+        subtotal = 0.0
+        for j in range(first, last + 1):
+            s = score[m, j] + log_weight[m] - best
+            if s > -LOST:
+                p = np.exp(s)
+                posterior[j] += p
+                subtotal += p
+        by_amplitude[m] = subtotal
+        total += subtotal
+    if total <= 0.0:
+        return 1.0, 0.0
+    inverse = 1.0 / total
+    for j in range(first, last + 1):
+        posterior[j] *= inverse
+    for m in range(score.shape[0]):
+        by_amplitude[m] *= inverse
+    return none * inverse, np.log(total) + best + log_uniform
+
+
+@numba.njit(cache=True, nogil=True)
+def mode_and_mean(
+    posterior: NDArray[np.float32], first: int, last: int, reach: int
+) -> tuple[int, float, float, float]:
+    """Most probable position, its local mean and standard deviation, and the mass within 1 px of that mean.
+
+    Ties go to the smaller index. The variance includes that of a position inside one pixel (1/12 px^2).
+    """
+    mode = first
+    for j in range(first, last + 1):
+        if posterior[j] > posterior[mode]:
+            mode = j
+    lo, hi = max(first, mode - reach), min(last, mode + reach)
+    mass = 0.0
+    mean = 0.0
+    for j in range(lo, hi + 1):
+        mass += posterior[j]
+        mean += posterior[j] * (j - mode)
+    if mass <= 0.0:
+        return mode, np.float64(mode), 0.0, 0.0
+    mean /= mass
+    variance = 0.0
+    for j in range(lo, hi + 1):
+        variance += posterior[j] * (j - mode - mean) ** 2
+    near = 0.0
+    for j in range(max(first, mode - 3), min(last, mode + 3) + 1):
+        # Overlap of the pixel with the 2 px around the answer.
+        overlap = min(j - mode + 0.5, mean + 1.0) - max(j - mode - 0.5, mean - 1.0)
+        near += posterior[j] * min(max(overlap, 0.0), 1.0)
+    return mode, mode + mean, np.sqrt(variance / mass + 1.0 / 12.0), min(near, 1.0)

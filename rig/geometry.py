@@ -1,0 +1,100 @@
+"""Where a column's stripe can lie: windows on every image row from the depth range, and the scene geometry of each pixel.
+
+A light plane n.X = d meets the ray (u, v, 1) of a pixel at inverse depth w = (n.r)/d: along a row w is monotone in x, so
+the depth range becomes one interval of pixels. No rectification is assumed; with distortion, roll or tilted planes the
+interval simply moves from row to row.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model import RigModel
+from rig.errors import UsageError
+
+WORD_PX = 64
+"""Windows start and end at multiples of one 64-bit word, so that counting runs on whole words."""
+MARGIN_PX = 10
+"""Pixels kept on both sides of the search interval: they still say where the haze ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepGeometry:
+    """Rays, planes and search windows of one sweep.
+
+    u, v: float32 (rows, width) ray tangents of every raw pixel, NaN where the camera model is not invertible.
+    plane: float64 (columns, 3), the plane as p.X = 1 (p = n/d), so that inverse depth is p.(u, v, 1).
+    planes: float64 (columns, 4) as (n, d), |n| = 1.
+    x_lo, x_hi: int32 (rows, columns), first and last pixel of the search window; empty where x_lo > x_hi.
+    x0: int32 (columns,) first stored pixel; window: stored pixels per row, a multiple of 64.
+    near_is_left: True where near points lie at smaller x than far ones (scanner on the left).
+    depth_range_m: nearest and farthest depth.
+    """
+
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    plane: NDArray[np.float64]
+    planes: NDArray[np.float64]
+    x_lo: NDArray[np.int32]
+    x_hi: NDArray[np.int32]
+    x0: NDArray[np.int32]
+    window: int
+    near_is_left: bool
+    depth_range_m: tuple[float, float]
+
+    @property
+    def rows(self) -> int:
+        """Image rows."""
+        return int(self.u.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Sensor width in pixels."""
+        return int(self.u.shape[1])
+
+    @property
+    def columns(self) -> int:
+        """Laser line positions of the sweep."""
+        return int(self.plane.shape[0])
+
+
+def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: tuple[float, float]) -> SweepGeometry:
+    """Search windows of `planes` (columns, 4) for a camera and a depth range in metres.
+
+    Raises UsageError where a plane passes through the camera (its depth is not determined) or where no column can be
+    seen at all within the depth range.
+    """
+    from rig.geometry_kernels import row_windows
+
+    u64, v64 = model.camera.tangents()
+    u, v = np.ascontiguousarray(u64, dtype=np.float32), np.ascontiguousarray(v64, dtype=np.float32)
+    planes = np.ascontiguousarray(planes, dtype=np.float64)
+    offset = planes[:, 3]
+    if np.any(np.abs(offset) < 1e-6):
+        worst = int(np.argmin(np.abs(offset)))
+        raise UsageError(
+            f"light plane of column {worst} passes {abs(offset[worst]):.1e} m from the camera, less than 1e-6 m: "
+            "depth is not determined; check the baseline in the calibration"
+        )
+    plane = planes[:, :3] / offset[:, None]
+    middle = len(plane) // 2
+    near_is_left = bool(plane[middle, 0] < 0)
+    near_m, far_m = depth_range_m
+    x_lo, x_hi = row_windows(u, v, plane, 1.0 / far_m, 1.0 / near_m)
+    seen = x_lo <= x_hi
+    if not seen.any():
+        raise UsageError(
+            f"no column meets the picture between {near_m:g} m and {far_m:g} m; widen depth_range or check the calibration"
+        )
+    width = u.shape[1]
+    padded = -(-width // WORD_PX) * WORD_PX
+    big = np.int32(padded)
+    first = np.where(seen, x_lo, big).min(axis=0) - MARGIN_PX
+    last = np.where(seen, x_hi, -1).max(axis=0) + MARGIN_PX
+    empty = ~seen.any(axis=0)
+    first = np.where(empty, 0, np.clip(first, 0, width - 1)) // WORD_PX * WORD_PX
+    last = np.where(empty, 0, np.clip(last, 0, width - 1))
+    window = int(-(-(last - first + 1).max() // WORD_PX) * WORD_PX)
+    x0 = np.minimum(first, padded - window).astype(np.int32)
+    return SweepGeometry(u, v, plane, planes, x_lo, x_hi, x0, window, near_is_left, (near_m, far_m))

@@ -1,0 +1,1 @@
+"""The simulated rig: worlds, effects, photons and simulated devices."""

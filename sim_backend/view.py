@@ -1,0 +1,143 @@
+"""What the camera sees of a scene, per pixel, as the light transport needs it: rays, inverse depth, facets, albedo."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model import RigModel
+from sim_backend.light_sheet import LightSheet, empty_sheet
+from sim_backend.light_sheet_kernels import DEPTH_JUMP, trace_rows
+from sim_backend.scenes.surfaces import Surfaces
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Rays and surfaces on the camera's pixel grid. All maps float64 (rows, width).
+
+    u, v: ray tangents, NaN where the lens has no inverse. u_x, v_x: their slopes per pixel along the row.
+    surface: inverse depth in 1/m (0: nothing there). facet: (rows, width, 3), the plane m.X = 1 through each surface point.
+    albedo: 0..1. source_m: (3,) where the light leaves the mirror.
+    """
+
+    u: Array
+    v: Array
+    u_x: Array
+    v_x: Array
+    surface: Array
+    facet: Array
+    albedo: Array
+    source_m: Array
+
+    @property
+    def rows(self) -> int:
+        """Image rows."""
+        return int(self.u.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Pixels per row."""
+        return int(self.u.shape[1])
+
+    def sheet(self, plane: Array) -> LightSheet:
+        """The light sheet of the plane (4,) = nx, ny, nz, d, traced on every row."""
+        sheet = empty_sheet(plane, self.rows)
+        self.trace(sheet, 0, self.rows)
+        return sheet
+
+    def trace(self, sheet: LightSheet, first_row: int, last_row: int) -> None:
+        """Trace rows first_row..last_row-1 of a sheet in place. Releases the GIL."""
+        trace_rows(
+            self.u,
+            self.v,
+            self.surface,
+            sheet.inverse,
+            first_row,
+            last_row,
+            sheet.x_stripe_px,
+            sheet.x_end_px,
+            sheet.start_px,
+            sheet.step,
+        )
+
+
+def make_view(model: RigModel, surfaces: Surfaces) -> View:
+    """View of the surfaces through the model's camera. The model must know where its light comes from (`source_m`)."""
+    assert model.source_m is not None, "checked by the world"
+    u, v = model.camera.tangents()
+    u_x, v_x = _slope(u, 1), _slope(v, 1)
+    u_y, v_y = _slope(u, 0), _slope(v, 0)
+    surface = 1.0 / surfaces.depth_m.astype(np.float64)
+    surface[~np.isfinite(surface)] = 0.0
+    return View(
+        u=np.ascontiguousarray(u),
+        v=np.ascontiguousarray(v),
+        u_x=u_x,
+        v_x=v_x,
+        surface=surface,
+        facet=_facets(surface, (u, v), (u_x, v_x, u_y, v_y)),
+        albedo=surfaces.albedo.astype(np.float64),
+        source_m=np.array(model.source_m, dtype=np.float64),
+    )
+
+
+def _slope(tangent: Array, axis: int) -> Array:
+    if tangent.shape[axis] < 2:
+        return np.zeros_like(tangent)
+    slope: Array = np.gradient(tangent, axis=axis)
+    return slope
+
+
+def _facets(surface: Array, rays: tuple[Array, Array], slopes: tuple[Array, Array, Array, Array]) -> Array:
+    """Planes m.X = 1 tangent to the surface, float64 (rows, width, 3).
+
+    On a plane the inverse depth is w = m.(u, v, 1), so m = (w_u, w_v, w - u w_u - v w_v). Gradients are averaged over two
+    pixels to each side that lie on the same surface.
+    """
+    u, v = rays
+    u_x, v_x, u_y, v_y = slopes
+    w_x, w_y = _surface_slope(surface, 1), _surface_slope(surface, 0)
+    determinant = u_x * v_y - u_y * v_x
+    with np.errstate(all="ignore"):
+        w_u = (w_x * v_y - w_y * v_x) / determinant
+        w_v = (w_y * u_x - w_x * u_y) / determinant
+    facet = np.stack([w_u, w_v, surface - u * w_u - v * w_v], axis=-1)
+    lost = ~np.isfinite(facet).all(axis=-1)
+    facet[lost] = 0.0
+    facet[lost, 2] = surface[lost]
+    return np.ascontiguousarray(facet)
+
+
+def _surface_slope(surface: Array, axis: int) -> Array:
+    """Slope of inverse depth per pixel from neighbours within two pixels, none of them across a depth jump."""
+    w = np.moveaxis(surface, axis, 0)
+    step = np.diff(w, axis=0)
+    joined = np.abs(step) <= DEPTH_JUMP * np.maximum(w[1:], w[:-1])
+    step = np.where(joined, step, 0.0)
+    total = np.zeros_like(w)
+    weight = np.zeros_like(w)
+    # The step between pixels i and i+1 (a neighbour's outer step counts half, and only if the inner one is joined).
+    for offset, share in ((0, 1.0), (-1, 1.0), (1, 0.5), (-2, 0.5)):
+        reach = joined.copy() if offset in (0, -1) else _inner_joined(joined, offset)
+        lo, hi = max(0, -offset), min(len(w), len(step) - offset)
+        if lo >= hi:
+            continue
+        take = slice(lo + offset, hi + offset)
+        usable = reach[take] & joined[take]
+        total[lo:hi] += share * step[take] * usable
+        weight[lo:hi] += share * usable
+    with np.errstate(all="ignore"):
+        slope = np.where(weight > 0, total / weight, 0.0)
+    return np.ascontiguousarray(np.moveaxis(slope, 0, axis))
+
+
+def _inner_joined(joined: NDArray[np.bool_], offset: int) -> NDArray[np.bool_]:
+    """For the outer step at `offset` (1 or -2), whether the inner step between it and the pixel is joined."""
+    inner = np.zeros_like(joined)
+    if offset == 1:
+        inner[1:] = joined[:-1]
+    else:
+        inner[:-1] = joined[1:]
+    return inner
