@@ -55,7 +55,7 @@ class RigModel:
             at = int(np.argmax(flat))
             angle = np.degrees(np.arctan2(abs(planes[at, 0]), abs(planes[at, 1])))
             raise CalibrationError(
-                f"light plane at command {commands[at]:g} lies {angle:.1f} degrees from the search axis (the image row); "
+                f"light plane at command {commands[at]:g} lies {angle:.1f} degrees from the search axis (image row); "
                 "it must be more than 45: turn the line, or mount the sensor sideways"
             )
 

@@ -14,6 +14,9 @@ from calibration.errors import CalibrationError
 
 Array = NDArray[np.float64]
 
+_ROUNDING = 1e-15
+"""A few units in the last place of 1.0."""
+
 
 class Scanner(Protocol):
     """What the rest of the project needs of a scanner model."""
@@ -56,7 +59,7 @@ class PlaneTable:
         if not np.all(np.isfinite(command)) or np.any(np.diff(command) <= 0):
             at = int(np.argmax(~(np.diff(command) > 0))) if len(command) > 1 else 0
             raise CalibrationError(f"plane table's commands must increase; not so after row {at} ({command[at]:g})")
-        rows /= length[:, None]
+        rows /= _exactly_one(length)[:, None]
         turned = np.sum(rows[1:, :3] * rows[:-1, :3], axis=1) < 0
         rows[1:][np.cumsum(turned) % 2 == 1] *= -1
         if np.sum(rows[:, 0]) < 0:
@@ -98,7 +101,8 @@ class PivotScanner:
         point = _vector(self.axis_point_m, "axis_point_m")
         axis = _unit(_vector(self.axis_direction, "axis_direction"), "axis_direction")
         normal = _vector(self.zero_normal, "zero_normal")
-        normal = _unit(normal - axis * (axis @ normal), "zero_normal (across the axis)")
+        along = float(axis @ normal)
+        normal = _unit(normal - axis * (along if abs(along) > _ROUNDING else 0.0), "zero_normal (across the axis)")
         angle = np.array(self.angle_rad, dtype=np.float64)
         if angle.ndim != 1 or angle.size == 0 or not np.all(np.isfinite(angle)):
             raise CalibrationError("pivot scanner's angle_rad must be finite polynomial terms, constant first")
@@ -146,5 +150,10 @@ def _unit(vector: Array, name: str) -> Array:
     length = float(np.linalg.norm(vector))
     if length < 1e-9:
         raise CalibrationError(f"pivot scanner's {name} has length zero")
-    result: Array = vector / length
+    result: Array = vector / _exactly_one(np.array(length))
     return result
+
+
+def _exactly_one(length: Array) -> Array:
+    """Lengths; one up to rounding counts as exactly one, so a model read back from its file is the same bit for bit."""
+    return np.where(np.abs(length - 1) < _ROUNDING, 1.0, length)

@@ -1,5 +1,7 @@
 """The error tree of everything a device can do wrong: one class per cause, each message one line."""
 
+# ruff: noqa: N818 - a class is named after what happened (`except InterlockOpen:`)
+
 
 class DeviceError(Exception):
     """Root of the tree. Raised itself only where no subclass fits; `str(error)` is one line for the user."""

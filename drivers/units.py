@@ -96,27 +96,27 @@ def parse_quantity(text: object, dimension: str) -> float:
     try:
         value = float(exact)
     except OverflowError:
-        raise ValueError(f"{_shown(text)} is too large for a {dimension}") from None
+        raise ValueError(f"{_shown(text)} is too large, beyond what 64-bit floats hold") from None
     if value == 0 and exact != 0:
-        raise ValueError(f"{_shown(text)} is too small for a {dimension}")
+        raise ValueError(f"{_shown(text)} is too small, below what 64-bit floats hold")
     return value
 
 
 def parse_exact(text: object, dimension: str) -> Fraction:
     """As `parse_quantity`, with nothing rounded; takes a fraction too ("100000/3 Hz")."""
     known = DIMENSIONS[dimension]
-    like = f'write a {known.name} like "{known.example}"'
+    like = f'write the {known.name} with a unit, like "{known.example}"'
     if not isinstance(text, str):
         raise ValueError(f"{_shown(text)} has no unit; {like}")
     stripped = text.strip()
     match = _NUMBER.match(stripped) if len(stripped) <= _MAX_TEXT else None
     if match is None:
-        raise ValueError(f"{_shown(text)} is no number with a unit; {like}")
+        raise ValueError(f"{_shown(text)} is no number; {like}")
     unit = stripped[match.end() :].strip()
     if not unit:
         raise ValueError(f"{_shown(text)} has no unit; {like}")
     if unit not in known.units:
-        raise ValueError(f"{_shown(text)}: {_shown(unit)} is no unit of a {known.name}; use {', '.join(known.units)}")
+        raise ValueError(f"{_shown(text)}: {_shown(unit)} is no unit of {known.name}; use {', '.join(known.units)}")
     divisor = int(match["divisor"] or 1)
     if divisor == 0:
         raise ValueError(f"{_shown(text)} divides by zero; {like}")
@@ -180,7 +180,7 @@ class _Text:
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         known = DIMENSIONS[self.dimension]
-        description = f"a {known.name} with its unit ({', '.join(known.units)})"
+        description = f"{known.name} with its unit ({', '.join(known.units)})"
         return {"type": "string", "description": description, "examples": [known.example]}
 
 

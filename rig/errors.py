@@ -1,7 +1,7 @@
 """What can go wrong above the devices, each with the exit code of the command line it leads to.
 
-A message names the thing, the value, the limit and the next step. Several problems found together are one error with one
-line each, so that nobody repairs a config one key at a time.
+A message names the thing, the value, the limit and the next step. Several problems found together are one error with
+one line each, so that nobody repairs a config one key at a time.
 """
 
 from collections.abc import Iterable
@@ -45,7 +45,7 @@ class DevicesError(RigError):
     exit_code = 3
 
 
-class Aborted(RigError):
+class Aborted(RigError):  # noqa: N818 - the word of the exit code
     """The run was ended before its last map, by the user or by the overload policy."""
 
     exit_code = 4

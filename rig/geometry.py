@@ -58,6 +58,20 @@ class SweepGeometry:
         """Laser line positions of the sweep."""
         return int(self.plane.shape[0])
 
+    def reference_px(self) -> NDArray[np.float64]:
+        """Where each column's line would stand at the middle inverse depth, (rows, columns), as if without distortion.
+
+        Only its differences between neighbouring rows and columns matter; it may lie outside the picture.
+        """
+        near_m, far_m = self.depth_range_m
+        w = 0.5 * (1.0 / near_m + 1.0 / far_m)
+        valid = np.isfinite(self.u)
+        y, x = np.nonzero(valid)
+        px_per_tangent, centre = np.polyfit(self.u[y, x].astype(np.float64), x, 1)
+        v_row = np.array([self.v[i, m].mean() if m.any() else 0.0 for i, m in enumerate(valid)], dtype=np.float64)
+        u = (w - self.plane[None, :, 2] - self.plane[None, :, 1] * v_row[:, None]) / self.plane[None, :, 0]
+        return np.asarray(centre + px_per_tangent * u)
+
 
 def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: tuple[float, float]) -> SweepGeometry:
     """Search windows of `planes` (columns, 4) for a camera and a depth range in metres.
@@ -98,3 +112,18 @@ def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: 
     window = int(-(-(last - first + 1).max() // WORD_PX) * WORD_PX)
     x0 = np.minimum(first, padded - window).astype(np.int32)
     return SweepGeometry(u, v, plane, planes, x_lo, x_hi, x0, window, near_is_left, (near_m, far_m))
+
+
+def uncalibrated_geometry(rows: int, width: int, columns: int) -> SweepGeometry:
+    """Geometry of a rig without a model: the whole row is searched and near is taken to be left; depth means nothing.
+
+    Inverse depth falls linearly from 1.5 to 0.5 across the picture, so that the estimators' haze profile has a scale.
+    """
+    u = np.broadcast_to(np.linspace(-0.5, 0.5, width, dtype=np.float32), (rows, width)).copy()
+    plane = np.tile(np.array([-1.0, 0.0, 1.0]), (columns, 1))
+    padded = -(-width // WORD_PX) * WORD_PX
+    return SweepGeometry(
+        u, np.zeros_like(u), plane, np.column_stack([plane, np.ones(columns)]),
+        np.zeros((rows, columns), np.int32), np.full((rows, columns), width - 1, np.int32),
+        np.zeros(columns, np.int32), padded, True, (1 / 1.5, 1 / 0.5),
+    )  # fmt: skip

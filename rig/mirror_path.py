@@ -1,8 +1,9 @@
 """The mirror's path over one sweep: run-in, constant velocity, run-out, fly-back, rest, all with bounded acceleration.
 
-Ramps raise the velocity along half a cosine, v(t) = v (1 - cos(pi t/T))/2, so the acceleration starts and ends at zero and
-peaks at pi v/(2 T). Moves from rest to rest are cycloids, x(t) = D (t/T - sin(2 pi t/T)/(2 pi)), peak velocity 2 D/T, peak
-acceleration 2 pi D/T^2. Every part but the lit one lasts a whole number of points, so a sweep does too and nothing drifts.
+Ramps raise the velocity along half a cosine, v(t) = v (1 - cos(pi t/T))/2, so the acceleration starts and ends at zero
+and peaks at pi v/(2 T). Moves from rest to rest are cycloids, x(t) = D (t/T - sin(2 pi t/T)/(2 pi)), peak velocity
+2 D/T, peak acceleration 2 pi D/T^2. Every segment lasts a whole number of points, so a sweep does too and nothing
+drifts; the lit part lies in the middle of the cruise and lasts exactly as long as its frames.
 """
 
 import math
@@ -23,8 +24,8 @@ MIN_RAMP_POINTS = 4
 class Segment:
     """A piece of the path that begins at `start` (command) and `start_point` (points) and lasts `points` points.
 
-    cruise: constant velocity; ramp: velocity from v0 to v1 along half a cosine; move: from rest over `distance` to rest;
-    hold: at rest. Velocities are command per point.
+    cruise: constant velocity; ramp: velocity from v0 to v1 along half a cosine; move: from rest over `distance` to
+    rest; hold: at rest. Velocities are command per point.
     """
 
     kind: Literal["ramp", "cruise", "move", "hold"]
@@ -53,8 +54,9 @@ class Segment:
 class SweepPath:
     """One sweep from its scan marker (point 0) to the next one.
 
-    points: length of the sweep. lit_start: points from the start to the command of the first lit edge; lit_points: points
-    between the two lit edges. cruise: first and last point of the constant-velocity part. low, high: extreme commands.
+    points: length of the sweep. lit_start: points from the start to the command of the first lit edge; lit_points:
+    points between the two lit edges. cruise: first and last point of the constant-velocity part. low, high: extreme
+    commands.
     """
 
     segments: tuple[Segment, ...]
@@ -64,6 +66,17 @@ class SweepPath:
     cruise: tuple[int, int]
     low: float
     high: float
+
+    @property
+    def rms_acceleration(self) -> float:
+        """Root-mean-square acceleration over the sweep, command per point squared."""
+        total = 0.0
+        for s in self.segments:
+            if s.kind == "ramp":
+                total += (math.pi * (s.v1 - s.v0) / (2 * s.points)) ** 2 / 2 * s.points
+            elif s.kind == "move":
+                total += (2 * math.pi * s.distance / s.points**2) ** 2 / 2 * s.points
+        return math.sqrt(total / self.points)
 
     def command(self, at: Array) -> Array:
         """Command at `at` points (any shape) after the scan marker, taken within one sweep."""
@@ -79,15 +92,16 @@ class SweepPath:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What bounds the mirror: velocity (/s), acceleration (/s^2) and the point clock that samples it."""
+    """What bounds the mirror: velocity, acceleration, the point clock that samples it, and the shortest ramp."""
 
     velocity_per_s: float
     acceleration_per_s2: float
     point_rate_hz: Fraction
+    least_ramp_s: float = 0.0
 
     def ramp_points(self, velocity_per_s: float) -> int:
         """Points of the ramp from rest to a velocity."""
-        return self._whole(math.pi * abs(velocity_per_s) / (2 * self.acceleration_per_s2))
+        return self._whole(max(math.pi * abs(velocity_per_s) / (2 * self.acceleration_per_s2), self.least_ramp_s))
 
     def move_points(self, distance: float) -> int:
         """Points of the fastest cycloid over a distance."""
@@ -110,7 +124,7 @@ def sweep_path(
     """The path that crosses `edges` (commands of the first and the last lit edge) at constant velocity within `lit_s`.
 
     margin_s: time the constant velocity lasts before the first edge and, likewise, after the last.
-    fly_back: return to the start before the sweep ends (unidirectional); otherwise the sweep ends where the return begins.
+    fly_back: return to the start before the sweep ends (unidirectional); else the sweep ends where the return begins.
     least_points: the sweep is drawn out by a rest to at least this length.
     """
     rate = motion.point_rate_hz

@@ -18,8 +18,8 @@ class LightSheet:
     normal: (3,) float64 unit vector; offset_m: d; inverse: (3,) float64 n/d, so that 1/z = inverse.(u, v, 1).
     x_stripe_px: (rows,) float64, sub-pixel stripe position, NaN = no stripe.
     x_end_px: (rows,) float64, end of the lit part, NaN = nothing lit.
-    start_px, step: (rows,) int64, first pixel on the light's way and its direction along the row (+1, -1, 0 = not seen).
-    """
+    start_px, step: (rows,) int64, first pixel on the light's way and its direction along the row (+1, -1, 0 = not
+    seen)."""
 
     normal: Array
     offset_m: float

@@ -1,17 +1,17 @@
 """Compiled walk of the light along each image row: where the sheet ends, and whether it ends as a stripe.
 
-On a row the sheet's inverse depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The walk
-starts at the near edge of the picture and ends where w passes the surface's inverse depth. Measured: about 0.3 ms for
-512 x 512 pixels on one core.
-"""
+On a row the sheet's inverse depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The
+walk starts at the near edge of the picture and ends where w passes the surface's inverse depth. Measured: about 0.3 ms
+for 512 x 512 pixels on one core."""
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 DEPTH_JUMP = 0.02
-"""Relative step of depth from one pixel to the next above which two pixels lie on different surfaces. A surface this steep
-makes 85 degrees with the image plane at f = 600 px and returns next to no light."""
+"""Relative step of depth from one pixel to the next above which two pixels lie on different surfaces. A surface this
+steep makes 85 degrees with the image plane at f = 600 px and returns next to no light.
+"""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -30,9 +30,9 @@ def trace_rows(
     """Trace rows first_row..last_row-1 of the plane p = n/d (3,), inverse depth p.(u, v, 1).
 
     surface: inverse depth of the scene (rows, width), 0 = open sky. Writes per row: x_stripe, NaN where there is none;
-    x_end, where the lit part of the sheet ends (NaN: nothing of it is lit); start, first pixel on the light's way; step,
-    +1 where the light travels towards larger x (scanner on the left), -1 the other way, 0 where the row sees no sheet.
-    """
+    x_end, where the lit part of the sheet ends (NaN: nothing of it is lit); start, first pixel on the light's way;
+    step, +1 where the light travels towards larger x (scanner on the left), -1 the other way, 0 where the row sees no
+    sheet."""
     px, py, pz = plane[0], plane[1], plane[2]
     width = u.shape[1]
     for y in range(first_row, last_row):

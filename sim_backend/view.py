@@ -18,9 +18,8 @@ class View:
     """Rays and surfaces on the camera's pixel grid. All maps float64 (rows, width).
 
     u, v: ray tangents, NaN where the lens has no inverse. u_x, v_x: their slopes per pixel along the row.
-    surface: inverse depth in 1/m (0: nothing there). facet: (rows, width, 3), the plane m.X = 1 through each surface point.
-    albedo: 0..1. source_m: (3,) where the light leaves the mirror.
-    """
+    surface: inverse depth in 1/m (0: nothing there). facet: (rows, width, 3), the plane m.X = 1 through each surface
+    point. albedo: 0..1. source_m: (3,) where the light leaves the mirror."""
 
     u: Array
     v: Array
@@ -93,9 +92,8 @@ def _slope(tangent: Array, axis: int) -> Array:
 def _facets(surface: Array, rays: tuple[Array, Array], slopes: tuple[Array, Array, Array, Array]) -> Array:
     """Planes m.X = 1 tangent to the surface, float64 (rows, width, 3).
 
-    On a plane the inverse depth is w = m.(u, v, 1), so m = (w_u, w_v, w - u w_u - v w_v). Gradients are averaged over two
-    pixels to each side that lie on the same surface.
-    """
+    On a plane the inverse depth is w = m.(u, v, 1), so m = (w_u, w_v, w - u w_u - v w_v). Gradients are averaged over
+    two pixels to each side that lie on the same surface."""
     u, v = rays
     u_x, v_x, u_y, v_y = slopes
     w_x, w_y = _surface_slope(surface, 1), _surface_slope(surface, 0)

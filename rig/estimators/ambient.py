@@ -13,8 +13,6 @@ from rig.estimators.likelihood_kernels import window_sums
 from rig.geometry import SweepGeometry
 
 NEIGHBOURHOOD_PX = 31
-PRIOR_COUNTS = 4.0
-"""Weight of the local mean, in counts: ambient varies by about half of itself between neighbours (texture)."""
 HOT_SIGMA = 6.0
 """Excess over the neighbours, in standard deviations, that makes a pixel hot: 1e-9 of good pixels pass."""
 
@@ -55,19 +53,28 @@ def _lowest_level(totals: NDArray[np.uint32]) -> float:
 
 
 def _shrunk(ones: NDArray[np.float64], exposures: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Flux per pixel: its own counts where they are many or far above the neighbours, else drawn to the local mean."""
-    # Hot pixels must not lift their neighbourhood: counts above the local expectation are cut for the mean.
-    mean = max(float(ones.sum() / exposures.sum()), 1e-6)
+    """Flux per pixel: its own counts drawn to the local mean by as much as pixels are alike (empirical Bayes)."""
+    row_rates = ones.sum(1)[exposures.sum(1) > 0] / exposures.sum(1)[exposures.sum(1) > 0]
+    overall = max(float(np.median(row_rates)), 1e-6)
+    mean = np.full(ones.shape, overall)
     for _ in range(2):
-        capped = np.minimum(ones, exposures * mean * 2 + 3)
-        local_ones = cv2.blur(capped, (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), borderType=cv2.BORDER_REFLECT)
-        local_exposures = cv2.blur(exposures, (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), borderType=cv2.BORDER_REFLECT)
-        mean = (local_ones + 1e-6) / (local_exposures + 1.0)
+        # Hot pixels must not lift their neighbourhood: they take no part in the mean.
+        usual = ones <= mean * exposures + 4.0 * np.sqrt(mean * exposures) + 4.0
+        local_ones, local_exposures = (
+            cv2.blur(np.where(usual, a, 0.0), (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), borderType=cv2.BORDER_REFLECT)
+            for a in (ones, exposures)
+        )
+        # Neighbourhoods without data take the picture's level.
+        mean = (local_ones + overall) / (local_exposures + 1.0)
     expected = mean * exposures
-    rate = (ones + PRIOR_COUNTS) / (exposures + PRIOR_COUNTS / np.maximum(mean, 1e-7))
     outlier = ones > expected + 4.0 * np.sqrt(expected) + 4.0
+    usual = ~outlier & (exposures > 0)
+    # Variance between pixels beyond that of counting, as the shape of a gamma prior: mean^2 / variance.
+    spread = float(np.sum(((ones - expected) ** 2 - expected)[usual]) / max(np.sum(expected[usual] ** 2), 1e-9))
+    prior_counts = 1.0 / min(max(spread, 1e-3), 1.0)
+    rate = (ones + prior_counts) / (exposures + prior_counts / np.maximum(mean, 1e-7))
     rate = np.where(outlier, ones / np.maximum(exposures, 1.0), rate)
-    return -np.log1p(-np.minimum(rate, 0.9999))
+    return np.asarray(-np.log1p(-np.minimum(rate, 0.9999)))
 
 
 def hot_pixels(totals: NDArray[np.uint32]) -> NDArray[np.float64]:

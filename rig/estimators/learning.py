@@ -59,16 +59,16 @@ def expect(
     evidence = learn_rows(
         volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left, geometry.plane,
         geometry.u, geometry.v, model.ambient, model.profile, model.w_lo, model.per_w, model.row_gain, model.amplitude,
-        *log_weights(model), line_profile(model.line_sigma_px), TABLE, lines[0], lines[1],
+        log_weights(model), model.none_weight, 1.0 / geometry.depth_range_m[0], 1.0 / geometry.depth_range_m[1],
+        line_profile(model.line_sigma_px), TABLE, lines[0], lines[1],
         5.0 * typical + 1e-3, levels, rows_seen, mass,
     )  # fmt: skip
     return Expectation(levels, rows_seen, mass, float(evidence))
 
 
-def log_weights(model: RowModel) -> tuple[NDArray[np.float32], float]:
-    """Log prior of the amplitudes (M,) float32 and of 'no stripe'."""
-    stripe = np.log(np.maximum(model.weight, 1e-6) * (1.0 - model.none_weight)).astype(np.float32)
-    return stripe, float(np.log(model.none_weight))
+def log_weights(model: RowModel) -> NDArray[np.float32]:
+    """Log prior of the amplitudes (M,) float32."""
+    return np.log(np.maximum(model.weight, 1e-6)).astype(np.float32)
 
 
 def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: NDArray[np.float32]) -> RowModel:
@@ -161,9 +161,11 @@ def maximise(model: RowModel, seen: Expectation, *, spread: bool) -> RowModel:
     fitted = fit.amplitude * np.exp(-2.0 * fit.extinction_per_m * path_m) if fit else np.zeros(BINS)
     before = _blend(haze, haze_variance, fitted)
     rest, rest_variance = _level(seen.levels[:, 3], seen.levels[:, 4], seen.levels[:, 5], typical)
-    rest_fit = fit_haze(path_m, rest, rest_variance)
-    rest_fitted = rest_fit.amplitude * np.exp(-2.0 * rest_fit.extinction_per_m * path_m) if rest_fit else np.zeros(BINS)
-    behind = np.minimum(_blend(rest, rest_variance, rest_fitted), before)
+    # The pedestal is light scattered more than once: where no counts say otherwise, a share of the haze itself.
+    known = np.isfinite(rest) & (before > 0)
+    weight_of = np.where(known, 1.0 / np.where(known, rest_variance, 1.0), 0.0)
+    share = float(np.sum(weight_of * before * np.nan_to_num(rest)) / max(np.sum(weight_of * before**2), 1e-30))
+    behind = np.minimum(_blend(rest, rest_variance, min(max(share, 0.0), 1.0) * before), before)
     resolved = fit is not None and np.isfinite(fit.extinction_sd_per_m)
     extinction = fit.extinction_per_m if fit is not None and resolved else 0.0
     profile = np.stack([before, behind, stripe_scale(path_m, extinction)], 1).astype(np.float32)

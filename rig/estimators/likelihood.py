@@ -51,14 +51,16 @@ class Likelihood:
         out = np.full((5, rows, columns), np.nan, np.float32)
         out[1] = 0.0
         quiet = np.zeros((2, rows, geometry.width), np.uint32)
-        weights, none = log_weights(model)
+        weights = log_weights(model)
+        near_m, far_m = geometry.depth_range_m
         psi = line_profile(model.line_sigma_px)
 
         def work(first: int, last: int) -> None:
             estimate_rows(
                 volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left,
                 geometry.plane, geometry.u, geometry.v, model.ambient, model.profile, model.w_lo, model.per_w,
-                model.row_gain, model.amplitude, weights, none, psi, TABLE, first, last, out, quiet,
+                model.row_gain, model.amplitude, weights, model.none_weight,
+                1.0 / near_m, 1.0 / far_m, psi, TABLE, first, last, out, quiet,
             )  # fmt: skip
 
         pieces = np.linspace(0, rows, 4 * self.threads + 1).astype(int)

@@ -1,11 +1,16 @@
 """Compiled sweeps of the row likelihood: one pass that learns, one that estimates."""
 
+from typing import Final
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.row_kernels import load_row, mode_and_mean, row_posterior, row_scores
+from rig.estimators.row_kernels import load_row, mode_and_mean, none_prior, row_posterior, row_scores
 from rig.geometry import MARGIN_PX
+
+CERTAIN: Final = 0.6
+"""Probability within 1 px from which a row teaches the haze profile."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -26,7 +31,9 @@ def learn_rows(
     row_gain: NDArray[np.float32],
     amplitude: NDArray[np.float32],
     log_weight: NDArray[np.float32],
-    log_none: float,
+    none_weight: float,
+    w_near: float,
+    w_far: float,
     psi: NDArray[np.float32],
     table: NDArray[np.float32],
     row_of: NDArray[np.int32],
@@ -50,6 +57,7 @@ def learn_rows(
     scale = np.empty(window, np.float32)
     cell = np.empty(window, np.int32)
     gain = np.empty(window, np.float32)
+    w = np.empty(window, np.float32)
     taps = np.empty((2, window), np.float32)
     edge = np.empty(window + 1, np.float32)
     score = np.empty((amplitudes, window), np.float32)
@@ -63,7 +71,7 @@ def learn_rows(
             continue
         length, first, start = load_row(
             counts[c, y], x0[c], y, x_lo[y, c], x_hi[y, c], MARGIN_PX, near_is_left, plane[c], u, v, ambient, profile,
-            profile_lo, profile_per_w, row_gain[y], n, before, behind, scale, cell, gain,
+            profile_lo, profile_per_w, row_gain[y], n, before, behind, scale, cell, gain, w,
         )  # fmt: skip
         last = first + x_hi[y, c] - x_lo[y, c]
         first, last = max(first, 0), min(last, length - 1)
@@ -71,17 +79,18 @@ def learn_rows(
             continue
         k = np.float32(n_frames[c])
         row_scores(n, k, before, behind, scale, length, amplitude, psi, table, taps, edge, score)
-        none, row_evidence = row_posterior(
-            score, edge, length, first, last, log_weight, log_none, posterior, mass
-        )
+        prior = none_prior(w_near, w_far, w[first], w[last], none_weight)
+        none, row_evidence = row_posterior(score, edge, length, first, last, log_weight, prior, posterior, mass)
         for t in range(length):
             evidence += taps[1, t]
         evidence += row_evidence
-        for m in range(amplitudes):
-            amplitude_mass[m] += mass[m]
-        amplitude_mass[amplitudes] += none
-        # Rows that may have no stripe say nothing certain about before and behind.
-        if none > 0.5:
+        if prior[0] + prior[1] < none_weight:  # rows cut by the picture's border would be counted as rows without
+            for m in range(amplitudes):
+                amplitude_mass[m] += mass[m]
+            amplitude_mass[amplitudes] += none
+        # Only rows whose stripe is fairly certain say what is before and what behind; doubtful ones would teach the
+        # model its own guess.
+        if mode_and_mean(posterior, first, last, reach)[3] < CERTAIN:
             continue
         passed = 0.0
         for t in range(length):
@@ -129,7 +138,9 @@ def estimate_rows(
     row_gain: NDArray[np.float32],
     amplitude: NDArray[np.float32],
     log_weight: NDArray[np.float32],
-    log_none: float,
+    none_weight: float,
+    w_near: float,
+    w_far: float,
     psi: NDArray[np.float32],
     table: NDArray[np.float32],
     first_row: int,
@@ -150,6 +161,7 @@ def estimate_rows(
     scale = np.empty(window, np.float32)
     cell = np.empty(window, np.int32)
     gain = np.empty(window, np.float32)
+    w = np.empty(window, np.float32)
     taps = np.empty((2, window), np.float32)
     edge = np.empty(window + 1, np.float32)
     score = np.empty((amplitudes, window), np.float32)
@@ -166,14 +178,15 @@ def estimate_rows(
                 continue
             length, first, start = load_row(
                 counts[c, y], x0[c], y, x_lo[y, c], x_hi[y, c], MARGIN_PX, near_is_left, plane[c], u, v, ambient,
-                profile, profile_lo, profile_per_w, row_gain[y], n, before, behind, scale, cell, gain,
+                profile, profile_lo, profile_per_w, row_gain[y], n, before, behind, scale, cell, gain, w,
             )  # fmt: skip
             last = first + x_hi[y, c] - x_lo[y, c]
             first, last = max(first, 0), min(last, length - 1)
             if first > last:
                 continue
             row_scores(n, k, before, behind, scale, length, amplitude, psi, table, taps, edge, score)
-            row_posterior(score, edge, length, first, last, log_weight, log_none, posterior, mass)
+            prior = none_prior(w_near, w_far, w[first], w[last], none_weight)
+            row_posterior(score, edge, length, first, last, log_weight, prior, posterior, mass)
             mode, x, sd, near = mode_and_mean(posterior, first, last, max(1, reach - 1))
             best = 0
             for m in range(1, amplitudes):

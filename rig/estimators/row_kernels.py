@@ -70,6 +70,7 @@ def load_row(
     scale: NDArray[np.float32],
     cell: NDArray[np.int32],
     gain_of: NDArray[np.float32],
+    inverse_depth: NDArray[np.float32],
 ) -> tuple[int, int, int]:
     """Read one row of one column in near-to-far order.
 
@@ -109,6 +110,7 @@ def load_row(
         scale[t] = profile[i, 2] + f * (profile[i + 1, 2] - profile[i, 2])
         cell[t] = i
         gain_of[t] = gain
+        inverse_depth[t] = w
     return length, (lo - first if near_is_left else last - hi), start
 
 
@@ -156,6 +158,27 @@ def row_scores(
 
 
 @numba.njit(cache=True, nogil=True)
+def none_prior(
+    near: float, far: float, w_first: float, w_last: float, none_weight: float
+) -> tuple[float, float, float]:
+    """Prior of 'no stripe' as `row_posterior` takes it, from the part of the depth range that the picture shows.
+
+    near, far: ends of the depth range as inverse depths; w_first, w_last: those of the first and last position. What
+    the picture's border cuts off is as likely, per inverse depth, as what it shows.
+    """
+    span = near - far
+    cut_near = min(max((near - w_first) / span, 0.0), 1.0)
+    cut_far = min(max((w_last - far) / span, 0.0), 1.0)
+    rest = 1.0 - none_weight
+    # A row that shows nearly nothing must not lose its few positions altogether.
+    cut = cut_near + cut_far
+    if cut > 0.9:
+        cut_near, cut_far = cut_near * 0.9 / cut, cut_far * 0.9 / cut
+    third = none_weight / 3.0
+    return third + rest * cut_near, third + rest * cut_far, third
+
+
+@numba.njit(cache=True, nogil=True)
 def row_posterior(
     score: NDArray[np.float32],
     edge: NDArray[np.float32],
@@ -163,33 +186,38 @@ def row_posterior(
     first: int,
     last: int,
     log_weight: NDArray[np.float32],
-    log_none: float,
+    none: tuple[float, float, float],
     posterior: NDArray[np.float32],
     by_amplitude: NDArray[np.float64],
 ) -> tuple[float, float]:
     """Posterior (length,) over positions, summed over amplitudes; by_amplitude (M,) sums the other way.
 
-    Returns (probability of 'no stripe', log evidence of the row). Prior: positions alike, amplitudes by log_weight.
+    none: prior of a row that is behind its stripe all along (nearer than the picture), of one that is before it, and of
+    one whose haze ends somewhere without a stripe. Returns (probability of 'no stripe', log evidence of the row). Prior:
+    positions alike, amplitudes by log_weight.
     """
     positions = last - first + 1
-    log_uniform = -np.log(np.float32(positions))
+    seen = 1.0 - none[0] - none[1] - none[2]
+    log_uniform = np.log(seen / positions)
     best = np.float32(-1e30)
     for m in range(score.shape[0]):
         top = np.float32(-1e30)
         for j in range(first, last + 1):
             top = max(top, score[m, j])
         best = max(best, top + log_weight[m])
+    log_step = np.log(none[2] / (length + 1)) - log_uniform
+    log_behind, log_before = np.log(none[0]) - log_uniform, np.log(none[1]) - log_uniform
     for t in range(length + 1):
-        best = max(best, edge[t] + log_none)
-    none = 0.0
-    log_edges = log_none - np.log(np.float32(length + 1)) - log_uniform
+        best = max(best, edge[t] + log_step)
+    best = max(best, edge[0] + log_behind, edge[length] + log_before)
+    total_none = np.exp(edge[0] + log_behind - best) + np.exp(edge[length] + log_before - best)
     for t in range(length + 1):
-        s = edge[t] + log_edges - best
+        s = edge[t] + log_step - best
         if s > -LOST:
-            none += np.exp(s)
+            total_none += np.exp(s)
     for t in range(length):
         posterior[t] = 0.0
-    total = none
+    total = total_none
     for m in range(score.shape[0]):
         subtotal = 0.0
         for j in range(first, last + 1):
@@ -207,7 +235,7 @@ def row_posterior(
         posterior[j] *= inverse
     for m in range(score.shape[0]):
         by_amplitude[m] *= inverse
-    return none * inverse, np.log(total) + best + log_uniform
+    return total_none * inverse, np.log(total) + best + log_uniform
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,9 +1,8 @@
 """A stereo data set's disparity and left picture made into surfaces.
 
-Centre crop to the camera's shape, unknown disparity painted in, clipped to its 0.5 to 99.5 percentiles, resized by nearest
-neighbour, quantisation steps smoothed away inside surfaces; inverse depth linear in disparity between 1/6 and 1/1.5 per
-metre; albedo from the linearised grey picture.
-"""
+Centre crop to the camera's shape, unknown disparity painted in, clipped to its 0.5 to 99.5 percentiles, resized by
+nearest neighbour, quantisation steps smoothed away inside surfaces; inverse depth linear in disparity between 1/6 and
+1/1.5 per metre; albedo from the linearised grey picture."""
 
 from pathlib import Path
 
@@ -28,27 +27,32 @@ EDGE_STEP = 0.02
 
 
 def prepare(disparity_file: Path, picture_file: Path, size: tuple[int, int]) -> Surfaces:
-    """Surfaces of size (rows, width) from `.npy` disparity (px, NaN = unknown) and an 8-bit picture of the same size."""
+    """Surfaces of size (rows, width) from `.npy` disparity (px, NaN = unknown) and an 8-bit picture of that size."""
     try:
         raw = np.asarray(np.load(disparity_file, allow_pickle=False), dtype=np.float64)
     except (OSError, ValueError) as error:
         raise DeviceError(f"scene file {disparity_file} cannot be read: {error}") from error
     picture = cv2.imread(str(picture_file), cv2.IMREAD_GRAYSCALE)
     if picture is None or raw.ndim != 2 or picture.shape != raw.shape:
-        raise DeviceError(f"scene {disparity_file.parent}: {picture_file.name} and {disparity_file.name} must be of one size")
+        raise DeviceError(
+            f"scene {disparity_file.parent}: {picture_file.name} and {disparity_file.name} must be of one size"
+        )
     known = np.isfinite(raw)
     if known.mean() < 0.1:
-        raise DeviceError(f"scene {disparity_file.parent}: {known.mean():.0%} of the disparity is known; 10 % are needed")
-    low, high = np.percentile(raw[known], [0.5, 99.5])
+        raise DeviceError(
+            f"scene {disparity_file.parent}: {known.mean():.0%} of the disparity is known; 10 % are needed"
+        )
+    crop = _centre_crop(raw.shape, size)
+    low, high = np.percentile(raw[crop][known[crop]], [0.5, 99.5])
     if not high > low:
         raise DeviceError(f"scene {disparity_file.parent}: disparity is the same everywhere ({low:g} px)")
-    crop = _centre_crop(raw.shape, size)
     full = np.clip(_paint_in(raw[crop], known[crop]), low, high)
     disparity, known = _resize(full, size), _resize(known[crop].astype(np.float64), size) > 0.5
     disparity = _smooth_steps(disparity, _quantum(raw[np.isfinite(raw)]))
     share = np.clip((disparity - low) / (high - low), 0, 1)
     depth = 1.0 / (1 / FARTHEST_M + share * (1 / NEAREST_M - 1 / FARTHEST_M))
-    albedo = np.clip(_resize((picture[crop] / 255.0) ** GAMMA, size), *ALBEDO_RANGE)
+    grey = cv2.resize(picture[crop], (size[1], size[0]), interpolation=cv2.INTER_LINEAR)
+    albedo = np.clip((grey / 255.0) ** GAMMA, *ALBEDO_RANGE)
     return checked(str(disparity_file.parent), depth, albedo, known & ~_near_edges(depth), size)
 
 

@@ -25,7 +25,9 @@ END_Z = 7.6
 
 
 def street(u: Array, v: Array) -> Surfaces:
-    """The street seen along rays (u, v), each float64 (rows, width). Rays without a direction (NaN) look straight ahead."""
+    """The street seen along rays (u, v), each float64 (rows, width). Rays without a direction (NaN) look straight
+    ahead.
+    """
     u, v = np.nan_to_num(u), np.nan_to_num(v)
     depth = np.full(u.shape, np.inf)
     albedo = np.zeros(u.shape)

@@ -22,7 +22,7 @@ class Surfaces:
 
 
 def checked(name: str, depth_m: object, albedo: object, trusted: object, size: tuple[int, int]) -> Surfaces:
-    """Surfaces from arrays of any float type. DeviceError where a shape or value is impossible; size is (rows, width)."""
+    """Surfaces from arrays of any float type. DeviceError where one is impossible; size is (rows, width)."""
     depth = np.asarray(depth_m, dtype=np.float32)
     light = np.asarray(albedo, dtype=np.float32)
     trust = np.asarray(trusted, dtype=bool)
@@ -34,7 +34,9 @@ def checked(name: str, depth_m: object, albedo: object, trusted: object, size: t
                 "prepare the scene at the camera's size"
             )
     if not (np.all(depth > 0)):
-        raise DeviceError(f"scene {name}: depth_m must be above 0 m everywhere (inf where nothing is), NaN is not allowed")
+        raise DeviceError(
+            f"scene {name}: depth_m must be above 0 m everywhere (inf where nothing is), NaN is not allowed"
+        )
     if not (np.all(light >= 0) and np.all(light <= 1)):
         raise DeviceError(f"scene {name}: albedo must lie within 0 to 1 everywhere")
     return Surfaces(np.ascontiguousarray(depth), np.ascontiguousarray(light), np.ascontiguousarray(trust))

@@ -112,7 +112,7 @@ def flux_row(u, v, plane, scanner, extinction, haze, ambient, sigma_px, x_true, 
         if lit > 0.0 and haze > 0.0:
             out[x] += haze * lit * haze_at(u[x], v[x], (n0 * u[x] + n1 * v[x] + n2) / d, scanner, extinction)
     if stripe > 0.0:
-        centre = int(round(x_true))
+        centre = round(x_true)
         scale = 1.0 / (sigma_px * math.sqrt(2.0))
         for x in range(max(0, centre - PROFILE_REACH_PX), min(width, centre + PROFILE_REACH_PX + 1)):
             share = 0.5 * (math.erf((x + 0.5 - x_true) * scale) - math.erf((x - 0.5 - x_true) * scale))
@@ -133,7 +133,9 @@ def flux_columns(u, v, planes, scanner, extinction, haze, ambient, sigma_px, x_t
 
 
 @numba.njit(cache=True, nogil=True)
-def draw_counts(u, v, planes, scanner, extinction, haze, ambient, sigma_px, x_true, x_end, stripe, exposures, seed, c0, c1, out):  # type: ignore[no-untyped-def]  # noqa: E501
+def draw_counts(
+    u, v, planes, scanner, extinction, haze, ambient, sigma_px, x_true, x_end, stripe, exposures, seed, c0, c1, out
+):  # type: ignore[no-untyped-def]
     """Binomial counts of columns c0..c1 into out (columns, H, W): inversion, one uniform number a pixel and part."""
     width = u.shape[1]
     row = np.empty(width, np.float64)

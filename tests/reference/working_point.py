@@ -176,9 +176,7 @@ def mean_free_haze(geometry: Geometry, extinction_per_m: float, depth_m: float =
     return total / number
 
 
-def camera_cosine(
-    depth_m: NDArray[np.float64], u: NDArray[np.float64], v: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def camera_cosine(depth_m: NDArray[np.float64], u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
     """|N.q_c| (H, W) with q_c = (u, v, 1), N from central differences smoothed over 5 px; at most |q_c|."""
     kernel = np.ones(5) / 5
     smooth = np.apply_along_axis(np.convolve, 0, np.pad(depth_m, 2, mode="edge"), kernel, "valid")
@@ -189,9 +187,7 @@ def camera_cosine(
     return np.asarray(np.abs(normal[..., 0] * u + normal[..., 1] * v + normal[..., 2]))
 
 
-def score(
-    x_est: NDArray[np.floating], x_true: NDArray[np.floating], trusted: NDArray[np.bool_]
-) -> dict[str, float]:
+def score(x_est: NDArray[np.floating], x_true: NDArray[np.floating], trusted: NDArray[np.bool_]) -> dict[str, float]:
     """Errors in px over the trusted true stripes, all arrays (H, columns).
 
     A missing answer (NaN) is left out of mean and median and counts as wrong in `within_1px`; `mean_abs_rounded` is

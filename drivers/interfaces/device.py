@@ -1,0 +1,96 @@
+"""What all devices share: a name, a state, verbs that check the state, and a close that leaves things safe."""
+
+import logging
+from abc import ABC, abstractmethod
+from enum import Enum
+from types import TracebackType
+from typing import Self
+
+from drivers.errors import WrongState
+
+_log = logging.getLogger(__name__)
+
+
+class DeviceState(Enum):
+    """Where a device stands.
+
+    ::
+
+                configure / load / program          start / run
+        READY -----------------------------> CONFIGURED ------> RUNNING
+                                                 ^                 |
+                                                 +-----------------+
+                                                  stop / abort / end
+        any state -- close --> CLOSED, for good
+
+    A laser goes READY -- arm --> RUNNING -- pause --> CONFIGURED -- arm --> RUNNING; `disarm` takes it to READY.
+    """
+
+    READY = "ready"
+    CONFIGURED = "configured"
+    RUNNING = "running"
+    CLOSED = "closed"
+
+
+OPEN_STATES = (DeviceState.READY, DeviceState.CONFIGURED, DeviceState.RUNNING)
+
+
+class Device(ABC):
+    """An open device. Creating one opens it (or raises); `close` or leaving the `with` block gives it back.
+
+    The public verbs of the interfaces check state and arguments, log, and call one `_do_*` hook each; a driver writes
+    the hooks only and never touches the state. Verbs belong to one thread, except where a verb says otherwise.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._state = DeviceState.READY
+
+    @property
+    def name(self) -> str:
+        """What messages call this device."""
+        return self._name
+
+    @property
+    def state(self) -> DeviceState:
+        """Where the device stands, as far as its verbs tell."""
+        return self._state
+
+    def close(self) -> None:
+        """Leave the device safe (laser paused, gate low, mirror parked) and give it back; again: nothing happens."""
+        if self._state is DeviceState.CLOSED:
+            return
+        _log.info("%s: close", self._name)
+        try:
+            self._make_safe()
+        finally:
+            self._state = DeviceState.CLOSED
+            self._do_close()
+
+    def __enter__(self) -> Self:
+        """The device itself, open."""
+        self._require("enter", *OPEN_STATES)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close, whatever happened."""
+        self.close()
+
+    def _require(self, verb: str, *allowed: DeviceState, first: str = "") -> None:
+        """Raise `WrongState` unless the state is one of `allowed`; `first` names the verb to call before."""
+        if self._state in allowed:
+            return
+        if self._state is DeviceState.CLOSED:
+            raise WrongState(f"{self._name}: {verb} after close; open the device again")
+        hint = f"; call {first} first" if first else ""
+        raise WrongState(f"{self._name}: {verb} is not possible while {self._state.value}{hint}")
+
+    @abstractmethod
+    def _make_safe(self) -> None:
+        """End what still runs; called once by `close`, in any state. Written by each interface."""
+
+    @abstractmethod
+    def _do_close(self) -> None:
+        """Give back handles and memory. Runs also where making the device safe failed."""

@@ -1,0 +1,106 @@
+"""The line laser: armed, it sends light wherever the gate lets it out."""
+
+import logging
+from abc import abstractmethod
+from dataclasses import dataclass
+
+from drivers.errors import DeviceFault, InterlockOpen, LimitExceeded
+from drivers.interfaces.device import OPEN_STATES, Device, DeviceState
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class LaserLimits:
+    """Powers the laser may be armed at: the smaller of the device's own range and the config's."""
+
+    min_power_w: float
+    max_power_w: float
+
+
+@dataclass(frozen=True, slots=True)
+class LaserStatus:
+    """What the laser says of itself, asked afresh each time."""
+
+    emission: bool
+    """The laser emits whenever the gate is high (light = emission AND gate). False while paused or warming up."""
+    armed: bool
+    """Between `arm` and `disarm`, pauses included."""
+    interlock_closed: bool
+    fault: str | None
+    key_on: bool | None
+    """None: the laser has no key, or does not say."""
+    warming_up: bool
+    input_mode: str
+    """How the gate input acts, e.g. "digital"."""
+
+
+class LineLaser(Device):
+    """A laser that a TTL gate modulates. `pause` is the normal end of a scan, `disarm` is for faults and for good.
+
+    READY = disarmed, RUNNING = armed, CONFIGURED = paused.
+    """
+
+    @property
+    @abstractmethod
+    def limits(self) -> LaserLimits:
+        """Powers the laser may be armed at."""
+
+    @property
+    def status(self) -> LaserStatus:
+        """Ask the laser. `WrongState` after close."""
+        self._require("status", *OPEN_STATES)
+        return self._do_status()
+
+    def arm(self, power_w: float) -> None:
+        """Set the power and enable emission under the gate; again while armed: change the power.
+
+        `LimitExceeded`, `InterlockOpen`, `DeviceFault`: refused before anything is enabled. Emission may follow later
+        (`status.warming_up`).
+        """
+        self._require("arm", *OPEN_STATES)
+        limits = self.limits
+        if not limits.min_power_w <= power_w <= limits.max_power_w:
+            raise LimitExceeded(
+                f"{self._name}: power {power_w:g} W is outside {limits.min_power_w:g} to {limits.max_power_w:g} W; "
+                "choose a power within the limits"
+            )
+        status = self._do_status()
+        if not status.interlock_closed:
+            raise InterlockOpen(f"{self._name}: the interlock is open; close it and arm again")
+        if status.fault is not None:
+            raise DeviceFault(f"{self._name}: fault {status.fault}; clear it at the laser and arm again")
+        _log.info("%s: arm at %g W", self._name, power_w)
+        self._do_arm(power_w)
+        self._state = DeviceState.RUNNING
+
+    def pause(self) -> None:
+        """Stop emission in the way that needs no key to resume. In any state; does nothing where nothing is armed."""
+        self._require("pause", *OPEN_STATES)
+        _log.info("%s: pause", self._name)
+        self._do_pause()
+        if self._state is DeviceState.RUNNING:
+            self._state = DeviceState.CONFIGURED
+
+    def disarm(self) -> None:
+        """Switch emission off for good; the laser may need its key turned before it arms again. In any state."""
+        self._require("disarm", *OPEN_STATES)
+        _log.info("%s: disarm", self._name)
+        self._do_disarm()
+        self._state = DeviceState.READY
+
+    def _make_safe(self) -> None:
+        self.pause()
+
+    @abstractmethod
+    def _do_status(self) -> LaserStatus: ...
+
+    @abstractmethod
+    def _do_arm(self, power_w: float) -> None: ...
+
+    @abstractmethod
+    def _do_pause(self) -> None:
+        """Stop emission; must work in any state, also where the laser was found emitting at open."""
+
+    @abstractmethod
+    def _do_disarm(self) -> None: ...

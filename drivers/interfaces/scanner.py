@@ -1,0 +1,194 @@
+"""The beam scanner: one mirror that plays a compiled waveform of drive commands with marker bits beside it."""
+
+import logging
+from abc import abstractmethod
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import LimitExceeded
+from drivers.interfaces.device import OPEN_STATES, Device, DeviceState
+
+_log = logging.getLogger(__name__)
+
+MARKER_LINE = 1
+MARKER_SCAN = 2
+LEVEL_BACKWARD = 4
+"""Bits of a waveform's marker words. A bit at point i is high from the start of point i for one point."""
+
+_ROUNDING = 1e-6
+"""Share by which a computed speed may exceed its limit: differences of float64 commands are that uncertain."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScannerLimits:
+    """What the mirror can follow. Commands are the normalised drive, -1 to 1 being the full range of the DAC."""
+
+    command_range: tuple[float, float]
+    velocity_per_s: float
+    acceleration_per_s2: float
+    step: float
+    """Largest change of command from one point to the next."""
+    rms_duty: float
+    """Largest root-mean-square acceleration of a waveform as a share of `acceleration_per_s2`: the mirror's heat."""
+    max_points: int
+    point_rate_hz: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class ScanWaveform:
+    """One period of a scan.
+
+    command: float64 (points,), normalised drive.
+    markers: uint8 (points,), OR of `MARKER_LINE`, `MARKER_SCAN`, `LEVEL_BACKWARD`.
+    point_rate_hz: a rate that `BeamScanner.point_clock` returned.
+    """
+
+    command: NDArray[np.float64]
+    markers: NDArray[np.uint8]
+    point_rate_hz: Fraction
+
+
+@dataclass(frozen=True, slots=True)
+class ScannerStatus:
+    """What the scanner says of itself, asked afresh each time."""
+
+    moving: bool
+    fault: str | None
+    position: float | None
+    """Normalised drive; None where the device does not say."""
+
+
+class BeamScanner(Device):
+    """A galvanometer with its DAC. load -> start -> the waveform ends after its repeats, or stop -> park."""
+
+    @property
+    @abstractmethod
+    def limits(self) -> ScannerLimits:
+        """What the mirror can follow: the stricter of the device's limits and the config's."""
+
+    @property
+    def status(self) -> ScannerStatus:
+        """Ask the scanner. `WrongState` after close. Any thread."""
+        self._require("status", *OPEN_STATES)
+        return self._do_status()
+
+    def point_clock(self, requested_hz: float) -> Fraction:
+        """The exact point rate nearest to `requested_hz` that the device can run; asking for that rate returns it."""
+        self._require("point_clock", *OPEN_STATES)
+        low, high = self.limits.point_rate_hz
+        if not low <= requested_hz <= high:
+            raise LimitExceeded(
+                f"{self._name}: point rate {requested_hz:g} Hz is outside {low:g} to {high:g} Hz; "
+                "choose a rate within the limits"
+            )
+        return self._do_point_clock(requested_hz)
+
+    def load(self, waveform: ScanWaveform, repeats: int) -> Fraction:
+        """Load a waveform, to be played `repeats` times without a seam; returns the exact point clock it will run at.
+
+        `LimitExceeded` names the first limit that the waveform breaks, its value and the limit. Nothing moves.
+        """
+        self._note_end()
+        self._require("load", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
+        if repeats < 1:
+            raise LimitExceeded(f"{self._name}: {repeats} repeats; give at least 1")
+        clock_hz = self.point_clock(float(waveform.point_rate_hz))
+        try:
+            check_waveform(waveform, self.limits, clock_hz, seamless=repeats > 1)
+        except LimitExceeded as error:
+            raise LimitExceeded(f"{self._name}: {error}") from None
+        self._do_load(waveform, repeats, clock_hz)
+        self._state = DeviceState.CONFIGURED
+        _log.info("%s: %d points at %g Hz, %d times", self._name, len(waveform.command), float(clock_hz), repeats)
+        return clock_hz
+
+    def start(self) -> None:
+        """Play the waveform. The mirror is brought to its first point within the limits beforehand."""
+        self._note_end()
+        self._require("start", DeviceState.CONFIGURED, first="load" if self._state is DeviceState.READY else "stop")
+        _log.info("%s: start", self._name)
+        self._do_start()
+        self._state = DeviceState.RUNNING
+
+    def stop(self) -> None:
+        """Bring the mirror to rest. The waveform stays loaded. Where nothing moves it does nothing. Any thread."""
+        self._require("stop", *OPEN_STATES)
+        if self._state is DeviceState.RUNNING:
+            _log.info("%s: stop", self._name)
+            self._do_stop()
+            self._state = DeviceState.CONFIGURED
+
+    def park(self) -> None:
+        """Stop, and turn the mirror to where the beam is dumped. In any state. Any thread."""
+        self.stop()
+        _log.info("%s: park", self._name)
+        self._do_park()
+
+    def _note_end(self) -> None:
+        """A waveform ends by itself: learn of it where the state matters."""
+        if self._state is DeviceState.RUNNING and not self._do_status().moving:
+            self._state = DeviceState.CONFIGURED
+
+    def _make_safe(self) -> None:
+        self.park()
+
+    @abstractmethod
+    def _do_status(self) -> ScannerStatus: ...
+
+    @abstractmethod
+    def _do_point_clock(self, requested_hz: float) -> Fraction: ...
+
+    @abstractmethod
+    def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None: ...
+
+    @abstractmethod
+    def _do_start(self) -> None: ...
+
+    @abstractmethod
+    def _do_stop(self) -> None: ...
+
+    @abstractmethod
+    def _do_park(self) -> None: ...
+
+
+def check_waveform(waveform: ScanWaveform, limits: ScannerLimits, clock_hz: Fraction, *, seamless: bool) -> None:
+    """Raise `LimitExceeded` where a waveform at `clock_hz` is more than a mirror of these limits can follow.
+
+    seamless: the waveform repeats, so that the way from its last point to its first is judged like any other.
+    """
+    command = waveform.command
+    points = len(command)
+    if not 2 <= points <= limits.max_points:
+        raise LimitExceeded(f"{points} points are outside 2 to {limits.max_points}; use a lower point rate")
+    if command.shape != (points,) or waveform.markers.shape != (points,):
+        raise LimitExceeded(f"commands {command.shape} and markers {waveform.markers.shape} are not of one length")
+    if not np.isfinite(command).all():
+        raise LimitExceeded(f"command {int(np.argmin(np.isfinite(command)))} is not finite; compile the scan anew")
+    low, high = limits.command_range
+    if command.min() < low or command.max() > high:
+        raise LimitExceeded(
+            f"commands {command.min():.6g} to {command.max():.6g} are outside {low:.6g} to {high:.6g}; narrow the range"
+        )
+    rate_hz = float(clock_hz)
+    steps = np.diff(command, append=command[:1]) if seamless else np.diff(command)
+    turns = np.diff(steps, append=steps[:1]) if seamless else np.diff(steps)
+    acceleration = np.abs(turns) * rate_hz**2
+    rms = float(np.sqrt(np.mean(acceleration**2))) if acceleration.size else 0.0
+    peak = float(acceleration.max(initial=0.0))
+    step = float(np.abs(steps).max())
+    slower = "raise exposures or narrow command_range"
+    for what, value, limit in (
+        ("step of {:.6g} from point to point exceeds {:.6g}; raise the point rate, " + slower, step, limits.step),
+        ("velocity of {:.6g} /s exceeds {:.6g} /s; " + slower, step * rate_hz, limits.velocity_per_s),
+        ("acceleration of {:.6g} /s2 exceeds {:.6g} /s2; " + slower, peak, limits.acceleration_per_s2),
+        (
+            "RMS acceleration of {:.6g} /s2 exceeds {:.6g} /s2; " + slower,
+            rms,
+            limits.rms_duty * limits.acceleration_per_s2,
+        ),
+    ):
+        if value > limit * (1 + _ROUNDING):
+            raise LimitExceeded(what.format(value, limit))

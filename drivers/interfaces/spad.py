@@ -1,0 +1,197 @@
+"""The SPAD array: takes binary frames and fills the ring with blocks of them."""
+
+import logging
+from abc import abstractmethod
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Literal
+
+from drivers.errors import LimitExceeded
+from drivers.interfaces.device import OPEN_STATES, Device, DeviceState
+from drivers.ring import BlockRing
+
+_log = logging.getLogger(__name__)
+
+SpadMode = Literal["stream", "burst"]
+
+_EXPOSURE_SLACK = 1e-9
+"""Share by which an exposure may exceed the period: 1e-05 s as a float is a little more than 1/100000 s."""
+
+
+@dataclass(frozen=True, slots=True)
+class BurstMode:
+    """The device stores a run in its own memory and is read out afterwards."""
+
+    capacity_frames: int
+    readout_bytes_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class StreamMode:
+    """The device sends frames while it takes them, as fast as its link carries them."""
+
+    bytes_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SpadInfo:
+    """What a SPAD array is and can do; constant while it is open."""
+
+    model: str
+    serial: str
+    width: int
+    height: int
+    rotation_deg: int
+    """How the sensor is mounted; the frames it delivers are upright already."""
+    max_frame_rate_hz: Fraction
+    burst: BurstMode | None
+    stream: StreamMode | None
+    roi_step_px: int
+    """Windows start and end at multiples of this."""
+    markers: bool
+    """Whether frame records carry the markers of scanner and gate."""
+    trigger_modes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SpadRequest:
+    """What the plan wants of a SPAD array."""
+
+    frame_rate_hz: Fraction
+    exposure_s: float
+    """At most one frame period."""
+    mode: SpadMode
+    block_frames: int
+    """Frames wanted per block; a device may send shorter blocks, never longer ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpadTiming:
+    """What a configured SPAD array will do, exactly."""
+
+    tick_hz: Fraction
+    frame_period_ticks: int
+    exposure_ticks: int
+    stride: int
+    """Bytes of a ring slot that holds one block."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpadCounters:
+    """Counts since `start`. None: the device does not say."""
+
+    exposed: int | None
+    delivered: int
+    lost: int | None
+    """exposed = delivered + lost once the run has ended; while it runs, frames on their way are in `exposed` only."""
+    crc_errors: int | None
+    resyncs: int | None
+
+
+class SpadArray(Device):
+    """A binary SPAD sensor. configure -> start -> fill until it returns False (or stop) -> start again."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self._mode: SpadMode | None = None
+        self._run_opened = False
+
+    @property
+    @abstractmethod
+    def info(self) -> SpadInfo:
+        """Geometry and abilities."""
+
+    @property
+    def counters(self) -> SpadCounters:
+        """Counts of the present run, or of the last one; also after `close`. Any thread."""
+        return self._do_counters()
+
+    def configure(self, request: SpadRequest) -> SpadTiming:
+        """Set the frame timing. `LimitExceeded` when the device cannot do it; nothing is rounded silently."""
+        self._require("configure", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
+        self._check(request)
+        timing = self._do_configure(request)
+        self._mode = request.mode
+        self._run_opened = False
+        self._state = DeviceState.CONFIGURED
+        _log.info("%s: configured for %g Hz, %s", self._name, float(request.frame_rate_hz), request.mode)
+        return timing
+
+    def start(self, n_frames: int | None) -> None:
+        """Begin to expose, `n_frames` or (None) until `stop`. Frame numbers and counters start at 0."""
+        first = "configure" if self._state is DeviceState.READY else "stop"
+        self._require("start", DeviceState.CONFIGURED, first=first)
+        if n_frames is not None and n_frames < 1:
+            raise LimitExceeded(f"{self._name}: start of {n_frames} frames; ask for at least 1, or None for no end")
+        burst = self.info.burst if self._mode == "burst" else None
+        if burst is not None and (n_frames is None or n_frames > burst.capacity_frames):
+            raise LimitExceeded(
+                f"{self._name}: a burst of {'endless' if n_frames is None else n_frames} frames exceeds the memory of "
+                f"{burst.capacity_frames} frames; split the run or lower exposures"
+            )
+        _log.info("%s: start, %s frames", self._name, "endless" if n_frames is None else n_frames)
+        self._do_start(n_frames)
+        self._run_opened = True
+        self._state = DeviceState.RUNNING
+
+    def fill(self, ring: BlockRing, timeout_s: float) -> bool:
+        """Claim, fill and publish at least one block; True while more may come, False once the run has ended.
+
+        Runs on the application's source thread and waits at most `timeout_s` (`DeviceTimeout`) for frames. Where the
+        ring is full, a source that can wait does so within the same time, one that cannot drops frames, counts them
+        as lost and calls `ring.mark_overflow`. Calls after the end return False. `stop` may come from another thread
+        meanwhile: then the call returns False early.
+        """
+        if not (self._run_opened and self._state is DeviceState.CONFIGURED):
+            self._require("fill", DeviceState.RUNNING, first="start")
+        if self._state is not DeviceState.RUNNING:
+            return False
+        more = self._do_fill(ring, timeout_s)
+        if not more and self._state is DeviceState.RUNNING:
+            self._state = DeviceState.CONFIGURED
+        return more and self._state is DeviceState.RUNNING
+
+    def stop(self) -> None:
+        """End the run; frames not yet published are dropped and counted as lost. Without a run it does nothing."""
+        self._require("stop", *OPEN_STATES)
+        if self._state is DeviceState.RUNNING:
+            _log.info("%s: stop", self._name)
+            self._state = DeviceState.CONFIGURED
+            self._do_stop()
+
+    def _check(self, request: SpadRequest) -> None:
+        info = self.info
+        if not 0 < request.frame_rate_hz <= info.max_frame_rate_hz:
+            raise LimitExceeded(
+                f"{self._name}: frame rate {float(request.frame_rate_hz):g} Hz is outside 0 to "
+                f"{float(info.max_frame_rate_hz):g} Hz; choose another frame_rate"
+            )
+        period_s = float(1 / request.frame_rate_hz)
+        if not 0 < request.exposure_s <= period_s * (1 + _EXPOSURE_SLACK):
+            raise LimitExceeded(
+                f"{self._name}: exposure {request.exposure_s:g} s is outside 0 to the frame period {period_s:g} s; "
+                "shorten the exposure or lower frame_rate"
+            )
+        modes = [mode for mode, able in (("stream", info.stream), ("burst", info.burst)) if able is not None]
+        if request.mode not in modes:
+            raise LimitExceeded(f"{self._name}: mode {request.mode!r} is not available; it can {' and '.join(modes)}")
+        if request.block_frames < 1:
+            raise LimitExceeded(f"{self._name}: blocks of {request.block_frames} frames; ask for at least 1")
+
+    def _make_safe(self) -> None:
+        self.stop()
+
+    @abstractmethod
+    def _do_configure(self, request: SpadRequest) -> SpadTiming: ...
+
+    @abstractmethod
+    def _do_start(self, n_frames: int | None) -> None: ...
+
+    @abstractmethod
+    def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool: ...
+
+    @abstractmethod
+    def _do_stop(self) -> None: ...
+
+    @abstractmethod
+    def _do_counters(self) -> SpadCounters: ...

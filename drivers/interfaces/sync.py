@@ -1,0 +1,142 @@
+"""The sync source: plays a program of output levels that opens the laser's gate once per sweep."""
+
+import logging
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from drivers.errors import DeviceFault, LimitExceeded
+from drivers.interfaces.device import OPEN_STATES, Device, DeviceState
+
+_log = logging.getLogger(__name__)
+
+OUT_FRAME = 1
+"""Output that triggers the SPAD array."""
+OUT_GATE = 2
+"""Output that lets laser light out."""
+OUT_MARKER = 4
+"""Output that marks the SPAD's records."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pulse:
+    """One word of a program: hold the outputs (OR of `OUT_*`) for a duration, or (None) until the scan marker."""
+
+    outputs: int
+    duration_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class SyncStatus:
+    """What the device says of itself, asked afresh each time."""
+
+    state: Literal["stopped", "waiting", "running", "aborted"]
+    outputs: int
+    """Levels read back from the pins."""
+
+
+class SyncSource(Device):
+    """A digital pattern generator. program -> run -> the program ends with all outputs low, or abort."""
+
+    @property
+    @abstractmethod
+    def resolution_s(self) -> float:
+        """Durations are rounded to multiples of this."""
+
+    @property
+    def status(self) -> SyncStatus:
+        """Ask the device. `WrongState` after close. Any thread."""
+        self._require("status", *OPEN_STATES)
+        return self._do_status()
+
+    def program(self, pulses: Sequence[Pulse], repeats: int) -> None:
+        """Load `pulses`, played `repeats` times and then all outputs low; nothing is played before `run`.
+
+        `LimitExceeded`: a word that waits with the gate high (a scanner at rest would be burnt upon for as long as it
+        rests), a duration under half the resolution, no pulses at all, or more than the device holds.
+        """
+        self._note_end()
+        self._require("program", DeviceState.READY, DeviceState.CONFIGURED, first="abort")
+        self._check(pulses, repeats)
+        self._do_program(pulses, repeats)
+        self._state = DeviceState.CONFIGURED
+        _log.info("%s: program of %d words, %d times", self._name, len(pulses), repeats)
+
+    def run(self) -> None:
+        """Play the program from its first word."""
+        self._note_end()
+        self._require("run", DeviceState.CONFIGURED, first="program" if self._state is DeviceState.READY else "abort")
+        _log.info("%s: run", self._name)
+        self._do_run()
+        self._state = DeviceState.RUNNING
+
+    def gate_low(self) -> None:
+        """Take the gate low now, in any state; it stays low until the next `run`. Any thread.
+
+        `DeviceFault` when the gate reads back high.
+        """
+        self._require("gate_low", *OPEN_STATES)
+        _log.info("%s: gate low", self._name)
+        self._do_gate_low()
+        self._check_low(OUT_GATE, "gate_low")
+
+    def abort(self) -> None:
+        """End the program now and take all outputs low, in any state. The program stays loaded. Any thread.
+
+        `DeviceFault` when an output reads back high.
+        """
+        self._require("abort", *OPEN_STATES)
+        _log.info("%s: abort", self._name)
+        self._do_abort()
+        if self._state is DeviceState.RUNNING:
+            self._state = DeviceState.CONFIGURED
+        self._check_low(~0, "abort")
+
+    def _note_end(self) -> None:
+        """A program ends by itself: learn of it where the state matters."""
+        if self._state is DeviceState.RUNNING and self._do_status().state in ("stopped", "aborted"):
+            self._state = DeviceState.CONFIGURED
+
+    def _check_low(self, outputs: int, verb: str) -> None:
+        high = self._do_status().outputs & outputs
+        if high:
+            raise DeviceFault(
+                f"{self._name}: outputs read back 0x{high:x} after {verb}, not low; turn the laser off by its key"
+            )
+
+    def _check(self, pulses: Sequence[Pulse], repeats: int) -> None:
+        if not pulses:
+            raise LimitExceeded(f"{self._name}: a program of 0 words; give at least 1")
+        if repeats < 1:
+            raise LimitExceeded(f"{self._name}: {repeats} repeats; give at least 1")
+        for index, pulse in enumerate(pulses):
+            where = f"{self._name}: word {index}"
+            if not 0 <= pulse.outputs <= OUT_FRAME | OUT_GATE | OUT_MARKER:
+                raise LimitExceeded(f"{where} sets outputs 0x{pulse.outputs:x}; outputs are 0x0 to 0x7")
+            if pulse.duration_s is None:
+                if pulse.outputs & OUT_GATE:
+                    raise LimitExceeded(f"{where} waits with the gate high (0x{pulse.outputs:x}); clear OUT_GATE 0x2")
+            elif not (math.isfinite(pulse.duration_s) and pulse.duration_s >= self.resolution_s / 2):
+                raise LimitExceeded(
+                    f"{where} lasts {pulse.duration_s:g} s, under the resolution {self.resolution_s:g} s; lengthen it"
+                )
+
+    def _make_safe(self) -> None:
+        self.abort()
+
+    @abstractmethod
+    def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None: ...
+
+    @abstractmethod
+    def _do_run(self) -> None: ...
+
+    @abstractmethod
+    def _do_gate_low(self) -> None: ...
+
+    @abstractmethod
+    def _do_abort(self) -> None: ...
+
+    @abstractmethod
+    def _do_status(self) -> SyncStatus: ...

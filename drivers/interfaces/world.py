@@ -1,0 +1,27 @@
+"""What only a simulated rig has: a world that knows the truth of a sweep."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class SweepTruth:
+    """The truth of one sweep, to judge an estimate by after it was made.
+
+    x_px: float32 (rows, columns), true stripe position per image row and column, raw pixels; NaN = no stripe.
+    depth_m: float32 (rows, width), true z per camera pixel; NaN = nothing there.
+    """
+
+    x_px: NDArray[np.float32]
+    depth_m: NDArray[np.float32]
+
+
+class World(Protocol):
+    """The scene that the simulated devices of a rig share."""
+
+    def truth(self, commands: NDArray[np.float64]) -> SweepTruth:
+        """The truth for the scanner commands (columns,) of a sweep's columns."""
+        ...

@@ -1,0 +1,215 @@
+"""The ring of block slots between one source thread and its readers: allocated once, nothing copied, nothing lost.
+
+The source claims free slots (several at once where USB transfers are queued), fills them and publishes them in the
+order of claiming; every reader gets every block in that order and holds its slot until it asks for the next.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import DeviceTimeout, WrongState
+from drivers.frames import FrameBlock
+
+_PAGE_BYTES = 4096
+"""Slots start on pages where the stride allows it: 64-bit counting and DMA both like aligned memory."""
+
+
+class BlockRing:
+    """`slots` pieces of memory of `stride` bytes each; allocated and touched at once.
+
+    One source thread calls `claim`, `publish`, `discard` and `finish`; each reader belongs to one thread.
+    """
+
+    def __init__(self, slots: int, stride: int) -> None:
+        if slots < 1 or stride < 1:
+            raise ValueError(f"a ring of {slots} slots of {stride} bytes; both must be at least 1")
+        self.slots = slots
+        self.stride = stride
+        self.high_water = 0
+        """Most slots that were published and not yet released at one time."""
+        self._memory = _aligned(slots * stride).reshape(slots, stride)
+        self._free = deque(range(slots))
+        self._claimed: deque[int] = deque()
+        self._holders = [0] * slots
+        self._readers: list[RingReader] = []
+        self._changed = threading.Condition()
+        self._any_claimed = False
+        self._overflowed = False
+        self._finished = False
+        self._error: BaseException | None = None
+
+    @property
+    def overflowed(self) -> bool:
+        """Whether the source had to drop blocks since the ring was made."""
+        return self._overflowed
+
+    @property
+    def finished(self) -> bool:
+        """Whether the source published its last block."""
+        return self._finished
+
+    def reader(self, name: str, *, required: bool = True) -> "RingReader":
+        """A new reader; before the first claim, so that all readers see all blocks.
+
+        A reader with required=False (a monitor) never makes the source wait: it holds one slot at most, gets the
+        newest block when it asks, and counts the ones it missed in `skipped`.
+        """
+        with self._changed:
+            if self._any_claimed:
+                raise WrongState(f"ring: reader {name!r} after the first claim; add readers before the source starts")
+            optional = sum(not reader.required for reader in self._readers) + (not required)
+            if optional >= self.slots:
+                raise ValueError(
+                    f"ring: optional reader {name!r} could hold the last of {self.slots} slots; make the ring longer"
+                )
+            reader = RingReader(self, name, required)
+            self._readers.append(reader)
+            return reader
+
+    def claim(self, timeout_s: float) -> NDArray[np.uint8] | None:
+        """Memory of a free slot, uint8 (stride,), with old bytes in it; None where none came free in `timeout_s`."""
+        with self._changed:
+            self._require_unfinished("claim")
+            self._any_claimed = True
+            if not self._changed.wait_for(lambda: bool(self._free), timeout_s):
+                return None
+            slot = self._free.popleft()
+            self._claimed.append(slot)
+            view: NDArray[np.uint8] = self._memory[slot]
+            return view
+
+    def publish(self, block: FrameBlock) -> None:
+        """Hand the block in the oldest claimed slot to the readers."""
+        with self._changed:
+            self._require_unfinished("publish")
+            slot = self._oldest_claimed("publish")
+            for reader in self._readers:
+                if reader._offer(slot, block):
+                    self._holders[slot] += 1
+            if self._holders[slot] == 0:
+                self._free.append(slot)
+            used = self.slots - len(self._free) - len(self._claimed)
+            self.high_water = max(self.high_water, used)
+            self._changed.notify_all()
+
+    def discard(self) -> None:
+        """Give the oldest claimed slot back unpublished: it held no frames (a heartbeat, a damaged block)."""
+        with self._changed:
+            self._free.append(self._oldest_claimed("discard"))
+            self._changed.notify_all()
+
+    def mark_overflow(self) -> None:
+        """Note for good that the source dropped blocks because no slot was free."""
+        self._overflowed = True
+
+    def finish(self, error: BaseException | None = None) -> None:
+        """No more blocks: readers get what is left, then None, or `error` raised. A second call changes nothing."""
+        with self._changed:
+            if not self._finished:
+                self._finished = True
+                self._error = error
+                self._changed.notify_all()
+
+    def _require_unfinished(self, verb: str) -> None:
+        if self._finished:
+            raise WrongState(f"ring: {verb} after finish; make a new ring for the next run")
+
+    def _oldest_claimed(self, verb: str) -> int:
+        if not self._claimed:
+            raise WrongState(f"ring: {verb} without a claimed slot; call claim first")
+        return self._claimed.popleft()
+
+    def _release(self, slot: int) -> None:
+        self._holders[slot] -= 1
+        if self._holders[slot] == 0:
+            self._free.append(slot)
+            self._changed.notify_all()
+
+
+class RingReader:
+    """One reader's place in the ring; `BlockRing.reader` makes it."""
+
+    def __init__(self, ring: BlockRing, name: str, required: bool) -> None:
+        self.name = name
+        self.required = required
+        self.skipped = 0
+        """Blocks an optional reader did not get."""
+        self._ring = ring
+        self._waiting: deque[tuple[int, FrameBlock]] = deque()
+        self._held: int | None = None
+        self._closed = False
+
+    def next(self, timeout_s: float | None = None) -> FrameBlock | None:
+        """The next block, whose memory stays as it is until the next call; the block before it is released.
+
+        None after the last block, or the source's error raised; `DeviceTimeout` after `timeout_s` (None: no limit).
+        """
+        ring = self._ring
+        with ring._changed:
+            if self._closed:
+                raise WrongState(f"ring: reader {self.name!r} is closed")
+            self._release_held()
+            if not ring._changed.wait_for(lambda: bool(self._waiting) or ring._finished, timeout_s):
+                raise DeviceTimeout(f"ring: no block for reader {self.name!r} within {timeout_s} s")
+            if self._waiting:
+                self._held, block = self._waiting.popleft()
+                return block
+            if ring._error is not None:
+                raise ring._error
+            return None
+
+    def close(self) -> None:
+        """Release everything and get nothing more, so that the source no longer waits for this reader."""
+        with self._ring._changed:
+            self._closed = True
+            self._release_held()
+            while self._waiting:
+                self._ring._release(self._waiting.popleft()[0])
+
+    def __enter__(self) -> Self:
+        """The reader itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()
+
+    def __iter__(self) -> Iterator[FrameBlock]:
+        """Blocks until the end."""
+        while (block := self.next()) is not None:
+            yield block
+
+    def _offer(self, slot: int, block: FrameBlock) -> bool:
+        """Whether this reader takes the block, and so holds its slot. The ring's lock is held."""
+        if self._closed:
+            return False
+        if not self.required:
+            if self._held is not None:
+                self.skipped += 1
+                return False
+            if self._waiting:
+                self.skipped += 1
+                self._ring._release(self._waiting.popleft()[0])
+        self._waiting.append((slot, block))
+        return True
+
+    def _release_held(self) -> None:
+        if self._held is not None:
+            self._ring._release(self._held)
+            self._held = None
+
+
+def _aligned(n_bytes: int) -> NDArray[np.uint8]:
+    """Zeroed bytes that start on a page, every page touched: the first block must not wait for the kernel."""
+    memory = np.empty(n_bytes + _PAGE_BYTES, np.uint8)
+    memory.fill(0)
+    start = -memory.ctypes.data % _PAGE_BYTES
+    return memory[start : start + n_bytes]

@@ -1,0 +1,87 @@
+"""Walking a stream of SPB1 blocks, damage and all: nothing damaged is passed on, nothing is passed over in silence."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import CorruptBlock
+from drivers.frames import FrameBlock
+from drivers.spb1.layout import ALIGN, MAGIC, check_stride, round_up
+from drivers.spb1.reader import read_frames, read_header
+
+_SEARCH_BYTES = 16 * 2**20
+"""A search looks at this much at a time, so that a big file mapped into memory is not read to its end for one gap."""
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """A piece of a stream that gave no block: where, how much (0 where only padding is missing) and why."""
+
+    offset: int
+    length: int
+    reason: str
+
+
+def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[FrameBlock | Damage]:
+    """Blocks and damage of `buffer` (uint8 (bytes,), contiguous) in order, the blocks over the same memory.
+
+    stride: bytes from block to block; None where it is not known or changes: each block ends then at its own size and
+    zeros up to the next one are padding. After damage the next header with the right CRC on a multiple of `ALIGN`
+    counts. A block whose number does not rise within its run was sent or written twice: damage too. Control blocks
+    are passed over. `UnsupportedBlock` where the stream is of another sort than this reader takes.
+    """
+    if stride is not None:
+        check_stride(stride)
+    offset = 0
+    rest = 0  # where the block before really ended: a piece lost from its padding brings the next one forward
+    last: FrameBlock | None = None
+    while offset < len(buffer):
+        if stride is None and not buffer[offset : offset + ALIGN].any():
+            offset += ALIGN
+            continue
+        try:
+            fields = read_header(buffer[offset:])
+            room = buffer[offset:] if stride is None else buffer[offset : offset + stride]
+            block = None if fields.is_control else read_frames(room, fields, check_payload=check_payload)
+        except CorruptBlock as error:
+            found = _next_header(buffer, rest, passed_over=offset)
+            start = min(offset, found)
+            yield Damage(start, found - start, str(error))
+            offset = rest = found
+            continue
+        rest = offset + round_up(fields.block_bytes, ALIGN)
+        end = rest if stride is None else offset + stride
+        if block is not None:
+            if last is not None and _repeats(block, last):
+                seq, run = block.header.block_seq, block.header.run_id
+                reason = f"block {seq} of run {run} comes after block {last.header.block_seq}"
+                yield Damage(offset, min(end, len(buffer)) - offset, reason)
+            else:
+                yield block
+                last = block
+        offset = end
+
+
+def _repeats(block: FrameBlock, last: FrameBlock) -> bool:
+    return block.header.run_id == last.header.run_id and block.header.block_seq <= last.header.block_seq
+
+
+def _next_header(buffer: NDArray[np.uint8], start: int, *, passed_over: int) -> int:
+    """Offset of the next sound header at or after `start`, or the buffer's end."""
+    for window in range(start, len(buffer), _SEARCH_BYTES):
+        first_bytes = buffer[window : window + _SEARCH_BYTES : ALIGN]
+        for index in np.flatnonzero(first_bytes == MAGIC[0]):
+            offset = window + int(index) * ALIGN
+            if offset != passed_over and _has_header(buffer[offset:]):
+                return offset
+    return len(buffer)
+
+
+def _has_header(buffer: NDArray[np.uint8]) -> bool:
+    try:
+        read_header(buffer)
+    except CorruptBlock:
+        return False
+    return True

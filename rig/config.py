@@ -1,0 +1,172 @@
+"""The config of a rig: which devices, which calibration, what scan and which estimate; validated with units and limits.
+
+Times, rates and lengths are text with a unit in YAML ("10 us", "100 kHz", "8 m"). Slots of devices hold the config
+model of their kind, which stands beside its driver. Files are read by `rig.config_files`.
+"""
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializeAsAny,
+    ValidationInfo,
+    model_validator,
+)
+
+from drivers.errors import UnknownKind
+from drivers.registry import KindConfig, kinds, lookup
+from drivers.units import ExactHertz, Metres, Seconds, Watts
+
+MIN_DARK_FRACTION = 0.05
+"""Share of a live sweep's frames that must be dark: the dark rate is learned from them."""
+
+Estimator = Literal["argmax", "edge", "likelihood", "joint"]
+Filter = Literal["none", "median"]
+
+
+class Section(BaseModel):
+    """Base of the config's sections: unknown keys are refused, values cannot change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _near_below_far(value: tuple[float, float]) -> tuple[float, float]:
+    near, far = value
+    if not 0 < near < far:
+        raise ValueError(f"runs from {near:g} m to {far:g} m; it must be [near, far] with 0 m < near < far")
+    return value
+
+
+def _two_ends(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] == value[1]:
+        raise ValueError(f"begins and ends at {value[0]:g}; the sweep needs two different ends")
+    return value
+
+
+DepthRange = Annotated[
+    tuple[Metres, Metres],
+    AfterValidator(_near_below_far),
+    Field(description="nearest and farthest depth to look for", examples=["[1 m, 8 m]"]),
+]
+Columns = Annotated[int, Field(ge=1, le=65535, description="laser line positions of a sweep", examples=[500])]
+Exposures = Annotated[
+    int, Field(ge=1, le=65535, description="frames nominally taken per column (K)", examples=[10])
+]
+FrameRate = Annotated[ExactHertz, Field(gt=0, description="SPAD frames per second", examples=["100 kHz"])]
+Command = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
+
+
+class ScanConfig(Section):
+    """What one sweep does."""
+
+    columns: Columns = 500
+    exposures: Exposures = 10
+    frame_rate: FrameRate
+    depth_range: DepthRange
+    command_range: Annotated[
+        tuple[Command, Command],
+        AfterValidator(_two_ends),
+        Field(
+            description="mirror drive (-1 to 1) at the outer edges of the first and the last column; may run downward",
+            examples=["[-0.9, 0.9]"],
+        ),
+    ] = (-0.9, 0.9)
+    bidirectional: bool = Field(
+        default=False, description="use the mirror's way back as a sweep of its own", examples=["false"]
+    )
+    dark_fraction: float = Field(
+        default=MIN_DARK_FRACTION,
+        ge=MIN_DARK_FRACTION,
+        lt=1,
+        description="least share of a sweep's frames taken with the gate low",
+        examples=[0.05],
+    )
+    exposure: Annotated[Seconds, Field(gt=0)] | None = Field(
+        default=None, description="exposure of a frame; the whole frame period where not given", examples=["10 us"]
+    )
+    power: Annotated[Watts, Field(gt=0)] | None = Field(
+        default=None, description="laser power of the scan; the laser's limit where not given", examples=["20 mW"]
+    )
+
+    @model_validator(mode="after")
+    def _exposure_fits(self) -> Self:
+        if self.exposure is not None and self.exposure > float(1 / self.frame_rate) * (1 + 1e-9):
+            raise ValueError(
+                f"exposure is {self.exposure * 1e6:g} us, longer than the {float(1e6 / self.frame_rate):g} us of a frame "
+                f"at {float(self.frame_rate):g} Hz; shorten exposure or lower frame_rate"
+            )
+        return self
+
+
+class EstimateConfig(Section):
+    """How depth is estimated from the counts."""
+
+    estimator: Estimator = Field(
+        default="likelihood", description="how the stripe is found on each row", examples=["likelihood"]
+    )
+    filter: Filter = Field(
+        default="none", description="what is done to the stripe positions afterwards", examples=["median"]
+    )
+    min_confidence: float = Field(
+        default=0.5, ge=0, le=1, description="answers below this confidence do not enter the depth map", examples=[0.5]
+    )
+
+
+def _of_slot(slot: str) -> BeforeValidator:
+    """Validates a mapping with the config model of the kind it names."""
+
+    def validate(value: object, info: ValidationInfo) -> object:
+        if isinstance(value, KindConfig):
+            value = value.model_dump(mode="json")
+        if not isinstance(value, dict):
+            raise ValueError(f"is {value!r}; it must be a mapping that names a kind, e.g. {{kind: {_a_kind(slot)}}}")
+        if "kind" not in value:
+            raise ValueError(f"has no 'kind'; add one of: {', '.join(kinds(slot))}")
+        try:
+            kind = lookup(slot, str(value["kind"]))
+        except UnknownKind as error:
+            raise ValueError(str(error).removeprefix(f"{slot}: ")) from error
+        return kind.config.model_validate(value, context=info.context)
+
+    return BeforeValidator(validate)
+
+
+def _a_kind(slot: str) -> str:
+    return next(iter(kinds(slot)), "simulated")
+
+
+def _beside_config(value: Path | None, info: ValidationInfo) -> Path | None:
+    folder = (info.context or {}).get("folder")
+    return value if value is None or folder is None else Path(folder) / value
+
+
+class RigConfig(Section):
+    """A whole rig and the scan it does."""
+
+    name: str = Field(min_length=1, description="name of the rig, for people", examples=["lab"])
+    calibration: Annotated[Path | None, AfterValidator(_beside_config)] = Field(
+        default=None, description="calibration file, relative to this file; without one there is no depth"
+    )
+    world: Annotated[SerializeAsAny[KindConfig], _of_slot("world")] | None = Field(
+        default=None, description="what simulated devices look at; real rigs have none"
+    )
+    spad: Annotated[SerializeAsAny[KindConfig], _of_slot("spad")]
+    scanner: Annotated[SerializeAsAny[KindConfig], _of_slot("scanner")]
+    laser: Annotated[SerializeAsAny[KindConfig], _of_slot("laser")]
+    sync: Annotated[SerializeAsAny[KindConfig], _of_slot("sync")]
+    scan: ScanConfig
+    estimate: EstimateConfig = EstimateConfig()
+
+
+class CubePlan(Section):
+    """`plan.yaml` of `rig reconstruct`: how the frames of a bare cube were taken."""
+
+    columns: Columns
+    exposures: Exposures
+    frame_rate: FrameRate
+    depth_range: DepthRange

@@ -1,0 +1,66 @@
+"""Compiled step from the stripe table to a depth map on the camera grid."""
+
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_COLUMN_GAP: Final = 2
+"""Stripes of columns farther apart than this are not joined to one surface."""
+SPACING_TOLERANCE_PX: Final = 1.0
+SPACING_SIGMAS: Final = 3.0
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_rows(
+    x_px: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    x_sd_px: NDArray[np.float32],
+    min_confidence: float,
+    plane: NDArray[np.float64],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    inverse_depth: NDArray[np.float32],
+    depth_confidence: NDArray[np.float32],
+) -> None:
+    """Write inverse depth and its confidence (rows, width) for pixels between stripes of neighbouring columns.
+
+    Two stripes of one row lie on one surface when their columns are at most MAX_COLUMN_GAP apart and their spacing is
+    that of equal depth within 1 px + 3 sd. Between them the column is linear in x. The more confident pair wins a pixel.
+    """
+    rows, columns = x_px.shape
+    width = u.shape[1]
+    for y in range(rows):
+        for c in range(columns - 1):
+            if not confidence[y, c] >= min_confidence or np.isnan(x_px[y, c]):
+                continue
+            for other in range(c + 1, min(c + MAX_COLUMN_GAP, columns - 1) + 1):
+                if not confidence[y, other] >= min_confidence or np.isnan(x_px[y, other]):
+                    continue
+                xa, xb = np.float64(x_px[y, c]), np.float64(x_px[y, other])
+                i = min(max(int(0.5 * (xa + xb)), 0), width - 2)
+                ux, vx = u[y, i], v[y, i]
+                slope = plane[c, 0] * (u[y, i + 1] - ux) + plane[c, 1] * (v[y, i + 1] - vx)
+                turn = (
+                    (plane[other, 0] - plane[c, 0]) * ux + (plane[other, 1] - plane[c, 1]) * vx
+                    + plane[other, 2] - plane[c, 2]
+                )  # fmt: skip
+                if not abs(slope) > 1e-12:
+                    continue
+                sd = np.sqrt(x_sd_px[y, c] ** 2 + x_sd_px[y, other] ** 2)
+                if not abs(xb - xa + turn / slope) <= SPACING_TOLERANCE_PX + SPACING_SIGMAS * sd:
+                    continue
+                sure = min(confidence[y, c], confidence[y, other])
+                for x in range(max(int(np.ceil(min(xa, xb))), 0), min(int(np.floor(max(xa, xb))), width - 1) + 1):
+                    if not sure > depth_confidence[y, x]:
+                        continue
+                    f = (x - xa) / (xb - xa) if xb != xa else 0.5
+                    ux, vx = u[y, x], v[y, x]
+                    wa = plane[c, 0] * ux + plane[c, 1] * vx + plane[c, 2]
+                    wb = plane[other, 0] * ux + plane[other, 1] * vx + plane[other, 2]
+                    w = (1.0 - f) * wa + f * wb
+                    if w > 1e-6:
+                        inverse_depth[y, x] = w
+                        depth_confidence[y, x] = sure
+                break

@@ -1,0 +1,163 @@
+"""Compiled rows of the simple estimators `argmax` and `edge`."""
+
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.geometry import MARGIN_PX
+
+EDGE_REACH_PX: Final = 8
+"""Pixels on each side between which `edge` measures the drop of the level (the report's discontinuity)."""
+NEAR_SHARE: Final = 0.25
+"""Share of the row, from its near end, to which `edge` fits the decaying background."""
+
+
+@numba.njit(cache=True, nogil=True)
+def sub_pixel(weight: NDArray[np.float64], peak: int, length: int) -> float:
+    """Offset of the peak in -0.5..0.5 from its two neighbours: centroid of what rises above the lower of them.
+
+    A flat top or a peak at the end of the row has no offset.
+    """
+    if peak <= 0 or peak >= length - 1:
+        return 0.0
+    left, centre, right = weight[peak - 1], weight[peak], weight[peak + 1]
+    floor = min(left, right)
+    mass = left + centre + right - 3.0 * floor
+    if not mass > 0.0:
+        return 0.0
+    return min(max((right - left) / mass, -0.5), 0.5)
+
+
+@numba.njit(cache=True, nogil=True)
+def peak_confidence(
+    weight: NDArray[np.float64], counts: NDArray[np.float64], k: float, peak: int, length: int
+) -> tuple[float, float]:
+    """(P(the true peak is within 1 px of `peak`), mean count away from it).
+
+    The row is read as 'one pixel at the peak's rate, the others at the mean rate of the rest', whose likelihood at x is
+    weight[x] (logit p_peak - logit p_rest); rates are kept off 0 and 1 by half a count.
+    """
+    total = 0.0
+    for t in range(length):
+        total += counts[t]
+    around = counts[peak]
+    pixels = 1.0
+    for t in (peak - 1, peak + 1):
+        if 0 <= t < length:
+            around += counts[t]
+            pixels += 1.0
+    rest = (total - around) / max(length - pixels, 1.0)
+    p_peak = (counts[peak] + 0.5) / (k + 1.0)
+    p_rest = min((max(rest, 0.0) + 0.5 / length) / (k + 1.0 / length), p_peak)
+    gain = np.log(p_peak / (1.0 - p_peak)) - np.log(p_rest / (1.0 - p_rest))
+    near = 0.0
+    everything = 0.0
+    for t in range(length):
+        share = np.exp(max(gain * (weight[t] - weight[peak]), -60.0))
+        everything += share
+        if abs(t - peak) <= 1:
+            near += share
+    return near / everything, rest
+
+
+@numba.njit(cache=True, nogil=True)
+def _near_fit(n: NDArray[np.float64], length: int) -> tuple[float, float]:
+    """Level and decay per pixel of an exponential through the near part of a row, by its two halves' sums."""
+    half = max(int(length * NEAR_SHARE) // 2, 2)
+    if 2 * half > length:
+        return 0.0, 0.0
+    a = 0.0
+    b = 0.0
+    for t in range(half):
+        a += n[t]
+        b += n[half + t]
+    if a <= 0.0:
+        return 0.0, 0.0
+    decay = np.log(a / b) / half if b > 0.0 else 0.0
+    decay = max(decay, 0.0)
+    if decay < 1e-6:
+        return (a + b) / (2 * half), 0.0
+    return a * -np.expm1(-decay) / -np.expm1(-decay * half), decay
+
+
+@numba.njit(cache=True, nogil=True)
+def peak_rows(
+    counts: NDArray[np.unsignedinteger],
+    n_frames: NDArray[np.int32],
+    x0: NDArray[np.int32],
+    x_lo: NDArray[np.int32],
+    x_hi: NDArray[np.int32],
+    near_is_left: bool,
+    with_edge: bool,
+    first_row: int,
+    last_row: int,
+    out: NDArray[np.float32],
+) -> None:
+    """`argmax` (with_edge False) or `edge` on rows first_row..last_row-1; out (5, rows, columns) as in StripeTable."""
+    window = counts.shape[2]
+    n = np.empty(window + 2 * MARGIN_PX, np.float64)
+    score = np.empty(window + 2 * MARGIN_PX, np.float64)
+    step = 1 if near_is_left else -1
+    for c in range(counts.shape[0]):
+        if n_frames[c] == 0:
+            continue
+        k = np.float64(n_frames[c])
+        for y in range(first_row, last_row):
+            first, last = max(x_lo[y, c], x0[c]), min(x_hi[y, c], x0[c] + window - 1)
+            if first > last:
+                continue
+            length = last - first + 1
+            start = first if near_is_left else last
+            for t in range(length):
+                n[t] = counts[c, y, start + step * t - x0[c]]
+            background = 0.0
+            decay = 0.0
+            if with_edge:
+                background, decay = _near_fit(n, length)
+                _edge_scores(n, length, background, decay, score)
+            peak = -1
+            for i in range(length):
+                # Ties go to the smallest x, whatever side is near.
+                t = i if near_is_left else length - 1 - i
+                value = score[t] if with_edge else n[t]
+                if peak < 0 or value > (score[peak] if with_edge else n[peak]):
+                    peak = t
+            weights = score if with_edge else n
+            offset = sub_pixel(weights, peak, length)
+            near, rest = peak_confidence(n, n, k, peak, length)
+            level = background * np.exp(-decay * peak) if with_edge else rest
+            out[0, y, c] = start + step * (peak + offset)
+            out[1, y, c] = near
+            net = max(n[peak] - level, 0.0)
+            out[2, y, c] = np.sqrt(1.0 / 12.0 + 0.5 / max(net, 1.0))
+            out[3, y, c] = _flux(net, k)
+            out[4, y, c] = _flux(min(level, k), k)
+
+
+@numba.njit(cache=True, nogil=True)
+def _edge_scores(n: NDArray[np.float64], length: int, background: float, decay: float, score: NDArray[np.float64]) -> None:
+    """(count - background) times the drop of the mean level from the 8 px before to the 8 px behind, both cut at 0."""
+    for t in range(length):
+        before = 0.0
+        m = 0
+        for i in range(max(0, t - EDGE_REACH_PX), t):
+            before += n[i]
+            m += 1
+        before = before / m if m else background
+        behind = 0.0
+        m = 0
+        for i in range(t + 1, min(length, t + 1 + EDGE_REACH_PX)):
+            behind += n[i]
+            m += 1
+        behind = behind / m if m else 0.0
+        rise = max(n[t] - background * np.exp(-decay * t), 0.0)
+        # A small constant keeps the peak decisive where there is no haze to drop.
+        score[t] = rise * (max(before - behind, 0.0) + 0.05)
+
+
+@numba.njit(cache=True, nogil=True)
+def _flux(count: float, k: float) -> float:
+    """Photons per exposure from a mean count over k exposures, finite at saturation."""
+    return np.log((k + 0.5) / (k - count + 0.5))

@@ -1,0 +1,187 @@
+"""The folder of a run: every output in one place, whole or not there at all.
+
+    depth/000000.npy  depth/000000.png  intensity/000000.png  stripe/000000.npz  cloud/000000.ply
+    truth/000000.npz (where a world knows it)  manifest.json  summary.json
+
+Everything is written beside the folder under a hidden name and moved in one step at the end.
+"""
+
+import io
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Mapping
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.interfaces import SweepTruth
+from rig.errors import UsageError
+from rig.pictures import depth_limits, depth_picture, intensity_picture, png_bytes
+from rig.pointcloud import cloud, ply_bytes
+from rig.reconstruction import MapResult
+
+Rays = tuple[NDArray[np.floating], NDArray[np.floating]]
+
+
+class RunFolder:
+    """Collects the outputs of a run; `publish` makes them appear as `path`, leaving without it removes every trace.
+
+    Raises UsageError, one line, where the folder exists with something in it or cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Claim the folder; nothing is visible at `path` yet."""
+        self.path = Path(path).absolute()
+        self.maps_written = 0
+        self._limits: tuple[float, float] | None = None
+        self._made_parents: list[Path] = []
+        self._scratch: Path | None = None
+        try:
+            self._scratch = self._claim()
+        except OSError as error:
+            self.discard()
+            raise _unwritable(self.path, error) from error
+
+    def __enter__(self) -> Self:
+        """The folder itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove what was not published."""
+        self.discard()
+
+    def write_map(self, index: int, result: MapResult, rays: Rays | None) -> None:
+        """Write all files of one map; `rays` (u, v) of the camera, None for an uncalibrated rig (no depth, no cloud).
+
+        Where one cannot be written (disk full), the map's other files go too and UsageError says why.
+        """
+        name = f"{index:06d}"
+        stripe = result.stripe
+        table = {key: getattr(stripe, key) for key in ("x_px", "confidence", "x_sd_px", "signal", "haze")}
+        files = {
+            f"intensity/{name}.png": png_bytes(intensity_picture(result.intensity)),
+            f"stripe/{name}.npz": _npz_bytes(table),
+        }
+        if rays is not None:
+            # The first map sets the colours of all, so that a film of them does not flicker.
+            self._limits = self._limits or depth_limits(result.depth_m)
+            files[f"depth/{name}.npy"] = _npy_bytes(result.depth_m)
+            files[f"depth/{name}.png"] = png_bytes(depth_picture(result.depth_m, self._limits))
+            files[f"cloud/{name}.ply"] = ply_bytes(cloud(result.depth_m, *rays, result.intensity))
+        self._write(files)
+        self.maps_written += 1
+
+    def write_truth(self, index: int, truth: SweepTruth) -> None:
+        """Write what the world says about the sweep of a map."""
+        self._write({f"truth/{index:06d}.npz": _npz_bytes({"x_px": truth.x_px, "depth_m": truth.depth_m})})
+
+    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write `name` (manifest.json, summary.json) as strict JSON."""
+        self._write({name: (json_text(content) + "\n").encode()})
+
+    def publish(self) -> Path:
+        """Make the folder appear under its name."""
+        scratch = self._scratch
+        assert scratch is not None, "a run folder is published once"
+        try:
+            if scratch.parent == self.path:  # an empty folder was given: fill it, summary.json last
+                for child in sorted(scratch.iterdir(), key=lambda file: file.name == "summary.json"):
+                    child.rename(self.path / child.name)
+                scratch.rmdir()
+            else:
+                scratch.rename(self.path)
+        except OSError as error:
+            raise _unwritable(self.path, error) from error
+        self._scratch = None
+        self._made_parents.clear()
+        return self.path
+
+    def discard(self) -> None:
+        """Remove everything not published, and the folders made for it."""
+        if self._scratch is not None:
+            shutil.rmtree(self._scratch, ignore_errors=True)
+            self._scratch = None
+        for parent in reversed(self._made_parents):
+            try:
+                parent.rmdir()
+            except OSError:
+                break  # somebody else has put something there meanwhile
+        self._made_parents.clear()
+
+    def _claim(self) -> Path:
+        if self.path.exists():
+            if not self.path.is_dir():
+                raise UsageError(f"--out {self.path} is a file; name a new folder")
+            if any(self.path.iterdir()):
+                raise UsageError(f"--out {self.path} exists and is not empty; name a new folder or empty this one")
+            parent = self.path
+        else:
+            missing = [folder for folder in self.path.parents if not folder.exists()]
+            for folder in reversed(missing):
+                folder.mkdir()
+                self._made_parents.append(folder)
+            parent = self.path.parent
+        scratch = parent / f".{self.path.name}.{secrets.token_hex(4)}.part"
+        scratch.mkdir()
+        return scratch
+
+    def _write(self, files: Mapping[str, bytes]) -> None:
+        assert self._scratch is not None, "the run folder is published or discarded already"
+        written: list[Path] = []
+        try:
+            for name, data in files.items():
+                file = self._scratch / name
+                file.parent.mkdir(exist_ok=True)
+                written.append(file)
+                file.write_bytes(data)
+        except OSError as error:
+            for file in written:
+                file.unlink(missing_ok=True)
+            raise _unwritable(self.path, error) from error
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """Strict JSON: NaN and infinities become null, arrays lists, paths text."""
+    return json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, Fraction):
+        return _plain(float(value))
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int | bool):
+        return value
+    return str(value)
+
+
+def _unwritable(path: Path, error: OSError) -> UsageError:
+    reason = error.strerror or str(error)
+    return UsageError(f"cannot write {path}: {reason}; name another folder with --out or free the space it needs")
+
+
+def _npy_bytes(array: NDArray[Any]) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=False)
+    return stream.getvalue()
+
+
+def _npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **arrays)
+    return stream.getvalue()

@@ -1,0 +1,81 @@
+"""Pictures for people: depth in colour with its scale, intensity in grey. The numbers are in the .npy files."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+SCALE_PX = 74
+"""Width of the strip beside a depth picture that holds its scale."""
+_BAR_PX = 14
+_TEXT_HEIGHT_PX = 10
+_LABELS = 6
+
+
+def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
+    """Depths (m) between which colours run: all but the outermost 1 % on each side; None where there is no depth."""
+    known = depth_m[np.isfinite(depth_m)]
+    if not known.size:
+        return None
+    low, high = (float(x) for x in np.percentile(known, [1, 99]))
+    spare = max(0.02 * (high - low), 1e-3 * high)
+    return low - spare, high + spare
+
+
+def depth_picture(depth_m: NDArray[np.float32], limits: tuple[float, float] | None) -> NDArray[np.uint8]:
+    """Colours near (red) to far (blue), black where there is no depth, with a scale in metres at the right; BGR."""
+    import cv2
+
+    rows, width = depth_m.shape
+    picture = np.zeros((rows, width + SCALE_PX, 3), np.uint8)
+    if limits is None:
+        return picture
+    low, high = limits
+    known = np.isfinite(depth_m)
+    picture[:, :width][known] = _colours(depth_m[known], limits)
+    top, bottom = min(12, rows // 8), max(rows - 12, rows - rows // 8)
+    bar = np.linspace(low, high, bottom - top)
+    left = width + 8
+    picture[top:bottom, left : left + _BAR_PX] = _colours(bar, limits)[:, None]
+    for value in _round_values(low, high, min(_LABELS, max(1, rows // 40))):
+        y = top + round((value - low) / (high - low) * (bottom - top - 1))
+        cv2.line(picture, (left + _BAR_PX, y), (left + _BAR_PX + 3, y), (255, 255, 255), 1)
+        at = (left + _BAR_PX + 6, min(max(y + _TEXT_HEIGHT_PX // 2, _TEXT_HEIGHT_PX), rows - 2))
+        cv2.putText(picture, f"{value:.4g} m", at, cv2.FONT_HERSHEY_SIMPLEX, 0.38, (255, 255, 255), 1, cv2.LINE_AA)
+    return picture
+
+
+def intensity_picture(intensity: NDArray[np.uint32]) -> NDArray[np.uint8]:
+    """Summed counts as grey, square-root scaled (shot noise looks alike in dark and bright); (rows, width)."""
+    root = np.sqrt(intensity.astype(np.float64))
+    # Hot pixels and glints beyond the brightest 0.5 % must not darken the rest.
+    top = max(float(np.percentile(root, 99.5)), 1.0)
+    return np.clip(root * (255.0 / top) + 0.5, 0, 255).astype(np.uint8)
+
+
+def png_bytes(picture: NDArray[np.uint8]) -> bytes:
+    """A picture, grey (rows, width) or BGR (rows, width, 3), as a PNG file."""
+    import cv2
+
+    done, data = cv2.imencode(".png", picture)
+    if not done:
+        raise ValueError(f"a picture of shape {picture.shape} cannot be written as PNG")
+    return bytes(data)
+
+
+def _colours(depth_m: NDArray[np.floating], limits: tuple[float, float]) -> NDArray[np.uint8]:
+    """BGR (n, 3) of depths (n,)."""
+    import cv2
+
+    low, high = limits
+    share = np.clip((high - depth_m) / (high - low), 0, 1)
+    # Both ends of the map are nearly black; black means 'no depth' here.
+    levels = np.round(20 + 225 * share).astype(np.uint8)
+    colours: NDArray[np.uint8] = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0]
+    return colours
+
+
+def _round_values(low: float, high: float, most: int) -> list[float]:
+    """At most `most` + 1 round numbers between low and high, 1, 2 or 5 times a power of ten apart."""
+    rough = (high - low) / max(most, 1)
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = next(power * m for m in (1, 2, 5, 10) if power * m >= rough)
+    return [float(k * step) for k in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)]

@@ -1,0 +1,112 @@
+"""From the counts of a sweep to its stripe table and depth map."""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model import RigModel
+from rig.counting import CountVolume
+from rig.depth import depth_map
+from rig.errors import UsageError
+from rig.estimators import ESTIMATORS, FILTERS, create_estimator
+from rig.geometry import SweepGeometry, sweep_geometry, uncalibrated_geometry
+from rig.stripes import StripeTable
+
+VISIBILITY_CONTRAST = 3.912
+"""-ln(0.02): visibility is the distance at which contrast falls to 2 %, 3.912 / extinction (Koschmieder)."""
+RESOLVED_SIGMAS = 3.0
+"""Extinction is stated where it is at least this many standard deviations above zero."""
+
+
+@dataclass(frozen=True, slots=True)
+class FogEstimate:
+    """Extinction learned from the haze of the stream; all None where the haze does not resolve it."""
+
+    extinction_per_m: float | None
+    extinction_sd_per_m: float | None
+    visibility_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class MapResult:
+    """One reconstructed map: stripe table, depth_m (rows, width) float32 with NaN, intensity (rows, width) uint32."""
+
+    stripe: StripeTable
+    depth_m: NDArray[np.float32]
+    intensity: NDArray[np.uint32]
+    fog: FogEstimate
+    compute_s: float
+
+
+class Reconstructor:
+    """Turns count volumes into maps, one after the other; estimators that learn carry their state from map to map.
+
+    model: rig model, None for an uncalibrated rig (stripes only). column_commands: (columns,) mirror command of each
+    column's centre. estimator, filter: names of ESTIMATORS and FILTERS. Raises UsageError for anything that does not fit.
+    """
+
+    def __init__(
+        self,
+        model: RigModel | None,
+        column_commands: Sequence[float] | NDArray[np.float64],
+        depth_range_m: tuple[float, float],
+        *,
+        sensor: tuple[int, int] | None = None,
+        estimator: str = "likelihood",
+        filter: str = "none",
+        min_confidence: float = 0.5,
+        threads: int = 2,
+    ) -> None:
+        if estimator not in ESTIMATORS:
+            raise UsageError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+        if filter not in FILTERS:
+            raise UsageError(f"filter {filter!r} is unknown; choose one of {', '.join(FILTERS)}")
+        self._model = model
+        self._commands = np.asarray(column_commands, dtype=np.float64)
+        self._min_confidence = min_confidence
+        self._filter = filter
+        self.estimator = create_estimator(estimator, threads)
+        if model is not None:
+            self.geometry = sweep_geometry(model, model.planes(self._commands), depth_range_m)
+        elif sensor is not None:
+            self.geometry = uncalibrated_geometry(*sensor, len(self._commands))
+        else:
+            raise UsageError("without a calibration the sensor size (rows, width) must be given")
+
+    def map(self, volume: CountVolume) -> MapResult:
+        """Stripe table, depth and intensity of one sweep, with the time that estimation took."""
+        begun = time.perf_counter()
+        geometry = self._bound(volume)
+        stripe = self.estimator.estimate(volume, geometry)
+        if self._filter == "median":
+            from rig.estimators.median import median_filter
+
+            stripe = median_filter(stripe, geometry.reference_px())
+        if self._model is None:
+            depth = np.full((geometry.rows, geometry.width), np.nan, np.float32)
+        else:
+            depth = depth_map(stripe, geometry, self._min_confidence)
+        compute_s = time.perf_counter() - begun
+        return MapResult(stripe, depth, volume.intensity(), self._fog(), compute_s)
+
+    def _bound(self, volume: CountVolume) -> SweepGeometry:
+        """Geometry with the planes where the frames of each column really were."""
+        if self._model is None:
+            return self.geometry
+        column = np.arange(len(self._commands), dtype=np.float64)
+        column = np.clip(np.where(np.isfinite(volume.column), volume.column, column), 0, len(column) - 1)
+        planes = self._model.planes(np.interp(column, np.arange(len(column)), self._commands))
+        return replace(self.geometry, planes=planes, plane=planes[:, :3] / planes[:, 3:])
+
+    def _fog(self) -> FogEstimate:
+        state = getattr(self.estimator, "model", None)
+        if state is None or self._model is None:
+            return FogEstimate(None, None, None)
+        extinction, sd = state.extinction_per_m, state.extinction_sd_per_m
+        if not (math.isfinite(extinction) and math.isfinite(sd) and extinction > RESOLVED_SIGMAS * sd):
+            return FogEstimate(None, None, None)
+        return FogEstimate(extinction, sd, VISIBILITY_CONTRAST / extinction)

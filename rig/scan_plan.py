@@ -1,0 +1,202 @@
+"""The compiled scan: what the mirror, the gate and the SPAD do over time, and which column a moment belongs to.
+
+Times within a sweep count from its scan marker on the scanner's point clock; every sweep lasts `sweep_points` points,
+so times of any sweep are exact rationals and do not drift. The command passes the value of point i at the start of
+point i and runs straight to the next; through the lit part it runs linearly. The mirror follows `lag_s` later. Column c
+spans c - 0.5 to c + 0.5; column 0 begins at `command_range[0]`, the last ends at `command_range[1]`, on the way back
+too.
+"""
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.interfaces import OUT_GATE, Pulse, ScanWaveform, SpadMode
+from rig.mirror_path import SweepPath
+
+Array = NDArray[np.float64]
+
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """One direction of the scan. A unidirectional period has one leg, a bidirectional one two.
+
+    direction: +1 where the command rises while lit, -1 where it falls. columns_rise: whether column numbers rise with
+    time. lag_s: the mirror is where the command was this much earlier. gate_open_s, gate_close_s: from the scan marker.
+    """
+
+    path: SweepPath
+    direction: int
+    columns_rise: bool
+    lag_s: float
+    gate_open_s: float
+    gate_close_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanPlan:
+    """Everything about a scan that is known before it starts.
+
+    frame_rate_hz, point_rate_hz: exact nominal rates of SPAD and scanner. sweep_points: points from one scan marker to
+    the next. marker_points: int64 (markers,), point of line marker j within a sweep; it marks the command of the edge
+    j * columns_per_marker columns into the lit part. commands: float64 (columns,), mirror command of each column's
+    centre. x0: int32 (columns,), first stored pixel of each column's window; window: stored pixels per row; both
+    multiples of 64.
+    """
+
+    columns: int
+    exposures: int
+    frame_rate_hz: Fraction
+    exposure_s: float
+    point_rate_hz: Fraction
+    sweep_points: int
+    legs: tuple[Leg, ...]
+    waveform: ScanWaveform
+    columns_per_marker: int
+    marker_points: NDArray[np.int64]
+    commands: Array
+    command_range: tuple[float, float]
+    depth_range_m: tuple[float, float]
+    x0: NDArray[np.int32]
+    window: int
+    rows: int
+    width: int
+    mode: SpadMode
+    burst_frames: int | None
+    readout_bytes_per_s: float | None
+
+    @property
+    def sweeps_per_period(self) -> int:
+        """Sweeps in one repetition of the waveform."""
+        return len(self.legs)
+
+    @property
+    def sweep_s(self) -> Fraction:
+        """Exact seconds from one scan marker to the next."""
+        return self.sweep_points / self.point_rate_hz
+
+    @property
+    def column_s(self) -> Fraction:
+        """Exact seconds the line takes over one column."""
+        return self.exposures / self.frame_rate_hz
+
+    @property
+    def points_per_column(self) -> Fraction:
+        """Points of the scanner's clock per column."""
+        return self.column_s * self.point_rate_hz
+
+    @property
+    def frames_per_sweep(self) -> Fraction:
+        """Frames from one scan marker to the next; rarely a whole number, since the two clocks are independent."""
+        return self.sweep_s * self.frame_rate_hz
+
+    @property
+    def lit_frames(self) -> int:
+        """Frames that fall on columns in a sweep, nominally."""
+        return self.columns * self.exposures
+
+    @property
+    def dark_fraction(self) -> float:
+        """Least share of a sweep's frames taken wholly with the gate low."""
+        gate_s = max(leg.gate_close_s - leg.gate_open_s for leg in self.legs)
+        return max(0.0, 1 - (gate_s + 2 / float(self.frame_rate_hz)) / float(self.sweep_s))
+
+    @property
+    def speed_per_s(self) -> float:
+        """Speed of the command over the lit part, per second, positive."""
+        return abs(self.command_range[1] - self.command_range[0]) / float(self.columns * self.column_s)
+
+    @property
+    def map_rate_hz(self) -> float:
+        """Depth maps per second of scanning."""
+        return float(1 / self.sweep_s)
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one full frame as the SPAD sends it, its record included."""
+        return self.rows * (-(-self.width // 64) * 8) + 16
+
+    def leg(self, sweep: int) -> Leg:
+        """The leg of sweep number `sweep`, counted from 0."""
+        return self.legs[sweep % len(self.legs)]
+
+    def sweep_start_ns(self, sweep: int) -> int:
+        """Nanoseconds (floor) from the first scan marker to that of `sweep`, exact at any length of run."""
+        return sweep * self.sweep_points * NS_PER_S * self.point_rate_hz.denominator // self.point_rate_hz.numerator
+
+    def command(self, time_s: Array) -> Array:
+        """Mirror command at times after the first scan marker, any shape; negative times give the first command."""
+        points = np.maximum(np.asarray(time_s, np.float64), 0) * float(self.point_rate_hz)
+        sweep = np.floor(points / self.sweep_points).astype(np.int64)
+        within = points - sweep * self.sweep_points
+        out = np.empty_like(within)
+        for i, leg in enumerate(self.legs):
+            here = sweep % len(self.legs) == i
+            out[here] = leg.path.command(within[here])
+        return out
+
+    def column(self, tau_s: Array, leg: Leg) -> Array:
+        """Fractional column the mirror stands at `tau_s` after the scan marker of a sweep of this leg.
+
+        Continued linearly outside the lit part (below -0.5, above columns - 0.5), where the mirror is on no column.
+        """
+        start_s = float(leg.path.lit_start / self.point_rate_hz) + leg.lag_s
+        done = (np.asarray(tau_s, np.float64) - start_s) / float(self.column_s)
+        return done - 0.5 if leg.columns_rise else self.columns - 0.5 - done
+
+    def command_at(self, column: Array) -> Array:
+        """Mirror command of fractional columns, any shape, NaN staying NaN."""
+        first, last = self.command_range
+        return first + (np.asarray(column, np.float64) + 0.5) * ((last - first) / self.columns)
+
+    def sync_program(self, maps: int) -> tuple[tuple[Pulse, ...], int]:
+        """Pulses and repeats that open the gate once in each of `maps` sweeps and then leave it low."""
+        whole, rest = divmod(maps, len(self.legs))
+        if rest == 0:
+            return tuple(p for leg in self.legs for p in self._pulses(leg)), whole
+        return tuple(p for sweep in range(maps) for p in self._pulses(self.leg(sweep))), 1
+
+    def scanner_repeats(self, maps: int) -> int:
+        """Repetitions of the waveform that hold `maps` sweeps and the scan marker that closes the last one."""
+        return -(-(maps + 1) // len(self.legs))
+
+    def readout_s(self, frames: int) -> float:
+        """Seconds to read `frames` out after a burst; 0 for a stream, which sends them as it goes."""
+        return frames * self.frame_bytes / self.readout_bytes_per_s if self.readout_bytes_per_s else 0.0
+
+    def _pulses(self, leg: Leg) -> tuple[Pulse, ...]:
+        return (
+            Pulse(0, None),  # gate low while waiting: a scanner that stands still is never lit
+            Pulse(0, leg.gate_open_s),
+            Pulse(OUT_GATE, leg.gate_close_s - leg.gate_open_s),
+            Pulse(0, float(1 / self.frame_rate_hz)),
+        )
+
+    def describe(self) -> str:
+        """The plan for people, a few lines."""
+        low, high = self.command_range
+        stored = self.window // 8 * self.rows
+        rate = float(self.frame_rate_hz)
+        link = "burst" if self.mode == "burst" else "stream"
+        sides = "both ways" if len(self.legs) == 2 else "one way"
+        lag = ", ".join(f"{leg.lag_s * 1e6:.0f} us {'up' if leg.direction > 0 else 'down'}" for leg in self.legs)
+        near, far = self.depth_range_m
+        gate = self.legs[0]
+        step = f"{self.columns_per_marker} columns" if self.columns_per_marker > 1 else "column"
+        lines = (
+            f"columns     {self.columns} x {self.exposures} frames at {rate / 1e3:g} kHz, "
+            f"{float(self.column_s) * 1e6:g} us each",
+            f"mirror      command {low:g} to {high:g}, {sides}, {self.speed_per_s:.3g} /s, lag {lag}",
+            f"sweep       {float(self.sweep_s) * 1e3:.2f} ms, {self.sweep_points} points at "
+            f"{float(self.point_rate_hz):g} Hz, a line marker every {step}",
+            f"maps        {self.map_rate_hz:.2f} a second from {float(self.frames_per_sweep):.1f} frames "
+            f"({float(self.sweep_s) * 1e3:.1f} ms of sensor time), {self.dark_fraction:.1%} of them dark",
+            f"gate        {gate.gate_open_s * 1e3:.3f} to {gate.gate_close_s * 1e3:.3f} ms after the scan marker",
+            f"window      {self.window} of {self.width} pixels for {near:g} to {far:g} m "
+            f"({stored * rate / 1e6:.0f} MB/s; full frames {self.frame_bytes * rate / 1e6:.0f} MB/s, {link})",
+        )
+        return "\n".join(lines)

@@ -1,0 +1,129 @@
+"""Opens all devices of a rig together, lists every failure at once, and closes them gate first, whatever happens."""
+
+import logging
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationError
+from calibration.files import load_rig_model
+from calibration.model import RigModel
+from drivers.clock import Clock, SystemClock, VirtualClock
+from drivers.errors import DeviceError
+from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SpadTiming, SyncSource, World
+from drivers.registry import KindConfig, Surroundings, lookup
+from rig.config import RigConfig, ScanConfig
+from rig.errors import DevicesError, UsageError
+from rig.plan import compile_plan, spad_request
+from rig.scan_plan import ScanPlan
+
+_log = logging.getLogger(__name__)
+
+HOLD_EXPOSURES = 10
+"""From so many frames per column on, simulated light is held at the column's centre; with fewer, at parts of columns."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpenRig:
+    """The open devices of a rig. world: None on a real rig; model: None where it is not calibrated."""
+
+    config: RigConfig
+    clock: Clock
+    world: World | None
+    spad: SpadArray
+    scanner: BeamScanner
+    laser: LineLaser
+    sync: SyncSource
+    model: RigModel | None
+
+
+@runtime_checkable
+class HoldsColumns(Protocol):
+    """A world that can keep its picture constant within each column, so that it is computed once for all its frames."""
+
+    def hold_columns(self, commands: NDArray[np.float64]) -> None:
+        """Hold the light at these mirror commands (columns,)."""
+        ...
+
+
+@contextmanager
+def open_rig(config: RigConfig, clock: Clock | None = None, seed: int = 0) -> Iterator[OpenRig]:
+    """Open every device of the config; on exit the sync source is closed first, then laser, scanner and SPAD.
+
+    clock: by default virtual time for a simulated rig and the host's for a real one. seed: of everything simulated.
+    Raises UsageError where config or calibration are at fault, DevicesError where devices are; each lists all problems.
+    """
+    with ExitStack() as stack:
+        yield _open(config, clock, seed, stack)
+
+
+def prepare(rig: OpenRig, scan: ScanConfig | None = None) -> tuple[ScanPlan, SpadTiming]:
+    """Configure the SPAD and compile the plan; nothing moves and nothing lights. scan: the config's by default."""
+    scan = rig.config.scan if scan is None else scan
+    timing = rig.spad.configure(spad_request(scan, rig.spad.info))
+    plan = compile_plan(scan, rig.scanner.limits, rig.scanner.point_clock, rig.model, rig.spad.info, timing)
+    if isinstance(rig.world, HoldsColumns):
+        # A frame's light may be held this far from where the mirror is: the mean over a column's frames is then
+        # within 1/20 column of the mean that the binding gives, at any number of exposures.
+        parts = math.ceil(HOLD_EXPOSURES / plan.exposures)
+        rig.world.hold_columns(plan.command_at((np.arange(plan.columns * parts) + 0.5) / parts - 0.5))
+    return plan, timing
+
+
+def _open(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -> OpenRig:
+    usage: list[str] = []
+    devices: list[str] = []
+    model = _load_model(config, usage)
+    clock = clock or (SystemClock() if config.world is None else VirtualClock())
+    world: World | None = None
+    if config.world is not None:
+        try:
+            world = _create("world", config.world, Surroundings(clock, None, seed))
+        except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
+            usage.append(f"world: {error}")
+    opened: dict[str, Any] = {}
+    if config.world is None or world is not None:
+        surroundings = Surroundings(clock, world, seed)
+        # Closing runs backwards: the gate goes low before the laser pauses, the mirror parks and the SPAD stops.
+        for slot in ("spad", "scanner", "laser", "sync"):
+            try:
+                opened[slot] = stack.enter_context(_create(slot, getattr(config, slot), surroundings))
+            except DeviceError as error:
+                devices.append(f"{slot}: {error}")
+    if "laser" in opened:
+        devices += _pause_if_emitting(opened["laser"])
+    if usage:
+        raise UsageError(*usage, *devices)
+    if devices:
+        raise DevicesError("\n".join(devices))
+    return OpenRig(config=config, clock=clock, world=world, model=model, **opened)
+
+
+def _create(slot: str, kind: KindConfig, surroundings: Surroundings) -> Any:
+    return lookup(slot, kind.kind).create(kind, surroundings)
+
+
+def _load_model(config: RigConfig, problems: list[str]) -> RigModel | None:
+    if config.calibration is None:
+        return None
+    try:
+        return load_rig_model(config.calibration)
+    except CalibrationError as error:
+        problems.append(f"calibration: {error}")
+        return None
+
+
+def _pause_if_emitting(laser: LineLaser) -> list[str]:
+    """A laser that emits before anybody armed it is paused, and the scan refused: somebody else is using it."""
+    try:
+        if not laser.status.emission:
+            return []
+        laser.pause()
+    except DeviceError as error:
+        return [f"laser: {error}"]
+    return [f"laser: {laser.name} was found emitting and has been paused; find out who armed it, then start again"]

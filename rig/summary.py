@@ -1,0 +1,142 @@
+"""What a run says of itself: counts of frames, times, fog, errors against the truth, and a verdict.
+
+`as_json` is what `--json` prints and what summary.json holds.
+"""
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from drivers.interfaces import SweepTruth
+from rig.reconstruction import FogEstimate, MapResult
+from rig.scoring import depth_errors, stripe_errors
+
+
+class Verdict(StrEnum):
+    """How a run ended; anything but `complete` is not to be trusted as it is."""
+
+    COMPLETE = "complete"
+    GAPS = "gaps"
+    UNSYNCHRONISED = "unsynchronised"
+    UNCALIBRATED = "uncalibrated"
+    ABORTED = "aborted"
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of the command line."""
+        return {Verdict.COMPLETE: 0, Verdict.ABORTED: 4}.get(self, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class RunFrames:
+    """Frames between the first and the last scan marker, dark and fly-back ones too; expected = received + lost.
+
+    crc_errors: blocks refused for their checksum, None where the source does not say. lit: frames that fell on columns.
+    """
+
+    expected: int = 0
+    received: int = 0
+    lost: int = 0
+    crc_errors: int | None = 0
+    lit: int = 0
+
+
+Errors = Mapping[str, float | None]
+
+
+@dataclass(frozen=True, slots=True)
+class TruthErrors:
+    """Errors against a known truth, averaged over maps (medians: the median of the maps')."""
+
+    stripe_error_px: Errors
+    depth_error_m: Errors
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A run in figures. Times in seconds of sensor and computer, fractions of camera pixels; None = no value."""
+
+    maps: int
+    map_rate_hz: float | None
+    columns: int
+    exposures: int
+    estimator: str
+    filter: str
+    frames: RunFrames
+    sensor_time_s: float
+    compute_time_s: float
+    realtime_factor: float | None
+    valid_fraction: float | None
+    fog: FogEstimate
+    truth: TruthErrors | None
+    verdict: Verdict
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary as plain values; `truth` only where it is known."""
+        content = asdict(self)
+        content["verdict"] = self.verdict.value
+        if self.truth is None:
+            del content["truth"]
+        return content
+
+
+@dataclass(slots=True)
+class MapTally:
+    """Adds up the maps of a run as they come."""
+
+    columns: int
+    exposures: int
+    estimator: str
+    filter: str
+    compute_s: float = 0.0
+    _valid: list[float] = field(default_factory=list)
+    _stripe: list[Errors] = field(default_factory=list)
+    _depth: list[Errors] = field(default_factory=list)
+    _fog: FogEstimate = field(default_factory=lambda: FogEstimate(None, None, None))
+
+    @property
+    def maps(self) -> int:
+        """Maps so far."""
+        return len(self._valid)
+
+    def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
+        """Count one map; `compute_s` is the wall time of its counting and estimation."""
+        self.compute_s += compute_s
+        self._valid.append(float(np.isfinite(result.depth_m).mean()))
+        self._fog = result.fog  # what was learned grows from map to map; the last one knows most
+        if truth is not None:
+            self._stripe.append(stripe_errors(result.stripe.x_px, truth.x_px))
+            self._depth.append(depth_errors(result.depth_m, truth.depth_m))
+
+    def summary(self, frames: RunFrames, sensor_time_s: float, verdict: Verdict) -> Summary:
+        """The run so far."""
+        truth = TruthErrors(_over_maps(self._stripe), _over_maps(self._depth)) if self._stripe else None
+        return Summary(
+            maps=self.maps,
+            map_rate_hz=self.maps / sensor_time_s if sensor_time_s > 0 else None,
+            columns=self.columns,
+            exposures=self.exposures,
+            estimator=self.estimator,
+            filter=self.filter,
+            frames=frames,
+            sensor_time_s=sensor_time_s,
+            compute_time_s=self.compute_s,
+            realtime_factor=sensor_time_s / self.compute_s if self.compute_s > 0 else None,
+            valid_fraction=statistics.fmean(self._valid) if self._valid else None,
+            fog=self._fog,
+            truth=truth,
+            verdict=verdict,
+        )
+
+
+def _over_maps(errors: Sequence[Errors]) -> Errors:
+    combined: dict[str, float | None] = {}
+    for key in errors[0]:
+        known = [value for each in errors if (value := each[key]) is not None]
+        middle = statistics.median if key.startswith("median") else statistics.fmean
+        combined[key] = middle(known) if known else None
+    return combined

@@ -1,0 +1,163 @@
+"""The bench the simulated devices stand on: one clock, one mirror, one laser, one gate line.
+
+light(t) = emission AND gate, and the mirror stands where its command was a lag ago. Devices tell the bench what they
+were told; the SPAD asks it what happened during its frames. Verbs act at the clock's present time; frames that were
+made before stay as they are. Thread-safe."""
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model import Lag
+from drivers.clock import NS_PER_S, Clock
+from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, OUT_GATE, Pulse, ScanWaveform
+from sim_backend.gate_program import GateProgram
+from sim_backend.mirror_motion import Motion, Playing, Resting
+
+Array = NDArray[np.float64]
+
+__all__ = ["LEVEL_BACKWARD", "Bench", "Happening"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Happening:
+    """What happened during n frames.
+
+    mirror: (n,) mirror position, as a command, in the middle of each exposure. share: (n,) part of the exposure with
+    the gate high. edge: (n,) bool, the gate changed during the exposure. backward: (n,) bool, direction level at the
+    start. line_s, scan_s: times of marker edges. power_w: emitted power, 0 while paused."""
+
+    mirror: Array
+    share: Array
+    edge: NDArray[np.bool_]
+    backward: NDArray[np.bool_]
+    line_s: Array
+    scan_s: Array
+    power_w: float
+
+
+class Bench:
+    """State of scanner, laser and gate over the bench's time, which starts at 0 s when the bench is made."""
+
+    def __init__(self, clock: Clock, lag: Lag) -> None:
+        self.clock = clock
+        self._lag = lag
+        self._epoch_ns = clock.now_ns()
+        self._lock = threading.RLock()
+        self._motion: Motion = Resting(0.0)
+        self._program: GateProgram | None = None
+        self._aborted = False
+        self._power_w = 0.0
+
+    def now_s(self) -> float:
+        """Present time of the bench."""
+        return (self.clock.now_ns() - self._epoch_ns) / NS_PER_S
+
+    def clock_ns(self, time_s: float) -> int:
+        """The clock's reading at a time of the bench."""
+        return self._epoch_ns + round(time_s * NS_PER_S)
+
+    def play(self, waveform: ScanWaveform, repeats: int, *, latency_s: float, rate_hz: float) -> None:
+        """Start the mirror, `latency_s` from now."""
+        with self._lock:
+            start_s = self.now_s() + latency_s
+            self._motion = Playing(waveform, repeats, start_s, rate_hz, self._lag.forward, self._lag.backward)
+
+    def rest(self, command: float) -> None:
+        """Stop the mirror at a command, now."""
+        with self._lock:
+            self._motion = Resting(command)
+
+    def moving(self) -> bool:
+        """Whether a waveform is being played."""
+        with self._lock:
+            return self._motion.moving(self.now_s())
+
+    def mirror(self) -> float:
+        """Where the mirror stands now, as a command."""
+        with self._lock:
+            return float(self._motion.mirror(np.array([self.now_s()]))[0])
+
+    def emit(self, power_w: float) -> None:
+        """Set the laser's power behind the gate; 0 = no emission."""
+        with self._lock:
+            self._power_w = power_w
+
+    def run_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
+        """Start a program of gate words now."""
+        with self._lock:
+            self._aborted = False
+            self._program = GateProgram(pulses, repeats, self.now_s())
+
+    def lower_gate(self) -> None:
+        """Gate low from now on, until the next program."""
+        with self._lock:
+            if self._program is not None:
+                self._catch_up()
+                self._program.lower_gate(self.now_s())
+
+    def abort_program(self) -> None:
+        """All outputs low from now on."""
+        with self._lock:
+            self._aborted = True
+            if self._program is not None:
+                self._catch_up()
+                self._program.abort(self.now_s())
+
+    def outputs(self) -> tuple[str, int]:
+        """State of the program (stopped, waiting, running, aborted) and the levels of its outputs now."""
+        with self._lock:
+            if self._program is None or self._aborted:
+                return ("aborted" if self._aborted else "stopped"), 0
+            self._catch_up()
+            word = int(self._program.levels(self.now_s(), np.inf)[1][0])
+            if self._program.ended and word == 0:
+                return "stopped", word
+            return ("waiting" if self._program.waiting else "running"), word
+
+    def during(self, start_s: Array, exposure_s: float, period_s: float) -> Happening:
+        """What happens during frames that start at start_s (n,), ascending, one period apart."""
+        until_s = float(start_s[-1]) + period_s
+        with self._lock:
+            motion = self._motion
+            share, edge = self._gate(start_s, exposure_s, until_s)
+            return Happening(
+                mirror=motion.mirror(start_s + 0.5 * exposure_s),
+                share=share,
+                edge=edge,
+                backward=motion.backward(start_s),
+                line_s=motion.edges(MARKER_LINE, float(start_s[0]), until_s),
+                scan_s=motion.edges(MARKER_SCAN, float(start_s[0]), until_s),
+                power_w=self._power_w,
+            )
+
+    def _gate(self, start_s: Array, exposure_s: float, until_s: float) -> tuple[Array, NDArray[np.bool_]]:
+        program = self._program
+        if program is None:
+            return np.zeros(len(start_s)), np.zeros(len(start_s), bool)
+        program.advance(until_s, self._trigger)
+        program.forget(float(start_s[0]) - exposure_s)
+        times, words = program.levels(float(start_s[0]), until_s)
+        high = (words & OUT_GATE) != 0
+        changes = times[1:][np.diff(high.astype(np.int8)) != 0]
+        end_s = start_s + exposure_s
+        edge = np.searchsorted(changes, end_s, side="left") > np.searchsorted(changes, start_s, side="right")
+        at_start = high[np.searchsorted(times, start_s, side="right") - 1]
+        share = at_start.astype(np.float64)
+        # Partly lit frames are two per sweep; their share is the time the gate was high.
+        ends = np.append(times[1:], np.inf)
+        for i in np.flatnonzero(edge):
+            overlap = np.minimum(ends, end_s[i]) - np.maximum(times, start_s[i])
+            share[i] = float(np.sum(np.clip(overlap, 0, None) * high)) / exposure_s
+        return share, edge
+
+    def _catch_up(self) -> None:
+        assert self._program is not None
+        # Up to and including now: an edge at this very moment has happened.
+        self._program.advance(np.nextafter(self.now_s(), np.inf), self._trigger)
+
+    def _trigger(self, from_s: float, until_s: float) -> Array:
+        return self._motion.edges(MARKER_SCAN, from_s, until_s)

@@ -1,0 +1,1 @@
+"""The simulated devices: peers of the real ones, sharing one bench."""

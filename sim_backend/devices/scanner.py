@@ -1,0 +1,87 @@
+"""The simulated galvanometer: plays a waveform on its own, slightly wrong clock; the mirror lags behind the command."""
+
+import math
+from fractions import Fraction
+from typing import Literal
+
+from pydantic import Field
+
+from drivers.interfaces import BeamScanner, ScannerLimits, ScannerStatus, ScanWaveform
+from drivers.registry import Kind, KindConfig, Surroundings
+from drivers.units import Ppm, Seconds
+from sim_backend.bench import Bench
+from sim_backend.devices.place import bench_of
+
+MASTER_HZ = 48_000_000
+"""The point clock is this divided by a whole number, as in a timer of a microcontroller."""
+
+LIMITS = ScannerLimits(
+    command_range=(-1.0, 1.0),
+    velocity_per_s=4000.0,
+    acceleration_per_s2=4e6,
+    step=0.25,
+    rms_duty=1.0,
+    max_points=1_000_000,
+    point_rate_hz=(1e3, 200e3),
+)
+"""A fast small galvo: full sweep in half a millisecond."""
+
+
+class SimulatedScannerConfig(KindConfig):
+    """Config of the simulated scanner."""
+
+    kind: Literal["simulated"] = "simulated"
+    clock_error: Ppm = Field(default=20e-6, ge=-1e-3, le=1e-3)
+    """Relative error of the scanner's crystal against the SPAD's."""
+    start_latency: Seconds = Field(default=1.3373e-3, ge=0)
+    """From `start` to the first point; no whole number of frames."""
+
+
+class SimulatedScanner(BeamScanner):
+    """Tells the bench where the mirror goes."""
+
+    def __init__(self, config: SimulatedScannerConfig, bench: Bench) -> None:
+        super().__init__("simulated scanner")
+        self._config = config
+        self._bench = bench
+        self._loaded: tuple[ScanWaveform, int, Fraction] | None = None
+
+    @property
+    def limits(self) -> ScannerLimits:
+        """Limits of the simulated galvo."""
+        return LIMITS
+
+    def _do_status(self) -> ScannerStatus:
+        return ScannerStatus(moving=self._bench.moving(), fault=None, position=self._bench.mirror())
+
+    def _do_point_clock(self, requested_hz: float) -> Fraction:
+        low, high = LIMITS.point_rate_hz
+        divider = min(max(round(MASTER_HZ / requested_hz), math.ceil(MASTER_HZ / high)), math.floor(MASTER_HZ / low))
+        return Fraction(MASTER_HZ, divider)
+
+    def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None:
+        frozen = ScanWaveform(waveform.command.copy(), waveform.markers.copy(), waveform.point_rate_hz)
+        self._loaded = (frozen, repeats, clock_hz)
+
+    def _do_start(self) -> None:
+        assert self._loaded is not None, "the interface starts loaded scanners only"
+        waveform, repeats, clock_hz = self._loaded
+        true_hz = float(clock_hz) * (1 + self._config.clock_error)
+        self._bench.play(waveform, repeats, latency_s=self._config.start_latency, rate_hz=true_hz)
+
+    def _do_stop(self) -> None:
+        self._bench.rest(self._bench.mirror())
+
+    def _do_park(self) -> None:
+        self._bench.rest(LIMITS.command_range[0])
+
+    def _do_close(self) -> None:
+        self._loaded = None
+
+
+def create(config: SimulatedScannerConfig, surroundings: Surroundings) -> SimulatedScanner:
+    """The scanner on the world's bench."""
+    return SimulatedScanner(config, bench_of(surroundings))
+
+
+KIND = Kind(config=SimulatedScannerConfig, create=create)

@@ -1,0 +1,240 @@
+"""The simulated SPAD array: asks the bench what happened during its frames and draws them, block by block.
+
+On a `VirtualClock` time passes as frames are made; on any other clock a block comes when its last frame has been
+exposed. Its tick counter is the rig's time base: the clock's own rate, without error."""
+
+import os
+from fractions import Fraction
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from drivers.clock import NS_PER_S, VirtualClock, ticks_to_ns
+from drivers.errors import DeviceTimeout, LimitExceeded
+from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader
+from drivers.interfaces import SpadArray, SpadCounters, SpadInfo, SpadRequest, SpadTiming, StreamMode
+from drivers.registry import Kind, KindConfig, Surroundings
+from drivers.ring import BlockRing
+from drivers.spb1 import BlockLayout, block_views, seal_block
+from drivers.units import ExactHertz
+from sim_backend.devices.markers import MarkerInputs
+from sim_backend.devices.place import world_of
+from sim_backend.photon_kernels import dropped_frames
+from sim_backend.photons import PhotonSource
+from sim_backend.world import SimulatedWorld
+
+TICK_HZ = 100_000_000
+"""Tick rate where it divides the frame period; else a multiple of the frame rate near it, so that nothing is rounded.
+"""
+TICKS_PER_FRAME = 1024
+LINK_BYTES_PER_S = 8e9
+"""More than any frame rate needs: the simulated link is no bottleneck."""
+MAX_THREADS = 4
+
+
+class SimulatedSpadConfig(KindConfig):
+    """Config of the simulated SPAD array. Its size is that of the world's camera."""
+
+    kind: Literal["simulated"] = "simulated"
+    max_frame_rate: ExactHertz = Field(default=Fraction(100_000), gt=0)
+    lost_frames: tuple[int, ...] = ()
+    """Numbers of frames that get lost on the way, to try gaps with."""
+    loss_probability: float = Field(default=0.0, ge=0, le=1)
+    """Chance of every frame to get lost on the way."""
+
+
+class SimulatedSpad(SpadArray):
+    """Makes frames of the world."""
+
+    def __init__(
+        self, config: SimulatedSpadConfig, world: SimulatedWorld, seed: int, threads: int | None = None
+    ) -> None:
+        super().__init__("simulated SPAD")
+        self._config = config
+        self._world = world
+        self._seed = seed
+        self._threads = threads or min(MAX_THREADS, os.cpu_count() or 1)
+        self._photons: PhotonSource | None = None
+        self._lost_frames = np.array(sorted(set(config.lost_frames)), dtype=np.int64)
+        self._counters = SpadCounters(0, 0, 0, 0, 0)
+        self._run_id = 0
+        self._n_frames: int | None = None
+        self._next_frame = 0
+        self._block_seq = 0
+        self._just_lost = False
+        self._markers = MarkerInputs()
+        rows, width = world.size
+        self._info = SpadInfo(
+            model="simulated",
+            serial="SIM-0001",
+            width=width,
+            height=rows,
+            rotation_deg=0,
+            max_frame_rate_hz=config.max_frame_rate,
+            burst=None,
+            stream=StreamMode(LINK_BYTES_PER_S),
+            roi_step_px=64,
+            markers=True,
+            trigger_modes=("free",),
+        )
+
+    @property
+    def info(self) -> SpadInfo:
+        """Geometry and abilities."""
+        return self._info
+
+    def _do_counters(self) -> SpadCounters:
+        return self._counters
+
+    def _do_configure(self, request: SpadRequest) -> SpadTiming:
+        ticks = TICK_HZ / request.frame_rate_hz
+        tick_hz = Fraction(TICK_HZ) if ticks.denominator == 1 else request.frame_rate_hz * TICKS_PER_FRAME
+        period = int(tick_hz / request.frame_rate_hz)
+        exposure = min(round(request.exposure_s * tick_hz), period)
+        if exposure < 1:
+            raise LimitExceeded(
+                f"{self.name}: exposure {request.exposure_s:g} s is under one tick of {float(1 / tick_hz):g} s"
+            )
+        self._block_frames = request.block_frames
+        self._timing = SpadTiming(tick_hz, period, exposure, self._layout(request.block_frames).min_stride)
+        if self._photons is not None:
+            self._photons.close()
+        world = self._world
+        exposure_s = float(exposure / tick_hz)
+        self._photons = PhotonSource(world.flux_model, world.model.planes, exposure_s, self._seed, self._threads)
+        return self._timing
+
+    def _do_start(self, n_frames: int | None) -> None:
+        clock = self._world.bench.clock
+        tick_hz = self._timing.tick_hz
+        # The counter runs since the bench was set up; a run starts at its next tick.
+        self._t0_ticks = -(-clock.now_ns() * tick_hz.numerator // (NS_PER_S * tick_hz.denominator))
+        self._n_frames = n_frames
+        self._next_frame = self._block_seq = 0
+        self._counters = SpadCounters(0, 0, 0, 0, 0)
+        self._markers = MarkerInputs()
+        self._just_lost = False
+        self._run_id = (self._run_id + 1) & 0xFFFF
+
+    def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
+        silent_s = 0.0
+        while True:
+            n, lost = self._frames_ahead()
+            if not lost:
+                self._expose_block(ring, n, timeout_s)
+                return self._next_frame != self._n_frames
+            silent_s += self._pass_over(n)
+            if self._next_frame == self._n_frames:
+                return False
+            if silent_s > timeout_s:
+                raise DeviceTimeout(f"{self.name}: every frame of {silent_s:g} s got lost on the way")
+
+    def _do_stop(self) -> None:
+        pass  # a frame is made and published in one go: nothing is on its way
+
+    def _do_close(self) -> None:
+        if self._photons is not None:
+            self._photons.close()
+
+    def _layout(self, n_frames: int) -> BlockLayout:
+        return BlockLayout(n_frames, self._info.width, self._info.height)
+
+    def _frames_ahead(self) -> tuple[int, bool]:
+        """How many frames the next block holds, or (n, True): how many of the next frames get lost."""
+        first = self._next_frame
+        n = self._block_frames if self._n_frames is None else min(self._block_frames, self._n_frames - first)
+        lost = dropped_frames(np.uint64(self._seed & 0xFFFFFFFFFFFFFFFF), first, n, self._config.loss_probability)
+        named = self._lost_frames[np.searchsorted(self._lost_frames, first) :]
+        lost[named[named < first + n] - first] = True
+        change = np.flatnonzero(lost != lost[0])
+        return (int(change[0]) if len(change) else n), bool(lost[0])
+
+    def _pass_over(self, n: int) -> float:
+        """Expose n frames that get lost: time passes and markers count. Returns the seconds they took."""
+        start_s, period_s, exposure_s = self._times(n)
+        happening = self._world.bench.during(start_s, exposure_s, period_s)
+        self._markers.record(happening, start_s, period_s, np.zeros(n, FRAME_RECORD))
+        self._advance(n, lost=n)
+        self._just_lost = True
+        return n * period_s
+
+    def _expose_block(self, ring: BlockRing, n: int, timeout_s: float) -> None:
+        buffer = ring.claim(timeout_s)
+        if buffer is None:
+            raise DeviceTimeout(f"{self.name}: no free slot in the ring within {timeout_s:g} s; readers are too slow")
+        assert self._photons is not None, "configured before started"
+        layout = self._layout(n)
+        records, bits = block_views(buffer, layout)
+        start_s, period_s, exposure_s = self._times(n)
+        happening = self._world.bench.during(start_s, exposure_s, period_s)
+        sweep = self._markers.sweep + int(np.count_nonzero(happening.scan_s < start_s[0] + period_s))
+        self._markers.record(happening, start_s, period_s, records)
+        records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
+        records["x0"] = records["y0"] = 0
+        held = self._world.grid.hold(happening.mirror)
+        self._photons.expose(self._next_frame, held, happening.power_w * happening.share, bits)
+        header = self._header(sweep, n)
+        block = seal_block(buffer, header, layout, frames_lost=header.lost_before, payload_crc=True)
+        self._advance(n, lost=0)
+        ring.publish(block)
+        self._block_seq += 1
+        self._just_lost = False
+
+    def _advance(self, n: int, *, lost: int) -> None:
+        """Let the time of n frames pass."""
+        self._next_frame += n
+        old = self._counters
+        exposed, all_lost = self._next_frame, (old.lost or 0) + lost
+        self._counters = SpadCounters(exposed, exposed - all_lost, all_lost, 0, 0)
+        timing, clock = self._timing, self._world.bench.clock
+        end_ns = ticks_to_ns(self._t0_ticks + self._next_frame * timing.frame_period_ticks, timing.tick_hz)
+        if isinstance(clock, VirtualClock):
+            clock.advance_to_ns(end_ns)
+        else:
+            clock.sleep((end_ns - clock.now_ns()) / NS_PER_S)
+
+    def _header(self, sweep: int, n: int) -> BlockHeader:
+        flags = BlockFlag(0)
+        if self._block_seq == 0:
+            flags |= BlockFlag.FIRST
+        if self._next_frame + n == self._n_frames:
+            flags |= BlockFlag.LAST
+        if self._just_lost:
+            flags |= BlockFlag.LOST_BEFORE
+        timing = self._timing
+        return BlockHeader(
+            flags=flags,
+            run_id=self._run_id,
+            block_seq=self._block_seq,
+            first_frame=self._next_frame,
+            t0_ticks=self._t0_ticks + self._next_frame * timing.frame_period_ticks,
+            lost_before=self._counters.lost or 0,
+            tick_hz=timing.tick_hz,
+            frame_period_ticks=timing.frame_period_ticks,
+            exposure_ticks=timing.exposure_ticks,
+            sweep=sweep,
+            frame_step=1,
+            width=self._info.width,
+            height=self._info.height,
+            sensor_width=self._info.width,
+            sensor_height=self._info.height,
+        )
+
+    def _times(self, n: int) -> tuple[NDArray[np.float64], float, float]:
+        """Start of each of the next n frames, period and exposure, in seconds of the bench."""
+        timing, bench = self._timing, self._world.bench
+        ticks = self._t0_ticks + np.arange(self._next_frame, self._next_frame + n) * timing.frame_period_ticks
+        epoch_ticks = bench.clock_ns(0.0) * timing.tick_hz / NS_PER_S
+        seconds = float(1 / timing.tick_hz)
+        start_s = (ticks.astype(np.float64) - float(epoch_ticks)) * seconds
+        return start_s, timing.frame_period_ticks * seconds, timing.exposure_ticks * seconds
+
+
+def create(config: SimulatedSpadConfig, surroundings: Surroundings) -> SimulatedSpad:
+    """The SPAD that looks at the world."""
+    return SimulatedSpad(config, world_of(surroundings, "simulated SPAD"), surroundings.seed)
+
+
+KIND = Kind(config=SimulatedSpadConfig, create=create)

@@ -1,0 +1,65 @@
+"""The simulated pattern generator: its gate output lets laser light out, its trigger input hears the scan marker."""
+
+from collections.abc import Sequence
+from typing import Literal, cast
+
+from drivers.interfaces import Pulse, SyncSource, SyncStatus
+from drivers.registry import Kind, KindConfig, Surroundings
+from sim_backend.bench import Bench
+from sim_backend.devices.place import bench_of
+
+RESOLUTION_S = 1e-8
+"""One cycle of a 100 MHz pattern generator."""
+
+State = Literal["stopped", "waiting", "running", "aborted"]
+
+
+class SimulatedSyncConfig(KindConfig):
+    """Config of the simulated sync source."""
+
+    kind: Literal["simulated"] = "simulated"
+
+
+class SimulatedSync(SyncSource):
+    """Tells the bench what the gate does."""
+
+    def __init__(self, bench: Bench) -> None:
+        super().__init__("simulated sync")
+        self._bench = bench
+        self._program: tuple[tuple[Pulse, ...], int] = ((), 0)
+
+    @property
+    def resolution_s(self) -> float:
+        """10 ns."""
+        return RESOLUTION_S
+
+    def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
+        rounded = tuple(
+            Pulse(p.outputs, None if p.duration_s is None else round(p.duration_s / RESOLUTION_S) * RESOLUTION_S)
+            for p in pulses
+        )
+        self._program = (rounded, repeats)
+
+    def _do_run(self) -> None:
+        self._bench.run_program(*self._program)
+
+    def _do_gate_low(self) -> None:
+        self._bench.lower_gate()
+
+    def _do_abort(self) -> None:
+        self._bench.abort_program()
+
+    def _do_status(self) -> SyncStatus:
+        state, outputs = self._bench.outputs()
+        return SyncStatus(cast(State, state), outputs)
+
+    def _do_close(self) -> None:
+        self._bench.abort_program()
+
+
+def create(config: SimulatedSyncConfig, surroundings: Surroundings) -> SimulatedSync:
+    """The sync source on the world's bench."""
+    return SimulatedSync(bench_of(surroundings))
+
+
+KIND = Kind(config=SimulatedSyncConfig, create=create)

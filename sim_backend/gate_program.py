@@ -1,0 +1,93 @@
+"""The simulated pattern generator's outputs over time: a program of words that the scan marker steps on."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.interfaces import OUT_GATE, Pulse
+
+Array = NDArray[np.float64]
+TriggerEdges = Callable[[float, float], Array]
+"""Times of the scan marker's rising edges in [from, until)."""
+
+
+class GateProgram:
+    """One run of a program from `start_s`. Output levels are known up to the time it was advanced to.
+
+    A word without duration waits for a rising edge after its own start. After the last repeat all outputs are low.
+    """
+
+    def __init__(self, pulses: Sequence[Pulse], repeats: int, start_s: float) -> None:
+        self._pulses = tuple(pulses)
+        self._words_left = repeats * len(self._pulses)
+        self._index = 0
+        self._word_start_s = start_s
+        self._searched_s = start_s
+        self._times: list[float] = [start_s]
+        self._levels: list[int] = [self._pulses[0].outputs]
+        self._mask = ~0
+
+    @property
+    def ended(self) -> bool:
+        """Whether the last word is over, as far as the program was advanced."""
+        return self._words_left == 0
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the present word waits for a trigger."""
+        return not self.ended and self._pulses[self._index].duration_s is None
+
+    def advance(self, until_s: float, edges: TriggerEdges) -> None:
+        """Play on up to `until_s`."""
+        while not self.ended:
+            duration_s = self._pulses[self._index].duration_s
+            if duration_s is None:
+                found = edges(self._searched_s, until_s)
+                self._searched_s = max(self._searched_s, until_s)
+                if not len(found):
+                    return
+                end_s = float(found[0])
+            else:
+                end_s = self._word_start_s + duration_s
+                if end_s >= until_s:
+                    return
+            self._words_left -= 1
+            self._index = (self._index + 1) % len(self._pulses)
+            self._word_start_s = self._searched_s = end_s
+            self._times.append(end_s)
+            self._levels.append(0 if self.ended else self._pulses[self._index].outputs & self._mask)
+
+    def lower_gate(self, at_s: float) -> None:
+        """Gate low from `at_s` for the rest of this run; the program plays on."""
+        self._mask = ~OUT_GATE
+        self._cut(at_s, lambda level: level & ~OUT_GATE)
+
+    def abort(self, at_s: float) -> None:
+        """All outputs low from `at_s`."""
+        self._words_left = 0
+        self._cut(at_s, lambda level: 0)
+
+    def levels(self, from_s: float, until_s: float) -> tuple[Array, NDArray[np.int64]]:
+        """Changes in (from_s, until_s) with the level at from_s in front: times (n,) and output words (n,)."""
+        times = np.array(self._times)
+        first = max(int(np.searchsorted(times, from_s, side="right")) - 1, 0)
+        last = int(np.searchsorted(times, until_s, side="left"))
+        at = times[first:last]
+        words = np.array(self._levels[first:last], dtype=np.int64)
+        if not len(at) or at[0] > from_s:  # before the program started
+            at, words = np.concatenate([[from_s], at]), np.concatenate([[0], words])
+        return at, words
+
+    def forget(self, before_s: float) -> None:
+        """Drop history that nobody will ask for any more."""
+        keep = 0
+        while keep + 1 < len(self._times) and self._times[keep + 1] <= before_s:
+            keep += 1
+        del self._times[:keep], self._levels[:keep]
+
+    def _cut(self, at_s: float, change: Callable[[int], int]) -> None:
+        times, words = self.levels(at_s, np.inf)
+        past = int(np.searchsorted(np.array(self._times), at_s, side="left"))
+        self._times = [*self._times[:past], at_s, *times[1:].tolist()]
+        self._levels = [*self._levels[:past], *(change(int(word)) for word in words)]

@@ -1,0 +1,121 @@
+"""Where the simulated mirror points and what the scanner's marker outputs do, at any time.
+
+The command passes the value of point i at the start of point i and runs straight to the next one; the mirror follows
+it by the lag of the direction it runs in. Marker outputs have no lag. Times are seconds of the bench.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.interfaces import LEVEL_BACKWARD, ScanWaveform
+
+Array = NDArray[np.float64]
+
+
+class Motion(Protocol):
+    """What the bench asks of the scanner."""
+
+    def mirror(self, time_s: Array) -> Array:
+        """Mirror position as the command it stands at, float64, same shape as the times."""
+        ...
+
+    def backward(self, time_s: Array) -> NDArray[np.bool_]:
+        """Level of the direction output at the times."""
+        ...
+
+    def edges(self, bit: int, from_s: float, until_s: float) -> Array:
+        """Times of the rising edges of a marker output in [from_s, until_s), ascending."""
+        ...
+
+    def moving(self, time_s: float) -> bool:
+        """Whether a waveform is being played."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Resting:
+    """A mirror that stands still."""
+
+    command: float
+
+    def mirror(self, time_s: Array) -> Array:
+        """The one position."""
+        return np.full(time_s.shape, self.command)
+
+    def backward(self, time_s: Array) -> NDArray[np.bool_]:
+        """Low."""
+        return np.zeros(time_s.shape, bool)
+
+    def edges(self, bit: int, from_s: float, until_s: float) -> Array:
+        """None."""
+        return np.empty(0)
+
+    def moving(self, time_s: float) -> bool:
+        """No."""
+        return False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Playing:
+    """A waveform played from `start_s` at `rate_hz` (the true rate, clock error included), then rest at its last
+    point.
+    """
+
+    waveform: ScanWaveform
+    repeats: int
+    start_s: float
+    rate_hz: float
+    lag_forward_s: float
+    lag_backward_s: float
+
+    @property
+    def end_s(self) -> float:
+        """When the last point of the last repetition ends."""
+        return self.start_s + self.repeats * len(self.waveform.command) / self.rate_hz
+
+    def mirror(self, time_s: Array) -> Array:
+        """Mirror positions, lag included."""
+        forward = self._command(time_s - self.lag_forward_s)
+        if self.lag_forward_s == self.lag_backward_s:
+            return forward
+        turned = self.backward(time_s - self.lag_backward_s)
+        return np.where(turned, self._command(time_s - self.lag_backward_s), forward)
+
+    def backward(self, time_s: Array) -> NDArray[np.bool_]:
+        """Level of the direction output; low before the start and after the end."""
+        points = len(self.waveform.command)
+        at = np.floor((time_s - self.start_s) * self.rate_hz).astype(np.int64)
+        inside = (at >= 0) & (at < self.repeats * points)
+        level: NDArray[np.bool_] = inside & ((self.waveform.markers[at % points] & LEVEL_BACKWARD) != 0)
+        return level
+
+    def edges(self, bit: int, from_s: float, until_s: float) -> Array:
+        """Rising edges; a bit that stays high over several points is one edge, over the seam as well."""
+        points = len(self.waveform.command)
+        high = (self.waveform.markers & bit) != 0
+        rising = np.flatnonzero(high & ~np.roll(high, 1))
+        first = (from_s - self.start_s) * self.rate_hz / points
+        last = (until_s - self.start_s) * self.rate_hz / points
+        repeats = np.arange(max(0, math.floor(first)), min(self.repeats, math.floor(last) + 1))
+        at = (repeats[:, None] * points + rising).ravel()
+        if high[0] and high[-1] and len(repeats) and repeats[0] == 0:
+            at = np.concatenate([[0], at])  # high from the very first point, with nothing before it
+        times = self.start_s + at / self.rate_hz
+        return times[(times >= from_s) & (times < until_s)]
+
+    def moving(self, time_s: float) -> bool:
+        """From the start until the last point has been played; before the start the waveform is under way already."""
+        return time_s < self.end_s
+
+    def _command(self, time_s: Array) -> Array:
+        command = self.waveform.command
+        points = len(command)
+        at = np.clip((time_s - self.start_s) * self.rate_hz, 0, self.repeats * points - 1)
+        index = np.floor(at).astype(np.int64)
+        here, following = command[index % points], command[(index + 1) % points]
+        result: Array = here + (at - index) * (following - here)
+        return result

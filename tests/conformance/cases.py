@@ -1,0 +1,52 @@
+"""What a conformance suite needs of an implementation besides the device: time to pass, and a look from outside."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drivers.clock import Clock
+from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SpadRequest, SyncSource, World
+
+
+@dataclass(frozen=True)
+class SpadCase:
+    """A SPAD array, open, and a request it can fulfil for a few thousand frames; small enough to be quick."""
+
+    device: SpadArray
+    request: SpadRequest
+
+
+@dataclass(frozen=True)
+class ScannerCase:
+    """A scanner, open. `turning` tells whether the mirror really moves, also after the device was closed."""
+
+    device: BeamScanner
+    clock: Clock
+    turning: Callable[[], bool]
+
+
+@dataclass(frozen=True)
+class LaserCase:
+    """A laser, open and off. `shining` tells whether it would shine through an open gate, also after close."""
+
+    device: LineLaser
+    clock: Clock
+    shining: Callable[[], bool]
+
+
+@dataclass(frozen=True)
+class SyncCase:
+    """A sync source, open. `trigger` gives its input one scan marker; `pins` reads the outputs, also after close."""
+
+    device: SyncSource
+    clock: Clock
+    trigger: Callable[[], None]
+    pins: Callable[[], int]
+
+
+@dataclass(frozen=True)
+class WorldCase:
+    """A world and the size of its camera."""
+
+    world: World
+    rows: int
+    width: int

@@ -1,0 +1,133 @@
+"""The implementations every conformance suite runs over: one factory each, by name.
+
+A new device is added here and nowhere else: it then has to behave like all the others.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.clock import VirtualClock
+from drivers.interfaces import MARKER_SCAN, ScanWaveform, SpadRequest
+from drivers.registry import Surroundings, lookup
+from tests.conformance.cases import LaserCase, ScannerCase, SpadCase, SyncCase, WorldCase
+
+ROWS, WIDTH = 24, 100
+"""A small camera, its width no multiple of 64."""
+
+SMALL_RIG = f"""
+format: spadrig-calibration
+version: 1
+camera:
+  width: {WIDTH}
+  height: {ROWS}
+  matrix: [[120, 0, {(WIDTH - 1) / 2}], [0, 120, {(ROWS - 1) / 2}], [0, 0, 1]]
+  distortion: [0, 0, 0, 0, 0]
+scanner:
+  pivot:
+    axis_point_m: [-0.3, 0, 0]
+    axis_direction: [0, 1, 0]
+    zero_normal: [1, 0, 0]
+    angle_rad: [0.0861, 0.3776]
+    command_range: [-1, 1]
+source_m: [-0.3, 0, 0]
+"""
+
+
+def simulated(slot: str, surroundings: Surroundings, **config: Any) -> Any:
+    """A simulated device or world, made the way the application makes it."""
+    kind = lookup(slot, "simulated")
+    return kind.create(kind.config.model_validate({"kind": "simulated", **config}), surroundings)
+
+
+def simulated_surroundings(folder: Path) -> Surroundings:
+    geometry = folder / "small-rig.yaml"
+    geometry.write_text(SMALL_RIG, encoding="utf-8")
+    clock = VirtualClock()
+    world = simulated("world", Surroundings(clock, None, seed=1), geometry=str(geometry))
+    return Surroundings(clock, world, seed=1)
+
+
+@contextmanager
+def simulated_spad(folder: Path, **config: Any) -> Iterator[SpadCase]:
+    with simulated("spad", simulated_surroundings(folder), **config) as device:
+        yield SpadCase(device, SpadRequest(Fraction(100_000), 1e-5, "stream", block_frames=64))
+
+
+@contextmanager
+def simulated_lossy_spad(folder: Path) -> Iterator[SpadCase]:
+    with simulated_spad(folder, loss_probability=0.01, lost_frames=[0, 64, 65, 66]) as case:
+        yield case
+
+
+@contextmanager
+def simulated_scanner(folder: Path) -> Iterator[ScannerCase]:
+    surroundings = simulated_surroundings(folder)
+    bench = surroundings.world.bench  # type: ignore[union-attr]
+    with simulated("scanner", surroundings) as device:
+        yield ScannerCase(device, surroundings.clock, bench.moving)
+
+
+@contextmanager
+def simulated_laser(folder: Path) -> Iterator[LaserCase]:
+    surroundings = simulated_surroundings(folder)
+    bench = surroundings.world.bench  # type: ignore[union-attr]
+
+    def shining() -> bool:
+        return bool(bench.during(np.array([bench.now_s()]), 1e-6, 1e-6).power_w > 0)
+
+    with simulated("laser", surroundings) as device:
+        yield LaserCase(device, surroundings.clock, shining)
+
+
+@contextmanager
+def simulated_sync(folder: Path) -> Iterator[SyncCase]:
+    surroundings = simulated_surroundings(folder)
+    bench = surroundings.world.bench  # type: ignore[union-attr]
+    marker = ScanWaveform(np.zeros(2), np.array([MARKER_SCAN, 0], np.uint8), Fraction(100_000))
+
+    def trigger() -> None:
+        bench.play(marker, 1, latency_s=1e-6, rate_hz=1e5)
+        surroundings.clock.sleep(2e-6)
+
+    with simulated("sync", surroundings) as device:
+        yield SyncCase(device, surroundings.clock, trigger, lambda: int(bench.outputs()[1]))
+
+
+@contextmanager
+def simulated_world(folder: Path) -> Iterator[WorldCase]:
+    world = simulated_surroundings(folder).world
+    assert world is not None
+    yield WorldCase(world, ROWS, WIDTH)
+
+
+Factory = Callable[[Path], AbstractContextManager[Any]]
+
+SPADS: dict[str, Factory] = {"simulated": simulated_spad, "simulated, lossy": simulated_lossy_spad}
+SCANNERS: dict[str, Factory] = {"simulated": simulated_scanner}
+LASERS: dict[str, Factory] = {"simulated": simulated_laser}
+SYNCS: dict[str, Factory] = {"simulated": simulated_sync}
+WORLDS: dict[str, Factory] = {"simulated": simulated_world}
+
+
+def over(factories: dict[str, Factory]) -> Any:
+    """A fixture that gives each implementation in turn, open, and closes it."""
+
+    @pytest.fixture(params=factories.values(), ids=factories.keys())
+    def case(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Any]:
+        with request.param(tmp_path) as made:
+            yield made
+
+    return case
+
+
+spad = over(SPADS)
+scanner = over(SCANNERS)
+laser = over(LASERS)
+sync = over(SYNCS)
+world = over(WORLDS)

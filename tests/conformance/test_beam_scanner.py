@@ -1,0 +1,215 @@
+"""Every beam scanner: states, the exact clock, limits before anything moves, an end, a park."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from drivers.errors import LimitExceeded, WrongState
+from drivers.interfaces import MARKER_LINE, MARKER_SCAN, DeviceState, ScannerLimits, ScanWaveform
+from tests.conformance.cases import ScannerCase
+
+POINTS = 200
+
+
+def clock_of(case: ScannerCase) -> Fraction:
+    """A point clock in the middle of what the device can run."""
+    low, high = case.device.limits.point_rate_hz
+    return case.device.point_clock((low * high) ** 0.5)
+
+
+def gentle(case: ScannerCase) -> ScanWaveform:
+    """A raised cosine, seamless, at a third of the first limit it meets."""
+    limits, clock = case.device.limits, clock_of(case)
+    low, high = limits.command_range
+    turn = 2 * np.pi / POINTS
+    rate = float(clock)
+    swing = min(
+        (high - low) / 2,
+        limits.step / turn,
+        limits.velocity_per_s / (turn * rate),
+        min(1.0, limits.rms_duty) * limits.acceleration_per_s2 / (turn * rate) ** 2,
+    )
+    command = (low + high) / 2 - swing / 3 * np.cos(turn * np.arange(POINTS))
+    markers = np.zeros(POINTS, np.uint8)
+    markers[0] = MARKER_SCAN
+    markers[POINTS // 2] = MARKER_LINE
+    return ScanWaveform(command, markers, clock)
+
+
+def test_its_limits_are_limits(scanner: ScannerCase) -> None:
+    limits: ScannerLimits = scanner.device.limits
+    assert -1 <= limits.command_range[0] < limits.command_range[1] <= 1
+    assert min(limits.velocity_per_s, limits.acceleration_per_s2, limits.step, limits.rms_duty) > 0
+    assert limits.max_points >= POINTS
+    assert 0 < limits.point_rate_hz[0] < limits.point_rate_hz[1]
+
+
+def test_the_point_clock_is_exact_and_asking_for_it_gives_it(scanner: ScannerCase) -> None:
+    low, high = scanner.device.limits.point_rate_hz
+    for requested in np.geomspace(low * 1.01, high * 0.99, 23):
+        clock = scanner.device.point_clock(float(requested))
+        assert isinstance(clock, Fraction)
+        assert low <= clock <= high
+        assert clock == scanner.device.point_clock(float(clock))
+
+
+def test_a_point_rate_beyond_the_limits_is_refused_with_value_and_limits(scanner: ScannerCase) -> None:
+    low, high = scanner.device.limits.point_rate_hz
+    for rate in (low / 2, high * 2, -1.0, float("nan")):
+        with pytest.raises(LimitExceeded) as refused:
+            scanner.device.point_clock(rate)
+        for number in (rate, low, high):
+            assert f"{number:g}" in str(refused.value)
+
+
+def test_verbs_out_of_order_are_refused_and_say_what_to_call(scanner: ScannerCase) -> None:
+    device = scanner.device
+    with pytest.raises(WrongState, match="load"):
+        device.start()
+    device.load(gentle(scanner), 1000)
+    assert device.state is DeviceState.CONFIGURED
+    device.start()
+    with pytest.raises(WrongState, match="stop"):
+        device.start()
+    with pytest.raises(WrongState, match="stop"):
+        device.load(gentle(scanner), 1)
+    device.stop()
+    device.load(gentle(scanner), 1)
+
+
+def test_load_returns_the_clock_it_was_asked_for_and_moves_nothing(scanner: ScannerCase) -> None:
+    wave = gentle(scanner)
+    assert scanner.device.load(wave, 3) == wave.point_rate_hz
+    assert not scanner.turning()
+    assert not scanner.device.status.moving
+
+
+@pytest.mark.parametrize("repeats", [0, -1])
+def test_repeats_below_one_are_refused(scanner: ScannerCase, repeats: int) -> None:
+    with pytest.raises(LimitExceeded, match=f"{repeats} repeats"):
+        scanner.device.load(gentle(scanner), repeats)
+
+
+def test_a_command_outside_the_range_is_refused_with_value_and_limit(scanner: ScannerCase) -> None:
+    wave = gentle(scanner)
+    low, high = scanner.device.limits.command_range
+    for command, worst in ((wave.command + 2 * (high - low), None), (np.full(POINTS, low - 0.01), low - 0.01)):
+        with pytest.raises(LimitExceeded, match="command") as refused:
+            scanner.device.load(replace(wave, command=command), 1)
+        assert f"{(command.max() if worst is None else worst):.6g}" in str(refused.value)
+        assert f"{high:.6g}" in str(refused.value)
+    assert scanner.device.state is DeviceState.READY
+
+
+def test_over_speed_is_refused_with_value_and_limit_before_anything_moves(scanner: ScannerCase) -> None:
+    wave, limits = gentle(scanner), scanner.device.limits
+    low, high = limits.command_range
+    jumps = np.where(np.arange(POINTS) % 2, low, high)
+    with pytest.raises(LimitExceeded, match=r"(step|velocity|acceleration) of \S+ .*exceeds \S+") as refused:
+        scanner.device.load(replace(wave, command=jumps), 1)
+    named = (limits.step, limits.velocity_per_s, limits.acceleration_per_s2)
+    assert any(f"exceeds {limit:.6g}" in str(refused.value) for limit in named)
+    assert scanner.device.state is DeviceState.READY
+    assert not scanner.turning()
+    with pytest.raises(WrongState):
+        scanner.device.start()
+
+
+def test_more_points_than_it_holds_are_refused_with_value_and_limit(scanner: ScannerCase) -> None:
+    most = scanner.device.limits.max_points
+    wave = gentle(scanner)
+    long = ScanWaveform(np.zeros(most + 1), np.zeros(most + 1, np.uint8), wave.point_rate_hz)
+    with pytest.raises(LimitExceeded, match=rf"{most + 1} points .*{most}"):
+        scanner.device.load(long, 1)
+
+
+def test_what_is_loaded_is_a_copy(scanner: ScannerCase) -> None:
+    wave = gentle(scanner)
+    scanner.device.load(wave, 1000)
+    wave.command[:] = np.nan
+    scanner.device.start()
+    scanner.clock.sleep(0.01)
+    position = scanner.device.status.position
+    assert position is None or np.isfinite(position)
+
+
+def test_it_moves_until_its_repeats_are_over(scanner: ScannerCase) -> None:
+    device, wave = scanner.device, gentle(scanner)
+    repeats = 4
+    device.load(wave, repeats)
+    device.start()
+    assert device.state is DeviceState.RUNNING
+    assert device.status.moving
+    assert scanner.turning()
+    assert device.status.fault is None
+    scanner.clock.sleep(1.0 + 1.1 * repeats * POINTS / float(wave.point_rate_hz))
+    assert not device.status.moving
+    assert not scanner.turning()
+    device.load(wave, 1)
+    assert device.state is DeviceState.CONFIGURED
+    device.start()
+    device.stop()
+
+
+def test_stop_ends_the_movement_and_the_waveform_can_be_started_again(scanner: ScannerCase) -> None:
+    device = scanner.device
+    device.stop()
+    device.load(gentle(scanner), 10_000)
+    device.start()
+    device.stop()
+    assert device.state is DeviceState.CONFIGURED
+    assert not device.status.moving
+    assert not scanner.turning()
+    device.stop()
+    device.start()
+    assert scanner.turning()
+
+
+def test_park_stops_and_is_possible_in_any_state(scanner: ScannerCase) -> None:
+    device = scanner.device
+    device.park()
+    device.load(gentle(scanner), 10_000)
+    device.park()
+    device.start()
+    device.park()
+    assert not device.status.moving
+    assert not scanner.turning()
+    low, high = device.limits.command_range
+    position = device.status.position
+    assert position is None or low <= position <= high
+
+
+def test_close_is_final_stops_the_mirror_and_may_be_called_twice(scanner: ScannerCase) -> None:
+    device, wave = scanner.device, gentle(scanner)
+    device.load(wave, 10_000)
+    device.start()
+    device.close()
+    device.close()
+    assert device.state is DeviceState.CLOSED
+    assert not scanner.turning()
+    for verb in (
+        lambda: device.load(wave, 1),
+        device.start,
+        device.stop,
+        device.park,
+        lambda: device.status,
+        lambda: device.point_clock(float(wave.point_rate_hz)),
+        device.__enter__,
+    ):
+        with pytest.raises(WrongState, match="close"):
+            verb()
+
+
+def test_leaving_the_with_block_closes_it_whatever_happened(scanner: ScannerCase) -> None:
+    def scan() -> None:
+        with scanner.device as device:
+            device.load(gentle(scanner), 10_000)
+            device.start()
+            raise RuntimeError("on the way")
+
+    with pytest.raises(RuntimeError, match="on the way"):
+        scan()
+    assert scanner.device.state is DeviceState.CLOSED
+    assert not scanner.turning()

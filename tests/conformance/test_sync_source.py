@@ -1,0 +1,201 @@
+"""Every sync source: no light while waiting, the program as written, all outputs low at every end."""
+
+import pytest
+
+from drivers.errors import LimitExceeded, WrongState
+from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, DeviceState, Pulse
+from tests.conformance.cases import SyncCase
+
+STEP_S = 0.01
+"""Long against the delays of a host, so that the suite can look at each word."""
+
+SWEEP = (Pulse(OUT_MARKER, None), Pulse(0, STEP_S), Pulse(OUT_GATE | OUT_FRAME, STEP_S), Pulse(0, STEP_S))
+"""Wait for the scan marker, settle, light, dark."""
+
+
+def running(case: SyncCase, repeats: int = 2) -> None:
+    """The program, triggered once, in the middle of its lit word."""
+    case.device.program(SWEEP, repeats)
+    case.device.run()
+    case.trigger()
+    case.clock.sleep(1.5 * STEP_S)
+    assert case.pins() == OUT_GATE | OUT_FRAME
+
+
+def test_it_is_found_with_all_outputs_low(sync: SyncCase) -> None:
+    assert sync.device.name
+    assert sync.device.resolution_s > 0
+    assert sync.device.status.outputs == 0
+    assert sync.pins() == 0
+
+
+def test_verbs_out_of_order_are_refused_and_say_what_to_call(sync: SyncCase) -> None:
+    device = sync.device
+    with pytest.raises(WrongState, match="program"):
+        device.run()
+    device.program(SWEEP, 2)
+    assert device.state is DeviceState.CONFIGURED
+    device.run()
+    with pytest.raises(WrongState, match="abort"):
+        device.run()
+    with pytest.raises(WrongState, match="abort"):
+        device.program(SWEEP, 1)
+    device.abort()
+    device.program(SWEEP, 1)
+
+
+@pytest.mark.parametrize("outputs", [OUT_GATE, OUT_GATE | OUT_MARKER, OUT_GATE | OUT_FRAME | OUT_MARKER])
+def test_a_word_that_waits_with_the_gate_high_is_refused(sync: SyncCase, outputs: int) -> None:
+    with pytest.raises(LimitExceeded, match=rf"word 1 waits with the gate high \(0x{outputs:x}\)"):
+        sync.device.program([Pulse(0, STEP_S), Pulse(outputs, None)], 1)
+    assert sync.device.state is DeviceState.READY
+    assert sync.pins() == 0
+
+
+@pytest.mark.parametrize("duration_s", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_duration_that_is_none_is_refused(sync: SyncCase, duration_s: float) -> None:
+    with pytest.raises(LimitExceeded, match="word 0"):
+        sync.device.program([Pulse(0, duration_s)], 1)
+
+
+def test_a_duration_below_the_resolution_is_refused_with_value_and_limit(sync: SyncCase) -> None:
+    resolution_s = sync.device.resolution_s
+    with pytest.raises(LimitExceeded) as refused:
+        sync.device.program([Pulse(0, STEP_S), Pulse(OUT_GATE, 0.4 * resolution_s)], 1)
+    assert f"{0.4 * resolution_s:g}" in str(refused.value)
+    assert f"{resolution_s:g}" in str(refused.value)
+
+
+def test_no_words_no_repeats_and_unknown_outputs_are_refused(sync: SyncCase) -> None:
+    with pytest.raises(LimitExceeded, match="0 words"):
+        sync.device.program([], 1)
+    with pytest.raises(LimitExceeded, match="0 repeats"):
+        sync.device.program(SWEEP, 0)
+    for outputs in (8, -1):
+        with pytest.raises(LimitExceeded, match="0x0 to 0x7"):
+            sync.device.program([Pulse(outputs, STEP_S)], 1)
+
+
+def test_a_program_that_was_refused_does_not_replace_the_one_that_was_taken(sync: SyncCase) -> None:
+    sync.device.program(SWEEP, 1)
+    with pytest.raises(LimitExceeded):
+        sync.device.program([], 1)
+    sync.device.run()
+    assert sync.device.status.state == "waiting"
+
+
+def test_loading_a_program_plays_nothing(sync: SyncCase) -> None:
+    sync.device.program([Pulse(OUT_FRAME, STEP_S)], 100)
+    assert sync.device.status.state == "stopped"
+    assert sync.pins() == 0
+
+
+def test_it_waits_dark_for_the_scan_marker_however_long(sync: SyncCase) -> None:
+    sync.device.program(SWEEP, 1)
+    sync.device.run()
+    for _ in range(3):
+        sync.clock.sleep(STEP_S)
+        status = sync.device.status
+        assert (status.state, status.outputs) == ("waiting", OUT_MARKER)
+        assert sync.pins() == OUT_MARKER
+    assert sync.device.state is DeviceState.RUNNING
+
+
+def test_each_scan_marker_plays_the_program_once_and_the_end_is_low(sync: SyncCase) -> None:
+    sync.device.program(SWEEP, 2)
+    sync.device.run()
+    for sweep in range(2):
+        sync.trigger()
+        sync.clock.sleep(0.5 * STEP_S)
+        assert (sync.device.status.state, sync.pins()) == ("running", 0)
+        sync.clock.sleep(STEP_S)
+        status = sync.device.status
+        assert (status.state, status.outputs) == ("running", OUT_GATE | OUT_FRAME)
+        assert sync.pins() == OUT_GATE | OUT_FRAME
+        sync.clock.sleep(STEP_S)
+        assert sync.pins() == 0
+        sync.clock.sleep(STEP_S)
+        assert sync.device.status.state == ("waiting", "stopped")[sweep]
+    assert sync.pins() == 0
+    sync.trigger()
+    sync.clock.sleep(1.5 * STEP_S)
+    assert sync.pins() == 0
+    sync.device.run()  # a program that has ended may run again
+    assert sync.device.status.state == "waiting"
+
+
+def test_a_program_that_ends_on_a_high_word_ends_low(sync: SyncCase) -> None:
+    sync.device.program([Pulse(OUT_GATE | OUT_MARKER, STEP_S)], 2)
+    sync.device.run()
+    sync.clock.sleep(1.5 * STEP_S)
+    assert sync.pins() == OUT_GATE | OUT_MARKER
+    sync.clock.sleep(STEP_S)
+    assert sync.pins() == 0
+    assert sync.device.status.state == "stopped"
+
+
+def test_abort_leaves_all_outputs_low_at_once(sync: SyncCase) -> None:
+    running(sync)
+    sync.device.abort()
+    assert sync.pins() == 0
+    status = sync.device.status
+    assert status.outputs == 0
+    assert status.state in ("aborted", "stopped")
+    assert sync.device.state is DeviceState.CONFIGURED
+    sync.trigger()
+    sync.clock.sleep(1.5 * STEP_S)
+    assert sync.pins() == 0
+
+
+def test_abort_is_possible_in_any_state_and_the_program_may_run_again(sync: SyncCase) -> None:
+    sync.device.abort()
+    assert sync.device.state is DeviceState.READY
+    running(sync)
+    sync.device.abort()
+    sync.device.abort()
+    sync.device.run()
+    assert sync.device.status.state == "waiting"
+
+
+def test_gate_low_is_low_until_the_next_run(sync: SyncCase) -> None:
+    sync.device.gate_low()
+    running(sync)
+    sync.device.gate_low()
+    assert not sync.pins() & OUT_GATE
+    sync.trigger()
+    for _ in range(5):
+        sync.clock.sleep(STEP_S)
+        assert not sync.pins() & OUT_GATE
+    sync.device.abort()
+    running(sync)
+
+
+def test_close_is_final_leaves_all_outputs_low_and_may_be_called_twice(sync: SyncCase) -> None:
+    device = sync.device
+    running(sync)
+    device.close()
+    device.close()
+    assert device.state is DeviceState.CLOSED
+    assert sync.pins() == 0
+    for verb in (
+        lambda: device.program(SWEEP, 1),
+        device.run,
+        device.gate_low,
+        device.abort,
+        lambda: device.status,
+        device.__enter__,
+    ):
+        with pytest.raises(WrongState, match="close"):
+            verb()
+
+
+def test_leaving_the_with_block_leaves_all_outputs_low_whatever_happened(sync: SyncCase) -> None:
+    def gate() -> None:
+        with sync.device:
+            running(sync)
+            raise RuntimeError("on the way")
+
+    with pytest.raises(RuntimeError, match="on the way"):
+        gate()
+    assert sync.device.state is DeviceState.CLOSED
+    assert sync.pins() == 0

@@ -1,0 +1,120 @@
+"""Accuracy of `rig reconstruct` on cubes that another program made, beside a genie that is told everything.
+
+Limits: mean stripe error of `likelihood` without filter at most 1.3 times the genie's, below 0.6 px at K = 10 at the
+report's working point, at most 5 % missing. The full table: `python -m tests.reference.accuracy`.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.reference.accuracy import RIGS
+from tests.reference.genie import Genie
+from tests.reference.geometry import Geometry
+from tests.reference.scene import Scene, load_scene, procedural_scene
+from tests.reference.working_point import POINTS, WorkingPoint, score
+
+RIG = Path(sys.executable).with_name("rig.exe" if sys.platform == "win32" else "rig")
+GENIE_RATIO = 1.3
+MISSING = 0.05
+GENIE_ROWS = 4  # every 4th row is scored
+
+
+def prepared(name: str, rows: int | None) -> Scene:
+    scene = load_scene(name)
+    if scene is None:
+        pytest.skip(f"prepared scene {name!r} is absent: ../shared/scenes/{name}/world.npz")
+    return scene if rows is None else scene.crop(rows, scene.shape[1])
+
+
+def working_point(scene: Scene, light: str, rig: str, columns: int = 500) -> WorkingPoint:
+    height, width = scene.shape
+    geometry = Geometry.build(width=width, height=height, columns=columns, **RIGS[rig])  # type: ignore[arg-type]
+    return WorkingPoint(scene, POINTS[light], geometry)
+
+
+def reconstruct(folder: Path, estimator: str = "likelihood", filtered: str = "none") -> Any:
+    """x_px (rows, columns) of the command `rig reconstruct` on the cube in `folder`."""
+    out = folder / f"out-{estimator}-{filtered}"
+    done = subprocess.run(
+        [
+            str(RIG), "reconstruct", str(folder / "cube.npy"), "--plan", str(folder / "plan.yaml"),
+            "--calibration", str(folder / "calibration.yaml"), "--estimator", estimator, "--filter", filtered,
+            "--json", "--out", str(out),
+        ],
+        capture_output=True, text=True, timeout=600, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["estimator"] == estimator
+    assert np.isfinite(np.load(out / "depth" / "000000.npy")).any()
+    with np.load(out / "stripe" / "000000.npz") as stripe:
+        return stripe["x_px"]
+
+
+def genie_figures(point: WorkingPoint, exposures: int, seed: int, rows: slice) -> dict[str, float]:
+    x = Genie().estimate(point, point.counts(exposures, seed), exposures, rows)
+    return score(x[rows], point.truth()[rows], point.trusted[rows])
+
+
+CASES = [
+    pytest.param("art", 256, "report", "rectified", 10, id="art, report, rectified"),
+    pytest.param(
+        "cones", None, "report", "turned", 10, id="cones, report, rolled, distorted, tilted, scanner on the right"
+    ),
+    pytest.param("motorcycle", 192, "dense", "rectified", 10, id="motorcycle, dense fog, rectified"),
+    pytest.param("moebius", 192, "clear", "turned", 3, id="moebius, clear air, turned"),
+    pytest.param("procedural", None, "report", "turned", 10, id="procedural, report, turned"),
+]
+
+
+@pytest.mark.parametrize(("name", "rows", "light", "rig", "exposures"), CASES)
+def test_likelihood_comes_near_the_genie(
+    tmp_path: Path, name: str, rows: int | None, light: str, rig: str, exposures: int
+) -> None:
+    scene = procedural_scene(192, 512) if name == "procedural" else prepared(name, rows)
+    point = working_point(scene, light, rig)
+    point.write_cube(tmp_path, exposures, seed=1)
+    thinned = slice(None, None, GENIE_ROWS)
+    genie = genie_figures(point, exposures, 1, thinned)
+    ours = score(reconstruct(tmp_path)[thinned], point.truth()[thinned], point.trusted[thinned])
+    assert ours["mean_abs"] <= GENIE_RATIO * genie["mean_abs"]
+    assert ours["missing"] <= MISSING
+    if light == "report" and name != "procedural":
+        assert ours["mean_abs"] < 0.6
+
+
+def test_naive_estimators_lose_in_fog_and_the_median_filter_helps(tmp_path: Path) -> None:
+    point = working_point(procedural_scene(64, 512), "report", "rectified")
+    point.write_cube(tmp_path, 10, seed=1)
+    truth, trusted = point.truth(), point.trusted
+
+    def error(estimator: str, filtered: str = "none") -> float:
+        return score(reconstruct(tmp_path, estimator, filtered), truth, trusted)["mean_abs"]
+
+    likelihood = error("likelihood")
+    assert error("edge") > 2 * likelihood
+    assert error("argmax") > 10 * likelihood
+    assert error("likelihood", "median") < likelihood
+
+
+@pytest.mark.parametrize(
+    ("exposures", "columns", "height", "width"), [(1, 125, 77, 499), (255, 51, 40, 450), (300, 51, 40, 512)]
+)
+def test_any_number_of_exposures_columns_and_pixels(
+    tmp_path: Path, exposures: int, columns: int, height: int, width: int
+) -> None:
+    point = working_point(procedural_scene(height, width), "report", "rectified", columns)
+    point.write_cube(tmp_path, exposures, seed=1)
+    x = reconstruct(tmp_path)
+    assert x.shape == (height, columns)
+    ours = score(x, point.truth(), point.trusted)
+    assert ours["missing"] <= MISSING
+    if exposures > 1:
+        assert ours["mean_abs"] <= GENIE_RATIO * genie_figures(point, exposures, 1, slice(None))["mean_abs"]

@@ -1,0 +1,162 @@
+"""The calibration file: what is written is read back, and what is wrong is said in one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration import (
+    CalibrationError,
+    Camera,
+    Lag,
+    PivotScanner,
+    PlaneTable,
+    RigModel,
+    load_rig_model,
+    save_rig_model,
+)
+from tests.unit.calibration.cameras import MATRIX, camera
+
+BUNDLED = Path(__file__).parents[3] / "config" / "simulated-rig.yaml"
+HEAD = "format: spadrig-calibration\nversion: 1\n"
+CAMERA = (
+    "camera: {width: 512, height: 512, matrix: [[600, 0, 255.5], [0, 600, 255.5], [0, 0, 1]], "
+    "distortion: [-0.1, 0, 0, 0, 0]}\n"
+)
+ROWS = "planes: [[1, 0, 0.3, -0.3], [1, 0, 0, -0.3], [1, 0, -0.3, -0.3]]\n"
+
+
+def write(folder: Path, text: str) -> Path:
+    file = folder / "calibration.yaml"
+    file.write_text(text)
+    return file
+
+
+def pivot() -> PivotScanner:
+    return PivotScanner(
+        np.array([-0.3, 0, 0.01]), np.array([0.01, 1, 0]), np.array([1, 0, 0]), np.array([0.1, 0.4, 1e-3])
+    )
+
+
+def table() -> PlaneTable:
+    return PlaneTable(np.array([-1, 0, 0.7]), np.array([[1, 0, 0.3, -0.3], [1, 0, 0, -0.3], [1, 0.1, -0.3, -0.3]]))
+
+
+def test_the_bundled_rig_sweeps_its_stated_tangents() -> None:
+    model = load_rig_model(BUNDLED)
+    planes = model.planes([-1, 1])
+    assert np.allclose(-planes[:, 2] / planes[:, 0], [-0.30, 0.50], atol=2e-4)
+    assert np.allclose(planes[:, 3] / planes[:, 0], -0.3)
+    assert model.lag_s == Lag(2e-4, 2e-4)
+    assert model.source_m is not None
+    model.check_sensor(512, 512)
+
+
+def test_planes_beside_the_file_or_inside_it_are_the_same_model(tmp_path: Path) -> None:
+    np.save(tmp_path / "planes.npy", [[1, 0, 0.3, -0.3], [1, 0, 0, -0.3], [1, 0, -0.3, -0.3]])
+    inside = load_rig_model(write(tmp_path, HEAD + CAMERA + ROWS))
+    beside = load_rig_model(write(tmp_path, HEAD + CAMERA + "planes: planes.npy\n"))
+    assert inside.fingerprint() == beside.fingerprint()
+    assert inside.scanner.command_range == (0, 2)
+
+
+@pytest.mark.parametrize("scanner", [pivot(), table()], ids=["pivot", "table"])
+@pytest.mark.parametrize("defects", [None, np.eye(512, dtype=bool)], ids=["no defects", "defects"])
+def test_what_is_saved_is_read_back(
+    tmp_path: Path, scanner: PivotScanner | PlaneTable, defects: np.ndarray | None
+) -> None:
+    model = RigModel(
+        camera=camera([-0.3, 0.1, 0.001, 0.001, 0.01]),
+        scanner=scanner,
+        lag_s=Lag(1e-4, 3e-4),
+        speed_range_per_s=(10.0, 400.0),
+        source_m=np.array([-0.3, 0, 0]),
+        defects=defects,
+        provenance={"rig": "bench", "residual_px": 0.1},
+    )
+    save_rig_model(model, tmp_path / "rig.yaml")
+    again = load_rig_model(tmp_path / "rig.yaml")
+    assert again.fingerprint() == model.fingerprint()
+    assert (again.lag_s, again.speed_range_per_s) == (model.lag_s, model.speed_range_per_s)
+    assert again.provenance == model.provenance
+    assert np.array_equal(again.camera.tangents()[0], model.camera.tangents()[0])
+    assert (defects is None) == (again.defects is None)
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
+    base = RigModel(camera([]), table())
+    others = [
+        RigModel(camera([-1e-6, 0, 0, 0]), table()),
+        RigModel(camera([]), pivot()),
+        RigModel(camera([]), table(), lag_s=Lag(1e-6, 0)),
+        RigModel(Camera(512, 511, MATRIX, np.zeros(0)), table()),
+    ]
+    assert len({model.fingerprint() for model in [base, *others]}) == 5
+    assert RigModel(camera([]), table()).fingerprint() == base.fingerprint()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "first entry must be 'format: spadrig-calibration'"),
+        ("just: text", "first entry must be"),
+        ("[1, 2", "is not YAML"),
+        ("format: spadrig-calibration\nversion: 2\n", "has version 2; this program reads version 1"),
+        (HEAD + ROWS, "'camera' is missing"),
+        (HEAD + CAMERA, "exactly one of 'planes' and 'scanner'"),
+        (HEAD + CAMERA + ROWS + "plane: 3\n", "unknown key 'plane'"),
+        (HEAD + CAMERA.replace("512", "wide", 1) + ROWS, "camera.width is 'wide'"),
+        (HEAD + CAMERA.replace("-0.1, ", "") + ROWS + "lag_s: {forward: .nan}\n", "lag_s.forward is nan"),
+        (HEAD + CAMERA.replace("-0.1, 0", "0") + "planes: none.npy\n", "does not exist"),
+        (HEAD + CAMERA + "planes: calibration.yaml\n", "is not a readable .npy"),
+        (HEAD + CAMERA + "planes: [[1, 0, 0]]\n", "planes.0"),
+        (HEAD + CAMERA + "planes: []\n", "nx, ny, nz, d"),
+        (HEAD + CAMERA + "planes: [[0.5, 0.6, 0, 1]]\n", "degrees from the search axis"),
+        (HEAD + CAMERA.replace("[-0.1, 0, 0, 0, 0]", "[1, 2]") + ROWS, "distortion has 2 terms"),
+        (HEAD + CAMERA + "scanner: {}\n", "exactly one of 'table' and 'pivot'"),
+        (HEAD + CAMERA + ROWS + "defects: planes.npy\n", "it must be bool"),
+        (HEAD + CAMERA + ROWS + "lag_s: {forward: -1.0}\n", "lag_s is"),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path: Path, text: str, said: str) -> None:
+    np.save(tmp_path / "planes.npy", np.zeros((3, 4)))
+    file = write(tmp_path, text)
+    with pytest.raises(CalibrationError) as caught:
+        load_rig_model(file)
+    message = str(caught.value)
+    assert said in message
+    assert str(file) in message
+    assert "\n" not in message
+
+
+def test_an_absent_or_binary_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="cannot read calibration"):
+        load_rig_model(tmp_path / "absent.yaml")
+    (tmp_path / "planes.npy").write_bytes(b"\x93NUMPY\xff\xfe")
+    with pytest.raises(CalibrationError, match="is not text"):
+        load_rig_model(tmp_path / "planes.npy")
+
+
+def test_another_sensor_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="512 x 512 pixels, this one has 320 x 240"):
+        RigModel(camera([]), table()).check_sensor(320, 240)
+
+
+def test_a_speed_the_lag_was_not_measured_at_is_refused() -> None:
+    model = RigModel(camera([]), table(), speed_range_per_s=(10, 100))
+    model.check_speed(50)
+    RigModel(camera([]), table()).check_speed(1e9)
+    with pytest.raises(CalibrationError, match="outside the 10 to 100 /s"):
+        model.check_speed(200)
+
+
+def test_planes_along_the_search_axis_are_refused_whatever_their_sign() -> None:
+    for angle, fits in ((44, True), (46, False), (-44, True), (-46, False), (136, True), (134, False)):
+        normal = [np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0, -0.3]
+        scanner = PlaneTable(np.zeros(1), np.array([normal]))
+        if fits:
+            RigModel(camera([]), scanner)
+        else:
+            with pytest.raises(CalibrationError, match=r"44\.0 degrees from the search axis"):
+                RigModel(camera([]), scanner)

@@ -1,0 +1,212 @@
+"""What the interfaces do for every driver, with drivers that misbehave as no simulated one does."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+
+import pytest
+
+from drivers.errors import DeviceDisconnected, DeviceFault, InterlockOpen, LimitExceeded, WrongState
+from drivers.interfaces import (
+    OUT_GATE,
+    BurstMode,
+    DeviceState,
+    LaserLimits,
+    LaserStatus,
+    LineLaser,
+    Pulse,
+    SpadArray,
+    SpadCounters,
+    SpadInfo,
+    SpadRequest,
+    SpadTiming,
+    SyncSource,
+    SyncStatus,
+)
+from drivers.ring import BlockRing
+
+DARK = LaserStatus(False, False, True, None, True, False, "digital")
+
+
+class TroubledLaser(LineLaser):
+    """A laser whose status and pause are for the test to spoil."""
+
+    def __init__(self, status: LaserStatus = DARK, pause_error: Exception | None = None) -> None:
+        super().__init__("lamp")
+        self.status_now = status
+        self.pause_error = pause_error
+        self.calls: list[str] = []
+
+    @property
+    def limits(self) -> LaserLimits:
+        return LaserLimits(0.001, 0.05)
+
+    def _do_status(self) -> LaserStatus:
+        return self.status_now
+
+    def _do_arm(self, power_w: float) -> None:
+        self.calls.append(f"arm {power_w}")
+
+    def _do_pause(self) -> None:
+        self.calls.append("pause")
+        if self.pause_error is not None:
+            raise self.pause_error
+
+    def _do_disarm(self) -> None:
+        self.calls.append("disarm")
+
+    def _do_close(self) -> None:
+        self.calls.append("close")
+
+
+def test_an_open_interlock_keeps_the_laser_off() -> None:
+    laser = TroubledLaser(replace(DARK, interlock_closed=False))
+    with pytest.raises(InterlockOpen, match="lamp: the interlock is open; close it"):
+        laser.arm(0.01)
+    assert laser.calls == []
+    assert laser.state is DeviceState.READY
+
+
+def test_a_fault_keeps_the_laser_off_and_is_told() -> None:
+    laser = TroubledLaser(replace(DARK, fault="diode too hot"))
+    with pytest.raises(DeviceFault, match="lamp: fault diode too hot; clear it"):
+        laser.arm(0.01)
+    assert laser.calls == []
+
+
+def test_a_laser_is_paused_before_its_port_is_given_back_and_never_switched_off() -> None:
+    laser = TroubledLaser()
+    laser.arm(0.01)
+    laser.close()
+    assert laser.calls == ["arm 0.01", "pause", "close"]
+
+
+def test_a_port_is_given_back_and_the_failure_told_where_the_pause_fails() -> None:
+    laser = TroubledLaser(pause_error=DeviceDisconnected("lamp: unplugged"))
+    with pytest.raises(DeviceDisconnected, match="unplugged"):
+        laser.close()
+    assert laser.calls == ["pause", "close"]
+    assert laser.state is DeviceState.CLOSED
+    laser.close()
+    assert laser.calls == ["pause", "close"]
+
+
+def test_a_failed_pause_is_not_taken_for_a_pause() -> None:
+    laser = TroubledLaser(pause_error=DeviceDisconnected("lamp: unplugged"))
+    laser.arm(0.01)
+    with pytest.raises(DeviceDisconnected):
+        laser.pause()
+    assert laser.state is DeviceState.RUNNING
+
+
+class StuckSync(SyncSource):
+    """A sync source whose gate output stays high."""
+
+    stuck = OUT_GATE
+
+    def __init__(self) -> None:
+        super().__init__("box")
+
+    @property
+    def resolution_s(self) -> float:
+        return 1e-8
+
+    def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None: ...
+
+    def _do_run(self) -> None: ...
+
+    def _do_gate_low(self) -> None: ...
+
+    def _do_abort(self) -> None: ...
+
+    def _do_close(self) -> None: ...
+
+    def _do_status(self) -> SyncStatus:
+        return SyncStatus("running" if self._state is DeviceState.RUNNING else "stopped", self.stuck)
+
+
+def test_an_output_that_reads_back_high_is_a_fault() -> None:
+    sync = StuckSync()
+    with pytest.raises(DeviceFault, match="box: outputs read back 0x2 after gate_low"):
+        sync.gate_low()
+    with pytest.raises(DeviceFault, match="box: outputs read back 0x2 after abort"):
+        sync.abort()
+    sync.stuck = 0x100  # an output nobody asked for
+    sync.gate_low()
+    with pytest.raises(DeviceFault, match="0x100 after abort"):
+        sync.abort()
+    sync.stuck = 0
+
+
+class SmallMemorySpad(SpadArray):
+    """A SPAD that only bursts, and whose read-out the test decides."""
+
+    def __init__(self) -> None:
+        super().__init__("cam")
+        self.answers: list[bool | Exception] = []
+        self.stopped = 0
+
+    @property
+    def info(self) -> SpadInfo:
+        burst = BurstMode(100, 4e8)
+        return SpadInfo("m", "s", 64, 8, 0, Fraction(100_000), burst, None, 64, True, ("free",))
+
+    def _do_configure(self, request: SpadRequest) -> SpadTiming:
+        return SpadTiming(Fraction(10**8), 1000, 1000, 1024)
+
+    def _do_start(self, n_frames: int | None) -> None: ...
+
+    def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
+        answer = self.answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def _do_stop(self) -> None:
+        self.stopped += 1
+
+    def _do_close(self) -> None: ...
+
+    def _do_counters(self) -> SpadCounters:
+        return SpadCounters(None, 0, None, None, None)
+
+
+BURST = SpadRequest(Fraction(100_000), 1e-5, "burst", 10)
+
+
+def test_a_burst_has_to_fit_the_memory() -> None:
+    spad = SmallMemorySpad()
+    spad.configure(BURST)
+    with pytest.raises(LimitExceeded, match="a burst of 101 frames exceeds the memory of 100 frames"):
+        spad.start(101)
+    with pytest.raises(LimitExceeded, match="endless frames exceeds the memory of 100"):
+        spad.start(None)
+    spad.start(100)
+    with pytest.raises(LimitExceeded, match="mode 'stream' is not available; it can burst"):
+        SmallMemorySpad().configure(replace(BURST, mode="stream"))
+
+
+def test_a_run_goes_on_after_an_error_until_it_is_stopped() -> None:
+    spad, ring = SmallMemorySpad(), BlockRing(1, 1024)
+    spad.configure(BURST)
+    spad.start(100)
+    spad.answers = [True, DeviceDisconnected("cam: unplugged"), True]
+    assert spad.fill(ring, 0.1)
+    with pytest.raises(DeviceDisconnected):
+        spad.fill(ring, 0.1)
+    assert spad.fill(ring, 0.1)
+    spad.stop()
+    spad.stop()
+    assert spad.stopped == 1
+    assert not spad.fill(ring, 0.1)
+    spad.configure(BURST)
+    with pytest.raises(WrongState, match="call start first"):
+        spad.fill(ring, 0.1)
+
+
+def test_close_stops_a_run() -> None:
+    spad = SmallMemorySpad()
+    spad.configure(BURST)
+    spad.start(100)
+    spad.close()
+    assert spad.stopped == 1

@@ -1,0 +1,80 @@
+"""Kinds by name: what is installed, what is unknown, what is no kind."""
+
+from importlib.metadata import EntryPoint
+
+import pytest
+from pydantic import ValidationError
+
+from drivers import registry
+from drivers.clock import VirtualClock
+from drivers.errors import UnknownKind
+from drivers.registry import Kind, KindConfig, Surroundings, kinds, lookup
+
+
+class LampConfig(KindConfig):
+    watts: int = 1
+
+
+LAMP = Kind(LampConfig, lambda config, surroundings: (config.watts, surroundings.seed))
+NO_KIND = object()
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def entry_points(group: str) -> list[EntryPoint]:
+        known = {
+            "spadrig.laser": [
+                ("lamp", "LAMP"),
+                ("broken", "NO_KIND"),
+                ("arc", "LAMP"),
+                ("twice", "LAMP"),
+                ("twice", "NO_KIND"),
+                ("same", "LAMP"),
+                ("same", "LAMP"),
+            ]
+        }
+        return [EntryPoint(name, f"{__name__}:{value}", group) for name, value in known.get(group, [])]
+
+    monkeypatch.setattr(registry, "entry_points", entry_points)
+
+
+@pytest.mark.usefixtures("installed")
+def test_kinds_are_listed_once_and_sorted() -> None:
+    assert kinds("laser") == ("arc", "broken", "lamp", "same", "twice")
+    assert kinds("spad") == ()
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_kind_is_found_and_creates_its_device() -> None:
+    kind = lookup("laser", "lamp")
+    device = kind.create(kind.config(kind="lamp", watts=3), Surroundings(VirtualClock(), None, seed=4))
+    assert device == (3, 4)
+    assert lookup("laser", "same") is kind
+
+
+@pytest.mark.usefixtures("installed")
+def test_an_unknown_kind_lists_the_choices() -> None:
+    with pytest.raises(UnknownKind, match=r"laser: unknown kind 'lmap'; choose one of: arc, broken, lamp, same, twice"):
+        lookup("laser", "lmap")
+    with pytest.raises(UnknownKind, match="none installed"):
+        lookup("spad", "lamp")
+
+
+@pytest.mark.usefixtures("installed")
+def test_an_entry_that_cannot_be_used_is_refused() -> None:
+    with pytest.raises(UnknownKind, match=r"no drivers.registry.Kind"):
+        lookup("laser", "broken")
+    with pytest.raises(UnknownKind, match="offered twice"):
+        lookup("laser", "twice")
+
+
+def test_a_slot_no_rig_has_is_a_mistake_of_the_program() -> None:
+    with pytest.raises(ValueError, match="no slot 'camera'"):
+        kinds("camera")
+
+
+def test_a_kinds_config_takes_no_stray_keys_and_does_not_change() -> None:
+    with pytest.raises(ValidationError, match="wats"):
+        LampConfig.model_validate({"kind": "lamp", "wats": 3})
+    with pytest.raises(ValidationError, match="frozen"):
+        LampConfig(kind="lamp").watts = 3  # type: ignore[misc]

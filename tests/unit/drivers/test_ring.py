@@ -1,0 +1,286 @@
+"""The ring: order, release, optional readers, ends and errors, alone and under real threads."""
+
+import random
+import threading
+import time
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.errors import DeviceFault, DeviceTimeout, WrongState
+from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
+from drivers.ring import BlockRing, RingReader
+
+STRIDE = 4096
+
+
+def block_in(memory: np.ndarray, seq: int) -> FrameBlock:
+    """A block that lies in `memory` and whose bytes are all `seq`."""
+    memory[:] = seq % 251
+    header = BlockHeader(BlockFlag(0), 1, seq, seq, 0, 0, Fraction(1), 1, 1, 0, 1, 64, 8, 64, 8)
+    return FrameBlock(header, np.zeros(1, FRAME_RECORD), memory[:64].reshape(1, 8, 8))
+
+
+def put(ring: BlockRing, seq: int) -> None:
+    memory = ring.claim(0)
+    assert memory is not None
+    ring.publish(block_in(memory, seq))
+
+
+def sequence(block: FrameBlock | None) -> int | None:
+    return None if block is None else block.header.block_seq
+
+
+def test_blocks_come_in_order_and_over_the_slots_memory() -> None:
+    ring = BlockRing(3, STRIDE)
+    reader = ring.reader("count")
+    for seq in range(3):
+        put(ring, seq)
+    ring.finish()
+    block = reader.next(0)
+    assert block is not None
+    assert np.shares_memory(block.bits, ring._memory)
+    assert [sequence(block)] + [block.header.block_seq for block in reader] == [0, 1, 2]
+    assert reader.next(0) is None
+
+
+def test_every_slot_is_aligned_and_zeroed() -> None:
+    ring = BlockRing(4, STRIDE)
+    for _ in range(4):
+        memory = ring.claim(0)
+        assert memory is not None
+        assert memory.ctypes.data % 4096 == 0
+        assert (memory.shape, memory.dtype, memory.flags.c_contiguous) == ((STRIDE,), np.uint8, True)
+        assert not memory.any()
+
+
+def test_a_full_ring_gives_no_slot_until_the_slowest_reader_moves_on() -> None:
+    ring = BlockRing(2, STRIDE)
+    quick, slow = ring.reader("quick"), ring.reader("slow")
+    put(ring, 0)
+    put(ring, 1)
+    assert [sequence(quick.next(0)), sequence(quick.next(0))] == [0, 1]
+    assert ring.claim(0) is None
+    assert sequence(slow.next(0)) == 0  # holds slot 0
+    assert ring.claim(0.01) is None
+    assert sequence(slow.next(0)) == 1  # gives it back
+    assert ring.claim(0) is not None
+    assert ring.high_water == 2
+
+
+def test_several_slots_are_claimed_ahead_and_published_in_order() -> None:
+    ring = BlockRing(3, STRIDE)
+    reader = ring.reader("count")
+    queued = [ring.claim(0), ring.claim(0), ring.claim(0)]
+    assert ring.claim(0) is None
+    for seq, memory in enumerate(queued):
+        assert memory is not None
+        ring.publish(block_in(memory, seq))
+    assert [sequence(reader.next(0)) for _ in range(3)] == [0, 1, 2]
+
+
+def test_a_discarded_slot_is_free_again_and_nobody_sees_it() -> None:
+    ring = BlockRing(1, STRIDE)
+    reader = ring.reader("count")
+    assert ring.claim(0) is not None
+    ring.discard()
+    put(ring, 5)
+    assert sequence(reader.next(0)) == 5
+    assert ring.high_water == 1
+
+
+def test_without_readers_nothing_piles_up() -> None:
+    ring = BlockRing(1, STRIDE)
+    for seq in range(3):
+        put(ring, seq)
+    assert ring.high_water == 0
+
+
+def test_an_optional_reader_gets_the_newest_block_and_counts_the_others() -> None:
+    ring = BlockRing(3, STRIDE)
+    count, monitor = ring.reader("count"), ring.reader("monitor", required=False)
+    for seq in range(10):
+        put(ring, seq)
+        assert sequence(count.next(0)) == seq
+    assert sequence(monitor.next(0)) == 9
+    assert monitor.skipped == 9
+
+
+def test_an_optional_reader_holds_one_slot_and_never_the_last_one() -> None:
+    ring = BlockRing(2, STRIDE)
+    monitor = ring.reader("monitor", required=False)
+    put(ring, 0)
+    held = monitor.next(0)
+    assert held is not None
+    for seq in range(1, 20):
+        put(ring, seq)
+    assert (held.bits == 0).all()
+    assert monitor.skipped == 19
+    with pytest.raises(DeviceTimeout):
+        monitor.next(0)
+    put(ring, 20)
+    assert sequence(monitor.next(0)) == 20
+
+
+def test_optional_readers_that_could_hold_every_slot_are_refused() -> None:
+    ring = BlockRing(2, STRIDE)
+    ring.reader("one", required=False)
+    with pytest.raises(ValueError, match="make the ring longer"):
+        ring.reader("two", required=False)
+
+
+def test_a_reader_that_closes_holds_nobody_up() -> None:
+    ring = BlockRing(2, STRIDE)
+    with ring.reader("count") as reader:
+        put(ring, 0)
+        put(ring, 1)
+        reader.next(0)
+        assert ring.claim(0) is None
+    put(ring, 2)
+    put(ring, 3)
+    put(ring, 4)
+    with pytest.raises(WrongState, match="closed"):
+        reader.next(0)
+
+
+def test_readers_get_what_is_left_and_then_the_sources_error() -> None:
+    ring = BlockRing(2, STRIDE)
+    reader = ring.reader("count")
+    put(ring, 0)
+    ring.finish(DeviceFault("spad: over temperature"))
+    ring.finish()
+    assert sequence(reader.next(0)) == 0
+    for _ in range(2):
+        with pytest.raises(DeviceFault, match="over temperature"):
+            reader.next(0)
+
+
+def test_a_reader_that_waits_in_vain_says_so() -> None:
+    reader = BlockRing(1, STRIDE).reader("count")
+    with pytest.raises(DeviceTimeout, match=r"no block for reader 'count' within 0.01 s"):
+        reader.next(0.01)
+
+
+def test_an_overflow_is_remembered() -> None:
+    ring = BlockRing(1, STRIDE)
+    assert not ring.overflowed
+    ring.mark_overflow()
+    put(ring, 0)
+    ring.finish()
+    assert ring.overflowed
+
+
+def test_verbs_out_of_order_are_refused() -> None:
+    ring = BlockRing(1, STRIDE)
+    with pytest.raises(WrongState, match="without a claimed slot"):
+        ring.discard()
+    memory = ring.claim(0)
+    assert memory is not None
+    with pytest.raises(WrongState, match="after the first claim"):
+        ring.reader("late")
+    block = block_in(memory, 0)
+    ring.publish(block)
+    with pytest.raises(WrongState, match="without a claimed slot"):
+        ring.publish(block)
+    ring.finish()
+    for late in (lambda: ring.claim(0), lambda: ring.publish(block)):
+        with pytest.raises(WrongState, match="after finish"):
+            late()
+
+
+@pytest.mark.parametrize(("slots", "stride"), [(0, 1), (1, 0), (-1, 4096)])
+def test_a_ring_of_nothing_is_refused(slots: int, stride: int) -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        BlockRing(slots, stride)
+
+
+def test_a_source_waits_for_a_slot_that_comes_free() -> None:
+    ring = BlockRing(1, STRIDE)
+    reader = ring.reader("count")
+    put(ring, 0)
+    reader.next(0)
+    later = threading.Timer(0.02, reader.close)
+    later.start()
+    assert ring.claim(10) is not None
+    later.join()
+
+
+def test_a_reader_wakes_up_at_the_end() -> None:
+    ring = BlockRing(1, STRIDE)
+    reader = ring.reader("count")
+    later = threading.Timer(0.02, ring.finish)
+    later.start()
+    assert reader.next() is None
+    later.join()
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    slots=st.integers(2, 6),
+    required=st.integers(1, 3),
+    ahead=st.integers(1, 4),
+    monitor=st.booleans(),
+    seed=st.integers(0, 2**32),
+)
+def test_under_threads_every_reader_gets_every_block_unspoilt(
+    slots: int, required: int, ahead: int, monitor: bool, seed: int
+) -> None:
+    """Each reader finds in the memory of each block what the source wrote, at the start and at the end of its use."""
+    n_blocks = 200
+    ring = BlockRing(slots, STRIDE)
+    readers = [ring.reader(f"reader {index}") for index in range(required)]
+    watcher = ring.reader("monitor", required=False) if monitor else None
+    ahead = min(ahead, slots - monitor)
+    seen: dict[str, list[int]] = {}
+    failures: list[BaseException] = []
+
+    def produce() -> None:
+        claimed: list[np.ndarray] = []
+        seq = 0
+        while seq < n_blocks:
+            while len(claimed) < ahead and (memory := ring.claim(0 if claimed else 10)) is not None:
+                claimed.append(memory)
+            ring.publish(block_in(claimed.pop(0), seq))
+            seq += 1
+        ring.finish()
+
+    def consume(reader: RingReader) -> None:
+        pause = random.Random(f"{seed} {reader.name}")
+        numbers = seen.setdefault(reader.name, [])
+        for block in reader:
+            expected = block.header.block_seq % 251
+            assert (block.bits == expected).all()
+            if pause.random() < 0.05:
+                time.sleep(0.0005)
+            assert (block.bits == expected).all()
+            numbers.append(block.header.block_seq)
+
+    def guarded(work: object, *args: object) -> None:
+        try:
+            work(*args)  # type: ignore[operator]
+        except BaseException as failure:
+            failures.append(failure)
+            ring.finish(failure)
+
+    threads = [threading.Thread(target=guarded, args=(produce,))]
+    threads += [
+        threading.Thread(target=guarded, args=(consume, reader))
+        for reader in [*readers, *([watcher] if watcher else [])]
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+        assert not thread.is_alive()
+    assert failures == []
+    for reader in readers:
+        assert seen[reader.name] == list(range(n_blocks))
+    if watcher is not None:
+        numbers = seen[watcher.name]
+        assert numbers == sorted(set(numbers))
+        assert len(numbers) + watcher.skipped == n_blocks
+    assert 1 <= ring.high_water <= slots
+    assert len(ring._free) + len(ring._claimed) == slots

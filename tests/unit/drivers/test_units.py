@@ -1,0 +1,176 @@
+"""Quantities with units: what is read, what is refused, and that written text reads back."""
+
+import math
+from fractions import Fraction
+from typing import Annotated
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel, Field, ValidationError
+
+from drivers.units import (
+    DIMENSIONS,
+    CountsPerSecond,
+    ExactHertz,
+    Hertz,
+    Lux,
+    Metres,
+    MetresPerHour,
+    PerMetre,
+    PerSecond,
+    Ppm,
+    Radians,
+    Seconds,
+    Watts,
+    format_quantity,
+    parse_exact,
+    parse_quantity,
+)
+
+DIMENSION = st.sampled_from(sorted(DIMENSIONS))
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+
+
+class Everything(BaseModel):
+    exposure: Seconds = 1e-5
+    rate: Hertz = 1e5
+    frame_rate: ExactHertz = Fraction(100_000, 3)
+    depth_range: tuple[Metres, Metres] = (1.0, 8.0)
+    power: Watts = 0.05
+    extinction: PerMetre | None = 0.05
+    roll: Radians = 0.05
+    sun: Lux = 2e4
+    drift: Ppm = 2e-5
+    rain: MetresPerHour = 0.02
+    dark: CountsPerSecond = 20.0
+    drops: PerSecond = 5.0
+
+
+@pytest.mark.parametrize(
+    ("text", "dimension", "value"),
+    [
+        ("10 us", "time", 1e-5),
+        ("0.1us", "time", 1e-7),
+        ("10 µs", "time", 1e-5),
+        ("10 μs", "time", 1e-5),
+        ("  +1.5e3 ns ", "time", 1.5e-6),
+        ("97.7 kHz", "frequency", 97_700.0),
+        ("30 m", "length", 30.0),
+        ("-3 mm", "length", -0.003),
+        ("0.05 /m", "inverse length", 0.05),
+        ("50 1/km", "inverse length", 0.05),
+        ("180 deg", "angle", math.pi),
+        ("20 ppm", "ratio", 2e-5),
+        ("20 mm/h", "rain rate", 0.02),
+        (".5 W", "power", 0.5),
+    ],
+)
+def test_a_quantity_is_read_in_si_correctly_rounded(text: str, dimension: str, value: float) -> None:
+    assert parse_quantity(text, dimension) == value
+
+
+@pytest.mark.parametrize("bare", [1e-5, 10, 0, True, None, [10, "us"], "10", "1e-5"])
+def test_a_bare_number_is_refused_with_an_example(bare: object) -> None:
+    with pytest.raises(ValueError, match="10 us") as refused:
+        parse_quantity(bare, "time")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["nan s", "inf s", "-inf s", "1e400 s", "1e9999 s", "1e-400 s", "1/0 s", "", "s", "ten s"]
+)
+def test_what_is_no_finite_number_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"s"):
+        parse_quantity(text, "time")
+
+
+@pytest.mark.parametrize(
+    "text", ["1 m", "1 Hz", "1 S", "1 us us", "1 us 2", "1,5 us", "1 2 us", "1us/2", "0x10 s", "١ s"]
+)
+def test_another_dimension_or_stray_text_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"time|number"):
+        parse_quantity(text, "time")
+
+
+def test_an_endless_text_is_refused_at_once_and_shown_shortened() -> None:
+    with pytest.raises(ValueError, match="no number") as refused:
+        parse_quantity("1" * 100_000 + " s", "time")
+    assert len(str(refused.value)) < 150
+
+
+def test_an_exact_frequency_stays_exact() -> None:
+    assert parse_exact("97.7 kHz", "frequency") == 97_700
+    assert parse_exact("100000/3 Hz", "frequency") == Fraction(100_000, 3)
+    assert parse_exact("0.1 Hz", "frequency") == Fraction(1, 10)
+
+
+@given(FINITE, DIMENSION)
+def test_a_float_written_as_text_reads_back_to_the_same_float(value: float, dimension: str) -> None:
+    assert parse_quantity(format_quantity(value, dimension), dimension) == value
+
+
+@given(st.fractions(max_denominator=10**9), DIMENSION)
+def test_a_fraction_written_as_text_reads_back_exactly(value: Fraction, dimension: str) -> None:
+    assert parse_exact(format_quantity(value, dimension), dimension) == value
+
+
+@given(st.text(max_size=20), DIMENSION)
+def test_any_text_gives_a_finite_number_or_one_line(text: str, dimension: str) -> None:
+    try:
+        value, message = parse_quantity(text, dimension), ""
+    except ValueError as refused:
+        value, message = 0.0, str(refused)
+    assert math.isfinite(value)
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_not_written(value: float) -> None:
+    with pytest.raises(ValueError, match="no time"):
+        format_quantity(value, "time")
+
+
+@pytest.mark.parametrize(
+    ("value", "dimension", "text"),
+    [
+        (1e-5, "time", "10 us"),
+        (1e5, "frequency", "100 kHz"),
+        (8.0, "length", "8 m"),
+        (0.05, "inverse length", "0.05 /m"),
+        (2e-5, "ratio", "20 ppm"),
+        (Fraction(100_000, 3), "frequency", "100000/3 Hz"),
+    ],
+)
+def test_text_is_written_as_people_write_it(value: float | Fraction, dimension: str, text: str) -> None:
+    assert format_quantity(value, dimension) == text
+
+
+def test_a_model_of_every_type_is_read_back_from_its_dump() -> None:
+    model = Everything()
+    dumped = model.model_dump(mode="json")
+    assert dumped["exposure"] == "10 us"
+    assert Everything.model_validate(dumped) == model
+    assert model.model_dump()["exposure"] == 1e-5
+
+
+def test_a_model_names_the_key_and_an_example() -> None:
+    with pytest.raises(ValidationError) as refused:
+        Everything.model_validate({"depth_range": ["1 m", 8]})
+    (error,) = refused.value.errors()
+    assert error["loc"] == ("depth_range", 1)
+    assert '"30 m"' in error["msg"]
+
+
+def test_limits_on_a_field_are_checked_in_si() -> None:
+    class Shutter(BaseModel):
+        exposure: Annotated[Seconds, Field(gt=0)]
+
+    assert Shutter.model_validate({"exposure": "1 ns"}).exposure == 1e-9
+    with pytest.raises(ValidationError, match="greater than 0"):
+        Shutter.model_validate({"exposure": "-10 us"})
+
+
+def test_the_json_schema_says_text_with_an_example() -> None:
+    schema = Everything.model_json_schema()["properties"]["exposure"]
+    assert (schema["type"], schema["examples"]) == ("string", ["10 us"])

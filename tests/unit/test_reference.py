@@ -1,0 +1,304 @@
+"""The yardstick against closed forms: geometry, light, photon statistics, packing, genie and score."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.reference import kernels
+from tests.reference.genie import (
+    Genie,
+    albedo_histogram,
+    label_profiles,
+    log_expm1,
+    log_expm1_table,
+)
+from tests.reference.geometry import BASELINE_M, DEPTH_RANGE_M, FOCAL_PX, Geometry, undistorted_rays
+from tests.reference.scene import Scene, procedural_scene
+from tests.reference.working_point import CLEAR, REPORT, Light, WorkingPoint, score
+
+ROWS, WIDTH, COLUMNS = 6, 512, 61
+
+
+def wall(depth_m: float = 3.0, albedo: float = 0.5, rows: int = ROWS, width: int = WIDTH) -> Scene:
+    shape = (rows, width)
+    return Scene(
+        "wall", np.full(shape, depth_m, np.float32), np.full(shape, albedo, np.float32), np.ones(shape, np.bool_)
+    )
+
+
+def point(
+    scene: Scene | None = None, light: Light = REPORT, columns: int = COLUMNS, **rig: float | str
+) -> WorkingPoint:
+    scene = scene or wall()
+    height, width = scene.shape
+    return WorkingPoint(
+        scene,
+        light,
+        Geometry.build(width=width, height=height, columns=columns, **rig),  # type: ignore[arg-type]
+    )
+
+
+def test_stripe_on_a_wall_stands_where_plane_and_wall_cross() -> None:
+    tangents = np.linspace(-0.30, 0.50, COLUMNS)
+    expected = (WIDTH - 1) / 2 + FOCAL_PX * (tangents - BASELINE_M / 3.0)
+    # a wall at the border of the picture may hide the first columns, none leaves on the far side before its end
+    x = point().x_true[2]
+    inside = (expected > 0) & (expected < WIDTH - 1)
+    np.testing.assert_allclose(x[inside], expected[inside], atol=1e-9)
+    assert np.isnan(x[~inside]).all()
+
+
+def test_scanner_on_the_right_sees_the_mirror_picture() -> None:
+    scene = procedural_scene(24, WIDTH)
+    mirrored = Scene("m", scene.depth_m[:, ::-1].copy(), scene.albedo[:, ::-1].copy(), scene.trusted[:, ::-1].copy())
+    left, right = point(scene), point(mirrored, side="right")
+    np.testing.assert_allclose(right.x_true, WIDTH - 1 - left.x_true, atol=1e-9)
+    np.testing.assert_allclose(right.flux_of_column(30)[:, ::-1], left.flux_of_column(30), rtol=1e-5)
+
+
+@pytest.mark.parametrize("k1", [0.0, -0.1, -0.35])
+def test_distorting_the_rays_again_gives_the_pixels(k1: float) -> None:
+    u, v = undistorted_rays(WIDTH, WIDTH, FOCAL_PX, k1)
+    scale = FOCAL_PX * (1 + k1 * (u**2 + v**2))
+    y, x = np.mgrid[0:WIDTH, 0:WIDTH]
+    np.testing.assert_allclose(scale * u + (WIDTH - 1) / 2, x, atol=1e-8)
+    np.testing.assert_allclose(scale * v + (WIDTH - 1) / 2, y, atol=1e-8)
+
+
+def test_k1_of_0_35_moves_the_corner_by_about_20_percent() -> None:
+    u, v = undistorted_rays(WIDTH, WIDTH, FOCAL_PX, -0.35)
+    corner = math.hypot(u[0, 0], v[0, 0])
+    assert 0.17 < 1 - math.hypot(255.5, 255.5) / FOCAL_PX / corner < 0.25
+
+
+def test_every_turned_plane_passes_the_scanner_and_the_points_it_reports() -> None:
+    g = Geometry.build(columns=7, height=40, side="right", roll_deg=3, k1=-0.35, axis_tilt_z_deg=2, axis_tilt_x_deg=3)
+    np.testing.assert_allclose(g.planes[:, :3] @ g.scanner_m, g.planes[:, 3], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(g.planes[:, :3], axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(g.scanner_m), BASELINE_M)
+    inverse = g.inverse_depth(3)
+    met = np.stack([g.u, g.v, np.ones_like(g.u)], axis=-1) / inverse[..., None]
+    np.testing.assert_allclose(met @ g.planes[3, :3], g.planes[3, 3], atol=1e-9)
+
+
+def test_a_rolled_camera_sees_points_of_the_rig_turned_the_other_way() -> None:
+    straight, rolled = Geometry.build(columns=5), Geometry.build(columns=5, roll_deg=90)
+    np.testing.assert_allclose(straight.scanner_m, [-0.3, 0, 0])
+    # a quarter turn of the camera, its x towards y: its y axis now points to where its left was
+    np.testing.assert_allclose(rolled.scanner_m, [0, 0.3, 0], atol=1e-12)
+    np.testing.assert_allclose(rolled.planes[:, 3], straight.planes[:, 3])
+
+
+def test_stripe_sums_to_its_amplitude_and_is_centred_on_the_truth() -> None:
+    p = point(light=Light(haze=0.0, ambient=0.0))
+    x = np.arange(WIDTH)
+    for c in range(15, 45, 3):
+        row = p.flux_of_column(c)[3].astype(np.float64)
+        assert row.sum() == pytest.approx(p.stripe[3, c], rel=1e-5)
+        assert (row * x).sum() / row.sum() == pytest.approx(p.x_true[3, c], abs=0.01)
+
+
+def test_median_stripe_is_that_of_the_working_point() -> None:
+    p = point(procedural_scene(32, WIDTH))
+    assert np.median(p.stripe[p.stripe > 0]) == pytest.approx(0.7)
+
+
+def test_stripe_falls_as_depth_squared_and_both_paths() -> None:
+    depth = np.full((1, WIDTH), 2.0, np.float32)
+    depth[:, 256:] = 4.0
+    p = point(Scene("step", depth, np.full_like(depth, 0.5), np.ones_like(depth, np.bool_)), columns=2001)
+    seen = np.flatnonzero(np.isfinite(p.x_true[0]))
+    a = seen[np.abs(p.x_true[0, seen] - 200).argmin()]
+    b = seen[np.abs(p.x_true[0, seen] - 300).argmin()]
+
+    def strength(c: int, z: float) -> float:
+        u = (p.x_true[0, c] - 255.5) / FOCAL_PX
+        path = z * (math.hypot(u, 1) + math.hypot(u + BASELINE_M / z, 1))
+        return math.exp(-0.05 * path) / z**2
+
+    assert p.stripe[0, a] / p.stripe[0, b] == pytest.approx(strength(a, 2.0) / strength(b, 4.0), rel=1e-6)
+
+
+def test_haze_is_exponential_in_the_path_and_ends_at_the_object() -> None:
+    p = point(light=Light(stripe=1e-9, ambient=0.0))
+    c, y = 35, 3
+    tangent = np.linspace(-0.30, 0.50, COLUMNS)[c]
+    u, v = (np.arange(WIDTH) - 255.5) / FOCAL_PX, (y - (ROWS - 1) / 2) / FOCAL_PX
+    z = BASELINE_M / (tangent - u)
+    q_p, q_c = np.sqrt(1 + tangent**2 + v**2), np.sqrt(1 + u**2 + v**2)
+    free = p.haze_scale * q_p * q_c * np.exp(-0.05 * z * (q_p + q_c))
+    x = np.arange(WIDTH)
+    before, behind = x < p.x_true[y, c] - 0.5, x > p.x_true[y, c] + 0.5
+    flux = p.flux_of_column(c)[y]
+    np.testing.assert_allclose(flux[before], free[before], rtol=1e-5)
+    assert flux[behind].max() < 1e-8
+
+
+def test_mean_haze_at_1_5_m_is_that_of_the_working_point() -> None:
+    columns = 200
+    p = point(wall(6.0), Light(stripe=1e-9, ambient=0.0), columns=columns)
+    tangents = np.linspace(-0.30, 0.50, columns)
+    x = np.rint(255.5 + FOCAL_PX * (tangents - BASELINE_M / 1.5)).astype(int)
+    values = [p.flux_of_column(c)[:, x[c]].mean() for c in range(columns) if 0 < x[c] < WIDTH - 1]
+    assert np.mean(values) == pytest.approx(0.14, rel=2e-3)
+
+
+def test_a_near_post_hides_the_wall_behind_it_and_shows_no_stripe_at_its_edges() -> None:
+    depth = np.full((1, WIDTH), 4.0, np.float32)
+    depth[:, 250:271] = 2.0
+    p = point(Scene("post", depth, np.full_like(depth, 0.5), np.ones_like(depth, np.bool_)), columns=2001)
+    x = p.x_true[0][np.isfinite(p.x_true[0])]
+    width_of_shadow = FOCAL_PX * BASELINE_M * (1 / 2 - 1 / 4)
+    hidden = (x > 271) & (x < 271 + width_of_shadow - 1)
+    assert not hidden.any()
+    assert ((x > 251) & (x < 269)).any()
+    assert (x > 271 + width_of_shadow + 1).any()
+    assert not ((x > 249) & (x < 250)).any()
+
+
+def test_counts_follow_the_binomial_law() -> None:
+    p = point(wall(rows=400), Light(stripe=2.0, ambient=0.3), columns=21)
+    exposures, c = 7, 11
+    counts, flux = p.counts(exposures, seed=5)[c].astype(np.float64), p.flux_of_column(c).astype(np.float64)
+    hit = 1 - np.exp(-flux)
+    mean_sigmas = (counts - exposures * hit).sum(axis=0) / np.sqrt((exposures * hit * (1 - hit)).sum(axis=0))
+    assert np.abs(mean_sigmas).max() < 5
+    assert mean_sigmas.std() == pytest.approx(1.0, abs=0.15)
+    spread = ((counts - exposures * hit) ** 2).sum() / (exposures * hit * (1 - hit)).sum()
+    assert spread == pytest.approx(1.0, abs=0.02)
+    assert counts.max() <= exposures
+
+
+def test_bright_pixels_of_many_exposures_do_not_overflow() -> None:
+    p = point(light=Light(stripe=30.0, ambient=3.0), columns=21)
+    counts = p.counts(1000, seed=1)
+    assert counts.dtype == np.uint16
+    assert counts.max() == 1000
+    assert counts.mean() == pytest.approx(1000 * (1 - math.exp(-3.0)), rel=0.02)
+
+
+def test_counts_depend_on_the_seed_alone() -> None:
+    p = point()
+    np.testing.assert_array_equal(p.counts(3, seed=1), p.counts(3, seed=1))
+    assert (p.counts(3, seed=1) != p.counts(3, seed=2)).any()
+
+
+@pytest.mark.parametrize(("width", "exposures"), [(512, 1), (509, 5), (300, 12)])
+def test_bits_of_a_cube_sum_to_the_counts(tmp_path: Path, width: int, exposures: int) -> None:
+    p = point(procedural_scene(5, width), columns=9)
+    cube = np.load(p.write_cube(tmp_path, exposures, seed=3))
+    assert cube.shape == (9 * exposures, 5, -(-width // 8))
+    bits = np.unpackbits(cube, axis=2)
+    assert not bits[:, :, width:].any()
+    sums = bits[:, :, :width].reshape(9, exposures, 5, width).sum(axis=1)
+    np.testing.assert_array_equal(sums, p.counts(exposures, seed=3))
+    plan = yaml.safe_load((tmp_path / "plan.yaml").read_text())
+    assert plan == {
+        "columns": 9, "exposures": exposures, "frame_rate": "100 kHz", "depth_range": ["1 m", "8 m"],
+    }  # fmt: skip
+    model = yaml.safe_load((tmp_path / "calibration.yaml").read_text())
+    assert (model["format"], model["version"], model["camera"]["width"]) == ("spadrig-calibration", 1, width)
+    assert np.load(tmp_path / model["planes"]).shape == (9, 4)
+
+
+def test_ones_of_a_pixel_are_spread_evenly_over_its_frames(tmp_path: Path) -> None:
+    p = point(wall(rows=200), Light(ambient=0.5), columns=9)
+    bits = np.unpackbits(np.load(p.write_cube(tmp_path, 4)), axis=2).reshape(9, 4, -1)
+    share = bits.mean(axis=(0, 2)) / bits.mean()
+    np.testing.assert_allclose(share, 1, atol=0.01)
+
+
+@given(st.floats(1e-4, 60.0))
+@settings(max_examples=200, deadline=None)
+def test_table_of_log_expm1_is_exact_enough(flux: float) -> None:
+    assert log_expm1(flux, log_expm1_table()) == pytest.approx(math.log(math.expm1(flux)), abs=2e-5)
+
+
+def test_albedo_histogram_keeps_the_mean() -> None:
+    p = point(procedural_scene(40, WIDTH))
+    values, weights = albedo_histogram(p, 12)
+    assert weights.sum() == pytest.approx(1.0)
+    assert (values * weights).sum() == pytest.approx(p.strength.mean(), rel=1e-6)
+
+
+def test_label_profiles_are_shares_of_one_stripe() -> None:
+    shares, lit = label_profiles(4, 4, 0.6)
+    np.testing.assert_allclose(shares.sum(axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose((shares * np.arange(-4, 5)).sum(axis=1), [-0.375, -0.125, 0.125, 0.375], atol=1e-3)
+    np.testing.assert_allclose(lit.sum(axis=1), 4.5 + np.array([-0.375, -0.125, 0.125, 0.375]))
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_genie_is_the_brute_force_posterior_mode(side: str) -> None:
+    """Every hypothesis of one row written out at length: same most probable pixel, same local mean."""
+    p = point(procedural_scene(4, WIDTH, seed=2), side=side)
+    exposures, y = 6, 1
+    counts = p.counts(exposures, seed=9)
+    x_genie = Genie(profile_reach=4).estimate(p, counts, exposures)
+    albedos, weights = albedo_histogram(p, 16)
+    g, light = p.geometry, p.light
+    before = 1 if side == "left" else -1
+    x = np.arange(WIDTH)
+    for c in range(12, 50, 7):
+        inverse = g.inverse_depth(c)[y]
+        free = p.haze_scale * np.array(
+            [
+                kernels.haze_at(g.u[y, i], g.v[y, i], inverse[i], g.scanner_m, light.extinction_per_m)
+                for i in range(WIDTH)
+            ]
+        )
+        window = np.flatnonzero((inverse >= 1 / DEPTH_RANGE_M[1]) & (inverse <= 1 / DEPTH_RANGE_M[0]))
+        posterior = {}
+        for j in window:
+            path = kernels.path_length(g.u[y, j], g.v[y, j], 1 / inverse[j], g.scanner_m)
+            amplitude = p.stripe_scale * inverse[j] ** 2 * math.exp(-light.extinction_per_m * path)
+            gap = (x - j) * before
+            haze = free * np.where(gap < 0, 1.0, np.where(gap == 0, 0.5, 0.0))
+            share = np.array([_gaussian_share(i - j, light.sigma_px) if abs(i - j) <= 4 else 0.0 for i in x])
+            logs = []
+            for albedo in albedos:
+                flux = light.ambient + haze + albedo * amplitude * share
+                logs.append((counts[c, y] * np.log(np.expm1(flux)) - exposures * flux).sum())
+            posterior[j] = np.logaddexp.reduce(np.array(logs) + np.log(weights))
+        mode = max(posterior, key=posterior.__getitem__)
+        near = [j for j in posterior if abs(j - mode) <= 2]
+        mass = np.exp([posterior[j] - posterior[mode] for j in near])
+        assert x_genie[y, c] == pytest.approx((mass * near).sum() / mass.sum(), abs=2e-3)
+
+
+def _gaussian_share(offset: float, sigma: float) -> float:
+    scale = 1 / (sigma * math.sqrt(2))
+    return 0.5 * (math.erf((offset + 0.5) * scale) - math.erf((offset - 0.5) * scale))
+
+
+@pytest.mark.parametrize("light", [REPORT, CLEAR])
+def test_genie_finds_a_bright_wall_with_many_exposures(light: Light) -> None:
+    p = point(light=light, columns=77)  # the truth falls on all fractions of a pixel
+    x = Genie(labels=4, mean_reach=8, profile_reach=3).estimate(p, p.counts(200), 200)
+    assert score(x, p.truth(), p.trusted)["mean_abs"] < 0.09
+
+
+def test_score_charges_what_it_says() -> None:
+    truth = np.array([[1.4, 2.0, 5.0, np.nan, 7.0]])
+    given_x = np.array([[1.0, np.nan, 8.0, 3.0, 99.0]])
+    trusted = np.array([[True, True, True, True, False]])
+    figures = score(given_x, truth, trusted)
+    assert figures["mean_abs"] == pytest.approx((0.4 + 3) / 2)
+    assert figures["mean_abs_rounded"] == pytest.approx(1.5)
+    assert figures["mean_abs_charged"] == pytest.approx((0.4 + 10 + 3) / 3)
+    assert figures["within_1px"] == pytest.approx(1 / 3)
+    assert figures["missing"] == pytest.approx(1 / 3)
+
+
+def test_score_without_any_answer_is_all_missing() -> None:
+    truth = np.ones((2, 3))
+    figures = score(np.full((2, 3), np.nan), truth, np.ones((2, 3), np.bool_))
+    assert figures["missing"] == 1.0
+    assert math.isnan(figures["mean_abs"])
