@@ -1,4 +1,4 @@
-"""Runs a scan: starts the devices in order, binds and counts their frames block by block, and makes everything safe.
+"""Runs a scan: starts the devices in order, takes their frames sweep by sweep, and makes everything safe.
 
 A source thread fills the ring; the caller's thread takes the blocks out and gets a `SweepData` at the end of each
 sweep. While the caller works on one, the source goes on as far as the ring reaches: a simulated SPAD then waits, a real
@@ -8,7 +8,7 @@ one raises RingOverflow when it would have to drop frames.
 import logging
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from fractions import Fraction
@@ -16,15 +16,17 @@ from fractions import Fraction
 import numpy as np
 
 from drivers.clock import Clock
-from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
+from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.frames import FrameBlock, packed_row_bytes
 from drivers.interfaces import SpadArray, SpadCounters, SpadTiming
 from drivers.ring import BlockRing, RingReader
-from rig.binding import FrameBinder, SweepClock
-from rig.counting import BIN_DARK, CountVolume, SweepCounter
+from rig.counting import SweepCounter
 from rig.errors import DevicesError
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig
+from rig.sweeps import FrameCounts, SweepAssembler, SweepData
+
+__all__ = ["Acquisition", "FrameCounts", "Progress", "SweepAssembler", "SweepData"]
 
 _log = logging.getLogger(__name__)
 
@@ -37,54 +39,6 @@ BURST_LEAD_S = 5e-3
 """Time between the SPAD's start and the first scan marker that a burst must have room for."""
 JOIN_S = 30.0
 
-Gap = tuple[int, int]
-
-
-@dataclass(frozen=True, slots=True)
-class FrameCounts:
-    """Frames of a sweep from its scan marker to the next one: expected = received + lost.
-
-    lit: frames that fell on columns; dark: frames with the gate low throughout.
-    """
-
-    expected: int
-    received: int
-    lost: int
-    lit: int
-    dark: int
-
-    def __add__(self, other: "FrameCounts") -> "FrameCounts":
-        """Counts of two sweeps together."""
-        return FrameCounts(
-            self.expected + other.expected,
-            self.received + other.received,
-            self.lost + other.lost,
-            self.lit + other.lit,
-            self.dark + other.dark,
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class SweepData:
-    """One sweep, counted.
-
-    direction: +1 where the mirror command rose, -1 where it fell; column indices mean the same commands both ways.
-    residual_columns: largest distance of a marker from the sweep's clock line; synchronised: whether that and the clock
-    are within their limits. gaps: (first, last) numbers of frames exposed but not received. first_frame, end_frame:
-    frame numbers from this scan marker to the next.
-    """
-
-    index: int
-    direction: int
-    volume: CountVolume
-    residual_columns: float
-    clock_error: float
-    synchronised: bool
-    frames: FrameCounts
-    gaps: tuple[Gap, ...]
-    first_frame: int
-    end_frame: int
-
 
 @dataclass(frozen=True, slots=True)
 class Progress:
@@ -94,101 +48,6 @@ class Progress:
     frames_planned: int
     sweeps: int
     maps: int
-
-
-class SweepAssembler:
-    """Turns the blocks of one run into sweeps. The result does not depend on how frames are grouped into blocks."""
-
-    def __init__(self, plan: ScanPlan, counter: SweepCounter, maps: int, first_index: int = 0) -> None:
-        self._plan = plan
-        self._counter = counter
-        self._maps = maps
-        self._first_index = first_index
-        self._binder = FrameBinder(plan)
-        self._next_frame: int | None = None
-        self._gaps: list[Gap] = []
-        self._received = self._lit = self._dark = 0
-        self._run_id: int | None = None
-        self.frames_seen = 0
-        self.sweeps_done = 0
-        self.complete = False
-        """Whether the scan marker that closes the last map has been seen."""
-
-    def add(self, block: FrameBlock) -> Iterator[SweepData]:
-        """Count a block; yields the sweeps that end in it. Stop adding once `complete`."""
-        self._check(block)
-        self._note_gap(block)
-        bound, clocks = self._binder.bind(block)
-        self.frames_seen += block.n_frames
-        sweeps = bound.sweep
-        starts = [0, *(np.flatnonzero(np.diff(sweeps)) + 1).tolist(), block.n_frames]
-        for a, b in zip(starts[:-1], starts[1:], strict=True):
-            number = int(sweeps[a])
-            while clocks and clocks[0].sweep < number:
-                yield self._finish(clocks.pop(0))
-                if self.complete:
-                    return
-            if number < 0:
-                continue
-            bins = bound.bins[a:b]
-            self._received += b - a
-            self._lit += int(np.count_nonzero(bins >= 0))
-            self._dark += int(np.count_nonzero(bins == BIN_DARK))
-            self._counter.add(block.bits[a:b], bins, bound.column[a:b])
-
-    def _finish(self, clock: SweepClock) -> SweepData:
-        expected = clock.end_frame - clock.first_frame
-        gaps = [
-            (max(first, clock.first_frame), min(last, clock.end_frame - 1))
-            for first, last in self._gaps
-            if first < clock.end_frame and last >= clock.first_frame
-        ]
-        self._gaps = [gap for gap in self._gaps if gap[1] >= clock.end_frame]
-        data = SweepData(
-            index=self._first_index + clock.sweep,
-            direction=self._plan.leg(clock.sweep).direction,
-            volume=self._counter.finish(),
-            residual_columns=clock.residual_columns,
-            clock_error=clock.clock_error,
-            synchronised=clock.synchronised,
-            frames=FrameCounts(expected, self._received, expected - self._received, self._lit, self._dark),
-            gaps=tuple(gaps),
-            first_frame=clock.first_frame,
-            end_frame=clock.end_frame,
-        )
-        if not data.synchronised:
-            _log.warning("sweep %d: markers stray %.3g columns from its clock", data.index, data.residual_columns)
-        self._counter.reset()
-        self._received = self._lit = self._dark = 0
-        self.sweeps_done += 1
-        self.complete = clock.sweep + 1 >= self._maps
-        return data
-
-    def _note_gap(self, block: FrameBlock) -> None:
-        first = block.header.first_frame
-        if self._next_frame is not None and first > self._next_frame:
-            self._gaps.append((self._next_frame, first - 1))
-            _log.warning("frames %d to %d were lost", self._next_frame, first - 1)
-        self._next_frame = first + block.n_frames
-
-    def _check(self, block: FrameBlock) -> None:
-        """Only blocks of this run and of the whole sensor can be counted."""
-        header, plan = block.header, self._plan
-        if (header.width, header.height) != (plan.width, plan.rows):
-            raise ProtocolError(
-                f"block {header.block_seq} holds frames of {header.width} x {header.height} pixels, the plan is for "
-                f"{plan.width} x {plan.rows}; configure the SPAD anew"
-            )
-        if self._run_id not in (None, header.run_id):
-            raise ProtocolError(
-                f"block {header.block_seq} is of run {header.run_id}, not of run {self._run_id}; start anew"
-            )
-        if self._next_frame is not None and header.first_frame < self._next_frame:
-            raise ProtocolError(
-                f"block {header.block_seq} begins at frame {header.first_frame}, before frame {self._next_frame} "
-                "that should come next; start anew"
-            )
-        self._run_id = header.run_id
 
 
 class Acquisition:
@@ -230,7 +89,7 @@ class Acquisition:
         """The SPAD's own counts of the present or the last start."""
         return self._rig.spad.counters
 
-    def run(self) -> Iterator[SweepData]:
+    def run(self) -> Generator[SweepData, None, None]:
         """Scan; yields each sweep as it ends. However the iteration ends, gate, laser, scanner and SPAD are made safe.
 
         Raises DeviceError where a device fails, DevicesError where they could not all be made safe.
@@ -262,13 +121,13 @@ class Acquisition:
         lead = Fraction(BURST_LEAD_S) * self._plan.frame_rate_hz
         return min(self._plan.burst_frames, math.ceil(sweeps * self._plan.frames_per_sweep + lead))
 
-    def _run_group(self, assembler: SweepAssembler, sweeps: int, done: int) -> Iterator[SweepData]:
+    def _run_group(self, assembler: SweepAssembler, sweeps: int, done: int) -> Generator[SweepData, None, None]:
         rig, plan = self._rig, self._plan
         clock = rig.scanner.load(plan.waveform, plan.scanner_repeats(sweeps))
         if clock != plan.point_rate_hz:
             raise DeviceFault(
-                f"{rig.scanner.name} runs at {float(clock):g} points a second, planned were {float(plan.point_rate_hz):g}; "
-                "compile the plan anew"
+                f"{rig.scanner.name} runs at {float(clock):g} points a second, planned were "
+                f"{float(plan.point_rate_hz):g}; compile the plan anew"
             )
         rig.sync.program(*plan.sync_program(sweeps))
         ring = BlockRing(RING_SLOTS, self._timing.stride)

@@ -1,37 +1,65 @@
 """Everything the command line does, as typed calls for notebooks and programs.
 
-    from rig.api import scan
-    result = scan(exposures=4, seed=1)
-    result.last.depth_m, result.summary.truth
+from rig.api import scan
+result = scan(exposures=4, seed=1)
+result.last.depth_m, result.summary.truth
 """
 
 import os
-import time
 from collections.abc import Mapping
-from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 from calibration.errors import CalibrationError
 from calibration.files import load_rig_model
 from calibration.model import RigModel
-from drivers.errors import DeviceError
-from rig.config import CubePlan, Estimator, Filter, RigConfig
-from rig.cube import column_commands, count_map, open_cube
-from rig.errors import RigError, UsageError
-from rig.run import OutFolder, Progress, Run, RunResult
+from rig.config import CubePlan, EstimateConfig, Estimator, Filter, RigConfig
+from rig.config_files import load_config, load_cube_plan, parse_config
+from rig.errors import UsageError
+from rig.estimators import ESTIMATORS, FILTERS
+from rig.run import OutFolder, Progress, RunResult
 from rig.saving import SavePolicy
-from rig.scan_plan import ScanPlan
-from rig.summary import MapTally, RunFrames, Verdict
 
-__all__ = ["Effect", "RunResult", "effects", "plan_scan", "reconstruct", "scan"]
+if TYPE_CHECKING:
+    from rig.effects import Effect
+    from rig.scan_plan import ScanPlan
+
+__all__ = ["RunResult", "configure", "effects", "plan_scan", "reconstruct", "scan"]
 
 PathLike = str | os.PathLike[str]
 Config = RigConfig | PathLike
 
 SIMULATED = "simulated"
-"""The kind of devices that emit no real light."""
+"""Name of the bundled rig, and kind of the devices, that need no hardware."""
+
+
+def configure(
+    config: Config = SIMULATED,
+    *,
+    scene: str | None = None,
+    exposures: int | None = None,
+    estimator: Estimator | None = None,
+    filter: Filter | None = None,
+    min_confidence: float | None = None,
+) -> RigConfig:
+    """The validated config that `scan` would use; options that are None stay as the config says.
+
+    config: a bundled rig's name, a file or a RigConfig. Raises UsageError with one line per problem.
+    """
+    options = {
+        "world.scene": scene,
+        "scan.exposures": exposures,
+        "estimate.estimator": estimator,
+        "estimate.filter": filter,
+        "estimate.min_confidence": min_confidence,
+    }
+    loaded = config if isinstance(config, RigConfig) else load_config(os.fspath(config))
+    if scene is not None and loaded.world is None:
+        raise UsageError(f"scene {scene!r} was asked for, but {loaded.name} is a real rig; leave --scene out")
+    given = {key: value for key, value in options.items() if value is not None}
+    if not given:
+        return loaded
+    return load_config(os.fspath(config), given) if not isinstance(config, RigConfig) else _changed(config, given)
 
 
 def scan(
@@ -51,79 +79,111 @@ def scan(
 ) -> RunResult:
     """Acquire and reconstruct `maps` depth maps (`rig scan`).
 
-    config: a bundled rig's name, a file or a RigConfig; options that are None stay as it says. arm: must be True where a
-    laser or gate is real. out: a folder to write, None to write nothing. progress: called with frames done and planned.
-    Raises UsageError for what cannot be and DeviceError or DevicesError where devices fail; maps that were whole by then
+    config and options: as `configure`. save: 'all', 'last' or 'every N' maps. arm: must be True where laser or gate are
+    real. out: a folder to write, None to write nothing. progress: called with frames done and planned.
+    Raises UsageError for what cannot be, DeviceError or DevicesError where devices fail; maps that were whole by then
     are in `out`. An interrupt ends the scan after its last whole map, with verdict 'aborted'.
     """
-    from rig.acquisition import Acquisition, SweepData
-    from rig.acquisition import Progress as ScanProgress
-    from rig.reconstruction import Reconstructor
-    from rig.session import open_rig, prepare
+    from rig.run import Run
+    from rig.scanning import require_simulated_or_armed, run_scan
+    from rig.session import open_rig
+    from rig.summary import MapTally
 
-    settings = _load(config, scene=scene, exposures=exposures, estimator=estimator, filter=filter, confidence=min_confidence)
+    settings = configure(
+        config,
+        scene=scene,
+        exposures=exposures,
+        estimator=estimator,
+        filter=filter,
+        min_confidence=min_confidence,
+    )
     policy = SavePolicy.parse(save)
-    _check_maps(maps)
-    _check_armed(settings, arm)
+    problems = require_simulated_or_armed(settings, arm)
+    if maps < 1:
+        problems.append(f"maps is {maps}; it must be at least 1")
+    if seed < 0:
+        problems.append(f"seed is {seed}; it must be 0 or more")
+    if problems:
+        raise UsageError.of(problems)
     estimate = settings.estimate
     tally = MapTally(settings.scan.columns, settings.scan.exposures, estimate.estimator, estimate.filter)
-    threads = os.cpu_count() or 1
-    sweeps: list[SweepData] = []
+    with Run(out, tally, policy) as run, open_rig(settings, seed=seed) as rig:
+        return run_scan(rig, run, maps, seed, progress)
 
-    def tell(done: ScanProgress) -> None:
-        if progress is not None:
-            progress(done.frames, done.frames_planned)
 
-    with Run(out, tally=tally, save=policy) as run, open_rig(settings, seed=seed) as rig:
-        plan, timing = prepare(rig)
-        reconstructor = Reconstructor(
-            rig.model,
-            plan.commands,
-            plan.depth_range_m,
-            sensor=(plan.rows, plan.width),
-            estimator=estimate.estimator,
-            filter=estimate.filter,
-            min_confidence=estimate.min_confidence,
-            threads=threads,
-        )
-        run.rays = (reconstructor.geometry.u, reconstructor.geometry.v) if rig.model is not None else None
-        acquisition = Acquisition(rig, plan, timing, maps, threads=threads, on_block=tell)
-        ended_by: BaseException | None = None
-        truth = None
-        try:
-            with closing(acquisition.run()) as running:  # type: ignore[type-var]
-                for sweep in running:
-                    result = reconstructor.map(sweep.volume)
-                    if truth is None and rig.world is not None:
-                        truth = rig.world.truth(plan.commands)  # only now: an estimate never sees it
-                    run.add(result, sweep.count_s + result.compute_s, truth)
-                    sweeps.append(sweep)
-        except (KeyboardInterrupt, DeviceError, RigError) as error:
-            if not isinstance(error, KeyboardInterrupt) and not sweeps:
-                raise
-            ended_by = error
-        frames = RunFrames(
-            expected=sum(sweep.frames.expected for sweep in sweeps),
-            received=sum(sweep.frames.received for sweep in sweeps),
-            lost=sum(sweep.frames.lost for sweep in sweeps),
-            crc_errors=acquisition.counters.crc_errors,
-            lit=sum(sweep.frames.lit for sweep in sweeps),
-        )
-        manifest = {
-            "command": "scan",
-            "config": settings.model_dump(mode="json"),
-            "plan": plan_content(plan),
-            "calibration": _calibration_content(rig.model),
-            "seed": seed,
-            "maps": maps,
-            "sweeps": [_sweep_content(sweep) for sweep in sweeps],
-            "gaps": [[first, last] for sweep in sweeps for first, last in sweep.gaps],
-        }
-        verdict = _verdict(sweeps, rig.model, aborted=ended_by is not None)
-        sensor_s = frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected)
-        finished = run.finish(frames, sensor_s, verdict, manifest)
-        if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
-            if finished.folder is not None:
-                ended_by.add_note(f"{tally.maps} of {maps} maps were whole and are in {finished.folder}")
-            raise ended_by
-        return finished
+def plan_scan(config: Config = SIMULATED, **options: Any) -> "ScanPlan":
+    """The compiled plan of a scan, checked against its devices' limits (`rig scan --dry-run`); options as `configure`.
+
+    Nothing moves and nothing shines: only rigs all of whose devices are simulated are opened for it.
+    """
+    from rig.session import open_rig, prepare
+
+    settings = configure(config, **options)
+    slots = ("spad", "scanner", "laser", "sync")
+    real = [f"{slot} {getattr(settings, slot).kind}" for slot in slots if getattr(settings, slot).kind != SIMULATED]
+    if real:
+        raise UsageError(f"{settings.name} has real devices ({', '.join(real)}); a dry run does not open them")
+    with open_rig(settings) as rig:
+        return prepare(rig)[0]
+
+
+def reconstruct(
+    cube: PathLike,
+    plan: CubePlan | PathLike,
+    calibration: RigModel | PathLike,
+    *,
+    estimator: Estimator = "likelihood",
+    filter: Filter = "none",
+    min_confidence: float = 0.5,
+    out: OutFolder = None,
+    progress: Progress | None = None,
+) -> RunResult:
+    """Depth from a packed `.npy` cube of frames that any program made (`rig reconstruct`).
+
+    cube: uint8 (maps x columns x exposures, height, ceil(width/8)). out: a folder to write, None to write nothing.
+    progress: called with maps done and all. Raises UsageError, a line per problem, for files that do not fit together.
+    An interrupt ends the run after its last whole map, with verdict 'aborted'.
+    """
+    from rig.cube import open_cube
+    from rig.cube_depth import reconstruct_cube
+
+    estimate = _estimate(estimator, filter, min_confidence)
+    cube_plan = plan if isinstance(plan, CubePlan) else load_cube_plan(Path(plan))
+    model = calibration if isinstance(calibration, RigModel) else _load_calibration(calibration)
+    return reconstruct_cube(open_cube(cube, cube_plan, model), model, estimate, out, progress)
+
+
+def effects(config: Config = SIMULATED, *, scene: str | None = None) -> "tuple[Effect, ...]":
+    """Which effects a simulated scene calls for, why, and what leaving each out would change (`rig effects`)."""
+    from rig.effects import scene_effects
+
+    return scene_effects(configure(config, scene=scene))
+
+
+def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
+    content = config.model_dump(mode="json")
+    for key, value in options.items():
+        section, name = key.split(".")
+        content[section][name] = value
+    return parse_config(content)
+
+
+def _load_calibration(path: PathLike) -> RigModel:
+    try:
+        return load_rig_model(path)
+    except CalibrationError as error:
+        raise UsageError(str(error)) from error
+
+
+def _estimate(estimator: str, filter: str, min_confidence: float) -> EstimateConfig:
+    problems = []
+    if estimator not in ESTIMATORS:
+        problems.append(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+    if filter not in FILTERS:
+        problems.append(f"filter {filter!r} is unknown; choose one of {', '.join(FILTERS)}")
+    if not 0 <= min_confidence <= 1:
+        problems.append(f"min_confidence is {min_confidence:g}; it is a probability from 0 to 1")
+    if problems:
+        raise UsageError.of(problems)
+    content = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
+    return EstimateConfig.model_validate(content)

@@ -1,13 +1,14 @@
 """The command line: `rig scan`, `rig reconstruct`, `rig effects`, `rig config`.
 
-Each command is one call of `rig.api` and some printing. Results go to stdout, everything else to stderr. Exit codes: 0 done,
-1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted. Nothing heavy is imported before a command runs.
+Each command is one call of `rig.api` and some printing. Results go to stdout, everything else to stderr. Exit codes:
+0 done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted. Nothing heavy is imported before a
+command runs.
 """
 
 import functools
 import logging
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -17,6 +18,7 @@ import typer
 
 if TYPE_CHECKING:
     from rig.run import Progress, RunResult
+    from rig.scan_plan import ScanPlan
 
 EXIT_USAGE = 2
 EXIT_DEVICE = 3
@@ -27,19 +29,27 @@ P = ParamSpec("P")
 app = typer.Typer(
     name="rig",
     help="Runs a single-photon structured-light scanner and returns depth through fog, rain and snow.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+config_app = typer.Typer(name="config", help="Check, show or describe a config.", rich_markup_mode=None)
+app.add_typer(config_app)
 
-EstimatorOption = Annotated[
-    str | None, typer.Option("--estimator", help="argmax, edge or likelihood", show_default="likelihood")
+ConfigArgument = Annotated[
+    str, typer.Argument(metavar="[CONFIG]", help="a bundled rig's name or a YAML file", show_default=True)
 ]
-FilterOption = Annotated[str | None, typer.Option("--filter", help="none or median (5 x 5)", show_default="none")]
+SceneOption = Annotated[
+    str | None,
+    typer.Option("--scene", help="a bundled scene, a scene file or a folder (simulated rigs)", show_default=False),
+]
+EstimatorOption = Annotated[
+    str | None, typer.Option("--estimator", help="argmax, edge or likelihood", show_default=False)
+]
+FilterOption = Annotated[str | None, typer.Option("--filter", help="none or median (5 x 5)", show_default=False)]
 ConfidenceOption = Annotated[
     float | None,
-    typer.Option("--min-confidence", help="answers below this do not enter the depth map", show_default="0.5"),
+    typer.Option("--min-confidence", help="answers below this do not enter the depth map", show_default=False),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout")]
 
@@ -75,8 +85,10 @@ def _command(function: Callable[P, int | None]) -> Callable[P, None]:
             code = _code_of(error)
             if code is None:
                 raise
-            for line in [*str(error).splitlines(), *getattr(error, "__notes__", [])]:
+            for line in str(error).splitlines():
                 _say(f"error: {line}")
+            for note in getattr(error, "__notes__", []):
+                _say(note)
         raise typer.Exit(code or 0)
 
     return wrapped
@@ -96,6 +108,7 @@ def _code_of(error: Exception) -> int | None:
 
 @app.callback(invoke_without_command=True)
 def _root(
+    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="print the version and exit", is_eager=True)] = False,
 ) -> None:
     if version:
@@ -103,6 +116,56 @@ def _root(
 
         print(f"spadrig {installed('spadrig')}")
         raise typer.Exit(0)
+    if context.invoked_subcommand is None:
+        _say(context.get_help())
+        raise typer.Exit(EXIT_USAGE)
+
+
+@app.command("scan")
+@_command
+def scan_command(
+    config: ConfigArgument = "simulated",
+    scene: SceneOption = None,
+    maps: Annotated[int, typer.Option("--maps", help="depth maps to take")] = 1,
+    exposures: Annotated[
+        int | None, typer.Option("--exposures", help="frames per column (K)", show_default=False)
+    ] = None,
+    estimator: EstimatorOption = None,
+    filter: FilterOption = None,
+    min_confidence: ConfidenceOption = None,
+    seed: Annotated[int, typer.Option("--seed", help="of everything simulated")] = 0,
+    save: Annotated[str, typer.Option("--save", help="maps to write: all, last or every N")] = "all",
+    out: Annotated[
+        Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="runs/DATE-TIME")
+    ] = None,
+    arm: Annotated[bool, typer.Option("--arm", help="let a real laser shine: the beam path is clear")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="compile and print the plan; nothing moves")] = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Acquire and reconstruct depth maps."""
+    from rig import api
+
+    options: dict[str, Any] = {
+        "scene": scene,
+        "exposures": exposures,
+        "estimator": estimator,
+        "filter": filter,
+        "min_confidence": min_confidence,
+    }
+    if dry_run:
+        return _show_plan(api.plan_scan(config, **options), as_json)
+    with _progress("frames") as progress:
+        result = api.scan(
+            config,
+            maps=maps,
+            seed=seed,
+            save=save,
+            arm=arm,
+            out=_default_out() if out is None else out,
+            progress=progress,
+            **options,
+        )
+    return _report(result, as_json)
 
 
 @app.command("reconstruct")
@@ -112,44 +175,106 @@ def reconstruct_command(
     plan: Annotated[Path, typer.Option("--plan", help="plan.yaml of the cube", show_default=False)],
     calibration: Annotated[Path, typer.Option("--calibration", help="calibration.yaml", show_default=False)],
     out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
-    estimator: EstimatorOption = None,
-    filter: FilterOption = None,
-    min_confidence: ConfidenceOption = None,
+    estimator: Annotated[str, typer.Option("--estimator", help="argmax, edge or likelihood")] = "likelihood",
+    filter: Annotated[str, typer.Option("--filter", help="none or median (5 x 5)")] = "none",
+    min_confidence: Annotated[
+        float, typer.Option("--min-confidence", help="answers below this do not enter the depth map")
+    ] = 0.5,
     as_json: JsonOption = False,
 ) -> int:
     """Depth from a packed .npy cube of frames."""
-    from rig.api import reconstruct
+    from rig import api
 
-    with _progress("map") as progress:
-        result = reconstruct(
-            cube,
-            plan,
-            calibration,
-            estimator=_choice("estimator", estimator, "likelihood"),
-            filter=_choice("filter", filter, "none"),
-            min_confidence=0.5 if min_confidence is None else min_confidence,
-            out=out,
-            progress=progress,
-        )
+    # Names that are none are refused by the call, which knows which there are.
+    options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
+    with _progress("maps") as progress:
+        result = api.reconstruct(cube, plan, calibration, out=out, progress=progress, **options)
     return _report(result, as_json)
 
 
-def _choice(name: str, value: str | None, default: str) -> Any:
-    """An option's value; the call it goes to says which there are."""
-    return default if value is None else value
+@app.command("effects")
+@_command
+def effects_command(
+    config: ConfigArgument = "simulated", scene: SceneOption = None, as_json: JsonOption = False
+) -> int:
+    """Which physical effects a scene calls for, why, and what leaving each out would change."""
+    from rig import api
+
+    effects = api.effects(config, scene=scene)
+    if as_json:
+        _print_json({"effects": [effect.as_json() for effect in effects]})
+    else:
+        from rig.report_text import effects_table
+
+        effects_table(effects)
+    return 0
+
+
+@config_app.command("check")
+@_command
+def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
+    """Say whether a config is valid; all problems at once."""
+    from rig.api import configure
+
+    checked = configure(config)
+    if as_json:
+        _print_json({"config": config, "name": checked.name, "valid": True})
+    else:
+        print(f"{config}: valid, rig '{checked.name}'")
+    return 0
+
+
+@config_app.command("show")
+@_command
+def show_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
+    """Print a config with every default filled in."""
+    from rig.api import configure
+
+    content = configure(config).model_dump(mode="json")
+    if as_json:
+        _print_json(content)
+    else:
+        import yaml
+
+        print(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), end="")
+    return 0
+
+
+@config_app.command("schema")
+@_command
+def schema_command() -> int:
+    """Print the JSON schema of a config, for editors."""
+    from rig.config_files import config_schema
+
+    _print_json(config_schema())
+    return 0
+
+
+def _show_plan(plan: "ScanPlan", as_json: bool) -> int:
+    if as_json:
+        from rig.scanning import plan_content
+
+        _print_json({"plan": plan_content(plan)})
+    else:
+        print(plan.describe())
+    return 0
 
 
 def _report(result: "RunResult", as_json: bool) -> int:
     """Print a run's summary, for programs or people; its exit code."""
     if as_json:
-        from rig.outputs import json_text
-
-        print(json_text(result.summary.as_json()))
+        _print_json(result.summary.as_json())
     else:
         from rig.report_text import run_table
 
         run_table(result)
     return result.summary.verdict.exit_code
+
+
+def _print_json(content: Mapping[str, Any]) -> None:
+    from rig.outputs import json_text
+
+    print(json_text(content))
 
 
 @contextmanager

@@ -54,9 +54,7 @@ DepthRange = Annotated[
     Field(description="nearest and farthest depth to look for", examples=["[1 m, 8 m]"]),
 ]
 Columns = Annotated[int, Field(ge=1, le=65535, description="laser line positions of a sweep", examples=[500])]
-Exposures = Annotated[
-    int, Field(ge=1, le=65535, description="frames nominally taken per column (K)", examples=[10])
-]
+Exposures = Annotated[int, Field(ge=1, le=65535, description="frames nominally taken per column (K)", examples=[10])]
 FrameRate = Annotated[ExactHertz, Field(gt=0, description="SPAD frames per second", examples=["100 kHz"])]
 Command = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
 
@@ -97,8 +95,8 @@ class ScanConfig(Section):
     def _exposure_fits(self) -> Self:
         if self.exposure is not None and self.exposure > float(1 / self.frame_rate) * (1 + 1e-9):
             raise ValueError(
-                f"exposure is {self.exposure * 1e6:g} us, longer than the {float(1e6 / self.frame_rate):g} us of a frame "
-                f"at {float(self.frame_rate):g} Hz; shorten exposure or lower frame_rate"
+                f"exposure is {self.exposure * 1e6:g} us, longer than the {float(1e6 / self.frame_rate):g} us of a "
+                f"frame at {float(self.frame_rate):g} Hz; shorten exposure or lower frame_rate"
             )
         return self
 

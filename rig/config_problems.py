@@ -55,7 +55,7 @@ class Sources:
     def place(self, key: Key) -> str:
         """What a message begins with: the option, or the file with the line."""
         if any(key[: len(option)] == option for option in self.options):
-            return "option"
+            return "option:"
         line = self.line(key)
         return f"{self.file}:" if line is None else f"{self.file}:{line}:"
 

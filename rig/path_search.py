@@ -1,4 +1,4 @@
-"""Finds the quickest mirror path that a scanner can follow for a scan, or says what stands against it and what helps."""
+"""Finds the quickest mirror path that a scanner can follow for a scan, or says what stands against it and helps."""
 
 import math
 from collections.abc import Callable
@@ -93,7 +93,7 @@ def find_path(demand: PathDemand, limits: ScannerLimits, point_clock: Callable[[
 def _within_limits(
     demand: PathDemand, limits: ScannerLimits, rate: Fraction, speed_limit: float
 ) -> tuple[SweepPath, list[str]]:
-    """The quickest path at this point clock whose RMS acceleration and reach are allowed; else the last, and why not."""
+    """The quickest path at this point clock whose RMS acceleration and reach are allowed; else one and why not."""
     low, high = limits.command_range
     heat_limit = limits.rms_duty * limits.acceleration_per_s2 * HEADROOM
     acceleration = limits.acceleration_per_s2 * HEADROOM
@@ -127,9 +127,7 @@ def _path(demand: PathDemand, motion: Motion) -> SweepPath:
     )
 
 
-def remedy(
-    demand: PathDemand, exposures: int, limits: ScannerLimits, point_clock: Callable[[float], Fraction]
-) -> str:
+def remedy(demand: PathDemand, exposures: int, limits: ScannerLimits, point_clock: Callable[[float], Fraction]) -> str:
     """What to change so that the scanner can follow: the fewest exposures, or the widest range, that work."""
 
     def works(changed: PathDemand) -> bool:

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.geometry import WORD_PX
+
 SCALE_PX = 74
 """Width of the strip beside a depth picture that holds its scale."""
 _BAR_PX = 14
@@ -45,10 +47,13 @@ def depth_picture(depth_m: NDArray[np.float32], limits: tuple[float, float] | No
 
 def intensity_picture(intensity: NDArray[np.uint32]) -> NDArray[np.uint8]:
     """Summed counts as grey, square-root scaled (shot noise looks alike in dark and bright); (rows, width)."""
-    root = np.sqrt(intensity.astype(np.float64))
-    # Hot pixels and glints beyond the brightest 0.5 % must not darken the rest.
-    top = max(float(np.percentile(root, 99.5)), 1.0)
-    return np.clip(root * (255.0 / top) + 0.5, 0, 255).astype(np.uint8)
+    level = _without_window_steps(intensity)
+    # Hot pixels and glints beyond the brightest 0.5 % must not darken the rest, nor haze everywhere wash it out.
+    low, high = np.percentile(level, [1, 99.5])
+    root = np.sqrt(np.clip(level - low, 0, None))
+    top = max(float(np.sqrt(high - low)), 1.0)
+    grey: NDArray[np.uint8] = np.clip(root * (255.0 / top) + 0.5, 0, 255).astype(np.uint8)
+    return grey
 
 
 def png_bytes(picture: NDArray[np.uint8]) -> bytes:
@@ -59,6 +64,19 @@ def png_bytes(picture: NDArray[np.uint8]) -> bytes:
     if not done:
         raise ValueError(f"a picture of shape {picture.shape} cannot be written as PNG")
     return bytes(data)
+
+
+def _without_window_steps(intensity: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Counts without the steps where windows begin and end.
+
+    A pixel's sum holds haze and ambient of as many columns as have it in their window, and windows are whole words.
+    """
+    level = intensity.astype(np.float64)
+    reach = 3
+    for edge in range(WORD_PX, level.shape[1] - reach, WORD_PX):
+        before, after = level[:, edge - reach : edge].mean(axis=1), level[:, edge : edge + reach].mean(axis=1)
+        level[:, edge:] -= np.median(after - before)
+    return level
 
 
 def _colours(depth_m: NDArray[np.floating], limits: tuple[float, float]) -> NDArray[np.uint8]:

@@ -96,7 +96,9 @@ def compile_plan(
     problems = [*_spad_problems(scan, info), *_model_problems(scan, model, info, demand.speed_per_s)]
     found = find_path(demand, limits, point_clock)
     advice = remedy(demand, scan.exposures, limits, point_clock) if found.problems else ""
-    problems += [f"{problem}; {advice}" for problem in found.problems]
+    first, last = scan.command_range
+    asked = f"scan of {scan.columns} columns x {scan.exposures} exposures over command_range [{first:g}, {last:g}]"
+    problems += [f"{asked}: {problem}; {advice}" for problem in found.problems]
     if problems or found.path is None:
         raise PlanError(*problems)
     path, rate = found.path, found.rate_hz
@@ -107,7 +109,6 @@ def compile_plan(
         check_waveform(waveform, limits, rate, seamless=True)
     except LimitExceeded as error:
         raise PlanError(f"scan: {error}") from error
-    first, last = scan.command_range
     centres: NDArray[np.float64] = np.arange(scan.columns, dtype=np.float64) + 0.5
     commands = first + centres * ((last - first) / scan.columns)
     x0, window = _windows(model, commands, scan, info)
@@ -173,8 +174,9 @@ def _spad_problems(scan: ScanConfig, info: SpadInfo) -> list[str]:
         need = _stream_bytes_per_s(scan.frame_rate, info)
         have = info.stream.bytes_per_s if info.stream is not None else 0.0
         problems.append(
-            f"scan.frame_rate {rate / 1e3:g} kHz makes {need / 1e6:.0f} MB/s of full frames, the link of the {info.model} "
-            f"SPAD carries {have / 1e6:.0f} MB/s; lower frame_rate to {math.floor(rate * have / need) / 1e3:g} kHz"
+            f"scan.frame_rate {rate / 1e3:g} kHz makes {need / 1e6:.0f} MB/s of full frames, the link of the "
+            f"{info.model} SPAD carries {have / 1e6:.0f} MB/s; "
+            f"lower frame_rate to {math.floor(rate * have / need) / 1e3:g} kHz"
         )
     return problems
 

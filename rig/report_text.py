@@ -1,10 +1,17 @@
-"""A run's summary for people: where the pictures lie, how good it is, and the verdict."""
+"""Results for people: a run's pictures, errors and verdict; the effects of a scene."""
+
+import sys
+from collections.abc import Sequence
 
 from rich.console import Console
 from rich.table import Table
 
+from rig.effects import Effect
 from rig.run import RunResult
 from rig.summary import Summary, Verdict
+
+WIDE = 300
+"""Characters; wider than any line here."""
 
 _NEXT_STEP = {
     Verdict.GAPS: "frames were lost; lower frame_rate or free the computer, then scan again",
@@ -23,12 +30,41 @@ def run_table(result: RunResult) -> None:
     for name, text in _rows(summary):
         table.add_row(name, text)
     if result.folder is not None:
-        table.add_row("pictures", f"{result.folder / 'depth'} and {result.folder / 'intensity'} (PNG)")
-        table.add_row("points", f"{result.folder / 'cloud'} (PLY)")
+        for name, what in (("depth", "depth"), ("intensity", "counts"), ("cloud", "points")):
+            for file in sorted((result.folder / name).glob("*.p[nl][gy]"))[-1:]:
+                table.add_row(what, str(file))
     verdict = summary.verdict.value
     advice = _NEXT_STEP.get(summary.verdict)
     table.add_row("verdict", f"{verdict}: {advice}" if advice else verdict)
-    Console(highlight=False, soft_wrap=True).print(table)
+    _console().print(table)
+
+
+def effects_table(effects: Sequence[Effect]) -> None:
+    """Print which effects are on, what they contribute and why, to stdout."""
+    table = Table(box=None, pad_edge=False)
+    for name, justify in (
+        ("effect", "left"),
+        ("", "left"),
+        ("photons", "right"),
+        ("left out changes at most", "right"),
+    ):
+        table.add_column(name, justify="right" if justify == "right" else "left", no_wrap=True)
+    table.add_column("why")
+    for effect in effects:
+        bound = f"{100 * effect.changed_decisions_bound:.2g} % of decisions" if effect.on else "-"
+        table.add_row(
+            effect.effect,
+            "on" if effect.on else "off",
+            f"{effect.share:.1%}" if effect.on else "-",
+            f"{bound}, negligible" if effect.on and effect.negligible else bound,
+            effect.why,
+        )
+    _console().print(table)
+
+
+def _console() -> Console:
+    # Into a file or a pipe nothing is wrapped.
+    return Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
 
 
 def _rows(summary: Summary) -> list[tuple[str, str]]:
@@ -41,7 +77,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
             f"{summary.sensor_time_s:.3g} s of sensor, {summary.compute_time_s:.3g} s of computing "
             f"(real time x {_number(summary.realtime_factor)})",
         ),
-        ("depth", f"{_percent(summary.valid_fraction)} of the pixels"),
+        ("filled", f"{_percent(summary.valid_fraction)} of the pixels have a depth"),
     ]
     fog = summary.fog
     if fog.extinction_per_m is not None:

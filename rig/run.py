@@ -13,10 +13,10 @@ from drivers.interfaces import SweepTruth
 from rig.outputs import Rays, RunFolder
 from rig.reconstruction import MapResult
 from rig.saving import SavePolicy
-from rig.summary import RunFrames, MapTally, Summary, Verdict
+from rig.summary import MapTally, RunFrames, Summary, Verdict
 
 Progress = Callable[[int, int], None]
-"""Called with the number of maps done and the number asked for."""
+"""Called now and then with what is done and what there is to do, in frames or maps."""
 OutFolder = str | os.PathLike[str] | None
 
 
@@ -38,29 +38,17 @@ class Run:
     """Takes the maps of a run one by one, writes those to be kept, and closes with manifest and summary.
 
     Leaving the context without `finish` removes everything that was written. out: folder, None to write nothing.
-    rays: the camera's (u, v), None for an uncalibrated rig.
+    rays: the camera's (u, v) of every pixel, to be set before the first map; None for an uncalibrated rig.
     """
 
-    def __init__(
-        self,
-        out: OutFolder,
-        *,
-        tally: MapTally,
-        total: int,
-        rays: Rays | None,
-        save: SavePolicy | None = None,
-        progress: Progress | None = None,
-    ) -> None:
+    def __init__(self, out: OutFolder, tally: MapTally, save: SavePolicy | None = None) -> None:
         """Claim the folder. Raises UsageError where it cannot be written."""
         self.tally = tally
         self._folder = None if out is None else RunFolder(out)
-        self._rays = rays
+        self.rays: Rays | None = None
         self._save = save or SavePolicy()
-        self._total = total
-        self._progress = progress or (lambda done, total: None)
         self._last: tuple[int, MapResult, SweepTruth | None] | None = None
         self._last_written = -1
-        self._progress(0, total)
 
     def __enter__(self) -> Self:
         """The run itself."""
@@ -80,7 +68,6 @@ class Run:
             self._write(index, result, truth)
         self.tally.add(result, compute_s, truth)
         self._last = index, result, truth
-        self._progress(self.tally.maps, self._total)
 
     def finish(
         self, frames: RunFrames, sensor_time_s: float, verdict: Verdict, manifest: Mapping[str, Any]
@@ -102,7 +89,7 @@ class Run:
     def _write(self, index: int, result: MapResult, truth: SweepTruth | None) -> None:
         if self._folder is None:
             return
-        self._folder.write_map(index, result, self._rays)
+        self._folder.write_map(index, result, self.rays)
         if truth is not None:
             self._folder.write_truth(index, truth)
         self._last_written = index

@@ -25,7 +25,7 @@ from rig.scan_plan import ScanPlan
 _log = logging.getLogger(__name__)
 
 HOLD_EXPOSURES = 10
-"""From so many frames per column on, simulated light is held at the column's centre; with fewer, at parts of columns."""
+"""From so many frames per column on, simulated light is held at the column's centre; with fewer, at parts of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class OpenRig:
 
 @runtime_checkable
 class HoldsColumns(Protocol):
-    """A world that can keep its picture constant within each column, so that it is computed once for all its frames."""
+    """A world that can keep its light constant within a column, so that it is computed once for its frames."""
 
     def hold_columns(self, commands: NDArray[np.float64]) -> None:
         """Hold the light at these mirror commands (columns,)."""

@@ -69,7 +69,7 @@ class GateProgram:
         self._cut(at_s, lambda level: 0)
 
     def levels(self, from_s: float, until_s: float) -> tuple[Array, NDArray[np.int64]]:
-        """Changes in (from_s, until_s) with the level at from_s in front: times (n,) and output words (n,)."""
+        """Changes up to until_s, the one that made the level at from_s first: times (n,) and output words (n,)."""
         times = np.array(self._times)
         first = max(int(np.searchsorted(times, from_s, side="right")) - 1, 0)
         last = int(np.searchsorted(times, until_s, side="left"))

@@ -68,8 +68,8 @@ def trace_rows(
                 continue
             s0 = surface[y, x - move]
             s1 = surface[y, x]
-            if abs(s1 - s0) > DEPTH_JUMP * max(s0, s1):
-                x_end[y] = x - 0.5 * move  # the light meets a side that the camera does not see
+            if abs(s1 - s0) > DEPTH_JUMP * max(s0, s1) or max(s0, s1) == 0.0:
+                x_end[y] = x - 0.5 * move  # a side that the camera does not see, or open sky
             else:
                 x_end[y] = x - move + move * before / (before - here)
                 x_stripe[y] = x_end[y]

@@ -4,6 +4,7 @@ Detections per second of a pixel that sees radiance L:  FF PDP T (pi/4)/N^2 pitc
 """
 
 import math
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,19 +35,19 @@ class _Part(BaseModel):
 class Optics(_Part):
     """Lens and filter in front of the sensor."""
 
-    f_number: float = Field(default=2.8, gt=0)
+    f_number: float = Field(default=2.0, gt=0)
     transmission: float = Field(default=0.85, gt=0, le=1)
-    filter_width: Metres = Field(default=10e-9, gt=0)
+    filter_width: Annotated[Metres, Field(gt=0)] = 10e-9
     """Bandwidth of the filter around the laser line; it decides how much ambient light gets in."""
 
 
 class Sensor(_Part):
     """The SPAD array's pixels. Defaults: 512 x 512 class at 520 nm."""
 
-    pitch: Metres = Field(default=16.38e-6, gt=0)
+    pitch: Annotated[Metres, Field(gt=0)] = 16.38e-6
     fill_factor: float = Field(default=0.105, gt=0, le=1)
     detection_probability: float = Field(default=0.5, gt=0, le=1)
-    dark_rate: CountsPerSecond = Field(default=20.0, ge=0)
+    dark_rate: Annotated[CountsPerSecond, Field(ge=0)] = 20.0
     """Median over the pixels; the distribution has a heavy tail of hot ones."""
     pixel_seed: int = Field(default=1, ge=0)
     """Which pixels are hot: a property of the one sensor, the same in every run."""
@@ -55,8 +56,8 @@ class Sensor(_Part):
 class Line(_Part):
     """The laser line as the scene and the camera see it."""
 
-    wavelength: Metres = Field(default=520e-9, gt=0)
-    fan: Radians = Field(default=math.radians(60), gt=0, lt=math.pi)
+    wavelength: Annotated[Metres, Field(gt=0)] = 520e-9
+    fan: Annotated[Radians, Field(gt=0, lt=math.pi)] = math.radians(50)
     """The power is spread evenly over this angle; it is taken to cover the picture."""
     sigma_px: float = Field(default=0.6, gt=0.05, le=20)
     """Gaussian width of the stripe in the picture, pixels: line width and blur of the lens together."""

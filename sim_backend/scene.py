@@ -47,14 +47,14 @@ class _Section(BaseModel):
 class Fog(_Section):
     """Fog by how far one sees in it (2 % contrast)."""
 
-    visibility: Metres = Field(gt=0)
+    visibility: Annotated[Metres, Field(gt=0)]
 
 
 class Medium(_Section):
     """A homogeneous scattering medium. Exactly one of `fog` and `extinction` says how dense it is."""
 
     fog: Fog | None = None
-    extinction: PerMetre | None = Field(default=None, gt=0)
+    extinction: Annotated[PerMetre, Field(gt=0)] | None = None
     backscatter: PerSteradian = 0.05
     """Phase function near 180 degrees. Water droplets about 0.05 /sr (lidar ratio 18 to 20 sr), isotropic 0.0796."""
     scattering_share: float = Field(default=1.0, ge=0, le=1)
@@ -83,7 +83,7 @@ class Medium(_Section):
 class Ambient(_Section):
     """Daylight or lamps on the scene, diffuse."""
 
-    illuminance: Lux = Field(ge=0)
+    illuminance: Annotated[Lux, Field(ge=0)]
 
 
 class SceneFile(_Section):

@@ -1,7 +1,7 @@
 """Reading one SPB1 block over the memory it lies in.
 
-Header and trailer are always checked in full; the payload's CRC on request, since at 6 GB/s it would cost a live path
-above 0.5 GB/s a good part of a core.
+Header and trailer are always checked in full; the payload's CRC on request, since it reads every byte: at full rate
+that would cost a live path a good part of a core.
 """
 
 import zlib

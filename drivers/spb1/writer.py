@@ -35,8 +35,8 @@ def seal_block(
     """Write all but records and pixels, which `block_views` gave out to fill; the block over the same memory.
 
     buffer: uint8 (stride,), contiguous; zeroed behind the trailer. frames_lost: since START. payload_crc: compute
-    the payload's CRC (about 0.16 ms per MiB), else say 'not computed'. Copies nothing. ValueError where the header
-    contradicts the layout or has no packed SPB1 1.0 form.
+    the payload's CRC, which reads every byte; else the trailer says 'not computed'. Copies nothing.
+    ValueError where the header contradicts the layout or has no packed SPB1 1.0 form.
     """
     _check(header, layout)
     records, bits = block_views(buffer, layout)

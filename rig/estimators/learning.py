@@ -5,6 +5,7 @@ stripe; haze, pedestal, row gains, amplitudes and line width are set to what tho
 medium or the light is assumed beyond 'haze falls with the path length', and that only where data are few.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -20,8 +21,9 @@ from rig.geometry import SweepGeometry
 
 LATTICE_LINES = 8192
 """Rows x columns of a sweep that a learning round reads: about 10^6 pixels."""
-FIRST_ROUNDS = 10
-NEXT_ROUNDS = 1
+FIRST_ROUNDS = 8
+LAST_ROUNDS = 3
+PIECES = 4
 PRIOR_PHOTONS = 100.0
 """Weight of the fitted exponential against each bin's own counts."""
 START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
@@ -52,18 +54,30 @@ def expect(
     volume: CountVolume, geometry: SweepGeometry, model: RowModel, lines: tuple[NDArray[np.int32], NDArray[np.int32]]
 ) -> Expectation:
     """Expectation step of `model` over the given (rows, columns)."""
-    levels = np.zeros((BINS, 6))
-    rows_seen = np.zeros((geometry.rows, 2))
-    mass = np.zeros(len(model.amplitude) + 1)
     typical = float(np.median(model.ambient))
-    evidence = learn_rows(
-        volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left, geometry.plane,
-        geometry.u, geometry.v, model.ambient, model.profile, model.w_lo, model.per_w, model.row_gain, model.amplitude,
-        log_weights(model), model.none_weight, 1.0 / geometry.depth_range_m[0], 1.0 / geometry.depth_range_m[1],
-        line_profile(model.line_sigma_px), TABLE, lines[0], lines[1],
-        5.0 * typical + 1e-3, levels, rows_seen, mass,
-    )  # fmt: skip
-    return Expectation(levels, rows_seen, mass, float(evidence))
+    psi = line_profile(model.line_sigma_px)
+    near_m, far_m = geometry.depth_range_m
+
+    def piece(rows: NDArray[np.int32], columns: NDArray[np.int32]) -> Expectation:
+        levels, rows_seen = np.zeros((BINS, 6)), np.zeros((geometry.rows, 2))
+        mass = np.zeros(len(model.amplitude) + 1)
+        evidence = learn_rows(
+            volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left,
+            geometry.plane, geometry.u, geometry.v, model.ambient, model.profile, model.w_lo, model.per_w,
+            model.row_gain, model.amplitude, log_weights(model), model.none_weight, 1.0 / near_m, 1.0 / far_m, psi, TABLE,
+            rows, columns, 5.0 * typical + 1e-3, levels, rows_seen, mass,
+        )  # fmt: skip
+        return Expectation(levels, rows_seen, mass, float(evidence))
+
+    # Fixed pieces, added in order: the sums do not depend on the number of threads.
+    with ThreadPoolExecutor(PIECES) as pool:
+        parts = list(pool.map(piece, np.array_split(lines[0], PIECES), np.array_split(lines[1], PIECES)))
+    return Expectation(
+        sum((p.levels for p in parts), np.zeros((BINS, 6))),
+        sum((p.rows_seen for p in parts), np.zeros((geometry.rows, 2))),
+        sum((p.amplitude_mass for p in parts), np.zeros(len(model.amplitude) + 1)),
+        sum(p.evidence for p in parts),
+    )
 
 
 def log_weights(model: RowModel) -> NDArray[np.float32]:
@@ -85,17 +99,18 @@ def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: NDArray[n
             best = evidence, model
     assert best is not None
     model = best[1]
-    for round_number in range(FIRST_ROUNDS):
-        model = maximise(model, expect(volume, geometry, model, lines), spread=round_number < 4)
+    for _ in range(FIRST_ROUNDS):
+        model = maximise(model, expect(volume, geometry, model, few), spread=True)
         model = fit_line_width(volume, geometry, model, few)
+    for _ in range(LAST_ROUNDS):
+        model = maximise(model, expect(volume, geometry, model, lines), spread=False)
     return model
 
 
 def learn_next(volume: CountVolume, geometry: SweepGeometry, model: RowModel) -> RowModel:
     """The model carried on by one more sweep."""
     lines = lattice(geometry, LATTICE_LINES)
-    for _ in range(NEXT_ROUNDS):
-        model = maximise(model, expect(volume, geometry, model, lines), spread=False)
+    model = maximise(model, expect(volume, geometry, model, lines), spread=False)
     return fit_line_width(volume, geometry, model, lattice(geometry, LATTICE_LINES // 4))
 
 
@@ -204,17 +219,16 @@ def _amplitudes(
     total = float(mass.sum())
     none = float(np.clip(mass[-1] / max(total, 1.0), 0.005, 0.5))
     weight = (mass[:-1] + 1.0) / (mass[:-1].sum() + len(mass) - 1)
-    if not spread:
+    if not spread or mass.sum() < 100.0:
         return model.amplitude, weight, none
-    # Keep the grid on the amplitudes that occur: weighted mean +- 1.8 sd of their logarithm, never narrower than 1.2x.
+    # Keep the grid on the amplitudes that occur: mean +- 1.8 sd of their logarithm, a factor 2.2 to 12 each way.
     log_q = np.log(model.amplitude.astype(np.float64))
     mean = float(np.sum(weight * log_q))
     sd = float(np.sqrt(np.sum(weight * (log_q - mean) ** 2)))
-    step = log_q[1] - log_q[0]
-    half = max(1.8 * max(sd, 0.5 * step), 0.5)
-    amplitude = np.exp(np.linspace(mean - half, mean + half, AMPLITUDES)).astype(np.float32)
-    weight = np.exp(-0.5 * ((np.log(amplitude) - mean) / max(sd, 0.3 * step)) ** 2)
-    return amplitude, weight / weight.sum(), none
+    half = float(np.clip(1.8 * sd, 0.8, 2.5))
+    moved = np.linspace(mean - half, mean + half, AMPLITUDES)
+    density = np.exp(-0.5 * ((moved - mean) / max(sd, 0.4)) ** 2)
+    return np.exp(moved).astype(np.float32), density / density.sum(), none
 
 
 def _row_gain(model: RowModel, seen: Expectation, ambient: float, before: NDArray[np.float64]) -> NDArray[np.float32]:

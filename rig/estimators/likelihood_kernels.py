@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from rig.estimators.row_kernels import load_row, mode_and_mean, none_prior, row_posterior, row_scores
 from rig.geometry import MARGIN_PX
 
+CUT: Final = 0.05
+"""Share of the depth range outside the picture up to which a row tells how often the stripe is missing."""
 CERTAIN: Final = 0.6
 """Probability within 1 px from which a row teaches the haze profile."""
 
@@ -58,7 +60,7 @@ def learn_rows(
     cell = np.empty(window, np.int32)
     gain = np.empty(window, np.float32)
     w = np.empty(window, np.float32)
-    taps = np.empty((2, window), np.float32)
+    taps = np.empty((3, window), np.float32)
     edge = np.empty(window + 1, np.float32)
     score = np.empty((amplitudes, window), np.float32)
     posterior = np.empty(window, np.float32)
@@ -84,7 +86,7 @@ def learn_rows(
         for t in range(length):
             evidence += taps[1, t]
         evidence += row_evidence
-        if prior[0] + prior[1] < none_weight:  # rows cut by the picture's border would be counted as rows without
+        if prior[0] + prior[1] < none_weight + CUT:  # else the picture's border cuts the row off
             for m in range(amplitudes):
                 amplitude_mass[m] += mass[m]
             amplitude_mass[amplitudes] += none
@@ -162,7 +164,7 @@ def estimate_rows(
     cell = np.empty(window, np.int32)
     gain = np.empty(window, np.float32)
     w = np.empty(window, np.float32)
-    taps = np.empty((2, window), np.float32)
+    taps = np.empty((3, window), np.float32)
     edge = np.empty(window + 1, np.float32)
     score = np.empty((amplitudes, window), np.float32)
     posterior = np.empty(window, np.float32)

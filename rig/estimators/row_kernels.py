@@ -18,8 +18,8 @@ FLOOR: Final = 1e-3
 EXPONENT_LOW: Final = -21
 EXPONENT_HIGH: Final = 8
 CELL_BITS: Final = 8
-TABLE_BASE: Final = np.int32((127 + EXPONENT_LOW) << CELL_BITS)
-TABLE_SHIFT: Final = np.int32(23 - CELL_BITS)
+TABLE_BASE: Final = np.uint32((127 + EXPONENT_LOW) << CELL_BITS)
+TABLE_SHIFT: Final = np.uint32(23 - CELL_BITS)
 FLUX_MIN: Final = np.float32(2.0**EXPONENT_LOW)
 FLUX_MAX: Final = np.float32(2.0**EXPONENT_HIGH * 0.999)
 LOST: Final = np.float32(24.0)
@@ -27,7 +27,7 @@ LOST: Final = np.float32(24.0)
 
 
 def logit_table() -> NDArray[np.float32]:
-    """Table (cells, 2) float32 of logit p' and log(1 - p') over flux: 256 cells an octave, value at the cell's middle.
+    """Table (2, cells) float32 of logit p' and log(1 - p') over flux: 256 cells an octave, value at the cell's middle.
 
     The largest error, half a cell, changes a log-likelihood by 0.002 per count: far below its own noise.
     """
@@ -37,14 +37,29 @@ def logit_table() -> NDArray[np.float32]:
     flux = np.ldexp(mantissa, (i >> CELL_BITS) + EXPONENT_LOW)
     q = (1 - FLOOR) * np.exp(-flux) + FLOOR / 2
     p = -(1 - FLOOR) * np.expm1(-flux) + FLOOR / 2
-    return np.stack([np.log(p) - np.log(q), np.log(q)], 1).astype(np.float32)
+    return np.stack([np.log(p) - np.log(q), np.log(q)]).astype(np.float32)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def evidence(n: np.float32, k: np.float32, flux: np.float32, table: NDArray[np.float32]) -> np.float32:
-    """Log-likelihood of n ones in k frames at a flux, which must lie in FLUX_MIN to FLUX_MAX."""
-    i = (np.float32(flux).view(np.int32) >> TABLE_SHIFT) - TABLE_BASE
-    return n * table[i, 0] + k * table[i, 1]
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def add_evidence(
+    n: NDArray[np.float32],
+    k: np.float32,
+    base: NDArray[np.float32],
+    light: np.float32,
+    scale: NDArray[np.float32],
+    own: NDArray[np.float32],
+    table: NDArray[np.float32],
+    score: NDArray[np.float32],
+) -> None:
+    """score += log-likelihood of n ones in k frames at flux base + light * scale, less `own`; all arrays alike long.
+
+    Fluxes must be at least FLUX_MIN. Written for the vectoriser: no branch, unsigned table index, slices from zero.
+    """
+    gain, loss = table[0], table[1]
+    for t in range(score.shape[0]):
+        flux = np.float32(min(base[t] + light * scale[t], FLUX_MAX))
+        i = np.uint64((flux.view(np.uint32) >> TABLE_SHIFT) - TABLE_BASE)
+        score[t] += n[t] * gain[i] + k * loss[i] - own[t]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -132,29 +147,32 @@ def row_scores(
     """Log-likelihood of every position and amplitude against 'everything is behind'.
 
     psi: (T + 1,) share of the stripe at 0..T px from its centre. Writes score (M, length), edge (length + 1,), the score
-    of a change from before to behind at t without any stripe, and taps (2, length), each pixel's own log-likelihood
-    before and behind.
+    of a change from before to behind at t without any stripe, and taps (3, length): each pixel's own log-likelihood
+    before and behind, and the flux between the two.
     """
-    reach = psi.shape[0] - 1
+    n, before, behind, scale = n[:length], before[:length], behind[:length], scale[:length]
+    near, far, middle = taps[0, :length], taps[1, :length], taps[2, :length]
+    for t in range(length):
+        near[t] = far[t] = 0.0
+        middle[t] = np.float32(0.5) * (before[t] + behind[t])
+    dark = np.float32(0.0)
+    add_evidence(n, k, before, dark, scale, near, table, near)
+    add_evidence(n, k, behind, dark, scale, far, table, far)
     edge[0] = 0.0
     total = 0.0
     for t in range(length):
-        taps[0, t] = evidence(n[t], k, before[t], table)
-        taps[1, t] = evidence(n[t], k, behind[t], table)
-        total += taps[0, t] - taps[1, t]
+        total += near[t] - far[t]
         edge[t + 1] = total
     for m in range(amplitude.shape[0]):
+        row = score[m, :length]
         for t in range(length):
-            base = np.float32(0.5) * (before[t] + behind[t])
-            flux = min(base + amplitude[m] * scale[t] * psi[0], FLUX_MAX)
-            score[m, t] = edge[t] + evidence(n[t], k, flux, table) - taps[1, t]
-        for d in range(1, reach + 1):
-            q = amplitude[m] * psi[d]
-            # The same pixel serves as tap of the stripe d px behind it, then of the one d px nearer.
-            for t in range(length - d):
-                score[m, t + d] += evidence(n[t], k, min(before[t] + q * scale[t], FLUX_MAX), table) - taps[0, t]
-            for t in range(d, length):
-                score[m, t - d] += evidence(n[t], k, min(behind[t] + q * scale[t], FLUX_MAX), table) - taps[1, t]
+            row[t] = edge[t]
+        add_evidence(n, k, middle, amplitude[m] * psi[0], scale, far, table, row)
+        for d in range(1, psi.shape[0]):
+            # The same pixel serves as tap of the stripe d px behind it, and of the one d px nearer.
+            light, m_px = amplitude[m] * psi[d], length - d
+            add_evidence(n[:m_px], k, before[:m_px], light, scale[:m_px], near[:m_px], table, row[d:])
+            add_evidence(n[d:], k, behind[d:], light, scale[d:], far[d:], table, row[:m_px])
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,6 +1,6 @@
 """The simulated line laser: no key, no warm-up, emission follows arm and pause at once."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -15,7 +15,7 @@ class SimulatedLaserConfig(KindConfig):
     """Config of the simulated laser."""
 
     kind: Literal["simulated"] = "simulated"
-    max_power: Watts = Field(default=0.1, gt=0)
+    max_power: Annotated[Watts, Field(gt=0)] = 0.1
 
 
 class SimulatedLaser(LineLaser):

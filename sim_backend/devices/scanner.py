@@ -2,7 +2,7 @@
 
 import math
 from fractions import Fraction
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -31,9 +31,9 @@ class SimulatedScannerConfig(KindConfig):
     """Config of the simulated scanner."""
 
     kind: Literal["simulated"] = "simulated"
-    clock_error: Ppm = Field(default=20e-6, ge=-1e-3, le=1e-3)
+    clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 20e-6
     """Relative error of the scanner's crystal against the SPAD's."""
-    start_latency: Seconds = Field(default=1.3373e-3, ge=0)
+    start_latency: Annotated[Seconds, Field(ge=0)] = 1.3373e-3
     """From `start` to the first point; no whole number of frames."""
 
 

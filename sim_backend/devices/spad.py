@@ -5,7 +5,7 @@ exposed. Its tick counter is the rig's time base: the clock's own rate, without 
 
 import os
 from fractions import Fraction
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ class SimulatedSpadConfig(KindConfig):
     """Config of the simulated SPAD array. Its size is that of the world's camera."""
 
     kind: Literal["simulated"] = "simulated"
-    max_frame_rate: ExactHertz = Field(default=Fraction(100_000), gt=0)
+    max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000)
     lost_frames: tuple[int, ...] = ()
     """Numbers of frames that get lost on the way, to try gaps with."""
     loss_probability: float = Field(default=0.0, ge=0, le=1)

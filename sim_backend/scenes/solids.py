@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Face = tuple[float, float, float, float]
+"""(nx, ny, nz, d): the half space n.X <= d."""
 
 
-def convex(u: Array, v: Array, faces: Sequence[tuple[float, float, float, float]]) -> Array:
-    """Depth of the solid {X: n.X <= d for all faces (nx, ny, nz, d)}."""
+def convex(u: Array, v: Array, faces: Sequence[Face]) -> Array:
+    """Depth of the solid {X: n.X <= d for all faces}."""
     enter, leave = np.full_like(u, 1e-6), np.full_like(u, np.inf)
     for nx, ny, nz, d in faces:
         along = nx * u + ny * v + nz
@@ -37,21 +39,6 @@ def post(u: Array, v: Array, x: float, z: float, radius: float, y: tuple[float, 
     with np.errstate(invalid="ignore"):
         t = (b - np.sqrt(root)) / a
     return np.where((root > 0) & (t * v >= y[0]) & (t * v <= y[1]), t, np.inf)
-
-
-def axle(u: Array, v: Array, y: float, z: float, radius: float, x: tuple[float, float]) -> Array:
-    """Depth of a wheel: a cylinder lying along x, mantle and both end discs."""
-    a, b, c = v * v + 1, y * v + z, y * y + z * z - radius * radius
-    root = b * b - a * c
-    with np.errstate(invalid="ignore"):
-        t = (b - np.sqrt(root)) / a
-    best = np.where((root > 0) & (t * u >= x[0]) & (t * u <= x[1]), t, np.inf)
-    for side in x:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = side / u
-            inside = (t > 0) & ((t * v - y) ** 2 + (t - z) ** 2 <= radius * radius)
-        best = np.where(inside, np.minimum(best, t), best)
-    return best
 
 
 def ellipsoid(u: Array, v: Array, centre: tuple[float, float, float], half: tuple[float, float, float]) -> Array:

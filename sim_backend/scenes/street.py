@@ -4,12 +4,12 @@ Made by formula for whatever camera looks at it, depth about 1.5 to 8 m. The cam
 Frame: x right, y down, z forward, metres.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.scenes.solids import axle, box, convex, ellipsoid, post
+from sim_backend.scenes.solids import Face, box, convex, ellipsoid, post
 from sim_backend.scenes.surfaces import Surfaces, checked
 from sim_backend.scenes.texture import layered_noise
 
@@ -20,7 +20,8 @@ Body = tuple[Array, Texture]
 ROAD_Y = 1.3
 PAVEMENT_Y = 1.18
 KERB_X = -1.15
-HOUSE_X = -1.9
+HOUSE_X, HOUSE_TURN = -2.75, 0.2
+"""The house front is x = HOUSE_X + HOUSE_TURN z: the street narrows."""
 END_Z = 7.6
 
 
@@ -47,33 +48,42 @@ def _ground(u: Array, v: Array) -> list[Body]:
 
 
 def _walls(u: Array, v: Array) -> list[Body]:
-    house = convex(u, v, [(1, 0, 0, HOUSE_X), (0, 0, 1, END_Z + 1)])
+    house = convex(u, v, [(1, 0, -HOUSE_TURN, HOUSE_X), (0, 0, 1, END_Z + 1)])
     end = END_Z / (1 - 0.06 * u)  # not quite square to the road
     gate = box(u, v, (-0.95, -0.15), (-0.75, ROAD_Y), (END_Z - 0.45, END_Z + 1))
     return [(house, _brick), (end, _plaster), (gate, _planks)]
 
 
 def _car(u: Array, v: Array) -> list[Body]:
-    x0, x1, z0, z1 = 0.75, 2.3, 4.1, 7.0
-    hull = convex(
-        u,
-        v,
-        [
-            (-1, 0, 0, -x0), (1, 0, 0, x1), (0, 1, 0, 1.12), (0, 0, 1, z1),
-            (0, -1, 0, -0.45), (0, -0.25, -1, -z0 - 0.25 * 0.6), (0, 0.5, -1, -z0 + 0.5 * 0.85),
-        ],
-    )  # fmt: skip
-    cabin = convex(
-        u,
-        v,
-        [
-            (-1, -0.30, 0, -x0 - 0.30 * 0.45), (1, -0.3, 0, x1 - 0.3 * 0.45), (0, 1, 0, 0.5), (0, -1, 0, 0.12),
-            (0, -0.55, -1, -z0 - 0.45 - 0.55 * 0.45), (0, 0, 1, z1 - 0.2),
-        ],
-    )  # fmt: skip
-    wheels = [axle(u, v, 1.0, z, 0.3, (x0 - 0.01, x0 + 0.2)) for z in (z0 + 0.6, z1 - 0.6)]
-    wheels.append(axle(u, v, 1.0, z0 + 0.6, 0.3, (x1 - 0.2, x1)))
-    return [(hull, _paint), (cabin, _glass), *((wheel, _flat(0.12)) for wheel in wheels)]
+    """A car parked askew. Its own frame: x across, z from front (negative) to back, origin on the camera's height."""
+    side, front, back = 0.75, -1.45, 1.45
+    hull = [
+        (-1, 0, 0, side), (1, 0, 0, side), (0, 1, 0, 1.1), (0, 0, 1, back),
+        (0, -1, 0, -0.45), (0, -0.25, -1, -front - 0.25 * 0.6),
+    ]  # fmt: skip
+    cabin = [
+        (-1, -0.3, 0, side - 0.3 * 0.45), (1, -0.3, 0, side - 0.3 * 0.45), (0, 1, 0, 0.5), (0, -1, 0, 0.08),
+        (0, -0.6, -1, -front - 0.5 - 0.6 * 0.45), (0, -0.3, 1, back - 0.1 - 0.3 * 0.45),
+    ]  # fmt: skip
+    wheels = [_wheel(x, z) for x in (-side + 0.09, side - 0.09) for z in (front + 0.5, back - 0.5)]
+    bodies: list[Body] = [(convex(u, v, _parked(hull)), _paint), (convex(u, v, _parked(cabin)), _glass)]
+    bodies += [(convex(u, v, _parked(wheel)), _flat(0.2)) for wheel in wheels]
+    return bodies
+
+
+def _wheel(x: float, z: float) -> list[Face]:
+    radius, half = 0.3, 0.11
+    rim = [(0.0, np.sin(a), np.cos(a)) for a in np.arange(20) * (np.pi / 10)]
+    faces: list[Face] = [(nx, ny, nz, radius + ny * (ROAD_Y - radius) + nz * z) for nx, ny, nz in rim]
+    return [*faces, (1, 0, 0, x + half), (-1, 0, 0, half - x)]
+
+
+def _parked(faces: Sequence[Face]) -> list[Face]:
+    """Faces turned and moved from the car's frame to where it is parked."""
+    angle, x, z = 0.6, 1.6, 5.7
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = [(nx * cos - nz * sin, ny, nx * sin + nz * cos, d) for nx, ny, nz, d in faces]
+    return [(nx, ny, nz, d + nx * x + nz * z) for nx, ny, nz, d in turned]
 
 
 def _people(u: Array, v: Array) -> list[Body]:
@@ -86,11 +96,11 @@ def _person(u: Array, v: Array, x: float, z: float, lean: float, jacket: float, 
     bodies: list[Body] = [
         (ellipsoid(u, v, (x + lean, top + 0.13, z), (0.095, 0.13, 0.11)), _flat(0.5)),
         (ellipsoid(u, v, (x + lean / 2, top + 0.58, z), (0.2, 0.36, 0.15)), _cloth(jacket, seed)),
-        (ellipsoid(u, v, (x, top + 0.92, z), (0.19, 0.17, 0.14)), _cloth(0.25, seed + 10)),
+        (ellipsoid(u, v, (x, top + 0.92, z), (0.19, 0.17, 0.14)), _cloth(0.3, seed + 10)),
     ]
     for side, stride in ((-1, 0.14), (1, -0.12)):
         bodies.append(
-            (ellipsoid(u, v, (x + side * 0.1, ROAD_Y - 0.42, z + stride), (0.085, 0.45, 0.1)), _cloth(0.25, seed + 10))
+            (ellipsoid(u, v, (x + side * 0.1, ROAD_Y - 0.42, z + stride), (0.085, 0.45, 0.1)), _cloth(0.3, seed + 10))
         )
         bodies.append(
             (ellipsoid(u, v, (x + side * 0.225, top + 0.62, z - stride), (0.055, 0.32, 0.07)), _cloth(jacket, seed))
@@ -114,7 +124,7 @@ def _cloth(value: float, seed: int) -> Texture:
 
 
 def _asphalt(x: Array, y: Array, z: Array) -> Array:
-    grain = 0.16 + 0.14 * layered_noise(x, z, 0.25, 3)
+    grain = 0.28 + 0.16 * layered_noise(x, z, 0.25, 3)
     line = (np.abs(x - 0.1) < 0.06) & ((z % 2.4) < 1.5)
     return np.where(line, 0.75, grain)
 
@@ -127,9 +137,9 @@ def _slabs(x: Array, y: Array, z: Array) -> Array:
 def _brick(x: Array, y: Array, z: Array) -> Array:
     course = np.floor(y / 0.12)
     joint = ((y % 0.12) < 0.015) | (((z + 0.14 * (course % 2)) % 0.28) < 0.015)
-    brick = 0.26 + 0.22 * layered_noise(z, y, 0.3, 7)
+    brick = 0.34 + 0.22 * layered_noise(z, y, 0.3, 7)
     window = (np.abs((z % 1.6) - 0.8) < 0.35) & (y < 0.45) & (y > -0.75)
-    return np.where(window, 0.16, np.where(joint, 0.55, brick))
+    return np.where(window, 0.24, np.where(joint, 0.55, brick))
 
 
 def _plaster(x: Array, y: Array, z: Array) -> Array:
@@ -147,7 +157,7 @@ def _paint(x: Array, y: Array, z: Array) -> Array:
 
 
 def _glass(x: Array, y: Array, z: Array) -> Array:
-    return np.where((y > 0.02) & (y < 0.4), 0.14, 0.55)
+    return np.where((y > 0.02) & (y < 0.4), 0.22, 0.55)
 
 
 def _banded(x: Array, y: Array, z: Array) -> Array:

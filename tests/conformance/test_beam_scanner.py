@@ -167,18 +167,26 @@ def test_stop_ends_the_movement_and_the_waveform_can_be_started_again(scanner: S
     assert scanner.turning()
 
 
-def test_park_stops_and_is_possible_in_any_state(scanner: ScannerCase) -> None:
-    device = scanner.device
-    device.park()
-    device.load(gentle(scanner), 10_000)
-    device.park()
-    device.start()
-    device.park()
-    assert not device.status.moving
-    assert not scanner.turning()
+def test_park_stops_at_one_place_and_is_possible_in_any_state(scanner: ScannerCase) -> None:
+    device, wave = scanner.device, gentle(scanner)
     low, high = device.limits.command_range
-    position = device.status.position
-    assert position is None or low <= position <= high
+
+    def parked() -> float | None:
+        device.park()
+        scanner.clock.sleep(0.1)
+        assert not device.status.moving
+        assert not scanner.turning()
+        return device.status.position
+
+    places = [parked()]
+    device.load(wave, 10_000)
+    places.append(parked())
+    device.start()
+    scanner.clock.sleep(2.3 * POINTS / float(wave.point_rate_hz))
+    places.append(parked())
+    if places[0] is not None:
+        assert places == pytest.approx([places[0]] * 3, abs=1e-3 * (high - low))
+        assert low <= places[0] <= high
 
 
 def test_close_is_final_stops_the_mirror_and_may_be_called_twice(scanner: ScannerCase) -> None:

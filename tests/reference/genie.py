@@ -106,7 +106,7 @@ def log_expm1(flux, table):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def estimate_columns(
+def estimate_columns(  # type: ignore[no-untyped-def]
     counts,
     exposures,
     rows,
@@ -128,7 +128,7 @@ def estimate_columns(
     first,
     end,
     x_est,
-):  # type: ignore[no-untyped-def]
+):
     """Fill x_est (H, columns) for columns first..end on the given rows."""
     width = u.shape[1]
     labels, taps = shares.shape

@@ -133,9 +133,9 @@ def flux_columns(u, v, planes, scanner, extinction, haze, ambient, sigma_px, x_t
 
 
 @numba.njit(cache=True, nogil=True)
-def draw_counts(
+def draw_counts(  # type: ignore[no-untyped-def]
     u, v, planes, scanner, extinction, haze, ambient, sigma_px, x_true, x_end, stripe, exposures, seed, c0, c1, out
-):  # type: ignore[no-untyped-def]
+):
     """Binomial counts of columns c0..c1 into out (columns, H, W): inversion, one uniform number a pixel and part."""
     width = u.shape[1]
     row = np.empty(width, np.float64)

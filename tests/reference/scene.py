@@ -38,11 +38,8 @@ class Scene:
         if min(top, left) < 0:
             raise ValueError(f"crop {height} x {width} is larger than the scene {self.shape}")
         part = np.s_[top : top + height, left : left + width]
-        return Scene(
-            self.name,
-            *(np.ascontiguousarray(a[part]) for a in (self.depth_m, self.albedo)),
-            np.ascontiguousarray(self.trusted[part]),
-        )
+        depth_m, albedo = np.ascontiguousarray(self.depth_m[part]), np.ascontiguousarray(self.albedo[part])
+        return Scene(self.name, depth_m, albedo, np.ascontiguousarray(self.trusted[part]))
 
 
 def scene_names() -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -94,16 +95,17 @@ class WorkingPoint:
 
     def flux_of_column(self, column: int) -> NDArray[np.float32]:
         """Expected detected photons per exposure (H, W) while the line stands at `column`."""
-        out = np.empty((1, self.geometry.height, self.geometry.width), np.float32)
-        kernels.flux_columns(*self._kernel_arguments(), column, column + 1, out)
-        return out[0]
+        out: NDArray[np.float32] = np.empty((self.geometry.height, self.geometry.width), np.float32)
+        kernels.flux_columns(*self._kernel_arguments(), column, column + 1, out[None])  # type: ignore[call-arg]
+        return out
 
     def counts(self, exposures: int, seed: int = 0) -> NDArray[np.unsignedinteger]:
         """Counts (columns, H, W), uint8 (uint16 above 255 exposures); the same for any number of threads."""
         g = self.geometry
         out = np.empty((g.columns, g.height, g.width), np.uint8 if exposures <= 255 else np.uint16)
         _over_columns(
-            g.columns, lambda a, b: kernels.draw_counts(*self._kernel_arguments(), exposures, seed, a, b, out)
+            g.columns,
+            lambda a, b: kernels.draw_counts(*self._kernel_arguments(), exposures, seed, a, b, out),  # type: ignore[call-arg]
         )
         return out
 
@@ -151,7 +153,7 @@ class WorkingPoint:
         cube.flush()
         return path
 
-    def _kernel_arguments(self) -> tuple[object, ...]:
+    def _kernel_arguments(self) -> tuple[Any, ...]:
         g, light = self.geometry, self.light
         return (
             g.u, g.v, g.planes, g.scanner_m, light.extinction_per_m, self.haze_scale, light.ambient, light.sigma_px,

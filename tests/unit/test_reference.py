@@ -261,7 +261,7 @@ def test_genie_is_the_brute_force_posterior_mode(side: str) -> None:
             amplitude = p.stripe_scale * inverse[j] ** 2 * math.exp(-light.extinction_per_m * path)
             gap = (x - j) * before
             haze = free * np.where(gap < 0, 1.0, np.where(gap == 0, 0.5, 0.0))
-            share = np.array([_gaussian_share(i - j, light.sigma_px) if abs(i - j) <= 4 else 0.0 for i in x])
+            share = np.array([_gaussian_share(float(i - j), light.sigma_px) if abs(i - j) <= 4 else 0.0 for i in x])
             logs = []
             for albedo in albedos:
                 flux = light.ambient + haze + albedo * amplitude * share

@@ -1,6 +1,7 @@
 """What the interfaces do for every driver, with drivers that misbehave as no simulated one does."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 
@@ -106,6 +107,7 @@ class StuckSync(SyncSource):
 
     def __init__(self) -> None:
         super().__init__("box")
+        self.aborts = 0
 
     @property
     def resolution_s(self) -> float:
@@ -117,7 +119,8 @@ class StuckSync(SyncSource):
 
     def _do_gate_low(self) -> None: ...
 
-    def _do_abort(self) -> None: ...
+    def _do_abort(self) -> None:
+        self.aborts += 1
 
     def _do_close(self) -> None: ...
 
@@ -135,7 +138,14 @@ def test_an_output_that_reads_back_high_is_a_fault() -> None:
     sync.gate_low()
     with pytest.raises(DeviceFault, match="0x100 after abort"):
         sync.abort()
-    sync.stuck = 0
+
+
+def test_a_sync_source_is_aborted_before_its_port_is_given_back() -> None:
+    sync = StuckSync()
+    with pytest.raises(DeviceFault, match="after abort"):
+        sync.close()
+    assert sync.aborts == 1
+    assert sync.state is DeviceState.CLOSED
 
 
 class SmallMemorySpad(SpadArray):
@@ -143,7 +153,7 @@ class SmallMemorySpad(SpadArray):
 
     def __init__(self) -> None:
         super().__init__("cam")
-        self.answers: list[bool | Exception] = []
+        self.answers: list[bool | Exception | Callable[[], None]] = []
         self.stopped = 0
 
     @property
@@ -160,7 +170,10 @@ class SmallMemorySpad(SpadArray):
         answer = self.answers.pop(0)
         if isinstance(answer, Exception):
             raise answer
-        return answer
+        if isinstance(answer, bool):
+            return answer
+        answer()
+        return True
 
     def _do_stop(self) -> None:
         self.stopped += 1
@@ -202,6 +215,20 @@ def test_a_run_goes_on_after_an_error_until_it_is_stopped() -> None:
     spad.configure(BURST)
     with pytest.raises(WrongState, match="call start first"):
         spad.fill(ring, 0.1)
+
+
+def test_a_stop_that_comes_while_a_block_is_filled_ends_the_run() -> None:
+    spad = SmallMemorySpad()
+    spad.configure(BURST)
+    spad.start(100)
+    spad.answers = [spad.stop]
+    assert not spad.fill(BlockRing(1, 1024), 0.1)
+
+
+def test_an_exposure_of_one_period_is_taken_though_its_last_bit_was_rounded_up() -> None:
+    SmallMemorySpad().configure(replace(BURST, exposure_s=math.nextafter(BURST.exposure_s, 1)))
+    with pytest.raises(LimitExceeded, match="exposure"):
+        SmallMemorySpad().configure(replace(BURST, exposure_s=1.0001e-5))
 
 
 def test_close_stops_a_run() -> None:

@@ -72,6 +72,7 @@ def test_any_geometry_reads_back_as_written(n_frames: int, width: int, height: i
     assert np.shares_memory(block.bits, memory) or n_frames == 0
 
 
+@FEW
 @given(st.integers(1, 700), st.integers(1, 600), st.integers(1, 5000))
 def test_a_stride_is_filled_to_the_last_frame_that_fits(width: int, height: int, kib: int) -> None:
     stride = kib * ALIGN

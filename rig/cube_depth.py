@@ -1,0 +1,59 @@
+"""Depth from a bare cube, map by map."""
+
+import os
+import time
+from contextlib import closing
+
+from calibration.model import RigModel
+from rig.config import EstimateConfig
+from rig.counting import SweepCounter
+from rig.cube import Cube, column_commands, count_map
+from rig.reconstruction import Reconstructor
+from rig.run import OutFolder, Progress, Run, RunResult
+from rig.summary import MapTally, RunFrames, Verdict
+from rig.warm_up import warm_up
+
+
+def reconstruct_cube(
+    cube: Cube, model: RigModel, estimate: EstimateConfig, out: OutFolder, progress: Progress | None = None
+) -> RunResult:
+    """All maps of a checked cube. An interrupt ends the run after its last whole map, with verdict 'aborted'."""
+    plan = cube.plan
+    threads = os.cpu_count() or 1
+    reconstructor = Reconstructor(
+        model,
+        column_commands(plan),
+        plan.depth_range,
+        estimator=estimate.estimator,
+        filter=estimate.filter,
+        min_confidence=estimate.min_confidence,
+        threads=threads,
+    )
+    warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=False)
+    geometry = reconstructor.geometry
+    tally = MapTally(plan.columns, plan.exposures, estimate.estimator, estimate.filter)
+    counter = SweepCounter(plan.columns, geometry.rows, geometry.width, geometry.x0, geometry.window, threads)
+    with closing(counter), Run(out, tally) as run:
+        run.rays = geometry.u, geometry.v
+        verdict = Verdict.COMPLETE
+        try:
+            for index in range(cube.maps):
+                begun = time.perf_counter()
+                volume = count_map(cube, index, counter)
+                count_s = time.perf_counter() - begun
+                result = reconstructor.map(volume)
+                run.add(result, count_s + result.compute_s)
+                if progress is not None:
+                    progress(tally.maps, cube.maps)
+        except KeyboardInterrupt:
+            verdict = Verdict.ABORTED
+        n = tally.maps * cube.frames_per_map
+        manifest = {
+            "command": "reconstruct",
+            "cube": cube.path.absolute(),
+            "plan": plan.model_dump(mode="json"),
+            "calibration": {"id": model.fingerprint(), "provenance": dict(model.provenance)},
+            "estimate": estimate.model_dump(mode="json"),
+            "gaps": [],
+        }
+        return run.finish(RunFrames(n, n, 0, None, n), n / float(plan.frame_rate), verdict, manifest)

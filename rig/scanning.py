@@ -1,0 +1,179 @@
+"""A scan from open devices to its folder: sweeps in, maps out, and an account of what was lost."""
+
+import os
+from contextlib import closing
+from typing import Any
+
+from calibration.model import RigModel
+from drivers.errors import DeviceError
+from drivers.interfaces import SweepTruth
+from rig.acquisition import Acquisition, SweepData
+from rig.acquisition import Progress as ScanProgress
+from rig.config import RigConfig
+from rig.errors import RigError
+from rig.reconstruction import Reconstructor
+from rig.run import Progress, Run, RunResult
+from rig.scan_plan import ScanPlan
+from rig.session import OpenRig, prepare
+from rig.summary import RunFrames, Verdict
+from rig.warm_up import warm_up
+
+
+def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, progress: Progress | None = None) -> RunResult:
+    """Scan with an open rig; `run` takes the maps. seed: as the rig was opened with, for the manifest.
+
+    An interrupt ends the scan after its last whole map, with verdict 'aborted'. So does an error, which is raised again
+    once the whole maps are safe; one before the first map leaves nothing.
+    """
+    plan, timing = prepare(rig)
+    threads = os.cpu_count() or 1
+    reconstructor = _reconstructor(rig, plan, threads)
+    geometry = reconstructor.geometry
+    run.rays = (geometry.u, geometry.v) if rig.model is not None else None
+
+    def tell(done: ScanProgress) -> None:
+        if progress is not None:
+            progress(done.frames, done.frames_planned)
+
+    estimate = rig.config.estimate
+    warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)
+    acquisition = Acquisition(rig, plan, timing, maps, threads=threads, on_block=tell)
+    sweeps: list[SweepData] = []
+    ended_by: BaseException | None = None
+    try:
+        _collect(acquisition, reconstructor, rig, plan, run, sweeps)
+    except (KeyboardInterrupt, DeviceError, RigError) as error:
+        if not sweeps and not isinstance(error, KeyboardInterrupt):
+            raise
+        ended_by = error
+    frames = _frames(sweeps, acquisition.counters.crc_errors)
+    result = run.finish(
+        frames,
+        frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
+        _verdict(sweeps, rig.model, aborted=ended_by is not None),
+        {
+            "command": "scan",
+            "config": rig.config.model_dump(mode="json"),
+            "plan": plan_content(plan),
+            "calibration": calibration_content(rig.model),
+            "seed": seed,
+            "maps": maps,
+            "sweeps": [_sweep_content(sweep) for sweep in sweeps],
+            "gaps": [list(gap) for sweep in sweeps for gap in sweep.gaps],
+        },
+    )
+    if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
+        if result.folder is not None:
+            ended_by.add_note(f"{len(sweeps)} of {maps} maps were whole and are in {result.folder}")
+        raise ended_by
+    return result
+
+
+def require_simulated_or_armed(config: RigConfig, arm: bool) -> list[str]:
+    """Problems with letting light out: every real laser and gate needs the user's word."""
+    real = [slot for slot in ("laser", "sync") if getattr(config, slot).kind != "simulated"]
+    if arm or not real:
+        return []
+    kinds = ", ".join(f"{slot} {getattr(config, slot).kind}" for slot in real)
+    return [f"{config.name} has real light ({kinds}); clear the beam path, then add --arm"]
+
+
+def plan_content(plan: ScanPlan) -> dict[str, Any]:
+    """A plan's figures for the manifest and for programs."""
+    return {
+        "columns": plan.columns,
+        "exposures": plan.exposures,
+        "frame_rate_hz": plan.frame_rate_hz,
+        "exposure_s": plan.exposure_s,
+        "point_rate_hz": plan.point_rate_hz,
+        "sweep_s": plan.sweep_s,
+        "frames_per_sweep": plan.frames_per_sweep,
+        "dark_fraction": plan.dark_fraction,
+        "map_rate_hz": plan.map_rate_hz,
+        "command_range": plan.command_range,
+        "speed_per_s": plan.speed_per_s,
+        "depth_range_m": plan.depth_range_m,
+        "columns_per_marker": plan.columns_per_marker,
+        "window_px": plan.window,
+        "mode": plan.mode,
+        "legs": [
+            {
+                "direction": leg.direction,
+                "lag_s": leg.lag_s,
+                "gate_open_s": leg.gate_open_s,
+                "gate_close_s": leg.gate_close_s,
+            }
+            for leg in plan.legs
+        ],
+    }
+
+
+def calibration_content(model: RigModel | None) -> dict[str, Any] | None:
+    """Which calibration a run used, for the manifest."""
+    return None if model is None else {"id": model.fingerprint(), "provenance": dict(model.provenance)}
+
+
+def _reconstructor(rig: OpenRig, plan: ScanPlan, threads: int) -> Reconstructor:
+    estimate = rig.config.estimate
+    return Reconstructor(
+        rig.model,
+        plan.commands,
+        plan.depth_range_m,
+        sensor=(plan.rows, plan.width),
+        estimator=estimate.estimator,
+        filter=estimate.filter,
+        min_confidence=estimate.min_confidence,
+        threads=threads,
+    )
+
+
+def _collect(
+    acquisition: Acquisition,
+    reconstructor: Reconstructor,
+    rig: OpenRig,
+    plan: ScanPlan,
+    run: Run,
+    sweeps: list[SweepData],
+) -> None:
+    truth: SweepTruth | None = None
+    running = acquisition.run()
+    with closing(running):  # type: ignore[type-var]
+        for sweep in running:
+            result = reconstructor.map(sweep.volume)
+            if truth is None and rig.world is not None:
+                truth = rig.world.truth(plan.commands)  # only now: no estimate ever sees it
+            run.add(result, getattr(sweep, "count_s", 0.0) + result.compute_s, truth)
+            sweeps.append(sweep)
+
+
+def _frames(sweeps: list[SweepData], crc_errors: int | None) -> RunFrames:
+    return RunFrames(
+        expected=sum(sweep.frames.expected for sweep in sweeps),
+        received=sum(sweep.frames.received for sweep in sweeps),
+        lost=sum(sweep.frames.lost for sweep in sweeps),
+        crc_errors=crc_errors,
+        lit=sum(sweep.frames.lit for sweep in sweeps),
+    )
+
+
+def _verdict(sweeps: list[SweepData], model: RigModel | None, *, aborted: bool) -> Verdict:
+    """The gravest that applies."""
+    if aborted:
+        return Verdict.ABORTED
+    if not all(sweep.synchronised for sweep in sweeps):
+        return Verdict.UNSYNCHRONISED
+    if any(sweep.frames.lost for sweep in sweeps):
+        return Verdict.GAPS
+    return Verdict.COMPLETE if model is not None else Verdict.UNCALIBRATED
+
+
+def _sweep_content(sweep: SweepData) -> dict[str, Any]:
+    return {
+        "direction": sweep.direction,
+        "first_frame": sweep.first_frame,
+        "end_frame": sweep.end_frame,
+        "lost": sweep.frames.lost,
+        "dark": sweep.frames.dark,
+        "clock_error": sweep.clock_error,
+        "residual_columns": sweep.residual_columns,
+    }

@@ -1,0 +1,52 @@
+"""The calls of docs/notebook.md, on a rig small enough for a test."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rig.api import configure, effects, plan_scan, scan
+from rig.errors import UsageError
+from tests.system.small_rig import HEIGHT, WIDTH
+
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebook.md"
+
+
+def test_a_scan_is_one_call_and_writes_nothing_unasked(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    told: list[tuple[int, int]] = []
+    result = scan(small, maps=2, seed=1, progress=lambda done, planned: told.append((done, planned)))
+    assert result.last is not None
+    assert result.truth is not None
+    assert result.last.depth_m.shape == (HEIGHT, WIDTH)
+    assert result.summary.maps == 2
+    assert result.folder is None
+    assert told[-1][0] >= 0.9 * told[-1][1]
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_config_object_and_its_file_give_the_same_scan(small: Path) -> None:
+    from_file = scan(small, exposures=3, seed=4).last
+    from_object = scan(configure(small), exposures=3, seed=4).last
+    assert from_file is not None
+    assert from_object is not None
+    assert np.array_equal(from_file.depth_m, from_object.depth_m, equal_nan=True)
+
+
+def test_plan_and_effects_are_one_call_each(small: Path) -> None:
+    assert plan_scan(small, exposures=3).exposures == 3
+    assert {effect.effect for effect in effects(small)} >= {"stripe", "fog"}
+
+
+def test_options_of_a_config_object_are_checked_too(small: Path) -> None:
+    with pytest.raises(UsageError, match="exposures is -1"):
+        scan(configure(small), exposures=-1)
+
+
+def test_the_document_runs_as_far_as_names_go() -> None:
+    code = NOTEBOOK.read_text().split("```python\n")[1].split("```")[0]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 10
+    compile(code, str(NOTEBOOK), "exec")

@@ -1,0 +1,341 @@
+import dataclasses
+import itertools
+import threading
+import time
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration.model import Lag
+from drivers.clock import VirtualClock
+from drivers.errors import DeviceDisconnected, DeviceFault, DeviceTimeout, ProtocolError
+from drivers.interfaces import BurstMode, LaserLimits, LaserStatus, SpadTiming
+from rig.acquisition import Acquisition, SweepAssembler
+from rig.counting import SweepCounter
+from rig.errors import DevicesError
+from rig.session import OpenRig
+from tests.unit.rig.streams import HEIGHT, SPAD, WIDTH, plan_of, scan, stream_of
+
+LAG = Lag(1e-4, 2e-4)
+
+
+class Recorder:
+    """A device that notes the verbs it is told, in one list shared by all, and fails where it is asked to."""
+
+    def __init__(self, name, log, failing=()):
+        self.name, self.log, self.failing = name, log, dict(failing)
+
+    def told(self, verb):
+        self.log.append(f"{self.name}.{verb}")
+        if verb in self.failing:
+            raise self.failing[verb]
+
+
+class FakeScanner(Recorder):
+    def load(self, waveform, repeats):
+        self.told("load")
+        self.repeats = repeats
+        return waveform.point_rate_hz
+
+    def start(self):
+        self.told("start")
+
+    def park(self):
+        self.told("park")
+
+
+class FakeLaser(Recorder):
+    limits = LaserLimits(0.0, 0.05)
+
+    def arm(self, power_w):
+        self.told("arm")
+        self.power_w = power_w
+        self.cold = 3
+
+    @property
+    def status(self):
+        self.cold -= 1
+        return LaserStatus(self.cold <= 0, True, True, None, None, self.cold > 0, "digital")
+
+    def pause(self):
+        self.told("pause")
+
+
+class FakeSync(Recorder):
+    def program(self, pulses, repeats):
+        self.told("program")
+
+    def run(self):
+        self.told("run")
+
+    def abort(self):
+        self.told("abort")
+
+
+class FakeSpad(Recorder):
+    """Plays streams, one per start; `behaviour` is called before every block."""
+
+    def __init__(self, log, streams, failing=(), size=64, lost=(), behaviour=lambda seq: None):
+        super().__init__("spad", log, failing)
+        self.info = SPAD
+        self.streams = iter(streams)
+        self.size, self.lost, self.behaviour = size, lost, behaviour
+        self.stopped = threading.Event()
+        self.counters = None
+
+    def start(self, n_frames):
+        self.told("start")
+        self.n_frames = n_frames
+        self.stopped.clear()
+        self.blocks = iter(next(self.streams).blocks(itertools.repeat(self.size), self.lost))
+
+    def fill(self, ring, timeout_s):
+        if self.stopped.is_set():
+            return False
+        block = next(self.blocks, None)
+        if block is None:
+            return False
+        self.behaviour(block.header.block_seq)
+        while ring.claim(0.01) is None:
+            if self.stopped.is_set():
+                return False
+        ring.publish(block)
+        return True
+
+    def stop(self):
+        self.told("stop")
+        self.stopped.set()
+
+
+def fake_rig(plan, streams, failing=None, power=None, **spad):
+    failing = failing or {}
+    log: list[str] = []
+    config = dataclasses.make_dataclass("Config", ["scan"])(scan(power=power))
+    rig = OpenRig(
+        config=config,
+        clock=VirtualClock(),
+        world=None,
+        spad=FakeSpad(log, streams, failing.get("spad", {}), **spad),
+        scanner=FakeScanner("scanner", log, failing.get("scanner", {})),
+        laser=FakeLaser("laser", log, failing.get("laser", {})),
+        sync=FakeSync("sync", log, failing.get("sync", {})),
+        model=None,
+    )
+    return rig, log
+
+
+def acquisition(rig, plan, maps, **options):
+    period = int(100_000_000 / plan.frame_rate_hz)
+    timing = SpadTiming(Fraction(100_000_000), period, period, 4096)
+    return Acquisition(rig, plan, timing, maps, threads=1, silence_s=0.2, **options)
+
+
+PLAN = plan_of(scan(), LAG)
+STOP = ["sync.abort", "laser.pause", "scanner.park", "spad.stop"]
+START = ["scanner.load", "sync.program", "spad.start", "laser.arm", "sync.run", "scanner.start"]
+
+
+def test_devices_start_in_order_and_are_made_safe_gate_first():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)])
+    sweeps = list(acquisition(rig, PLAN, 2).run())
+    assert [sweep.index for sweep in sweeps] == [0, 1]
+    assert log == START + STOP
+    assert rig.laser.power_w == 0.05  # the limit, since the config names none
+    assert rig.clock.now_ns() > 0  # it waited until the laser was warm
+    assert rig.spad.n_frames is None
+    assert rig.scanner.repeats == 3
+
+
+def test_the_configured_power_is_used():
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 1, lag=LAG)], power="20 mW")
+    list(acquisition(rig, PLAN, 1).run())
+    assert rig.laser.power_w == 0.02
+
+
+def test_leaving_the_iteration_early_makes_the_rig_safe():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
+    run = acquisition(rig, PLAN, 5).run()
+    next(run)
+    assert log == START
+    run.close()
+    assert log == START + STOP
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("estimate failed")])
+def test_an_exception_in_the_caller_makes_the_rig_safe(error):
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
+    run = acquisition(rig, PLAN, 5).run()
+    next(run)
+    with pytest.raises(type(error)):
+        run.throw(error)
+    assert log == START + STOP
+
+
+def test_an_interrupt_while_blocks_are_awaited_makes_the_rig_safe():
+    def told(progress):
+        raise KeyboardInterrupt
+
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
+    with pytest.raises(KeyboardInterrupt):
+        list(acquisition(rig, PLAN, 5, on_block=told).run())
+    assert log == START + STOP
+
+
+@pytest.mark.parametrize("verb", [("spad", "start"), ("laser", "arm"), ("sync", "run"), ("scanner", "start")])
+def test_a_device_that_fails_to_start_leaves_all_of_them_safe(verb):
+    device, name = verb
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 1, lag=LAG)], {device: {name: DeviceFault("broken")}})
+    with pytest.raises(DeviceFault, match="broken"):
+        list(acquisition(rig, PLAN, 1).run())
+    assert log == [*START[: START.index(f"{device}.{name}") + 1], *STOP]
+
+
+def test_a_step_that_fails_does_not_keep_the_others_from_running():
+    failing = {"sync": {"abort": DeviceFault("gate reads high")}, "laser": {"pause": OSError("port is gone")}}
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 1, lag=LAG)], failing)
+    with pytest.raises(DevicesError, match="gate: gate reads high\nlaser: port is gone"):
+        list(acquisition(rig, PLAN, 1).run())
+    assert log == START + STOP
+
+
+def test_a_second_interrupt_while_stopping_still_makes_everything_safe():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)], {"sync": {"abort": KeyboardInterrupt()}})
+    run = acquisition(rig, PLAN, 5).run()
+    next(run)
+    with pytest.raises(KeyboardInterrupt):
+        run.throw(ValueError("first"))
+    assert log == START + STOP
+
+
+def test_trouble_while_stopping_is_noted_on_the_error_that_led_there():
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], {"scanner": {"park": DeviceFault("stuck")}})
+    run = acquisition(rig, PLAN, 2).run()
+    next(run)
+    with pytest.raises(ValueError) as caught:
+        run.throw(ValueError("first"))
+    assert caught.value.__notes__ == ["scanner: stuck"]
+
+
+def test_an_error_of_the_source_reaches_the_caller():
+    def unplugged(seq):
+        if seq == 1:
+            raise DeviceDisconnected("spad: unplugged")
+
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)], behaviour=unplugged)
+    with pytest.raises(DeviceDisconnected, match="unplugged"):
+        list(acquisition(rig, PLAN, 5).run())
+    assert log == START + STOP
+
+
+def test_a_silent_spad_is_a_time_out_in_its_own_words():
+    def silent(seq):
+        if seq:
+            time.sleep(0.2)
+            raise DeviceTimeout("spad: nothing came")
+
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)], behaviour=silent)
+    with pytest.raises(DeviceTimeout, match="nothing came"):
+        list(acquisition(rig, PLAN, 5).run())
+    assert log == START + STOP
+
+
+def test_a_caller_slower_than_the_time_out_loses_nothing():
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 3, lag=LAG)], size=8)
+    sweeps = []
+    acquired = acquisition(rig, PLAN, 3)
+    for sweep in acquired.run():
+        time.sleep(0.5)
+        sweeps.append(sweep)
+    assert sum(sweep.frames.lost for sweep in sweeps) == 0
+    assert acquired.high_water >= 7
+
+
+def test_a_stream_that_ends_without_the_closing_marker_is_an_error():
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)])
+    with pytest.raises(DeviceFault, match="ended after 2 of 4 sweeps"):
+        list(acquisition(rig, PLAN, 4).run())
+
+
+def test_progress_is_told_block_by_block():
+    told = []
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], size=16)
+    list(acquisition(rig, PLAN, 2, on_block=told.append).run())
+    assert [p.frames for p in told] == sorted(p.frames for p in told)
+    assert told[-1].sweeps == told[-1].maps == 2
+    assert told[-1].frames == pytest.approx(told[-1].frames_planned, abs=40)
+
+
+def test_bursts_are_taken_in_groups_and_numbered_through():
+    spad = dataclasses.replace(SPAD, stream=None, burst=BurstMode(900, 1e6))
+    plan = plan_of(scan(columns=40), LAG, spad=spad)
+    per_start = int((900 - 500) / float(plan.frames_per_sweep))
+    assert per_start == 1
+    streams = [stream_of(plan, 1, lag=LAG, latency_s=t) for t in (1e-4, 3e-4, 7e-4)]
+    rig, log = fake_rig(plan, streams)
+    sweeps = list(acquisition(rig, plan, 3).run())
+    assert [sweep.index for sweep in sweeps] == [0, 1, 2]
+    assert log == 3 * (START + STOP)
+    assert rig.spad.n_frames <= 900
+
+
+def sweeps_of(plan, blocks, maps):
+    counter = SweepCounter(plan.columns, HEIGHT, WIDTH, plan.x0, plan.window, 1)
+    assembler = SweepAssembler(plan, counter, maps)
+    found = []
+    for block in blocks:
+        found += assembler.add(block)
+        if assembler.complete:
+            break
+    counter.close()
+    return found
+
+
+def test_expected_frames_are_received_and_lost_ones_between_the_markers():
+    stream = stream_of(PLAN, 2, lag=LAG)
+    begin, middle, end = stream.scan_frames[:3]
+    lost = [begin - 3, begin + 30, begin + 31, begin + 60, middle - 1, middle, middle + 1]
+    first, second = sweeps_of(PLAN, stream.blocks(itertools.repeat(50), lost), 2)
+    assert (first.first_frame, first.end_frame, second.end_frame) == (begin, middle, end)
+    assert first.gaps == ((begin + 30, begin + 31), (begin + 60, begin + 60), (middle - 1, middle - 1))
+    assert second.gaps == ((middle, middle + 1),)
+    assert (first.frames.expected, first.frames.lost) == (middle - begin, 4)
+    assert (second.frames.expected, second.frames.lost) == (end - middle, 2)
+    for sweep in (first, second):
+        assert sweep.frames.received == sweep.frames.expected - sweep.frames.lost
+        assert sweep.frames.lit == sweep.volume.n_frames.sum()
+        assert sweep.frames.dark == sweep.volume.n_dark
+    total = first.frames + second.frames
+    assert total.expected == end - begin
+    assert total.received + total.lost == total.expected
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.lists(st.integers(1, 200), min_size=1, max_size=8), st.lists(st.integers(0, 400), max_size=6))
+def test_counted_sweeps_do_not_depend_on_the_size_of_blocks(sizes, lost):
+    plan = plan_of(scan(bidirectional=True, columns=11), LAG)
+    stream = stream_of(plan, 3, lag=LAG, clock_error=6e-5)
+    whole = sweeps_of(plan, stream.blocks(itertools.repeat(10**6), lost), 3)
+    parts = sweeps_of(plan, stream.blocks(itertools.cycle(sizes), lost), 3)
+    assert len(whole) == 3
+    for one, other in zip(whole, parts, strict=True):
+        for field in dataclasses.fields(one):
+            a, b = getattr(one, field.name), getattr(other, field.name)
+            if field.name not in ("volume", "count_s"):
+                assert a == b or a != a, field.name
+        for name in ("counts", "x0", "n_frames", "column", "dark_counts"):
+            np.testing.assert_array_equal(getattr(one.volume, name), getattr(other.volume, name))
+
+
+def test_blocks_of_another_run_or_size_are_refused():
+    blocks = stream_of(PLAN, 1, lag=LAG).blocks(itertools.repeat(32))
+    stale = dataclasses.replace(blocks[1], header=dataclasses.replace(blocks[1].header, run_id=9))
+    small = dataclasses.replace(blocks[0], header=dataclasses.replace(blocks[0].header, height=2))
+    with pytest.raises(ProtocolError, match="of run 9, not of run 1"):
+        sweeps_of(PLAN, [blocks[0], stale], 1)
+    with pytest.raises(ProtocolError, match="64 x 2 pixels, the plan is for 64 x 4"):
+        sweeps_of(PLAN, [small], 1)
+    with pytest.raises(ProtocolError, match="before frame 32"):
+        sweeps_of(PLAN, [blocks[0], blocks[0]], 1)

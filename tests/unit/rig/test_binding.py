@@ -1,0 +1,207 @@
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from calibration.model import Lag
+from drivers.frames import Mark
+from rig.binding import FrameBinder, SweepClock
+from rig.counting import BIN_DARK, BIN_UNUSABLE
+from rig.errors import PlanError
+from tests.unit.rig.streams import Stream, plan_of, scan, scanner_limits, stream_of
+
+
+def bind(plan, blocks):
+    binder = FrameBinder(plan)
+    bound, clocks = [], []
+    for block in blocks:
+        places, closed = binder.bind(block)
+        bound.append(places)
+        clocks += closed
+    merged = {
+        name: np.concatenate([getattr(b, name) for b in bound]) for name in ("sweep", "direction", "column", "bins")
+    }
+    return merged, clocks
+
+
+def whole(stream: Stream, sizes=None, lost=()):
+    return stream.blocks(sizes or itertools.repeat(64), lost)
+
+
+@st.composite
+def cases(draw):
+    lag = Lag(draw(st.floats(0, 4e-4)), draw(st.floats(0, 4e-4)))
+    first = draw(st.floats(-0.3, 0.3))
+    width = draw(st.floats(0.001, 0.2)) * draw(st.sampled_from([1, -1]))
+    config = scan(
+        columns=draw(st.integers(1, 60)),
+        exposures=draw(st.sampled_from([1, 2, 3, 7, 10, 40, 255, 300])),
+        frame_rate=draw(st.sampled_from(["100 kHz", "50 kHz", "6.25 kHz"])),
+        command_range=[first, first + width],
+        bidirectional=draw(st.booleans()),
+        dark_fraction=draw(st.sampled_from([0.05, 0.3])),
+    )
+    assume(config.columns * config.exposures <= 4000)
+    fastest = draw(st.sampled_from([7e3, 25e3, 40.001e3, 65.535e3, 2e5]))
+    limits = scanner_limits(velocity_per_s=1e6, acceleration_per_s2=1e10, point_rate_hz=(1e3, fastest))
+    try:
+        plan = plan_of(config, lag, limits)
+    except PlanError:
+        assume(False)
+        raise
+    errors = st.floats(-1e-4, 1e-4)
+    stream = stream_of(
+        plan,
+        3,
+        lag=lag,
+        clock_error=draw(errors),
+        gate_error=draw(errors),
+        latency_s=draw(st.floats(1e-5, 1e-3)),
+        exposure_ticks=draw(st.sampled_from([None, 700])),
+    )
+    return plan, stream
+
+
+@settings(max_examples=60, deadline=None)
+@given(cases())
+def test_every_column_gets_its_exposures_and_the_column_is_where_the_mirror_is(case):
+    plan, stream = case
+    bound, clocks = bind(plan, whole(stream))
+    first, last = plan.command_range
+    true_column = (stream.mirror - first) / ((last - first) / plan.columns) - 0.5
+    on_column = bound["bins"] >= 0
+    assert np.abs(bound["column"] - true_column)[on_column].max() < 0.05
+    # A marker that shares its frame with a gate edge is not used, so these clocks may miss a few.
+    assert [clock.sweep for clock in clocks] == [0, 1, 2]
+    assert all(clock.synchronised for clock in clocks)
+    for sweep in range(3):
+        n = np.bincount(bound["bins"][on_column & (bound["sweep"] == sweep)], minlength=plan.columns)
+        assert np.abs(n - plan.exposures).max() <= 1
+        dark = np.count_nonzero((bound["bins"] == BIN_DARK) & (bound["sweep"] == sweep))
+        assert dark >= 0.05 * np.count_nonzero(bound["sweep"] == sweep) - 1
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.integers(1, 300), min_size=1, max_size=20), st.booleans())
+def test_places_do_not_depend_on_the_size_of_blocks(sizes, bidirectional):
+    plan = plan_of(scan(bidirectional=bidirectional), Lag(1e-4, 2e-4))
+    stream = stream_of(plan, 3, lag=Lag(1e-4, 2e-4), clock_error=7e-5)
+    one, clocks = bind(plan, whole(stream, itertools.repeat(10**6)))
+    other, same_clocks = bind(plan, whole(stream, itertools.cycle(sizes)))
+    for name, values in one.items():
+        np.testing.assert_array_equal(other[name], values)
+    assert same_clocks == clocks
+
+
+def test_frames_before_the_first_marker_are_not_used():
+    plan = plan_of(scan())
+    stream = stream_of(plan, 1, latency_s=5e-4)
+    bound, _ = bind(plan, whole(stream))
+    before = np.arange(len(stream.records)) < stream.scan_frames[0]
+    assert before.sum() == 50
+    assert (bound["sweep"][before] == -1).all()
+    assert (bound["bins"][before] == BIN_UNUSABLE).all()
+    assert np.isnan(bound["column"][before]).all()
+
+
+def test_the_way_back_runs_through_the_same_columns_downwards():
+    plan = plan_of(scan(bidirectional=True, columns=21), Lag(1e-4, 3e-4))
+    stream = stream_of(plan, 2, lag=Lag(1e-4, 3e-4))
+    bound, _ = bind(plan, whole(stream))
+    out, back = (bound["column"][(bound["sweep"] == s) & (bound["bins"] >= 0)] for s in (0, 1))
+    assert (np.diff(out) > 0).all()
+    assert (np.diff(back) < 0).all()
+    assert set(bound["direction"][bound["sweep"] == 1].tolist()) == {-1}
+    for sweep in (0, 1):
+        lit = (bound["sweep"] == sweep) & (bound["bins"] >= 0)
+        np.testing.assert_allclose(plan.command_at(bound["column"][lit]), stream.mirror[lit], atol=0.05 * 0.6 / 21)
+
+
+@pytest.mark.parametrize("error", [-9e-5, 0.0, 1.1e-4])
+def test_the_ratio_of_the_clocks_is_found_and_used_in_the_next_sweep(error):
+    plan = plan_of(scan(columns=300, exposures=10))
+    stream = stream_of(plan, 2, clock_error=error)
+    _, clocks = bind(plan, whole(stream))
+    for clock in clocks:
+        assert clock.clock_error == pytest.approx(error, abs=2e-6)
+        assert clock.residual_columns < 0.002
+
+
+def test_lost_frames_leave_the_others_where_they_were():
+    plan = plan_of(scan())
+    stream = stream_of(plan, 3, clock_error=5e-5)
+    lost = [*range(30, 45), *range(stream.scan_frames[1] - 8, stream.scan_frames[1] + 9)]
+    complete, clocks = bind(plan, whole(stream))
+    gappy, gappy_clocks = bind(plan, whole(stream, lost=lost))
+    kept = np.setdiff1d(np.arange(len(stream.records)), lost)
+    np.testing.assert_array_equal(gappy["bins"], complete["bins"][kept])
+    np.testing.assert_array_equal(gappy["sweep"], complete["sweep"][kept])
+    np.testing.assert_allclose(gappy["column"], complete["column"][kept], atol=0.01)
+    # The second scan marker was among the lost frames: its frame number follows from the scanner's clock.
+    assert [(c.first_frame, c.end_frame) for c in gappy_clocks] == [(c.first_frame, c.end_frame) for c in clocks]
+
+
+def test_a_sweep_that_was_lost_whole_is_still_counted():
+    plan = plan_of(scan())
+    stream = stream_of(plan, 4)
+    lost = range(stream.scan_frames[1] - 5, stream.scan_frames[2] + 7)
+    _, clocks = bind(plan, whole(stream, lost=lost))
+    assert [c.sweep for c in clocks] == [0, 1, 2, 3]
+    frames = [c.first_frame for c in clocks] + [clocks[-1].end_frame]
+    assert np.abs(np.array(frames) - stream.scan_frames[:5]).max() <= 1
+    assert not clocks[1].synchronised
+
+
+def test_a_stray_marker_position_flags_the_sweep():
+    plan = plan_of(scan(columns=40, exposures=1))
+    stream = stream_of(plan, 2)
+    line = np.flatnonzero(stream.records["marks"] & Mark.LINE)[2]
+    marks = int(stream.records["marks"][line])
+    stream.records["marks"][line] = (marks & 0xFF) | (((marks >> 8) + 100) % 256 << 8)
+    _, clocks = bind(plan, whole(stream))
+    assert clocks[0].residual_columns > 0.05
+    assert not clocks[0].synchronised
+    assert clocks[1].synchronised
+
+
+def test_a_direction_level_that_is_not_the_plans_flags_the_sweep():
+    plan = plan_of(scan(bidirectional=True))
+    stream = stream_of(plan, 2)
+    stream.records["marks"] ^= np.uint32(Mark.BACKWARD)
+    _, clocks = bind(plan, whole(stream))
+    assert not any(clock.synchronised for clock in clocks)
+
+
+def test_frames_whose_window_is_not_to_be_trusted_are_not_used():
+    plan = plan_of(scan())
+    stream = stream_of(plan, 1)
+    stream.records["marks"] |= np.uint32(Mark.WINDOW_LOST)
+    bound, _ = bind(plan, whole(stream))
+    assert (bound["bins"] == BIN_UNUSABLE).all()
+
+
+def test_counters_of_16_bits_run_over_without_harm():
+    plan = plan_of(scan(columns=5))
+    stream = stream_of(plan, 3)
+    expected, _ = bind(plan, whole(stream))
+    counted = stream.records["sweep"].astype(np.int64)
+    blocks = whole(stream)
+    shifted = []
+    for block in blocks:
+        at = block.header.first_frame
+        block.records["sweep"] = (counted[at : at + block.n_frames] + 65534) & 0xFFFF
+        header = dataclasses.replace(block.header, sweep=int(counted[at]) + 65534)
+        shifted.append(dataclasses.replace(block, header=header))
+    bound, clocks = bind(plan, shifted)
+    lit = expected["bins"] >= 0
+    np.testing.assert_array_equal(bound["bins"][lit], expected["bins"][lit])
+    assert [c.sweep for c in clocks][-3:] == [65534, 65535, 65536]
+
+
+def test_a_sweep_with_too_few_markers_is_not_called_synchronised():
+    assert not SweepClock(0, 0.0, float("nan"), 1, 0, 10, 0).synchronised
+    assert not SweepClock(0, 5e-3, 0.0, 9, 0, 10, 0).synchronised
+    assert SweepClock(0, 5e-5, 0.01, 9, 0, 10, 0).synchronised

@@ -1,0 +1,193 @@
+import json
+from fractions import Fraction
+
+import pytest
+import yaml
+
+from rig.config import MIN_DARK_FRACTION
+from rig.config_files import (
+    BUNDLED,
+    bundled_configs,
+    config_schema,
+    find_config,
+    load_config,
+    load_cube_plan,
+    parse_config,
+)
+from rig.errors import UsageError
+
+RIG = """\
+name: test
+world: {kind: simulated}
+spad: {kind: simulated}
+scanner: {kind: simulated}
+laser: {kind: simulated, max_power: 50 mW}
+sync: {kind: simulated}
+scan:
+  columns: 100
+  exposures: 4
+  frame_rate: 97.7 kHz
+  depth_range: [1 m, 8 m]
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text, name="rig.yaml"):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def problems(path, overrides=None):
+    with pytest.raises(UsageError) as caught:
+        load_config(path, overrides)
+    assert caught.value.exit_code == 2
+    return [line.replace(str(path), "rig.yaml") for line in str(caught.value).splitlines()]
+
+
+def test_the_bundled_rig_loads_by_name_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = load_config("simulated")
+    assert config.name == "simulated"
+    assert config.calibration is not None
+    assert config.calibration.is_file()
+    assert "simulated" in bundled_configs()
+    assert find_config("simulated") == BUNDLED / "simulated.yaml"
+
+
+def test_quantities_become_exact_numbers(write):
+    config = load_config(write(RIG))
+    assert config.scan.frame_rate == Fraction(97_700)
+    assert config.scan.depth_range == (1.0, 8.0)
+    assert config.scan.dark_fraction == MIN_DARK_FRACTION
+    assert config.estimate.estimator == "likelihood"
+
+
+def test_all_problems_are_listed_at_once_in_the_order_of_the_file(write):
+    path = write(
+        RIG.replace("columns: 100", "colums: 100")
+        .replace("exposures: 4", "exposures: -3")
+        .replace("97.7 kHz", "97700")
+        .replace("[1 m, 8 m]", "[8 m, 1 m]")
+        .replace("max_power: 50 mW", "max_power: 50")
+        .replace("sync: {kind: simulated}", "sync: {kind: simulate}")
+    )
+    assert problems(path) == [
+        'rig.yaml:5: laser.max_power: 50 has no unit; write the power with a unit, like "50 mW"',
+        "rig.yaml:6: sync: unknown kind 'simulate'; choose one of: simulated",
+        "rig.yaml:8: unknown key 'scan.colums'; did you mean 'columns'?",
+        "rig.yaml:9: scan.exposures is -3, it must be at least 1; write for example 'exposures: 10'",
+        'rig.yaml:10: scan.frame_rate: 97700 has no unit; write the frequency with a unit, like "100 kHz"',
+        "rig.yaml:11: scan.depth_range runs from 8 m to 1 m; it must be [near, far] with 0 m < near < far",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("exposures: 4", "exposures: 2.5"), "scan.exposures is 2.5, it must be a whole number"),
+        (("exposures: 4", "exposures: many"), "scan.exposures is 'many', it must be a whole number"),
+        (("exposures: 4", "bidirectional: maybe"), "scan.bidirectional is 'maybe', it must be true or false"),
+        (("exposures: 4", "command_range: [-2, 1]"), "scan.command_range.0 is -2, it must be at least -1"),
+        (("exposures: 4", "command_range: [0.5, 0.5]"), "scan.command_range begins and ends at 0.5"),
+        (("exposures: 4", "dark_fraction: 0.01"), "scan.dark_fraction is 0.01, it must be at least 0.05"),
+        (("exposures: 4", "exposure: 20 us"), "scan: exposure is 20 us, longer than the 10.2354 us of a frame"),
+        (("exposures: 4", "exposure: 20 m"), "scan.exposure: '20 m': 'm' is no unit of time"),
+        (("  frame_rate: 97.7 kHz\n", ""), "'scan.frame_rate' is missing; write for example 'frame_rate: 100 kHz'"),
+        (("name: test", "estimate: {estimator: likelyhood}\nname: t"), "did you mean 'likelihood'?"),
+        (("sync: {kind: simulated}", "sync: {}"), "sync has no 'kind'; add one of: simulated"),
+        (("sync: {kind: simulated}", "sync: 3"), "sync is 3; it must be a mapping that names a kind"),
+        (
+            ("sync: {kind: simulated}", "sync: {kind: simulated, port: 1}"),
+            "unknown key 'sync.port'; keys here are kind",
+        ),
+        (("  exposures: 4", "  exposures: 4\n  exposures: 5"), "'scan.exposures' is given twice; keep one"),
+        (("  exposures: 4", " exposures: 4"), "not YAML"),
+    ],
+)
+def test_a_mistake_is_one_line_with_file_line_key_value_and_next_step(write, change, message):
+    before, after = change
+    assert before in RIG
+    (line,) = problems(write(RIG.replace(before, after)))
+    assert line.startswith("rig.yaml:")
+    assert line.split(":")[1].isdigit()
+    assert message in line
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("", "is empty"), ("- 1", "holds a list"), ("a: [", "not YAML"), (b"\xff\xfe\x00a", "not text")],
+)
+def test_a_file_that_is_no_config_says_so(tmp_path, text, message):
+    path = tmp_path / "rig.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    (line,) = problems(path)
+    assert message in line
+
+
+def test_an_unknown_name_suggests_the_nearest_bundled_one():
+    with pytest.raises(UsageError, match=r"no config 'simulatd': did you mean 'simulated'[?] bundled configs are "):
+        load_config("simulatd")
+
+
+def test_a_missing_file_and_a_folder_are_told_apart(tmp_path):
+    assert "no config" in problems(tmp_path / "none.yaml")[0]
+    assert "is a folder" in problems(tmp_path)[0]
+
+
+def test_overrides_lie_over_the_file_and_none_leaves_it_alone(write):
+    config = load_config(
+        write(RIG), {"scan.exposures": 7, "estimate.filter": "median", "scan.columns": None, "world.scene": "x/y"}
+    )
+    assert (config.scan.exposures, config.scan.columns, config.estimate.filter) == (7, 100, "median")
+    assert config.world is not None
+    assert config.world.model_dump()["scene"] == "x/y"
+
+
+def test_a_mistake_in_an_override_is_called_an_option(write):
+    assert problems(write(RIG), {"scan.exposures": 0, "scan.colum": 3}) == [
+        "option: unknown key 'scan.colum'; did you mean 'columns'?",
+        "option: scan.exposures is 0, it must be at least 1; write for example 'exposures: 10'",
+    ]
+
+
+def test_paths_are_relative_to_the_config(write, tmp_path, monkeypatch):
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "hall.yaml").write_text("surfaces: street\n", encoding="utf-8")
+    text = RIG.replace("name: test", "name: test\ncalibration: cal.yaml").replace(
+        "world: {kind: simulated}", "world: {kind: simulated, scene: scenes/hall.yaml, geometry: ./rig-model.yaml}"
+    )
+    path = write(text)
+    monkeypatch.chdir("/")
+    config = load_config(path)
+    assert config.calibration == tmp_path / "cal.yaml"
+    assert config.world is not None
+    dumped = config.world.model_dump()
+    assert dumped["scene"] == str(tmp_path / "scenes" / "hall.yaml")
+    assert dumped["geometry"] == str(tmp_path / "rig-model.yaml")
+
+
+def test_a_config_written_out_reads_back_to_the_same(write):
+    config = load_config(write(RIG), {"scan.exposure": "9 us", "scan.power": "20 mW"})
+    text = yaml.safe_dump(config.model_dump(mode="json"))
+    assert load_config(write(text, "again.yaml")) == config
+    assert parse_config(json.loads(config.model_dump_json())) == config
+
+
+def test_the_schema_offers_the_installed_kinds_of_every_slot():
+    schema = config_schema()
+    json.dumps(schema)
+    for slot in ("spad", "scanner", "laser", "sync", "world"):
+        assert {"$ref": f"#/$defs/{slot}.simulated"} in schema["properties"][slot]["oneOf"]
+        assert schema["$defs"][f"{slot}.simulated"]["properties"]["kind"] == {"const": "simulated"}
+    assert schema["$defs"]["ScanConfig"]["properties"]["exposures"]["minimum"] == 1
+
+
+def test_a_cube_plan_has_its_four_keys_and_no_others(write):
+    plan = load_cube_plan(write("{columns: 500, exposures: 10, frame_rate: 100 kHz, depth_range: [1 m, 8 m]}"))
+    assert (plan.columns, plan.exposures, plan.frame_rate, plan.depth_range) == (500, 10, 100_000, (1.0, 8.0))
+    with pytest.raises(UsageError, match="unknown key 'bidirectional'"):
+        load_cube_plan(write("{columns: 5, exposures: 1, frame_rate: 1 Hz, depth_range: [1 m, 8 m], bidirectional: 1}"))

@@ -1,0 +1,75 @@
+"""Rigs and walls for tests of the simulator, small enough to be quick."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.camera import Camera
+from calibration.model import RigModel
+from calibration.scanner import PivotScanner
+from sim_backend.effects.setting import Setting
+from sim_backend.flux import FluxModel
+from sim_backend.optics import Line, Optics, Sensor, detections_per_radiance
+from sim_backend.scene import SceneFile
+from sim_backend.scenes.surfaces import Surfaces, checked
+from sim_backend.view import make_view
+
+Array = NDArray[np.float64]
+
+
+def rig(
+    *,
+    size: tuple[int, int] = (64, 96),
+    focal_px: float = 110.0,
+    baseline_m: float = 0.3,
+    roll: float = 0.0,
+    k1: float = 0.0,
+) -> RigModel:
+    """Camera and mirror; the mirror at x = -baseline (negative: on the right), its axis tilted by `roll` (rad)."""
+    rows, width = size
+    matrix = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (rows - 1) / 2], [0, 0, 1.0]])
+    source = np.array([-baseline_m, 0.02 if roll else 0.0, 0.0])
+    axis = np.array([np.sin(roll), np.cos(roll), 0.05 if roll else 0.0])
+    return RigModel(
+        camera=Camera(width, rows, matrix, np.array([k1, 0, 0, 0, 0])),
+        scanner=PivotScanner(source, axis, np.array([1.0, 0, 0]), np.array([0.0, 0.35])),
+        source_m=source,
+    )
+
+
+def wall(model: RigModel, normal: tuple[float, float, float], distance_m: float, albedo: float = 0.5) -> Surfaces:
+    """The plane normal.X = distance as the camera sees it."""
+    u, v = model.camera.tangents()
+    depth = distance_m / (normal[0] * u + normal[1] * v + normal[2])
+    return checked("wall", depth, np.full(u.shape, albedo), np.ones(u.shape, bool), u.shape)
+
+
+def setting(model: RigModel, surfaces: Surfaces, **scene: Any) -> Setting:
+    """Default optics in a scene given by the keys of a scene file."""
+    optics, sensor, line = Optics(), Sensor(), Line()
+    parsed = SceneFile.model_validate(scene)
+    gain = detections_per_radiance(optics, sensor, line)
+    return Setting(make_view(model, surfaces), parsed, optics, sensor, line, gain)
+
+
+def effect_rate(setup: Setting, name: str, plane: Array) -> Array:
+    """Detections per second and watt that one laser effect brings for a plane (4,), (rows, width)."""
+    from sim_backend.effects.catalogue import CATALOGUE
+
+    model = FluxModel(setup, [entry for entry in CATALOGUE if entry.name == name])
+    rate = np.zeros((setup.view.rows, setup.view.width))
+    model.add_sheet(setup.view.sheet(plane), 0, setup.view.rows, rate)
+    return rate
+
+
+def pixel_solid_angle(model: RigModel, u: Array, v: Array) -> Array:
+    """Solid angle (sr) of a pixel around the rays (u, v), from the camera's forward projection alone."""
+    h = 1e-5
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1)
+    x0, y0 = model.camera.project(rays - np.array([h, 0, 0]))
+    x1, y1 = model.camera.project(rays + np.array([h, 0, 0]))
+    x2, y2 = model.camera.project(rays - np.array([0, h, 0]))
+    x3, y3 = model.camera.project(rays + np.array([0, h, 0]))
+    pixels_per_tangent2 = np.abs((x1 - x0) * (y3 - y2) - (x3 - x2) * (y1 - y0)) / (2 * h) ** 2
+    return 1.0 / pixels_per_tangent2 / (u * u + v * v + 1) ** 1.5

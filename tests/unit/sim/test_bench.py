@@ -1,0 +1,151 @@
+"""The bench over time: mirror with lag, marker edges, gate program, light = emission AND gate."""
+
+from fractions import Fraction
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from calibration.model import Lag
+from drivers.clock import VirtualClock
+from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, OUT_GATE, OUT_MARKER, Pulse, ScanWaveform
+from sim_backend.bench import Bench
+from sim_backend.gate_program import GateProgram
+from sim_backend.mirror_motion import Playing
+
+PERIOD_S = 1e-5
+
+
+def _waveform(markers: list[int] | None = None) -> ScanWaveform:
+    command = np.array([0.0, 0.1, 0.2, 0.3, 0.2, 0.1])
+    words = np.array(
+        markers or [MARKER_SCAN, MARKER_LINE, 0, LEVEL_BACKWARD, LEVEL_BACKWARD | MARKER_LINE, 0], np.uint8
+    )
+    return ScanWaveform(command, words, Fraction(1000))
+
+
+def _playing(repeats: int = 3, lag: tuple[float, float] = (0.0, 0.0), markers: list[int] | None = None) -> Playing:
+    return Playing(
+        _waveform(markers), repeats, start_s=1.0, rate_hz=1000.0, lag_forward_s=lag[0], lag_backward_s=lag[1]
+    )
+
+
+def test_the_command_runs_straight_from_point_to_point_and_over_the_seam() -> None:
+    at = 1.0 + np.array([0.0, 0.5, 1.0, 3.25, 5.5, 6.0, 6.5]) * 1e-3
+    np.testing.assert_allclose(_playing().mirror(at), [0.0, 0.05, 0.1, 0.275, 0.05, 0.0, 0.05], atol=1e-12)
+
+
+def test_the_mirror_rests_at_the_first_point_before_and_at_the_last_after() -> None:
+    np.testing.assert_allclose(_playing().mirror(np.array([0.0, 0.999, 1.5])), [0.0, 0.0, 0.1])
+    assert _playing().moving(0.5)
+    assert _playing().moving(1.0179)
+    assert not _playing().moving(1.0181)
+
+
+def test_the_mirror_lags_by_direction() -> None:
+    playing = _playing(lag=(2e-4, 5e-4))
+    at = np.array([1.0012, 1.0042])  # the second on the way back
+    np.testing.assert_allclose(playing.mirror(at), [0.1, 0.3 - 0.1 * 0.7], atol=1e-9)
+
+
+def test_marker_edges_are_rising_edges_within_the_time_asked_for() -> None:
+    playing = _playing()
+    np.testing.assert_allclose(playing.edges(MARKER_SCAN, 0.0, 9.0), [1.0, 1.006, 1.012])
+    np.testing.assert_allclose(playing.edges(MARKER_LINE, 1.001, 1.010), [1.001, 1.004, 1.007])
+    assert len(playing.edges(MARKER_LINE, 1.0011, 1.004)) == 0
+
+
+def test_a_marker_held_high_over_the_seam_is_one_edge() -> None:
+    playing = _playing(markers=[MARKER_LINE, 0, 0, 0, 0, MARKER_LINE])
+    np.testing.assert_allclose(playing.edges(MARKER_LINE, 0.0, 9.0), [1.0, 1.005, 1.011, 1.017])
+
+
+@settings(max_examples=50, deadline=None)
+@given(cuts=st.lists(st.floats(0.9, 1.03), max_size=8))
+def test_edges_are_found_once_however_time_is_cut(cuts: list[float]) -> None:
+    playing = _playing(repeats=4)
+    times = [0.5, *sorted(cuts), 2.0]
+    found = np.concatenate([playing.edges(MARKER_LINE, a, b) for a, b in pairwise(times)])
+    np.testing.assert_array_equal(found, playing.edges(MARKER_LINE, 0.5, 2.0))
+
+
+def _edges(times: list[float]):  # type: ignore[no-untyped-def]
+    at = np.array(times)
+    return lambda from_s, until_s: at[(at >= from_s) & (at < until_s)]
+
+
+@pytest.mark.parametrize("step", [0.01, 0.13, 10.0])
+def test_the_gate_program_waits_for_each_trigger_and_ends_low(step: float) -> None:
+    program = GateProgram([Pulse(0, None), Pulse(OUT_MARKER, 0.2), Pulse(OUT_GATE, 0.5)], 2, start_s=0.0)
+    for until in np.arange(step, 10 + step, step):
+        program.advance(float(until), _edges([1.0, 1.4, 3.0, 5.0]))
+    times, words = program.levels(0.0, 10.0)
+    np.testing.assert_allclose(times, [0.0, 1.0, 1.2, 1.7, 3.0, 3.2, 3.7])
+    assert words.tolist() == [0, OUT_MARKER, OUT_GATE, 0, OUT_MARKER, OUT_GATE, 0]
+    assert program.ended
+
+
+def test_lowering_the_gate_keeps_the_past_and_lasts() -> None:
+    program = GateProgram([Pulse(0, None), Pulse(OUT_GATE | OUT_MARKER, 1.0)], 3, start_s=0.0)
+    program.advance(1.5, _edges([1.0, 3.0]))
+    program.lower_gate(1.5)
+    program.advance(9.0, _edges([1.0, 3.0]))
+    times, words = program.levels(0.5, 9.0)
+    assert times.tolist() == [0.0, 1.0, 1.5, 2.0, 3.0, 4.0]
+    assert words.tolist() == [0, OUT_GATE | OUT_MARKER, OUT_MARKER, 0, OUT_MARKER, 0]
+
+
+def _bench() -> tuple[Bench, VirtualClock]:
+    clock = VirtualClock(5_000)
+    return Bench(clock, Lag(0.0, 0.0)), clock
+
+
+def _frames(n: int, start_s: float = 0.0) -> NDArray[np.float64]:
+    return start_s + np.arange(n) * PERIOD_S
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    opens=st.floats(0.0, 2e-4), lasts=st.floats(1e-8, 2e-4), exposure_s=st.floats(1e-6, 1e-5), block=st.integers(1, 60)
+)
+def test_the_share_of_light_is_the_time_the_gate_is_high(
+    opens: float, lasts: float, exposure_s: float, block: int
+) -> None:
+    bench, _ = _bench()
+    bench.run_program([Pulse(0, max(opens, 1e-9)), Pulse(OUT_GATE, lasts)], 1)
+    start = _frames(60)
+    parts = [bench.during(start[i : i + block], exposure_s, PERIOD_S) for i in range(0, 60, block)]
+    share = np.concatenate([p.share for p in parts])
+    edge = np.concatenate([p.edge for p in parts])
+    on, off = max(opens, 1e-9), max(opens, 1e-9) + lasts
+    expected = np.clip(np.minimum(off, start + exposure_s) - np.maximum(on, start), 0, None) / exposure_s
+    np.testing.assert_allclose(share, expected, atol=1e-6)
+    inside = [((start < t - 1e-12) & (t + 1e-12 < start + exposure_s)) for t in (on, off)]
+    assert np.all(edge[inside[0] | inside[1]])
+    assert np.all(share[~edge] == np.rint(share[~edge]))
+
+
+def test_no_program_no_light() -> None:
+    bench, _ = _bench()
+    bench.emit(1.0)
+    assert np.all(bench.during(_frames(5), 1e-5, PERIOD_S).share == 0)
+
+
+def test_the_state_of_the_program_is_read_back() -> None:
+    bench, clock = _bench()
+    assert bench.outputs() == ("stopped", 0)
+    bench.run_program([Pulse(0, 1e-3), Pulse(OUT_GATE, 1e-3)], 1)
+    assert bench.outputs() == ("running", 0)
+    clock.sleep(1.5e-3)
+    assert bench.outputs() == ("running", OUT_GATE)
+    bench.lower_gate()
+    assert bench.outputs() == ("running", 0)
+    clock.sleep(1e-3)
+    assert bench.outputs() == ("stopped", 0)
+    bench.run_program([Pulse(0, None)], 1)
+    assert bench.outputs() == ("waiting", 0)
+    bench.abort_program()
+    assert bench.outputs() == ("aborted", 0)

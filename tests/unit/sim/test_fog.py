@@ -1,0 +1,94 @@
+"""The haze against its closed form, against light traced forward through the volume, and where it must end."""
+
+import numpy as np
+import pytest
+
+from sim_backend.scenes.surfaces import Surfaces
+from tests.unit.sim.rigs import effect_rate, pixel_solid_angle, rig, setting, wall
+
+EXTINCTION, PHASE = 0.15, 0.05
+FOG = {"medium": {"extinction": f"{EXTINCTION} /m", "backscatter": f"{PHASE} /sr", "scattering_share": 0.9}}
+
+
+@pytest.mark.parametrize("baseline_m", [0.3, -0.3], ids=["scanner left", "scanner right"])
+def test_a_rectified_rig_sees_the_closed_form_up_to_the_stripe(baseline_m: float) -> None:
+    model = rig(baseline_m=baseline_m)
+    setup = setting(model, wall(model, (0.0, 0.0, 1.0), 2.5), **FOG)
+    plane = model.planes(0.2 * np.sign(baseline_m))
+    rate, stripe = effect_rate(setup, "fog", plane), setup.view.sheet(plane).x_stripe_px
+    u_p, x = -plane[2] / plane[0], np.arange(96)
+    u = (x - 47.5) / 110.0
+    for row in (0, 31, 63):
+        v = (row - 31.5) / 110.0
+        q_c, q_p = np.sqrt(u**2 + v**2 + 1), np.sqrt(u_p**2 + v**2 + 1)
+        depth = baseline_m / (u_p - u)
+        line_density = np.sqrt(1 + u_p**2) / q_p**2 / setup.line.fan
+        with np.errstate(over="ignore"):
+            transmission = np.exp(-EXTINCTION * depth * (q_p + q_c))
+        haze = 0.9 * EXTINCTION * PHASE * line_density * q_p * q_c / abs(baseline_m) * transmission
+        before = (stripe[row] - x) * np.sign(baseline_m)
+        lit, dark = before > 4, before < -4
+        assert lit.sum() > 20
+        np.testing.assert_allclose(rate[row][lit], setup.gain * haze[lit], rtol=1e-9)
+        assert np.all(rate[row][dark] == 0)
+
+
+@pytest.mark.parametrize(("baseline_m", "roll", "k1"), [(0.3, 0.12, -0.2), (-0.3, -0.1, 0.1)])
+def test_the_haze_is_what_the_volume_scatters_into_the_camera(baseline_m: float, roll: float, k1: float) -> None:
+    model = rig(baseline_m=baseline_m, roll=roll, k1=k1)
+    setup = setting(model, wall(model, (0.0, 0.0, 1.0), 3.0), **FOG)
+    plane = model.planes(0.1 * np.sign(baseline_m))
+    rate = effect_rate(setup, "fog", plane)
+    along = np.cross(plane[:3], [0.0, 1.0, 0.0])
+    along = along / np.linalg.norm(along) * np.sign(along[2])
+    angle, r = np.linspace(-0.45, 0.45, 901), np.linspace(0.3, 4.0, 901)
+    ray = np.cos(angle)[:, None] * along + np.sin(angle)[:, None] * np.cross(plane[:3], along)
+    assert model.source_m is not None
+    point = model.source_m + r[None, :, None] * ray[:, None, :]
+    camera_m = np.linalg.norm(point, axis=-1)
+    power = (angle[1] - angle[0]) * (r[1] - r[0]) / setup.line.fan
+    irradiance = 0.9 * EXTINCTION * PHASE * power * np.exp(-EXTINCTION * (r + camera_m)) / camera_m**2
+    x, y = model.camera.project(point)
+    radiance = irradiance / pixel_solid_angle(model, point[..., 0] / point[..., 2], point[..., 1] / point[..., 2])
+    seen = np.isfinite(x) & (point[..., 2] < 3.0)
+    traced, _, _ = np.histogram2d(
+        y[seen], x[seen], bins=(np.arange(65) - 0.5, np.arange(97) - 0.5), weights=radiance[seen]
+    )
+    # Blocks of 8 x 8 pixels well before the stripe, where the sheet is farther than the nearest traced point.
+    stripe = setup.view.sheet(plane).x_stripe_px
+    blocks = 0
+    for top in range(8, 56, 8):
+        for left in range(0, 96, 8):
+            area = np.s_[top : top + 8, left : left + 8]
+            ends = stripe[top : top + 8]
+            before = np.nanmin((ends - left - 4) * np.sign(baseline_m))
+            if 10 < before < 40:
+                assert rate[area].sum() == pytest.approx(setup.gain * traced[area].sum(), rel=0.01)
+                blocks += 1
+    assert blocks >= 12
+
+
+def test_haze_ends_in_the_shadow_of_a_body_and_does_not_come_back() -> None:
+    model = rig()
+    back = wall(model, (0.0, 0.0, 1.0), 3.0)
+    depth = back.depth_m.copy()
+    depth[:, 40:50] = 1.2
+    setup = setting(model, Surfaces(depth, back.albedo, back.trusted), **FOG)
+    met = 0
+    for command in np.linspace(-0.5, 0.9, 41):
+        plane = model.planes(command)
+        sheet, rate = setup.view.sheet(plane), effect_rate(setup, "fog", plane)
+        depth_of_sheet = plane[3] / (plane[:3] @ np.array([(40 - 47.5) / 110, 0.0, 1.0]))
+        if 1.3 < depth_of_sheet < 2.8:  # passes behind the body's near edge
+            met += 1
+            assert np.isnan(sheet.x_stripe_px[32])
+            assert rate[32, 30] > 0
+            assert np.all(rate[32, 40:] == 0)
+    assert met >= 2
+
+
+def test_clear_air_has_no_haze_code_and_no_haze() -> None:
+    model = rig()
+    from sim_backend.flux import FluxModel
+
+    assert "fog" not in FluxModel(setting(model, wall(model, (0.0, 0.0, 1.0), 3.0))).names

@@ -1,0 +1,270 @@
+"""The simulated devices together: what the SPAD records depends on mirror, gate and laser, and on nothing else."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calibration.files import save_rig_model
+from drivers.clock import VirtualClock
+from drivers.errors import DeviceError, DeviceTimeout
+from drivers.frames import BlockFlag, FrameBlock, Mark
+from drivers.interfaces import (
+    LEVEL_BACKWARD,
+    MARKER_LINE,
+    MARKER_SCAN,
+    OUT_GATE,
+    BeamScanner,
+    LineLaser,
+    Pulse,
+    ScanWaveform,
+    SpadArray,
+    SpadRequest,
+    SyncSource,
+)
+from drivers.registry import Surroundings
+from drivers.ring import BlockRing
+from sim_backend.devices import laser, scanner, spad, sync
+from sim_backend.world import KIND as WORLD
+from sim_backend.world import SimulatedWorld, WorldConfig
+from tests.unit.sim.rigs import rig
+
+POINTS, RATE_HZ = 400, 100_000
+GATE_OPEN_S, GATE_S = 5e-4, 3e-3
+
+
+@dataclass
+class Rig:
+    """A small simulated rig, every device open."""
+
+    clock: VirtualClock
+    world: SimulatedWorld
+    spad: SpadArray
+    scanner: BeamScanner
+    laser: LineLaser
+    sync: SyncSource
+
+    def start(self, *, frames: int | None = 1000, block_frames: int = 31, power_w: float = 0.1) -> BlockRing:
+        """Everything started in the order of a scan: two sweeps of 4 ms, gate high from 0.5 to 3.5 ms of each."""
+        timing = self.spad.configure(SpadRequest(Fraction(100_000), 1e-5, "stream", block_frames))
+        command = -0.4 * np.cos(2 * np.pi * np.arange(POINTS) / POINTS)
+        markers = np.zeros(POINTS, np.uint8)
+        markers[0] |= MARKER_SCAN
+        markers[50:350:10] |= MARKER_LINE
+        markers[200:] |= LEVEL_BACKWARD
+        rate = self.scanner.point_clock(RATE_HZ)
+        self.scanner.load(ScanWaveform(command, markers, rate), 2)
+        self.sync.program([Pulse(0, None), Pulse(0, GATE_OPEN_S), Pulse(OUT_GATE, GATE_S)], 2)
+        self.spad.start(frames)
+        self.laser.arm(power_w)
+        self.sync.run()
+        self.scanner.start()
+        return BlockRing(4, timing.stride)
+
+
+@dataclass
+class Recording:
+    """What came out of a run, copied."""
+
+    headers: list
+    frames: NDArray[np.int64]
+    records: NDArray[np.void]
+    bits: NDArray[np.uint8]
+    ticks: NDArray[np.int64]
+
+    @property
+    def ones(self) -> NDArray[np.int64]:
+        """1s per frame."""
+        return np.bitwise_count(self.bits).sum(axis=(1, 2), dtype=np.int64)
+
+    def marked(self, mark: Mark) -> NDArray[np.bool_]:
+        """Frames with a mark."""
+        return (self.records["marks"] & mark) != 0
+
+
+def _record(rig: Rig, ring: BlockRing) -> Recording:
+    reader, blocks = ring.reader("test"), []
+    more = True
+    while more:
+        more = rig.spad.fill(ring, 1.0)
+        if not more:
+            ring.finish()
+        block = reader.next(0.1)
+        if block is not None:  # None: the last frames of the run got lost
+            blocks.append(FrameBlock(block.header, block.records.copy(), block.bits.copy()))
+    return Recording(
+        headers=[b.header for b in blocks],
+        frames=np.concatenate([b.frame_numbers for b in blocks]),
+        records=np.concatenate([b.records for b in blocks]),
+        bits=np.concatenate([b.bits for b in blocks]),
+        ticks=np.concatenate([b.start_ticks for b in blocks]),
+    )
+
+
+def _open(folder: Path, seed: int = 1, scene: str = "street-clear", **spad_config: object) -> Rig:
+    geometry = folder / "rig.yaml"
+    if not geometry.exists():
+        save_rig_model(rig(size=(20, 70), focal_px=80.0), geometry)
+    clock = VirtualClock(123_457)
+    world = WORLD.create(WorldConfig(geometry=str(geometry), scene=scene), Surroundings(clock, None, seed))
+    around = Surroundings(clock, world, seed)
+    return Rig(
+        clock,
+        world,
+        spad.KIND.create(spad.KIND.config.model_validate({"kind": "simulated", **spad_config}), around),
+        scanner.KIND.create(scanner.SimulatedScannerConfig(), around),
+        laser.KIND.create(laser.SimulatedLaserConfig(), around),
+        sync.KIND.create(sync.SimulatedSyncConfig(), around),
+    )
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Iterator[Rig]:
+    opened = _open(tmp_path)
+    yield opened
+    for device in (opened.sync, opened.laser, opened.scanner, opened.spad):
+        device.close()
+
+
+def test_frames_are_lit_exactly_while_the_gate_is_high(small: Rig) -> None:
+    run = _record(small, small.start())
+    lit = run.marked(Mark.GATE_HIGH)
+    assert 2 * 298 <= lit.sum() <= 2 * 300
+    assert run.marked(Mark.GATE_EDGE).sum() <= 4
+    dark = ~lit & ~run.marked(Mark.GATE_EDGE)
+    assert run.ones[lit].mean() > 3 * run.ones[dark].mean()
+
+
+def test_a_paused_laser_leaves_the_gate_marks_but_no_light(small: Rig) -> None:
+    ring = small.start()
+    small.laser.pause()
+    run = _record(small, ring)
+    lit = run.marked(Mark.GATE_HIGH)
+    assert lit.sum() > 590
+    assert run.ones[lit].mean() == pytest.approx(run.ones[~lit].mean(), abs=0.3)
+
+
+def test_the_picture_follows_the_mirror(small: Rig) -> None:
+    run = _record(small, small.start())
+    lit = np.flatnonzero(run.marked(Mark.GATE_HIGH))[:290]
+    columns = np.unpackbits(run.bits[lit], axis=-1)[:, :, :70].sum(axis=1)
+    x = np.arange(70)
+    early, late = columns[:20].sum(axis=0), columns[130:150].sum(axis=0)
+    assert late @ x / late.sum() > early @ x / early.sum() + 8
+
+
+def test_the_gate_lowered_midway_ends_the_light(small: Rig) -> None:
+    ring = small.start(block_frames=10)
+    reader = ring.reader("test")
+    for _ in range(30):
+        small.spad.fill(ring, 1.0)
+        reader.next(0.1)
+    small.sync.gate_low()
+    after = []
+    while small.spad.fill(ring, 1.0):
+        block = reader.next(0.1)
+        assert block is not None
+        after.append(block.records["marks"].copy())
+    assert not np.any(np.concatenate(after) & (Mark.GATE_HIGH | Mark.GATE_EDGE))
+
+
+def test_the_same_seed_gives_the_same_bits_for_any_block_size(tmp_path: Path) -> None:
+    runs = []
+    for block_frames in (31, 7, 600):
+        opened = _open(tmp_path)
+        runs.append(_record(opened, opened.start(block_frames=block_frames)))
+    other = _open(tmp_path, seed=2)
+    for run in runs[1:]:
+        assert np.array_equal(run.bits, runs[0].bits)
+        assert np.array_equal(run.ticks, runs[0].ticks)
+        for name in ("marks", "line", "sweep"):
+            assert np.array_equal(run.records[name], runs[0].records[name])
+    assert not np.array_equal(_record(other, other.start()).bits, runs[0].bits)
+
+
+def test_pad_bits_are_zero(small: Rig) -> None:
+    run = _record(small, small.start())
+    assert not np.unpackbits(run.bits, axis=-1)[:, :, 70:].any()
+
+
+def test_records_tell_markers_direction_and_counters(small: Rig) -> None:
+    run = _record(small, small.start())
+    scans, lines = np.flatnonzero(run.marked(Mark.SCAN)), np.flatnonzero(run.marked(Mark.LINE))
+    assert len(scans) == 2
+    assert len(lines) == 60
+    assert run.records["sweep"][[scans[0] - 1, scans[0], scans[1]]].tolist() == [0, 1, 2]
+    assert run.records["line"][[lines[0], lines[29], scans[1], lines[30]]].tolist() == [1, 30, 0, 1]
+    backward = run.marked(Mark.BACKWARD)
+    assert 390 <= backward.sum() <= 410
+    # Sub-frame places: scan edges are 4 ms apart on a clock 20 ppm fast, so 400 frames less 0.8 hundredths.
+    place = (run.records["marks"][scans] >> 8) & 0xFF
+    times = run.ticks[scans] / 1000 + (place + 0.5) / 256
+    assert np.diff(times)[0] == pytest.approx(400 / (1 + 20e-6), abs=1 / 256)
+
+
+def test_the_scan_does_not_start_on_a_frame_border(small: Rig) -> None:
+    run = _record(small, small.start())
+    place = (run.records["marks"][run.marked(Mark.SCAN)] >> 8) & 0xFF
+    assert 10 < place[0] < 246
+
+
+def test_time_passes_as_frames_are_made(small: Rig) -> None:
+    before = small.clock.now_ns()
+    _record(small, small.start(frames=600))
+    assert small.clock.now_ns() - before == pytest.approx(6_000_000, abs=10)
+
+
+def test_lost_frames_close_the_block_and_are_counted(tmp_path: Path) -> None:
+    clean, gappy = _open(tmp_path), _open(tmp_path, lost_frames=(0, 40, 41, 999))
+    whole, run = _record(clean, clean.start()), _record(gappy, gappy.start())
+    kept = np.setdiff1d(np.arange(1000), [0, 40, 41, 999])
+    assert np.array_equal(run.frames, kept)
+    assert np.array_equal(run.bits, whole.bits[kept])
+    assert np.array_equal(run.records["sweep"], whole.records["sweep"][kept])
+    after_gap = [h for h in run.headers if h.first_frame in (1, 42)]
+    assert [h.lost_before for h in after_gap] == [1, 3]
+    assert all(h.flags & BlockFlag.LOST_BEFORE for h in after_gap)
+    counters = gappy.spad.counters
+    assert (counters.exposed, counters.delivered, counters.lost) == (1000, 996, 4)
+
+
+def test_frames_lost_at_random_differ_by_seed(tmp_path: Path) -> None:
+    runs = []
+    for seed in (1, 2):
+        opened = _open(tmp_path, seed=seed, loss_probability=0.05)
+        runs.append(_record(opened, opened.start()).frames)
+    assert all(900 < len(frames) < 990 for frames in runs)
+    assert not np.array_equal(*[np.isin(np.arange(1000), frames) for frames in runs])
+
+
+def test_a_spad_that_loses_everything_times_out(tmp_path: Path) -> None:
+    opened = _open(tmp_path, loss_probability=1.0)
+    ring = opened.start(frames=None)
+    with pytest.raises(DeviceTimeout, match="got lost"):
+        opened.spad.fill(ring, 0.01)
+
+
+def test_headers_carry_the_timing_exactly(tmp_path: Path) -> None:
+    opened = _open(tmp_path)
+    timing = opened.spad.configure(SpadRequest(Fraction(97_700), 1e-5, "stream", 31))
+    assert timing.tick_hz / timing.frame_period_ticks == 97_700
+    assert float(timing.exposure_ticks / timing.tick_hz) == pytest.approx(1e-5, rel=1e-3)
+
+
+def test_the_frames_of_a_column_share_the_flux_of_its_centre(small: Rig) -> None:
+    commands = np.linspace(-0.3, 0.3, 13)
+    small.world.hold_columns(commands)
+    near = commands[4] + np.linspace(-0.45, 0.45, 10) * 0.05
+    assert np.all(small.world.grid.hold(near) == commands[4])
+    assert np.isnan(small.world.grid.hold(np.array([1.2]))[0])
+    outside = small.world.grid.hold(np.array([0.41]))
+    assert outside[0] == pytest.approx(0.4)
+
+
+def test_a_spad_without_a_world_is_refused() -> None:
+    with pytest.raises(DeviceError, match="no simulated world"):
+        spad.KIND.create(spad.SimulatedSpadConfig(), Surroundings(VirtualClock(), None, 0))

@@ -1,0 +1,76 @@
+"""The stripe's light against closed forms and against light traced forward from the mirror."""
+
+import numpy as np
+import pytest
+
+from tests.unit.sim.rigs import effect_rate, pixel_solid_angle, rig, setting, wall
+
+EXTINCTION = 0.1
+FOG = {"medium": {"extinction": f"{EXTINCTION} /m"}}
+
+
+@pytest.mark.parametrize("baseline_m", [0.3, -0.3], ids=["scanner left", "scanner right"])
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.6, 0.0), (-0.5, 0.4)])
+def test_a_rectified_rig_sees_the_camera_side_cosine_law(baseline_m: float, slope: tuple[float, float]) -> None:
+    model = rig(baseline_m=baseline_m)
+    normal = np.array([slope[0], slope[1], 1.0])
+    setup = setting(model, wall(model, tuple(normal), 2.0), **FOG)
+    plane = model.planes(0.15)
+    sheet = setup.view.sheet(plane)
+    rate = effect_rate(setup, "stripe", plane)
+    rows = np.flatnonzero((sheet.x_stripe_px > 6) & (sheet.x_stripe_px < 90))
+    assert len(rows) > 50
+    focal, u_p = 110.0, -plane[2] / plane[0]
+    u = (sheet.x_stripe_px[rows] - 47.5) / focal
+    v = (rows - 31.5) / focal
+    q_c, q_p = np.sqrt(u**2 + v**2 + 1), np.sqrt(u_p**2 + v**2 + 1)
+    depth = 2.0 / (normal[0] * u + normal[1] * v + 1)
+    line_density = np.sqrt(1 + u_p**2) / q_p**2 / setup.line.fan
+    cosine = np.abs(normal[0] * u + normal[1] * v + 1) / np.linalg.norm(normal)
+    expected = 0.5 / np.pi * line_density * cosine / depth**2 * np.exp(-EXTINCTION * depth * (q_p + q_c)) * focal
+    np.testing.assert_allclose(rate[rows].sum(axis=1), setup.gain * expected, rtol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("baseline_m", "roll", "k1"), [(0.3, 0.0, 0.0), (-0.3, 0.0, -0.2), (0.3, 0.12, -0.2), (-0.3, -0.2, 0.1)]
+)
+def test_rows_hold_the_light_that_rays_from_the_mirror_bring(baseline_m: float, roll: float, k1: float) -> None:
+    model = rig(baseline_m=baseline_m, roll=roll, k1=k1)
+    normal, distance = np.array([0.2, -0.3, 1.0]), 2.5
+    setup = setting(model, wall(model, tuple(normal), distance), **FOG)
+    plane = model.planes(0.1 if baseline_m > 0 else -0.1)
+    rate = effect_rate(setup, "stripe", plane)
+
+    # Forward: rays of equal power within the sheet, scattered by a Lambertian wall into the camera.
+    along = np.cross(plane[:3], [0.0, 1.0, 0.0])
+    along = along / np.linalg.norm(along) * np.sign(along[2])
+    across = np.cross(plane[:3], along)
+    angle = np.linspace(-0.5, 0.5, 400_001)
+    step = angle[1] - angle[0]
+    ray = np.cos(angle)[:, None] * along + np.sin(angle)[:, None] * across
+    assert model.source_m is not None
+    r = (distance - normal @ model.source_m) / (ray @ normal)
+    point = model.source_m + r[:, None] * ray
+    camera_m = np.linalg.norm(point, axis=1)
+    cosine = np.abs(point @ normal) / camera_m / np.linalg.norm(normal)
+    irradiance = 0.5 / np.pi * cosine * step / setup.line.fan / camera_m**2 * np.exp(-EXTINCTION * (r + camera_m))
+    x, y = model.camera.project(point)
+    radiance = irradiance / pixel_solid_angle(model, point[:, 0] / point[:, 2], point[:, 1] / point[:, 2])
+    inside = np.isfinite(x) & (x > 5) & (x < 90) & (y > -0.5) & (y < 63.5)
+    traced = np.bincount(np.rint(y[inside]).astype(int), weights=radiance[inside], minlength=64)
+    counts = np.bincount(np.rint(y[inside]).astype(int), minlength=64)
+    whole = slice(2, 62)
+    assert counts[whole].min() > 500
+    np.testing.assert_allclose(rate.sum(axis=1)[whole], setup.gain * traced[whole], rtol=4e-3)
+
+
+def test_the_profile_is_a_gaussian_integrated_over_pixels() -> None:
+    model = rig()
+    setup = setting(model, wall(model, (0.0, 0.0, 1.0), 2.0))
+    plane = model.planes(0.1)
+    rate, centre = effect_rate(setup, "stripe", plane), setup.view.sheet(plane).x_stripe_px
+    x = np.arange(96)
+    for row in (0, 20, 63):
+        weight = rate[row] / rate[row].sum()
+        assert weight @ x == pytest.approx(centre[row], abs=1e-3)
+        assert weight @ (x - centre[row]) ** 2 == pytest.approx(0.6**2 + 1 / 12, abs=2e-3)
