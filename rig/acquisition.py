@@ -31,13 +31,17 @@ __all__ = ["Acquisition", "FrameCounts", "Progress", "SweepAssembler", "SweepDat
 _log = logging.getLogger(__name__)
 
 RING_SLOTS = 8
+"""Blocks between source and counting; a simulated SPAD runs ahead by as many."""
 SILENCE_S = 5.0
 """A SPAD that sends nothing for so long, with the ring empty, has failed."""
 WARM_UP_S = 120.0
 """Longest wait for a laser to warm up."""
 BURST_LEAD_S = 5e-3
 """Time between the SPAD's start and the first scan marker that a burst must have room for."""
+HANG_S = 180.0
+"""Longest wait for a SPAD whose `fill` neither returns nor says that it has nothing."""
 JOIN_S = 30.0
+"""Longest wait for the source thread after the SPAD was stopped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,8 +213,8 @@ class _Source:
         self._silence_s = silence_s
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="spad source", daemon=True)
-        self.silence: DeviceTimeout | None = None
-        """What the SPAD said when it last had nothing, or no room, for a while."""
+        self.silences: list[DeviceTimeout] = []
+        """What the SPAD said each time it had nothing, or no room, for half of `silence_s`."""
 
     def start(self) -> None:
         self._thread.start()
@@ -228,24 +232,33 @@ class _Source:
         try:
             while not self._over.is_set():
                 try:
-                    if not self._spad.fill(self._ring, self._silence_s):
+                    if not self._spad.fill(self._ring, self._silence_s / 2):
                         break
-                    self.silence = None
                 except DeviceTimeout as error:
                     # Either the SPAD is silent or the ring is full; only the reader knows, by having nothing to read.
-                    self.silence = error
+                    self.silences.append(error)
             self._ring.finish()
         except BaseException as error:  # handed to the reader, which raises it on the caller's thread
             self._ring.finish(error)
 
 
 def _blocks(reader: RingReader, source: _Source, silence_s: float) -> Iterator[FrameBlock]:
+    """The blocks of the run. DeviceTimeout, in the SPAD's own words, where it is silent while the ring is empty."""
     while True:
-        try:
-            # Longer than the source's own limit, so that its words about the device are there to be raised.
-            block = reader.next(2 * silence_s)
-        except DeviceTimeout as error:
-            raise source.silence or error from None
+        heard = len(source.silences)
+        waited_s = 0.0
+        while True:
+            try:
+                block = reader.next(silence_s)
+                break
+            except DeviceTimeout:
+                waited_s += silence_s
+                # The first time-out may be of a wait for room that ended just before the ring was empty. One that does
+                # not come means that the SPAD is at work: a simulated one compiles its kernels before the first block.
+                if len(source.silences) >= heard + 2:
+                    raise source.silences[-1] from None
+                if waited_s >= HANG_S:
+                    raise
         if block is None:
             return
         yield block

@@ -137,7 +137,7 @@ def _collect(
 ) -> None:
     truth: SweepTruth | None = None
     running = acquisition.run()
-    with closing(running):  # type: ignore[type-var]
+    with closing(running):
         for sweep in running:
             result = reconstructor.map(sweep.volume)
             if truth is None and rig.world is not None:

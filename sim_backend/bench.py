@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 
 from calibration.model import Lag
 from drivers.clock import NS_PER_S, Clock
-from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, OUT_GATE, Pulse, ScanWaveform
+from drivers.interfaces import MARKER_LINE, MARKER_SCAN, OUT_GATE, Pulse, ScanWaveform
 from sim_backend.gate_program import GateProgram
 from sim_backend.mirror_motion import Motion, Playing, Resting
 
 Array = NDArray[np.float64]
-
-__all__ = ["LEVEL_BACKWARD", "Bench", "Happening"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.row_kernels import load_row, mode_and_mean, none_prior, row_posterior, row_scores
+from rig.estimators.row_kernels import LABELS, load_row, mode_of, none_prior, refine, row_posterior, row_scores
 from rig.geometry import MARGIN_PX
 
 CUT: Final = 0.05
@@ -92,7 +92,7 @@ def learn_rows(
             amplitude_mass[amplitudes] += none
         # Only rows whose stripe is fairly certain say what is before and what behind; doubtful ones would teach the
         # model its own guess.
-        if mode_and_mean(posterior, first, last, reach)[3] < CERTAIN:
+        if mode_of(posterior, first, last)[1] < CERTAIN:
             continue
         passed = 0.0
         for t in range(length):
@@ -144,6 +144,7 @@ def estimate_rows(
     w_near: float,
     w_far: float,
     psi: NDArray[np.float32],
+    fine: NDArray[np.float32],
     table: NDArray[np.float32],
     first_row: int,
     last_row: int,
@@ -169,6 +170,7 @@ def estimate_rows(
     score = np.empty((amplitudes, window), np.float32)
     posterior = np.empty(window, np.float32)
     mass = np.empty(amplitudes, np.float64)
+    labels = np.empty(LABELS, np.float64)
     reach = psi.shape[0] - 1
     step = 1 if near_is_left else -1
     for c in range(counts.shape[0]):
@@ -189,12 +191,15 @@ def estimate_rows(
             row_scores(n, k, before, behind, scale, length, amplitude, psi, table, taps, edge, score)
             prior = none_prior(w_near, w_far, w[first], w[last], none_weight)
             row_posterior(score, edge, length, first, last, log_weight, prior, posterior, mass)
-            mode, x, sd, near = mode_and_mean(posterior, first, last, max(1, reach - 1))
+            mode, near = mode_of(posterior, first, last)
+            offset, sd = refine(
+                n, k, before, behind, scale, length, mode, score, edge, taps, amplitude, log_weight, fine, table, labels
+            )
             best = 0
             for m in range(1, amplitudes):
                 if score[m, mode] + log_weight[m] > score[best, mode] + log_weight[best]:
                     best = m
-            out[0, y, c] = start + step * x
+            out[0, y, c] = start + step * (mode + offset)
             out[1, y, c] = near
             out[2, y, c] = sd
             out[3, y, c] = amplitude[best] * scale[mode]

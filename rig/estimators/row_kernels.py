@@ -22,6 +22,11 @@ TABLE_BASE: Final = np.uint32((127 + EXPONENT_LOW) << CELL_BITS)
 TABLE_SHIFT: Final = np.uint32(23 - CELL_BITS)
 FLUX_MIN: Final = np.float32(2.0**EXPONENT_LOW)
 FLUX_MAX: Final = np.float32(2.0**EXPONENT_HIGH * 0.999)
+LABEL_PX: Final = 0.25
+"""Spacing of the sub-pixel positions around the most probable pixel."""
+LABELS: Final = 13
+"""Sub-pixel positions, 1.5 px each way: the mean of the peak, not of its neighbours."""
+AMPLITUDE_CUT: Final = np.float32(6.0)
 LOST: Final = np.float32(24.0)
 """Log-likelihood below the best at which a hypothesis no longer counts (exp(-24) = 4e-11)."""
 
@@ -257,32 +262,70 @@ def row_posterior(
 
 
 @numba.njit(cache=True, nogil=True)
-def mode_and_mean(
-    posterior: NDArray[np.float32], first: int, last: int, reach: int
-) -> tuple[int, float, float, float]:
-    """Most probable position, its local mean and standard deviation, and the mass within 1 px of that mean.
-
-    Ties go to the smaller index. The variance includes that of a position inside one pixel (1/12 px^2).
-    """
+def mode_of(posterior: NDArray[np.float32], first: int, last: int) -> tuple[int, float]:
+    """Most probable position, ties to the smaller index, and the probability of lying within 1 px of it."""
     mode = first
     for j in range(first, last + 1):
         if posterior[j] > posterior[mode]:
             mode = j
-    lo, hi = max(first, mode - reach), min(last, mode + reach)
+    near = posterior[mode]
+    for j in (mode - 1, mode + 1):
+        if first <= j <= last:
+            near += posterior[j]
+    return mode, min(near, np.float32(1.0))
+
+
+@numba.njit(cache=True, nogil=True)
+def refine(
+    n: NDArray[np.float32],
+    k: np.float32,
+    before: NDArray[np.float32],
+    behind: NDArray[np.float32],
+    scale: NDArray[np.float32],
+    length: int,
+    mode: int,
+    score: NDArray[np.float32],
+    edge: NDArray[np.float32],
+    taps: NDArray[np.float32],
+    amplitude: NDArray[np.float32],
+    log_weight: NDArray[np.float32],
+    fine: NDArray[np.float32],
+    table: NDArray[np.float32],
+    likelihood: NDArray[np.float64],
+) -> tuple[float, float]:
+    """Offset of the stripe from `mode` in px and its standard deviation: posterior over positions a quarter pixel apart.
+
+    fine: (labels, 2R + 1), share of the stripe in pixels -R..R from the mode for each label; the pixel that holds the
+    label sees haze on its near part only. Amplitudes far from the best one at the mode are left out.
+    """
+    labels, reach = fine.shape[0], (fine.shape[1] - 1) // 2
+    best = np.float32(-1e30)
+    for m in range(amplitude.shape[0]):
+        best = max(best, score[m, mode] + log_weight[m])
+    for i in range(labels):
+        likelihood[i] = 0.0
+    start, stop = max(mode - reach, 0), min(mode + reach, length - 1)
+    for m in range(amplitude.shape[0]):
+        if score[m, mode] + log_weight[m] < best - AMPLITUDE_CUT:
+            continue
+        light = amplitude[m] * scale[mode]
+        for i in range(labels):
+            offset = (i - labels // 2) * LABEL_PX
+            total = np.float32(edge[start] + log_weight[m] - best)
+            for t in range(start, stop + 1):
+                free = min(max(np.float32(offset - (t - mode) + 0.5), np.float32(0.0)), np.float32(1.0))
+                base = free * before[t] + (np.float32(1.0) - free) * behind[t]
+                flux = np.float32(min(base + light * fine[i, t - mode + reach], FLUX_MAX))
+                cell = np.uint64((flux.view(np.uint32) >> TABLE_SHIFT) - TABLE_BASE)
+                total += n[t] * table[0, cell] + k * table[1, cell] - taps[1, t]
+            likelihood[i] += np.exp(min(max(total, np.float32(-80.0)), np.float32(80.0)))
     mass = 0.0
     mean = 0.0
-    for j in range(lo, hi + 1):
-        mass += posterior[j]
-        mean += posterior[j] * (j - mode)
-    if mass <= 0.0:
-        return mode, np.float64(mode), 0.0, 0.0
+    for i in range(labels):
+        mass += likelihood[i]
+        mean += likelihood[i] * (i - labels // 2)
     mean /= mass
     variance = 0.0
-    for j in range(lo, hi + 1):
-        variance += posterior[j] * (j - mode - mean) ** 2
-    near = 0.0
-    for j in range(max(first, mode - 3), min(last, mode + 3) + 1):
-        # Overlap of the pixel with the 2 px around the answer.
-        overlap = min(j - mode + 0.5, mean + 1.0) - max(j - mode - 0.5, mean - 1.0)
-        near += posterior[j] * min(max(overlap, 0.0), 1.0)
-    return mode, mode + mean, np.sqrt(variance / mass + 1.0 / 12.0), min(near, 1.0)
+    for i in range(labels):
+        variance += likelihood[i] * (i - labels // 2 - mean) ** 2
+    return mean * LABEL_PX, LABEL_PX * np.sqrt(variance / mass + 1.0 / 12.0)

@@ -233,13 +233,18 @@ def test_an_error_of_the_source_reaches_the_caller():
 def test_a_silent_spad_is_a_time_out_in_its_own_words():
     def silent(seq):
         if seq:
-            time.sleep(0.2)
+            time.sleep(0.1)
             raise DeviceTimeout("spad: nothing came")
 
     rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)], behaviour=silent)
     with pytest.raises(DeviceTimeout, match="nothing came"):
         list(acquisition(rig, PLAN, 5).run())
     assert log == START + STOP
+
+
+def test_a_spad_that_takes_its_time_for_the_first_block_is_not_silent():
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 1, lag=LAG)], behaviour=lambda seq: time.sleep(0.9 if seq == 0 else 0))
+    assert len(list(acquisition(rig, PLAN, 1).run())) == 1
 
 
 def test_a_caller_slower_than_the_time_out_loses_nothing():
