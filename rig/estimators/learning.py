@@ -24,6 +24,10 @@ LATTICE_LINES = 8192
 FIRST_ROUNDS = 8
 LAST_ROUNDS = 3
 PIECES = 4
+AMPLITUDE_SPAN = 4.6
+"""Natural logarithm of the ratio of the largest amplitude to the smallest: two decades of reflectance."""
+EVEN_SHARE = 0.25
+"""Part of the prior over positions that stays even, whatever the map before looked like."""
 PRIOR_PHOTONS = 100.0
 """Weight of the fitted exponential against each bin's own counts."""
 START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
@@ -59,7 +63,7 @@ def expect(
     near_m, far_m = geometry.depth_range_m
 
     def piece(rows: NDArray[np.int32], columns: NDArray[np.int32]) -> Expectation:
-        levels, rows_seen = np.zeros((BINS, 6)), np.zeros((geometry.rows, 2))
+        levels, rows_seen = np.zeros((BINS, 8)), np.zeros((geometry.rows, 2))
         mass = np.zeros(len(model.amplitude) + 1)
         evidence = learn_rows(
             volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left,
@@ -73,7 +77,7 @@ def expect(
     with ThreadPoolExecutor(PIECES) as pool:
         parts = list(pool.map(piece, np.array_split(lines[0], PIECES), np.array_split(lines[1], PIECES)))
     return Expectation(
-        sum((p.levels for p in parts), np.zeros((BINS, 6))),
+        sum((p.levels for p in parts), np.zeros((BINS, 8))),
         sum((p.rows_seen for p in parts), np.zeros((geometry.rows, 2))),
         sum((p.amplitude_mass for p in parts), np.zeros(len(model.amplitude) + 1)),
         sum(p.evidence for p in parts),
@@ -141,7 +145,8 @@ def _start(
     typical = float(np.median(ambient))
     near_m = geometry.depth_range_m[0] * 1.2
     haze = max(level - typical, 0.0) * np.exp(-2.0 * extinction_per_m * np.maximum(path_m - near_m, 0.0))
-    profile = np.stack([haze, np.zeros(BINS), stripe_scale(path_m, extinction_per_m)], 1).astype(np.float32)
+    columns = [haze, np.zeros(BINS), stripe_scale(path_m, extinction_per_m), np.zeros(BINS)]
+    profile = np.stack(columns, 1).astype(np.float32)
     amplitude = np.geomspace(0.03, 30.0, AMPLITUDES).astype(np.float32)
     return RowModel(
         profile, w_lo, per_w, np.ones(geometry.rows, np.float32), ambient, amplitude,
@@ -180,10 +185,11 @@ def maximise(model: RowModel, seen: Expectation, *, spread: bool) -> RowModel:
     known = np.isfinite(rest) & (before > 0)
     weight_of = np.where(known, 1.0 / np.where(known, rest_variance, 1.0), 0.0)
     share = float(np.sum(weight_of * before * np.nan_to_num(rest)) / max(np.sum(weight_of * before**2), 1e-30))
-    behind = np.minimum(_blend(rest, rest_variance, min(max(share, 0.0), 1.0) * before), before)
+    behind = min(max(share, 0.0), 1.0) * before
     resolved = fit is not None and np.isfinite(fit.extinction_sd_per_m)
     extinction = fit.extinction_per_m if fit is not None and resolved else 0.0
-    profile = np.stack([before, behind, stripe_scale(path_m, extinction)], 1).astype(np.float32)
+    scale = stripe_scale(path_m, extinction)
+    profile = np.stack([before, behind, scale, _position_prior(seen.levels)], 1).astype(np.float32)
     amplitude, weight, none = _amplitudes(model, seen.amplitude_mass, spread)
     return replace(
         model, profile=profile, row_gain=_row_gain(model, seen, typical, before), amplitude=amplitude, weight=weight,
@@ -221,14 +227,25 @@ def _amplitudes(
     weight = (mass[:-1] + 1.0) / (mass[:-1].sum() + len(mass) - 1)
     if not spread or mass.sum() < 100.0:
         return model.amplitude, weight, none
-    # Keep the grid on the amplitudes that occur: mean +- 1.8 sd of their logarithm, a factor 2.2 to 12 each way.
+    # The grid ends at the brightest stripes that occur and reaches down to those a single row can hardly show.
     log_q = np.log(model.amplitude.astype(np.float64))
-    mean = float(np.sum(weight * log_q))
-    sd = float(np.sqrt(np.sum(weight * (log_q - mean) ** 2)))
-    half = float(np.clip(1.8 * sd, 0.8, 2.5))
-    moved = np.linspace(mean - half, mean + half, AMPLITUDES)
-    density = np.exp(-0.5 * ((moved - mean) / max(sd, 0.4)) ** 2)
+    step = log_q[1] - log_q[0]
+    below = np.cumsum(weight)
+    top = float(np.interp(0.97, below, log_q + 0.5 * step))
+    moved = np.linspace(top - AMPLITUDE_SPAN, top, AMPLITUDES)
+    density = np.exp(np.interp(moved, log_q, np.log(weight)))
     return np.exp(moved).astype(np.float32), density / density.sum(), none
+
+
+def _position_prior(levels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Log density of stripes over the bins (BINS,), 0 where they are spread evenly; smooth, and never against a place.
+
+    It decides only where a row hardly has photons; a quarter of it stays even, so that it can say at most 1.4 against.
+    """
+    kernel = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
+    found, even = (np.convolve(np.pad(levels[:, i], 2), kernel, "valid") for i in (6, 7))
+    density = (found + 1e-9) / (even + 1e-9)
+    return np.asarray(np.log(EVEN_SHARE + (1.0 - EVEN_SHARE) * density))
 
 
 def _row_gain(model: RowModel, seen: Expectation, ambient: float, before: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -11,9 +11,6 @@ from rig.geometry import MARGIN_PX
 
 CUT: Final = 0.05
 """Share of the depth range outside the picture up to which a row tells how often the stripe is missing."""
-CERTAIN: Final = 0.6
-"""Probability within 1 px from which a row teaches the haze profile."""
-
 
 @numba.njit(cache=True, nogil=True)
 def learn_rows(
@@ -47,8 +44,8 @@ def learn_rows(
 ) -> float:
     """Expectation step over the listed (row, column) pairs; returns the log evidence.
 
-    Adds to levels (bins, 6): ones, exposures and geometry-weighted exposures before the stripe, then the same behind it,
-    each weighted with the probability of being there; rows_seen (rows, 2): ones before the stripe that haze explains,
+    Adds to levels (bins, 8): ones, exposures and geometry-weighted exposures before the stripe, then the same behind it,
+    each weighted with the probability of being there, then stripes, and stripes if all positions were alike; rows_seen (rows, 2): ones before the stripe that haze explains,
     and those expected; amplitude_mass (M + 1,): rows per amplitude, the last one 'no stripe'.
     """
     window = counts.shape[2]
@@ -60,6 +57,7 @@ def learn_rows(
     cell = np.empty(window, np.int32)
     gain = np.empty(window, np.float32)
     w = np.empty(window, np.float32)
+    log_prior = np.empty(window, np.float32)
     taps = np.empty((3, window), np.float32)
     edge = np.empty(window + 1, np.float32)
     score = np.empty((amplitudes, window), np.float32)
@@ -73,7 +71,7 @@ def learn_rows(
             continue
         length, first, start = load_row(
             counts[c, y], x0[c], y, x_lo[y, c], x_hi[y, c], MARGIN_PX, near_is_left, plane[c], u, v, ambient, profile,
-            profile_lo, profile_per_w, row_gain[y], n, before, behind, scale, cell, gain, w,
+            profile_lo, profile_per_w, row_gain[y], n, before, behind, scale, cell, gain, w, log_prior,
         )  # fmt: skip
         last = first + x_hi[y, c] - x_lo[y, c]
         first, last = max(first, 0), min(last, length - 1)
@@ -82,7 +80,7 @@ def learn_rows(
         k = np.float32(n_frames[c])
         row_scores(n, k, before, behind, scale, length, amplitude, psi, table, taps, edge, score)
         prior = none_prior(w_near, w_far, w[first], w[last], none_weight)
-        none, row_evidence = row_posterior(score, edge, length, first, last, log_weight, prior, posterior, mass)
+        none, row_evidence = row_posterior(score, edge, length, first, last, log_weight, log_prior, prior, posterior, mass)
         for t in range(length):
             evidence += taps[1, t]
         evidence += row_evidence
@@ -90,9 +88,10 @@ def learn_rows(
             for m in range(amplitudes):
                 amplitude_mass[m] += mass[m]
             amplitude_mass[amplitudes] += none
-        # Only rows whose stripe is fairly certain say what is before and what behind; doubtful ones would teach the
-        # model its own guess.
-        if mode_of(posterior, first, last)[1] < CERTAIN:
+            for j in range(first, last + 1):
+                levels[cell[j], 6] += posterior[j]
+                levels[cell[j], 7] += (1.0 - none) / (last - first + 1)
+        if none > 0.5:
             continue
         passed = 0.0
         for t in range(length):
@@ -165,6 +164,7 @@ def estimate_rows(
     cell = np.empty(window, np.int32)
     gain = np.empty(window, np.float32)
     w = np.empty(window, np.float32)
+    log_prior = np.empty(window, np.float32)
     taps = np.empty((3, window), np.float32)
     edge = np.empty(window + 1, np.float32)
     score = np.empty((amplitudes, window), np.float32)
@@ -182,7 +182,7 @@ def estimate_rows(
                 continue
             length, first, start = load_row(
                 counts[c, y], x0[c], y, x_lo[y, c], x_hi[y, c], MARGIN_PX, near_is_left, plane[c], u, v, ambient,
-                profile, profile_lo, profile_per_w, row_gain[y], n, before, behind, scale, cell, gain, w,
+                profile, profile_lo, profile_per_w, row_gain[y], n, before, behind, scale, cell, gain, w, log_prior,
             )  # fmt: skip
             last = first + x_hi[y, c] - x_lo[y, c]
             first, last = max(first, 0), min(last, length - 1)
@@ -190,7 +190,7 @@ def estimate_rows(
                 continue
             row_scores(n, k, before, behind, scale, length, amplitude, psi, table, taps, edge, score)
             prior = none_prior(w_near, w_far, w[first], w[last], none_weight)
-            row_posterior(score, edge, length, first, last, log_weight, prior, posterior, mass)
+            row_posterior(score, edge, length, first, last, log_weight, log_prior, prior, posterior, mass)
             mode, near = mode_of(posterior, first, last)
             offset, sd = refine(
                 n, k, before, behind, scale, length, mode, score, edge, taps, amplitude, log_weight, fine, table, labels

@@ -91,12 +91,13 @@ def load_row(
     cell: NDArray[np.int32],
     gain_of: NDArray[np.float32],
     inverse_depth: NDArray[np.float32],
+    log_prior: NDArray[np.float32],
 ) -> tuple[int, int, int]:
     """Read one row of one column in near-to-far order.
 
-    counts: (window,) of this row and column from pixel x0 on; lo, hi: search interval; profile: (bins, 3) of haze before,
-    level behind and stripe scale over path inverse depth. Fills n, before, behind, scale, cell up to the returned
-    length; returns (length, first hypothesis, x of index 0). Pixel of index t is x + t or x - t.
+    counts: (window,) of this row and column from pixel x0 on; lo, hi: search interval; profile: (bins, 4) of haze before,
+    level behind, stripe scale and log prior of positions over path inverse depth. Fills n, before, behind, scale, cell,
+    gain_of, inverse_depth and log_prior up to the returned length; returns (length, first hypothesis, x of index 0). Pixel of index t is x + t or x - t.
     """
     first = max(lo - margin, x0, 0)
     last = min(hi + margin, x0 + counts.shape[0] - 1, u.shape[1] - 1)
@@ -131,6 +132,7 @@ def load_row(
         cell[t] = i
         gain_of[t] = gain
         inverse_depth[t] = w
+        log_prior[t] = profile[i, 3]
     return length, (lo - first if near_is_left else last - hi), start
 
 
@@ -209,6 +211,7 @@ def row_posterior(
     first: int,
     last: int,
     log_weight: NDArray[np.float32],
+    log_prior: NDArray[np.float32],
     none: tuple[float, float, float],
     posterior: NDArray[np.float32],
     by_amplitude: NDArray[np.float64],
@@ -216,20 +219,22 @@ def row_posterior(
     """Posterior (length,) over positions, summed over amplitudes; by_amplitude (M,) sums the other way.
 
     none: prior of a row that is behind its stripe all along (nearer than the picture), of one that is before it, and of
-    one whose haze ends somewhere without a stripe. Returns (probability of 'no stripe', log evidence of the row). Prior:
-    positions alike, amplitudes by log_weight.
+    one whose haze ends somewhere without a stripe. log_prior: of positions, up to a constant; log_weight: of amplitudes.
+    Returns (probability of 'no stripe', log evidence of the row).
     """
-    positions = last - first + 1
-    seen = 1.0 - none[0] - none[1] - none[2]
-    log_uniform = np.log(seen / positions)
+    mass = 0.0
+    for j in range(first, last + 1):
+        posterior[j] = np.exp(log_prior[j])
+        mass += posterior[j]
+    log_share = np.log((1.0 - none[0] - none[1] - none[2]) / mass)
     best = np.float32(-1e30)
     for m in range(score.shape[0]):
         top = np.float32(-1e30)
         for j in range(first, last + 1):
-            top = max(top, score[m, j])
+            top = max(top, score[m, j] + log_prior[j])
         best = max(best, top + log_weight[m])
-    log_step = np.log(none[2] / (length + 1)) - log_uniform
-    log_behind, log_before = np.log(none[0]) - log_uniform, np.log(none[1]) - log_uniform
+    log_step = np.log(none[2] / (length + 1)) - log_share
+    log_behind, log_before = np.log(none[0]) - log_share, np.log(none[1]) - log_share
     for t in range(length + 1):
         best = max(best, edge[t] + log_step)
     best = max(best, edge[0] + log_behind, edge[length] + log_before)
@@ -244,7 +249,7 @@ def row_posterior(
     for m in range(score.shape[0]):
         subtotal = 0.0
         for j in range(first, last + 1):
-            s = score[m, j] + log_weight[m] - best
+            s = score[m, j] + log_prior[j] + log_weight[m] - best
             if s > -LOST:
                 p = np.exp(s)
                 posterior[j] += p
@@ -258,7 +263,7 @@ def row_posterior(
         posterior[j] *= inverse
     for m in range(score.shape[0]):
         by_amplitude[m] *= inverse
-    return total_none * inverse, np.log(total) + best + log_uniform
+    return total_none * inverse, np.log(total) + best + log_share
 
 
 @numba.njit(cache=True, nogil=True)

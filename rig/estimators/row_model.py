@@ -22,8 +22,8 @@ EXTINCTION_MAX_PER_M = 5.0
 class RowModel:
     """Learned state of the row likelihood, enough to estimate any map again bit for bit.
 
-    profile: (BINS, 3) float32 over path inverse depth from w_lo in steps 1/per_w: haze before the stripe and level behind
-    it in photons per exposure and pixel at unit geometry factor, and the stripe scale S.
+    profile: (BINS, 4) float32 over path inverse depth from w_lo in steps 1/per_w: haze before the stripe and level behind
+    it in photons per exposure and pixel at unit geometry factor, the stripe scale S, and the log prior of positions.
     row_gain: (rows,) float32, strength of the line on each row; ambient: (rows, width) float32, photons per exposure of
     ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at S = 1 and their probability;
     none_weight: probability of a row without stripe. line_sigma_px: width of the line. extinction_per_m and its standard
