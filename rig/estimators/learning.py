@@ -93,21 +93,22 @@ def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: NDArray[n
     """Row model of a sweep that nothing is known about: several starts, the likeliest one refined."""
     lines = lattice(geometry, LATTICE_LINES)
     few = lattice(geometry, LATTICE_LINES // 4)
+    guessed = volume.dark_counts is None
     best: tuple[float, RowModel] | None = None
     for extinction in START_EXTINCTIONS_PER_M:
         model = _start(volume, geometry, ambient, extinction)
         for _ in range(2):
-            model = maximise(model, expect(volume, geometry, model, few), spread=True)
+            model = maximise(model, expect(volume, geometry, model, few), spread=True, free_ambient=guessed)
         evidence = expect(volume, geometry, model, few).evidence
         if best is None or evidence > best[0]:
             best = evidence, model
     assert best is not None
     model = best[1]
     for _ in range(FIRST_ROUNDS):
-        model = maximise(model, expect(volume, geometry, model, few), spread=True)
+        model = maximise(model, expect(volume, geometry, model, few), spread=True, free_ambient=guessed)
         model = fit_line_width(volume, geometry, model, few)
     for _ in range(LAST_ROUNDS):
-        model = maximise(model, expect(volume, geometry, model, lines), spread=False)
+        model = maximise(model, expect(volume, geometry, model, lines), spread=False, free_ambient=guessed)
     return model
 
 
@@ -172,20 +173,25 @@ def flux(ones: float, exposures: float) -> float:
     return float(np.log((exposures + 0.5) / (exposures - ones + 0.5))) if exposures > 0 else 0.0
 
 
-def maximise(model: RowModel, seen: Expectation, *, spread: bool) -> RowModel:
-    """Model that explains the weighted counts best; `spread` lets the amplitude grid move."""
+def maximise(model: RowModel, seen: Expectation, *, spread: bool, free_ambient: bool = False) -> RowModel:
+    """Model that explains the weighted counts best.
+
+    spread: the amplitude grid may move; free_ambient: the level of ambient light was guessed and is learned as well.
+    """
     path_m = model.path_m()
     typical = float(np.median(model.ambient))
     haze, haze_variance = _level(seen.levels[:, 0], seen.levels[:, 1], seen.levels[:, 2], typical)
+    rest, rest_variance = _level(seen.levels[:, 3], seen.levels[:, 4], seen.levels[:, 5], typical)
+    excess, share = _split_rest(rest, rest_variance, haze)
+    if free_ambient:
+        shift = max(excess, 1e-6 - typical)
+        model = replace(model, ambient=np.maximum(model.ambient + np.float32(shift), np.float32(1e-6)))
+        typical += shift
+        haze = haze - shift
     fit = fit_haze(path_m, haze, haze_variance)
     fitted = fit.amplitude * np.exp(-2.0 * fit.extinction_per_m * path_m) if fit else np.zeros(BINS)
     before = _blend(haze, haze_variance, fitted)
-    rest, rest_variance = _level(seen.levels[:, 3], seen.levels[:, 4], seen.levels[:, 5], typical)
-    # The pedestal is light scattered more than once: where no counts say otherwise, a share of the haze itself.
-    known = np.isfinite(rest) & (before > 0)
-    weight_of = np.where(known, 1.0 / np.where(known, rest_variance, 1.0), 0.0)
-    share = float(np.sum(weight_of * before * np.nan_to_num(rest)) / max(np.sum(weight_of * before**2), 1e-30))
-    behind = min(max(share, 0.0), 1.0) * before
+    behind = share * before
     resolved = fit is not None and np.isfinite(fit.extinction_sd_per_m)
     extinction = fit.extinction_per_m if fit is not None and resolved else 0.0
     scale = stripe_scale(path_m, extinction)
@@ -196,6 +202,26 @@ def maximise(model: RowModel, seen: Expectation, *, spread: bool) -> RowModel:
         none_weight=none, extinction_per_m=fit.extinction_per_m if fit else np.nan,
         extinction_sd_per_m=fit.extinction_sd_per_m if fit and resolved else np.nan,
     )  # fmt: skip
+
+
+def _split_rest(
+    rest: NDArray[np.float64], variance: NDArray[np.float64], haze: NDArray[np.float64]
+) -> tuple[float, float]:
+    """The level behind the stripe as ambient left over and a share (0 to 1) of the haze: light scattered more than once.
+
+    Weighted fit of rest = excess + share * haze over the bins; without enough bins all of it is haze's, or nothing.
+    """
+    known = np.isfinite(rest) & np.isfinite(haze) & (variance > 0)
+    if known.sum() < 4:
+        return 0.0, 0.0
+    weight, x, y = 1.0 / variance[known], np.maximum(haze[known], 0.0), rest[known]
+    mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)
+    spread = float(np.average((x - mean_x) ** 2, weights=weight))
+    # A haze as even as this cannot be told from ambient light.
+    if spread < 1e-4 * mean_x**2 + 1e-12:
+        return float(mean_y), 0.0
+    share = float(np.clip(np.average((x - mean_x) * (y - mean_y), weights=weight) / spread, 0.0, 1.0))
+    return float(mean_y - share * mean_x), share
 
 
 def _level(

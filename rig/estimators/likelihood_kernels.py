@@ -11,6 +11,9 @@ from rig.geometry import MARGIN_PX
 
 CUT: Final = 0.05
 """Share of the depth range outside the picture up to which a row tells how often the stripe is missing."""
+CERTAIN: Final = 0.6
+"""Probability within 1 px from which a row teaches the level behind the stripe."""
+
 
 @numba.njit(cache=True, nogil=True)
 def learn_rows(
@@ -93,6 +96,8 @@ def learn_rows(
                 levels[cell[j], 7] += (1.0 - none) / (last - first + 1)
         if none > 0.5:
             continue
+        # Doubtful rows would teach the level behind the stripe their own guess; haze before it is plentiful anyway.
+        certain = mode_of(posterior, first, last)[1] > CERTAIN
         passed = 0.0
         for t in range(length):
             passed += posterior[t]
@@ -113,9 +118,10 @@ def learn_rows(
             levels[b, 0] += p_before * n[t]
             levels[b, 1] += p_before * k
             levels[b, 2] += p_before * k * gain[t]
-            levels[b, 3] += p_behind * n[t]
-            levels[b, 4] += p_behind * k
-            levels[b, 5] += p_behind * k * gain[t]
+            if certain:
+                levels[b, 3] += p_behind * n[t]
+                levels[b, 4] += p_behind * k
+                levels[b, 5] += p_behind * k * gain[t]
             rows_seen[y, 0] += p_before * n[t]
             rows_seen[y, 1] += p_before * k * -np.expm1(-before[t])
     return evidence
