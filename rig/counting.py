@@ -39,6 +39,10 @@ class CountVolume:
     n_dark: int
     width: int
 
+    def bound_column(self) -> NDArray[np.float64]:
+        """Fractional column of each bin (columns,), its own centre where it has no frames."""
+        return np.where(self.n_frames > 0, self.column, np.arange(len(self.column), dtype=np.float64))
+
     def intensity(self) -> NDArray[np.uint32]:
         """Counts summed over the columns, (rows, width) uint32."""
         columns, rows, window = self.counts.shape

@@ -97,9 +97,8 @@ class Reconstructor:
         """Geometry with the planes where the frames of each column really were."""
         if self._model is None:
             return self.geometry
-        column = np.arange(len(self._commands), dtype=np.float64)
-        column = np.clip(np.where(np.isfinite(volume.column), volume.column, column), 0, len(column) - 1)
-        planes = self._model.planes(np.interp(column, np.arange(len(column)), self._commands))
+        columns = np.arange(len(self._commands))
+        planes = self._model.planes(np.interp(volume.bound_column(), columns, self._commands))
         return replace(self.geometry, planes=planes, plane=planes[:, :3] / planes[:, 3:])
 
     def _fog(self) -> FogEstimate:

@@ -135,14 +135,14 @@ def _collect(
     run: Run,
     sweeps: list[SweepData],
 ) -> None:
-    truth: SweepTruth | None = None
     running = acquisition.run()
     with closing(running):
         for sweep in running:
             result = reconstructor.map(sweep.volume)
-            if truth is None and rig.world is not None:
-                truth = rig.world.truth(plan.commands)  # only now: no estimate ever sees it
-            run.add(result, getattr(sweep, "count_s", 0.0) + result.compute_s, truth)
+            truth: SweepTruth | None = None
+            if rig.world is not None:  # asked only now: no estimate ever sees it
+                truth = rig.world.truth(plan.command_at(sweep.volume.bound_column()))
+            run.add(result, sweep.count_s + result.compute_s, truth)
             sweeps.append(sweep)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import CountVolume
-from rig.estimators.likelihood_kernels import window_sums
+from rig.estimators.ambient_kernels import window_sums
 from rig.geometry import SweepGeometry
 
 NEIGHBOURHOOD_PX = 31
@@ -17,9 +17,7 @@ HOT_SIGMA = 6.0
 """Excess over the neighbours, in standard deviations, that makes a pixel hot: 1e-9 of good pixels pass."""
 
 
-def ambient_map(
-    volume: CountVolume, geometry: SweepGeometry, quiet: NDArray[np.uint32] | None
-) -> NDArray[np.float32]:
+def ambient_map(volume: CountVolume, geometry: SweepGeometry, quiet: NDArray[np.uint32] | None) -> NDArray[np.float32]:
     """Photons per exposure (rows, width) float32 from dark frames, `quiet` (2, rows, width) counts and hot pixels.
 
     quiet: ones and exposures of each pixel while clearly behind the stripe; None before any stripe is known.

@@ -13,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import CountVolume
-from rig.estimators.ambient import ambient_map
 from rig.estimators.likelihood_kernels import learn_rows
-from rig.estimators.row_kernels import logit_table
-from rig.estimators.row_model import AMPLITUDES, BINS, RowModel, fit_haze, line_profile, stripe_scale
+from rig.estimators.row_input import state_of, sweep_of
+from rig.estimators.row_model import AMPLITUDES, BINS, RowModel, fit_haze, stripe_scale
 from rig.geometry import SweepGeometry
 
 LATTICE_LINES = 8192
 """Rows x columns of a sweep that a learning round reads: about 10^6 pixels."""
 FIRST_ROUNDS = 8
 LAST_ROUNDS = 3
+LEVELS = 14
+"""Sums per profile bin of an expectation, see `learn_rows`."""
 PIECES = 4
 AMPLITUDE_SPAN = 4.6
 """Natural logarithm of the ratio of the largest amplitude to the smallest: two decades of reflectance."""
@@ -31,7 +32,6 @@ EVEN_SHARE = 0.25
 PRIOR_PHOTONS = 100.0
 """Weight of the fitted exponential against each bin's own counts."""
 START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
-TABLE = logit_table()
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +40,7 @@ class Expectation:
 
     levels: NDArray[np.float64]
     rows_seen: NDArray[np.float64]
+    columns_seen: NDArray[np.float64]
     amplitude_mass: NDArray[np.float64]
     evidence: float
 
@@ -50,7 +51,11 @@ def lattice(geometry: SweepGeometry, lines: int) -> tuple[NDArray[np.int32], NDA
     if len(y) <= lines:
         return y.astype(np.int32), c.astype(np.int32)
     # Golden-ratio steps cover rows and columns without beating against either.
-    pick = np.unique((np.arange(lines) * (len(y) / lines) + (np.arange(lines) * 0.6180339887) % 1 * (len(y) / lines)).astype(np.int64))
+    pick = np.unique(
+        (np.arange(lines) * (len(y) / lines) + (np.arange(lines) * 0.6180339887) % 1 * (len(y) / lines)).astype(
+            np.int64
+        )
+    )
     return y[pick].astype(np.int32), c[pick].astype(np.int32)
 
 
@@ -59,34 +64,25 @@ def expect(
 ) -> Expectation:
     """Expectation step of `model` over the given (rows, columns)."""
     typical = float(np.median(model.ambient))
-    psi = line_profile(model.line_sigma_px)
-    near_m, far_m = geometry.depth_range_m
+    sweep, state = sweep_of(volume, geometry), state_of(model)
 
     def piece(rows: NDArray[np.int32], columns: NDArray[np.int32]) -> Expectation:
-        levels, rows_seen = np.zeros((BINS, 8)), np.zeros((geometry.rows, 2))
+        levels = np.zeros((BINS, LEVELS))
+        rows_seen, columns_seen = np.zeros((geometry.rows, 2)), np.zeros((geometry.columns, 2))
         mass = np.zeros(len(model.amplitude) + 1)
-        evidence = learn_rows(
-            volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left,
-            geometry.plane, geometry.u, geometry.v, model.ambient, model.profile, model.w_lo, model.per_w,
-            model.row_gain, model.amplitude, log_weights(model), model.none_weight, 1.0 / near_m, 1.0 / far_m, psi, TABLE,
-            rows, columns, 5.0 * typical + 1e-3, levels, rows_seen, mass,
-        )  # fmt: skip
-        return Expectation(levels, rows_seen, mass, float(evidence))
+        evidence = learn_rows(sweep, state, rows, columns, 5.0 * typical + 1e-3, levels, rows_seen, columns_seen, mass)
+        return Expectation(levels, rows_seen, columns_seen, mass, float(evidence))
 
     # Fixed pieces, added in order: the sums do not depend on the number of threads.
     with ThreadPoolExecutor(PIECES) as pool:
         parts = list(pool.map(piece, np.array_split(lines[0], PIECES), np.array_split(lines[1], PIECES)))
     return Expectation(
-        sum((p.levels for p in parts), np.zeros((BINS, 8))),
+        sum((p.levels for p in parts), np.zeros((BINS, LEVELS))),
         sum((p.rows_seen for p in parts), np.zeros((geometry.rows, 2))),
+        sum((p.columns_seen for p in parts), np.zeros((geometry.columns, 2))),
         sum((p.amplitude_mass for p in parts), np.zeros(len(model.amplitude) + 1)),
         sum(p.evidence for p in parts),
     )
-
-
-def log_weights(model: RowModel) -> NDArray[np.float32]:
-    """Log prior of the amplitudes (M,) float32."""
-    return np.log(np.maximum(model.weight, 1e-6)).astype(np.float32)
 
 
 def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: NDArray[np.float32]) -> RowModel:
@@ -123,7 +119,9 @@ def fit_line_width(
     volume: CountVolume, geometry: SweepGeometry, model: RowModel, lines: tuple[NDArray[np.int32], NDArray[np.int32]]
 ) -> RowModel:
     """Move the line width one step up or down where that makes the counts likelier."""
-    tried = [replace(model, line_sigma_px=float(np.clip(model.line_sigma_px * f, 0.25, 2.4))) for f in (0.87, 1.0, 1.15)]
+    tried = [
+        replace(model, line_sigma_px=float(np.clip(model.line_sigma_px * f, 0.25, 2.4))) for f in (0.87, 1.0, 1.15)
+    ]
     evidence = [expect(volume, geometry, m, lines).evidence for m in tried]
     return tried[int(np.argmax(evidence))]
 
@@ -150,7 +148,8 @@ def _start(
     profile = np.stack(columns, 1).astype(np.float32)
     amplitude = np.geomspace(0.03, 30.0, AMPLITUDES).astype(np.float32)
     return RowModel(
-        profile, w_lo, per_w, np.ones(geometry.rows, np.float32), ambient, amplitude,
+        profile, w_lo, per_w, np.ones(geometry.rows, np.float32),
+        np.ones(geometry.columns, np.float32), ambient, amplitude,
         np.full(AMPLITUDES, 1.0 / AMPLITUDES), 0.02, 0.8, extinction_per_m, np.nan,
     )  # fmt: skip
 
@@ -162,7 +161,11 @@ def _near_level(volume: CountVolume, geometry: SweepGeometry) -> float:
     lo, hi = geometry.x_lo[rows, columns], geometry.x_hi[rows, columns]
     share = np.maximum((hi - lo + 1) // 8, 1)
     for y, c, a, b, n in zip(rows, columns, lo, hi, share, strict=True):
-        x = slice(a - volume.x0[c], a - volume.x0[c] + n) if geometry.near_is_left else slice(b - n + 1 - volume.x0[c], b + 1 - volume.x0[c])
+        x = (
+            slice(a - volume.x0[c], a - volume.x0[c] + n)
+            if geometry.near_is_left
+            else slice(b - n + 1 - volume.x0[c], b + 1 - volume.x0[c])
+        )
         ones += float(volume.counts[c, y, x].sum())
         exposures += float(volume.n_frames[c]) * n
     return flux(ones, exposures)
@@ -180,8 +183,8 @@ def maximise(model: RowModel, seen: Expectation, *, spread: bool, free_ambient: 
     """
     path_m = model.path_m()
     typical = float(np.median(model.ambient))
-    haze, haze_variance = _level(seen.levels[:, 0], seen.levels[:, 1], seen.levels[:, 2], typical)
-    rest, rest_variance = _level(seen.levels[:, 3], seen.levels[:, 4], seen.levels[:, 5], typical)
+    haze, haze_variance = _level(seen.levels[:, 0:4])
+    rest, rest_variance = _level(seen.levels[:, 4:8])
     excess, share = _split_rest(rest, rest_variance, haze)
     if free_ambient:
         shift = max(excess, 1e-6 - typical)
@@ -197,10 +200,13 @@ def maximise(model: RowModel, seen: Expectation, *, spread: bool, free_ambient: 
     scale = stripe_scale(path_m, extinction)
     profile = np.stack([before, behind, scale, _position_prior(seen.levels)], 1).astype(np.float32)
     amplitude, weight, none = _amplitudes(model, seen.amplitude_mass, spread)
+    # The stated extinction comes from rows beyond doubt alone: a stripe taken for haze would flatten the decay.
+    clear = fit_haze(path_m, *_level(seen.levels[:, 8:12]))
     return replace(
-        model, profile=profile, row_gain=_row_gain(model, seen, typical, before), amplitude=amplitude, weight=weight,
-        none_weight=none, extinction_per_m=fit.extinction_per_m if fit else np.nan,
-        extinction_sd_per_m=fit.extinction_sd_per_m if fit and resolved else np.nan,
+        model, profile=profile, row_gain=_gain(model.row_gain, seen.rows_seen, typical, before),
+        column_gain=_gain(model.column_gain, seen.columns_seen, typical, before), amplitude=amplitude, weight=weight,
+        none_weight=none, extinction_per_m=clear.extinction_per_m if clear else np.nan,
+        extinction_sd_per_m=clear.extinction_sd_per_m if clear else np.nan,
     )  # fmt: skip
 
 
@@ -224,16 +230,19 @@ def _split_rest(
     return float(mean_y - share * mean_x), share
 
 
-def _level(
-    ones: NDArray[np.float64], exposures: NDArray[np.float64], geometric: NDArray[np.float64], ambient: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Flux above ambient per unit geometry factor and its variance, NaN in bins without data."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        gain = geometric / exposures
-        total = np.log((exposures + 0.5) / (exposures - ones + 0.5))
-        variance = np.expm1(total) / exposures + 1.0 / exposures**2
-        few = exposures < 50
-        return np.where(few, np.nan, (total - ambient) / gain), np.where(few, np.nan, variance / gain**2)
+def _level(sums: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Flux above ambient per unit geometry factor and its variance (BINS,), NaN in bins without data.
+
+    sums: (BINS, 4), ones, exposures, and exposures weighted with geometry factor and ambient flux.
+    """
+    ones, exposures, geometric, ambient = sums.T
+    few = exposures < 50
+    weight = np.where(few, 1.0, exposures)
+    gain = np.where(few, 1.0, geometric) / weight
+    total = np.log((weight + 0.5) / (weight - np.where(few, 0.0, ones) + 0.5))
+    variance = np.expm1(total) / weight + 1.0 / weight**2
+    level = (total - ambient / weight) / gain
+    return np.where(few, np.nan, level), np.where(few, np.nan, variance / gain**2)
 
 
 def _blend(
@@ -269,24 +278,25 @@ def _position_prior(levels: NDArray[np.float64]) -> NDArray[np.float64]:
     It decides only where a row hardly has photons; a quarter of it stays even, so that it can say at most 1.4 against.
     """
     kernel = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
-    found, even = (np.convolve(np.pad(levels[:, i], 2), kernel, "valid") for i in (6, 7))
+    found, even = (np.convolve(np.pad(levels[:, i], 2), kernel, "valid") for i in (12, 13))
     density = (found + 1e-9) / (even + 1e-9)
     return np.asarray(np.log(EVEN_SHARE + (1.0 - EVEN_SHARE) * density))
 
 
-def _row_gain(model: RowModel, seen: Expectation, ambient: float, before: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Strength of the line per row, smoothed over 65 rows; 1 on average, and everywhere where haze is weak."""
-    expected, ones = (
-        cv2.blur(np.ascontiguousarray(seen.rows_seen[:, i : i + 1]), (1, 65), borderType=cv2.BORDER_REFLECT).ravel()
-        for i in (1, 0)
+def _gain(
+    gain: NDArray[np.float32], seen: NDArray[np.float64], ambient: float, before: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Strength of the haze per row or column, smoothed over 65 of them; 1 on average, unchanged where haze is weak.
+
+    seen: (n, 2), ones before the stripe and those expected with the present gain.
+    """
+    ones, expected = (
+        cv2.blur(np.ascontiguousarray(seen[:, i : i + 1]), (1, 65), borderType=cv2.BORDER_REFLECT).ravel()
+        for i in (0, 1)
     )
     haze_share = float(before.mean() / (before.mean() + ambient + 1e-9))
-    if haze_share < 0.3 or expected.min() < 100:
-        return model.row_gain
-    gain = model.row_gain * np.clip(ones / expected, 0.5, 2.0)
-    return np.clip(gain / gain.mean(), 0.2, 5.0).astype(np.float32)
-
-
-def first_ambient(volume: CountVolume, geometry: SweepGeometry) -> NDArray[np.float32]:
-    """Ambient and dark flux per pixel before anything else is known."""
-    return ambient_map(volume, geometry, None)
+    if haze_share < 0.3:
+        return gain
+    # Few counts say little: as if 100 more had been as expected.
+    learned = gain * np.clip((ones + 100.0) / (expected + 100.0), 0.5, 2.0)
+    return np.asarray(np.clip(learned / learned.mean(), 0.2, 5.0), dtype=np.float32)

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from rig.counting import CountVolume
 from rig.estimators.ambient import ambient_map
-from rig.estimators.learning import TABLE, learn_first, learn_next, log_weights
+from rig.estimators.learning import learn_first, learn_next
 from rig.estimators.likelihood_kernels import estimate_rows
-from rig.estimators.row_model import RowModel, fine_profiles, line_profile
+from rig.estimators.row_input import state_of, sweep_of
+from rig.estimators.row_model import RowModel
 from rig.geometry import SweepGeometry
 from rig.stripes import StripeTable
 
@@ -51,17 +52,10 @@ class Likelihood:
         out = np.full((5, rows, columns), np.nan, np.float32)
         out[1] = 0.0
         quiet = np.zeros((2, rows, geometry.width), np.uint32)
-        weights = log_weights(model)
-        near_m, far_m = geometry.depth_range_m
-        psi, fine = line_profile(model.line_sigma_px), fine_profiles(model.line_sigma_px)
+        sweep, state = sweep_of(volume, geometry), state_of(model)
 
         def work(first: int, last: int) -> None:
-            estimate_rows(
-                volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left,
-                geometry.plane, geometry.u, geometry.v, model.ambient, model.profile, model.w_lo, model.per_w,
-                model.row_gain, model.amplitude, weights, model.none_weight,
-                1.0 / near_m, 1.0 / far_m, psi, fine, TABLE, first, last, out, quiet,
-            )  # fmt: skip
+            estimate_rows(sweep, state, first, last, out, quiet)
 
         pieces = np.linspace(0, rows, 4 * self.threads + 1).astype(int)
         with ThreadPoolExecutor(self.threads) as pool:

@@ -137,7 +137,9 @@ def peak_rows(
 
 
 @numba.njit(cache=True, nogil=True)
-def _edge_scores(n: NDArray[np.float64], length: int, background: float, decay: float, score: NDArray[np.float64]) -> None:
+def _edge_scores(
+    n: NDArray[np.float64], length: int, background: float, decay: float, score: NDArray[np.float64]
+) -> None:
     """(count - background) times the drop of the mean level from the 8 px before to the 8 px behind, both cut at 0."""
     for t in range(length):
         before = 0.0

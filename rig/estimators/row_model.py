@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rig.estimators.row_kernels import LABEL_PX, LABELS
 
 BINS = 64
-AMPLITUDES = 6
+AMPLITUDES = 4
 EXTINCTION_MAX_PER_M = 5.0
 
 
@@ -24,7 +24,7 @@ class RowModel:
 
     profile: (BINS, 4) float32 over path inverse depth from w_lo in steps 1/per_w: haze before the stripe and level behind
     it in photons per exposure and pixel at unit geometry factor, the stripe scale S, and the log prior of positions.
-    row_gain: (rows,) float32, strength of the line on each row; ambient: (rows, width) float32, photons per exposure of
+    row_gain: (rows,) and column_gain: (columns,) float32, strength of the haze on each; ambient: (rows, width) float32, photons per exposure of
     ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at S = 1 and their probability;
     none_weight: probability of a row without stripe. line_sigma_px: width of the line. extinction_per_m and its standard
     deviation: NaN where the haze does not resolve it.
@@ -34,6 +34,7 @@ class RowModel:
     w_lo: float
     per_w: float
     row_gain: NDArray[np.float32]
+    column_gain: NDArray[np.float32]
     ambient: NDArray[np.float32]
     amplitude: NDArray[np.float32]
     weight: NDArray[np.float64]
@@ -87,9 +88,7 @@ class HazeFit:
     extinction_sd_per_m: float
 
 
-def fit_haze(
-    path_m: NDArray[np.float64], flux: NDArray[np.float64], variance: NDArray[np.float64]
-) -> HazeFit | None:
+def fit_haze(path_m: NDArray[np.float64], flux: NDArray[np.float64], variance: NDArray[np.float64]) -> HazeFit | None:
     """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,); None where there is no haze.
 
     Gauss-Newton on amplitude and extinction, the latter kept in 0 to EXTINCTION_MAX_PER_M.
@@ -118,7 +117,11 @@ def fit_haze(
         if np.linalg.det(normal) <= 1e-12 * normal[0, 0] * max(normal[1, 1], 1e-300):
             break
         step = float(np.linalg.solve(normal, (design * weight) @ (h - amplitude * shape))[1])
-        extinction = float(np.clip(extinction + np.clip(step, -0.5 * extinction - 0.01, 0.5 * extinction + 0.01), 0.0, EXTINCTION_MAX_PER_M))
+        extinction = float(
+            np.clip(
+                extinction + np.clip(step, -0.5 * extinction - 0.01, 0.5 * extinction + 0.01), 0.0, EXTINCTION_MAX_PER_M
+            )
+        )
         if abs(step) < 1e-7:
             break
     misfit, amplitude = residual(extinction)
@@ -126,5 +129,7 @@ def fit_haze(
     slope = -2.0 * (s - s.min()) * amplitude * shape
     normal = (np.stack([shape, slope]) * weight) @ np.stack([shape, slope]).T
     determinant = float(np.linalg.det(normal))
-    sd = np.inf if determinant <= 0 else float(np.sqrt(normal[0, 0] / determinant * max(misfit / (used.sum() - 2), 1.0)))
+    sd = (
+        np.inf if determinant <= 0 else float(np.sqrt(normal[0, 0] / determinant * max(misfit / (used.sum() - 2), 1.0)))
+    )
     return HazeFit(amplitude * float(np.exp(2.0 * extinction * s.min())), extinction, sd)

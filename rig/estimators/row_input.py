@@ -1,0 +1,190 @@
+"""What the compiled row likelihood reads: the sweep, the learned state, and one row of it in near-to-far order."""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.counting import CountVolume
+from rig.estimators.row_kernels import (
+    FLUX_MAX,
+    FLUX_MIN,
+    LABELS,
+    logit_table,
+    none_prior,
+    row_posterior,
+    row_scores,
+)
+from rig.estimators.row_model import RowModel, fine_profiles, line_profile
+from rig.geometry import MARGIN_PX, SweepGeometry
+
+TABLE = logit_table()
+
+Float32 = NDArray[np.float32]
+
+
+class Sweep(NamedTuple):
+    """Counts and geometry of a sweep; arrays as in CountVolume and SweepGeometry, depth range as inverse depths."""
+
+    counts: NDArray[np.unsignedinteger]
+    n_frames: NDArray[np.int32]
+    x0: NDArray[np.int32]
+    x_lo: NDArray[np.int32]
+    x_hi: NDArray[np.int32]
+    near_is_left: bool
+    plane: NDArray[np.float64]
+    u: Float32
+    v: Float32
+    w_near: float
+    w_far: float
+
+
+class State(NamedTuple):
+    """A RowModel as the kernels read it: log weights instead of weights, the line's profiles instead of its width."""
+
+    profile: Float32
+    w_lo: float
+    per_w: float
+    row_gain: Float32
+    column_gain: Float32
+    ambient: Float32
+    amplitude: Float32
+    log_weight: Float32
+    none_weight: float
+    psi: Float32
+    fine: Float32
+    table: Float32
+
+
+class Row(NamedTuple):
+    """Buffers of one row, filled by `judge_row` from index 0 (nearest pixel) on; made once per thread.
+
+    n: ones; before, behind: flux of each pixel in front of and behind the stripe; scale: stripe photons at amplitude 1;
+    cell: nearest profile bin; gain: geometry factor of the haze; w: inverse depth; log_prior: of positions; taps, edge, score,
+    posterior, by_amplitude: see `row_scores` and `row_posterior`; labels: scratch of `refine`.
+    """
+
+    n: Float32
+    before: Float32
+    behind: Float32
+    scale: Float32
+    cell: NDArray[np.int32]
+    gain: Float32
+    w: Float32
+    log_prior: Float32
+    taps: Float32
+    edge: Float32
+    score: Float32
+    posterior: Float32
+    by_amplitude: NDArray[np.float64]
+    labels: NDArray[np.float64]
+
+
+def sweep_of(volume: CountVolume, geometry: SweepGeometry) -> Sweep:
+    """Kernel input of one sweep."""
+    near_m, far_m = geometry.depth_range_m
+    return Sweep(
+        volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left, geometry.plane,
+        geometry.u, geometry.v, 1.0 / near_m, 1.0 / far_m,
+    )  # fmt: skip
+
+
+def state_of(model: RowModel) -> State:
+    """Kernel input of a learned state."""
+    return State(
+        model.profile, model.w_lo, model.per_w, model.row_gain, model.column_gain, model.ambient, model.amplitude,
+        np.log(np.maximum(model.weight, 1e-6)).astype(np.float32), model.none_weight, line_profile(model.line_sigma_px),
+        fine_profiles(model.line_sigma_px), TABLE,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def row_buffers(window: int, amplitudes: int) -> Row:
+    """Buffers for rows of up to `window` pixels."""
+    return Row(
+        np.empty(window, np.float32), np.empty(window, np.float32), np.empty(window, np.float32),
+        np.empty(window, np.float32), np.empty(window, np.int32), np.empty(window, np.float32),
+        np.empty(window, np.float32), np.empty(window, np.float32), np.empty((3, window), np.float32),
+        np.empty(window + 1, np.float32), np.empty((amplitudes, window), np.float32), np.empty(window, np.float32),
+        np.empty(amplitudes, np.float64), np.empty(LABELS, np.float64),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def read_row(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[int, int, int, int]:
+    """Fill n to log_prior of `row` for row y of column c.
+
+    Returns (length, first and last index that a stripe may have, x of index 0); pixel t is x + t where near is left,
+    else x - t. The length is 0 where there is nothing to search.
+    """
+    lo, hi, x0 = sweep.x_lo[y, c], sweep.x_hi[y, c], sweep.x0[c]
+    if sweep.n_frames[c] == 0 or lo > hi:
+        return 0, 0, -1, 0
+    counts, plane, u, v, profile = sweep.counts[c, y], sweep.plane[c], sweep.u, sweep.v, state.profile
+    first = max(lo - MARGIN_PX, x0, 0)
+    last = min(hi + MARGIN_PX, x0 + counts.shape[0] - 1, u.shape[1] - 1)
+    while first < last and np.isnan(u[y, first]):
+        first += 1
+    while last > first and np.isnan(u[y, last]):
+        last -= 1
+    length = last - first + 1
+    start, step = (first, 1) if sweep.near_is_left else (last, -1)
+    begin = lo - first if sweep.near_is_left else last - hi
+    end = min(begin + hi - lo, length - 1)
+    begin = max(begin, 0)
+    if begin > end:
+        return 0, 0, -1, 0
+    top = profile.shape[0] - 1.001
+    vy = v[y, (first + last) // 2]
+    # Tangent at which this row meets the plane infinitely far away: the direction of the light in the row.
+    path_u = -(plane[1] * vy + plane[2]) / plane[0]
+    path_p = np.sqrt(1.0 + path_u * path_u + vy * vy)
+    strength = state.row_gain[y] * state.column_gain[c] * path_p
+    for t in range(length):
+        x = start + step * t
+        ux, vx = u[y, x], v[y, x]
+        path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
+        w = plane[0] * ux + plane[1] * vx + plane[2]
+        b = min(max((w * 2.0 / (path_p + path_c) - state.w_lo) * state.per_w, 0.0), top)
+        i = int(b)
+        f = np.float32(b - i)
+        gain = strength * path_c
+        haze = gain * (profile[i, 0] + f * (profile[i + 1, 0] - profile[i, 0]))
+        rest = gain * (profile[i, 1] + f * (profile[i + 1, 1] - profile[i, 1]))
+        ambient = state.ambient[y, x]
+        row.n[t] = counts[x - x0]
+        row.before[t] = min(max(ambient + haze, FLUX_MIN), FLUX_MAX)
+        row.behind[t] = min(max(ambient + rest, FLUX_MIN), FLUX_MAX)
+        row.scale[t] = profile[i, 2] + f * (profile[i + 1, 2] - profile[i, 2])
+        nearest = int(b + 0.5)
+        row.cell[t] = nearest
+        row.gain[t] = gain
+        row.w[t] = w
+        row.log_prior[t] = profile[nearest, 3]
+    return length, begin, end, start
+
+
+@numba.njit(cache=True, nogil=True)
+def judge_row(
+    sweep: Sweep, state: State, row: Row, y: int, c: int
+) -> tuple[int, int, int, int, float, float, float]:
+    """Posterior of row y of column c, in `row`.
+
+    Returns what `read_row` does, then the probability of 'no stripe', the share of its prior that the picture's border
+    accounts for, and the log evidence.
+    """
+    length, first, last, start = read_row(sweep, state, row, y, c)
+    if length == 0:
+        return 0, 0, -1, 0, 1.0, 0.0, 0.0
+    row_scores(
+        row.n, np.float32(sweep.n_frames[c]), row.before, row.behind, row.scale, length, state.amplitude, state.psi,
+        state.table, row.taps, row.edge, row.score,
+    )  # fmt: skip
+    prior = none_prior(sweep.w_near, sweep.w_far, row.w[first], row.w[last], state.none_weight)
+    none, evidence = row_posterior(
+        row.score, row.edge, length, first, last, state.log_weight, row.log_prior, prior, row.posterior, row.by_amplitude
+    )
+    for t in range(length):
+        evidence += row.taps[1, t]
+    return length, first, last, start, none, prior[0] + prior[1] - 2.0 * prior[2], evidence

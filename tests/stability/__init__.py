@@ -1,0 +1,1 @@
+"""Numerical stability: hard input, no warning, no NaN where an answer is promised."""
