@@ -25,7 +25,7 @@ from drivers.units import ExactHertz, Metres, Seconds, Watts
 MIN_DARK_FRACTION = 0.05
 """Share of a live sweep's frames that must be dark: the dark rate is learned from them."""
 
-Estimator = Literal["argmax", "edge", "likelihood", "joint"]
+Estimator = Literal["argmax", "edge", "likelihood"]
 Filter = Literal["none", "median"]
 
 

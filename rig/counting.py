@@ -7,6 +7,8 @@ Harley and Seal; only the window of the column is expanded to integers, once per
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,8 @@ BIN_DARK = -1
 BIN_UNUSABLE = -2
 """Bin of a frame that belongs to no column and is not dark (gate edge inside, outside the sweep)."""
 
-Counts = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.uint32]
+Counts = NDArray[np.unsignedinteger[Any]]
+"""uint8, uint16 or uint32, as wide as the counts need."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +58,7 @@ class CountVolume:
 class SweepCounter:
     """Adds the frames of one sweep to its count volume.
 
-    n_columns columns of `window` pixels from x0 (columns,) on, both multiples of 64, on a sensor of rows x width pixels.
+    n_columns columns of `window` pixels from x0 (columns,) on, multiples of 64, on a sensor of rows x width pixels.
     The result depends neither on the number of threads nor on how frames are grouped into blocks.
     """
 
@@ -81,7 +84,7 @@ class SweepCounter:
         self._n_dark = 0
 
     def add(self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64]) -> None:
-        """Add packed frames `bits` (n, rows, row bytes) to the bins (n,); `column` (n,) is each frame's fractional column.
+        """Add packed frames `bits` (n, rows, row bytes) to `bins` (n,); `column` (n,): each frame's fractional column.
 
         Row bytes are a multiple of 8; bins are a column index, BIN_DARK or BIN_UNUSABLE.
         """
@@ -122,4 +125,4 @@ class SweepCounter:
 
 def _pieces(rows: int, threads: int) -> Sequence[tuple[int, int]]:
     edges = np.linspace(0, rows, threads + 1).astype(int)
-    return [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+    return [(int(a), int(b)) for a, b in pairwise(edges) if b > a]

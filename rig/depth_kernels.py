@@ -27,7 +27,7 @@ def fill_rows(
     """Write inverse depth and its confidence (rows, width) for pixels between stripes of neighbouring columns.
 
     Two stripes of one row lie on one surface when their columns are at most MAX_COLUMN_GAP apart and their spacing is
-    that of equal depth within 1 px + 3 sd. Between them the column is linear in x. The more confident pair wins a pixel.
+    that of equal depth within 1 px + 3 sd. Between them the column is linear in x. The more confident pair wins.
     """
     rows, columns = x_px.shape
     width = u.shape[1]

@@ -1,7 +1,7 @@
-"""Where a column's stripe can lie: windows on every image row from the depth range, and the scene geometry of each pixel.
+"""Where a column's stripe can lie: windows on every image row from the depth range, and the geometry of each pixel.
 
-A light plane n.X = d meets the ray (u, v, 1) of a pixel at inverse depth w = (n.r)/d: along a row w is monotone in x, so
-the depth range becomes one interval of pixels. No rectification is assumed; with distortion, roll or tilted planes the
+A light plane n.X = d meets the ray (u, v, 1) of a pixel at inverse depth w = (n.r)/d: along a row w is monotone in x,
+so the depth range becomes one interval of pixels. No rectification is assumed; with distortion, roll or tilted planes the
 interval simply moves from row to row.
 """
 
@@ -29,7 +29,7 @@ class SweepGeometry:
     x_lo, x_hi: int32 (rows, columns), first and last pixel of the search window; empty where x_lo > x_hi.
     x0: int32 (columns,) first stored pixel; window: stored pixels per row, a multiple of 64.
     near_is_left: True where near points lie at smaller x than far ones (scanner on the left).
-    depth_range_m: nearest and farthest depth.
+    depth_range_m: nearest and farthest depth. defects: bool (rows, width), True where a pixel is not to be used.
     """
 
     u: NDArray[np.float32]
@@ -42,6 +42,7 @@ class SweepGeometry:
     window: int
     near_is_left: bool
     depth_range_m: tuple[float, float]
+    defects: NDArray[np.bool_]
 
     @property
     def rows(self) -> int:
@@ -99,7 +100,8 @@ def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: 
     seen = x_lo <= x_hi
     if not seen.any():
         raise UsageError(
-            f"no column meets the picture between {near_m:g} m and {far_m:g} m; widen depth_range or check the calibration"
+            f"no column meets the picture between {near_m:g} m and {far_m:g} m; "
+            "widen depth_range or check the calibration"
         )
     width = u.shape[1]
     padded = -(-width // WORD_PX) * WORD_PX
@@ -111,7 +113,8 @@ def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: 
     last = np.where(empty, 0, np.clip(last, 0, width - 1))
     window = int(-(-(last - first + 1).max() // WORD_PX) * WORD_PX)
     x0 = np.minimum(first, padded - window).astype(np.int32)
-    return SweepGeometry(u, v, plane, planes, x_lo, x_hi, x0, window, near_is_left, (near_m, far_m))
+    defects = np.zeros(u.shape, np.bool_) if model.defects is None else model.defects
+    return SweepGeometry(u, v, plane, planes, x_lo, x_hi, x0, window, near_is_left, (near_m, far_m), defects)
 
 
 def uncalibrated_geometry(rows: int, width: int, columns: int) -> SweepGeometry:
@@ -126,4 +129,5 @@ def uncalibrated_geometry(rows: int, width: int, columns: int) -> SweepGeometry:
         u, np.zeros_like(u), plane, np.column_stack([plane, np.ones(columns)]),
         np.zeros((rows, columns), np.int32), np.full((rows, columns), width - 1, np.int32),
         np.zeros(columns, np.int32), padded, True, (1 / 1.5, 1 / 0.5),
+        np.zeros((rows, width), np.bool_),
     )  # fmt: skip

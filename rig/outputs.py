@@ -71,6 +71,8 @@ class RunFolder:
             f"intensity/{name}.png": png_bytes(intensity_picture(result.intensity)),
             f"stripe/{name}.npz": _npz_bytes(table),
         }
+        if result.learned is not None:
+            files[f"learned/{name}.npz"] = _npz_bytes(result.learned.arrays())
         if rays is not None:
             # The first map sets the colours of all, so that a film of them does not flicker.
             self._limits = self._limits or depth_limits(result.depth_m)

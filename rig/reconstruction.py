@@ -12,7 +12,7 @@ from calibration.model import RigModel
 from rig.counting import CountVolume
 from rig.depth import depth_map
 from rig.errors import UsageError
-from rig.estimators import ESTIMATORS, FILTERS, create_estimator
+from rig.estimators import ESTIMATORS, FILTERS, Learned, create_estimator
 from rig.geometry import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from rig.stripes import StripeTable
 
@@ -33,20 +33,24 @@ class FogEstimate:
 
 @dataclass(frozen=True, slots=True)
 class MapResult:
-    """One reconstructed map: stripe table, depth_m (rows, width) float32 with NaN, intensity (rows, width) uint32."""
+    """One reconstructed map: stripe table, depth_m (rows, width) float32 with NaN, intensity (rows, width) uint32.
+
+    learned: the state that the estimator used, None where it learns nothing.
+    """
 
     stripe: StripeTable
     depth_m: NDArray[np.float32]
     intensity: NDArray[np.uint32]
     fog: FogEstimate
     compute_s: float
+    learned: Learned | None = None
 
 
 class Reconstructor:
     """Turns count volumes into maps, one after the other; estimators that learn carry their state from map to map.
 
     model: rig model, None for an uncalibrated rig (stripes only). column_commands: (columns,) mirror command of each
-    column's centre. estimator, filter: names of ESTIMATORS and FILTERS. Raises UsageError for anything that does not fit.
+    column's centre. estimator, filter: of ESTIMATORS and FILTERS. Raises UsageError for what does not fit.
     """
 
     def __init__(
@@ -91,7 +95,7 @@ class Reconstructor:
         else:
             depth = depth_map(stripe, geometry, self._min_confidence)
         compute_s = time.perf_counter() - begun
-        return MapResult(stripe, depth, volume.intensity(), self._fog(), compute_s)
+        return MapResult(stripe, depth, volume.intensity(), self._fog(), compute_s, self.estimator.used)
 
     def _bound(self, volume: CountVolume) -> SweepGeometry:
         """Geometry with the planes where the frames of each column really were."""
@@ -102,7 +106,7 @@ class Reconstructor:
         return replace(self.geometry, planes=planes, plane=planes[:, :3] / planes[:, 3:])
 
     def _fog(self) -> FogEstimate:
-        state = getattr(self.estimator, "model", None)
+        state = self.estimator.used
         if state is None or self._model is None:
             return FogEstimate(None, None, None)
         extinction, sd = state.extinction_per_m, state.extinction_sd_per_m

@@ -51,7 +51,7 @@ def effects_table(effects: Sequence[Effect]) -> None:
         table.add_column(name, justify="right" if justify == "right" else "left", no_wrap=True)
     table.add_column("why")
     for effect in effects:
-        bound = f"{100 * effect.changed_decisions_bound:.2g} % of decisions" if effect.on else "-"
+        bound = _share_of_decisions(effect.changed_decisions_bound) if effect.on else "-"
         table.add_row(
             effect.effect,
             "on" if effect.on else "off",
@@ -103,6 +103,10 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
 
 def _number(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}g}"
+
+
+def _share_of_decisions(bound: float) -> str:
+    return "every decision" if bound >= 1 else f"{100 * bound:.2g} % of decisions"
 
 
 def _percent(value: float | None) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 from calibration.model import RigModel
 from drivers.errors import DeviceError
 from drivers.interfaces import SweepTruth
-from rig.acquisition import Acquisition, SweepData
+from rig.acquisition import Acquisition
 from rig.acquisition import Progress as ScanProgress
 from rig.config import RigConfig
 from rig.errors import RigError
@@ -16,6 +16,7 @@ from rig.run import Progress, Run, RunResult
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, prepare
 from rig.summary import RunFrames, Verdict
+from rig.sweeps import SweepAccount
 from rig.warm_up import warm_up
 
 
@@ -38,7 +39,7 @@ def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, progress: Progress | 
     estimate = rig.config.estimate
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)
     acquisition = Acquisition(rig, plan, timing, maps, threads=threads, on_block=tell)
-    sweeps: list[SweepData] = []
+    sweeps: list[SweepAccount] = []
     ended_by: BaseException | None = None
     try:
         _collect(acquisition, reconstructor, rig, plan, run, sweeps)
@@ -133,7 +134,7 @@ def _collect(
     rig: OpenRig,
     plan: ScanPlan,
     run: Run,
-    sweeps: list[SweepData],
+    sweeps: list[SweepAccount],
 ) -> None:
     running = acquisition.run()
     with closing(running):
@@ -143,10 +144,10 @@ def _collect(
             if rig.world is not None:  # asked only now: no estimate ever sees it
                 truth = rig.world.truth(plan.command_at(sweep.volume.bound_column()))
             run.add(result, sweep.count_s + result.compute_s, truth)
-            sweeps.append(sweep)
+            sweeps.append(sweep.account())
 
 
-def _frames(sweeps: list[SweepData], crc_errors: int | None) -> RunFrames:
+def _frames(sweeps: list[SweepAccount], crc_errors: int | None) -> RunFrames:
     return RunFrames(
         expected=sum(sweep.frames.expected for sweep in sweeps),
         received=sum(sweep.frames.received for sweep in sweeps),
@@ -156,7 +157,7 @@ def _frames(sweeps: list[SweepData], crc_errors: int | None) -> RunFrames:
     )
 
 
-def _verdict(sweeps: list[SweepData], model: RigModel | None, *, aborted: bool) -> Verdict:
+def _verdict(sweeps: list[SweepAccount], model: RigModel | None, *, aborted: bool) -> Verdict:
     """The gravest that applies."""
     if aborted:
         return Verdict.ABORTED
@@ -167,7 +168,7 @@ def _verdict(sweeps: list[SweepData], model: RigModel | None, *, aborted: bool) 
     return Verdict.COMPLETE if model is not None else Verdict.UNCALIBRATED
 
 
-def _sweep_content(sweep: SweepData) -> dict[str, Any]:
+def _sweep_content(sweep: SweepAccount) -> dict[str, Any]:
     return {
         "direction": sweep.direction,
         "first_frame": sweep.first_frame,

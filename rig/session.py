@@ -18,7 +18,7 @@ from drivers.errors import DeviceError
 from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SpadTiming, SyncSource, World
 from drivers.registry import KindConfig, Surroundings, lookup
 from rig.config import RigConfig, ScanConfig
-from rig.errors import DevicesError, UsageError
+from rig.errors import DevicesError, PlanError, UsageError
 from rig.plan import compile_plan, spad_request
 from rig.scan_plan import ScanPlan
 
@@ -65,6 +65,12 @@ def open_rig(config: RigConfig, clock: Clock | None = None, seed: int = 0) -> It
 def prepare(rig: OpenRig, scan: ScanConfig | None = None) -> tuple[ScanPlan, SpadTiming]:
     """Configure the SPAD and compile the plan; nothing moves and nothing lights. scan: the config's by default."""
     scan = rig.config.scan if scan is None else scan
+    most_w = rig.laser.limits.max_power_w
+    if scan.power is not None and scan.power > most_w:
+        raise PlanError(
+            f"scan.power is {scan.power * 1e3:g} mW, the most {rig.laser.name} may give is {most_w * 1e3:g} mW; "
+            "lower scan.power"
+        )
     timing = rig.spad.configure(spad_request(scan, rig.spad.info))
     plan = compile_plan(scan, rig.scanner.limits, rig.scanner.point_clock, rig.model, rig.spad.info, timing)
     if isinstance(rig.world, HoldsColumns):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 class StripeTable:
     """Result of an estimator for one sweep; all arrays float32 (rows, columns).
 
-    x_px: sub-pixel stripe position in raw pixels, centres at integers; NaN only where the row has no data in the window.
+    x_px: sub-pixel stripe position in raw pixels, centres at integers; NaN only where the row has no data there.
     confidence: probability that x_px is within 1 px of the truth, 0 to 1 (0 where x_px is NaN).
     x_sd_px: standard deviation of x_px given that it is the right stripe.
     signal: photons per exposure of the stripe, summed across it; haze: photons per exposure and pixel just before it.

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
@@ -43,19 +43,18 @@ class FrameCounts:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class SweepData:
-    """One sweep, counted.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SweepAccount:
+    """What is kept of a sweep when its counts are gone.
 
     direction: +1 where the mirror command rose, -1 where it fell; column indices mean the same commands both ways.
     residual_columns: largest distance of a marker from the sweep's clock line; synchronised: whether that and the clock
     are within their limits. gaps: (first, last) numbers of frames exposed but not received. first_frame, end_frame:
-    frame numbers from this scan marker to the next. count_s: wall time spent on binding and counting.
+    frame numbers from this scan marker to the next.
     """
 
     index: int
     direction: int
-    volume: CountVolume
     residual_columns: float
     clock_error: float
     synchronised: bool
@@ -63,7 +62,18 @@ class SweepData:
     gaps: tuple[Gap, ...]
     first_frame: int
     end_frame: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SweepData(SweepAccount):
+    """One sweep, counted. count_s: wall time spent on binding and counting."""
+
+    volume: CountVolume
     count_s: float
+
+    def account(self) -> SweepAccount:
+        """The sweep without its counts, which are large."""
+        return SweepAccount(**{field.name: getattr(self, field.name) for field in fields(SweepAccount)})
 
 
 class SweepAssembler:

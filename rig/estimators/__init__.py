@@ -2,6 +2,9 @@
 
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rig.counting import CountVolume
 from rig.geometry import SweepGeometry
 from rig.stripes import StripeTable
@@ -10,8 +13,31 @@ ESTIMATORS = ("argmax", "edge", "likelihood")
 FILTERS = ("none", "median")
 
 
+class Learned(Protocol):
+    """State that an estimator has learned; fog in it where the haze resolves it, else NaN."""
+
+    @property
+    def extinction_per_m(self) -> float:
+        """Extinction of the medium."""
+        ...
+
+    @property
+    def extinction_sd_per_m(self) -> float:
+        """Its standard deviation."""
+        ...
+
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Every field as an array, enough to estimate the map again bit for bit."""
+        ...
+
+
 class Estimator(Protocol):
-    """What every estimator offers; some remember what earlier sweeps taught them."""
+    """What every estimator offers. used: the state the last map was estimated with, None where none is learned."""
+
+    @property
+    def used(self) -> Learned | None:
+        """State of the last map."""
+        ...
 
     def estimate(self, volume: CountVolume, geometry: SweepGeometry) -> StripeTable:
         """Stripe table of one sweep."""

@@ -1,7 +1,8 @@
-"""Ambient light and dark counts of every pixel, from dark frames, from the quiet side of the stripe and from hot pixels.
+"""Ambient light and dark counts of every pixel, from dark frames, the quiet side of the stripe and the pixel view.
 
-Both are constant for a pixel over the columns (the pixel view of the counts): a pixel that fires far more often than its
-neighbours while the laser crosses the whole picture is hot, whatever the scene. Few counts are shrunk to the local mean.
+Both are constant for a pixel over the columns (the pixel view of the counts): a pixel that fires far more often than
+its neighbours while the laser crosses the whole picture is hot, whatever the scene. Few counts are drawn to the local
+mean.
 """
 
 import cv2
@@ -10,9 +11,12 @@ from numpy.typing import NDArray
 
 from rig.counting import CountVolume
 from rig.estimators.ambient_kernels import window_sums
+from rig.estimators.row_kernels import FLUX_MAX
 from rig.geometry import SweepGeometry
 
 NEIGHBOURHOOD_PX = 31
+DEFECT_FLUX = float(FLUX_MAX)
+"""Ambient given to pixels not to be used: one that is always lit says the same of every hypothesis, nothing."""
 HOT_SIGMA = 6.0
 """Excess over the neighbours, in standard deviations, that makes a pixel hot: 1e-9 of good pixels pass."""
 
@@ -38,7 +42,9 @@ def ambient_map(volume: CountVolume, geometry: SweepGeometry, quiet: NDArray[np.
         base = np.full(ones.shape, level)
     else:
         base = _shrunk(ones, exposures)
-    return np.maximum(base, hot_pixels(totals)).astype(np.float32)
+    ambient: NDArray[np.float32] = np.maximum(base, hot_pixels(totals)).astype(np.float32)
+    ambient[geometry.defects] = DEFECT_FLUX
+    return ambient
 
 
 def _lowest_level(totals: NDArray[np.uint32]) -> float:

@@ -213,7 +213,7 @@ def maximise(model: RowModel, seen: Expectation, *, spread: bool, free_ambient: 
 def _split_rest(
     rest: NDArray[np.float64], variance: NDArray[np.float64], haze: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """The level behind the stripe as ambient left over and a share (0 to 1) of the haze: light scattered more than once.
+    """The level behind the stripe as ambient left over and a share (0 to 1) of the haze: light scattered twice or more.
 
     Weighted fit of rest = excess + share * haze over the bins; without enough bins all of it is haze's, or nothing.
     """

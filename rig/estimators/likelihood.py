@@ -30,6 +30,8 @@ class Likelihood:
     def __init__(self, threads: int = 2, model: RowModel | None = None) -> None:
         self.threads = threads
         self.model = model
+        self.used: RowModel | None = None
+        """The state that the last map was estimated with."""
 
     def estimate(self, volume: CountVolume, geometry: SweepGeometry) -> StripeTable:
         """Stripe table of one sweep; afterwards `model` is what the next sweep will be estimated with."""
@@ -41,6 +43,7 @@ class Likelihood:
         else:
             model = self.model
         stripes, quiet = self._sweep(volume, geometry, model)
+        self.used = model
         self.model = learn_next(volume, geometry, replace(model, ambient=ambient_map(volume, geometry, quiet)))
         return stripes
 

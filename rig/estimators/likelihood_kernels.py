@@ -57,7 +57,9 @@ def learn_rows(
                 levels[row.cell[j], 12] += row.posterior[j]
                 levels[row.cell[j], 13] += (1.0 - none) / (last - first + 1)
         if none < 0.5:
-            _learn_levels(sweep, state, row, y, c, length, first, last, start, none, hot_flux, levels, rows_seen, columns_seen)
+            _learn_levels(
+                sweep, state, row, y, c, length, first, last, start, none, hot_flux, levels, rows_seen, columns_seen
+            )
     return total
 
 

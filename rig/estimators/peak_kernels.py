@@ -27,7 +27,7 @@ def sub_pixel(weight: NDArray[np.float64], peak: int, length: int) -> float:
     mass = left + centre + right - 3.0 * floor
     if not mass > 0.0:
         return 0.0
-    return min(max((right - left) / mass, -0.5), 0.5)
+    return float(min(max((right - left) / mass, -0.5), 0.5))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -90,6 +90,7 @@ def peak_rows(
     x_lo: NDArray[np.int32],
     x_hi: NDArray[np.int32],
     near_is_left: bool,
+    defects: NDArray[np.bool_],
     with_edge: bool,
     first_row: int,
     last_row: int,
@@ -111,7 +112,8 @@ def peak_rows(
             length = last - first + 1
             start = first if near_is_left else last
             for t in range(length):
-                n[t] = counts[c, y, start + step * t - x0[c]]
+                x = start + step * t
+                n[t] = 0.0 if defects[y, x] else counts[c, y, x - x0[c]]
             background = 0.0
             decay = 0.0
             if with_edge:
@@ -162,4 +164,4 @@ def _edge_scores(
 @numba.njit(cache=True, nogil=True)
 def _flux(count: float, k: float) -> float:
     """Photons per exposure from a mean count over k exposures, finite at saturation."""
-    return np.log((k + 0.5) / (k - count + 0.5))
+    return float(np.log((k + 0.5) / (k - count + 0.5)))

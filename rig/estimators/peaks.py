@@ -23,6 +23,11 @@ class Peaks:
     with_edge: bool
     threads: int = 2
 
+    @property
+    def used(self) -> None:
+        """Nothing is learned."""
+        return None
+
     def estimate(self, volume: CountVolume, geometry: SweepGeometry) -> StripeTable:
         """Stripe table of one sweep."""
         out = np.full((5, geometry.rows, geometry.columns), np.nan, np.float32)
@@ -31,7 +36,7 @@ class Peaks:
         def work(first: int, last: int) -> None:
             peak_rows(
                 volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left,
-                self.with_edge, first, last, out,
+                geometry.defects, self.with_edge, first, last, out,
             )  # fmt: skip
 
         pieces = np.linspace(0, geometry.rows, 4 * self.threads + 1).astype(int)

@@ -61,8 +61,8 @@ class Row(NamedTuple):
     """Buffers of one row, filled by `judge_row` from index 0 (nearest pixel) on; made once per thread.
 
     n: ones; before, behind: flux of each pixel in front of and behind the stripe; scale: stripe photons at amplitude 1;
-    cell: nearest profile bin; gain: geometry factor of the haze; w: inverse depth; log_prior: of positions; taps, edge, score,
-    posterior, by_amplitude: see `row_scores` and `row_posterior`; labels: scratch of `refine`.
+    cell: nearest profile bin; gain: geometry factor of the haze; w: inverse depth; log_prior: of positions; taps, edge,
+    score, posterior, by_amplitude: see `row_scores` and `row_posterior`; labels: scratch of `refine`.
     """
 
     n: Float32
@@ -166,9 +166,7 @@ def read_row(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[int,
 
 
 @numba.njit(cache=True, nogil=True)
-def judge_row(
-    sweep: Sweep, state: State, row: Row, y: int, c: int
-) -> tuple[int, int, int, int, float, float, float]:
+def judge_row(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[int, int, int, int, float, float, float]:
     """Posterior of row y of column c, in `row`.
 
     Returns what `read_row` does, then the probability of 'no stripe', the share of its prior that the picture's border
@@ -183,7 +181,16 @@ def judge_row(
     )  # fmt: skip
     prior = none_prior(sweep.w_near, sweep.w_far, row.w[first], row.w[last], state.none_weight)
     none, evidence = row_posterior(
-        row.score, row.edge, length, first, last, state.log_weight, row.log_prior, prior, row.posterior, row.by_amplitude
+        row.score,
+        row.edge,
+        length,
+        first,
+        last,
+        state.log_weight,
+        row.log_prior,
+        prior,
+        row.posterior,
+        row.by_amplitude,
     )
     for t in range(length):
         evidence += row.taps[1, t]

@@ -7,11 +7,13 @@ row cost one cumulative sum plus 2T + 1 taps. The floor e bounds what a single p
 Amplitudes q are marginalised over a log grid whose weights are learned; 'no stripe on this row' is a hypothesis too.
 """
 
-from typing import Final
+from typing import Any, Final
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
+
+Real = float | np.floating[Any]
 
 FLOOR: Final = 1e-3
 """Probability e of a pixel that does not follow the model (physics of defects: 2-4 % of real pixels are defective)."""
@@ -48,9 +50,9 @@ def logit_table() -> NDArray[np.float32]:
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def add_evidence(
     n: NDArray[np.float32],
-    k: np.float32,
+    k: Real,
     base: NDArray[np.float32],
-    light: np.float32,
+    light: Real,
     scale: NDArray[np.float32],
     own: NDArray[np.float32],
     table: NDArray[np.float32],
@@ -70,7 +72,7 @@ def add_evidence(
 @numba.njit(cache=True, nogil=True)
 def row_scores(
     n: NDArray[np.float32],
-    k: float,
+    k: Real,
     before: NDArray[np.float32],
     behind: NDArray[np.float32],
     scale: NDArray[np.float32],
@@ -84,8 +86,8 @@ def row_scores(
 ) -> None:
     """Log-likelihood of every position and amplitude against 'everything is behind'.
 
-    psi: (T + 1,) share of the stripe at 0..T px from its centre. Writes score (M, length), edge (length + 1,), the score
-    of a change from before to behind at t without any stripe, and taps (3, length): each pixel's own log-likelihood
+    psi: (T + 1,) share of the stripe at 0..T px from its centre. Writes score (M, length), edge (length + 1,), the
+    score of a change from before to behind at t without any stripe, and taps (3, length): each pixel's own log-likelihood
     before and behind, and the flux between the two.
     """
     n, before, behind, scale = n[:length], before[:length], behind[:length], scale[:length]
@@ -150,8 +152,8 @@ def row_posterior(
     """Posterior (length,) over positions, summed over amplitudes; by_amplitude (M,) sums the other way.
 
     none: prior of a row that is behind its stripe all along (nearer than the picture), of one that is before it, and of
-    one whose haze ends somewhere without a stripe. log_prior: of positions, up to a constant; log_weight: of amplitudes.
-    Returns (probability of 'no stripe', log evidence of the row).
+    one whose haze ends somewhere without a stripe. log_prior: of positions, up to a constant; log_weight: of
+    amplitudes. Returns (probability of 'no stripe', log evidence of the row).
     """
     mass = 0.0
     for j in range(first, last + 1):
@@ -214,7 +216,7 @@ def mode_of(posterior: NDArray[np.float32], first: int, last: int) -> tuple[int,
 @numba.njit(cache=True, nogil=True)
 def refine(
     n: NDArray[np.float32],
-    k: np.float32,
+    k: Real,
     before: NDArray[np.float32],
     behind: NDArray[np.float32],
     scale: NDArray[np.float32],
@@ -229,7 +231,7 @@ def refine(
     table: NDArray[np.float32],
     likelihood: NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Offset of the stripe from `mode` in px and its standard deviation: posterior over positions a quarter pixel apart.
+    """Offset of the stripe from `mode` in px and its standard deviation: posterior over places a quarter pixel apart.
 
     fine: (labels, 2R + 1), share of the stripe in pixels -R..R from the mode for each label; the pixel that holds the
     label sees haze on its near part only. Amplitudes far from the best one at the mode are left out.

@@ -6,7 +6,9 @@ the stripe at inverse depth w carries q S(w) photons, S = w^2 exp(-2 extinction 
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +24,12 @@ EXTINCTION_MAX_PER_M = 5.0
 class RowModel:
     """Learned state of the row likelihood, enough to estimate any map again bit for bit.
 
-    profile: (BINS, 4) float32 over path inverse depth from w_lo in steps 1/per_w: haze before the stripe and level behind
-    it in photons per exposure and pixel at unit geometry factor, the stripe scale S, and the log prior of positions.
-    row_gain: (rows,) and column_gain: (columns,) float32, strength of the haze on each; ambient: (rows, width) float32, photons per exposure of
-    ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at S = 1 and their probability;
-    none_weight: probability of a row without stripe. line_sigma_px: width of the line. extinction_per_m and its standard
-    deviation: NaN where the haze does not resolve it.
+    profile: (BINS, 4) float32 over path inverse depth from w_lo in steps 1/per_w: haze before the stripe and level
+    behind it in photons per exposure and pixel at unit geometry factor, the stripe scale S, and the log prior of
+    positions. row_gain: (rows,) and column_gain: (columns,) float32, strength of the haze on each. ambient: (rows,
+    width) float32, photons per exposure of ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at
+    S = 1 and their probability. none_weight: probability of a row without stripe. line_sigma_px: width of the line.
+    extinction_per_m and its standard deviation: NaN where the haze does not resolve it.
     """
 
     profile: NDArray[np.float32]
@@ -43,6 +45,17 @@ class RowModel:
     extinction_per_m: float
     extinction_sd_per_m: float
 
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Every field as an array, to be kept with the map."""
+        return {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "RowModel":
+        """The state that `arrays` gave, bit for bit. KeyError where one is missing."""
+        kept = {field.name: arrays[field.name] for field in fields(cls)}
+        values: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in kept.items()}
+        return cls(**values)
+
     def path_m(self) -> NDArray[np.float64]:
         """Mean of the two path lengths at each profile bin, (BINS,) metres."""
         return 1.0 / (self.w_lo + np.arange(BINS) / self.per_w)
@@ -52,7 +65,7 @@ def stripe_scale(path_m: NDArray[np.float64], extinction_per_m: float) -> NDArra
     """Relative strength of a stripe of given reflectance over distance, 1 at the middle of the inverse depth range."""
     log_scale = -2.0 * np.log(path_m) - 2.0 * extinction_per_m * path_m
     middle = len(path_m) // 2
-    return np.exp(np.clip(log_scale - log_scale[middle], -30.0, 30.0))
+    return np.asarray(np.exp(np.clip(log_scale - log_scale[middle], -30.0, 30.0)))
 
 
 def line_profile(sigma_px: float) -> NDArray[np.float32]:

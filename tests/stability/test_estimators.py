@@ -1,0 +1,218 @@
+"""Every estimator on hard input: no warning (pytest makes them errors), no NaN but where no answer is promised."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rig.estimators import ESTIMATORS, create_estimator
+from rig.estimators.median import median_filter
+from rig.geometry import uncalibrated_geometry
+from tests.reference.geometry import Geometry
+from tests.unit.small_maps import RIGS, geometry_of, simulated, volume_of
+
+ROWS, COLUMNS = 12, 24
+
+
+@cache
+def view(rig="left", rows=ROWS, width=256, columns=COLUMNS):
+    return geometry_of(Geometry.build(width=width, height=rows, columns=columns, **RIGS[rig]))
+
+
+def check(table, volume, geometry):
+    """What a stripe table promises for any counts."""
+    asked = (geometry.x_lo <= geometry.x_hi) & (volume.n_frames > 0)
+    np.testing.assert_array_equal(np.isfinite(table.x_px), asked)
+    assert np.all((table.confidence >= 0) & (table.confidence <= 1))
+    assert not table.confidence[~asked].any()
+    for values in (table.x_sd_px, table.signal, table.haze):
+        np.testing.assert_array_equal(np.isfinite(values), asked)
+    assert np.all(table.x_sd_px[asked] > 0)
+    assert np.all(table.signal[asked] >= 0)
+    assert np.all(table.haze[asked] >= 0)
+    assert np.all(table.x_px[asked] >= geometry.x_lo[asked] - 2)
+    assert np.all(table.x_px[asked] <= geometry.x_hi[asked] + 2)
+    filtered = median_filter(table, geometry.reference_px()).x_px
+    np.testing.assert_array_equal(np.isfinite(filtered), asked)
+
+
+def run(name, counts, exposures, geometry, maps=1, **volume):
+    """Estimate the same counts `maps` times with what was learned before, checking each table."""
+    estimator = create_estimator(name)
+    made = volume_of(counts, geometry, exposures, **volume)
+    for _ in range(maps):
+        table = estimator.estimate(made, geometry)
+        check(table, made, geometry)
+    return table, estimator
+
+
+def full(level, geometry, dtype=np.uint8):
+    return np.full((geometry.columns, geometry.rows, geometry.width), level, dtype)
+
+
+EVERY = pytest.mark.parametrize("name", ESTIMATORS)
+
+
+@EVERY
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize(("k", "level"), [(1, 0), (1, 1), (10, 0), (10, 10), (255, 0), (255, 255), (10, 5)])
+def test_pictures_without_any_contrast(name, rig, k, level):
+    geometry = view(rig)
+    table, _ = run(name, full(level, geometry), k, geometry, maps=2)
+    seen = table.x_px[np.isfinite(table.x_px)]
+    assert seen.size > 50
+
+
+@EVERY
+@pytest.mark.parametrize(("k", "dtype"), [(1, np.uint8), (300, np.uint16), (70_000, np.uint32)])
+@pytest.mark.parametrize("rate", [1e-4, 0.5, 0.9999])
+def test_noise_without_any_stripe(name, k, dtype, rate):
+    geometry = view()
+    counts = np.random.default_rng(1).binomial(k, rate, full(0, geometry).shape).astype(dtype)
+    table, _ = run(name, counts, k, geometry)
+    if name == "likelihood":
+        assert np.median(table.confidence[np.isfinite(table.x_px)]) < 0.5
+
+
+@EVERY
+@pytest.mark.parametrize("exposures", [300, 3000, 65_535])
+def test_many_exposures(name, exposures):
+    sweep = simulated(exposures=exposures, rows=16, columns=32)
+    table, _ = run(name, sweep.counts, exposures, sweep.geometry)
+    if name == "likelihood":
+        errors = sweep.errors(table.x_px)
+        assert np.median(errors) < 0.12
+        assert np.mean(errors <= 1) > 0.98
+
+
+@EVERY
+@pytest.mark.parametrize("light", ["report", "dense", "clear"])
+def test_single_exposures(name, light):
+    sweep = simulated(light, 1)
+    run(name, sweep.counts, 1, sweep.geometry)
+
+
+@EVERY
+@pytest.mark.parametrize("lost", ["odd", "all but one", "all"])
+def test_columns_without_frames(name, lost):
+    sweep = simulated()
+    frames = np.full(128, 10)
+    frames[{"odd": np.arange(1, 128, 2), "all but one": np.arange(128) != 64, "all": np.arange(128)}[lost]] = 0
+    counts = np.where(frames[:, None, None] > 0, sweep.counts, 0).astype(np.uint8)
+    run(name, counts, frames, sweep.geometry, maps=2)
+
+
+@EVERY
+def test_columns_of_very_different_numbers_of_frames(name):
+    rng = np.random.default_rng(1)
+    geometry = view()
+    frames = rng.choice([1, 2, 10, 200, 40_000], geometry.columns)
+    counts = rng.binomial(frames[:, None, None], 0.1, full(0, geometry).shape).astype(np.uint16)
+    run(name, counts, frames, geometry)
+
+
+@EVERY
+def test_rows_without_a_window(name):
+    sweep = simulated()
+    geometry = replace(sweep.geometry, x_lo=sweep.geometry.x_lo.copy(), x_hi=sweep.geometry.x_hi.copy())
+    geometry.x_lo[[0, 7, 20]], geometry.x_hi[[0, 7, 20]] = 0, -1
+    geometry.x_lo[:, 50], geometry.x_hi[:, 50] = 0, -1
+    run(name, sweep.counts, 10, geometry)
+
+
+@EVERY
+def test_rays_that_end_within_the_picture(name):
+    sweep = simulated()
+    u, v = sweep.geometry.u.copy(), sweep.geometry.v.copy()
+    for y in range(48):
+        reach = int(6 * y**0.5) + 5
+        u[y, :reach] = v[y, :reach] = np.nan
+        u[y, -reach:] = v[y, -reach:] = np.nan
+    u[3], v[3] = np.nan, np.nan
+    g = sweep.geometry
+    valid = np.isfinite(u)
+    first, last = valid.argmax(axis=1), 511 - valid[:, ::-1].argmax(axis=1)
+    x_lo, x_hi = np.maximum(g.x_lo, first[:, None]), np.minimum(g.x_hi, last[:, None])
+    x_lo[3], x_hi[3] = 0, -1
+    geometry = replace(g, u=u, v=v, x_lo=x_lo.astype(np.int32), x_hi=x_hi.astype(np.int32))
+    run(name, sweep.counts, 10, geometry)
+
+
+@EVERY
+@pytest.mark.parametrize("near_is_left", [True, False])
+@pytest.mark.parametrize("length", [1, 2, 3, 8])
+def test_search_windows_of_a_few_pixels(name, near_is_left, length):
+    geometry = view("left" if near_is_left else "right")
+    seen = geometry.x_lo <= geometry.x_hi
+    x_hi = np.where(seen, np.minimum(geometry.x_lo + length - 1, geometry.x_hi), -1).astype(np.int32)
+    counts = np.random.default_rng(2).binomial(10, 0.2, full(0, geometry).shape).astype(np.uint8)
+    run(name, counts, 10, replace(geometry, x_hi=x_hi))
+
+
+@EVERY
+@pytest.mark.parametrize(("rows", "width", "columns"), [(1, 256, 24), (1, 256, 1), (50, 70, 24), (30, 500, 7)])
+@pytest.mark.parametrize("rig", ["left", "right"])
+def test_odd_sensors_and_sweeps(name, rows, width, columns, rig):
+    g = Geometry.build(width=width, height=rows, columns=max(columns, 3), **RIGS[rig])
+    g = replace(g, planes=g.planes[len(g.planes) // 2 :][:columns]) if columns == 1 else g
+    geometry = geometry_of(g)
+    counts = np.random.default_rng(3).binomial(10, 0.1, full(0, geometry).shape).astype(np.uint8)
+    run(name, counts, 10, geometry, maps=2)
+
+
+@EVERY
+@pytest.mark.parametrize(("rows", "width"), [(1, 1), (1, 2), (2, 1), (3, 65)])
+def test_tiny_sensors_without_a_model(name, rows, width):
+    geometry = uncalibrated_geometry(rows, width, 3)
+    counts = np.random.default_rng(3).binomial(10, 0.3, full(0, geometry).shape).astype(np.uint8)
+    estimator = create_estimator(name)
+    for _ in range(2):
+        table = estimator.estimate(volume_of(counts, geometry, 10), geometry)
+        assert np.isfinite(table.x_px).all()
+        assert np.all((table.confidence >= 0) & (table.confidence <= 1))
+
+
+@EVERY
+@pytest.mark.parametrize("light", ["report", "dense"])
+def test_half_of_the_picture_saturated(name, light):
+    sweep = simulated(light)
+    counts = sweep.counts.copy()
+    counts[:, :, :260] = 10
+    run(name, counts, 10, sweep.geometry)
+
+
+@EVERY
+def test_rows_of_stuck_pixels(name):
+    sweep = simulated()
+    counts = sweep.counts.copy()
+    counts[:, 10] = 10
+    counts[:, 11] = 0
+    counts[:, :, 300] = 10
+    table, _ = run(name, counts, 10, sweep.geometry)
+    if name == "likelihood":
+        good = np.delete(np.arange(48), [10, 11])
+        errors = np.abs(table.x_px - sweep.point.x_true)[good][sweep.point.trusted[good]]
+        assert np.mean(errors <= 1) > 0.8
+
+
+@EVERY
+def test_dark_frames_that_are_all_ones_or_all_zeros(name):
+    sweep = simulated()
+    for level in (0, 50):
+        dark = np.full((48, 512), level, np.uint32)
+        run(name, sweep.counts, 10, sweep.geometry, dark_counts=dark, n_dark=50)
+
+
+@EVERY
+@pytest.mark.parametrize("level", [0, 10])
+def test_a_bad_map_does_not_spoil_the_next_ones(name, level):
+    sweep = simulated()
+    estimator = create_estimator(name)
+    estimator.estimate(volume_of(np.full_like(sweep.counts, level), sweep.geometry, 10), sweep.geometry)
+    for _ in range(6):
+        table = estimator.estimate(sweep.volume, sweep.geometry)
+        check(table, sweep.volume, sweep.geometry)
+    fresh = create_estimator(name).estimate(sweep.volume, sweep.geometry)
+    after, alone = (np.mean(sweep.errors(t.x_px) <= 1) for t in (table, fresh))
+    assert after > alone - 0.05

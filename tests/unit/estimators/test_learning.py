@@ -1,0 +1,177 @@
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rig.estimators.ambient import ambient_map
+from rig.estimators.learning import flux, lattice, learn_first, learn_next
+from rig.estimators.row_model import BINS, RowModel, fit_haze, stripe_scale
+from tests.reference.geometry import Geometry
+from tests.unit.small_maps import RIGS, geometry_of, simulated, volume_of
+
+PATH_M = 1.0 / np.linspace(0.08, 1.1, BINS)
+
+
+@cache
+def learned(light="report", exposures=10, rig="left") -> RowModel:
+    sweep = simulated(light, exposures, rig)
+    return learn_first(sweep.volume, sweep.geometry, ambient_map(sweep.volume, sweep.geometry, None))
+
+
+def noisy_haze(rng, extinction, amplitude=0.3, photons=2000.0):
+    """Haze of an exponential with the scatter of counting, and its variance."""
+    haze = amplitude * np.exp(-2 * extinction * PATH_M)
+    variance = haze / photons + 1e-9
+    return haze + rng.normal(0, np.sqrt(variance)), variance
+
+
+@pytest.mark.parametrize("extinction", [0.02, 0.05, 0.3, 1.0, 2.0])
+def test_an_exponential_is_fitted_within_its_own_uncertainty(extinction):
+    rng = np.random.default_rng(1)
+    pulls = []
+    for _ in range(200):
+        fit = fit_haze(PATH_M, *noisy_haze(rng, extinction))
+        assert fit.extinction_sd_per_m < 0.5 * extinction
+        pulls.append((fit.extinction_per_m - extinction) / fit.extinction_sd_per_m)
+    assert abs(np.mean(pulls)) < 0.4
+    assert 0.7 < np.std(pulls) < 1.2
+
+
+def test_an_exact_exponential_is_found_again():
+    haze = 0.4 * np.exp(-2 * 0.123 * PATH_M)
+    fit = fit_haze(PATH_M, haze, np.full(BINS, 1e-6))
+    assert fit.extinction_per_m == pytest.approx(0.123, rel=1e-4)
+    assert fit.amplitude == pytest.approx(0.4, rel=1e-4)
+
+
+def test_even_light_has_no_extinction():
+    fit = fit_haze(PATH_M, np.full(BINS, 0.2), np.full(BINS, 1e-6))
+    assert fit.extinction_per_m == pytest.approx(0.0, abs=1e-6)
+    growing = fit_haze(PATH_M, 0.1 + 0.02 * PATH_M, np.full(BINS, 1e-6))
+    assert growing.extinction_per_m == 0.0
+
+
+def test_where_there_is_no_haze_there_is_no_fit():
+    nothing, variance = np.zeros(BINS), np.full(BINS, 1e-6)
+    assert fit_haze(PATH_M, nothing, variance) is None
+    assert fit_haze(PATH_M, nothing - 1e-3, variance) is None
+    assert fit_haze(PATH_M, np.full(BINS, np.nan), variance) is None
+    few = np.full(BINS, np.nan)
+    few[:3] = 0.1
+    assert fit_haze(PATH_M, few, variance) is None
+    # Haze that is lost in its own noise.
+    assert fit_haze(PATH_M, np.full(BINS, 1e-4), np.ones(BINS)) is None
+
+
+def test_bins_without_data_take_no_part_in_the_fit():
+    rng = np.random.default_rng(2)
+    haze, variance = noisy_haze(rng, 0.2)
+    haze[::3], variance[::3] = np.nan, np.nan
+    assert fit_haze(PATH_M, haze, variance).extinction_per_m == pytest.approx(0.2, abs=0.03)
+
+
+@pytest.mark.parametrize("extinction", [0.0, 0.05, 5.0])
+def test_stripe_scale_falls_as_distance_squared_and_both_paths(extinction):
+    scale = stripe_scale(PATH_M, extinction)
+    assert np.all(np.isfinite(scale) & (scale > 0))
+    assert scale[BINS // 2] == pytest.approx(1.0)
+    a, b = BINS // 2, BINS // 2 + 10
+    wanted = (PATH_M[a] / PATH_M[b]) ** 2 * math.exp(-2 * extinction * (PATH_M[b] - PATH_M[a]))
+    assert scale[b] / scale[a] == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("lines", [1, 50, 3000, 10**6])
+def test_the_lattice_picks_distinct_rows_and_columns_that_have_a_window(rig, lines):
+    geometry = geometry_of(Geometry.build(width=300, height=40, columns=100, **RIGS[rig]))
+    y, c = lattice(geometry, lines)
+    seen = geometry.x_lo <= geometry.x_hi
+    assert seen[y, c].all()
+    assert len(set(zip(y.tolist(), c.tolist(), strict=True))) == len(y)
+    if lines >= seen.sum():
+        assert len(y) == seen.sum()
+    else:
+        assert 0.6 * lines <= len(y) <= lines
+    if lines == 3000:
+        # Every row with windows takes part about evenly.
+        share = np.bincount(y, minlength=40) / np.maximum(seen.sum(axis=1), 1)
+        assert share[seen.any(axis=1)].max() < 3 * share[seen.any(axis=1)].mean()
+        assert (share[seen.any(axis=1)] > 0).all()
+
+
+def test_flux_is_finite_from_no_ones_to_all_ones():
+    assert flux(0.0, 0.0) == 0.0
+    assert flux(0.0, 1000.0) == 0.0
+    assert np.isfinite(flux(1000.0, 1000.0))
+    assert flux(1000.0, 1000.0) > 7
+    assert flux(632.12, 1000.0) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("light", ["report", "dense", "clear"])
+def test_the_learned_haze_is_that_of_the_light(light):
+    sweep, model = simulated(light), learned(light)
+    # Light before the stripe at the near end of the rows, by the truth.
+    wanted = np.median(
+        [sweep.point.flux_of_column(c)[24, max(int(sweep.geometry.x_lo[24, c]), 0) + 5] for c in range(40, 128, 8)]
+    )
+    path_m = model.path_m()
+    near = np.median(model.profile[(path_m > 1.1) & (path_m < 2.0), 0])
+    found = near + np.median(model.ambient)
+    assert found == pytest.approx(wanted, rel=0.35, abs=0.01)
+
+
+@pytest.mark.parametrize("light", ["report", "dense"])
+@pytest.mark.parametrize("exposures", [3, 10])
+def test_the_width_of_the_line_is_learned(light, exposures):
+    assert learned(light, exposures).line_sigma_px == pytest.approx(0.6, rel=0.35)
+
+
+def test_the_level_behind_the_stripe_is_ambient_light():
+    for light in ("report", "dense"):
+        model, truth = learned(light), simulated(light).point.light.ambient
+        behind = np.median(model.ambient) + np.median(model.profile[:, 1])
+        assert behind == pytest.approx(truth, rel=0.5, abs=0.005)
+
+
+def test_learned_numbers_are_in_range():
+    for light in ("report", "dense", "clear"):
+        model = learned(light)
+        assert np.isfinite(model.profile).all()
+        assert (model.profile[:, :3] >= 0).all()
+        assert np.all(np.diff(model.amplitude) > 0)
+        assert model.weight.sum() == pytest.approx(1.0)
+        assert 0 < model.none_weight <= 0.5
+        assert (model.ambient > 0).all()
+        assert (model.row_gain > 0).all()
+
+
+def test_one_more_sweep_of_the_same_light_moves_the_model_little():
+    sweep, model = simulated(seed=2), learned()
+    after = learn_next(sweep.volume, sweep.geometry, model)
+    assert after.extinction_per_m == pytest.approx(model.extinction_per_m, rel=0.25)
+    assert abs(np.log(after.line_sigma_px / model.line_sigma_px)) < 0.15
+    far = (model.path_m() > 1.0) & (model.path_m() < 4.0)
+    np.testing.assert_allclose(after.profile[far, 0], model.profile[far, 0], rtol=0.25, atol=0.01)
+
+
+def test_rows_with_a_weaker_line_get_a_smaller_gain():
+    sweep = simulated("dense")
+    rng = np.random.default_rng(5)
+    # The lower rows see half of all light: haze, stripe and ambient.
+    counts = sweep.counts.copy()
+    counts[:, 24:] = rng.binomial(counts[:, 24:], 0.5)
+    volume = volume_of(counts, sweep.geometry, 10)
+    model = learn_first(volume, sweep.geometry, ambient_map(volume, sweep.geometry, None))
+    for _ in range(3):
+        model = learn_next(volume, sweep.geometry, model)
+    assert model.row_gain[:8].mean() > 1.02 * model.row_gain[-8:].mean()
+
+
+def test_learning_does_not_change_the_model_it_started_from():
+    sweep, model = simulated(seed=2), learned()
+    kept = replace(model, profile=model.profile.copy(), ambient=model.ambient.copy(), row_gain=model.row_gain.copy())
+    learn_next(sweep.volume, sweep.geometry, model)
+    for name in ("profile", "ambient", "row_gain"):
+        np.testing.assert_array_equal(getattr(model, name), getattr(kept, name))
