@@ -1,8 +1,8 @@
 """Where a column's stripe can lie: windows on every image row from the depth range, and the geometry of each pixel.
 
 A light plane n.X = d meets the ray (u, v, 1) of a pixel at inverse depth w = (n.r)/d: along a row w is monotone in x,
-so the depth range becomes one interval of pixels. No rectification is assumed; with distortion, roll or tilted planes the
-interval simply moves from row to row.
+so the depth range becomes one interval of pixels. No rectification is assumed; with distortion, roll or tilted planes
+the interval simply moves from row to row.
 """
 
 from dataclasses import dataclass

@@ -109,30 +109,34 @@ def peak_rows(
             first, last = max(x_lo[y, c], x0[c]), min(x_hi[y, c], x0[c] + window - 1)
             if first > last:
                 continue
-            length = last - first + 1
-            start = first if near_is_left else last
-            for t in range(length):
+            # Pixels beyond the search window say what lies before and behind; none of them can be the answer.
+            low = max(first - EDGE_REACH_PX, x0[c], 0)
+            high = min(last + EDGE_REACH_PX, x0[c] + window - 1, defects.shape[1] - 1)
+            start = low if near_is_left else high
+            for t in range(high - low + 1):
                 x = start + step * t
                 n[t] = 0.0 if defects[y, x] else counts[c, y, x - x0[c]]
+            begin = first - low if near_is_left else high - last
+            length = last - first + 1
+            inside = n[begin : begin + length]
             background = 0.0
             decay = 0.0
             if with_edge:
-                background, decay = _near_fit(n, length)
-                _edge_scores(n, length, background, decay, score)
+                background, decay = _near_fit(inside, length)
+                _edge_scores(n[: high - low + 1], begin, length, background, decay, score)
+            weights = score[:length] if with_edge else inside
             peak = -1
             for i in range(length):
                 # Ties go to the smallest x, whatever side is near.
                 t = i if near_is_left else length - 1 - i
-                value = score[t] if with_edge else n[t]
-                if peak < 0 or value > (score[peak] if with_edge else n[peak]):
+                if peak < 0 or weights[t] > weights[peak]:
                     peak = t
-            weights = score if with_edge else n
             offset = sub_pixel(weights, peak, length)
-            near, rest = peak_confidence(n, n, k, peak, length)
+            near, rest = peak_confidence(inside, inside, k, peak, length)
             level = background * np.exp(-decay * peak) if with_edge else rest
-            out[0, y, c] = start + step * (peak + offset)
+            net = max(inside[peak] - level, 0.0)
+            out[0, y, c] = start + step * (begin + peak + offset)
             out[1, y, c] = near
-            net = max(n[peak] - level, 0.0)
             out[2, y, c] = np.sqrt(1.0 / 12.0 + 0.5 / max(net, 1.0))
             out[3, y, c] = _flux(net, k)
             out[4, y, c] = _flux(min(level, k), k)
@@ -140,23 +144,25 @@ def peak_rows(
 
 @numba.njit(cache=True, nogil=True)
 def _edge_scores(
-    n: NDArray[np.float64], length: int, background: float, decay: float, score: NDArray[np.float64]
+    n: NDArray[np.float64], begin: int, length: int, background: float, decay: float, score: NDArray[np.float64]
 ) -> None:
-    """(count - background) times the drop of the mean level from the 8 px before to the 8 px behind, both cut at 0."""
+    """(count - background) times the drop of the mean level from the 8 px before to the 8 px behind, both cut at 0.
+
+    n: counts with whatever lies beyond the window; score (length,) is of pixels begin..begin + length - 1.
+    """
     for t in range(length):
+        at = begin + t
         before = 0.0
-        m = 0
-        for i in range(max(0, t - EDGE_REACH_PX), t):
-            before += n[i]
-            m += 1
-        before = before / m if m else background
         behind = 0.0
-        m = 0
-        for i in range(t + 1, min(length, t + 1 + EDGE_REACH_PX)):
+        near, far = max(0, at - EDGE_REACH_PX), min(n.shape[0], at + 1 + EDGE_REACH_PX)
+        for i in range(near, at):
+            before += n[i]
+        for i in range(at + 1, far):
             behind += n[i]
-            m += 1
-        behind = behind / m if m else 0.0
-        rise = max(n[t] - background * np.exp(-decay * t), 0.0)
+        expected = background * np.exp(-decay * t)
+        before = before / (at - near) if at > near else expected
+        behind = behind / (far - at - 1) if far > at + 1 else before
+        rise = max(n[at] - expected, 0.0)
         # A small constant keeps the peak decisive where there is no haze to drop.
         score[t] = rise * (max(before - behind, 0.0) + 0.05)
 

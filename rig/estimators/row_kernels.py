@@ -87,8 +87,8 @@ def row_scores(
     """Log-likelihood of every position and amplitude against 'everything is behind'.
 
     psi: (T + 1,) share of the stripe at 0..T px from its centre. Writes score (M, length), edge (length + 1,), the
-    score of a change from before to behind at t without any stripe, and taps (3, length): each pixel's own log-likelihood
-    before and behind, and the flux between the two.
+    score of a change from before to behind at t without any stripe, and taps (3, length): each pixel's own
+    log-likelihood before and behind, and the flux between the two.
     """
     n, before, behind, scale = n[:length], before[:length], behind[:length], scale[:length]
     near, far, middle = taps[0, :length], taps[1, :length], taps[2, :length]
