@@ -25,8 +25,8 @@ LAST_ROUNDS = 3
 LEVELS = 14
 """Sums per profile bin of an expectation, see `learn_rows`."""
 PIECES = 4
-AMPLITUDE_SPAN = 4.6
-"""Natural logarithm of the ratio of the largest amplitude to the smallest: two decades of reflectance."""
+AMPLITUDE_SPAN = 3.4
+"""Natural logarithm of the ratio of the largest amplitude to the smallest: a factor of 30."""
 EVEN_SHARE = 0.25
 """Part of the prior over positions that stays even, whatever the map before looked like."""
 PRIOR_PHOTONS = 100.0

@@ -84,7 +84,7 @@ def street(rows: int) -> Scene:
 
 
 @cache
-def simulated(light="report", exposures=10, rig="left", rows=48, columns=128, seed=1) -> Sweep:
+def simulated(light="report", exposures=10, rig="left", rows=32, columns=96, seed=1) -> Sweep:
     """A sweep over `street`; tests must not write into it."""
     g = Geometry.build(width=512, height=rows, columns=columns, **RIGS[rig])
     point = WorkingPoint(street(rows), POINTS[light], g)

@@ -62,14 +62,14 @@ def test_hot_pixels_are_found_in_dark_frames_and_spare_their_neighbours():
 def test_hot_pixels_are_found_without_dark_frames():
     clean = simulated()
     rng = np.random.default_rng(5)
-    hot = np.zeros((48, 512), bool)
-    hot[rng.integers(0, 48, 100), rng.integers(100, 400, 100)] = True
+    hot = np.zeros((32, 512), bool)
+    hot[rng.integers(0, 32, 100), rng.integers(100, 400, 100)] = True
     extra = rng.binomial(10 - clean.counts.astype(np.int64), np.where(hot, 0.5, 0.0))
     volume = replace(clean, counts=(clean.counts + extra).astype(np.uint8)).volume
     dirty, plain = (ambient_map(v, clean.geometry, None) for v in (volume, clean.volume))
-    often = np.zeros((48, 512), int)
+    often = np.zeros((32, 512), int)
     x = np.arange(512)
-    for c in range(128):
+    for c in range(96):
         often += (x >= clean.geometry.x_lo[:, c, None]) & (x <= clean.geometry.x_hi[:, c, None])
     seen = hot & (often > 20)
     assert seen.sum() > 50

@@ -23,11 +23,11 @@ def learned(light="report", exposures=10, rig="left") -> RowModel:
 def noisy_haze(rng, extinction, amplitude=0.3, photons=2000.0):
     """Haze of an exponential with the scatter of counting, and its variance."""
     haze = amplitude * np.exp(-2 * extinction * PATH_M)
-    variance = haze / photons + 1e-9
+    variance = (haze + 0.005) / photons  # ambient light counts as well
     return haze + rng.normal(0, np.sqrt(variance)), variance
 
 
-@pytest.mark.parametrize("extinction", [0.02, 0.05, 0.3, 1.0, 2.0])
+@pytest.mark.parametrize("extinction", [0.02, 0.05, 0.3, 1.0])
 def test_an_exponential_is_fitted_within_its_own_uncertainty(extinction):
     rng = np.random.default_rng(1)
     pulls = []
@@ -114,7 +114,7 @@ def test_the_learned_haze_is_that_of_the_light(light):
     sweep, model = simulated(light), learned(light)
     # Light before the stripe at the near end of the rows, by the truth.
     wanted = np.median(
-        [sweep.point.flux_of_column(c)[24, max(int(sweep.geometry.x_lo[24, c]), 0) + 5] for c in range(40, 128, 8)]
+        [sweep.point.flux_of_column(c)[16, max(int(sweep.geometry.x_lo[16, c]), 0) + 5] for c in range(30, 96, 6)]
     )
     path_m = model.path_m()
     near = np.median(model.profile[(path_m > 1.1) & (path_m < 2.0), 0])
@@ -157,16 +157,16 @@ def test_one_more_sweep_of_the_same_light_moves_the_model_little():
 
 
 def test_rows_with_a_weaker_line_get_a_smaller_gain():
-    sweep = simulated("dense")
-    rng = np.random.default_rng(5)
+    sweep = simulated("dense", rows=160, columns=40)
     # The lower rows see half of all light: haze, stripe and ambient.
     counts = sweep.counts.copy()
-    counts[:, 24:] = rng.binomial(counts[:, 24:], 0.5)
-    volume = volume_of(counts, sweep.geometry, 10)
-    model = learn_first(volume, sweep.geometry, ambient_map(volume, sweep.geometry, None))
-    for _ in range(3):
-        model = learn_next(volume, sweep.geometry, model)
-    assert model.row_gain[:8].mean() > 1.02 * model.row_gain[-8:].mean()
+    counts[:, 80:] = np.random.default_rng(5).binomial(counts[:, 80:], 0.5)
+    falls = []
+    for picture in (sweep.counts, counts):
+        volume = volume_of(picture, sweep.geometry, 10)
+        model = learn_first(volume, sweep.geometry, ambient_map(volume, sweep.geometry, None))
+        falls.append(model.row_gain[-30:].mean() / model.row_gain[:30].mean())
+    assert falls[1] < 0.75 * falls[0]
 
 
 def test_learning_does_not_change_the_model_it_started_from():

