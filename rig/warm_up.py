@@ -1,7 +1,5 @@
 """Compiles the kernels of an estimate before a run, so that its times are those of the work alone."""
 
-import warnings
-
 import numpy as np
 
 from rig.counting import Counts, CountVolume
@@ -35,11 +33,9 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
         width=WORD_PX,
     )
     geometry = uncalibrated_geometry(ROWS, WORD_PX, COLUMNS)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # noise has no stripe to find
-        stripe = create_estimator(estimator, 1).estimate(volume, geometry)
-        if filter == "median":
-            from rig.estimators.median import median_filter
+    stripe = create_estimator(estimator, 1).estimate(volume, geometry)
+    if filter == "median":
+        from rig.estimators.median import median_filter
 
-            stripe = median_filter(stripe, geometry.reference_px())
-        depth_map(stripe, geometry, 0.5)
+        stripe = median_filter(stripe, geometry.reference_px())
+    depth_map(stripe, geometry, 0.5)

@@ -5,7 +5,6 @@ is estimated twice (the first pass finds which pixels were quiet behind the stri
 what the map before it taught, so a map depends on nothing inside itself and a live scan never waits.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +17,7 @@ from rig.estimators.likelihood_kernels import estimate_rows
 from rig.estimators.row_input import state_of, sweep_of
 from rig.estimators.row_model import RowModel
 from rig.geometry import SweepGeometry
+from rig.row_threads import over_rows
 from rig.stripes import StripeTable
 
 
@@ -60,7 +60,5 @@ class Likelihood:
         def work(first: int, last: int) -> None:
             estimate_rows(sweep, state, first, last, out, quiet)
 
-        pieces = np.linspace(0, rows, 4 * self.threads + 1).astype(int)
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(work, pieces[:-1].tolist(), pieces[1:].tolist()))
+        over_rows(rows, self.threads, work)
         return StripeTable(*out), quiet

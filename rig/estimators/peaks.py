@@ -5,7 +5,6 @@ side of the row, then the largest (count - background) weighted with the drop of
 8 px behind. Both refine to sub-pixel with the two neighbours, and both are told nothing and learn nothing.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from rig.counting import CountVolume
 from rig.estimators.peak_kernels import peak_rows
 from rig.geometry import SweepGeometry
+from rig.row_threads import over_rows
 from rig.stripes import StripeTable
 
 
@@ -39,7 +39,5 @@ class Peaks:
                 geometry.defects, self.with_edge, first, last, out,
             )  # fmt: skip
 
-        pieces = np.linspace(0, geometry.rows, 4 * self.threads + 1).astype(int)
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(work, pieces[:-1].tolist(), pieces[1:].tolist()))
+        over_rows(geometry.rows, self.threads, work)
         return StripeTable(*out)

@@ -98,6 +98,16 @@ def test_stored_windows_hold_every_search_interval_with_its_margin(rig, width, h
     assert np.all(x0 + geometry.window > np.minimum(geometry.x_hi[seen] + MARGIN_PX, width - 1))
 
 
+@pytest.mark.parametrize("rig", ["left", "right"])
+def test_the_margin_is_kept_on_both_sides_of_every_single_column(rig):
+    g = Geometry.build(width=512, height=3, columns=120, **RIGS[rig])
+    for c in range(20, 100):
+        geometry = sweep_geometry(rig_model(g), g.planes[c : c + 1], (1.0, 8.0))
+        first, last = geometry.x_lo.min(), geometry.x_hi.max()
+        assert geometry.x0[0] <= max(first - MARGIN_PX, 0) < geometry.x0[0] + 64
+        assert geometry.x0[0] + geometry.window > min(last + MARGIN_PX, 511)
+
+
 def test_windows_are_no_wider_than_the_disparity_span_asks():
     # f = 600 px, baseline 0.3 m: 1 to 8 m are 157.5 px, with margins and the word grid at most 4 words.
     assert geometry_of(Geometry.build(height=4, columns=100)).window <= 256
