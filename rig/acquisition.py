@@ -24,9 +24,7 @@ from rig.counting import SweepCounter
 from rig.errors import DevicesError
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig
-from rig.sweeps import FrameCounts, SweepAssembler, SweepData
-
-__all__ = ["Acquisition", "FrameCounts", "Progress", "SweepAssembler", "SweepData"]
+from rig.sweeps import SweepAssembler, SweepData
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +43,7 @@ JOIN_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class ScanProgress:
     """How far a run is, told after every block."""
 
     frames: int
@@ -68,7 +66,7 @@ class Acquisition:
         maps: int,
         *,
         threads: int = 2,
-        on_block: Callable[[Progress], None] | None = None,
+        on_block: Callable[[ScanProgress], None] | None = None,
         silence_s: float = SILENCE_S,
     ) -> None:
         if maps < 1:
@@ -138,8 +136,8 @@ class Acquisition:
         reader = ring.reader("counting")
         source = _Source(rig.spad, ring, self._silence_s)
         try:
-            rig.spad.start(self._burst_frames(sweeps))
             self._arm()
+            rig.spad.start(self._burst_frames(sweeps))
             rig.sync.run()
             rig.scanner.start()
             source.start()
@@ -169,9 +167,11 @@ class Acquisition:
         if self._on_block is not None:
             before = round(done * self._plan.frames_per_sweep)
             frames = before + assembler.frames_seen
-            self._on_block(Progress(frames, self.frames_planned, done + assembler.sweeps_done, self._maps))
+            self._on_block(ScanProgress(frames, self.frames_planned, done + assembler.sweeps_done, self._maps))
 
     def _arm(self) -> None:
+        """Arm the laser behind a gate that reads back low and wait for it; a started SPAD would overflow meanwhile."""
+        self._rig.sync.gate_low()
         power_w = self._rig.config.scan.power
         self._rig.laser.arm(self._rig.laser.limits.max_power_w if power_w is None else power_w)
         _wait_until_warm(self._rig, self._rig.clock)

@@ -6,7 +6,7 @@ result.last.depth_m, result.summary.truth
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,9 @@ Config = RigConfig | PathLike
 
 SIMULATED = "simulated"
 """Name of the bundled rig, and kind of the devices, that need no hardware."""
+
+MAX_SEED = 2**63 - 1
+"""Largest seed: the largest number that other programs read from the manifest as an integer."""
 
 
 def configure(
@@ -97,28 +100,26 @@ def scan(
         filter=filter,
         min_confidence=min_confidence,
     )
-    policy = SavePolicy.parse(save)
-    problems = require_simulated_or_armed(settings, arm)
-    if maps < 1:
-        problems.append(f"maps is {maps}; it must be at least 1")
-    if seed < 0:
-        problems.append(f"seed is {seed}; it must be 0 or more")
-    if problems:
-        raise UsageError.of(problems)
+    policy = _checked_policy(maps, seed, save, require_simulated_or_armed(settings, arm))
     estimate = settings.estimate
     tally = MapTally(settings.scan.columns, settings.scan.exposures, estimate.estimator, estimate.filter)
     with Run(out, tally, policy) as run, open_rig(settings, seed=seed) as rig:
         return run_scan(rig, run, maps, seed, progress)
 
 
-def plan_scan(config: Config = SIMULATED, **options: Any) -> "ScanPlan":
-    """The compiled plan of a scan, checked against its devices' limits (`rig scan --dry-run`); options as `configure`.
+def plan_scan(
+    config: Config = SIMULATED, *, maps: int = 1, seed: int = 0, save: str = "all", **options: Any
+) -> "ScanPlan":
+    """The compiled plan of a scan, checked against its devices' limits (`rig scan --dry-run`).
+
+    maps, seed, save: checked as `scan` would; the plan does not depend on them. options: as `configure`.
 
     Nothing moves and nothing shines: only rigs all of whose devices are simulated are opened for it.
     """
     from rig.session import open_rig, prepare
 
     settings = configure(config, **options)
+    _checked_policy(maps, seed, save)
     slots = ("spad", "scanner", "laser", "sync")
     real = [f"{slot} {getattr(settings, slot).kind}" for slot in slots if getattr(settings, slot).kind != SIMULATED]
     if real:
@@ -158,6 +159,22 @@ def effects(config: Config = SIMULATED, *, scene: str | None = None) -> "tuple[E
     from rig.effects import scene_effects
 
     return scene_effects(configure(config, scene=scene))
+
+
+def _checked_policy(maps: int, seed: int, save: str, others: Sequence[str] = ()) -> SavePolicy:
+    """The policy of `save`; UsageError, with `others`, for what is wrong with any of these."""
+    problems = list(others)
+    if maps < 1:
+        problems.append(f"maps is {maps}; it must be at least 1")
+    if not 0 <= seed <= MAX_SEED:
+        problems.append(f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})")
+    try:
+        policy = SavePolicy.parse(save)
+    except UsageError as error:
+        raise UsageError.of([*problems, *error.problems]) from None
+    if problems:
+        raise UsageError.of(problems)
+    return policy
 
 
 def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:

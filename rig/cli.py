@@ -1,13 +1,16 @@
 """The command line: `rig scan`, `rig reconstruct`, `rig effects`, `rig config`.
 
 Each command is one call of `rig.api` and some printing. Results go to stdout, everything else to stderr. Exit codes:
-0 done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted. Nothing heavy is imported before a
-command runs.
+0 done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted, 70 an error in the program itself.
+Nothing heavy is imported before a command runs.
 """
 
 import functools
 import logging
+import signal
 import sys
+import threading
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
@@ -23,6 +26,8 @@ if TYPE_CHECKING:
 EXIT_USAGE = 2
 EXIT_DEVICE = 3
 EXIT_ABORTED = 4
+EXIT_SOFTWARE = 70
+"""An error in the program itself: EX_SOFTWARE of sysexits.h."""
 
 P = ParamSpec("P")
 
@@ -58,17 +63,59 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `rig`; ends the process with the exit code."""
     arguments = _join_save(list(sys.argv[1:] if argv is None else argv))
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(levelname)s: %(message)s")
-    try:
-        code = app(args=arguments, prog_name="rig", standalone_mode=False)
-    except Exception as error:
-        # Click's own usage errors. Typer carries click inside or beside itself, depending on its version.
-        if not hasattr(error, "format_message"):
-            raise
-        context = getattr(error, "ctx", None)
-        command = context.command_path if context is not None else "rig"
-        _say(f"error: {error.format_message().rstrip('.')}; see '{command} --help'")
-        code = EXIT_USAGE
+    with _signals_interrupt():
+        try:
+            code = app(args=arguments, prog_name="rig", standalone_mode=False)
+        except KeyboardInterrupt:
+            code = EXIT_ABORTED
+        except Exception as error:
+            code = _say_why(error)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+@contextmanager
+def _signals_interrupt() -> Iterator[None]:
+    """Let the signals that end a program raise KeyboardInterrupt, so that they make the rig safe as Ctrl-C does.
+
+    One that is ignored (nohup) stays ignored; threads other than the main one get none.
+    """
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+                before[number] = signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _say_why(error: Exception) -> int:
+    """Say what ended a command that did not handle it: a usage error of click's, an interrupt or a mistake of ours."""
+    if isinstance(error.__cause__, KeyboardInterrupt):
+        return EXIT_ABORTED
+    # Typer carries click inside or beside itself, depending on its version.
+    if not hasattr(error, "format_message"):
+        traceback.print_exception(error)
+        return EXIT_SOFTWARE
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context is not None else "rig"
+    message = error.format_message().rstrip(".")
+    # What an error tells of its option's type differs between versions, these words do not.
+    steps = (
+        ("valid integer", "write a whole number or "),
+        ("valid float", "write a number or "),
+        ("valid number", "write a number or "),
+    )
+    wanted = next((step for words, step in steps if words in message), "")
+    _say(f"error: {message}; {wanted}see '{command} --help'")
+    return EXIT_USAGE
 
 
 def _command(function: Callable[P, int | None]) -> Callable[P, None]:
@@ -153,7 +200,7 @@ def scan_command(
         "min_confidence": min_confidence,
     }
     if dry_run:
-        return _show_plan(api.plan_scan(config, **options), as_json)
+        return _show_plan(api.plan_scan(config, maps=maps, seed=seed, save=save, **options), as_json)
     with _progress("frames") as progress:
         result = api.scan(
             config,
@@ -262,6 +309,10 @@ def _show_plan(plan: "ScanPlan", as_json: bool) -> int:
 
 def _report(result: "RunResult", as_json: bool) -> int:
     """Print a run's summary, for programs or people; its exit code."""
+    from rig.summary import Verdict
+
+    if result.summary.valid_fraction == 0 and result.summary.verdict is not Verdict.UNCALIBRATED:
+        _say("warning: no pixel has a depth; raise --exposures, lower --min-confidence or check the depth range")
     if as_json:
         _print_json(result.summary.as_json())
     else:

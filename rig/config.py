@@ -91,6 +91,11 @@ class ScanConfig(Section):
         default=None, description="laser power of the scan; the laser's limit where not given", examples=["20 mW"]
     )
 
+    @property
+    def exposure_s(self) -> float:
+        """Exposure of a frame; without a setting the whole frame period."""
+        return float(1 / self.frame_rate) if self.exposure is None else self.exposure
+
     @model_validator(mode="after")
     def _exposure_fits(self) -> Self:
         if self.exposure is not None and self.exposure > float(1 / self.frame_rate) * (1 + 1e-9):

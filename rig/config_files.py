@@ -2,6 +2,7 @@
 
 import copy
 import difflib
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -68,8 +69,9 @@ def find_config(name_or_path: str | Path) -> Path:
         raise UsageError(f"config {path} is a folder; name the YAML file in it")
     close = difflib.get_close_matches(path.stem, names, n=1)
     meant = f"did you mean '{close[0]}'? " if close else ""
+    missing = "" if plain and not str(name_or_path).endswith(("/", os.sep)) else "that path does not exist; "
     raise UsageError(
-        f"no config '{name_or_path}': {meant}bundled configs are {', '.join(names) or 'none'}; "
+        f"no config '{name_or_path}': {missing}{meant}bundled configs are {', '.join(names) or 'none'}; "
         "anything else is the path of a YAML file"
     )
 

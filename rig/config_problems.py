@@ -36,6 +36,14 @@ _BOUNDS = {
     "less_than": ("less than", "lt"),
     "less_than_equal": ("at most", "le"),
 }
+FLAGS: Mapping[Key, str] = {
+    ("world", "scene"): "--scene",
+    ("scan", "exposures"): "--exposures",
+    ("estimate", "estimator"): "--estimator",
+    ("estimate", "filter"): "--filter",
+    ("estimate", "min_confidence"): "--min-confidence",
+}
+"""Keys that the command line has an option for."""
 _READS_ON = ("is ", "has ", "runs ", "begins ")
 """A validator's message that begins so reads on from the key; any other follows a colon."""
 
@@ -67,8 +75,9 @@ def explain(
     found = []
     for problem in error.errors():
         key = _key(problem)
-        text = _text(problem, key, _Schema(model, content))
-        found.append((sources.line(key) or 0, f"{sources.place(key)} {text}"))
+        flag = FLAGS.get(key) if key in sources.options else None
+        text = _text(problem, key, _Schema(model, content), flag)
+        found.append((sources.line(key) or 0, text if flag else f"{sources.place(key)} {text}"))
     for _, text in sorted(found, key=lambda item: item[0]):
         yield text
 
@@ -115,10 +124,11 @@ def _named(key: Key) -> Key:
     return key
 
 
-def _text(problem: ErrorDetails, key: Key, schema: _Schema) -> str:
-    dotted = ".".join(key)
+def _text(problem: ErrorDetails, key: Key, schema: _Schema, flag: str | None) -> str:
+    """flag: the option that the value was given with."""
+    dotted = flag or ".".join(key)
     kind, context = problem["type"], problem.get("ctx", {})
-    example = _example(key, schema.field(key))
+    example = _example(f"{_named(key)[-1]}: " if flag is None else f"{flag} ", schema.field(key)) if key else ""
     if kind == "extra_forbidden":
         return _unknown_key(key, schema.section(key[:-1]))
     if kind == "missing":
@@ -149,10 +159,10 @@ def _unknown_key(key: Key, section: type[BaseModel] | None) -> str:
     return f"unknown key '{'.'.join(key)}'; {meant}"
 
 
-def _example(key: Key, info: FieldInfo | None) -> str:
+def _example(name: str, info: FieldInfo | None) -> str:
     if info is None or not info.examples:
         return ""
-    return f"write for example '{_named(key)[-1]}: {info.examples[0]}'"
+    return f"write for example '{name}{info.examples[0]}'"
 
 
 def _meant(value: object, expected: str) -> str:

@@ -58,6 +58,14 @@ def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> 
     return Cube(file, frames, plan, model.camera.width)
 
 
+def cube_columns(model: RigModel) -> int | None:
+    """Columns of the bare cube that a model with `planes` is for; None where its commands are a mirror's."""
+    scanner = model.scanner
+    if isinstance(scanner, PlaneTable) and np.array_equal(scanner.command, np.arange(len(scanner.command))):
+        return len(scanner.command)
+    return None
+
+
 def column_commands(plan: CubePlan) -> NDArray[np.float64]:
     """Commands of a cube's columns: their index, which is what the `planes` of its calibration are sampled at."""
     return np.arange(plan.columns, dtype=np.float64)
@@ -105,14 +113,14 @@ def _frame_problems(file: Path, frames: NDArray[np.generic], plan: CubePlan, mod
 
 
 def _plane_problems(plan: CubePlan, model: RigModel) -> list[str]:
-    scanner = model.scanner
-    if not isinstance(scanner, PlaneTable) or not np.array_equal(scanner.command, np.arange(len(scanner.command))):
+    columns = cube_columns(model)
+    if columns is None:
         return [
             "the calibration maps mirror commands to planes; a bare cube needs 'planes', one per column of its plan"
         ]
-    if len(scanner.command) != plan.columns:
+    if columns != plan.columns:
         return [
-            f"the calibration has {len(scanner.command)} planes, the plan {plan.columns} columns; "
+            f"the calibration has {columns} planes, the plan {plan.columns} columns; "
             "use the calibration made for this cube's plan"
         ]
     return []

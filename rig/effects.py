@@ -53,9 +53,8 @@ def scene_effects(config: RigConfig) -> tuple[Effect, ...]:
     if not isinstance(world, ReportsEffects):
         raise UsageError(f"world {config.world.kind} says nothing of its effects")
     scan = config.scan
-    exposure_s = float(1 / scan.frame_rate) if scan.exposure is None else scan.exposure
     power_w = _power_w(config)
-    return tuple(Effect(**line) for line in world.effects_report(power_w, exposure_s, scan.exposures))
+    return tuple(Effect(**line) for line in world.effects_report(power_w, scan.exposure_s, scan.exposures))
 
 
 def _power_w(config: RigConfig) -> float:

@@ -33,19 +33,7 @@ class PlanError(UsageError):
     """The scan that was asked for cannot be done with this scanner, sensor or calibration."""
 
 
-class ResultError(RigError):
-    """The result is there but not to be trusted (gaps, no synchronisation, no calibration)."""
-
-    exit_code = 1
-
-
 class DevicesError(RigError):
     """One or more devices could not be opened, or failed while they were being stopped; one line per device."""
 
     exit_code = 3
-
-
-class Aborted(RigError):  # noqa: N818 - the word of the exit code
-    """The run was ended before its last map, by the user or by the overload policy."""
-
-    exit_code = 4

@@ -66,12 +66,16 @@ class SweepGeometry:
         """
         near_m, far_m = self.depth_range_m
         w = 0.5 * (1.0 / near_m + 1.0 / far_m)
-        valid = np.isfinite(self.u)
-        y, x = np.nonzero(valid)
-        px_per_tangent, centre = np.polyfit(self.u[y, x].astype(np.float64), x, 1)
-        v_row = np.array([self.v[i, m].mean() if m.any() else 0.0 for i, m in enumerate(valid)], dtype=np.float64)
-        u = (w - self.plane[None, :, 2] - self.plane[None, :, 1] * v_row[:, None]) / self.plane[None, :, 0]
-        return np.asarray(centre + px_per_tangent * u)
+        fullest = int(np.isfinite(self.u).sum(axis=1).argmax())
+        valid = np.flatnonzero(np.isfinite(self.u[fullest]))
+        if len(valid) < 2:
+            return np.zeros((self.rows, self.columns))
+        left, right = int(valid[0]), int(valid[-1])
+        u_left = float(self.u[fullest, left])
+        px_per_tangent = (right - left) / (float(self.u[fullest, right]) - u_left)
+        row = np.nan_to_num(self.v[:, (left + right) // 2].astype(np.float64))
+        u = (w - self.plane[None, :, 2] - self.plane[None, :, 1] * row[:, None]) / self.plane[None, :, 0]
+        return np.asarray(left + px_per_tangent * (u - u_left))
 
 
 def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: tuple[float, float]) -> SweepGeometry:

@@ -1,6 +1,7 @@
 """The folder of a run: every output in one place, whole or not there at all.
 
     depth/000000.npy  depth/000000.png  intensity/000000.png  stripe/000000.npz  cloud/000000.ply
+    learned/000000.npz (what the map was estimated with, where the estimator learns)
     truth/000000.npz (where a world knows it)  manifest.json  summary.json
 
 Everything is written beside the folder under a hidden name and moved in one step at the end.
@@ -8,12 +9,14 @@ Everything is written beside the folder under a hidden name and moved in one ste
 
 import io
 import json
+import logging
 import math
 import os
 import secrets
 import shutil
 from collections.abc import Mapping
 from fractions import Fraction
+from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -27,6 +30,8 @@ from rig.pictures import depth_limits, depth_picture, intensity_picture, png_byt
 from rig.pointcloud import cloud, ply_bytes
 from rig.reconstruction import MapResult
 
+_log = logging.getLogger(__name__)
+
 Rays = tuple[NDArray[np.floating], NDArray[np.floating]]
 
 
@@ -39,7 +44,6 @@ class RunFolder:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Claim the folder; nothing is visible at `path` yet."""
         self.path = Path(path).absolute()
-        self.maps_written = 0
         self._limits: tuple[float, float] | None = None
         self._made_parents: list[Path] = []
         self._scratch: Path | None = None
@@ -80,32 +84,46 @@ class RunFolder:
             files[f"depth/{name}.png"] = png_bytes(depth_picture(result.depth_m, self._limits))
             files[f"cloud/{name}.ply"] = ply_bytes(cloud(result.depth_m, *rays, result.intensity))
         self._write(files)
-        self.maps_written += 1
 
     def write_truth(self, index: int, truth: SweepTruth) -> None:
         """Write what the world says about the sweep of a map."""
         self._write({f"truth/{index:06d}.npz": _npz_bytes({"x_px": truth.x_px, "depth_m": truth.depth_m})})
+
+    def remove_map(self, index: int) -> None:
+        """Remove every file of a map that was not finished."""
+        assert self._scratch is not None, "the run folder is published or discarded already"
+        for file in self._scratch.glob(f"*/{index:06d}.*"):
+            file.unlink(missing_ok=True)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write `name` (manifest.json, summary.json) as strict JSON."""
         self._write({name: (json_text(content) + "\n").encode()})
 
     def publish(self) -> Path:
-        """Make the folder appear under its name."""
+        """Make the folder appear under its name, or beside it (NAME-2, ...) where somebody was faster; its path."""
         scratch = self._scratch
         assert scratch is not None, "a run folder is published once"
         try:
-            if scratch.parent == self.path:  # an empty folder was given: fill it, summary.json last
-                for child in sorted(scratch.iterdir(), key=lambda file: file.name == "summary.json"):
-                    child.rename(self.path / child.name)
-                scratch.rmdir()
-            else:
-                scratch.rename(self.path)
+            published = self._move(scratch)
         except OSError as error:
             raise _unwritable(self.path, error) from error
         self._scratch = None
         self._made_parents.clear()
-        return self.path
+        if published != self.path:
+            _log.warning("%s was taken while the run went on; the run is in %s", self.path, published)
+        return published
+
+    def _move(self, scratch: Path) -> Path:
+        if scratch.parent == self.path:  # an empty folder was given: fill it, summary.json last
+            if list(self.path.iterdir()) == [scratch]:
+                for child in sorted(scratch.iterdir(), key=lambda file: file.name == "summary.json"):
+                    child.rename(self.path / child.name)
+                scratch.rmdir()
+                return self.path
+        elif _renamed(scratch, self.path):
+            return self.path
+        beside = (self.path.with_name(f"{self.path.name}-{number}") for number in count(2))
+        return next(path for path in beside if _renamed(scratch, path))
 
     def discard(self) -> None:
         """Remove everything not published, and the folders made for it."""
@@ -145,15 +163,28 @@ class RunFolder:
                 file.parent.mkdir(exist_ok=True)
                 written.append(file)
                 file.write_bytes(data)
-        except OSError as error:
+        except BaseException as error:  # an interrupt too leaves no half of a map
             for file in written:
                 file.unlink(missing_ok=True)
-            raise _unwritable(self.path, error) from error
+            if isinstance(error, OSError):
+                raise _unwritable(self.path, error) from error
+            raise
 
 
 def json_text(content: Mapping[str, Any]) -> str:
     """Strict JSON: NaN and infinities become null, arrays lists, paths text."""
     return json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
+
+
+def _renamed(folder: Path, target: Path) -> bool:
+    """Move a folder; False where something is at `target` already."""
+    try:
+        folder.rename(target)
+    except OSError:
+        if not target.exists():
+            raise
+        return False
+    return True
 
 
 def _plain(value: Any) -> Any:

@@ -32,7 +32,7 @@ from rig.mirror_path import SweepPath, mirrored
 from rig.path_search import PathDemand, find_path, remedy
 from rig.scan_plan import Leg, ScanPlan
 
-__all__ = ["Leg", "ScanPlan", "compile_plan", "spad_request"]
+__all__ = ["Leg", "ScanPlan", "compile_plan", "spad_problems", "spad_request"]
 
 CLOCK_TOLERANCE = 2e-4
 """Relative difference allowed for between SPAD, scanner and sync clocks: three crystals of +-50 ppm, and margin."""
@@ -51,18 +51,49 @@ PointClock = Callable[[float], Fraction]
 
 
 def spad_request(scan: ScanConfig, info: SpadInfo) -> SpadRequest:
-    """What the scan wants of this SPAD. PlanError lists everything the SPAD cannot do."""
-    problems = _spad_problems(scan, info)
-    if problems:
-        raise PlanError(*problems)
+    """What the scan wants of this SPAD; one that cannot be has `spad_problems`."""
     frame_bytes = packed_row_bytes(info.width) * info.height
-    exposure_s = float(1 / scan.frame_rate) if scan.exposure is None else scan.exposure
     return SpadRequest(
         frame_rate_hz=scan.frame_rate,
-        exposure_s=exposure_s,
+        exposure_s=scan.exposure_s,
         mode="stream" if _stream_carries(scan.frame_rate, info) else "burst",
         block_frames=max(1, min(BLOCK_FRAMES, BLOCK_BYTES // frame_bytes)),
     )
+
+
+def spad_problems(scan: ScanConfig, info: SpadInfo) -> list[str]:
+    """Everything about the scan that the SPAD cannot do, a line each."""
+    problems = []
+    rate = float(scan.frame_rate)
+    too_fast: list[tuple[float, str]] = []
+    if scan.frame_rate > info.max_frame_rate_hz:
+        most = float(info.max_frame_rate_hz)
+        too_fast.append(
+            (
+                most,
+                f"scan.frame_rate is {rate / 1e3:g} kHz, the most the {info.model} SPAD does is {most / 1e3:g} kHz; "
+                "lower frame_rate",
+            )
+        )
+    if not _stream_carries(scan.frame_rate, info) and info.burst is None:
+        need = _stream_bytes_per_s(scan.frame_rate, info)
+        have = info.stream.bytes_per_s if info.stream is not None else 0.0
+        carried = math.floor(rate * have / need)
+        too_fast.append(
+            (
+                carried,
+                f"scan.frame_rate {rate / 1e3:g} kHz makes {need / 1e6:.0f} MB/s of full frames, the link of the "
+                f"{info.model} SPAD carries {have / 1e6:.0f} MB/s; lower frame_rate to {carried / 1e3:g} kHz",
+            )
+        )
+    if too_fast:  # the stricter limit: the other remedy would not be enough
+        problems.append(min(too_fast)[1])
+    if not info.markers:
+        problems.append(
+            f"the {info.model} SPAD puts no scanner markers into its frames, so they cannot be bound to columns; "
+            "use a SPAD with markers"
+        )
+    return problems
 
 
 def compile_plan(
@@ -93,7 +124,7 @@ def compile_plan(
         dark_fraction=scan.dark_fraction,
         bidirectional=scan.bidirectional,
     )
-    problems = [*_spad_problems(scan, info), *_model_problems(scan, model, info, demand.speed_per_s)]
+    problems = [*spad_problems(scan, info), *_model_problems(scan, model, info, demand.speed_per_s)]
     found = find_path(demand, limits, point_clock)
     advice = remedy(demand, scan.exposures, limits, point_clock) if found.problems else ""
     first, last = scan.command_range
@@ -117,7 +148,7 @@ def compile_plan(
         columns=scan.columns,
         exposures=scan.exposures,
         frame_rate_hz=frame_rate,
-        exposure_s=_exposure_s(scan, timing, frame_rate),
+        exposure_s=scan.exposure_s if timing is None else float(timing.exposure_ticks / timing.tick_hz),
         point_rate_hz=rate,
         sweep_points=path.points,
         legs=legs,
@@ -143,42 +174,12 @@ def compile_plan(
     return plan
 
 
-def _exposure_s(scan: ScanConfig, timing: SpadTiming | None, frame_rate: Fraction) -> float:
-    if timing is not None:
-        return float(timing.exposure_ticks / timing.tick_hz)
-    return float(1 / frame_rate) if scan.exposure is None else scan.exposure
-
-
 def _stream_carries(frame_rate: Fraction, info: SpadInfo) -> bool:
     return info.stream is not None and info.stream.bytes_per_s >= _stream_bytes_per_s(frame_rate, info)
 
 
 def _stream_bytes_per_s(frame_rate: Fraction, info: SpadInfo) -> float:
     return float(frame_rate) * packed_row_bytes(info.width) * info.height
-
-
-def _spad_problems(scan: ScanConfig, info: SpadInfo) -> list[str]:
-    problems = []
-    rate = float(scan.frame_rate)
-    if scan.frame_rate > info.max_frame_rate_hz:
-        problems.append(
-            f"scan.frame_rate is {rate / 1e3:g} kHz, the most the {info.model} SPAD does is "
-            f"{float(info.max_frame_rate_hz) / 1e3:g} kHz; lower frame_rate"
-        )
-    if not info.markers:
-        problems.append(
-            f"the {info.model} SPAD puts no scanner markers into its frames, so they cannot be bound to columns; "
-            "use a SPAD with markers"
-        )
-    if not _stream_carries(scan.frame_rate, info) and info.burst is None:
-        need = _stream_bytes_per_s(scan.frame_rate, info)
-        have = info.stream.bytes_per_s if info.stream is not None else 0.0
-        problems.append(
-            f"scan.frame_rate {rate / 1e3:g} kHz makes {need / 1e6:.0f} MB/s of full frames, the link of the "
-            f"{info.model} SPAD carries {have / 1e6:.0f} MB/s; "
-            f"lower frame_rate to {math.floor(rate * have / need) / 1e3:g} kHz"
-        )
-    return problems
 
 
 def _model_problems(scan: ScanConfig, model: RigModel | None, info: SpadInfo, speed_per_s: float) -> list[str]:

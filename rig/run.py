@@ -48,7 +48,6 @@ class Run:
         self.rays: Rays | None = None
         self._save = save or SavePolicy()
         self._last: tuple[int, MapResult, SweepTruth | None] | None = None
-        self._last_written = -1
 
     def __enter__(self) -> Self:
         """The run itself."""
@@ -62,12 +61,20 @@ class Run:
             self._folder.discard()
 
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
-        """Take the next map."""
+        """Take the next map: whole, or, where anything ends it before it is counted, not at all."""
         index = self.tally.maps
-        if self._save.keeps(index):
-            self._write(index, result, truth)
-        self.tally.add(result, compute_s, truth)
-        self._last = index, result, truth
+        before = self._last
+        try:
+            if self._save.keeps(index):
+                self._write(index, result, truth)
+            self._last = index, result, truth
+            self.tally.add(result, compute_s, truth)
+        except BaseException:
+            if self.tally.maps == index:
+                self._last = before
+                if self._folder is not None:
+                    self._folder.remove_map(index)
+            raise
 
     def finish(
         self, frames: RunFrames, sensor_time_s: float, verdict: Verdict, manifest: Mapping[str, Any]
@@ -79,7 +86,7 @@ class Run:
         index, result, truth = self._last
         folder = None
         if self._folder is not None:
-            if self._last_written < index and self._save.step is None:
+            if self._save.step is None:
                 self._write(index, result, truth)
             self._folder.write_json("manifest.json", {"versions": versions(), **manifest})
             self._folder.write_json("summary.json", summary.as_json())
@@ -92,7 +99,6 @@ class Run:
         self._folder.write_map(index, result, self.rays)
         if truth is not None:
             self._folder.write_truth(index, truth)
-        self._last_written = index
 
 
 def versions() -> dict[str, str]:

@@ -18,8 +18,6 @@ from rig.mirror_path import SweepPath
 
 Array = NDArray[np.float64]
 
-NS_PER_S = 1_000_000_000
-
 
 @dataclass(frozen=True, slots=True)
 class Leg:
@@ -95,11 +93,6 @@ class ScanPlan:
         return self.sweep_s * self.frame_rate_hz
 
     @property
-    def lit_frames(self) -> int:
-        """Frames that fall on columns in a sweep, nominally."""
-        return self.columns * self.exposures
-
-    @property
     def dark_fraction(self) -> float:
         """Least share of a sweep's frames taken wholly with the gate low."""
         gate_s = max(leg.gate_close_s - leg.gate_open_s for leg in self.legs)
@@ -123,10 +116,6 @@ class ScanPlan:
     def leg(self, sweep: int) -> Leg:
         """The leg of sweep number `sweep`, counted from 0."""
         return self.legs[sweep % len(self.legs)]
-
-    def sweep_start_ns(self, sweep: int) -> int:
-        """Nanoseconds (floor) from the first scan marker to that of `sweep`, exact at any length of run."""
-        return sweep * self.sweep_points * NS_PER_S * self.point_rate_hz.denominator // self.point_rate_hz.numerator
 
     def command(self, time_s: Array) -> Array:
         """Mirror command at times after the first scan marker, any shape; negative times give the first command."""

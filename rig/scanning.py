@@ -7,8 +7,7 @@ from typing import Any
 from calibration.model import RigModel
 from drivers.errors import DeviceError
 from drivers.interfaces import SweepTruth
-from rig.acquisition import Acquisition
-from rig.acquisition import Progress as ScanProgress
+from rig.acquisition import Acquisition, ScanProgress
 from rig.config import RigConfig
 from rig.errors import RigError
 from rig.reconstruction import Reconstructor
@@ -44,9 +43,10 @@ def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, progress: Progress | 
     try:
         _collect(acquisition, reconstructor, rig, plan, run, sweeps)
     except (KeyboardInterrupt, DeviceError, RigError) as error:
-        if not sweeps and not isinstance(error, KeyboardInterrupt):
+        if not run.tally.maps and not isinstance(error, KeyboardInterrupt):
             raise
         ended_by = error
+    del sweeps[run.tally.maps :]
     frames = _frames(sweeps, acquisition.counters.crc_errors)
     result = run.finish(
         frames,
@@ -143,8 +143,8 @@ def _collect(
             truth: SweepTruth | None = None
             if rig.world is not None:  # asked only now: no estimate ever sees it
                 truth = rig.world.truth(plan.command_at(sweep.volume.bound_column()))
+            sweeps.append(sweep.account())  # before its map: whatever ends the run, no map is without its account
             run.add(result, sweep.count_s + result.compute_s, truth)
-            sweeps.append(sweep.account())
 
 
 def _frames(sweeps: list[SweepAccount], crc_errors: int | None) -> RunFrames:

@@ -18,8 +18,9 @@ from drivers.errors import DeviceError
 from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SpadTiming, SyncSource, World
 from drivers.registry import KindConfig, Surroundings, lookup
 from rig.config import RigConfig, ScanConfig
+from rig.cube import cube_columns
 from rig.errors import DevicesError, PlanError, UsageError
-from rig.plan import compile_plan, spad_request
+from rig.plan import compile_plan, spad_problems, spad_request
 from rig.scan_plan import ScanPlan
 
 _log = logging.getLogger(__name__)
@@ -71,8 +72,11 @@ def prepare(rig: OpenRig, scan: ScanConfig | None = None) -> tuple[ScanPlan, Spa
             f"scan.power is {scan.power * 1e3:g} mW, the most {rig.laser.name} may give is {most_w * 1e3:g} mW; "
             "lower scan.power"
         )
-    timing = rig.spad.configure(spad_request(scan, rig.spad.info))
-    plan = compile_plan(scan, rig.scanner.limits, rig.scanner.point_clock, rig.model, rig.spad.info, timing)
+    info, scanner = rig.spad.info, rig.scanner
+    if spad_problems(scan, info):  # refused with all other problems of the plan, for which the nominal rate will do
+        compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info)
+    timing = rig.spad.configure(spad_request(scan, info))
+    plan = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, timing)
     if isinstance(rig.world, HoldsColumns):
         # A frame's light may be held this far from where the mirror is: the mean over a column's frames is then
         # within 1/20 column of the mean that the binding gives, at any number of exposures.
@@ -118,10 +122,17 @@ def _load_model(config: RigConfig, problems: list[str]) -> RigModel | None:
     if config.calibration is None:
         return None
     try:
-        return load_rig_model(config.calibration)
+        model = load_rig_model(config.calibration)
     except CalibrationError as error:
         problems.append(f"calibration: {error}")
         return None
+    if (cube_columns(model) or 0) > 2:  # commands 0 and 1 may as well be those of a mirror
+        problems.append(
+            f"calibration: {config.calibration} is for a bare cube ('planes', one per column); a scan needs a "
+            "calibration with 'scanner', which says where the plane is at any mirror command"
+        )
+        return None
+    return model
 
 
 def _pause_if_emitting(laser: LineLaser) -> list[str]:

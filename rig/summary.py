@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -84,6 +84,14 @@ class Summary:
         return content
 
 
+class _OfMap(NamedTuple):
+    compute_s: float
+    valid: float
+    fog: FogEstimate
+    errors: tuple[Errors, Errors] | None
+    """Of stripe and depth, where the truth is known."""
+
+
 @dataclass(slots=True)
 class MapTally:
     """Adds up the maps of a run as they come."""
@@ -92,29 +100,27 @@ class MapTally:
     exposures: int
     estimator: str
     filter: str
-    compute_s: float = 0.0
-    _valid: list[float] = field(default_factory=list)
-    _stripe: list[Errors] = field(default_factory=list)
-    _depth: list[Errors] = field(default_factory=list)
-    _fog: FogEstimate = field(default_factory=lambda: FogEstimate(None, None, None))
+    _maps: list[_OfMap] = field(default_factory=list)
 
     @property
     def maps(self) -> int:
         """Maps so far."""
-        return len(self._valid)
+        return len(self._maps)
 
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
         """Count one map; `compute_s` is the wall time of its counting and estimation."""
-        self.compute_s += compute_s
-        self._valid.append(float(np.isfinite(result.depth_m).mean()))
-        self._fog = result.fog  # what was learned grows from map to map; the last one knows most
+        valid = float(np.isfinite(result.depth_m).mean())
+        errors = None
         if truth is not None:
-            self._stripe.append(stripe_errors(result.stripe.x_px, truth.x_px))
-            self._depth.append(depth_errors(result.depth_m, truth.depth_m))
+            errors = stripe_errors(result.stripe.x_px, truth.x_px), depth_errors(result.depth_m, truth.depth_m)
+        # What was learned grows from map to map; the last one knows most. One step: an interrupt counts it or does not.
+        self._maps.append(_OfMap(compute_s, valid, result.fog, errors))
 
     def summary(self, frames: RunFrames, sensor_time_s: float, verdict: Verdict) -> Summary:
         """The run so far."""
-        truth = TruthErrors(_over_maps(self._stripe), _over_maps(self._depth)) if self._stripe else None
+        errors = [each.errors for each in self._maps if each.errors is not None]
+        truth = TruthErrors(*(_over_maps(kind) for kind in zip(*errors, strict=True))) if errors else None
+        compute_s = sum(each.compute_s for each in self._maps)
         return Summary(
             maps=self.maps,
             map_rate_hz=self.maps / sensor_time_s if sensor_time_s > 0 else None,
@@ -124,10 +130,10 @@ class MapTally:
             filter=self.filter,
             frames=frames,
             sensor_time_s=sensor_time_s,
-            compute_time_s=self.compute_s,
-            realtime_factor=sensor_time_s / self.compute_s if self.compute_s > 0 else None,
-            valid_fraction=statistics.fmean(self._valid) if self._valid else None,
-            fog=self._fog,
+            compute_time_s=compute_s,
+            realtime_factor=sensor_time_s / compute_s if compute_s > 0 else None,
+            valid_fraction=statistics.fmean(each.valid for each in self._maps) if self._maps else None,
+            fog=self._maps[-1].fog if self._maps else FogEstimate(None, None, None),
             truth=truth,
             verdict=verdict,
         )

@@ -32,16 +32,6 @@ class FrameCounts:
     lit: int
     dark: int
 
-    def __add__(self, other: "FrameCounts") -> "FrameCounts":
-        """Counts of two sweeps together."""
-        return FrameCounts(
-            self.expected + other.expected,
-            self.received + other.received,
-            self.lost + other.lost,
-            self.lit + other.lit,
-            self.dark + other.dark,
-        )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepAccount:

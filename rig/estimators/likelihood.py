@@ -20,6 +20,9 @@ from rig.geometry import SweepGeometry
 from rig.row_threads import over_rows
 from rig.stripes import StripeTable
 
+LEAST_SURE = 0.02
+"""Share of confident answers below which a map teaches nothing: a closed shutter must not spoil the maps after it."""
+
 
 class Likelihood:
     """Row likelihood with the state it has learned so far; `model` is None before the first map.
@@ -44,7 +47,8 @@ class Likelihood:
             model = self.model
         stripes, quiet = self._sweep(volume, geometry, model)
         self.used = model
-        self.model = learn_next(volume, geometry, replace(model, ambient=ambient_map(volume, geometry, quiet)))
+        if np.mean(stripes.confidence > 0.5) >= LEAST_SURE:
+            self.model = learn_next(volume, geometry, replace(model, ambient=ambient_map(volume, geometry, quiet)))
         return stripes
 
     def _sweep(

@@ -237,14 +237,18 @@ def refine(
     label sees haze on its near part only. Amplitudes far from the best one at the mode are left out.
     """
     labels, reach = fine.shape[0], (fine.shape[1] - 1) // 2
-    best = np.float32(-1e30)
-    for m in range(amplitude.shape[0]):
-        best = max(best, score[m, mode] + log_weight[m])
+    likeliest = 0
+    for m in range(1, amplitude.shape[0]):
+        if score[m, mode] + log_weight[m] > score[likeliest, mode] + log_weight[likeliest]:
+            likeliest = m
+    best = score[likeliest, mode] + log_weight[likeliest]
+    top = -np.inf
     for i in range(labels):
         likelihood[i] = 0.0
     start, stop = max(mode - reach, 0), min(mode + reach, length - 1)
     for m in range(amplitude.shape[0]):
-        if score[m, mode] + log_weight[m] < best - AMPLITUDE_CUT:
+        # Away from the middle of the pixel the next amplitude may be the better one.
+        if abs(m - likeliest) > 1 and score[m, mode] + log_weight[m] < best - AMPLITUDE_CUT:
             continue
         light = amplitude[m] * scale[mode]
         for i in range(labels):
@@ -256,7 +260,13 @@ def refine(
                 flux = np.float32(min(base + light * fine[i, t - mode + reach], FLUX_MAX))
                 cell = np.uint64((flux.view(np.uint32) >> TABLE_SHIFT) - TABLE_BASE)
                 total += n[t] * table[0, cell] + k * table[1, cell] - taps[1, t]
-            likelihood[i] += np.exp(min(max(total, np.float32(-80.0)), np.float32(80.0)))
+            if total > top:
+                # Sums are kept relative to the best term so far, so that none overflows.
+                shrink = np.exp(top - total)
+                for h in range(labels):
+                    likelihood[h] *= shrink
+                top = float(total)
+            likelihood[i] += np.exp(total - top)
     mass = 0.0
     mean = 0.0
     for i in range(labels):

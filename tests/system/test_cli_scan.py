@@ -1,5 +1,6 @@
 """`rig scan` on a small simulated rig: what it prints, what it writes, and how it ends."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -153,7 +154,8 @@ def test_ctrl_c_before_the_first_map_leaves_nothing(rig: Rig, small: Path, monke
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-def test_a_real_interrupt_ends_a_scan_in_order(small: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_real_signal_ends_a_scan_in_order(small: Path, tmp_path: Path, name: str) -> None:
     command = [sys.executable, "-c", "from rig.cli import main; main()", "scan", str(small), "--maps", "100000"]
     out = tmp_path / "run"
     with subprocess.Popen([*command, "--json", "--out", str(out)], stdout=-1, stderr=-1, text=True) as process:
@@ -161,13 +163,86 @@ def test_a_real_interrupt_ends_a_scan_in_order(small: Path, tmp_path: Path) -> N
         while not list(tmp_path.glob(".run.*.part/depth/000001.npy")) and time.monotonic() - began < 60:
             assert process.poll() is None, process.communicate()[1]
             time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(getattr(signal, name))
         printed, said = process.communicate(timeout=60)
     assert process.returncode == 4, said
     assert strict(printed)["verdict"] == "aborted"
     assert "Traceback" not in said
     assert (out / "summary.json").exists()
     assert not list(tmp_path.glob(".run*"))
+
+
+def test_signals_are_as_before_after_a_command(rig: Rig) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    rig("config", "check")
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_an_interrupt_while_a_map_is_written_leaves_no_part_of_it(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_truth = RunFolder.write_truth
+
+    def interrupted(self: RunFolder, index: int, *rest: object) -> None:
+        if index == 1:
+            raise KeyboardInterrupt
+        write_truth(self, index, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(RunFolder, "write_truth", interrupted)
+    ran = rig("scan", small, "--maps", 3, "--json", "--out", "run")
+    summary = strict(ran.out)
+    assert (ran.code, summary["verdict"], summary["maps"]) == (4, "aborted", 1)
+    assert files(Path("run")) == FILES
+    assert len(strict(Path("run/manifest.json").read_text())["sweeps"]) == 1  # type: ignore[arg-type]
+
+
+def test_a_mistake_of_the_program_prints_its_traceback_and_exits_70(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop_at_map(0, ZeroDivisionError("ours"), monkeypatch)
+    ran = rig("scan", small, "--out", "run")
+    assert (ran.code, ran.out) == (70, "")
+    assert "Traceback" in ran.err
+    assert "ZeroDivisionError: ours" in ran.err
+    assert not list(Path().iterdir())
+
+
+def test_a_map_without_any_depth_is_warned_of(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    estimate = Reconstructor.map
+
+    def empty(self: Reconstructor, volume: object) -> MapResult:
+        result = estimate(self, volume)  # type: ignore[arg-type]
+        return dataclasses.replace(result, depth_m=np.full_like(result.depth_m, np.nan))
+
+    monkeypatch.setattr(Reconstructor, "map", empty)
+    ran = rig("scan", small, "--out", "run", "--json")
+    assert ran.err.splitlines() == [
+        "warning: no pixel has a depth; raise --exposures, lower --min-confidence or check the depth range"
+    ]
+
+
+def test_the_calibration_of_a_cube_is_refused_as_such(rig: Rig, tmp_path: Path) -> None:
+    from tests.system.small_rig import calibration
+
+    file = write_rig(tmp_path / "cube", config())
+    content = calibration()
+    del content["scanner"], content["source_m"], content["lag_s"]
+    np.save(file.parent / "planes.npy", np.array([[1.0, 0.0, 0.3, 0.1]] * 200))
+    (file.parent / "planes.yaml").write_text(yaml.safe_dump({**content, "planes": "planes.npy"}))
+    file.write_text(file.read_text().replace("calibration: rig.yaml", "calibration: planes.yaml"))
+    ran = rig("scan", file, "--dry-run")
+    assert (ran.code, len(ran.problems)) == (2, 1)
+    assert "is for a bare cube" in ran.problems[0]
+
+
+def test_problems_of_spad_and_scanner_are_listed_together(rig: Rig, tmp_path: Path) -> None:
+    content = config()
+    content["scan"] |= {"frame_rate": "1 MHz", "columns": 3}
+    ran = rig("scan", write_rig(tmp_path / "fast", content))
+    assert ran.code == 2
+    assert "the most the" in ran.problems[0]
+    assert "scan of 3 columns" in ran.problems[-1]
+    assert len(ran.problems) >= 2
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,13 +314,18 @@ def test_a_bad_config_is_refused_in_a_line_and_nothing_is_left(
     [
         (["--no-such-option"], "No such option"),
         (["--record"], "No such option"),
-        (["--exposures", "-1"], "exposures is -1, it must be at least 1"),
-        (["--exposures", "many"], "'--exposures'"),
+        (["--exposures", "-1"], "--exposures is -1, it must be at least 1; write for example '--exposures 10'"),
+        (["--exposures", "many"], "write a whole number or see 'rig scan --help'"),
+        (["--min-confidence", "high"], "write a number or see 'rig scan --help'"),
         (["--maps", "0"], "maps is 0; it must be at least 1"),
         (["--seed", "-3"], "seed is -3; it must be 0 or more"),
-        (["--estimator", "best"], "choose 'argmax', 'edge', 'likelihood'"),
+        (["--seed", str(2**63)], "at most 2^63 - 1"),
+        (["--dry-run", "--maps", "0"], "maps is 0; it must be at least 1"),
+        (["--dry-run", "--seed", "-5"], "seed is -5; it must be 0 or more"),
+        (["--dry-run", "--save", "never"], "write 'all', 'last' or 'every N'"),
+        (["--estimator", "best"], "choose 'argmax', 'edge'"),
         (["--filter", "mean"], "choose 'none' or 'median'"),
-        (["--min-confidence", "1.5"], "min_confidence is 1.5, it must be at most 1"),
+        (["--min-confidence", "1.5"], "--min-confidence is 1.5, it must be at most 1"),
         (["--save", "some"], "write 'all', 'last' or 'every N'"),
         (["--save", "every", "0"], "'every N' with N of 1 or more"),
         (["--scene", "nowhere"], "scene 'nowhere' is no file, no folder and none of the bundled"),

@@ -62,6 +62,12 @@ def test_the_saved_model_gives_the_very_same_table_again():
     assert_same_model(again.model, twice.model)
 
 
+def test_the_very_first_map_is_estimated_again_from_the_state_it_used():
+    table, estimator = estimated()
+    sweep = simulated()
+    assert_same(table, Likelihood(3, model=estimator.used).estimate(sweep.volume, sweep.geometry))
+
+
 def test_estimating_leaves_counts_and_learned_state_as_they_were():
     _, estimator = estimated()
     saved, later = estimator.model, simulated(seed=2)

@@ -63,13 +63,18 @@ def test_a_step_between_surfaces_keeps_its_place():
     np.testing.assert_allclose(median_filter(table(x), reference).x_px, x, atol=1e-4)
 
 
-def test_only_positions_change():
+def test_light_stays_and_confidence_is_the_agreement_of_the_neighbours():
     rng = np.random.default_rng(1)
     before = table(rng.uniform(0, 100, (9, 9)))
     x = before.x_px.copy()
     after = median_filter(before, np.zeros((9, 9)))
-    for name in ("confidence", "x_sd_px", "signal", "haze"):
+    for name in ("signal", "haze"):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    window = before.x_px[2:7, 2:7]
+    assert after.confidence[4, 4] == pytest.approx(np.mean(np.abs(window - np.median(window)) <= 1.0))
+    even = median_filter(table(np.full((9, 9), 7.0)), np.zeros((9, 9)))
+    np.testing.assert_allclose(even.confidence, 1.0)
+    assert np.all(even.x_sd_px < before.x_sd_px)
     np.testing.assert_array_equal(before.x_px, x)
     assert not np.array_equal(after.x_px, x)
 

@@ -1,10 +1,11 @@
 import json
 from fractions import Fraction
+from typing import get_args
 
 import pytest
 import yaml
 
-from rig.config import MIN_DARK_FRACTION
+from rig.config import MIN_DARK_FRACTION, Estimator, Filter
 from rig.config_files import (
     BUNDLED,
     bundled_configs,
@@ -15,6 +16,7 @@ from rig.config_files import (
     parse_config,
 )
 from rig.errors import UsageError
+from rig.estimators import ESTIMATORS, FILTERS
 
 RIG = """\
 name: test
@@ -135,7 +137,13 @@ def test_an_unknown_name_suggests_the_nearest_bundled_one():
 
 def test_a_missing_file_and_a_folder_are_told_apart(tmp_path):
     assert "no config" in problems(tmp_path / "none.yaml")[0]
+    for absent in ("none.yaml", "nodir/", "nodir/none"):
+        assert "that path does not exist" in problems(absent)[0]
     assert "is a folder" in problems(tmp_path)[0]
+
+
+def test_names_of_estimators_and_filters_are_the_same_everywhere():
+    assert (get_args(Estimator), get_args(Filter)) == (ESTIMATORS, FILTERS)
 
 
 def test_overrides_lie_over_the_file_and_none_leaves_it_alone(write):
@@ -150,7 +158,7 @@ def test_overrides_lie_over_the_file_and_none_leaves_it_alone(write):
 def test_a_mistake_in_an_override_is_called_an_option(write):
     assert problems(write(RIG), {"scan.exposures": 0, "scan.colum": 3}) == [
         "option: unknown key 'scan.colum'; did you mean 'columns'?",
-        "option: scan.exposures is 0, it must be at least 1; write for example 'exposures: 10'",
+        "--exposures is 0, it must be at least 1; write for example '--exposures 10'",
     ]
 
 

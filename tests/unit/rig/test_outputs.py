@@ -122,6 +122,51 @@ def test_what_is_not_published_leaves_no_trace(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_an_interrupt_in_the_middle_of_a_map_leaves_none_of_its_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, done = Path.write_bytes, []
+
+    def interrupted(self: Path, data: bytes) -> int:
+        done.append(write(self, data))
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        return done[-1]
+
+    with RunFolder(tmp_path / "run") as folder:
+        monkeypatch.setattr(Path, "write_bytes", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            folder.write_map(0, a_map(), rays())
+        folder.write_json("summary.json", {})
+        run = folder.publish()
+    assert [file.name for file in run.rglob("*") if file.is_file()] == ["summary.json"]
+
+
+def test_a_run_whose_name_was_taken_meanwhile_is_kept_beside_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    out = tmp_path / "run"
+    with RunFolder(out) as first, RunFolder(out) as second, RunFolder(out) as third:
+        for folder in (first, second, third):
+            folder.write_json("summary.json", {})
+        published = [folder.publish().name for folder in (first, second, third)]
+    assert published == ["run", "run-2", "run-3"]
+    assert all((tmp_path / name / "summary.json").exists() for name in published)
+    assert len(list(tmp_path.iterdir())) == 3
+    assert [record.getMessage().rpartition("/")[2] for record in caplog.records] == ["run-2", "run-3"]
+
+
+def test_an_empty_folder_that_was_filled_meanwhile_stays_as_it_is(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    with RunFolder(out) as folder:
+        folder.write_json("summary.json", {"mine": 1})
+        (out / "summary.json").write_text("theirs")
+        assert folder.publish() == tmp_path / "run-2"
+    assert (out / "summary.json").read_text() == "theirs"
+    assert list(out.iterdir()) == [out / "summary.json"]
+
+
 def test_parents_are_made_and_kept_with_a_published_run(tmp_path: Path) -> None:
     with RunFolder(tmp_path / "deep/er/run") as folder:
         folder.write_json("summary.json", {})

