@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 import typer
 
 if TYPE_CHECKING:
-    from rig.run import Progress, RunResult
+    from rig.kernel_cache import ensure_kernel_cache
+from rig.run import Progress, RunResult
     from rig.scan_plan import ScanPlan
 
 EXIT_USAGE = 2
@@ -63,6 +64,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `rig`; ends the process with the exit code."""
     arguments = _join_save(list(sys.argv[1:] if argv is None else argv))
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(levelname)s: %(message)s")
+    ensure_kernel_cache()
     with _signals_interrupt():
         try:
             code = app(args=arguments, prog_name="rig", standalone_mode=False)

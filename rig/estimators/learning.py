@@ -111,7 +111,7 @@ def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: NDArray[n
 def learn_next(volume: CountVolume, geometry: SweepGeometry, model: RowModel) -> RowModel:
     """The model carried on by one more sweep."""
     lines = lattice(geometry, LATTICE_LINES)
-    model = maximise(model, expect(volume, geometry, model, lines), spread=False)
+    model = maximise(model, expect(volume, geometry, model, lines), spread=False, gains=False)
     return fit_line_width(volume, geometry, model, lattice(geometry, LATTICE_LINES // 4))
 
 
@@ -176,7 +176,9 @@ def flux(ones: float, exposures: float) -> float:
     return float(np.log((exposures + 0.5) / (exposures - ones + 0.5))) if exposures > 0 else 0.0
 
 
-def maximise(model: RowModel, seen: Expectation, *, spread: bool, free_ambient: bool = False) -> RowModel:
+def maximise(
+    model: RowModel, seen: Expectation, *, spread: bool, free_ambient: bool = False, gains: bool = True
+) -> RowModel:
     """Model that explains the weighted counts best.
 
     spread: the amplitude grid may move; free_ambient: the level of ambient light was guessed and is learned as well.
@@ -203,8 +205,8 @@ def maximise(model: RowModel, seen: Expectation, *, spread: bool, free_ambient: 
     # The stated extinction comes from rows beyond doubt alone: a stripe taken for haze would flatten the decay.
     clear = fit_haze(path_m, *_level(seen.levels[:, 8:12]))
     return replace(
-        model, profile=profile, row_gain=_gain(model.row_gain, seen.rows_seen, typical, before),
-        column_gain=_gain(model.column_gain, seen.columns_seen, typical, before), amplitude=amplitude, weight=weight,
+        model, profile=profile, row_gain=_gain(model.row_gain, seen.rows_seen, typical, before) if gains else model.row_gain,
+        column_gain=_gain(model.column_gain, seen.columns_seen, typical, before) if gains else model.column_gain, amplitude=amplitude, weight=weight,
         none_weight=none, extinction_per_m=clear.extinction_per_m if clear else np.nan,
         extinction_sd_per_m=clear.extinction_sd_per_m if clear else np.nan,
     )  # fmt: skip

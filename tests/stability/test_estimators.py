@@ -207,6 +207,16 @@ def test_dark_frames_that_are_all_ones_or_all_zeros(name):
         run(name, sweep.counts, 10, sweep.geometry, dark_counts=dark, n_dark=50)
 
 
+def test_learning_goes_on_for_many_maps_without_drifting():
+    maps = [simulated(exposures=5, rows=48, columns=120, seed=seed) for seed in range(4)]
+    estimator = create_estimator("likelihood")
+    errors = []
+    for index in range(40):
+        sweep = maps[index % len(maps)]
+        errors.append(np.nanmean(sweep.errors(estimator.estimate(sweep.volume, sweep.geometry).x_px)))
+    assert np.mean(errors[-4:]) < 1.15 * np.mean(errors[:4])
+
+
 @EVERY
 @pytest.mark.parametrize("level", [0, 10])
 def test_a_bad_map_does_not_spoil_the_next_ones(name, level):
