@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 
 import typer
 
+from rig.kernel_cache import ensure_kernel_cache
+
 if TYPE_CHECKING:
-    from rig.kernel_cache import ensure_kernel_cache
-from rig.run import Progress, RunResult
+    from rig.run import Progress, RunResult
     from rig.scan_plan import ScanPlan
 
 EXIT_USAGE = 2

@@ -181,7 +181,8 @@ def maximise(
 ) -> RowModel:
     """Model that explains the weighted counts best.
 
-    spread: the amplitude grid may move; free_ambient: the level of ambient light was guessed and is learned as well.
+    spread: the amplitude grid may move; free_ambient: the level of ambient light was guessed and is learned as well;
+    gains: the strength of the haze per row and column is learned, which must not go on from map to map (it drifts).
     """
     path_m = model.path_m()
     typical = float(np.median(model.ambient))
@@ -204,10 +205,15 @@ def maximise(
     amplitude, weight, none = _amplitudes(model, seen.amplitude_mass, spread)
     # The stated extinction comes from rows beyond doubt alone: a stripe taken for haze would flatten the decay.
     clear = fit_haze(path_m, *_level(seen.levels[:, 8:12]))
+    if gains:
+        model = replace(
+            model,
+            row_gain=_gain(model.row_gain, seen.rows_seen, typical, before),
+            column_gain=_gain(model.column_gain, seen.columns_seen, typical, before),
+        )
     return replace(
-        model, profile=profile, row_gain=_gain(model.row_gain, seen.rows_seen, typical, before) if gains else model.row_gain,
-        column_gain=_gain(model.column_gain, seen.columns_seen, typical, before) if gains else model.column_gain, amplitude=amplitude, weight=weight,
-        none_weight=none, extinction_per_m=clear.extinction_per_m if clear else np.nan,
+        model, profile=profile, amplitude=amplitude, weight=weight, none_weight=none,
+        extinction_per_m=clear.extinction_per_m if clear else np.nan,
         extinction_sd_per_m=clear.extinction_sd_per_m if clear else np.nan,
     )  # fmt: skip
 
