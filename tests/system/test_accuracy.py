@@ -24,6 +24,8 @@ from tests.reference.working_point import POINTS, WorkingPoint, score
 RIG = Path(sys.executable).with_name("rig.exe" if sys.platform == "win32" else "rig")
 GENIE_RATIO = 1.3
 MISSING = 0.05
+MOST_PX = {10: 0.6, 20: 0.4}
+"""Largest mean error without filter by exposures, at the report's working point on the prepared scenes."""
 GENIE_ROWS = 4  # every 4th row is scored
 
 
@@ -71,6 +73,8 @@ CASES = [
     pytest.param("motorcycle", 192, "dense", "rectified", 10, id="motorcycle, dense fog, rectified"),
     pytest.param("moebius", 192, "clear", "turned", 3, id="moebius, clear air, turned"),
     pytest.param("procedural", None, "report", "turned", 10, id="procedural, report, turned"),
+    pytest.param("procedural", None, "report", "rectified", 1, id="procedural, report, one exposure"),
+    pytest.param("cones", 192, "report", "rectified", 20, id="cones, report, twenty exposures"),
 ]
 
 
@@ -87,7 +91,7 @@ def test_likelihood_comes_near_the_genie(
     assert ours["mean_abs"] <= GENIE_RATIO * genie["mean_abs"]
     assert ours["missing"] <= MISSING
     if light == "report" and name != "procedural":
-        assert ours["mean_abs"] < 0.6
+        assert ours["mean_abs"] < MOST_PX[exposures]
 
 
 def test_naive_estimators_lose_in_fog_and_the_median_filter_helps(tmp_path: Path) -> None:

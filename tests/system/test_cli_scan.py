@@ -156,7 +156,11 @@ def test_ctrl_c_before_the_first_map_leaves_nothing(rig: Rig, small: Path, monke
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_real_signal_ends_a_scan_in_order(small: Path, tmp_path: Path, name: str) -> None:
-    command = [sys.executable, "-c", "from rig.cli import main; main()", "scan", str(small), "--maps", "100000"]
+    # Shells start background jobs with SIGINT ignored, and a child would inherit that.
+    program = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from rig.cli import main; main()"
+    )
+    command = [sys.executable, "-c", program, "scan", str(small), "--maps", "100000"]
     out = tmp_path / "run"
     with subprocess.Popen([*command, "--json", "--out", str(out)], stdout=-1, stderr=-1, text=True) as process:
         began = time.monotonic()
@@ -164,7 +168,10 @@ def test_a_real_signal_ends_a_scan_in_order(small: Path, tmp_path: Path, name: s
             assert process.poll() is None, process.communicate()[1]
             time.sleep(0.05)
         process.send_signal(getattr(signal, name))
-        printed, said = process.communicate(timeout=60)
+        try:
+            printed, said = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert process.returncode == 4, said
     assert strict(printed)["verdict"] == "aborted"
     assert "Traceback" not in said
