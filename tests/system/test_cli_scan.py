@@ -58,7 +58,8 @@ def test_a_scan_prints_its_summary_and_writes_one_folder(rig: Rig, small: Path, 
     depth = np.load("run/depth/000000.npy")
     assert (depth.dtype, depth.shape) == (np.float32, (HEIGHT, WIDTH))
     assert summary["valid_fraction"] == pytest.approx(np.isfinite(depth).mean())
-    stripe = np.load("run/stripe/000000.npz")
+    with np.load("run/stripe/000000.npz") as table:
+        stripe = dict(table)
     assert set(stripe) >= {"x_px", "confidence", "x_sd_px", "signal", "haze"}
     assert all(stripe[key].shape == (HEIGHT, 200) for key in stripe)
     manifest = strict(Path("run/manifest.json").read_text())

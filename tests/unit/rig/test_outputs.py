@@ -55,9 +55,11 @@ def test_a_map_is_written_in_formats_others_read(tmp_path: Path) -> None:
     depth = np.load(run / "depth/000003.npy", allow_pickle=False)
     assert depth.dtype == np.float32
     assert np.array_equal(depth, result.depth_m, equal_nan=True)
-    stripe = np.load(run / "stripe/000003.npz", allow_pickle=False)
+    with np.load(run / "stripe/000003.npz", allow_pickle=False) as table:
+        stripe = dict(table)
     assert {stripe[key].shape for key in ("x_px", "confidence", "x_sd_px", "signal", "haze")} == {(ROWS, COLUMNS)}
-    assert set(np.load(run / "truth/000003.npz")) == {"x_px", "depth_m"}
+    with np.load(run / "truth/000003.npz") as truth:
+        assert set(truth) == {"x_px", "depth_m"}
     points = read_ply(run / "cloud/000003.ply")
     known = np.isfinite(depth)
     assert len(points) == known.sum()
