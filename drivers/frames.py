@@ -65,6 +65,11 @@ def packed_row_bytes(width: int) -> int:
     return -(-width // (8 * ROW_ALIGN_BYTES)) * ROW_ALIGN_BYTES
 
 
+def frame_bytes(width: int, height: int) -> int:
+    """Bytes of one frame of width x height pixels as it is sent and kept, its record included."""
+    return FRAME_RECORD.itemsize + packed_row_bytes(width) * height
+
+
 @dataclass(frozen=True, slots=True)
 class BlockHeader:
     """What holds for every frame of a block. Fields as in the SPB1 1.0 wire layout (docs/spb1.md)."""

@@ -2,37 +2,62 @@
 
 The source claims free slots (several at once where USB transfers are queued), fills them and publishes them in the
 order of claiming; every reader gets every block in that order and holds its slot until it asks for the next.
+
+What a source does that finds no free slot is said by the ring, `on_full`, so that drivers need to know no policy: they
+claim, and where they got nothing and `ring.waits` is False, they drop the block, count it as lost and say so.
 """
 
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator
+from enum import Enum
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import DeviceTimeout, WrongState
+from drivers.errors import DeviceTimeout, RingOverflow, WrongState
 from drivers.frames import FrameBlock
 
 _PAGE_BYTES = 4096
 """Slots start on pages where the stride allows it: 64-bit counting and DMA both like aligned memory."""
 
 
+class OnFull(Enum):
+    """What becomes of a block for which there is no free slot."""
+
+    WAIT = "wait"
+    """The source waits until one comes free. A source that cannot drops the block all the same."""
+    DROP = "drop"
+    """The block is dropped and counted; the run goes on."""
+    FAIL = "fail"
+    """The block is dropped and counted, and ends the run with `RingOverflow`."""
+
+
 class BlockRing:
     """`slots` pieces of memory of `stride` bytes each; allocated and touched at once.
 
-    One source thread calls `claim`, `publish`, `discard` and `finish`; each reader belongs to one thread.
+    One source thread calls `claim`, `publish`, `discard`, `mark_overflow` and `finish`; each reader belongs to one
+    thread. holds_s: seconds of the stream that fill the ring, for the message of an overflow; None: not known.
     """
 
-    def __init__(self, slots: int, stride: int) -> None:
+    def __init__(self, slots: int, stride: int, *, on_full: OnFull = OnFull.WAIT, holds_s: float | None = None) -> None:
         if slots < 1 or stride < 1:
             raise ValueError(f"a ring of {slots} slots of {stride} bytes; both must be at least 1")
         self.slots = slots
         self.stride = stride
         self.high_water = 0
         """Most slots that were published and not yet released at one time."""
+        self.waited_s = 0.0
+        """Time the source spent in `claim` because no slot was free."""
+        self.dropped_blocks = 0
+        self.dropped_frames = 0
+        """Blocks, and the frames in them, that the source dropped because no slot was free."""
+        self._on_full = on_full
+        self._holds_s = holds_s
+        self._patient = True
         self._memory = _aligned(slots * stride).reshape(slots, stride)
         self._free = deque(range(slots))
         self._claimed: deque[int] = deque()
@@ -43,6 +68,16 @@ class BlockRing:
         self._overflowed = False
         self._finished = False
         self._error: BaseException | None = None
+
+    @property
+    def waits(self) -> bool:
+        """Whether a source that can wait for a free slot is to do so; else it drops the block."""
+        return self._on_full is OnFull.WAIT
+
+    @property
+    def full(self) -> bool:
+        """Whether there is no free slot at this moment."""
+        return not self._free
 
     @property
     def overflowed(self) -> bool:
@@ -73,11 +108,14 @@ class BlockRing:
             return reader
 
     def claim(self, timeout_s: float) -> NDArray[np.uint8] | None:
-        """Memory of a free slot, uint8 (stride,), with old bytes in it; None where none came free in `timeout_s`."""
+        """Memory of a free slot, uint8 (stride,), with old bytes in it; None where none came free in `timeout_s`.
+
+        A ring that does not wait (`waits`) gives its answer at once, whatever the time-out.
+        """
         with self._changed:
             self._require_unfinished("claim")
             self._any_claimed = True
-            if not self._changed.wait_for(lambda: bool(self._free), timeout_s):
+            if not self._free and not self._wait_for_slot(timeout_s):
                 return None
             slot = self._free.popleft()
             self._claimed.append(slot)
@@ -104,9 +142,28 @@ class BlockRing:
             self._free.append(self._oldest_claimed("discard"))
             self._changed.notify_all()
 
-    def mark_overflow(self) -> None:
-        """Note for good that the source dropped blocks because no slot was free."""
-        self._overflowed = True
+    def mark_overflow(self, n_frames: int = 0) -> None:
+        """Note for good that the source dropped a block of `n_frames` frames because no slot was free.
+
+        Called once the source has counted them as lost. Raises RingOverflow where such a loss ends the run.
+        """
+        with self._changed:
+            self._overflowed = True
+            self.dropped_blocks += 1
+            self.dropped_frames += n_frames
+        if self._on_full is OnFull.FAIL:
+            seconds = "" if self._holds_s is None else f", {self._holds_s:.3g} s of the stream"
+            raise RingOverflow(
+                f"ring: all {self.slots} slots ({self.slots * self.stride / 1e6:.0f} MB{seconds}) are full and a block "
+                f"of {n_frames} frames found none; lower frame_rate, free the computer, or lose frames and go on with "
+                "'--on-overload drop'"
+            )
+
+    def end_waits(self) -> None:
+        """From now on `claim` gives its answer at once: the source is to end, and readers may never come again."""
+        with self._changed:
+            self._patient = False
+            self._changed.notify_all()
 
     def finish(self, error: BaseException | None = None) -> None:
         """No more blocks: readers get what is left, then None, or `error` raised. A second call changes nothing."""
@@ -115,6 +172,15 @@ class BlockRing:
                 self._finished = True
                 self._error = error
                 self._changed.notify_all()
+
+    def _wait_for_slot(self, timeout_s: float) -> bool:
+        """Whether a slot came free; the time it took counts. The ring's lock is held."""
+        if not self.waits:
+            return False
+        begun = time.perf_counter()
+        self._changed.wait_for(lambda: bool(self._free) or not self._patient, timeout_s)
+        self.waited_s += time.perf_counter() - begun
+        return bool(self._free)
 
     def _require_unfinished(self, verb: str) -> None:
         if self._finished:
@@ -163,6 +229,11 @@ class RingReader:
             if ring._error is not None:
                 raise ring._error
             return None
+
+    def release(self) -> None:
+        """Give the present block back before the next one is asked for; its memory is then the source's again."""
+        with self._ring._changed:
+            self._release_held()
 
     def close(self) -> None:
         """Release everything and get nothing more, so that the source no longer waits for this reader."""

@@ -80,6 +80,11 @@ _ALL = (
     Dimension("ratio", {"ppm": Fraction(1, 10**6), "%": Fraction(1, 100), "ppb": Fraction(1, 10**9)}, "20 ppm"),
     Dimension("rain rate", {"m/h": Fraction(1), "mm/h": Fraction(1, 10**3)}, "20 mm/h"),
     Dimension("count rate", {"cps": Fraction(1), "kcps": Fraction(10**3), "Mcps": Fraction(10**6)}, "20 cps"),
+    Dimension(
+        "data rate",
+        {"B/s": Fraction(1), "kB/s": Fraction(10**3), "MB/s": Fraction(10**6), "GB/s": Fraction(10**9)},
+        "400 MB/s",
+    ),
     Dimension("rate", {"/s": Fraction(1), "1/s": Fraction(1), "/ms": Fraction(10**3)}, "5 /s"),
 )
 
@@ -197,3 +202,4 @@ Ppm = Annotated[float, _Text("ratio")]
 MetresPerHour = Annotated[float, _Text("rain rate")]
 CountsPerSecond = Annotated[float, _Text("count rate")]
 PerSecond = Annotated[float, _Text("rate")]
+BytesPerSecond = Annotated[float, _Text("data rate")]

@@ -1,61 +1,70 @@
-"""Runs a scan: starts the devices in order, takes their frames sweep by sweep, and makes everything safe.
+"""Runs a scan: starts the devices in order, takes maps from their frames, and makes everything safe.
 
-A source thread fills the ring; the caller's thread takes the blocks out and gets a `SweepData` at the end of each
-sweep. While the caller works on one, the source goes on as far as the ring reaches: a simulated SPAD then waits, a real
-one raises RingOverflow when it would have to drop frames.
+The `Pipeline` does the work between the SPAD and the caller. As soon as all frames are there, or anything fails, the
+rig is made safe, on the caller's thread; what is in the ring by then is still counted and estimated.
 """
 
 import logging
 import math
-import threading
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from fractions import Fraction
 
 import numpy as np
 
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, DeviceTimeout
-from drivers.frames import FrameBlock, packed_row_bytes
-from drivers.interfaces import SpadArray, SpadCounters, SpadTiming
-from drivers.ring import BlockRing, RingReader
+from drivers.frames import packed_row_bytes
+from drivers.interfaces import SpadCounters, SpadTiming
 from rig.counting import SweepCounter
 from rig.errors import DevicesError
+from rig.map_queue import AcquiredMap
+from rig.mapping import MakesMaps
+from rig.monitor import Watch
+from rig.overload import Overload, require_policy, ring_for
+from rig.pipeline import JOIN_S, Pipeline
+from rig.recording import Recording
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig
-from rig.sweeps import SweepAssembler, SweepData
+from rig.stages import PipelineStats
+from rig.sweeps import SweepAssembler
 
 _log = logging.getLogger(__name__)
 
-RING_SLOTS = 8
-"""Blocks between source and counting; a simulated SPAD runs ahead by as many."""
 SILENCE_S = 5.0
 """A SPAD that sends nothing for so long, with the ring empty, has failed."""
 WARM_UP_S = 120.0
 """Longest wait for a laser to warm up."""
 BURST_LEAD_S = 5e-3
 """Time between the SPAD's start and the first scan marker that a burst must have room for."""
-HANG_S = 180.0
-"""Longest wait for a SPAD whose `fill` neither returns nor says that it has nothing."""
-JOIN_S = 30.0
-"""Longest wait for the source thread after the SPAD was stopped."""
+TELL_S = 0.1
+"""Time from one report of progress to the next."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanProgress:
-    """How far a run is, told after every block."""
+    """How far a run is, told several times a second and at its end.
+
+    frames: received, of about frames_planned; lost: the SPAD's own count. sweeps: counted, of `maps`. stages: what each
+    stage has done so far.
+    """
 
     frames: int
     frames_planned: int
+    lost: int
     sweeps: int
     maps: int
+    stages: PipelineStats
 
 
 class Acquisition:
     """A scan of `maps` maps with an open rig, a plan and the SPAD's timing from `rig.session.prepare`.
 
-    Iterate once over `run()`. on_block is called after every block, on the caller's thread.
+    Iterate once over `run()`. maker: makes the maps, on the counting thread. first_alone: take the first map with a
+    start of its own, so that a SPAD that cannot wait stands still while it is learned from. recording, watch: what
+    recorder and monitor work for, None for none. on_progress is called on the caller's thread.
+    Raises UsageError where the SPAD cannot do what `policy` asks.
     """
 
     def __init__(
@@ -64,22 +73,35 @@ class Acquisition:
         plan: ScanPlan,
         timing: SpadTiming,
         maps: int,
+        maker: MakesMaps,
         *,
+        policy: Overload = Overload.ABORT,
+        first_alone: bool = False,
+        recording: Recording | None = None,
+        watch: Watch | None = None,
         threads: int = 2,
-        on_block: Callable[[ScanProgress], None] | None = None,
+        on_progress: Callable[[ScanProgress], None] | None = None,
         silence_s: float = SILENCE_S,
     ) -> None:
         if maps < 1:
             raise ValueError(f"{maps} maps; ask for at least 1")
+        require_policy(policy, rig.spad.info)
         self._rig = rig
         self._plan = plan
         self._timing = timing
         self._maps = maps
+        self._maker = maker
+        self._policy = policy
+        self._first_alone = first_alone
+        self._recording = recording
+        self._watch = watch
         self._threads = threads
-        self._on_block = on_block
+        self._on_progress = on_progress
         self._silence_s = silence_s
-        self.high_water = 0
-        """Most ring slots in use at one time; RING_SLOTS means that the source had to wait."""
+        self._pipeline: Pipeline | None = None
+        self._stats_before = PipelineStats()
+        self._counters_before = SpadCounters(0, 0, 0, 0, 0)
+        self._frames_before = 0
 
     @property
     def frames_planned(self) -> int:
@@ -88,30 +110,41 @@ class Acquisition:
 
     @property
     def counters(self) -> SpadCounters:
-        """The SPAD's own counts of the present or the last start."""
-        return self._rig.spad.counters
+        """The SPAD's own counts over all its starts so far. Any thread."""
+        if self._pipeline is None:
+            return self._counters_before
+        return _added(self._counters_before, self._rig.spad.counters)
 
-    def run(self) -> Generator[SweepData, None, None]:
-        """Scan; yields each sweep as it ends. However the iteration ends, gate, laser, scanner and SPAD are made safe.
+    @property
+    def stages(self) -> PipelineStats:
+        """What each stage has done so far. Any thread."""
+        return self._stats_before if self._pipeline is None else self._stats_before.and_then(self._pipeline.stats())
 
-        Raises DeviceError where a device fails, DevicesError where they could not all be made safe.
+    def run(self) -> Generator[AcquiredMap, None, None]:
+        """Scan; yields the maps in order. However the iteration ends, gate, laser, scanner and SPAD are made safe.
+
+        Raises DeviceError where a device fails, RingOverflow where frames came too fast, RecordingError where the disk
+        is full, each after the maps that were whole by then; DevicesError where devices could not all be made safe.
         """
         plan = self._plan
-        counter = SweepCounter(plan.columns, plan.rows, plan.width, plan.x0, plan.window, self._threads)
+        counter = SweepCounter(plan.columns, plan.rows, plan.width, plan.x0, plan.window, self._threads, plan.used_px)
         with closing(counter):
             # Compiles the counting kernel now: a second of waiting in the run would overflow a real ring.
             no_frames = np.zeros((0, plan.rows, packed_row_bytes(plan.width)), np.uint8)
             counter.add(no_frames, np.zeros(0, np.int32), np.zeros(0, np.float64))
             done = 0
             while done < self._maps:
-                group = self._group(self._maps - done)
+                group = self._group(done)
                 assembler = SweepAssembler(plan, counter, group, done)
                 counter.reset()
                 yield from self._run_group(assembler, group, done)
                 done += group
 
-    def _group(self, left: int) -> int:
-        """Sweeps of one start of the SPAD: all of them in a stream, as many as its memory holds in a burst."""
+    def _group(self, done: int) -> int:
+        """Sweeps of the next start of the SPAD: all in a stream, as many as its memory holds in a burst."""
+        left = self._maps - done
+        if self._first_alone and done == 0:
+            return 1
         if self._plan.burst_frames is None:
             return left
         spare = self._plan.burst_frames - BURST_LEAD_S * float(self._plan.frame_rate_hz)
@@ -123,7 +156,7 @@ class Acquisition:
         lead = Fraction(BURST_LEAD_S) * self._plan.frame_rate_hz
         return min(self._plan.burst_frames, math.ceil(sweeps * self._plan.frames_per_sweep + lead))
 
-    def _run_group(self, assembler: SweepAssembler, sweeps: int, done: int) -> Generator[SweepData, None, None]:
+    def _run_group(self, assembler: SweepAssembler, sweeps: int, done: int) -> Generator[AcquiredMap, None, None]:
         rig, plan = self._rig, self._plan
         clock = rig.scanner.load(plan.waveform, plan.scanner_repeats(sweeps))
         if clock != plan.point_rate_hz:
@@ -132,42 +165,65 @@ class Acquisition:
                 f"{float(plan.point_rate_hz):g}; compile the plan anew"
             )
         rig.sync.program(*plan.sync_program(sweeps))
-        ring = BlockRing(RING_SLOTS, self._timing.stride)
-        reader = ring.reader("counting")
-        source = _Source(rig.spad, ring, self._silence_s)
+        pipeline = Pipeline(
+            rig.spad,
+            ring_for(self._policy, rig.spad.info, plan, self._timing),
+            assembler,
+            sweeps,
+            self._maker,
+            self._silence_s,
+            recording=self._recording,
+            watch=self._watch,
+        )
+        trouble: list[str] = []
         try:
-            self._arm()
-            rig.spad.start(self._burst_frames(sweeps))
-            rig.sync.run()
-            rig.scanner.start()
-            source.start()
-            for block in _blocks(reader, source, self._silence_s):
-                for sweep in assembler.add(block):
-                    yield sweep
-                    if assembler.complete:
-                        break
-                self.high_water = max(self.high_water, ring.high_water)
+            try:
+                self._arm()
+                rig.spad.start(self._burst_frames(sweeps))
+                self._pipeline = pipeline
+                rig.sync.run()
+                rig.scanner.start()
+                pipeline.start()
+                while pipeline.streaming:
+                    if (found := pipeline.take_streaming(TELL_S)) is not None:
+                        yield found
+                    self._tell(assembler, done)
+            finally:
+                trouble = self._make_safe(pipeline)
+            # Nothing moves or shines any more: what was received is still counted and estimated.
+            while not pipeline.drained:
+                if (found := pipeline.take_rest(TELL_S)) is not None:
+                    yield found
                 self._tell(assembler, done)
-                if assembler.complete:
-                    break
-            else:
-                raise DeviceFault(
-                    f"{rig.spad.name}: the stream ended after {assembler.sweeps_done} of {sweeps} sweeps, without the "
-                    "scan marker that closes the last one; check the scanner and its marker line"
-                )
+            if (failure := pipeline.error()) is not None:
+                raise failure
+            if trouble:
+                raise DevicesError("\n".join(trouble))
         except BaseException as error:
-            for line in self._make_safe(source, reader):
-                error.add_note(line)
+            if not isinstance(error, DevicesError):
+                for line in trouble:
+                    error.add_note(line)
             raise
-        trouble = self._make_safe(source, reader)
-        if trouble:
-            raise DevicesError("\n".join(trouble))
+        finally:
+            self._end_group(pipeline, assembler)
+
+    def _end_group(self, pipeline: Pipeline, assembler: SweepAssembler) -> None:
+        pipeline.close()
+        if pipeline.monitor_lost:
+            self._watch = None
+        if self._pipeline is not None:
+            self._counters_before, self._stats_before = self.counters, self.stages
+            self._pipeline = None
+        self._frames_before += assembler.frames_seen
 
     def _tell(self, assembler: SweepAssembler, done: int) -> None:
-        if self._on_block is not None:
-            before = round(done * self._plan.frames_per_sweep)
-            frames = before + assembler.frames_seen
-            self._on_block(ScanProgress(frames, self.frames_planned, done + assembler.sweeps_done, self._maps))
+        if self._on_progress is None:
+            return
+        frames, sweeps = self._frames_before + assembler.frames_seen, done + assembler.sweeps_done
+        stages = self.stages
+        lost = self.counters.lost
+        lost = stages.dropped_frames if lost is None else lost
+        self._on_progress(ScanProgress(frames, self.frames_planned, lost, sweeps, self._maps, stages))
 
     def _arm(self) -> None:
         """Arm the laser behind a gate that reads back low and wait for it; a started SPAD would overflow meanwhile."""
@@ -176,10 +232,10 @@ class Acquisition:
         self._rig.laser.arm(self._rig.laser.limits.max_power_w if power_w is None else power_w)
         _wait_until_warm(self._rig, self._rig.clock)
 
-    def _make_safe(self, source: "_Source", reader: RingReader) -> list[str]:
+    def _make_safe(self, pipeline: Pipeline) -> list[str]:
         """Gate low, laser paused, mirror parked, SPAD stopped, in this order and each one whatever the others did."""
         rig = self._rig
-        source.end()
+        pipeline.end_source()
         trouble: list[str] = []
         interrupted: BaseException | None = None
         steps: tuple[tuple[str, Callable[[], None]], ...] = (
@@ -194,74 +250,13 @@ class Acquisition:
             except BaseException as error:  # neither a step that fails nor a second Ctrl-C may keep the others away
                 trouble.append(f"{name}: {error or type(error).__name__}")
                 interrupted = interrupted or (None if isinstance(error, Exception) else error)
-        reader.close()
-        if not source.join():
+        if not pipeline.join_source():
             trouble.append(f"spad: {rig.spad.name} did not return within {JOIN_S:g} s of being stopped; unplug it")
         for line in trouble:
             _log.error("while making the rig safe: %s", line)
         if interrupted is not None:
             raise interrupted
         return trouble
-
-
-class _Source:
-    """The thread that fills the ring."""
-
-    def __init__(self, spad: SpadArray, ring: BlockRing, silence_s: float) -> None:
-        self._spad = spad
-        self._ring = ring
-        self._silence_s = silence_s
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="spad source", daemon=True)
-        self.silences: list[DeviceTimeout] = []
-        """What the SPAD said each time it had nothing, or no room, for half of `silence_s`."""
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def end(self) -> None:
-        self._over.set()
-
-    def join(self) -> bool:
-        """Wait for the thread; False where it does not end."""
-        if self._thread.ident is not None:
-            self._thread.join(JOIN_S)
-        return not self._thread.is_alive()
-
-    def _run(self) -> None:
-        try:
-            while not self._over.is_set():
-                try:
-                    if not self._spad.fill(self._ring, self._silence_s / 2):
-                        break
-                except DeviceTimeout as error:
-                    # Either the SPAD is silent or the ring is full; only the reader knows, by having nothing to read.
-                    self.silences.append(error)
-            self._ring.finish()
-        except BaseException as error:  # handed to the reader, which raises it on the caller's thread
-            self._ring.finish(error)
-
-
-def _blocks(reader: RingReader, source: _Source, silence_s: float) -> Iterator[FrameBlock]:
-    """The blocks of the run. DeviceTimeout, in the SPAD's own words, where it is silent while the ring is empty."""
-    while True:
-        heard = len(source.silences)
-        waited_s = 0.0
-        while True:
-            try:
-                block = reader.next(silence_s)
-                break
-            except DeviceTimeout:
-                waited_s += silence_s
-                # The first time-out may be of a wait for room that ended just before the ring was empty. One that does
-                # not come means that the SPAD is at work: a simulated one compiles its kernels before the first block.
-                if len(source.silences) >= heard + 2:
-                    raise source.silences[-1] from None
-                if waited_s >= HANG_S:
-                    raise
-        if block is None:
-            return
-        yield block
 
 
 def _wait_until_warm(rig: OpenRig, clock: Clock) -> None:
@@ -272,3 +267,12 @@ def _wait_until_warm(rig: OpenRig, clock: Clock) -> None:
             raise DeviceTimeout(f"{rig.laser.name} is still warming up after {WARM_UP_S:g} s; wait and start again")
         clock.sleep(0.2)
         waited_s += 0.2
+
+
+def _added(before: SpadCounters, now: SpadCounters) -> SpadCounters:
+    """Counts of two runs; None where the device does not say."""
+    counts = (
+        None if (a := getattr(before, field.name)) is None or (b := getattr(now, field.name)) is None else a + b
+        for field in fields(SpadCounters)
+    )
+    return SpadCounters(*counts)  # type: ignore[arg-type]

@@ -6,7 +6,7 @@ result.last.depth_m, result.summary.truth
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,10 @@ from rig.run import OutFolder, Progress, RunResult
 from rig.saving import SavePolicy
 
 if TYPE_CHECKING:
+    from rig.acquisition import ScanProgress
     from rig.effects import Effect
+    from rig.monitor import Watch
+    from rig.overload import Overload
     from rig.scan_plan import ScanPlan
 
 __all__ = ["RunResult", "configure", "effects", "plan_scan", "reconstruct", "scan"]
@@ -78,17 +81,24 @@ def scan(
     save: str = "all",
     arm: bool = False,
     out: OutFolder = None,
+    record: bool = False,
+    on_overload: str = "abort",
     progress: Progress | None = None,
+    live: "Callable[[ScanProgress], None] | None" = None,
+    monitor: "Watch | None" = None,
 ) -> RunResult:
     """Acquire and reconstruct `maps` depth maps (`rig scan`).
 
     config and options: as `configure`. save: 'all', 'last' or 'every N' maps. arm: must be True where laser or gate are
-    real. out: a folder to write, None to write nothing. progress: called with frames done and planned.
+    real. out: a folder to write, None to write nothing. record: write the frames into it too. on_overload: 'abort',
+    'drop' or 'block', what to do with frames that come too fast. progress: called with frames done and planned; live:
+    with a `ScanProgress`, the figures of every stage in it; both several times a second. monitor: called with the
+    newest frames as a `MonitorView`, at most ten times a second, on a thread of its own; the run never waits for it.
     Raises UsageError for what cannot be, DeviceError or DevicesError where devices fail; maps that were whole by then
     are in `out`. An interrupt ends the scan after its last whole map, with verdict 'aborted'.
     """
     from rig.run import Run
-    from rig.scanning import require_simulated_or_armed, run_scan
+    from rig.scanning import ScanOptions, require_simulated_or_armed, run_scan
     from rig.session import open_rig
     from rig.summary import MapTally
 
@@ -100,31 +110,50 @@ def scan(
         filter=filter,
         min_confidence=min_confidence,
     )
-    policy = _checked_policy(maps, seed, save, require_simulated_or_armed(settings, arm))
+    problems = require_simulated_or_armed(settings, arm)
+    if record and out is None:
+        problems.append("record writes the frames into the run's folder; name one with out")
+    policy, overload = _checked_policies(maps, seed, save, on_overload, problems)
+
+    def tell(done: "ScanProgress") -> None:
+        if progress is not None:
+            progress(done.frames, done.frames_planned)
+        if live is not None:
+            live(done)
+
+    options = ScanOptions(overload, record, monitor, tell)
     estimate = settings.estimate
     tally = MapTally(settings.scan.columns, settings.scan.exposures, estimate.estimator, estimate.filter)
     with Run(out, tally, policy) as run, open_rig(settings, seed=seed) as rig:
-        return run_scan(rig, run, maps, seed, progress)
+        return run_scan(rig, run, maps, seed, options)
 
 
 def plan_scan(
-    config: Config = SIMULATED, *, maps: int = 1, seed: int = 0, save: str = "all", **options: Any
+    config: Config = SIMULATED,
+    *,
+    maps: int = 1,
+    seed: int = 0,
+    save: str = "all",
+    on_overload: str = "abort",
+    **options: Any,
 ) -> "ScanPlan":
     """The compiled plan of a scan, checked against its devices' limits (`rig scan --dry-run`).
 
-    maps, seed, save: checked as `scan` would; the plan does not depend on them. options: as `configure`.
+    maps, seed, save, on_overload: checked as `scan` would; the plan does not depend on them. options: as `configure`.
 
     Nothing moves and nothing shines: only rigs all of whose devices are simulated are opened for it.
     """
+    from rig.overload import require_policy
     from rig.session import open_rig, prepare
 
     settings = configure(config, **options)
-    _checked_policy(maps, seed, save)
+    _, overload = _checked_policies(maps, seed, save, on_overload)
     slots = ("spad", "scanner", "laser", "sync")
     real = [f"{slot} {getattr(settings, slot).kind}" for slot in slots if getattr(settings, slot).kind != SIMULATED]
     if real:
         raise UsageError(f"{settings.name} has real devices ({', '.join(real)}); a dry run does not open them")
     with open_rig(settings) as rig:
+        require_policy(overload, rig.spad.info)
         return prepare(rig)[0]
 
 
@@ -161,20 +190,29 @@ def effects(config: Config = SIMULATED, *, scene: str | None = None) -> "tuple[E
     return scene_effects(configure(config, scene=scene))
 
 
-def _checked_policy(maps: int, seed: int, save: str, others: Sequence[str] = ()) -> SavePolicy:
-    """The policy of `save`; UsageError, with `others`, for what is wrong with any of these."""
+def _checked_policies(
+    maps: int, seed: int, save: str, on_overload: str, others: Sequence[str] = ()
+) -> "tuple[SavePolicy, Overload]":
+    """The policies of `save` and `on_overload`; UsageError, with `others`, for what is wrong with any of these."""
+    from rig.overload import Overload
+
     problems = list(others)
     if maps < 1:
         problems.append(f"maps is {maps}; it must be at least 1")
     if not 0 <= seed <= MAX_SEED:
         problems.append(f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})")
+    policy, overload = SavePolicy(), Overload.ABORT
     try:
         policy = SavePolicy.parse(save)
     except UsageError as error:
-        raise UsageError.of([*problems, *error.problems]) from None
+        problems += error.problems
+    try:
+        overload = Overload.parse(on_overload)
+    except UsageError as error:
+        problems += error.problems
     if problems:
         raise UsageError.of(problems)
-    return policy
+    return policy, overload
 
 
 def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:

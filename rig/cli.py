@@ -22,7 +22,7 @@ import typer
 from rig.kernel_cache import ensure_kernel_cache
 
 if TYPE_CHECKING:
-    from rig.run import Progress, RunResult
+    from rig.run import RunResult
     from rig.scan_plan import ScanPlan
 
 EXIT_USAGE = 2
@@ -188,6 +188,10 @@ def scan_command(
     out: Annotated[
         Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="runs/DATE-TIME")
     ] = None,
+    record: Annotated[bool, typer.Option("--record", help="write the frames into the folder too")] = False,
+    on_overload: Annotated[
+        str, typer.Option("--on-overload", help="frames come too fast: abort, drop (and count) or block (wait)")
+    ] = "abort",
     arm: Annotated[bool, typer.Option("--arm", help="let a real laser shine: the beam path is clear")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="compile and print the plan; nothing moves")] = False,
     as_json: JsonOption = False,
@@ -203,8 +207,9 @@ def scan_command(
         "min_confidence": min_confidence,
     }
     if dry_run:
-        return _show_plan(api.plan_scan(config, maps=maps, seed=seed, save=save, **options), as_json)
-    with _progress("frames") as progress:
+        plan = api.plan_scan(config, maps=maps, seed=seed, save=save, on_overload=on_overload, **options)
+        return _show_plan(plan, as_json)
+    with _progress("frames") as bar:
         result = api.scan(
             config,
             maps=maps,
@@ -212,7 +217,9 @@ def scan_command(
             save=save,
             arm=arm,
             out=_default_out() if out is None else out,
-            progress=progress,
+            record=record,
+            on_overload=on_overload,
+            live=None if bar is None else lambda done: bar(done.frames, done.frames_planned, done.lost),
             **options,
         )
     return _report(result, as_json)
@@ -332,8 +339,8 @@ def _print_json(content: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def _progress(what: str) -> Iterator["Progress | None"]:
-    """A progress bar on stderr while somebody is watching it."""
+def _progress(what: str) -> Iterator["Callable[..., None] | None"]:
+    """A progress bar on stderr while somebody is watching it, told what is done, all there is and how many got lost."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -344,7 +351,11 @@ def _progress(what: str) -> Iterator["Progress | None"]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+        def update(done: int, total: int, lost: int = 0) -> None:
+            bar.update(task, completed=done, total=total, description=f"{what}, {lost} lost" if lost else what)
+
+        yield update
 
 
 def _default_out() -> Path:

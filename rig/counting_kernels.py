@@ -1,103 +1,170 @@
-"""Compiled counting: bit-sliced addition of packed frames, expanded once per run of frames of one column."""
+"""Compiled counting: packed frames are added as they are, 64 pixels to a word, into counters that lie in bit planes.
+
+Plane i holds bit i of 64 counts a word. Seven frames at a time go through a tree of full adders (Harley and Seal; see
+Muła, Kurz, Lemire, "Faster population counts using AVX2 instructions", 2018) and into the planes as one 3-bit number.
+The planes of `CHUNK` words lie side by side, so that they stay in the fastest cache while frame after frame is added,
+and at distances known to the compiler, which then needs no check that they do not overlap.
+Measured on one core of a Zen 3 processor with 16 GB/s of plain reads: 11 to 15 GB/s at 3 to 14 frames a column; one
+frame after the other without the tree 4 to 6; with planes in separate arrays 2 to 5 (not vectorised).
+"""
+
+from typing import Final
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-PLANES = 6
-"""Bit planes of a run: up to 63 frames are added before their counts are expanded."""
-RUN_FRAMES = (1 << PLANES) - 1
+CHUNK: Final = 256
+"""Words of a frame that are counted together; their planes fill half of a 32 KiB cache."""
+PLANES: Final = 8
+MOST_FRAMES: Final = (1 << PLANES) - 1
+"""Frames that a set of planes can count."""
+FEW_FRAMES: Final = 15
+"""Up to so many frames four planes do."""
 
 
-@numba.njit(cache=True, nogil=True)
-def _msb_first(word: np.uint64) -> np.uint64:
-    """Byte-swap, so that pixel i of a little-endian load of packed bytes is bit 63 - i."""
-    word = ((word & np.uint64(0x00FF00FF00FF00FF)) << np.uint64(8)) | (
-        (word >> np.uint64(8)) & np.uint64(0x00FF00FF00FF00FF)
-    )
-    word = ((word & np.uint64(0x0000FFFF0000FFFF)) << np.uint64(16)) | (
-        (word >> np.uint64(16)) & np.uint64(0x0000FFFF0000FFFF)
-    )
-    return (word << np.uint64(32)) | (word >> np.uint64(32))
+def new_planes(words: int) -> NDArray[np.uint64]:
+    """Counters, all zero, for `words` words of a frame: (chunks, PLANES + 1, CHUNK); the last plane is scratch.
 
-
-@numba.njit(cache=True, nogil=True)
-def _add_run(
-    words: NDArray[np.uint64], first: int, last: int, y: int, start: int, n_words: int, out: NDArray[np.unsignedinteger]
-) -> None:
-    """Add the 1s of frames first..last-1, row y, words start..start+n_words-1 to out (64 * n_words,)."""
-    for k in range(n_words):
-        p0 = np.uint64(0)
-        p1 = np.uint64(0)
-        p2 = np.uint64(0)
-        p3 = np.uint64(0)
-        p4 = np.uint64(0)
-        p5 = np.uint64(0)
-        for f in range(first, last):
-            carry = words[f, y, start + k]
-            t = p0 & carry
-            p0 ^= carry
-            carry = t
-            t = p1 & carry
-            p1 ^= carry
-            carry = t
-            t = p2 & carry
-            p2 ^= carry
-            carry = t
-            t = p3 & carry
-            p3 ^= carry
-            carry = t
-            t = p4 & carry
-            p4 ^= carry
-            p5 ^= t
-        if p0 | p1 | p2 | p3 | p4 | p5 == np.uint64(0):
-            continue
-        p0 = _msb_first(p0)
-        p1 = _msb_first(p1)
-        p2 = _msb_first(p2)
-        p3 = _msb_first(p3)
-        p4 = _msb_first(p4)
-        p5 = _msb_first(p5)
-        one = np.uint64(1)
-        for i in range(64):
-            s = np.uint64(63 - i)
-            n = (
-                ((p0 >> s) & one)
-                + (((p1 >> s) & one) << np.uint64(1))
-                + (((p2 >> s) & one) << np.uint64(2))
-                + (((p3 >> s) & one) << np.uint64(3))
-                + (((p4 >> s) & one) << np.uint64(4))
-                + (((p5 >> s) & one) << np.uint64(5))
-            )
-            out[64 * k + i] += n
-
-
-@numba.njit(cache=True, nogil=True)
-def add_runs(
-    words: NDArray[np.uint64],
-    bins: NDArray[np.int32],
-    x0: NDArray[np.int32],
-    counts: NDArray[np.unsignedinteger],
-    dark: NDArray[np.uint32],
-    first_row: int,
-    last_row: int,
-) -> None:
-    """Add frames `words` (n, rows, row words) to `counts` (columns, rows, window) or `dark` (rows, 64 * row words).
-
-    Only rows first_row..last_row-1 are touched, so that threads may share the outputs. bins: column, -1 dark, -2 skip.
+    Padded by two words, since kernels read 16 bytes at a time.
     """
-    n = words.shape[0]
-    n_words = counts.shape[2] // 64
-    first = 0
-    while first < n:
-        last = first + 1
-        while last < n and bins[last] == bins[first] and last - first < RUN_FRAMES:
-            last += 1
-        c = bins[first]
-        if c >= 0:
-            for y in range(first_row, last_row):
-                _add_run(words, first, last, y, x0[c] // 64, n_words, counts[c, y])
-        elif c == -1:
-            for y in range(first_row, last_row):
-                _add_run(words, first, last, y, 0, words.shape[2], dark[y])
-        first = last
+    chunks = -(-words // CHUNK)
+    size = chunks * (PLANES + 1) * CHUNK
+    return np.zeros(size + 2, np.uint64)[:size].reshape(chunks, PLANES + 1, CHUNK)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_7(words, at, frame, n, p):  # type: ignore[no-untyped-def]
+    a, b, c = words[at : at + n], words[at + frame : at + frame + n], words[at + 2 * frame : at + 2 * frame + n]
+    d, e = words[at + 3 * frame : at + 3 * frame + n], words[at + 4 * frame : at + 4 * frame + n]
+    g, h = words[at + 5 * frame : at + 5 * frame + n], words[at + 6 * frame : at + 6 * frame + n]
+    for i in range(n):
+        u = a[i] ^ b[i]
+        ones = u ^ c[i]
+        t = (a[i] & b[i]) | (u & c[i])
+        u = ones ^ d[i]
+        v = (ones & d[i]) | (u & e[i])
+        ones = u ^ e[i]
+        u = ones ^ g[i]
+        w = (ones & g[i]) | (u & h[i])
+        ones = u ^ h[i]
+        u = t ^ v
+        twos = u ^ w
+        fours = (t & v) | (u & w)
+        x = p[i]
+        carry = x & ones
+        p[i] = x ^ ones
+        x = p[CHUNK + i]
+        u = x ^ twos
+        p[CHUNK + i] = u ^ carry
+        carry = (x & twos) | (u & carry)
+        x = p[2 * CHUNK + i]
+        u = x ^ fours
+        p[2 * CHUNK + i] = u ^ carry
+        carry = (x & fours) | (u & carry)
+        x = p[3 * CHUNK + i]
+        p[3 * CHUNK + i] = x ^ carry
+        p[PLANES * CHUNK + i] = x & carry
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_3(words, at, frame, n, p):  # type: ignore[no-untyped-def]
+    a, b, c = words[at : at + n], words[at + frame : at + frame + n], words[at + 2 * frame : at + 2 * frame + n]
+    for i in range(n):
+        u = a[i] ^ b[i]
+        ones = u ^ c[i]
+        twos = (a[i] & b[i]) | (u & c[i])
+        x = p[i]
+        carry = x & ones
+        p[i] = x ^ ones
+        x = p[CHUNK + i]
+        u = x ^ twos
+        p[CHUNK + i] = u ^ carry
+        carry = (x & twos) | (u & carry)
+        x = p[2 * CHUNK + i]
+        p[2 * CHUNK + i] = x ^ carry
+        carry = x & carry
+        x = p[3 * CHUNK + i]
+        p[3 * CHUNK + i] = x ^ carry
+        p[PLANES * CHUNK + i] = x & carry
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_2(words, at, frame, n, p):  # type: ignore[no-untyped-def]
+    a, b = words[at : at + n], words[at + frame : at + frame + n]
+    for i in range(n):
+        ones = a[i] ^ b[i]
+        twos = a[i] & b[i]
+        x = p[i]
+        carry = x & ones
+        p[i] = x ^ ones
+        x = p[CHUNK + i]
+        u = x ^ twos
+        p[CHUNK + i] = u ^ carry
+        carry = (x & twos) | (u & carry)
+        x = p[2 * CHUNK + i]
+        p[2 * CHUNK + i] = x ^ carry
+        carry = x & carry
+        x = p[3 * CHUNK + i]
+        p[3 * CHUNK + i] = x ^ carry
+        p[PLANES * CHUNK + i] = x & carry
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_1(words, at, n, p):  # type: ignore[no-untyped-def]
+    a = words[at : at + n]
+    for i in range(n):
+        x = p[i]
+        carry = x & a[i]
+        p[i] = x ^ a[i]
+        for q in range(1, 4):
+            x = p[q * CHUNK + i]
+            p[q * CHUNK + i] = x ^ carry
+            carry = x & carry
+        p[PLANES * CHUNK + i] = carry
+
+
+@numba.njit(cache=True, nogil=True)
+def _carry_on(n, p):  # type: ignore[no-untyped-def]
+    """Add what overflowed the first four planes to the others."""
+    for i in range(n):
+        carry = p[PLANES * CHUNK + i]
+        for q in range(4, PLANES):
+            x = p[q * CHUNK + i]
+            p[q * CHUNK + i] = x ^ carry
+            carry = x & carry
+
+
+@numba.njit(cache=True, nogil=True)
+def add_frames(
+    words: NDArray[np.uint64], frame: int, at: int, first: int, last: int, n: int, few: bool, planes: NDArray[np.uint64]
+) -> None:
+    """Add words at..at+n-1 of frames first..last-1 to counters.
+
+    words: (all words,), `frame` of them a frame; n: at most CHUNK; planes: ((PLANES + 1) * CHUNK,), one chunk's. few: no
+    count will exceed FEW_FRAMES.
+    """
+    f = first
+    while f < last:
+        here = f * frame + at
+        if f + 7 <= last:
+            _add_7(words, here, frame, n, planes)
+            f += 7
+        elif f + 3 <= last:
+            _add_3(words, here, frame, n, planes)
+            f += 3
+        elif f + 2 <= last:
+            _add_2(words, here, frame, n, planes)
+            f += 2
+        else:
+            _add_1(words, here, n, planes)
+            f += 1
+        if not few:
+            _carry_on(n, planes)
+
+
+@numba.njit(cache=True, nogil=True)
+def clear(n_planes: int, n: int, planes: NDArray[np.uint64]) -> None:
+    """Set the first n counters of a chunk to zero."""
+    for q in range(n_planes):
+        planes[q * CHUNK : q * CHUNK + n] = np.uint64(0)

@@ -37,3 +37,9 @@ class DevicesError(RigError):
     """One or more devices could not be opened, or failed while they were being stopped; one line per device."""
 
     exit_code = 3
+
+
+class RecordingError(RigError):
+    """The recording that was asked for cannot be written; the run ends, and what was recorded is kept."""
+
+    exit_code = 3

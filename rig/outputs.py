@@ -85,6 +85,11 @@ class RunFolder:
             files[f"cloud/{name}.ply"] = ply_bytes(cloud(result.depth_m, *rays, result.intensity))
         self._write(files)
 
+    def place(self, name: str) -> Path:
+        """Where to put a file that grows while the run goes on; it must be closed before `publish`."""
+        assert self._scratch is not None, "the run folder is published or discarded already"
+        return self._scratch / name
+
     def write_truth(self, index: int, truth: SweepTruth) -> None:
         """Write what the world says about the sweep of a map."""
         self._write({f"truth/{index:06d}.npz": _npz_bytes({"x_px": truth.x_px, "depth_m": truth.depth_m})})

@@ -32,7 +32,8 @@ def depth_picture(depth_m: NDArray[np.float32], limits: tuple[float, float] | No
         return picture
     low, high = limits
     known = np.isfinite(depth_m)
-    picture[:, :width][known] = _colours(depth_m[known], limits)
+    if known.any():  # of a sweep whose frames were all lost nothing is known, whatever the maps before it saw
+        picture[:, :width][known] = _colours(depth_m[known], limits)
     top, bottom = min(12, rows // 8), max(rows - 12, rows - rows // 8)
     bar = np.linspace(low, high, bottom - top)
     left = width + 8

@@ -1,10 +1,12 @@
 """Compiles a scan: checks it against scanner, SPAD and calibration, all together, before anything moves.
 
-`spad_request` says what the SPAD must do; with the exact timing it answers, `compile_plan` makes the `ScanPlan`.
+`compile_plan` makes the `ScanPlan` for the nominal frame rate, `spad_request` asks the SPAD for it; with the exact
+timing that the SPAD answers the plan is compiled once more.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -13,15 +15,15 @@ from numpy.typing import NDArray
 from calibration.errors import CalibrationError
 from calibration.model import Lag, RigModel
 from drivers.errors import LimitExceeded
-from drivers.frames import packed_row_bytes
+from drivers.frames import frame_bytes
 from drivers.interfaces import (
     LEVEL_BACKWARD,
     MARKER_LINE,
     MARKER_SCAN,
+    BurstMode,
     ScannerLimits,
     ScanWaveform,
     SpadInfo,
-    SpadMode,
     SpadRequest,
     SpadTiming,
 )
@@ -30,70 +32,32 @@ from rig.config import ScanConfig
 from rig.errors import PlanError, UsageError
 from rig.mirror_path import SweepPath, mirrored
 from rig.path_search import PathDemand, find_path, remedy
-from rig.scan_plan import Leg, ScanPlan
+from rig.scan_plan import Leg, ScanPlan, rounded
+from rig.windows import LEAST_MARKER_FRAMES, LEAST_MARKER_POINTS, moving_windows, window_widths
 
-__all__ = ["Leg", "ScanPlan", "compile_plan", "spad_problems", "spad_request"]
+__all__ = ["Leg", "ScanPlan", "compile_plan", "spad_request"]
 
 CLOCK_TOLERANCE = 2e-4
 """Relative difference allowed for between SPAD, scanner and sync clocks: three crystals of +-50 ppm, and margin."""
 GUARD_FRAMES = 1.0
 """Frames the gate opens before the first and closes after the last column, so that their own frames are wholly lit."""
-LEAST_MARKER_POINTS = 4
-"""A marker needs a high and a low point, and as many again before a comparator sees the next one for sure."""
-LEAST_MARKER_FRAMES = 2
-"""Edges this far apart never share a frame, whose record has room for the position of one."""
-BLOCK_BYTES = 1 << 20
-"""Bytes of a block of full frames: large enough that the cost per block vanishes, about 0.3 ms at 3.3 GB/s."""
-BLOCK_FRAMES = 1024
-"""Most frames in a block; small sensors would otherwise wait a long time for one."""
+BLOCK_S = 1e-3
+"""Time that the frames of a block span: at any rate Python's cost per block is then a few percent of one core."""
+BLOCK_BYTES = 4 << 20
+"""Most bytes of a block's frames: blocks of big sensors stay in the cache of a laptop."""
 
 PointClock = Callable[[float], Fraction]
 
 
-def spad_request(scan: ScanConfig, info: SpadInfo) -> SpadRequest:
-    """What the scan wants of this SPAD; one that cannot be has `spad_problems`."""
-    frame_bytes = packed_row_bytes(info.width) * info.height
+def spad_request(scan: ScanConfig, plan: ScanPlan) -> SpadRequest:
+    """What the scan wants of the SPAD that the plan was compiled for."""
     return SpadRequest(
         frame_rate_hz=scan.frame_rate,
         exposure_s=scan.exposure_s,
-        mode="stream" if _stream_carries(scan.frame_rate, info) else "burst",
-        block_frames=max(1, min(BLOCK_FRAMES, BLOCK_BYTES // frame_bytes)),
+        mode=plan.mode,
+        block_frames=max(1, min(round(BLOCK_S * float(plan.frame_rate_hz)), BLOCK_BYTES // plan.frame_bytes)),
+        window=plan.windows if plan.windowed else None,
     )
-
-
-def spad_problems(scan: ScanConfig, info: SpadInfo) -> list[str]:
-    """Everything about the scan that the SPAD cannot do, a line each."""
-    problems = []
-    rate = float(scan.frame_rate)
-    too_fast: list[tuple[float, str]] = []
-    if scan.frame_rate > info.max_frame_rate_hz:
-        most = float(info.max_frame_rate_hz)
-        too_fast.append(
-            (
-                most,
-                f"scan.frame_rate is {rate / 1e3:g} kHz, the most the {info.model} SPAD does is {most / 1e3:g} kHz; "
-                "lower frame_rate",
-            )
-        )
-    if not _stream_carries(scan.frame_rate, info) and info.burst is None:
-        need = _stream_bytes_per_s(scan.frame_rate, info)
-        have = info.stream.bytes_per_s if info.stream is not None else 0.0
-        carried = math.floor(rate * have / need)
-        too_fast.append(
-            (
-                carried,
-                f"scan.frame_rate {rate / 1e3:g} kHz makes {need / 1e6:.0f} MB/s of full frames, the link of the "
-                f"{info.model} SPAD carries {have / 1e6:.0f} MB/s; lower frame_rate to {carried / 1e3:g} kHz",
-            )
-        )
-    if too_fast:  # the stricter limit: the other remedy would not be enough
-        problems.append(min(too_fast)[1])
-    if not info.markers:
-        problems.append(
-            f"the {info.model} SPAD puts no scanner markers into its frames, so they cannot be bound to columns; "
-            "use a SPAD with markers"
-        )
-    return problems
 
 
 def compile_plan(
@@ -110,49 +74,137 @@ def compile_plan(
     is not calibrated; there is then no lag and the window is the whole row. timing: what the SPAD answered to
     `spad_request`; its nominal rate where None. Raises PlanError with one line per problem.
     """
+
+    def draft(scan: ScanConfig) -> tuple[ScanPlan | None, list[str]]:
+        return _draft(scan, limits, point_clock, model, info, timing)
+
+    plan, problems = draft(scan)
+    too_fast = [*_beyond_sensor(scan, info)]
+    if plan is not None and plan.mode == "stream" and plan.bytes_per_s > (plan.link_bytes_per_s or 0.0):
+        too_fast.append(_beyond_link(plan, info, lambda rate: draft(scan.model_copy(update={"frame_rate": rate}))[0]))
+    spad_problems = [min(too_fast)[1]] if too_fast else []  # the stricter limit: the other remedy would not be enough
+    if not info.markers:
+        spad_problems.append(
+            f"the {info.model} SPAD puts no scanner markers into its frames, so they cannot be bound to columns; "
+            "use a SPAD with markers"
+        )
+    problems = [*spad_problems, *problems]
+    if problems or plan is None:
+        raise PlanError(*problems)
+    if plan.burst_frames is not None and plan.burst_frames < plan.frames_per_sweep:
+        raise PlanError(
+            f"one sweep takes {float(plan.frames_per_sweep):.0f} frames, the SPAD's memory holds {plan.burst_frames}; "
+            "lower scan.exposures or scan.columns"
+        )
+    return plan
+
+
+def _beyond_sensor(scan: ScanConfig, info: SpadInfo) -> Iterator[tuple[float, str]]:
+    """The highest frame rate of the sensor and the problem with the asked one, where there is one."""
+    if scan.frame_rate > info.max_frame_rate_hz:
+        most = float(info.max_frame_rate_hz)
+        yield (
+            most,
+            f"scan.frame_rate is {float(scan.frame_rate) / 1e3:g} kHz, the most the {info.model} SPAD does is "
+            f"{most / 1e3:g} kHz; lower frame_rate",
+        )
+
+
+def _beyond_link(plan: ScanPlan, info: SpadInfo, draft_at: Callable[[Fraction], ScanPlan | None]) -> tuple[float, str]:
+    """The highest frame rate that the link carries, whole hertz, and the problem with the asked one."""
+    rate, have = float(plan.frame_rate_hz), plan.link_bytes_per_s or 0.0
+    made = f"{rounded(rate * frame_bytes(plan.width, plan.rows) / 1e6)} MB/s of full frames"
+    if plan.windows is not None:
+        width = plan.windows.width_px
+        made += f", {rounded(rate * frame_bytes(width, plan.rows) / 1e6)} MB/s of moving windows of {width} pixels"
+    carried = _carried_hz(plan, info.roi_step_px, draft_at)
+    remedy = (
+        f"lower frame_rate to {carried / 1e3:g} kHz or narrow depth_range" if carried else "use a SPAD that streams"
+    )
+    return carried, (
+        f"scan.frame_rate {rate / 1e3:g} kHz makes {made}; the link of the {info.model} SPAD carries "
+        f"{rounded(have / 1e6)} MB/s; {remedy}"
+    )
+
+
+def _carried_hz(plan: ScanPlan, step_px: int, draft_at: Callable[[Fraction], ScanPlan | None]) -> int:
+    """The highest frame rate of this scan that the link carries, in whole hertz.
+
+    The slower the scan, the closer its markers and the narrower its windows may be: tried from the narrowest ones,
+    which are carried fastest, to full frames.
+    """
+    for width in range(*window_widths(plan, step_px)):
+        rate = math.floor((plan.link_bytes_per_s or 0.0) / frame_bytes(width, plan.rows))
+        slower = draft_at(Fraction(rate)) if 0 < rate < plan.frame_rate_hz else None
+        if slower is not None and slower.windows is not None and slower.windows.width_px <= width:
+            return rate
+    return math.floor(plan.full_frames_hz or 0.0)
+
+
+def _draft(
+    scan: ScanConfig,
+    limits: ScannerLimits,
+    point_clock: PointClock,
+    model: RigModel | None,
+    info: SpadInfo,
+    timing: SpadTiming | None,
+) -> tuple[ScanPlan | None, list[str]]:
+    """The plan, where there is a mirror path for it, and everything that stands against scanner and calibration."""
     frame_rate = scan.frame_rate if timing is None else timing.tick_hz / timing.frame_period_ticks
-    column_s = scan.exposures / frame_rate
-    lag = model.lag_s if model is not None else Lag()
     demand = PathDemand(
         edges=scan.command_range,
         columns=scan.columns,
-        column_s=column_s,
+        column_s=scan.exposures / frame_rate,
         frame_s=1 / frame_rate,
-        lag_s=max(lag),
+        lag_s=max(model.lag_s if model is not None else Lag()),
         guard_s=GUARD_FRAMES / float(frame_rate),
         clock_tolerance=CLOCK_TOLERANCE,
         dark_fraction=scan.dark_fraction,
         bidirectional=scan.bidirectional,
     )
-    problems = [*spad_problems(scan, info), *_model_problems(scan, model, info, demand.speed_per_s)]
+    wrong_model = _model_problems(scan, model, info, demand.speed_per_s)
     found = find_path(demand, limits, point_clock)
     advice = remedy(demand, scan.exposures, limits, point_clock) if found.problems else ""
     first, last = scan.command_range
     asked = f"scan of {scan.columns} columns x {scan.exposures} exposures over command_range [{first:g}, {last:g}]"
-    problems += [f"{asked}: {problem}; {advice}" for problem in found.problems]
-    if problems or found.path is None:
-        raise PlanError(*problems)
-    path, rate = found.path, found.rate_hz
-    legs = _legs(path, scan, lag, demand.gate_margin_s, rate)
-    step, markers = _markers(path, scan)
-    waveform = _waveform(legs, markers, rate)
+    problems = [*wrong_model, *(f"{asked}: {problem}; {advice}" for problem in found.problems)]
+    if found.path is None or problems:
+        return None, problems
     try:
-        check_waveform(waveform, limits, rate, seamless=True)
+        plan = _plan(scan, found.path, found.rate_hz, demand, model, info, timing)
+        check_waveform(plan.waveform, limits, plan.point_rate_hz, seamless=True)
     except LimitExceeded as error:
-        raise PlanError(f"scan: {error}") from error
+        return None, [f"scan: {error}"]
+    except PlanError as error:
+        return None, list(error.problems)
+    return plan, []
+
+
+def _plan(
+    scan: ScanConfig,
+    path: SweepPath,
+    rate: Fraction,
+    demand: PathDemand,
+    model: RigModel | None,
+    info: SpadInfo,
+    timing: SpadTiming | None,
+) -> ScanPlan:
+    """The plan along a mirror path; whether the SPAD's link carries it is for the caller to judge."""
+    legs = _legs(path, scan, model.lag_s if model is not None else Lag(), demand.gate_margin_s, rate)
+    step, markers = _markers(path, scan)
+    first, last = scan.command_range
     centres: NDArray[np.float64] = np.arange(scan.columns, dtype=np.float64) + 0.5
     commands = first + centres * ((last - first) / scan.columns)
     x0, window = _windows(model, commands, scan, info)
-    mode: SpadMode = "stream" if _stream_carries(frame_rate, info) else "burst"
     plan = ScanPlan(
         columns=scan.columns,
         exposures=scan.exposures,
-        frame_rate_hz=frame_rate,
+        frame_rate_hz=1 / demand.frame_s,
         exposure_s=scan.exposure_s if timing is None else float(timing.exposure_ticks / timing.tick_hz),
         point_rate_hz=rate,
         sweep_points=path.points,
         legs=legs,
-        waveform=waveform,
+        waveform=_waveform(legs, markers, rate),
         columns_per_marker=step,
         marker_points=markers,
         commands=commands,
@@ -162,24 +214,39 @@ def compile_plan(
         window=window,
         rows=info.height,
         width=info.width,
-        mode=mode,
-        burst_frames=info.burst.capacity_frames if mode == "burst" and info.burst else None,
-        readout_bytes_per_s=info.burst.readout_bytes_per_s if mode == "burst" and info.burst else None,
+        mode="stream",
+        burst_frames=None,
+        readout_bytes_per_s=None,
+        link_bytes_per_s=info.stream.bytes_per_s if info.stream is not None else None,
+        windows=None,
+        windowed=False,
     )
-    if plan.burst_frames is not None and plan.burst_frames < plan.frames_per_sweep:
-        raise PlanError(
-            f"one sweep takes {float(plan.frames_per_sweep):.0f} frames, the SPAD's memory holds {plan.burst_frames}; "
-            "lower scan.exposures or scan.columns"
-        )
-    return plan
+    return _transported(_with_windows(plan, info.roi_step_px), info.burst)
 
 
-def _stream_carries(frame_rate: Fraction, info: SpadInfo) -> bool:
-    return info.stream is not None and info.stream.bytes_per_s >= _stream_bytes_per_s(frame_rate, info)
+def _with_windows(plan: ScanPlan, step_px: int) -> ScanPlan:
+    """The plan with its moving windows, and the markers that move them in the dark."""
+    moving = moving_windows(plan, step_px)
+    if moving is None:
+        return plan
+    windows, dark_points = moving
+    markers = np.append(plan.marker_points, dark_points)
+    waveform = _waveform(plan.legs, markers, plan.point_rate_hz)
+    return replace(plan, windows=windows, marker_points=markers, waveform=waveform)
 
 
-def _stream_bytes_per_s(frame_rate: Fraction, info: SpadInfo) -> float:
-    return float(frame_rate) * packed_row_bytes(info.width) * info.height
+def _transported(plan: ScanPlan, burst: BurstMode | None) -> ScanPlan:
+    """How the frames come: whole where the link carries them, else their windows, else in bursts; else not at all."""
+    rate = float(plan.frame_rate_hz)
+    if rate <= (plan.full_frames_hz or 0.0):
+        return plan
+    if rate <= (plan.windows_hz or 0.0):
+        return replace(plan, windowed=True)
+    if burst is None:
+        return plan
+    return replace(
+        plan, mode="burst", burst_frames=burst.capacity_frames, readout_bytes_per_s=burst.readout_bytes_per_s
+    )
 
 
 def _model_problems(scan: ScanConfig, model: RigModel | None, info: SpadInfo, speed_per_s: float) -> list[str]:

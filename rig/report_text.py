@@ -8,10 +8,14 @@ from rich.table import Table
 
 from rig.effects import Effect
 from rig.run import RunResult
+from rig.stages import PipelineStats
 from rig.summary import Summary, Verdict
 
 WIDE = 300
 """Characters; wider than any line here."""
+
+LEAST_WAIT_S = 1e-3
+"""Shorter waits of the source are not worth words."""
 
 _NEXT_STEP = {
     Verdict.GAPS: "frames were lost; lower frame_rate or free the computer, then scan again",
@@ -77,6 +81,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
             f"{summary.sensor_time_s:.3g} s of sensor, {summary.compute_time_s:.3g} s of computing "
             f"(real time x {_number(summary.realtime_factor)})",
         ),
+        *(() if summary.stages is None else (("stages", _stages(summary.stages)),)),
         ("filled", f"{_percent(summary.valid_fraction)} of the pixels have a depth"),
     ]
     fog = summary.fog
@@ -99,6 +104,23 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
             ("depth error", f"mean {_number(depth['mean_abs'])} m, median {_number(depth['median_abs'])} m"),
         ]
     return rows
+
+
+def _stages(stages: PipelineStats) -> str:
+    source = f"source {stages.source_fill_s:.3g} s" + (
+        f" and {stages.source_wait_s:.3g} s of waiting" if stages.source_wait_s >= LEAST_WAIT_S else ""
+    )
+    parts = [
+        source,
+        f"ring {stages.ring_high_water} of {stages.ring_slots} slots",
+        f"counting {stages.counting_s:.3g} s",
+        f"estimation {stages.estimation_s:.3g} s",
+    ]
+    if stages.dropped_blocks:
+        parts.insert(2, f"{stages.dropped_blocks} blocks of {stages.dropped_frames} frames dropped")
+    if stages.recorder_s is not None:
+        parts.append(f"recorder {stages.recorder_s:.3g} s for {(stages.recorder_bytes or 0) / 1e6:.0f} MB")
+    return ", ".join(parts)
 
 
 def _number(value: float | None, digits: int = 3) -> str:

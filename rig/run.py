@@ -10,9 +10,12 @@ from types import TracebackType
 from typing import Any, Self
 
 from drivers.interfaces import SweepTruth
+from rig.errors import UsageError
 from rig.outputs import Rays, RunFolder
 from rig.reconstruction import MapResult
+from rig.recording import FIRST_FILE, Recording
 from rig.saving import SavePolicy
+from rig.stages import PipelineStats
 from rig.summary import MapTally, RunFrames, Summary, Verdict
 
 Progress = Callable[[int, int], None]
@@ -48,6 +51,19 @@ class Run:
         self.rays: Rays | None = None
         self._save = save or SavePolicy()
         self._last: tuple[int, MapResult, SweepTruth | None] | None = None
+        self._recording: Recording | None = None
+
+    @property
+    def worth_keeping(self) -> bool:
+        """Whether there is a whole map or a recorded block."""
+        return self.tally.maps > 0 or (self._recording is not None and self._recording.blocks > 0)
+
+    def start_recording(self) -> Recording:
+        """The run's recording, in its folder; closed with the run. Raises RecordingError where it cannot be written."""
+        if self._folder is None:
+            raise UsageError("record writes the frames into the run's folder; name one with out")
+        self._recording = Recording(self._folder.place(FIRST_FILE))
+        return self._recording
 
     def __enter__(self) -> Self:
         """The run itself."""
@@ -57,6 +73,8 @@ class Run:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Remove what was not finished."""
+        if self._recording is not None:
+            self._recording.close()
         if self._folder is not None:
             self._folder.discard()
 
@@ -77,18 +95,25 @@ class Run:
             raise
 
     def finish(
-        self, frames: RunFrames, sensor_time_s: float, verdict: Verdict, manifest: Mapping[str, Any]
+        self,
+        frames: RunFrames,
+        sensor_time_s: float,
+        verdict: Verdict,
+        manifest: Mapping[str, Any],
+        stages: PipelineStats | None = None,
     ) -> RunResult:
-        """Write manifest and summary and make the folder appear; a run without a single map leaves none."""
-        summary = self.tally.summary(frames, sensor_time_s, verdict)
-        if self._last is None:
-            return RunResult(summary, None, None, None)
-        index, result, truth = self._last
+        """Write manifest and summary and make the folder appear; one without a map or a recorded block leaves none."""
+        summary = self.tally.summary(frames, sensor_time_s, verdict, stages)
+        index, result, truth = self._last or (None, None, None)
         folder = None
-        if self._folder is not None:
-            if self._save.step is None:
+        if self._folder is not None and self.worth_keeping:
+            if self._save.step is None and index is not None and result is not None:
                 self._write(index, result, truth)
-            self._folder.write_json("manifest.json", {"versions": versions(), **manifest})
+            content = {"versions": versions(), **manifest}
+            if self._recording is not None:
+                self._recording.close()
+                content["recording"] = self._recording.content()
+            self._folder.write_json("manifest.json", content)
             self._folder.write_json("summary.json", summary.as_json())
             folder = self._folder.publish()
         return RunResult(summary, result, truth, folder)

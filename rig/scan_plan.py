@@ -13,7 +13,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.interfaces import OUT_GATE, Pulse, ScanWaveform, SpadMode
+from drivers.frames import frame_bytes
+from drivers.interfaces import OUT_GATE, Pulse, ScanWaveform, SpadMode, WindowTable
 from rig.mirror_path import SweepPath
 
 Array = NDArray[np.float64]
@@ -41,9 +42,11 @@ class ScanPlan:
 
     frame_rate_hz, point_rate_hz: exact nominal rates of SPAD and scanner. sweep_points: points from one scan marker to
     the next. marker_points: int64 (markers,), point of line marker j within a sweep; it marks the command of the edge
-    j * columns_per_marker columns into the lit part. commands: float64 (columns,), mirror command of each column's
-    centre. x0: int32 (columns,), first stored pixel of each column's window; window: stored pixels per row; both
-    multiples of 64.
+    j * columns_per_marker columns into the lit part; those behind the lit part only move the window in the dark.
+    commands: float64 (columns,), mirror command of each column's centre. x0: int32 (columns,), first stored pixel of
+    each column's window; window: stored pixels per row; both multiples of 64. windows: the pixels of each frame that
+    are used, by the markers before it; None: all. windowed: whether the SPAD sends only these. link_bytes_per_s: what
+    its link carries, None where it cannot stream.
     """
 
     columns: int
@@ -66,6 +69,9 @@ class ScanPlan:
     mode: SpadMode
     burst_frames: int | None
     readout_bytes_per_s: float | None
+    link_bytes_per_s: float | None
+    windows: WindowTable | None
+    windowed: bool
 
     @property
     def sweeps_per_period(self) -> int:
@@ -109,9 +115,47 @@ class ScanPlan:
         return float(1 / self.sweep_s)
 
     @property
+    def used_px(self) -> int | None:
+        """Pixels per row of a frame that are used, from `window_x0` on; None: all."""
+        return None if self.windows is None else self.windows.width_px
+
+    @property
+    def frame_width(self) -> int:
+        """Pixels per row of a frame as the SPAD sends it."""
+        return self.windows.width_px if self.windows is not None and self.windowed else self.width
+
+    @property
     def frame_bytes(self) -> int:
-        """Bytes of one full frame as the SPAD sends it, its record included."""
-        return self.rows * (-(-self.width // 64) * 8) + 16
+        """Bytes of one frame as the SPAD sends it, its record included."""
+        return frame_bytes(self.frame_width, self.rows)
+
+    @property
+    def bytes_per_s(self) -> float:
+        """What the SPAD sends, or stores in a burst."""
+        return float(self.frame_rate_hz) * self.frame_bytes
+
+    @property
+    def full_frames_hz(self) -> float | None:
+        """Highest rate of full frames that the link carries; None where there is no stream."""
+        return None if self.link_bytes_per_s is None else self.link_bytes_per_s / frame_bytes(self.width, self.rows)
+
+    @property
+    def windows_hz(self) -> float | None:
+        """Highest rate of this plan's windows that the link carries; None where there are no windows or no stream."""
+        if self.windows is None or self.link_bytes_per_s is None:
+            return None
+        return self.link_bytes_per_s / frame_bytes(self.windows.width_px, self.rows)
+
+    def window_x0(
+        self, marks: NDArray[np.integer], line: NDArray[np.integer], sweep: NDArray[np.integer]
+    ) -> NDArray[np.int32]:
+        """First pixel used of each frame, int32 (n,), from marks and line of its record and the number of its sweep.
+
+        The same for a frame whether the SPAD sent it whole or only its window; sweep is -1 before the first marker.
+        """
+        if self.windows is None:
+            return np.zeros(len(line), np.int32)
+        return self.windows.x0_of(marks, line, sweep)
 
     def leg(self, sweep: int) -> Leg:
         """The leg of sweep number `sweep`, counted from 0."""
@@ -168,9 +212,7 @@ class ScanPlan:
     def describe(self) -> str:
         """The plan for people, a few lines."""
         low, high = self.command_range
-        stored = self.window // 8 * self.rows
         rate = float(self.frame_rate_hz)
-        link = "burst" if self.mode == "burst" else "stream"
         sides = "both ways" if len(self.legs) == 2 else "one way"
         lag = ", ".join(f"{leg.lag_s * 1e6:.0f} us {'up' if leg.direction > 0 else 'down'}" for leg in self.legs)
         near, far = self.depth_range_m
@@ -185,7 +227,24 @@ class ScanPlan:
             f"maps        {self.map_rate_hz:.2f} a second from {float(self.frames_per_sweep):.1f} frames "
             f"({float(self.sweep_s) * 1e3:.1f} ms of sensor time), {self.dark_fraction:.1%} of them dark",
             f"gate        {gate.gate_open_s * 1e3:.3f} to {gate.gate_close_s * 1e3:.3f} ms after the scan marker",
-            f"window      {self.window} of {self.width} pixels for {near:g} to {far:g} m "
-            f"({stored * rate / 1e6:.0f} MB/s; full frames {self.frame_bytes * rate / 1e6:.0f} MB/s, {link})",
+            f"window      {self.window} of {self.width} pixels for {near:g} to {far:g} m",
+            f"link        {self._describe_link()}",
         )
         return "\n".join(lines)
+
+    def _describe_link(self) -> str:
+        sent = "full frames"
+        if self.windowed:
+            sent = f"moving windows of {self.frame_width} pixels"
+        text = f"{self.mode} of {sent}, {rounded(self.bytes_per_s / 1e6)} MB/s"
+        if self.full_frames_hz is None:
+            return text
+        text += f"; the link carries full frames up to {rounded(self.full_frames_hz / 1e3)} kHz"
+        if self.windows is None or self.windows_hz is None:
+            return text
+        return f"{text}, windows of {self.windows.width_px} pixels up to {rounded(self.windows_hz / 1e3)} kHz"
+
+
+def rounded(value: float) -> str:
+    """A figure for people, four digits and no exponent."""
+    return f"{float(f'{value:.4g}'):g}"

@@ -1,7 +1,10 @@
 """A scan from open devices to its folder: sweeps in, maps out, and an account of what was lost."""
 
+import math
 import os
+from collections.abc import Callable
 from contextlib import closing
+from dataclasses import dataclass
 from typing import Any
 
 from calibration.model import RigModel
@@ -10,8 +13,11 @@ from drivers.interfaces import SweepTruth
 from rig.acquisition import Acquisition, ScanProgress
 from rig.config import RigConfig
 from rig.errors import RigError
+from rig.estimators import LEARNING
+from rig.monitor import Watch
+from rig.overload import Overload, require_policy
 from rig.reconstruction import Reconstructor
-from rig.run import Progress, Run, RunResult
+from rig.run import Run, RunResult
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, prepare
 from rig.summary import RunFrames, Verdict
@@ -19,31 +25,56 @@ from rig.sweeps import SweepAccount
 from rig.warm_up import warm_up
 
 
-def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, progress: Progress | None = None) -> RunResult:
+@dataclass(frozen=True, slots=True)
+class ScanOptions:
+    """How a scan is run, apart from its config. record: keep the frames; needs a run with a folder.
+
+    watch: a monitor's callback, on a thread of its own. live: told of the progress several times a second, on the
+    caller's thread.
+    """
+
+    policy: Overload = Overload.ABORT
+    record: bool = False
+    watch: Watch | None = None
+    live: Callable[[ScanProgress], None] | None = None
+
+
+def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, options: ScanOptions | None = None) -> RunResult:
     """Scan with an open rig; `run` takes the maps. seed: as the rig was opened with, for the manifest.
 
     An interrupt ends the scan after its last whole map, with verdict 'aborted'. So does an error, which is raised again
-    once the whole maps are safe; one before the first map leaves nothing.
+    once the whole maps and the recording are safe; one before there is either leaves nothing.
     """
+    options = options or ScanOptions()
+    require_policy(options.policy, rig.spad.info)
     plan, timing = prepare(rig)
     threads = os.cpu_count() or 1
     reconstructor = _reconstructor(rig, plan, threads)
     geometry = reconstructor.geometry
     run.rays = (geometry.u, geometry.v) if rig.model is not None else None
 
-    def tell(done: ScanProgress) -> None:
-        if progress is not None:
-            progress(done.frames, done.frames_planned)
-
     estimate = rig.config.estimate
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)
-    acquisition = Acquisition(rig, plan, timing, maps, threads=threads, on_block=tell)
+    acquisition = Acquisition(
+        rig,
+        plan,
+        timing,
+        maps,
+        reconstructor,
+        policy=options.policy,
+        # Learning takes a second or more, and a live stream cannot stand still meanwhile.
+        first_alone=estimate.estimator in LEARNING and not rig.spad.info.can_wait,
+        recording=run.start_recording() if options.record else None,
+        watch=options.watch,
+        threads=threads,
+        on_progress=options.live,
+    )
     sweeps: list[SweepAccount] = []
     ended_by: BaseException | None = None
     try:
-        _collect(acquisition, reconstructor, rig, plan, run, sweeps)
+        _collect(acquisition, rig, plan, run, sweeps)
     except (KeyboardInterrupt, DeviceError, RigError) as error:
-        if not run.tally.maps and not isinstance(error, KeyboardInterrupt):
+        if not run.worth_keeping and not isinstance(error, KeyboardInterrupt):
             raise
         ended_by = error
     del sweeps[run.tally.maps :]
@@ -61,7 +92,9 @@ def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, progress: Progress | 
             "maps": maps,
             "sweeps": [_sweep_content(sweep) for sweep in sweeps],
             "gaps": [list(gap) for sweep in sweeps for gap in sweep.gaps],
+            "on_overload": options.policy.value,
         },
+        acquisition.stages,
     )
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:
@@ -97,6 +130,13 @@ def plan_content(plan: ScanPlan) -> dict[str, Any]:
         "columns_per_marker": plan.columns_per_marker,
         "window_px": plan.window,
         "mode": plan.mode,
+        "windowed": plan.windowed,
+        "frame_width_px": plan.frame_width,
+        "bytes_per_s": plan.bytes_per_s,
+        "link_bytes_per_s": plan.link_bytes_per_s,
+        "full_frames_hz": plan.full_frames_hz,
+        "windows_px": None if plan.windows is None else plan.windows.width_px,
+        "windows_hz": plan.windows_hz,
         "legs": [
             {
                 "direction": leg.direction,
@@ -130,7 +170,6 @@ def _reconstructor(rig: OpenRig, plan: ScanPlan, threads: int) -> Reconstructor:
 
 def _collect(
     acquisition: Acquisition,
-    reconstructor: Reconstructor,
     rig: OpenRig,
     plan: ScanPlan,
     run: Run,
@@ -138,13 +177,12 @@ def _collect(
 ) -> None:
     running = acquisition.run()
     with closing(running):
-        for sweep in running:
-            result = reconstructor.map(sweep.volume)
+        for found in running:
             truth: SweepTruth | None = None
             if rig.world is not None:  # asked only now: no estimate ever sees it
-                truth = rig.world.truth(plan.command_at(sweep.volume.bound_column()))
-            sweeps.append(sweep.account())  # before its map: whatever ends the run, no map is without its account
-            run.add(result, sweep.count_s + result.compute_s, truth)
+                truth = rig.world.truth(plan.command_at(found.column))
+            sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
+            run.add(found.result, found.compute_s, truth)
 
 
 def _frames(sweeps: list[SweepAccount], crc_errors: int | None) -> RunFrames:
@@ -161,11 +199,16 @@ def _verdict(sweeps: list[SweepAccount], model: RigModel | None, *, aborted: boo
     """The gravest that applies."""
     if aborted:
         return Verdict.ABORTED
-    if not all(sweep.synchronised for sweep in sweeps):
+    if not all(sweep.synchronised or _markers_lost(sweep) for sweep in sweeps):
         return Verdict.UNSYNCHRONISED
     if any(sweep.frames.lost for sweep in sweeps):
         return Verdict.GAPS
     return Verdict.COMPLETE if model is not None else Verdict.UNCALIBRATED
+
+
+def _markers_lost(sweep: SweepAccount) -> bool:
+    """Whether so many frames were lost that too few markers are left to judge the sweep's clock."""
+    return sweep.frames.lost > 0 and math.isnan(sweep.residual_columns)
 
 
 def _sweep_content(sweep: SweepAccount) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from drivers.registry import KindConfig, Surroundings, lookup
 from rig.config import RigConfig, ScanConfig
 from rig.cube import cube_columns
 from rig.errors import DevicesError, PlanError, UsageError
-from rig.plan import compile_plan, spad_problems, spad_request
+from rig.plan import compile_plan, spad_request
 from rig.scan_plan import ScanPlan
 
 _log = logging.getLogger(__name__)
@@ -73,10 +73,11 @@ def prepare(rig: OpenRig, scan: ScanConfig | None = None) -> tuple[ScanPlan, Spa
             "lower scan.power"
         )
     info, scanner = rig.spad.info, rig.scanner
-    if spad_problems(scan, info):  # refused with all other problems of the plan, for which the nominal rate will do
-        compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info)
-    timing = rig.spad.configure(spad_request(scan, info))
+    nominal = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info)
+    timing = rig.spad.configure(spad_request(scan, nominal))
     plan = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, timing)
+    if plan.frame_rate_hz != nominal.frame_rate_hz:  # its windows may be others, its timing is the same again
+        timing = rig.spad.configure(spad_request(scan, plan))
     if isinstance(rig.world, HoldsColumns):
         # A frame's light may be held this far from where the mirror is: the mean over a column's frames is then
         # within 1/20 column of the mean that the binding gives, at any number of exposures.

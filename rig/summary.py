@@ -14,6 +14,7 @@ import numpy as np
 from drivers.interfaces import SweepTruth
 from rig.reconstruction import FogEstimate, MapResult
 from rig.scoring import depth_errors, stripe_errors
+from rig.stages import PipelineStats
 
 
 class Verdict(StrEnum):
@@ -74,13 +75,16 @@ class Summary:
     fog: FogEstimate
     truth: TruthErrors | None
     verdict: Verdict
+    stages: PipelineStats | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """The summary as plain values; `truth` only where it is known."""
+        """The summary as plain values; `truth` only where it is known, `stages` only of a scan."""
         content = asdict(self)
         content["verdict"] = self.verdict.value
         if self.truth is None:
             del content["truth"]
+        if self.stages is None:
+            del content["stages"]
         return content
 
 
@@ -116,7 +120,9 @@ class MapTally:
         # What was learned grows from map to map; the last one knows most. One step: an interrupt counts it or does not.
         self._maps.append(_OfMap(compute_s, valid, result.fog, errors))
 
-    def summary(self, frames: RunFrames, sensor_time_s: float, verdict: Verdict) -> Summary:
+    def summary(
+        self, frames: RunFrames, sensor_time_s: float, verdict: Verdict, stages: PipelineStats | None = None
+    ) -> Summary:
         """The run so far."""
         errors = [each.errors for each in self._maps if each.errors is not None]
         truth = TruthErrors(*(_over_maps(kind) for kind in zip(*errors, strict=True))) if errors else None
@@ -136,6 +142,7 @@ class MapTally:
             fog=self._maps[-1].fog if self._maps else FogEstimate(None, None, None),
             truth=truth,
             verdict=verdict,
+            stages=stages,
         )
 
 

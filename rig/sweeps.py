@@ -1,17 +1,20 @@
 """Blocks in, sweeps out: binds and counts the frames of a run, and keeps account of those that are missing."""
 
 import logging
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.errors import ProtocolError
-from drivers.frames import FrameBlock
-from rig.binding import FrameBinder, SweepClock
-from rig.counting import BIN_DARK, CountVolume, SweepCounter
+from drivers.frames import FrameBlock, Mark
+from rig.binding import BoundFrames, FrameBinder, SweepClock
+from rig.counting import BIN_DARK, BIN_UNUSABLE, CountVolume, SweepCounter
+from rig.geometry import WORD_PX
 from rig.scan_plan import ScanPlan
 
 _log = logging.getLogger(__name__)
@@ -91,6 +94,8 @@ class SweepAssembler:
         self._note_gap(block)
         begun = time.perf_counter()
         bound, clocks = self._binder.bind(block)
+        x0 = self._windows(block, bound)
+        bins = _covered(bound.bins, x0, self._plan)
         self._count_s += time.perf_counter() - begun
         self.frames_seen += block.n_frames
         sweeps = bound.sweep
@@ -104,11 +109,10 @@ class SweepAssembler:
             if number < 0:
                 continue
             begun = time.perf_counter()
-            bins = bound.bins[a:b]
             self._received += b - a
-            self._lit += int(np.count_nonzero(bins >= 0))
-            self._dark += int(np.count_nonzero(bins == BIN_DARK))
-            self._counter.add(block.bits[a:b], bins, bound.column[a:b])
+            self._lit += int(np.count_nonzero(bins[a:b] >= 0))
+            self._dark += int(np.count_nonzero(bins[a:b] == BIN_DARK))
+            self._counter.add(block.bits[a:b], bins[a:b], bound.column[a:b], x0[a:b])
             self._count_s += time.perf_counter() - begun
 
     def _finish(self, clock: SweepClock) -> SweepData:
@@ -132,8 +136,7 @@ class SweepAssembler:
             end_frame=clock.end_frame,
             count_s=self._count_s,
         )
-        if not data.synchronised:
-            _log.warning("sweep %d: markers stray %.3g columns from its clock", data.index, data.residual_columns)
+        _warn(data)
         self._counter.reset()
         self._received = self._lit = self._dark = 0
         self._count_s = 0.0
@@ -145,16 +148,33 @@ class SweepAssembler:
         first = block.header.first_frame
         if self._next_frame is not None and first > self._next_frame:
             self._gaps.append((self._next_frame, first - 1))
-            _log.warning("frames %d to %d were lost", self._next_frame, first - 1)
         self._next_frame = first + block.n_frames
 
+    def _windows(self, block: FrameBlock, bound: BoundFrames) -> NDArray[np.int32]:
+        """First pixel used of each frame, int32 (n,): what its record says, or for full frames what the plan says."""
+        records, plan = block.records, self._plan
+        if block.header.width == plan.width:
+            return plan.window_x0(records["marks"], records["line"], bound.sweep)
+        trusted = (records["marks"] & Mark.WINDOW_LOST) == 0
+        x0: NDArray[np.int32] = np.where(trusted, records["x0"], 0).astype(np.int32)
+        row = -(-plan.width // WORD_PX) * WORD_PX
+        off = np.flatnonzero((x0 % WORD_PX != 0) | (x0 > row - block.header.width) | (trusted & (records["y0"] != 0)))
+        if off.size:
+            raise ProtocolError(
+                f"block {block.header.block_seq}: the window of frame {block.header.first_frame + off[0]} begins at "
+                f"pixel {records['x0'][off[0]]}, row {records['y0'][off[0]]}, where the plan has none; configure the "
+                "SPAD anew"
+            )
+        return x0
+
     def _check(self, block: FrameBlock) -> None:
-        """Only blocks of this run and of the whole sensor can be counted."""
+        """Only blocks of this run, of whole frames or of the plan's windows, can be counted."""
         header, plan = block.header, self._plan
-        if (header.width, header.height) != (plan.width, plan.rows):
+        widths = {plan.width} if plan.windows is None else {plan.width, plan.windows.width_px}
+        if header.width not in widths or header.height != plan.rows:
             raise ProtocolError(
                 f"block {header.block_seq} holds frames of {header.width} x {header.height} pixels, the plan is for "
-                f"{plan.width} x {plan.rows}; configure the SPAD anew"
+                f"{' or '.join(f'{width} x {plan.rows}' for width in sorted(widths))}; configure the SPAD anew"
             )
         if self._run_id not in (None, header.run_id):
             raise ProtocolError(
@@ -166,3 +186,25 @@ class SweepAssembler:
                 "that should come next; start anew"
             )
         self._run_id = header.run_id
+
+
+def _warn(sweep: SweepData) -> None:
+    """Say what is wrong with a sweep: once, since a stream that is dropped from may have a gap in every block."""
+    if sweep.gaps:
+        lost, gaps, first = sweep.frames.lost, len(sweep.gaps), sweep.gaps[0]
+        _log.warning(
+            "sweep %d: %d frames were lost in %d gaps, the first from %d to %d", sweep.index, lost, gaps, *first
+        )
+    if math.isnan(sweep.residual_columns):
+        _log.warning("sweep %d: too few markers were received to check its clock", sweep.index)
+    elif not sweep.synchronised:
+        _log.warning("sweep %d: markers stray %.3g columns from its clock", sweep.index, sweep.residual_columns)
+
+
+def _covered(bins: NDArray[np.int32], x0: NDArray[np.int32], plan: ScanPlan) -> NDArray[np.int32]:
+    """The bins, without frames whose window does not hold all that their column counts: none is counted in part."""
+    if plan.windows is None:
+        return bins
+    first = plan.x0[np.maximum(bins, 0)]
+    held = (x0 <= first) & (first + plan.window <= x0 + plan.windows.width_px)
+    return np.where((bins >= 0) & ~held, np.int32(BIN_UNUSABLE), bins)

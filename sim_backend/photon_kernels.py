@@ -122,19 +122,24 @@ def draw_frames(
     first_frame: int,
     first_row: int,
     last_row: int,
+    first_word: NDArray[np.int32],
     words: NDArray[np.uint64],
 ) -> None:
     """Draw frames first_frame, first_frame + 1, ... into `words` (frames, rows, words) uint64, rows
     first_row..last_row-1.
+
+    first_word: (frames,), word of the row at which each frame's window begins; its bits are those of the whole frame.
     """
     frames, _, n_words = words.shape
+    row_words = planes.shape[1]
     keys = np.empty(frames, np.uint64)
     for f in range(frames):
         keys[f] = frame_key(seed, np.uint64(first_frame + f))
     for y in range(first_row, last_row):
         for f in range(frames):
-            for k in range(n_words):
-                counter = keys[f] + np.uint64((y * n_words + k) * PLANES) * _GOLDEN
+            for i_word in range(n_words):
+                k = first_word[f] + i_word
+                counter = keys[f] + np.uint64((y * row_words + k) * PLANES) * _GOLDEN
                 undecided = _ALL
                 result = _ZERO
                 for i in range(PLANES):
@@ -145,7 +150,7 @@ def draw_frames(
                     undecided &= ~(plane ^ random)
                     if undecided == _ZERO:
                         break
-                words[f, y, k] = result
+                words[f, y, i_word] = result
 
 
 _DROP_STREAM = np.uint64(0xA0761D6478BD642F)

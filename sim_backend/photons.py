@@ -43,28 +43,39 @@ class PhotonSource:
             lambda a, b: bit_planes(model.steady_per_s, self._rate, exposure_s, 0.0, nothing, a, b, self._dark)
         )
 
-    def expose(self, first_frame: int, held: Array, power_w: Array, bits: NDArray[np.uint8]) -> None:
-        """Fill `bits` (n, rows, row bytes) with frames first_frame, first_frame + 1, ...
+    def expose(
+        self, first_frame: int, held: Array, power_w: Array, x0: NDArray[np.int32], bits: NDArray[np.uint8]
+    ) -> None:
+        """Fill `bits` (n, rows, row bytes) with windows of frames first_frame, first_frame + 1, ...
 
         held: (n,) mirror positions, NaN = the light goes nowhere. power_w: (n,) power averaged over each exposure.
+        x0: (n,) first pixel of each window, a multiple of 64; a window has the very bits of the whole frame.
         """
         words = bits.view(np.uint64)
+        first_word = x0 // np.int32(WORD_PX)
         dark = np.isnan(held) | (power_w == 0)
         held = np.where(dark, 0.0, held)
         power_w = np.where(dark, 0.0, power_w)
         change = (np.diff(held) != 0) | (np.diff(power_w) != 0) | (dark[1:] != dark[:-1])
         starts = [0, *(np.flatnonzero(change) + 1).tolist()]
         for a, b in zip(starts, [*starts[1:], len(held)], strict=True):
-            self._draw(first_frame + a, None if dark[a] else (float(held[a]), float(power_w[a])), words[a:b])
+            light = None if dark[a] else (float(held[a]), float(power_w[a]))
+            self._draw(first_frame + a, light, first_word[a:b], words[a:b])
 
     def close(self) -> None:
         """End the threads."""
         self._pool.shutdown()
 
-    def _draw(self, first_frame: int, light: tuple[float, float] | None, words: NDArray[np.uint64]) -> None:
+    def _draw(
+        self,
+        first_frame: int,
+        light: tuple[float, float] | None,
+        first_word: NDArray[np.int32],
+        words: NDArray[np.uint64],
+    ) -> None:
         model, rate, lit = self._model, self._rate, self._lit
         if light is None:
-            self._each_band(lambda a, b: draw_frames(self._dark, self._seed, first_frame, a, b, words))
+            self._each_band(lambda a, b: draw_frames(self._dark, self._seed, first_frame, a, b, first_word, words))
             return
         held, power_w = light
         sheet: LightSheet | None = None
@@ -79,7 +90,7 @@ class PhotonSource:
                 model.add_sheet(sheet, a, b, rate)
             if fresh:
                 bit_planes(model.steady_per_s, rate, self._exposure_s, power_w, self._dark, a, b, lit)
-            draw_frames(lit, self._seed, first_frame, a, b, words)
+            draw_frames(lit, self._seed, first_frame, a, b, first_word, words)
 
         self._each_band(band)
         self._held, self._lit_for = held, light

@@ -22,6 +22,7 @@ from drivers.interfaces.spad import (
     StreamMode,
 )
 from drivers.interfaces.sync import OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse, SyncSource, SyncStatus
+from drivers.interfaces.window_table import WindowTable
 from drivers.interfaces.world import SweepTruth, World
 
 __all__ = [
@@ -52,5 +53,6 @@ __all__ = [
     "SweepTruth",
     "SyncSource",
     "SyncStatus",
+    "WindowTable",
     "World",
 ]

@@ -7,7 +7,9 @@ from fractions import Fraction
 from typing import Literal
 
 from drivers.errors import LimitExceeded
+from drivers.frames import frame_bytes
 from drivers.interfaces.device import OPEN_STATES, Device, DeviceState
+from drivers.interfaces.window_table import WindowTable
 from drivers.ring import BlockRing
 
 _log = logging.getLogger(__name__)
@@ -51,6 +53,8 @@ class SpadInfo:
     markers: bool
     """Whether frame records carry the markers of scanner and gate."""
     trigger_modes: tuple[str, ...]
+    can_wait: bool = False
+    """Whether it can stand still while the ring is full, as a simulation on virtual time does; a sensor cannot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +67,8 @@ class SpadRequest:
     mode: SpadMode
     block_frames: int
     """Frames wanted per block; a device may send shorter blocks, never longer ones."""
+    window: WindowTable | None = None
+    """Windows that move with the line; None: full frames. In a stream only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,8 +144,9 @@ class SpadArray(Device):
         """Claim, fill and publish at least one block; True while more may come, False once the run has ended.
 
         Runs on the application's source thread and waits at most `timeout_s` (`DeviceTimeout`) for frames. Where the
-        ring is full, a source that can wait does so within the same time, one that cannot drops frames, counts them
-        as lost and calls `ring.mark_overflow`. Calls after the end return False. `stop` may come from another thread
+        ring is full, a source that can wait does so within the same time as long as `ring.waits`; else, and where it
+        cannot wait, it drops the block, counts its frames as lost and then calls `ring.mark_overflow` with their
+        number, which may raise to end the run. Calls after the end return False. `stop` may come from another thread
         meanwhile: then the call returns False early.
         """
         if not (self._run_opened and self._state is DeviceState.CONFIGURED):
@@ -177,6 +184,32 @@ class SpadArray(Device):
             raise LimitExceeded(f"{self._name}: mode {request.mode!r} is not available; it can {' and '.join(modes)}")
         if request.block_frames < 1:
             raise LimitExceeded(f"{self._name}: blocks of {request.block_frames} frames; ask for at least 1")
+        if request.window is not None:
+            self._check_window(request.window, request.mode)
+        self._check_link(request)
+
+    def _check_window(self, window: WindowTable, mode: SpadMode) -> None:
+        if mode != "stream":
+            raise LimitExceeded(
+                f"{self._name}: windows in mode {mode!r}; they move in a stream only, ask for full frames"
+            )
+        try:
+            window.check(self.info.width, self.info.roi_step_px)
+        except LimitExceeded as error:
+            raise LimitExceeded(f"{self._name}: {error}") from None
+
+    def _check_link(self, request: SpadRequest) -> None:
+        info = self.info
+        if request.mode != "stream" or info.stream is None:
+            return
+        width = info.width if request.window is None else request.window.width_px
+        need = float(request.frame_rate_hz) * frame_bytes(width, info.height)
+        if need > info.stream.bytes_per_s:
+            raise LimitExceeded(
+                f"{self._name}: {float(request.frame_rate_hz):g} frames of {width} x {info.height} pixels a second are "
+                f"{need / 1e6:.1f} MB/s, the link carries {info.stream.bytes_per_s / 1e6:.1f} MB/s; lower frame_rate "
+                "or ask for narrower windows"
+            )
 
     def _make_safe(self) -> None:
         self.stop()

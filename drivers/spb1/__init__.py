@@ -3,7 +3,7 @@
 from drivers.spb1.layout import ALIGN, HEADER_BYTES, TRAILER_BYTES, BlockLayout, block_views, frames_per_block
 from drivers.spb1.reader import parse_block
 from drivers.spb1.walk import Damage, walk_blocks
-from drivers.spb1.writer import seal_block
+from drivers.spb1.writer import block_parts, seal_block
 
 __all__ = [
     "ALIGN",
@@ -11,6 +11,7 @@ __all__ = [
     "TRAILER_BYTES",
     "BlockLayout",
     "Damage",
+    "block_parts",
     "block_views",
     "frames_per_block",
     "parse_block",

@@ -1,7 +1,8 @@
-"""Sealing an SPB1 block: header, padding and trailer round records and pixels that are in place already."""
+"""Writing SPB1 blocks: sealed round records and pixels that are in place already, or in parts for a file."""
 
 import struct
 import zlib
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,16 +45,47 @@ def seal_block(
     buffer[HEADER_BYTES + FRAME_RECORD.itemsize * layout.n_frames : layout.pixels_offset] = 0
     end = HEADER_BYTES + layout.payload_bytes
     crc = zlib.crc32(raw[HEADER_BYTES:end]) if payload_crc else 0
-    try:
-        _pack_header(raw, header, layout)
-        lost_low = frames_lost & 0xFFFFFFFF
-        TRAILER.pack_into(raw, end, TRAILER_MAGIC, status, header.block_seq, layout.payload_bytes, crc, lost_low, 0)
-    except struct.error as error:
-        raise ValueError(f"block {header.block_seq}: a field does not fit SPB1 1.0: {error}") from None
-    _sign(raw[:HEADER_BYTES])
-    _sign(raw[end : end + TRAILER_BYTES])
+    _pack(raw[:HEADER_BYTES], raw[end : end + TRAILER_BYTES], header, layout, status, frames_lost, crc)
     buffer[end + TRAILER_BYTES :] = 0
     return FrameBlock(header, records, bits, status)
+
+
+def block_parts(block: FrameBlock) -> tuple[memoryview, ...]:
+    """The bytes of a block in order, with the payload's CRC and zeros to the next multiple of `ALIGN`, for a file.
+
+    Records and pixels are views of the block's memory, wherever it lies, and as valid as that. Reads every byte,
+    without the interpreter's lock. ValueError as of `seal_block`.
+    """
+    header = block.header
+    layout = BlockLayout(block.n_frames, header.width, header.height)
+    _check(header, layout)
+    records = _bytes_of(block.records)
+    bits = _bytes_of(block.bits)
+    gap = memoryview(bytes(layout.pixels_offset - HEADER_BYTES - records.nbytes))
+    crc = zlib.crc32(bits, zlib.crc32(gap, zlib.crc32(records)))
+    head, tail = memoryview(bytearray(HEADER_BYTES)), bytearray(layout.min_stride - layout.block_bytes + TRAILER_BYTES)
+    trailer = memoryview(tail)[:TRAILER_BYTES]
+    _pack(head, trailer, header, layout, block.status, header.lost_before, crc)
+    return head, records, gap, bits, memoryview(tail)
+
+
+def _bytes_of(array: NDArray[Any]) -> memoryview:
+    """The array's memory as bytes; a copy only where it is not contiguous."""
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+
+
+def _pack(
+    head: memoryview, trailer: memoryview, header: BlockHeader, layout: BlockLayout, status: int, lost: int, crc: int
+) -> None:
+    try:
+        _pack_header(head, header, layout)
+        TRAILER.pack_into(
+            trailer, 0, TRAILER_MAGIC, status, header.block_seq, layout.payload_bytes, crc, lost & 0xFFFFFFFF, 0
+        )
+    except struct.error as error:
+        raise ValueError(f"block {header.block_seq}: a field does not fit SPB1 1.0: {error}") from None
+    _sign(head)
+    _sign(trailer)
 
 
 def _pack_header(raw: memoryview, header: BlockHeader, layout: BlockLayout) -> None:

@@ -11,6 +11,8 @@ from rig.stripes import StripeTable
 
 ESTIMATORS = ("argmax", "edge", "likelihood")
 FILTERS = ("none", "median")
+LEARNING = frozenset({"likelihood"})
+"""Estimators that learn from the stream, for which the first map takes much longer than those after it."""
 
 
 class Learned(Protocol):

@@ -30,7 +30,7 @@ def ambient_map(volume: CountVolume, geometry: SweepGeometry, quiet: NDArray[np.
     exposures = np.zeros_like(ones)
     if volume.dark_counts is not None:
         ones += volume.dark_counts
-        exposures += volume.n_dark
+        exposures += volume.n_dark if volume.dark_frames is None else volume.dark_frames
     if quiet is not None:
         ones += quiet[0]
         exposures += quiet[1]

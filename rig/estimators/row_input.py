@@ -113,17 +113,30 @@ def row_buffers(window: int, amplitudes: int) -> Row:
 
 @numba.njit(cache=True, nogil=True)
 def read_row(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[int, int, int, int]:
-    """Fill n to log_prior of `row` for row y of column c.
+    """Fill n to log_prior of `row` for row y of column c; returns what `row_fluxes` does."""
+    if sweep.n_frames[c] == 0:
+        return 0, 0, -1, 0
+    length, begin, end, start = row_fluxes(sweep, state, row, y, c)
+    counts, x0 = sweep.counts[c, y], sweep.x0[c]
+    step = 1 if sweep.near_is_left else -1
+    for t in range(length):
+        row.n[t] = counts[start + step * t - x0]
+    return length, begin, end, start
+
+
+@numba.njit(cache=True, nogil=True)
+def row_fluxes(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[int, int, int, int]:
+    """Fill before to log_prior of `row` for row y of column c: what is expected there, whatever was counted.
 
     Returns (length, first and last index that a stripe may have, x of index 0); pixel t is x + t where near is left,
     else x - t. The length is 0 where there is nothing to search.
     """
     lo, hi, x0 = sweep.x_lo[y, c], sweep.x_hi[y, c], sweep.x0[c]
-    if sweep.n_frames[c] == 0 or lo > hi:
+    if lo > hi:
         return 0, 0, -1, 0
-    counts, plane, u, v, profile = sweep.counts[c, y], sweep.plane[c], sweep.u, sweep.v, state.profile
+    plane, u, v, profile = sweep.plane[c], sweep.u, sweep.v, state.profile
     first = max(lo - MARGIN_PX, x0, 0)
-    last = min(hi + MARGIN_PX, x0 + counts.shape[0] - 1, u.shape[1] - 1)
+    last = min(hi + MARGIN_PX, x0 + sweep.counts.shape[2] - 1, u.shape[1] - 1)
     while first < last and np.isnan(u[y, first]):
         first += 1
     while last > first and np.isnan(u[y, last]):
@@ -153,7 +166,6 @@ def read_row(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[int,
         haze = gain * (profile[i, 0] + f * (profile[i + 1, 0] - profile[i, 0]))
         rest = gain * (profile[i, 1] + f * (profile[i + 1, 1] - profile[i, 1]))
         ambient = state.ambient[y, x]
-        row.n[t] = counts[x - x0]
         row.before[t] = min(max(ambient + haze, FLUX_MIN), FLUX_MAX)
         row.behind[t] = min(max(ambient + rest, FLUX_MIN), FLUX_MAX)
         row.scale[t] = profile[i, 2] + f * (profile[i + 1, 2] - profile[i, 2])

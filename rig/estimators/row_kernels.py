@@ -47,6 +47,12 @@ def logit_table() -> NDArray[np.float32]:
     return np.stack([np.log(p) - np.log(q), np.log(q)]).astype(np.float32)
 
 
+@numba.njit(inline="always")
+def cell_of(flux):  # type: ignore[no-untyped-def]
+    """Cell of `logit_table` that a float32 flux of FLUX_MIN to FLUX_MAX lies in; unsigned, for the vectoriser."""
+    return np.uint64((np.float32(flux).view(np.uint32) >> TABLE_SHIFT) - TABLE_BASE)
+
+
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def add_evidence(
     n: NDArray[np.float32],
@@ -65,7 +71,7 @@ def add_evidence(
     gain, loss = table[0], table[1]
     for t in range(score.shape[0]):
         flux = np.float32(min(base[t] + light * scale[t], FLUX_MAX))
-        i = np.uint64((flux.view(np.uint32) >> TABLE_SHIFT) - TABLE_BASE)
+        i = cell_of(flux)
         score[t] += n[t] * gain[i] + k * loss[i] - own[t]
 
 
@@ -258,7 +264,7 @@ def refine(
                 free = min(max(np.float32(offset - (t - mode) + 0.5), np.float32(0.0)), np.float32(1.0))
                 base = free * before[t] + (np.float32(1.0) - free) * behind[t]
                 flux = np.float32(min(base + light * fine[i, t - mode + reach], FLUX_MAX))
-                cell = np.uint64((flux.view(np.uint32) >> TABLE_SHIFT) - TABLE_BASE)
+                cell = cell_of(flux)
                 total += n[t] * table[0, cell] + k * table[1, cell] - taps[1, t]
             if total > top:
                 # Sums are kept relative to the best term so far, so that none overflows.

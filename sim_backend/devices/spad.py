@@ -14,11 +14,11 @@ from pydantic import Field
 from drivers.clock import NS_PER_S, VirtualClock, ticks_to_ns
 from drivers.errors import DeviceTimeout, LimitExceeded
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader
-from drivers.interfaces import SpadArray, SpadCounters, SpadInfo, SpadRequest, SpadTiming, StreamMode
+from drivers.interfaces import SpadArray, SpadCounters, SpadInfo, SpadRequest, SpadTiming, StreamMode, WindowTable
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, seal_block
-from drivers.units import ExactHertz
+from drivers.units import BytesPerSecond, ExactHertz
 from sim_backend.devices.markers import MarkerInputs
 from sim_backend.devices.place import world_of
 from sim_backend.photon_kernels import dropped_frames
@@ -30,7 +30,7 @@ TICK_HZ = 100_000_000
 """
 TICKS_PER_FRAME = 1024
 LINK_BYTES_PER_S = 8e9
-"""More than any frame rate needs: the simulated link is no bottleneck."""
+"""More than any frame rate needs: unless the config names a `link`, it is no bottleneck."""
 MAX_THREADS = 4
 
 
@@ -39,6 +39,8 @@ class SimulatedSpadConfig(KindConfig):
 
     kind: Literal["simulated"] = "simulated"
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000)
+    link: Annotated[BytesPerSecond, Field(gt=0)] = LINK_BYTES_PER_S
+    """What the link to the computer carries; where full frames are too much for it, windows are sent."""
     lost_frames: tuple[int, ...] = ()
     """Numbers of frames that get lost on the way, to try gaps with."""
     loss_probability: float = Field(default=0.0, ge=0, le=1)
@@ -57,6 +59,7 @@ class SimulatedSpad(SpadArray):
         self._seed = seed
         self._threads = threads or min(MAX_THREADS, os.cpu_count() or 1)
         self._photons: PhotonSource | None = None
+        self._window: WindowTable | None = None
         self._lost_frames = np.array(sorted(set(config.lost_frames)), dtype=np.int64)
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._run_id = 0
@@ -74,10 +77,11 @@ class SimulatedSpad(SpadArray):
             rotation_deg=0,
             max_frame_rate_hz=config.max_frame_rate,
             burst=None,
-            stream=StreamMode(LINK_BYTES_PER_S),
+            stream=StreamMode(config.link),
             roi_step_px=64,
             markers=True,
             trigger_modes=("free",),
+            can_wait=isinstance(world.bench.clock, VirtualClock),
         )
 
     @property
@@ -98,6 +102,7 @@ class SimulatedSpad(SpadArray):
                 f"{self.name}: exposure {request.exposure_s:g} s is under one tick of {float(1 / tick_hz):g} s"
             )
         self._block_frames = request.block_frames
+        self._window = request.window
         self._timing = SpadTiming(tick_hz, period, exposure, self._layout(request.block_frames).min_stride)
         if self._photons is not None:
             self._photons.close()
@@ -139,7 +144,12 @@ class SimulatedSpad(SpadArray):
             self._photons.close()
 
     def _layout(self, n_frames: int) -> BlockLayout:
-        return BlockLayout(n_frames, self._info.width, self._info.height)
+        return BlockLayout(n_frames, self._width_px, self._info.height)
+
+    @property
+    def _width_px(self) -> int:
+        """Pixels of a row as they are sent."""
+        return self._info.width if self._window is None else self._window.width_px
 
     def _frames_ahead(self) -> tuple[int, bool]:
         """How many frames the next block holds, or (n, True): how many of the next frames get lost."""
@@ -161,9 +171,16 @@ class SimulatedSpad(SpadArray):
         return n * period_s
 
     def _expose_block(self, ring: BlockRing, n: int, timeout_s: float) -> None:
-        buffer = ring.claim(timeout_s)
+        waits = self._info.can_wait and ring.waits
+        buffer = ring.claim(timeout_s if waits else 0.0)
         if buffer is None:
-            raise DeviceTimeout(f"{self.name}: no free slot in the ring within {timeout_s:g} s; readers are too slow")
+            if waits:
+                raise DeviceTimeout(
+                    f"{self.name}: no free slot in the ring within {timeout_s:g} s; readers are too slow"
+                )
+            self._pass_over(n)
+            ring.mark_overflow(n)
+            return
         assert self._photons is not None, "configured before started"
         layout = self._layout(n)
         records, bits = block_views(buffer, layout)
@@ -171,16 +188,24 @@ class SimulatedSpad(SpadArray):
         happening = self._world.bench.during(start_s, exposure_s, period_s)
         sweep = self._markers.sweep + int(np.count_nonzero(happening.scan_s < start_s[0] + period_s))
         self._markers.record(happening, start_s, period_s, records)
+        x0 = self._window_x0(sweep, records)
         records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
-        records["x0"] = records["y0"] = 0
+        records["x0"], records["y0"] = x0, 0
         held = self._world.grid.hold(happening.mirror)
-        self._photons.expose(self._next_frame, held, happening.power_w * happening.share, bits)
+        self._photons.expose(self._next_frame, held, happening.power_w * happening.share, x0, bits)
         header = self._header(sweep, n)
         block = seal_block(buffer, header, layout, frames_lost=header.lost_before, payload_crc=True)
         self._advance(n, lost=0)
         ring.publish(block)
         self._block_seq += 1
         self._just_lost = False
+
+    def _window_x0(self, sweep: int, records: NDArray[np.void]) -> NDArray[np.int32]:
+        """First pixel of each frame's window. sweep: scan markers since START at the first frame."""
+        if self._window is None:
+            return np.zeros(len(records), np.int32)
+        since = sweep + ((records["sweep"].astype(np.int64) - sweep) & 0xFFFF)
+        return self._window.x0_of(records["marks"], records["line"], since - 1)
 
     def _advance(self, n: int, *, lost: int) -> None:
         """Let the time of n frames pass."""
@@ -216,7 +241,7 @@ class SimulatedSpad(SpadArray):
             exposure_ticks=timing.exposure_ticks,
             sweep=sweep,
             frame_step=1,
-            width=self._info.width,
+            width=self._width_px,
             height=self._info.height,
             sensor_width=self._info.width,
             sensor_height=self._info.height,

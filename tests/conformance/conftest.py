@@ -5,6 +5,7 @@ A new device is added here and nowhere else: it then has to behave like all the 
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.clock import VirtualClock
-from drivers.interfaces import MARKER_SCAN, ScanWaveform, SpadRequest
+from drivers.interfaces import MARKER_SCAN, ScanWaveform, SpadRequest, WindowTable
 from drivers.registry import Surroundings, lookup
 from tests.conformance.cases import LaserCase, ScannerCase, SpadCase, SyncCase, WorldCase
 
@@ -66,6 +67,13 @@ def simulated_lossy_spad(folder: Path) -> Iterator[SpadCase]:
 
 
 @contextmanager
+def simulated_window_spad(folder: Path) -> Iterator[SpadCase]:
+    with simulated_spad(folder, link="21 MB/s") as case:
+        window = WindowTable(64, (np.array([64, 0], np.int32),))
+        yield SpadCase(case.device, replace(case.request, window=window))
+
+
+@contextmanager
 def simulated_scanner(folder: Path) -> Iterator[ScannerCase]:
     surroundings = simulated_surroundings(folder)
     bench = surroundings.world.bench  # type: ignore[union-attr]
@@ -108,7 +116,11 @@ def simulated_world(folder: Path) -> Iterator[WorldCase]:
 
 Factory = Callable[[Path], AbstractContextManager[Any]]
 
-SPADS: dict[str, Factory] = {"simulated": simulated_spad, "simulated, lossy": simulated_lossy_spad}
+SPADS: dict[str, Factory] = {
+    "simulated": simulated_spad,
+    "simulated, lossy": simulated_lossy_spad,
+    "simulated, windows": simulated_window_spad,
+}
 SCANNERS: dict[str, Factory] = {"simulated": simulated_scanner}
 LASERS: dict[str, Factory] = {"simulated": simulated_laser}
 SYNCS: dict[str, Factory] = {"simulated": simulated_sync}

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.errors import DeviceTimeout, LimitExceeded, WrongState
 from drivers.frames import BlockFlag, FrameBlock, packed_row_bytes
-from drivers.interfaces import DeviceState, SpadTiming
+from drivers.interfaces import DeviceState, SpadTiming, WindowTable
 from drivers.ring import BlockRing
 from tests.conformance.cases import SpadCase
 
@@ -100,6 +100,23 @@ def test_a_mode_it_does_not_have_is_refused(spad: SpadCase) -> None:
             spad.device.configure(replace(spad.request, mode="stream"))
 
 
+def test_windows_beyond_the_sensor_are_refused(spad: SpadCase) -> None:
+    info = spad.device.info
+    if info.stream is None:
+        pytest.skip("no stream mode")
+    beyond = WindowTable(info.roi_step_px * 64, (np.array([info.width // 64 * 64 + 64], np.int32),))
+    with pytest.raises(LimitExceeded, match="reaches beyond"):
+        spad.device.configure(replace(spad.request, window=beyond))
+
+
+def test_blocks_are_of_the_window_that_was_asked_for(spad: SpadCase) -> None:
+    window = spad.request.window
+    _, blocks = run(spad)
+    assert {block.header.width for block in blocks} == {spad.device.info.width if window is None else window.width_px}
+    first = 0 if window is None else window.x0[0][0]  # there was no marker yet
+    assert all((block.records["x0"] == first).all() for block in blocks)
+
+
 def test_blocks_and_runs_of_no_frames_are_refused(spad: SpadCase) -> None:
     with pytest.raises(LimitExceeded, match="blocks of 0 frames"):
         spad.device.configure(replace(spad.request, block_frames=0))
@@ -177,7 +194,10 @@ def test_bits_are_packed_rows_with_pad_bits_zero_inside_the_window(spad: SpadCas
         assert block.bits.shape == (block.n_frames, header.height, packed_row_bytes(header.width))
         pixels = np.unpackbits(block.bits, axis=2)
         assert not pixels[:, :, header.width :].any()
-        assert (block.records["x0"] + header.width <= header.sensor_width).all()
+        beyond = block.records["x0"][:, None] + np.arange(pixels.shape[2]) >= header.sensor_width
+        assert not (pixels & beyond[:, None, :]).any()
+        row_px = 8 * packed_row_bytes(header.sensor_width)  # the last window may end in the padding
+        assert (block.records["x0"] + header.width <= row_px).all()
         assert (block.records["y0"] + header.height <= header.sensor_height).all()
         ones += int(pixels.sum())
     assert 0 < ones < sum(block.n_frames for block in blocks) * blocks[0].header.height * blocks[0].header.width

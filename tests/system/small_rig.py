@@ -54,10 +54,10 @@ def config() -> dict[str, Any]:
     }
 
 
-def write_rig(folder: Path, content: dict[str, Any] | None = None) -> Path:
+def write_rig(folder: Path, content: dict[str, Any] | None = None, *, width: int = WIDTH, height: int = HEIGHT) -> Path:
     """Write calibration and config; the config's path."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "rig.yaml").write_text(yaml.safe_dump(calibration()))
+    (folder / "rig.yaml").write_text(yaml.safe_dump(calibration(width, height)))
     file = folder / "small.yaml"
     file.write_text(yaml.safe_dump(content or config(), sort_keys=False))
     return file

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -14,14 +15,18 @@ import numpy as np
 import pytest
 import yaml
 
+from drivers.frames import FrameBlock
+from drivers.ring import BlockRing
+from drivers.spb1 import walk_blocks
 from rig.outputs import RunFolder
 from rig.reconstruction import MapResult, Reconstructor
+from rig.recording import Recording
 from tests.system.conftest import Rig
 from tests.system.small_rig import HEIGHT, WIDTH, config, write_rig
 
 KEYS = {
     "maps", "map_rate_hz", "columns", "exposures", "estimator", "filter", "frames", "sensor_time_s", "compute_time_s",
-    "realtime_factor", "valid_fraction", "fog", "truth", "verdict",
+    "realtime_factor", "valid_fraction", "fog", "truth", "verdict", "stages",
 }  # fmt: skip
 FILES = {
     "depth/000000.npy", "depth/000000.png", "intensity/000000.png", "stripe/000000.npz", "cloud/000000.ply",
@@ -80,6 +85,76 @@ def test_people_are_told_the_errors_the_verdict_and_where_the_pictures_lie(rig: 
     assert "stripe error" in ran.out
     assert "complete" in ran.out
     assert str(Path("run/depth/000000.png").absolute()) in ran.out
+
+
+def test_a_recording_holds_every_frame_of_the_scan(rig: Rig, small: Path) -> None:
+    summary = strict(rig("scan", small, "--maps", 2, "--record", "--json", "--out", "run").out)
+    assert files(Path("run")) > {"frames-000000.spb", "summary.json"}
+    blocks = list(walk_blocks(np.fromfile("run/frames-000000.spb", np.uint8), None, check_payload=True))
+    assert all(isinstance(block, FrameBlock) for block in blocks)
+    numbers = np.concatenate([block.frame_numbers for block in blocks])  # type: ignore[union-attr]
+    assert numbers.tolist() == list(range(len(numbers)))
+    assert len(numbers) >= summary["frames"]["received"]  # type: ignore[index]
+    stages, recording = summary["stages"], strict(Path("run/manifest.json").read_text())["recording"]
+    assert isinstance(stages, dict)
+    assert recording == {
+        "files": ["frames-000000.spb"],
+        "blocks": stages["recorder_blocks"],
+        "bytes": Path("run/frames-000000.spb").stat().st_size,
+    }
+
+
+def test_recording_and_policies_change_no_result(rig: Rig, small: Path) -> None:
+    for name, options in (("plain", ()), ("recorded", ("--record", "--on-overload", "block"))):
+        assert rig("scan", small, "--seed", 4, "--out", name, *options).code == 0
+    plain, recorded = (np.load(f"{name}/depth/000000.npy") for name in ("plain", "recorded"))
+    assert np.array_equal(plain, recorded, equal_nan=True)
+
+
+def test_frames_dropped_for_a_slow_estimate_are_gaps(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    estimate, dropping = Reconstructor.map, threading.Event()
+    mark = BlockRing.mark_overflow
+
+    def marked(self: BlockRing, n_frames: int = 0) -> None:
+        mark(self, n_frames)
+        dropping.set()
+
+    def slow(self: Reconstructor, volume: object) -> MapResult:
+        assert dropping.wait(60)
+        return estimate(self, volume)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(BlockRing, "mark_overflow", marked)
+    monkeypatch.setattr(Reconstructor, "map", slow)
+    ran = rig("scan", small, "--maps", 3, "--on-overload", "drop", "--json", "--out", "run")
+    summary, manifest = strict(ran.out), strict(Path("run/manifest.json").read_text())
+    frames, gaps = summary["frames"], manifest["gaps"]
+    assert isinstance(frames, dict)
+    assert isinstance(gaps, list)
+    assert (ran.code, summary["verdict"], summary["maps"]) == (1, "gaps", 3)
+    assert frames["expected"] == frames["received"] + frames["lost"]
+    assert frames["lost"] == sum(last - first + 1 for first, last in gaps) > 0
+    assert summary["stages"]["dropped_frames"] >= frames["lost"]  # type: ignore[index]
+    assert manifest["on_overload"] == "drop"
+
+
+def test_a_disk_that_the_recording_fills_ends_the_scan_in_a_line_and_keeps_what_is_whole(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append = Recording.append
+
+    def full(self: Recording, block: FrameBlock) -> None:
+        if self.blocks == 3:
+            monkeypatch.setattr(self, "_write", lambda part: os.write(-1, b""), raising=False)
+        append(self, block)
+
+    monkeypatch.setattr(Recording, "append", full)
+    ran = rig("scan", small, "--maps", 20, "--record", "--out", "run")
+    assert (ran.code, len(ran.problems)) == (3, 1)
+    assert "cannot write the recording frames-000000.spb" in ran.problems[0]
+    assert "of 20 maps were whole" in ran.err
+    assert strict(Path("run/summary.json").read_text())["verdict"] == "aborted"
+    blocks = list(walk_blocks(np.fromfile("run/frames-000000.spb", np.uint8), None, check_payload=True))
+    assert [isinstance(block, FrameBlock) for block in blocks] == [True] * 3
 
 
 def test_without_out_the_folder_is_named_after_the_time(rig: Rig, small: Path) -> None:
@@ -320,7 +395,8 @@ def test_a_bad_config_is_refused_in_a_line_and_nothing_is_left(
     ("arguments", "said"),
     [
         (["--no-such-option"], "No such option"),
-        (["--record"], "No such option"),
+        (["--on-overload", "ignore"], "write 'abort', 'drop' or 'block'"),
+        (["--dry-run", "--on-overload", "ignore"], "write 'abort', 'drop' or 'block'"),
         (["--exposures", "-1"], "--exposures is -1, it must be at least 1; write for example '--exposures 10'"),
         (["--exposures", "many"], "write a whole number or see 'rig scan --help'"),
         (["--min-confidence", "high"], "write a number or see 'rig scan --help'"),

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 
+import numpy as np
 import pytest
 
 from drivers.errors import DeviceDisconnected, DeviceFault, InterlockOpen, LimitExceeded, WrongState
@@ -21,8 +22,10 @@ from drivers.interfaces import (
     SpadInfo,
     SpadRequest,
     SpadTiming,
+    StreamMode,
     SyncSource,
     SyncStatus,
+    WindowTable,
 )
 from drivers.ring import BlockRing
 
@@ -197,6 +200,37 @@ def test_a_burst_has_to_fit_the_memory() -> None:
     spad.start(100)
     with pytest.raises(LimitExceeded, match="mode 'stream' is not available; it can burst"):
         SmallMemorySpad().configure(replace(BURST, mode="stream"))
+
+
+class StreamingSpad(SmallMemorySpad):
+    """A SPAD whose link carries half of its full frames."""
+
+    @property
+    def info(self) -> SpadInfo:
+        return SpadInfo("m", "s", 128, 8, 0, Fraction(100_000), BurstMode(100, 4e8), LINK, 64, True, ("free",))
+
+
+LINK = StreamMode(8e6)
+STREAM = SpadRequest(Fraction(100_000), 1e-5, "stream", 10)
+HALF = WindowTable(64, (np.array([0, 64], np.int32),))
+
+
+def test_a_stream_that_the_link_cannot_carry_is_refused_with_both_rates() -> None:
+    with pytest.raises(
+        LimitExceeded, match=r"128 x 8 pixels a second are 14\.4 MB/s, the link carries 8\.0 MB/s; lower"
+    ):
+        StreamingSpad().configure(STREAM)
+    StreamingSpad().configure(replace(STREAM, window=HALF))
+    StreamingSpad().configure(replace(STREAM, frame_rate_hz=Fraction(50_000)))
+
+
+def test_windows_off_the_grid_or_in_a_burst_are_refused_under_the_name_of_the_device() -> None:
+    spad = StreamingSpad()
+    with pytest.raises(LimitExceeded, match="cam: a window of 64 pixels from pixel 128 on reaches beyond"):
+        spad.configure(replace(STREAM, window=WindowTable(64, (np.array([128], np.int32),))))
+    with pytest.raises(LimitExceeded, match="cam: windows in mode 'burst'"):
+        spad.configure(replace(STREAM, mode="burst", window=HALF))
+    assert spad.state is DeviceState.READY
 
 
 def test_a_run_goes_on_after_an_error_until_it_is_stopped() -> None:

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import DeviceFault, DeviceTimeout, WrongState
+from drivers.errors import DeviceFault, DeviceTimeout, RingOverflow, WrongState
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
-from drivers.ring import BlockRing, RingReader
+from drivers.ring import BlockRing, OnFull, RingReader
 
 STRIDE = 4096
 
@@ -171,6 +171,63 @@ def test_an_overflow_is_remembered() -> None:
     put(ring, 0)
     ring.finish()
     assert ring.overflowed
+
+
+@pytest.mark.parametrize("on_full", [OnFull.DROP, OnFull.FAIL])
+def test_a_ring_that_does_not_wait_answers_at_once(on_full: OnFull) -> None:
+    ring = BlockRing(1, STRIDE, on_full=on_full)
+    reader = ring.reader("count")
+    assert not ring.waits
+    assert not ring.full
+    put(ring, 0)
+    assert ring.full
+    assert ring.claim(1e9) is None
+    assert ring.waited_s == 0
+    assert sequence(reader.next(0)) == 0
+
+
+def test_dropped_blocks_are_counted_and_the_run_goes_on() -> None:
+    ring = BlockRing(1, STRIDE, on_full=OnFull.DROP)
+    ring.mark_overflow(64)
+    ring.mark_overflow(10)
+    assert (ring.dropped_blocks, ring.dropped_frames, ring.overflowed) == (2, 74, True)
+    put(ring, 0)
+
+
+def test_where_no_frame_may_be_lost_the_first_dropped_block_ends_the_run_and_says_what_to_do() -> None:
+    ring = BlockRing(2, 1_000_000, on_full=OnFull.FAIL, holds_s=0.0125)
+    with pytest.raises(RingOverflow) as caught:
+        ring.mark_overflow(64)
+    assert str(caught.value).startswith("ring: all 2 slots (2 MB, 0.0125 s of the stream) are full and a block of 64")
+    assert "'--on-overload drop'" in str(caught.value)
+    assert (ring.dropped_blocks, ring.dropped_frames) == (1, 64)
+
+
+def test_the_time_that_a_source_waits_is_measured_and_its_wait_can_be_ended() -> None:
+    ring = BlockRing(1, STRIDE)
+    ring.reader("count")
+    put(ring, 0)
+    assert ring.claim(0.01) is None
+    assert ring.waited_s >= 0.009
+    later = threading.Timer(0.02, ring.end_waits)
+    later.start()
+    assert ring.claim(100) is None
+    assert ring.claim(100) is None
+    later.join()
+    assert ring.waited_s < 50
+
+
+def test_a_reader_may_give_its_block_back_before_it_asks_for_the_next() -> None:
+    ring = BlockRing(1, STRIDE)
+    reader = ring.reader("count")
+    put(ring, 0)
+    reader.next(0)
+    assert ring.full
+    reader.release()
+    reader.release()
+    assert not ring.full
+    put(ring, 1)
+    assert sequence(reader.next(0)) == 1
 
 
 def test_verbs_out_of_order_are_refused() -> None:

@@ -1,6 +1,7 @@
 """SPB1 against bytes made by hand from the wire layout: reading, writing, refusing."""
 
 import zlib
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import CorruptBlock, UnsupportedBlock
 from drivers.frames import BlockFlag, BlockHeader, Mark
-from drivers.spb1 import BlockLayout, block_views, frames_per_block, parse_block, seal_block
+from drivers.spb1 import BlockLayout, block_parts, block_views, frames_per_block, parse_block, seal_block
 from tests.unit.drivers.spb1_bytes import PAYLOAD, PIXELS, RECORDS, golden_block, header_bytes, trailer_bytes
 
 GOLDEN_HEADER = BlockHeader(
@@ -67,6 +68,24 @@ def test_a_sealed_block_has_the_very_bytes_made_by_hand() -> None:
     assert memory.tobytes() == golden_block()
     assert np.shares_memory(block.bits, memory)
     assert block.header is GOLDEN_HEADER
+
+
+def test_a_block_in_parts_has_the_very_bytes_made_by_hand_and_copies_no_pixels() -> None:
+    memory = array(golden_block()).copy()
+    block = parse_block(memory, check_payload=False)
+    parts = block_parts(block)
+    assert b"".join(parts) == golden_block()
+    assert np.shares_memory(np.frombuffer(parts[3], np.uint8), memory)
+
+
+def test_a_block_in_parts_that_lies_anywhere_and_holds_nothing_is_written_too() -> None:
+    block = parse_block(array(golden_block()), check_payload=True)
+    elsewhere = replace(block, records=block.records[::2].copy(), bits=block.bits[::2])
+    again = parse_block(array(b"".join(block_parts(elsewhere))), check_payload=True)
+    np.testing.assert_array_equal(again.bits, block.bits[::2])
+    np.testing.assert_array_equal(again.records, block.records[::2])
+    empty = replace(block, records=block.records[:0], bits=block.bits[:0])
+    assert parse_block(array(b"".join(block_parts(empty))), check_payload=True).n_frames == 0
 
 
 def test_without_payload_crc_the_trailer_says_not_computed() -> None:

@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from drivers.units import (
     DIMENSIONS,
+    BytesPerSecond,
     CountsPerSecond,
     ExactHertz,
     Hertz,
@@ -45,6 +46,7 @@ class Everything(BaseModel):
     rain: MetresPerHour = 0.02
     dark: CountsPerSecond = 20.0
     drops: PerSecond = 5.0
+    link: BytesPerSecond = 4e8
 
 
 @pytest.mark.parametrize(
@@ -64,6 +66,8 @@ class Everything(BaseModel):
         ("20 ppm", "ratio", 2e-5),
         ("20 mm/h", "rain rate", 0.02),
         (".5 W", "power", 0.5),
+        ("400 MB/s", "data rate", 4e8),
+        ("3.28GB/s", "data rate", 3.28e9),
     ],
 )
 def test_a_quantity_is_read_in_si_correctly_rounded(text: str, dimension: str, value: float) -> None:

@@ -1,8 +1,6 @@
 import dataclasses
 import itertools
-import threading
 import time
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -10,136 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.model import Lag
-from drivers.clock import VirtualClock
 from drivers.errors import DeviceDisconnected, DeviceFault, DeviceTimeout, ProtocolError
-from drivers.interfaces import BurstMode, LaserLimits, LaserStatus, SpadTiming
-from rig.acquisition import Acquisition
+from drivers.interfaces import BurstMode
 from rig.counting import SweepCounter
 from rig.errors import DevicesError
-from rig.session import OpenRig
 from rig.sweeps import SweepAssembler
+from tests.unit.rig.fakes import START, STOP, acquisition, fake_rig
 from tests.unit.rig.streams import HEIGHT, SPAD, WIDTH, plan_of, scan, stream_of
 
 LAG = Lag(1e-4, 2e-4)
 
 
-class Recorder:
-    """A device that notes the verbs it is told, in one list shared by all, and fails where it is asked to."""
-
-    def __init__(self, name, log, failing=()):
-        self.name, self.log, self.failing = name, log, dict(failing)
-
-    def told(self, verb):
-        self.log.append(f"{self.name}.{verb}")
-        if verb in self.failing:
-            raise self.failing[verb]
-
-
-class FakeScanner(Recorder):
-    def load(self, waveform, repeats):
-        self.told("load")
-        self.repeats = repeats
-        return waveform.point_rate_hz
-
-    def start(self):
-        self.told("start")
-
-    def park(self):
-        self.told("park")
-
-
-class FakeLaser(Recorder):
-    limits = LaserLimits(0.0, 0.05)
-
-    def arm(self, power_w):
-        self.told("arm")
-        self.power_w = power_w
-        self.cold = 3
-
-    @property
-    def status(self):
-        self.cold -= 1
-        return LaserStatus(self.cold <= 0, True, True, None, None, self.cold > 0, "digital")
-
-    def pause(self):
-        self.told("pause")
-
-
-class FakeSync(Recorder):
-    def program(self, pulses, repeats):
-        self.told("program")
-
-    def run(self):
-        self.told("run")
-
-    def gate_low(self):
-        self.told("gate_low")
-
-    def abort(self):
-        self.told("abort")
-
-
-class FakeSpad(Recorder):
-    """Plays streams, one per start; `behaviour` is called before every block."""
-
-    def __init__(self, log, streams, failing=(), size=64, lost=(), behaviour=lambda seq: None):
-        super().__init__("spad", log, failing)
-        self.info = SPAD
-        self.streams = iter(streams)
-        self.size, self.lost, self.behaviour = size, lost, behaviour
-        self.stopped = threading.Event()
-        self.counters = None
-
-    def start(self, n_frames):
-        self.told("start")
-        self.n_frames = n_frames
-        self.stopped.clear()
-        self.blocks = iter(next(self.streams).blocks(itertools.repeat(self.size), self.lost))
-
-    def fill(self, ring, timeout_s):
-        if self.stopped.is_set():
-            return False
-        block = next(self.blocks, None)
-        if block is None:
-            return False
-        self.behaviour(block.header.block_seq)
-        while ring.claim(0.01) is None:
-            if self.stopped.is_set():
-                return False
-        ring.publish(block)
-        return True
-
-    def stop(self):
-        self.told("stop")
-        self.stopped.set()
-
-
-def fake_rig(plan, streams, failing=None, power=None, **spad):
-    failing = failing or {}
-    log: list[str] = []
-    config = dataclasses.make_dataclass("Config", ["scan"])(scan(power=power))
-    rig = OpenRig(
-        config=config,
-        clock=VirtualClock(),
-        world=None,
-        spad=FakeSpad(log, streams, failing.get("spad", {}), **spad),
-        scanner=FakeScanner("scanner", log, failing.get("scanner", {})),
-        laser=FakeLaser("laser", log, failing.get("laser", {})),
-        sync=FakeSync("sync", log, failing.get("sync", {})),
-        model=None,
-    )
-    return rig, log
-
-
-def acquisition(rig, plan, maps, **options):
-    period = int(100_000_000 / plan.frame_rate_hz)
-    timing = SpadTiming(Fraction(100_000_000), period, period, 4096)
-    return Acquisition(rig, plan, timing, maps, threads=1, silence_s=0.2, **options)
-
-
 PLAN = plan_of(scan(), LAG)
-STOP = ["sync.abort", "laser.pause", "scanner.park", "spad.stop"]
-START = ["scanner.load", "sync.program", "sync.gate_low", "laser.arm", "spad.start", "sync.run", "scanner.start"]
 
 
 def test_the_laser_is_warm_before_the_spad_starts():
@@ -152,8 +32,8 @@ def test_the_laser_is_warm_before_the_spad_starts():
 
 def test_devices_start_in_order_and_are_made_safe_gate_first():
     rig, log = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)])
-    sweeps = list(acquisition(rig, PLAN, 2).run())
-    assert [sweep.index for sweep in sweeps] == [0, 1]
+    maps = list(acquisition(rig, PLAN, 2).run())
+    assert [found.sweep.index for found in maps] == [0, 1]
     assert log == START + STOP
     assert rig.laser.power_w == 0.05  # the limit, since the config names none
     assert rig.clock.now_ns() > 0  # it waited until the laser was warm
@@ -186,13 +66,13 @@ def test_an_exception_in_the_caller_makes_the_rig_safe(error):
     assert log == START + STOP
 
 
-def test_an_interrupt_while_blocks_are_awaited_makes_the_rig_safe():
+def test_an_interrupt_while_maps_are_awaited_makes_the_rig_safe():
     def told(progress):
         raise KeyboardInterrupt
 
     rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
     with pytest.raises(KeyboardInterrupt):
-        list(acquisition(rig, PLAN, 5, on_block=told).run())
+        list(acquisition(rig, PLAN, 5, on_progress=told).run())
     assert log == START + STOP
 
 
@@ -261,30 +141,21 @@ def test_a_spad_that_takes_its_time_for_the_first_block_is_not_silent():
     assert len(list(acquisition(rig, PLAN, 1).run())) == 1
 
 
-def test_a_caller_slower_than_the_time_out_loses_nothing():
-    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 3, lag=LAG)], size=8)
-    sweeps = []
-    acquired = acquisition(rig, PLAN, 3)
-    for sweep in acquired.run():
-        time.sleep(0.5)
-        sweeps.append(sweep)
-    assert sum(sweep.frames.lost for sweep in sweeps) == 0
-    assert acquired.high_water >= 7
-
-
 def test_a_stream_that_ends_without_the_closing_marker_is_an_error():
     rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)])
     with pytest.raises(DeviceFault, match="ended after 2 of 4 sweeps"):
         list(acquisition(rig, PLAN, 4).run())
 
 
-def test_progress_is_told_block_by_block():
+def test_progress_is_told_on_the_way_and_at_the_end():
     told = []
     rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], size=16)
-    list(acquisition(rig, PLAN, 2, on_block=told.append).run())
+    list(acquisition(rig, PLAN, 2, on_progress=told.append).run())
     assert [p.frames for p in told] == sorted(p.frames for p in told)
     assert told[-1].sweeps == told[-1].maps == 2
+    assert told[-1].lost == 0
     assert told[-1].frames == pytest.approx(told[-1].frames_planned, abs=40)
+    assert told[-1].stages.counting_s > 0
 
 
 def test_bursts_are_taken_in_groups_and_numbered_through():
@@ -294,8 +165,8 @@ def test_bursts_are_taken_in_groups_and_numbered_through():
     assert per_start == 1
     streams = [stream_of(plan, 1, lag=LAG, latency_s=t) for t in (1e-4, 3e-4, 7e-4)]
     rig, log = fake_rig(plan, streams)
-    sweeps = list(acquisition(rig, plan, 3).run())
-    assert [sweep.index for sweep in sweeps] == [0, 1, 2]
+    maps = list(acquisition(rig, plan, 3).run())
+    assert [found.sweep.index for found in maps] == [0, 1, 2]
     assert log == 3 * (START + STOP)
     assert rig.spad.n_frames <= 900
 

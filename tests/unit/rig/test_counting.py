@@ -161,6 +161,39 @@ def test_a_volume_outlives_the_next_sweep():
             np.testing.assert_array_equal(got, wanted)
 
 
+@pytest.mark.parametrize("blocks", [(10**9,), (1,), (7, 30)])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_frames_cut_to_their_used_pixels_are_counted_as_whole_ones(blocks, threads):
+    frames, bins, column = stream(11, 300, 5, 300, 6)
+    rng, used, window = np.random.default_rng(2), 192, 128
+    bins = np.repeat(bins[::5], 5)  # runs of one column, so that its frames share a run
+    x0 = np.array([0, 64, 64, 128, 128, 192], np.int32)
+    used_x0 = rng.integers(0, 3, 300).astype(np.int32) * 64  # rows of 300 pixels have 5 words, windows 3
+    outside = (bins >= 0) & ~((used_x0 <= x0[bins]) & (x0[bins] + window <= used_x0 + used))
+    bins[outside] = BIN_UNUSABLE
+    assert len(np.unique(bins)) == 8
+    whole = packed(frames)
+    cut = np.stack([frame[:, at // 8 : (at + used) // 8] for frame, at in zip(whole, used_x0, strict=True)])
+    volumes = []
+    for bits in (whole, cut):
+        counter = SweepCounter(6, 5, 300, x0, window, threads, used)
+        first, sizes = 0, list(blocks)
+        while first < len(bits):
+            part = slice(first, first + (sizes.pop(0) if len(sizes) > 1 else sizes[0]))
+            counter.add(np.ascontiguousarray(bits[part]), bins[part], column[part], used_x0[part])
+            first = part.stop
+        counter.close()
+        volumes.append(counter.finish())
+    for name in CountVolume.__slots__:
+        np.testing.assert_array_equal(getattr(volumes[0], name), getattr(volumes[1], name))
+    np.testing.assert_array_equal(volumes[0].counts, expected_counts(frames, bins, x0, window))
+    seen = (used_x0[:, None] <= np.arange(300)) & (np.arange(300) < used_x0[:, None] + used)
+    dark = bins == BIN_DARK
+    np.testing.assert_array_equal(volumes[0].dark_frames, seen[dark].sum(axis=0))
+    np.testing.assert_array_equal(volumes[0].dark_counts, (frames & seen[:, None, :])[dark].sum(axis=0))
+    assert volumes[0].n_dark == dark.sum()
+
+
 @pytest.mark.parametrize(("window", "x0"), [(100, 0), (64, 32), (64, 1)])
 def test_windows_off_the_word_grid_are_refused(window, x0):
     with pytest.raises(ValueError, match="multiples of 64"):

@@ -11,7 +11,7 @@ import pytest
 from drivers.interfaces import SweepTruth
 from rig.errors import UsageError
 from rig.outputs import RunFolder, json_text
-from rig.pictures import SCALE_PX
+from rig.pictures import SCALE_PX, depth_picture
 from rig.reconstruction import FogEstimate, MapResult
 from rig.stripes import StripeTable
 
@@ -69,6 +69,12 @@ def test_a_map_is_written_in_formats_others_read(tmp_path: Path) -> None:
     assert np.allclose(points["y"], v[known] * depth[known], atol=1e-6)
     assert np.array_equal(points["intensity"], result.intensity[known])
     assert {file.name for file in tmp_path.iterdir()} == {"run"}
+
+
+def test_a_map_without_any_depth_after_others_is_black() -> None:
+    picture = depth_picture(np.full((40, 30), np.nan, np.float32), (1.0, 8.0))
+    assert not picture[:, :30].any()
+    assert picture[:, 30:].any()
 
 
 def test_the_depth_picture_is_black_where_there_is_no_depth_and_red_where_it_is_near(tmp_path: Path) -> None:

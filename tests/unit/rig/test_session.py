@@ -13,6 +13,7 @@ from rig.acquisition import Acquisition
 from rig.config_files import load_config
 from rig.errors import DevicesError, UsageError
 from rig.session import HOLD_EXPOSURES, open_rig, prepare
+from tests.unit.rig.fakes import FakeMaker
 
 SMALL = {"scan.columns": 8, "scan.exposures": 2, "scan.command_range": [-0.1, 0.1]}
 
@@ -106,16 +107,17 @@ def test_the_simulated_rig_scans_both_ways_and_the_same_frames_with_the_same_see
         with open_rig(config, seed=seed) as rig:
             assert isinstance(rig.clock, VirtualClock)
             plan, timing = prepare(rig)
-            runs.append(list(Acquisition(rig, plan, timing, 2).run()))
+            maker = FakeMaker()
+            runs.append((maker.volumes, [found.sweep for found in Acquisition(rig, plan, timing, 2, maker).run()]))
             assert not rig.laser.status.emission
             assert rig.sync.status.outputs == 0
             assert not rig.scanner.status.moving
-    for sweeps in runs:
+    for volumes, sweeps in runs:
         assert [sweep.direction for sweep in sweeps] == [1, -1]
         assert all(sweep.synchronised for sweep in sweeps)
         assert all(sweep.frames.lost == 0 for sweep in sweeps)
-        assert all(np.abs(sweep.volume.n_frames - 2).max() <= 1 for sweep in sweeps)
-    first, same, other = (np.concatenate([sweep.volume.counts for sweep in sweeps]) for sweeps in runs)
+        assert all(np.abs(volume.n_frames - 2).max() <= 1 for volume in volumes)
+    first, same, other = (np.concatenate([volume.counts for volume in volumes]) for volumes, _ in runs)
     np.testing.assert_array_equal(first, same)
     assert (first != other).any()
 
@@ -124,7 +126,8 @@ def test_lost_frames_of_the_simulated_spad_are_gaps():
     config = load_config("simulated", {**SMALL, "spad.lost_frames": [150, 151, 160]})
     with open_rig(config) as rig:
         plan, timing = prepare(rig)
-        (sweep,) = Acquisition(rig, plan, timing, 1).run()
+        (found,) = Acquisition(rig, plan, timing, 1, FakeMaker()).run()
+    sweep = found.sweep
     assert sweep.gaps == ((150, 151), (160, 160))
     assert sweep.frames.lost == 3
     assert sweep.frames.received + 3 == sweep.frames.expected == sweep.end_frame - sweep.first_frame

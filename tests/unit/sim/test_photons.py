@@ -20,7 +20,7 @@ def _planes(flux: NDArray[np.float64]) -> NDArray[np.uint64]:
 def _draw(flux: NDArray[np.float64], frames: int, seed: int = 3, first: int = 0) -> NDArray[np.uint8]:
     planes = _planes(flux)
     words = np.empty((frames, *planes.shape[:2]), np.uint64)
-    draw_frames(planes, np.uint64(seed), first, 0, len(flux), words)
+    draw_frames(planes, np.uint64(seed), first, 0, len(flux), np.zeros(frames, np.int32), words)
     return np.unpackbits(words.view(np.uint8).reshape(frames, len(flux), -1), axis=-1)
 
 
@@ -80,11 +80,27 @@ def test_bits_do_not_depend_on_block_size_or_threads(threads: int, block: int) -
         bits = np.full((40, 21, 16), 255, np.uint8)
         for first in range(0, 40, block):
             part = slice(first, first + block)
-            source.expose(100 + first, held[part], power[part], bits[part])
+            source.expose(100 + first, held[part], power[part], np.zeros(len(bits[part]), np.int32), bits[part])
         source.close()
         return bits
 
     assert np.array_equal(frames(block, threads), frames(40, 1))
+
+
+def test_a_window_has_the_very_bits_of_the_whole_frame() -> None:
+    model = rig(size=(9, 200))
+    flux = FluxModel(setting(model, wall(model, (0.1, 0, 1), 2.0), medium={"extinction": "0.1 /m"}))
+    held, power = np.repeat([np.nan, 0.1, 0.2], 4), np.full(12, 0.5)
+    x0 = np.array([0, 64, 128, 0] * 3, np.int32)
+    source = PhotonSource(flux, model.planes, 1e-5, 9, 2)
+    whole, window = np.empty((12, 9, 32), np.uint8), np.empty((12, 9, 16), np.uint8)
+    source.expose(7, held, power, np.zeros(12, np.int32), whole)
+    source.expose(7, held, power, x0, window)
+    source.close()
+    assert whole.any()
+    for frame in range(12):
+        at = x0[frame] // 8
+        assert np.array_equal(window[frame], whole[frame, :, at : at + 16])
 
 
 def test_frames_get_lost_with_the_given_chance_whatever_the_block() -> None:

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.files import save_rig_model
-from drivers.clock import VirtualClock
+from drivers.clock import SystemClock, VirtualClock
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.frames import BlockFlag, FrameBlock, Mark
 from drivers.interfaces import (
@@ -25,9 +25,11 @@ from drivers.interfaces import (
     SpadArray,
     SpadRequest,
     SyncSource,
+    WindowTable,
 )
 from drivers.registry import Surroundings
-from drivers.ring import BlockRing
+from drivers.ring import BlockRing, OnFull
+from drivers.spb1 import walk_blocks
 from sim_backend.devices import laser, scanner, spad, sync
 from sim_backend.world import KIND as WORLD
 from sim_backend.world import SimulatedWorld, WorldConfig
@@ -48,9 +50,16 @@ class Rig:
     laser: LineLaser
     sync: SyncSource
 
-    def start(self, *, frames: int | None = 1000, block_frames: int = 31, power_w: float = 0.1) -> BlockRing:
+    def start(
+        self,
+        *,
+        frames: int | None = 1000,
+        block_frames: int = 31,
+        power_w: float = 0.1,
+        window: WindowTable | None = None,
+    ) -> BlockRing:
         """Everything started in the order of a scan: two sweeps of 4 ms, gate high from 0.5 to 3.5 ms of each."""
-        timing = self.spad.configure(SpadRequest(Fraction(100_000), 1e-5, "stream", block_frames))
+        timing = self.spad.configure(SpadRequest(Fraction(100_000), 1e-5, "stream", block_frames, window))
         command = -0.4 * np.cos(2 * np.pi * np.arange(POINTS) / POINTS)
         markers = np.zeros(POINTS, np.uint8)
         markers[0] |= MARKER_SCAN
@@ -186,6 +195,53 @@ def test_the_same_seed_gives_the_same_bits_for_any_block_size(tmp_path: Path) ->
     assert not np.array_equal(_record(other, other.start()).bits, runs[0].bits)
 
 
+def test_windows_move_with_the_markers_and_hold_the_bits_of_the_full_frames(tmp_path: Path) -> None:
+    entries = np.arange(31) // 7 % 2 * 64
+    window = WindowTable(64, (entries.astype(np.int32), 64 - entries.astype(np.int32)))
+    full, *runs = [
+        _record(opened, opened.start(block_frames=block_frames, window=table))
+        for block_frames, table in ((31, None), (31, window), (7, window), (600, window))
+        for opened in [_open(tmp_path, lost_frames=[200, 201, 430])]
+    ]
+    for run in runs:
+        assert np.array_equal(run.records["marks"], full.records["marks"])
+        assert {header.width for header in run.headers} == {64}
+        for i in range(1, len(run.frames)):
+            if run.frames[i] - 1 != run.frames[i - 1]:
+                continue  # the markers before it were lost with the frames
+            before = full.records[i - 1]
+            table = window.x0[max(int(before["sweep"]) - 1, 0) % 2]
+            expected = table[min(int(before["line"]), 30)] if before["sweep"] else window.x0[0][0]
+            assert run.records["x0"][i] == expected
+        at = run.records["x0"] // 8
+        for i in range(len(run.frames)):
+            assert np.array_equal(run.bits[i], full.bits[i, :, at[i] : at[i] + 8])
+        assert set(run.records["x0"].tolist()) == {0, 64}
+
+
+def test_a_block_of_windows_is_an_spb1_block(small: Rig) -> None:
+    window = WindowTable(64, (np.array([64], np.int32),))
+    ring = small.start(block_frames=10, window=window)
+    reader = ring.reader("test")
+    small.spad.fill(ring, 1.0)
+    block = reader.next(0.1)
+    assert block is not None
+    slot = next(memory for memory in ring._memory if np.shares_memory(memory, block.bits))
+    (read,) = walk_blocks(slot, ring.stride, check_payload=True)
+    assert isinstance(read, FrameBlock)
+    assert (read.header.width, read.header.sensor_width) == (64, 70)
+    assert np.array_equal(read.records, block.records)
+    assert np.array_equal(read.bits, block.bits)
+
+
+def test_only_virtual_time_can_wait(small: Rig) -> None:
+    assert small.spad.info.can_wait
+    small.world.bench.clock = SystemClock()
+    seeing = spad.SimulatedSpad(spad.SimulatedSpadConfig(), small.world, 0)
+    assert not seeing.info.can_wait
+    seeing.close()
+
+
 def test_pad_bits_are_zero(small: Rig) -> None:
     run = _record(small, small.start())
     assert not np.unpackbits(run.bits, axis=-1)[:, :, 70:].any()
@@ -268,3 +324,21 @@ def test_the_frames_of_a_column_share_the_flux_of_its_centre(small: Rig) -> None
 def test_a_spad_without_a_world_is_refused() -> None:
     with pytest.raises(DeviceError, match="no simulated world"):
         spad.KIND.create(spad.SimulatedSpadConfig(), Surroundings(VirtualClock(), None, 0))
+
+
+def test_where_the_ring_lets_it_not_wait_it_drops_whole_blocks_and_counts_them(small: Rig) -> None:
+    stride = small.start(frames=155).stride
+    ring = BlockRing(2, stride, on_full=OnFull.DROP)
+    reader = ring.reader("test")
+    for _ in range(4):
+        assert small.spad.fill(ring, 1.0)
+    assert (ring.dropped_blocks, ring.dropped_frames) == (2, 62)
+    assert reader.next(0) is not None
+    assert reader.next(0) is not None
+    assert not small.spad.fill(ring, 1.0)
+    last = reader.next(0)
+    assert last is not None
+    assert (last.header.first_frame, last.header.block_seq, last.header.lost_before) == (124, 2, 62)
+    assert last.header.flags == BlockFlag.LAST | BlockFlag.LOST_BEFORE
+    counters = small.spad.counters
+    assert (counters.exposed, counters.delivered, counters.lost) == (155, 93, 62)

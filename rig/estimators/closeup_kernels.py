@@ -1,0 +1,120 @@
+"""Compiled close look at the best position of a row: where within the pixel the line lies, and how bright it is.
+
+The counts of the few pixels around the position are compared with lines a quarter pixel apart, all at once: one label
+to a lane. What a count says of each label is tabled over the two fluxes that matter, haze and line, half an octave
+apart; the line's brightness is taken from the counts themselves.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, LABEL_PX, LABELS, cell_of
+from rig.estimators.screen_tables import LANES, STEPS
+from rig.estimators.search_kernels import PAD, Search
+from rig.lanes import highest, larger_float, load_float32, total, truncated, two_to
+
+LEVEL_SHIFT: Final = np.uint32(22)
+"""Two levels an octave: the exponent and the first bit behind it of a float32."""
+LOWEST_OCTAVE: Final = -14
+LEVEL_BASE: Final = np.uint32((127 + LOWEST_OCTAVE) << 1)
+LEVELS: Final = 36
+"""2^-14 to 2^4 photons per exposure."""
+IMPOSSIBLE: Final = np.float32(-1e30)
+PER_NAT: Final = np.float32(1.4426950408889634)
+
+
+class Closeup(NamedTuple):
+    """Tables of the close look.
+
+    weight: float32 (LEVELS, LEVELS, F + 1, LANES) over haze, line, pixel from -R to R, label: octaves per count; the
+    last of the F + 1 is per exposure. index, square: float32 (LANES,), label number from the middle one, and squared.
+    """
+
+    weight: NDArray[np.float32]
+    index: NDArray[np.float32]
+    square: NDArray[np.float32]
+
+
+@numba.njit(cache=True, nogil=True)
+def closeup_tables(
+    ambient: float, share: float, near_is_left: bool, fine: NDArray[np.float32], table: NDArray[np.float32]
+) -> Closeup:
+    """Tables for ambient light of so many photons per exposure and a pedestal of so large a share of the haze.
+
+    fine: (LABELS, F) as `row_model.fine_profiles`; table: `logit_table`.
+    """
+    pixels = fine.shape[1]
+    reach = (pixels - 1) // 2
+    weight = np.zeros((LEVELS, LEVELS, pixels + 1, LANES), np.float32)
+    gain, loss = table[0], table[1]
+    for a in range(LEVELS):
+        before = np.float32(level_flux(a))
+        behind = np.float32(min(ambient + share * max(before - ambient, 0.0), before))
+        left, right = (before, behind) if near_is_left else (behind, before)
+        for b in range(LEVELS):
+            light = np.float32(level_flux(b))
+            out = weight[a, b]
+            out[pixels, LABELS:] = IMPOSSIBLE
+            for i in range(LABELS):
+                offset = (i - LABELS // 2) * LABEL_PX
+                for t in range(pixels):
+                    of_left = np.float32(min(max(offset - (t - reach) + 0.5, 0.0), 1.0))
+                    flux = of_left * left + (np.float32(1.0) - of_left) * right + light * fine[i, t]
+                    cell = cell_of(min(max(flux, FLUX_MIN), FLUX_MAX))
+                    own = cell_of(min(max(right, FLUX_MIN), FLUX_MAX))
+                    out[t, i] = (gain[cell] - gain[own]) * PER_NAT
+                    out[pixels, i] += (loss[cell] - loss[own]) * PER_NAT
+    index, square = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
+    for i in range(LABELS):
+        index[i] = i - LABELS // 2
+        square[i] = (i - LABELS // 2) ** 2
+    return Closeup(weight, index, square)
+
+
+@numba.njit(inline="always")
+def level_of(flux):  # type: ignore[no-untyped-def]
+    """Level that a flux in photons per exposure lies in."""
+    octave = np.int64(np.float32(flux).view(np.uint32) >> LEVEL_SHIFT) - np.int64(LEVEL_BASE)
+    return min(max(octave, 0), LEVELS - 1)
+
+
+@numba.njit(inline="always")
+def level_flux(level):  # type: ignore[no-untyped-def]
+    """Flux in the middle of a level: 1.25 or 1.75 times a power of two."""
+    return (1.25 + 0.5 * (level & 1)) * 2.0 ** (LOWEST_OCTAVE + (level >> 1))
+
+
+@numba.njit(inline="always")
+def _power(a):  # type: ignore[no-untyped-def]
+    """2^a for a from -120 to 0: a cubic within each octave, exact to 1e-4."""
+    whole = truncated(a)
+    f = a - whole
+    return two_to(whole) * (((f * np.float32(0.0433) + np.float32(0.2348)) * f + np.float32(0.6913)) * f + np.float32(0.99993))
+
+
+@numba.njit(cache=True, nogil=True)
+def place_line(
+    search: Search, x: int, exposures: float, haze_level: int, line_level: int, closeup: Closeup
+) -> tuple[float, float]:
+    """Offset of the line from the middle of stored pixel x in px, to the right, and its standard deviation."""
+    lanes = search.start.shape[0]
+    stride = lanes + 2 * PAD
+    weight = closeup.weight[haze_level, line_level]
+    pixels = weight.shape[0] - 1
+    flat = weight.ravel()
+    score = load_float32(flat, pixels * LANES) * np.float32(exposures)
+    first = x - (pixels - 1) // 2
+    for t in range(pixels):
+        at = first + t
+        count = np.float32(search.n[(at % STEPS) * stride + PAD + at // STEPS])
+        score = score + load_float32(flat, t * LANES) * count
+    score = larger_float(score - highest(score), np.float32(-100.0))
+    likelihood = _power(score)
+    mass = total(likelihood)
+    mean = total(likelihood * load_float32(closeup.index, 0)) / mass
+    square = total(likelihood * load_float32(closeup.square, 0)) / mass
+    variance = max(square - mean * mean, np.float32(0.0))
+    return LABEL_PX * mean, LABEL_PX * np.sqrt(variance + np.float32(1.0 / 12.0))

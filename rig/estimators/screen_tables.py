@@ -1,0 +1,179 @@
+"""Tables of the search along a row: what a count at each pixel says of every stripe position, per column and band.
+
+Haze and pedestal vary slowly from row to row, so the rows of a band share one table per column. Weights are whole
+numbers of 1 / `units` octaves of likelihood (16 bits: sixteen fit one vector register); what does not depend on the
+counts is kept per exposure, since the number of frames differs from column to column.
+
+Left and right: the flux of a pixel left and right of the stripe. Where near is left, left is haze and ambient light,
+right is the pedestal; with the scanner on the other side it is the other way round. Scores are relative to 'everything
+is as right of the stripe', in units; a pixel left of position x adds its edge weight, the pixels around x their taps.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimators.row_input import Row, State, Sweep, row_buffers, row_fluxes
+from rig.estimators.row_kernels import FLUX_MAX, none_prior
+from rig.estimators.row_kernels import cell_of as cell_of
+
+LANES: Final = 16
+STEPS: Final = 8
+"""Pixels per lane: lane i of step s holds pixel 8 i + s, as the bits of packed bytes lie."""
+SCREENS: Final = 2
+"""Stripe amplitudes of the search; all of them take part in what follows it."""
+OUTSIDE: Final = np.float32(-1e6)
+"""Log prior of a position where the column's stripe cannot lie."""
+"""Score 'everything is as right of the stripe' starts from: most of the range lies above it."""
+LN2: Final = 0.6931471805599453
+WEIGHT_LIMIT: Final = 30000.0
+"""Largest sum of products of counts and weights, with room to 32767."""
+
+
+class Tables(NamedTuple):
+    """See the module. P: stored pixels per row, padded to whole vectors; in lane order (step, lane) unless said.
+
+    edge: int16 (columns, bands, P), weight of a count left of the stripe.
+    tap: int16 (columns, bands, SCREENS, 2T + 1, P), weight at position x of a count at x - T .. x + T.
+    position: float32 (columns, bands, SCREENS, P), units per exposure of position x.
+    prior: float32 (columns, bands, SCREENS, P), units of position x and amplitude, whatever the exposures.
+    lane: float32 (columns, bands, lanes), units per exposure of all pixels of a lane lying left of the stripe.
+    none: float32 (columns, bands, 3), units of 'no stripe': all as right, all as left, a change somewhere (per lane).
+    neutral: float32 (columns, bands, P), ones per exposure that say nothing, in pixel order.
+    before, scale: float32 (columns, bands, P) as in `Row`, in pixel order.
+    first, last: int32 (columns, bands), first and last position in stored pixels.
+    """
+
+    edge: NDArray[np.int16]
+    tap: NDArray[np.int16]
+    position: NDArray[np.float32]
+    prior: NDArray[np.float32]
+    lane: NDArray[np.float32]
+    none: NDArray[np.float32]
+    neutral: NDArray[np.float32]
+    before: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    first: NDArray[np.int32]
+    last: NDArray[np.int32]
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_tables(
+    sweep: Sweep,
+    state: State,
+    light: NDArray[np.float32],
+    log_share: NDArray[np.float32],
+    units: float,
+    first_band: int,
+    last_band: int,
+    out: Tables,
+) -> None:
+    """Tables of bands first_band..last_band-1.
+
+    sweep, state: as of a sweep whose rows are the bands (see `banded`), its counts unused. light, log_share:
+    (SCREENS,), amplitudes of the search and the logarithm of their probability. units: per octave.
+    """
+    columns = sweep.plane.shape[0]
+    pixels = out.edge.shape[2]
+    lanes = pixels // STEPS
+    reach = (out.tap.shape[3] - 1) // 2
+    per_nat = np.float32(units / LN2)
+    row = row_buffers(pixels + 2, 1)
+    left, right = np.empty((2, pixels), np.float32), np.empty((2, pixels), np.float32)
+    flux_left, flux_right = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+    gain, loss = state.table[0], state.table[1]
+    for b in range(first_band, last_band):
+        for c in range(columns):
+            edge, tap, position, prior = out.edge[c, b], out.tap[c, b], out.position[c, b], out.prior[c, b]
+            edge[:] = 0
+            tap[:] = 0
+            position[:] = 0.0
+            prior[:] = OUTSIDE
+            out.lane[c, b] = 0.0
+            out.neutral[c, b] = 0.0
+            out.none[c, b] = OUTSIDE
+            out.first[c, b], out.last[c, b] = 0, -1
+            length, begin, end, start = row_fluxes(sweep, state, row, b, c)
+            if length == 0:
+                continue
+            step = 1 if sweep.near_is_left else -1
+            low = (start if sweep.near_is_left else start - length + 1) - sweep.x0[c]
+            for i in range(length):
+                t = i if sweep.near_is_left else length - 1 - i
+                x = low + i
+                near, far = row.before[t], row.behind[t]
+                flux_left[x], flux_right[x] = (near, far) if sweep.near_is_left else (far, near)
+                out.before[c, b, x], out.scale[c, b, x] = near, row.scale[t]
+                at = cell_of(flux_left[x])
+                left[0, x], left[1, x] = gain[at], loss[at]
+                at = cell_of(flux_right[x])
+                right[0, x], right[1, x] = gain[at], loss[at]
+                weight = left[0, x] - right[0, x]
+                constant = left[1, x] - right[1, x]
+                edge[_place(x, lanes)] = np.int16(round(weight * per_nat))
+                if abs(weight) > 1e-3:
+                    out.neutral[c, b, x] = min(max(-constant / weight, np.float32(0.0)), np.float32(1.0))
+            _positions(
+                sweep, state, light, log_share, per_nat, b, c, low, length, reach, row, begin, end, step, start, left,
+                right, flux_left, flux_right, out,
+            )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _positions(
+    sweep, state, light, log_share, per_nat, b, c, low, length, reach, row, begin, end, step, start, left, right,
+    flux_left, flux_right, out,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Taps, constants and priors of every position of one table."""
+    gain, loss = state.table[0], state.table[1]
+    lanes = out.lane.shape[2]
+    tap, position, prior = out.tap[c, b], out.position[c, b], out.prior[c, b]
+    first = (start + step * (begin if step > 0 else end)) - sweep.x0[c]
+    last = (start + step * (end if step > 0 else begin)) - sweep.x0[c]
+    out.first[c, b], out.last[c, b] = first, last
+    within = np.float32(0.0)
+    for x in range(low, low + length):
+        if x % STEPS == 0:
+            within = np.float32(0.0)
+        place = _place(x, lanes)
+        for m in range(light.shape[0]):
+            constant = within
+            for d in range(-reach, reach + 1):
+                at = x + d
+                if at < low or at >= low + length:
+                    continue
+                extra = light[m] * state.psi[abs(d)] * out.scale[c, b, at]
+                if d < 0:
+                    base, own_gain, own_loss = flux_left[at], left[0, at], left[1, at]
+                else:
+                    base, own_gain, own_loss = flux_right[at], right[0, at], right[1, at]
+                if d == 0:
+                    base = np.float32(0.5) * (flux_left[at] + flux_right[at])
+                cell = cell_of(min(base + extra, FLUX_MAX))
+                tap[m, d + reach, place] = np.int16(round((gain[cell] - own_gain) * per_nat))
+                constant += (loss[cell] - own_loss) * per_nat
+            position[m, place] = constant
+            if first <= x <= last:
+                t = x - low if step > 0 else length - 1 - (x - low)
+                prior[m, place] = (row.log_prior[t] + log_share[m]) * per_nat
+        within += (left[1, x] - right[1, x]) * per_nat
+        out.lane[c, b, x // STEPS] += (left[1, x] - right[1, x]) * per_nat
+    mass = 0.0
+    for t in range(begin, end + 1):
+        mass += np.exp(row.log_prior[t])
+    behind, before, change = none_prior(
+        sweep.w_near, sweep.w_far, row.w[begin], row.w[end], state.none_weight
+    )
+    share = np.log((1.0 - behind - before - change) / mass)
+    all_right, all_left = (behind, before) if step > 0 else (before, behind)
+    out.none[c, b, 0] = (np.log(all_right) - share) * per_nat
+    out.none[c, b, 1] = (np.log(all_left) - share) * per_nat
+    out.none[c, b, 2] = (np.log(change * STEPS / (length + 1)) - share) * per_nat
+
+
+@numba.njit(inline="always")
+def _place(x, lanes):  # type: ignore[no-untyped-def]
+    """Index of stored pixel x in lane order."""
+    return (x % STEPS) * lanes + x // STEPS

@@ -1,0 +1,313 @@
+"""Sixteen lanes as one numba value: the vector arithmetic of the hot path, spelled out instead of hoped for.
+
+LLVM's own vectoriser gives up on the search along a row (several short loops over one small buffer), so its kernels say
+what they mean: `Lanes` is an LLVM vector of 16 numbers, legalised to whatever the processor has (AVX2, AVX-512, NEON).
+Everything here is for code compiled with `numba.njit`; lanes live in registers and cannot leave a kernel.
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any, Final
+
+import numba
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.datamodel import models
+from numba.extending import intrinsic, overload, register_model
+
+LANES: Final = 16
+
+_INT32 = ir.IntType(32)
+_Signature = Any
+_Codegen = Callable[[Any, Any, Any, Any], Any]
+
+
+class Lanes(types.Type):  # type: ignore[misc]
+    """Numba type of 16 integers of `bits` bits, or of 16 float32."""
+
+    def __init__(self, bits: int, *, real: bool = False) -> None:
+        self.bits = bits
+        self.real = real
+        super().__init__(name=f"Lanes({'float' if real else 'int'}{bits})")
+
+    @property
+    def llvm(self) -> ir.VectorType:
+        """The LLVM type."""
+        return ir.VectorType(ir.FloatType() if self.real else ir.IntType(self.bits), LANES)
+
+
+@register_model(Lanes)
+class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
+    """Lanes are passed about as the LLVM vector itself."""
+
+    def __init__(self, manager: Any, lanes: Lanes) -> None:
+        super().__init__(manager, lanes, lanes.llvm)
+
+
+INT8 = Lanes(8)
+INT16 = Lanes(16)
+FLOAT32 = Lanes(32, real=True)
+
+
+def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any, lanes: Any) -> Any:
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), lanes.as_pointer())
+
+
+def _loader(lanes: Lanes) -> Any:
+    @intrinsic  # type: ignore[untyped-decorator]
+    def load(typing: Any, array: Any, index: Any) -> tuple[_Signature, _Codegen]:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            array_type = signature.args[0]
+            loaded = builder.load(_pointer(context, builder, array_type, args[0], args[1], lanes.llvm))
+            loaded.align = array_type.dtype.bitwidth // 8
+            return loaded
+
+        return lanes(array, types.intp), code
+
+    return load
+
+
+load_int8 = _loader(INT8)
+"""load_int8(array, index): 16 elements of a uint8 array from `index` on; no bounds are checked."""
+load_int16 = _loader(INT16)
+"""load_int16(array, index): the same of an int16 array."""
+load_float32 = _loader(FLOAT32)
+"""load_float32(array, index): the same of a float32 array."""
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def store(typing: Any, array: Any, index: Any, value: Any) -> tuple[_Signature, _Codegen]:
+    """store(array, index, lanes): write 16 elements from `index` on; no bounds are checked."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pointer = _pointer(context, builder, signature.args[0], args[0], args[1], signature.args[2].llvm)
+        stored = builder.store(args[2], pointer)
+        stored.align = signature.args[0].dtype.bitwidth // 8
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value), code
+
+
+def _splat(context: Any, builder: Any, lanes: Lanes, number_type: Any, number: Any) -> Any:
+    element = types.float32 if lanes.real else types.Integer.from_bitwidth(lanes.bits, signed=True)
+    cast = context.cast(builder, number, number_type, element)
+    nothing = ir.Constant(lanes.llvm, ir.Undefined)
+    first = builder.insert_element(nothing, cast, ir.Constant(_INT32, 0))
+    return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(_INT32, LANES), [0] * LANES))
+
+
+def _llvm_name(vector: ir.VectorType) -> str:
+    return f"v{LANES}" + ("f32" if isinstance(vector.element, ir.FloatType) else f"i{vector.element.width}")
+
+
+def _call(builder: Any, name: str, result: Any, *args: Any) -> Any:
+    function_type = ir.FunctionType(result, [arg.type for arg in args])
+    return builder.call(cgutils.get_or_insert_function(builder.module, function_type, name), args)
+
+
+def _binary(emit: Callable[[Any, Any, Any], Any]) -> Any:
+    """An operation of lanes with lanes or with a number."""
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def operation(typing: Any, a: Any, b: Any) -> tuple[_Signature, _Codegen]:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            left, right = args
+            if not isinstance(signature.args[1], Lanes):
+                right = _splat(context, builder, signature.args[0], signature.args[1], right)
+            return emit(builder, left, right)
+
+        return a(a, b), code
+
+    return operation
+
+
+def _named(name: str) -> Any:
+    return _binary(lambda builder, a, b: _call(builder, f"llvm.{name}.{_llvm_name(a.type)}", a.type, a, b))
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value.type.element, ir.FloatType)
+
+
+# Sums of a fixed number of products may be fused: every machine with the same instructions gives the same bits.
+_add = _binary(lambda b, x, y: b.fadd(x, y, flags=("contract",)) if _is_real(x) else b.add(x, y))
+_sub = _binary(lambda b, x, y: b.fsub(x, y, flags=("contract",)) if _is_real(x) else b.sub(x, y))
+_mul = _binary(lambda b, x, y: b.fmul(x, y, flags=("contract",)) if _is_real(x) else b.mul(x, y))
+
+add_saturated = _named("sadd.sat")
+"""add_saturated(a, b): signed sum that stops at the limits of the type instead of wrapping round."""
+sub_saturated = _named("ssub.sat")
+"""sub_saturated(a, b): signed difference that stops at the limits of the type."""
+larger = _named("smax")
+"""larger(a, b): the larger one of two integers in each lane."""
+smaller = _named("smin")
+"""smaller(a, b): the smaller one of two integers in each lane."""
+larger_float = _named("maxnum")
+"""larger_float(a, b): the larger one of two float32 in each lane."""
+
+for _operator, _operation in (
+    (operator.add, _add),
+    (operator.sub, _sub),
+    (operator.mul, _mul),
+    (operator.and_, _binary(lambda b, x, y: b.and_(x, y))),
+    (operator.or_, _binary(lambda b, x, y: b.or_(x, y))),
+    (operator.rshift, _binary(lambda b, x, y: b.lshr(x, y))),
+    (operator.lshift, _binary(lambda b, x, y: b.shl(x, y))),
+):
+
+    def _overload(operation: Any) -> Any:
+        def of_lanes(a, b):  # type: ignore[no-untyped-def]
+            return (lambda a, b: operation(a, b)) if isinstance(a, Lanes) else None
+
+        return of_lanes
+
+    overload(_operator)(_overload(_operation))
+
+
+def _conversion(to: Lanes, emit: Callable[[Any, Any], Any]) -> Any:
+    @intrinsic  # type: ignore[untyped-decorator]
+    def convert(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return emit(builder, args[0])
+
+        return to(a), code
+
+    return convert
+
+
+def _as_float(builder: Any, bits: Any) -> Any:
+    wide = ir.VectorType(_INT32, LANES)
+    shifted = builder.shl(builder.zext(bits, wide), ir.Constant(wide, [16] * LANES))
+    return builder.bitcast(shifted, FLOAT32.llvm)
+
+
+widen = _conversion(INT16, lambda builder, a: builder.zext(a, INT16.llvm))
+"""widen(a): unsigned 8-bit lanes as 16-bit ones."""
+from_bfloat16 = _conversion(FLOAT32, _as_float)
+"""from_bfloat16(a): 16-bit patterns, the upper halves of float32 numbers, as those numbers."""
+truncated = _conversion(FLOAT32, lambda b, a: b.sitofp(b.fptosi(a, ir.VectorType(_INT32, LANES)), FLOAT32.llvm))
+"""truncated(a): float32 lanes without their fraction, which must fit 32 bits."""
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def two_to(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
+    """two_to(a): 2^a of whole float32 lanes from -126 to 127."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        wide = ir.VectorType(_INT32, LANES)
+        exponent = builder.add(builder.fptosi(args[0], wide), ir.Constant(wide, [127] * LANES))
+        return builder.bitcast(builder.shl(exponent, ir.Constant(wide, [23] * LANES)), FLOAT32.llvm)
+
+    return FLOAT32(a), code
+
+
+def _shifted(by: int) -> Any:
+    """Lane i takes what lane i - by had, and 0 where there is none."""
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def shift(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            zeros = ir.Constant(signature.args[0].llvm, [0] * LANES)
+            source = [i - by if 0 <= i - by < LANES else LANES for i in range(LANES)]
+            return builder.shuffle_vector(args[0], zeros, ir.Constant(ir.VectorType(_INT32, LANES), source))
+
+        return a(a), code
+
+    return shift
+
+
+up_1, up_2, up_4, up_8 = _shifted(1), _shifted(2), _shifted(4), _shifted(8)
+
+
+@numba.njit(inline="always")
+def running_sum(a):  # type: ignore[no-untyped-def]
+    """Saturated sum of each lane and all lanes below it."""
+    a = add_saturated(a, up_1(a))
+    a = add_saturated(a, up_2(a))
+    a = add_saturated(a, up_4(a))
+    return add_saturated(a, up_8(a))
+
+
+def _reduction(name: str, result: Any) -> Any:
+    @intrinsic  # type: ignore[untyped-decorator]
+    def reduce(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            vector = args[0].type
+            return _call(builder, f"llvm.vector.reduce.{name}.{_llvm_name(vector)}", vector.element, args[0])
+
+        return result(a), code
+
+    return reduce
+
+
+largest = _reduction("smax", types.int16)
+"""largest(a): the largest of 16 integers of 16 bits."""
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def total(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
+    """total(a): sum of 16 float32 lanes, by halves: the order is fixed."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value = args[0]
+        half = LANES // 2
+        while half:
+            index = ir.VectorType(_INT32, half)
+            low = builder.shuffle_vector(value, value, ir.Constant(index, list(range(half))))
+            high = builder.shuffle_vector(value, value, ir.Constant(index, list(range(half, 2 * half))))
+            value = builder.fadd(low, high)
+            half //= 2
+        return builder.extract_element(value, ir.Constant(_INT32, 0))
+
+    return types.float32(a), code
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def last_lane(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
+    """last_lane(a): the highest lane of 16-bit lanes."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.extract_element(args[0], ir.Constant(_INT32, LANES - 1))
+
+    return types.int16(a), code
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def equal_mask(typing: Any, a: Any, b: Any) -> tuple[_Signature, _Codegen]:
+    """equal_mask(a, number): bit i is set where lane i equals the number."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        number = _splat(context, builder, signature.args[0], signature.args[1], args[1])
+        mask = builder.bitcast(builder.icmp_signed("==", args[0], number), ir.IntType(LANES))
+        return builder.zext(mask, _INT32)
+
+    return types.uint32(a, b), code
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def lowest_bit(typing: Any, mask: Any) -> tuple[_Signature, _Codegen]:
+    """lowest_bit(mask): number of the lowest bit that is set; 32 where none is."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 0))
+
+    return types.uint32(types.uint32), code
+
+
+def _constant(lanes: Lanes, number: float) -> Any:
+    @intrinsic  # type: ignore[untyped-decorator]
+    def constant(typing: Any) -> tuple[_Signature, _Codegen]:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return ir.Constant(lanes.llvm, [number] * LANES)
+
+        return lanes(), code
+
+    return constant
+
+
+zero_int16 = _constant(INT16, 0)
+zero_float32 = _constant(FLOAT32, 0.0)
+highest = _reduction("fmax", types.float32)
+"""highest(a): the largest of 16 float32."""

@@ -1,0 +1,115 @@
+"""A link too slow for full frames: windows that move with the line, and the same maps to the last bit."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rig.api import configure, plan_scan, scan
+from rig.session import open_rig, prepare
+from tests.system.conftest import Rig
+from tests.system.small_rig import config, write_rig
+
+WIDTH = 320
+
+FAST, SLOW = "8 GB/s", "100 MB/s"
+"""What carries full frames of 320 x 40 pixels at 100 kHz, 162 MB/s, and what carries no more than windows of 192."""
+
+
+def wide_rig(folder: Path, link: str, *, height: int = 40, spad: dict[str, Any] | None = None, **scan: Any) -> Path:
+    """Config file of a small rig with 320 pixels a row, of which a column takes 128, and a link."""
+    content = config()
+    content["scan"] |= {"depth_range": ["2 m", "15 m"], **scan}
+    content["spad"] |= {"link": link, **(spad or {})}
+    return write_rig(folder, content, width=WIDTH, height=height)
+
+
+@pytest.mark.parametrize("estimator", ["argmax", "likelihood"])
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"bidirectional": True}, {"exposures": 1, "columns": 300}, {"command_range": [0.8, -0.8]}],
+    ids=["one way", "both ways", "one exposure", "downward"],
+)
+def test_windows_give_the_very_maps_of_the_full_frames(tmp_path: Path, estimator: Any, changes: dict[str, Any]) -> None:
+    full, windows = (
+        scan(
+            wide_rig(tmp_path / link, link, **changes), estimator=estimator, maps=2, seed=3, out=tmp_path / link / "run"
+        )
+        for link in (FAST, SLOW)
+    )
+    assert full.summary.frames == windows.summary.frames
+    assert full.summary.frames.lost == 0
+    assert full.summary.truth == windows.summary.truth
+    written = sorted((tmp_path / FAST / "run").rglob("*.np[yz]"))
+    assert len(written) >= 4
+    for file in written:
+        other = tmp_path / SLOW / "run" / file.relative_to(tmp_path / FAST / "run")
+        ours, theirs = np.load(file), np.load(other)
+        if file.suffix == ".npy":
+            np.testing.assert_array_equal(ours, theirs)
+        else:
+            assert ours.files == theirs.files
+            for name in ours.files:
+                np.testing.assert_array_equal(ours[name], theirs[name])
+
+
+def test_lost_frames_are_lost_alike(tmp_path: Path) -> None:
+    lost = {"lost_frames": [*range(400, 431), 900, 901], "loss_probability": 0.01}
+    full, windows = (scan(wide_rig(tmp_path / link, link, spad=lost), maps=1, seed=5) for link in (FAST, SLOW))
+    assert windows.summary.frames == full.summary.frames
+    assert windows.summary.frames.lost > 30
+    np.testing.assert_array_equal(windows.last.depth_m, full.last.depth_m)
+    np.testing.assert_array_equal(windows.last.stripe.x_px, full.last.stripe.x_px)
+
+
+def test_a_link_of_400_megabytes_a_second_streams_windows(tmp_path: Path) -> None:
+    file = wide_rig(tmp_path, "400 MB/s", height=160, columns=100)
+    plan = plan_scan(file)
+    assert (plan.mode, plan.windowed, plan.frame_width) == ("stream", True, 192)
+    assert plan.bytes_per_s == 1e5 * (160 * 24 + 16)
+    result = scan(file)
+    assert result.summary.verdict == "complete"
+    assert result.summary.truth is not None
+    assert result.summary.truth.stripe_error_px["missing"] == 0
+    assert result.summary.truth.stripe_error_px["within_1px"] > 0.8
+
+
+def test_a_dry_run_prints_window_megabytes_and_the_rates_of_the_link(rig: Rig, tmp_path: Path) -> None:
+    ran = rig("scan", wide_rig(tmp_path / "rig", SLOW), "--dry-run")
+    assert ran.code == 0
+    assert "window      128 of 320 pixels for 2 to 15 m" in ran.out
+    assert "stream of moving windows of 192 pixels, 97.6 MB/s; the link carries full frames up to 61.88 kHz" in ran.out
+    assert "windows of 192 pixels up to 102.5 kHz" in ran.out
+
+
+def test_a_link_too_slow_for_windows_is_refused_with_the_rate_it_carries(rig: Rig, tmp_path: Path) -> None:
+    ran = rig("scan", wide_rig(tmp_path / "slow", "50 MB/s"))
+    assert (ran.code, len(ran.problems)) == (2, 1)
+    assert "162 MB/s of full frames" in ran.problems[0] or "161.6 MB/s of full frames" in ran.problems[0]
+    assert "lower frame_rate to 51.229 kHz" in ran.problems[0]
+    slower = rig("scan", wide_rig(tmp_path / "slower", "50 MB/s", frame_rate="51.229 kHz"), "--dry-run")
+    assert slower.code == 0
+    assert "moving windows of 192 pixels" in slower.out
+
+
+def test_a_spad_that_rounds_its_frame_rate_gets_the_windows_of_the_rate_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with open_rig(configure(wide_rig(tmp_path, SLOW))) as opened:
+        spad = opened.spad
+        requests = []
+        do_configure = spad._do_configure
+
+        def coarse(request: Any) -> Any:
+            requests.append(request)
+            timing = do_configure(request)
+            return type(timing)(timing.tick_hz, timing.frame_period_ticks + 1, timing.exposure_ticks, timing.stride)
+
+        monkeypatch.setattr(spad, "_do_configure", coarse)
+        plan, timing = prepare(opened)
+    assert len(requests) == 2
+    assert plan.frame_rate_hz == timing.tick_hz / timing.frame_period_ticks
+    assert plan.windows is not None
+    for ours, theirs in zip(requests[-1].window.x0, plan.windows.x0, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
