@@ -14,6 +14,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+WORD_PX: Final = 64
+WORD_BYTES: Final = 8
 CHUNK: Final = 256
 """Words of a frame that are counted together; their planes fill half of a 32 KiB cache."""
 PLANES: Final = 8
@@ -164,7 +166,7 @@ def add_frames(
 
 
 @numba.njit(cache=True, nogil=True)
-def clear(n_planes: int, n: int, planes: NDArray[np.uint64]) -> None:
-    """Set the first n counters of a chunk to zero."""
-    for q in range(n_planes):
+def clear(first_plane: int, last_plane: int, n: int, planes: NDArray[np.uint64]) -> None:
+    """Set planes first_plane..last_plane-1 of a chunk's first n counters to zero."""
+    for q in range(first_plane, last_plane):
         planes[q * CHUNK : q * CHUNK + n] = np.uint64(0)

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, LABEL_PX, LABELS, cell_of
-from rig.estimators.screen_tables import LANES, STEPS
-from rig.estimators.search_kernels import PAD, Search
-from rig.lanes import highest, larger_float, load_float32, total, truncated, two_to
+from rig.lane_order import place_of
+from rig.lanes import LANES, highest, larger_float, load_float32, total, truncated, two_to
 
 LEVEL_SHIFT: Final = np.uint32(22)
 """Two levels an octave: the exponent and the first bit behind it of a float32."""
@@ -97,19 +96,16 @@ def _power(a):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def place_line(
-    search: Search, x: int, exposures: float, haze_level: int, line_level: int, closeup: Closeup
+    n: NDArray[np.int16], x: int, exposures: float, haze_level: int, line_level: int, closeup: Closeup
 ) -> tuple[float, float]:
-    """Offset of the line from the middle of stored pixel x in px, to the right, and its standard deviation."""
-    lanes = search.start.shape[0]
-    stride = lanes + 2 * PAD
+    """Offset of the line from the middle of pixel x in px, to the right, and its standard deviation; n: the counts."""
     weight = closeup.weight[haze_level, line_level]
     pixels = weight.shape[0] - 1
     flat = weight.ravel()
     score = load_float32(flat, pixels * LANES) * np.float32(exposures)
     first = x - (pixels - 1) // 2
     for t in range(pixels):
-        at = first + t
-        count = np.float32(search.n[(at % STEPS) * stride + PAD + at // STEPS])
+        count = np.float32(n[place_of(n, first + t)])
         score = score + load_float32(flat, t * LANES) * count
     score = larger_float(score - highest(score), np.float32(-100.0))
     likelihood = _power(score)

@@ -1,4 +1,8 @@
-"""Compiled estimate of one row: search, close look, and what the row teaches of the ambient light."""
+"""Compiled estimate of rows: search, close look, and what each row teaches of the light, from counters or from counts.
+
+The same `judge_row` serves frames as they come (counters in bit planes, `search_frames`) and counts that are there
+already (`search_counts`): the answers are the same bit for bit.
+"""
 
 from typing import Final, NamedTuple
 
@@ -6,161 +10,201 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.counting_kernels import CHUNK, FEW_FRAMES, PLANES, add_frames, clear
 from rig.estimators.closeup_kernels import Closeup, level_of, place_line
-from rig.estimators.screen_tables import STEPS, Tables
+from rig.estimators.screen_tables import Tables
 from rig.estimators.search_kernels import (
     MEAN_EXCESS,
-    PAD,
-    START,
     Search,
     best_position,
     mass_of,
     none_mass,
     power,
-    read_counts,
     score_row,
     search_buffers,
     set_exposures,
 )
+from rig.lane_order import PAD, STEPS, halve_counts, place_of, read_counts, read_planes, sum_counts
 
 QUIET: Final = 0.9
 """Probability within 1 px from which the pixels behind the stripe teach the ambient light."""
-QUIET_STEP: Final = 4
-"""Every 4th column does so."""
-COUNT_LIMIT: Final = 255
-"""Largest count the search works with; more exposures are divided by a power of two."""
+QUIET_STEP: Final = 8
+"""Every 8th column does so where there are dark frames as well, else every one."""
+COUNT_LIMIT: Final = 63
+"""Largest count the search works with; counts of more exposures are halved until they fit."""
 FIELDS: Final = 5
 """x_px, confidence, x_sd_px, signal, haze: see `StripeTable`."""
+SIGNAL_REACH_PX: Final = 2
+"""Pixels on either side whose light is the stripe's, where the line is narrower."""
+NO_COLUMN: Final = -1
 
 
-class Search0(NamedTuple):
-    pass
+class Judge(NamedTuple):
+    """All that is needed to judge the rows of a sweep; fixed while the sweep lasts.
+
+    x0: int32 (columns,), first stored pixel; window: stored pixels; x_lo, x_hi: int32 (rows, columns), search windows.
+    ambient: float32 (bands, width padded to whole words). hot_start: int32 (rows + 1,) and hot_x: int32, pixels of each
+    row whose counts say nothing. faintest, brightest: photons of a stripe at scale 1. reach: half the line's width in
+    px. shift: units of the scores are 128 >> shift an octave. quiet_step: every so manieth column teaches the ambient light.
+    """
+
+    tables: Tables
+    closeup: Closeup
+    band_rows: int
+    x0: NDArray[np.int32]
+    window: int
+    x_lo: NDArray[np.int32]
+    x_hi: NDArray[np.int32]
+    near_is_left: bool
+    ambient: NDArray[np.float32]
+    hot_start: NDArray[np.int32]
+    hot_x: NDArray[np.int32]
+    faintest: float
+    brightest: float
+    reach: int
+    shift: int
+    quiet_step: int
+
+
+class Found(NamedTuple):
+    """What a sweep gives, to be filled.
+
+    stripe: float32 (FIELDS, rows, columns), NaN and confidence 0 where there is nothing. quiet: int32 (rows, STEPS,
+    lanes of the sensor and LANES more), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures:
+    int32 (rows, lanes + 1), their exposures as steps up and down. light: int16, like quiet, ones of every pixel within
+    the windows since they were last carried to light_carried, int32. lines: int16 (lines, window), counts of the rows
+    that the learning reads; line_start: int32 (columns + 1,) and line_row: int32, the rows of each column in order.
+    """
+
+    stripe: NDArray[np.float32]
+    quiet: NDArray[np.int32]
+    quiet_exposures: NDArray[np.int32]
+    light: NDArray[np.int16]
+    light_carried: NDArray[np.int32]
+    lines: NDArray[np.int16]
+    line_start: NDArray[np.int32]
+    line_row: NDArray[np.int32]
+
+
+class Bench(NamedTuple):
+    """A thread's own buffers. flux: float32 (COUNT_LIMIT + 1,), photons that each count speaks for."""
+
+    search: Search
+    ambient: NDArray[np.float32]
+    flux: NDArray[np.float32]
 
 
 @numba.njit(cache=True, nogil=True)
-def count_flux(exposures: float, flux: NDArray[np.float32]) -> None:
-    """Photons per exposure that each count from 0 on speaks for, nearly unbiased and finite; flux: (n,) to be filled."""
+def new_bench(lanes: int) -> Bench:
+    """Buffers for rows of `lanes` lanes."""
+    return Bench(
+        search_buffers(lanes), np.zeros(lanes * STEPS, np.float32), np.zeros(COUNT_LIMIT + 1, np.float32)
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def halvings(exposures: int) -> int:
+    """How often counts of so many exposures are halved."""
+    times = 0
+    while (exposures >> times) > COUNT_LIMIT:
+        times += 1
+    return times
+
+
+@numba.njit(cache=True, nogil=True)
+def set_column(judge: Judge, bench: Bench, c: int, b: int, exposures: float) -> None:
+    """Make ready for rows of band b of column c."""
+    set_exposures(judge.tables, c, b, exposures, bench.search)
+    x0 = judge.x0[c]
+    for x in range(judge.window):
+        bench.ambient[x] = judge.ambient[b, x0 + x]
+
+
+@numba.njit(cache=True, nogil=True)
+def set_flux(exposures: float, flux: NDArray[np.float32]) -> None:
+    """Photons per exposure that each count speaks for: nearly unbiased, and finite also where every frame fired."""
     for n in range(flux.shape[0]):
         flux[n] = np.log((exposures + 0.5) / (max(exposures - n, 0.0) + 0.5))
 
 
 @numba.njit(cache=True, nogil=True)
-def judge_counts(
-    search: Search,
-    tables: Tables,
-    closeup: Closeup,
-    c: int,
-    b: int,
-    exposures: float,
-    flux: NDArray[np.float32],
-    ambient: NDArray[np.float32],
-    brightest: float,
-    faintest: float,
-    reach: int,
-    shift: int,
-    low: int,
-    high: int,
-    x0: int,
-    near_is_left: bool,
-    answer: NDArray[np.float32],
-) -> int:
-    """Estimate the row in search.n with table (c, b), whose constants are set; returns the stored pixel found.
-
-    answer: (FIELDS,) is filled. flux: see `count_flux`. ambient: (P,) of the band in stored pixels. low, high: first and
-    last stored pixel that the row itself allows.
-    """
-    lanes = search.start.shape[0]
-    stride = lanes + 2 * PAD
-    best, all_left = score_row(tables.edge[c, b], tables.tap[c, b], search)
-    x = best_position(search, best)
-    mass = np.float32(1.0) + (mass_of(search, best, shift) - np.float32(1.0)) / MEAN_EXCESS
-    none = none_mass(search, tables.none[c, b], all_left, best, shift) / MEAN_EXCESS
-    near = np.float32(1.0)
-    for at in (x - 1, x + 1):
-        if 0 <= at < lanes * STEPS:
-            near += power(np.int64(search.score[(at % STEPS) * lanes + at // STEPS]) - best, shift) / MEAN_EXCESS
-    x = min(max(x, low), high)
-    light = np.float32(0.0)
-    for d in range(-reach, reach + 1):
-        at = x + d
-        count = np.int64(search.n[(at % STEPS) * stride + PAD + at // STEPS])
-        light += flux[min(count, flux.shape[0] - 1)]
-    before = tables.before[c, b, x]
-    base = np.float32(0.5) * (before + ambient[x]) * np.float32(2 * reach + 1)
-    scale = tables.scale[c, b, x]
-    signal = min(max(light - base, faintest * scale), brightest * scale)
-    offset, sd = place_line(search, x, exposures, level_of(before), level_of(signal), closeup)
-    answer[0] = x0 + x + offset
-    answer[1] = min(near / (mass + none), np.float32(1.0))
-    answer[2] = sd
-    answer[3] = signal
-    answer[4] = max(before - ambient[x], np.float32(0.0))
-    return x
+def mute_hot(judge: Judge, search: Search, y: int, c: int, b: int, exposures: float) -> None:
+    """Give the hot pixels of row y counts that speak for no position."""
+    for h in range(judge.hot_start[y], judge.hot_start[y + 1]):
+        x = judge.hot_x[h]
+        at = x - judge.x0[c]
+        if 0 <= at < judge.window:
+            # Rounded up or down as by chance, so that hot pixels lean to neither side on average.
+            chance = ((x * 40503 + y * 30011 + c * 20011) & 0xFFFF) / 65536.0
+            neutral = np.int16(exposures * judge.tables.neutral[c, b, at] + chance)
+            search.n[place_of(search.n, at)] = neutral
 
 
 @numba.njit(cache=True, nogil=True)
-def search_volume(
-    counts: NDArray[np.unsignedinteger],
-    n_frames: NDArray[np.int32],
-    x0: NDArray[np.int32],
-    x_lo: NDArray[np.int32],
-    x_hi: NDArray[np.int32],
-    near_is_left: bool,
-    tables: Tables,
-    closeup: Closeup,
-    ambient: NDArray[np.float32],
-    hot_start: NDArray[np.int32],
-    hot_x: NDArray[np.int32],
-    light: NDArray[np.float32],
-    reach: int,
-    shift: int,
-    band_rows: int,
-    first_row: int,
-    last_row: int,
-    out: NDArray[np.float32],
-    quiet: NDArray[np.uint32],
-) -> None:
-    columns, rows, window = counts.shape
-    lanes = tables.lane.shape[2]
-    stride = lanes + 2 * PAD
-    search = search_buffers(lanes)
-    band_ambient = np.zeros(lanes * STEPS, np.float32)
-    answer = np.empty(FIELDS, np.float32)
-    flux = np.empty(COUNT_LIMIT + 1, np.float32)
-    for c in range(columns):
-        k = n_frames[c]
-        if k == 0:
-            continue
-        halvings = 0
-        while (k >> halvings) > COUNT_LIMIT:
-            halvings += 1
-        exposures = np.float32(k / 2.0**halvings)
-        count_flux(exposures, flux)
-        for y in range(first_row, last_row):
-            b = y // band_rows
-            if y == first_row or y % band_rows == 0:
-                set_exposures(tables, c, b, exposures, search)
-                stored = min(window, ambient.shape[1] - x0[c])
-                band_ambient[:stored] = ambient[b, x0[c] : x0[c] + stored]
-            if x_lo[y, c] > x_hi[y, c] or tables.first[c, b] > tables.last[c, b]:
-                continue
-            read_counts(counts[c, y], halvings, search)
-            for h in range(hot_start[y], hot_start[y + 1]):
-                at = hot_x[h] - x0[c]
-                if 0 <= at < window:
-                    neutral = exposures * tables.neutral[c, b, at]
-                    # Rounded up or down by chance, so that hot pixels lean to neither side on average.
-                    chance = ((hot_x[h] * 40503 + y * 30011 + c * 20011) & 0xFFFF) / 65536.0
-                    search.n[(at % STEPS) * stride + PAD + at // STEPS] = np.int16(neutral + chance)
-            x = judge_counts(
-                search, tables, closeup, c, b, exposures, flux, band_ambient, light[1], light[0], reach, shift,
-                max(x_lo[y, c] - x0[c], 0), min(x_hi[y, c] - x0[c], window - 1), x0[c], near_is_left, answer,
-            )
-            for i in range(FIELDS):
-                out[i, y, c] = answer[i]
-            if answer[1] > QUIET and c % QUIET_STEP == 0:
-                begin = x + reach + 2 if near_is_left else 0
-                end = min(window, quiet.shape[2] - x0[c]) if near_is_left else x - reach - 1
-                for at in range(begin, end):
-                    quiet[0, y, x0[c] + at] += np.uint32(counts[c, y, at])
-                    quiet[1, y, x0[c] + at] += np.uint32(k)
+def judge_row(judge: Judge, bench: Bench, y: int, c: int, b: int, exposures: float, found: Found) -> None:
+    """Estimate row y of column c from the counts in bench.search, made ready by `set_column`."""
+    low, high = judge.x_lo[y, c] - judge.x0[c], judge.x_hi[y, c] - judge.x0[c]
+    tables, search = judge.tables, bench.search
+    if low > high or tables.first[c, b] > tables.last[c, b]:
+        return
+    if judge.hot_start[y] < judge.hot_start[y + 1]:
+        mute_hot(judge, search, y, c, b, exposures)
+    lanes = search.start.shape[0]
+    best, all_left = score_row(tables.edge[c, b], tables.tap[c, b], search)
+    x = best_position(search, best)
+    near = np.float32(0.0)
+    if x > 0:
+        near += power(np.int64(search.score[((x - 1) % STEPS) * lanes + (x - 1) // STEPS]) - best, judge.shift)
+    if x + 1 < judge.window:
+        near += power(np.int64(search.score[((x + 1) % STEPS) * lanes + (x + 1) // STEPS]) - best, judge.shift)
+    # The best position's own term is exactly 1, the others are too large by the same share on average.
+    others = mass_of(search, best, judge.shift) - np.float32(1.0)
+    others += none_mass(search, tables.none[c, b], all_left, best, judge.shift)
+    confidence = (MEAN_EXCESS + near) / (MEAN_EXCESS + others)
+    x = min(max(x, low, 0), high, judge.window - 1)
+    light = np.float32(0.0)
+    for at in range(x - judge.reach, x + judge.reach + 1):
+        light += bench.flux[min(search.n[place_of(search.n, at)], COUNT_LIMIT)]
+    before, ambient, scale = tables.before[c, b, x], bench.ambient[x], tables.scale[c, b, x]
+    light -= np.float32(0.5) * (before + ambient) * np.float32(2 * judge.reach + 1)
+    signal = min(max(light, judge.faintest * scale), judge.brightest * scale)
+    offset, sd = place_line(search.n, x, exposures, level_of(before), level_of(signal), judge.closeup)
+    stripe = found.stripe
+    stripe[0, y, c] = judge.x0[c] + x + offset
+    stripe[1, y, c] = min(confidence, np.float32(1.0))
+    stripe[2, y, c] = sd
+    stripe[3, y, c] = signal
+    stripe[4, y, c] = max(before - ambient, np.float32(0.0))
+    if confidence > QUIET and c % judge.quiet_step == 0:
+        _learn_quiet(judge, search.n, y, c, x, exposures, found)
+
+
+@numba.njit(cache=True, nogil=True)
+def _learn_quiet(judge: Judge, n: NDArray[np.int16], y: int, c: int, x: int, exposures: float, found: Found) -> None:
+    """Add the whole lanes behind the stripe at stored pixel x to the quiet counts."""
+    stride = n.shape[0] // STEPS
+    lane = judge.x0[c] // STEPS
+    begin, end = 0, judge.window // STEPS
+    if judge.near_is_left:
+        begin = (x + judge.reach + 1) // STEPS + 1
+    else:
+        end = (x - judge.reach) // STEPS
+    if begin >= end:
+        return
+    for s in range(STEPS):
+        counts = n[s * stride + PAD + begin : s * stride + PAD + end]
+        sums = found.quiet[y, s, lane + begin : lane + end]
+        for i in range(counts.shape[0]):
+            sums[i] += counts[i]
+    found.quiet_exposures[y, lane + begin] += np.int32(exposures)
+    found.quiet_exposures[y, lane + end] -= np.int32(exposures)
+
+
+@numba.njit(cache=True, nogil=True)
+def keep_line(n: NDArray[np.int16], y: int, c: int, found: Found) -> None:
+    """Keep the counts of row y of column c where the learning reads them."""
+    for i in range(found.line_start[c], found.line_start[c + 1]):
+        if found.line_row[i] == y:
+            line = found.lines[i]
+            for x in range(line.shape[0]):
+                line[x] = n[place_of(n, x)]

@@ -16,17 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.row_input import Row, State, Sweep, row_buffers, row_fluxes
-from rig.estimators.row_kernels import FLUX_MAX, none_prior
-from rig.estimators.row_kernels import cell_of as cell_of
+from rig.estimators.row_kernels import FLUX_MAX, cell_of, none_prior
+from rig.lane_order import STEPS
 
-LANES: Final = 16
-STEPS: Final = 8
-"""Pixels per lane: lane i of step s holds pixel 8 i + s, as the bits of packed bytes lie."""
 SCREENS: Final = 2
 """Stripe amplitudes of the search; all of them take part in what follows it."""
 OUTSIDE: Final = np.float32(-1e6)
 """Log prior of a position where the column's stripe cannot lie."""
-"""Score 'everything is as right of the stripe' starts from: most of the range lies above it."""
 LN2: Final = 0.6931471805599453
 WEIGHT_LIMIT: Final = 30000.0
 """Largest sum of products of counts and weights, with room to 32767."""

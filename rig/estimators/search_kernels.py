@@ -1,8 +1,7 @@
 """Compiled search along a row: every position scored at once, sixteen to a vector, then the best one looked at closely.
 
-A row of 128 pixels is eight vectors: lane i of step s holds the count of pixel 8 i + s, which is how the bits of packed
-bytes lie, so that counters in bit planes become vectors of counts with shifts and masks alone. Prefix sums run over the
-steps within a lane and then once over the lanes. Scores are saturating 16-bit numbers (`screen_tables`); the probability
+A row of 128 pixels is eight vectors of counts (`rig.lane_order`). Prefix sums run over the steps within a lane and then
+once over the lanes. Scores are saturating 16-bit numbers (`screen_tables`); the probability
 of a place is summed with 2^x read off the bits of a bfloat16, exact to 6 % a term and unbiased.
 """
 
@@ -12,15 +11,16 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.screen_tables import LANES, SCREENS, STEPS, Tables
+from rig.estimators.screen_tables import SCREENS, Tables
+from rig.lane_order import PAD, STEPS, new_counts
 from rig.lanes import (
+    LANES,
     add_saturated,
     equal_mask,
     from_bfloat16,
     larger,
     largest,
     last_lane,
-    load_int8,
     load_int16,
     lowest_bit,
     running_sum,
@@ -29,12 +29,9 @@ from rig.lanes import (
     sub_saturated,
     total,
     up_1,
-    widen,
     zero_float32,
 )
 
-PAD: Final = 16
-"""Zeros on both sides of each step's lanes: the neighbours of the first and the last pixel."""
 START: Final = -20000
 """Score of 'everything is as right of the stripe': most of the range lies above it."""
 BIAS: Final = np.int16(127 << 7)
@@ -66,7 +63,7 @@ def search_buffers(lanes: int) -> Search:
     """Buffers for rows of `lanes` lanes."""
     pixels = STEPS * lanes
     return Search(
-        np.zeros(STEPS * (lanes + 2 * PAD), np.int16), np.zeros(pixels, np.int16), np.zeros(lanes, np.int16),
+        new_counts(lanes), np.zeros(pixels, np.int16), np.zeros(lanes, np.int16),
         np.zeros(lanes, np.int16), np.zeros(SCREENS * pixels, np.int16), np.zeros(lanes, np.int16),
     )  # fmt: skip
 
@@ -84,72 +81,6 @@ def set_exposures(tables: Tables, c: int, b: int, exposures: float, search: Sear
     lane = tables.lane[c, b]
     for i in range(lane.shape[0]):
         search.lane[i] = np.int16(min(max(exposures * lane[i], np.float32(-32000)), np.float32(32000)))
-
-
-@numba.njit(inline="always")
-def _nibbles(b0, b1, b2, b3):  # type: ignore[no-untyped-def]
-    """Counts of pixels 0 to 7 of each lane from four bit planes, 16-bit lanes of one byte each; first pixel highest."""
-    even_01, odd_01 = (b0 & 0x55) | ((b1 & 0x55) << 1), ((b0 >> 1) & 0x55) | (b1 & 0xAA)
-    even_23, odd_23 = (b2 & 0x55) | ((b3 & 0x55) << 1), ((b2 >> 1) & 0x55) | (b3 & 0xAA)
-    a, b = (odd_01 & 0x33) | ((odd_23 & 0x33) << 2), ((odd_01 >> 2) & 0x33) | (odd_23 & 0xCC)
-    c, d = (even_01 & 0x33) | ((even_23 & 0x33) << 2), ((even_01 >> 2) & 0x33) | (even_23 & 0xCC)
-    return b >> 4, d >> 4, a >> 4, c >> 4, b & 15, d & 15, a & 15, c & 15
-
-
-@numba.njit(cache=True, nogil=True)
-def read_planes(planes: NDArray[np.uint8], at: int, plane_bytes: int, n_planes: int, search: Search) -> None:
-    """Counts of a row into search.n from its bit planes: bytes from `at` on, planes `plane_bytes` apart.
-
-    n_planes: 1, 4 or 8. Reads 16 bytes per vector, whatever the window.
-    """
-    lanes = search.start.shape[0]
-    stride = lanes + 2 * PAD
-    n = search.n
-    for v in range(0, lanes, LANES):
-        b0 = widen(load_int8(planes, at + v))
-        to = PAD + v
-        if n_planes == 1:
-            store(n, to, b0 >> 7)
-            store(n, to + stride, (b0 >> 6) & 1)
-            store(n, to + 2 * stride, (b0 >> 5) & 1)
-            store(n, to + 3 * stride, (b0 >> 4) & 1)
-            store(n, to + 4 * stride, (b0 >> 3) & 1)
-            store(n, to + 5 * stride, (b0 >> 2) & 1)
-            store(n, to + 6 * stride, (b0 >> 1) & 1)
-            store(n, to + 7 * stride, b0 & 1)
-            continue
-        b1 = widen(load_int8(planes, at + v + plane_bytes))
-        b2 = widen(load_int8(planes, at + v + 2 * plane_bytes))
-        b3 = widen(load_int8(planes, at + v + 3 * plane_bytes))
-        n0, n1, n2, n3, n4, n5, n6, n7 = _nibbles(b0, b1, b2, b3)
-        if n_planes == 8:
-            b4 = widen(load_int8(planes, at + v + 4 * plane_bytes))
-            b5 = widen(load_int8(planes, at + v + 5 * plane_bytes))
-            b6 = widen(load_int8(planes, at + v + 6 * plane_bytes))
-            b7 = widen(load_int8(planes, at + v + 7 * plane_bytes))
-            h0, h1, h2, h3, h4, h5, h6, h7 = _nibbles(b4, b5, b6, b7)
-            n0, n1, n2, n3 = n0 | (h0 << 4), n1 | (h1 << 4), n2 | (h2 << 4), n3 | (h3 << 4)
-            n4, n5, n6, n7 = n4 | (h4 << 4), n5 | (h5 << 4), n6 | (h6 << 4), n7 | (h7 << 4)
-        store(n, to, n0)
-        store(n, to + stride, n1)
-        store(n, to + 2 * stride, n2)
-        store(n, to + 3 * stride, n3)
-        store(n, to + 4 * stride, n4)
-        store(n, to + 5 * stride, n5)
-        store(n, to + 6 * stride, n6)
-        store(n, to + 7 * stride, n7)
-
-
-@numba.njit(cache=True, nogil=True)
-def read_counts(counts: NDArray[np.unsignedinteger], shift: int, search: Search) -> None:
-    """Counts of a row (window,) into search.n, divided by 2^shift and rounded."""
-    lanes = search.start.shape[0]
-    stride = lanes + 2 * PAD
-    half = (1 << shift) >> 1
-    for s in range(STEPS):
-        step = search.n[s * stride + PAD : s * stride + PAD + lanes]
-        for i in range(counts.shape[0] // STEPS):
-            step[i] = np.int16((np.int64(counts[STEPS * i + s]) + half) >> shift)
 
 
 @numba.njit(inline="always")

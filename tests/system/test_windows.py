@@ -1,5 +1,6 @@
 """A link too slow for full frames: windows that move with the line, and the same maps to the last bit."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,14 @@ FAST, SLOW = "8 GB/s", "100 MB/s"
 """What carries full frames of 320 x 40 pixels at 100 kHz, 162 MB/s, and what carries no more than windows of 192."""
 
 
-def wide_rig(folder: Path, link: str, *, height: int = 40, spad: dict[str, Any] | None = None, **scan: Any) -> Path:
+def wide_rig(
+    folder: Path, link: str, *, width: int = WIDTH, height: int = 40, spad: dict[str, Any] | None = None, **scan: Any
+) -> Path:
     """Config file of a small rig with 320 pixels a row, of which a column takes 128, and a link."""
     content = config()
     content["scan"] |= {"depth_range": ["2 m", "15 m"], **scan}
     content["spad"] |= {"link": link, **(spad or {})}
-    return write_rig(folder, content, width=WIDTH, height=height)
+    return write_rig(folder, content, width=width, height=height)
 
 
 @pytest.mark.parametrize("estimator", ["argmax", "likelihood"])
@@ -54,9 +57,11 @@ def test_windows_give_the_very_maps_of_the_full_frames(tmp_path: Path, estimator
                 np.testing.assert_array_equal(ours[name], theirs[name])
 
 
-def test_lost_frames_are_lost_alike(tmp_path: Path) -> None:
+def test_lost_frames_are_lost_alike_also_where_rows_end_in_padding(tmp_path: Path) -> None:
     lost = {"lost_frames": [*range(400, 431), 900, 901], "loss_probability": 0.01}
-    full, windows = (scan(wide_rig(tmp_path / link, link, spad=lost), maps=1, seed=5) for link in (FAST, SLOW))
+    full, windows = (
+        scan(wide_rig(tmp_path / link, link, width=300, spad=lost), maps=1, seed=5) for link in (FAST, SLOW)
+    )
     assert windows.summary.frames == full.summary.frames
     assert windows.summary.frames.lost > 30
     np.testing.assert_array_equal(windows.last.depth_m, full.last.depth_m)
@@ -81,6 +86,16 @@ def test_a_dry_run_prints_window_megabytes_and_the_rates_of_the_link(rig: Rig, t
     assert "window      128 of 320 pixels for 2 to 15 m" in ran.out
     assert "stream of moving windows of 192 pixels, 97.6 MB/s; the link carries full frames up to 61.88 kHz" in ran.out
     assert "windows of 192 pixels up to 102.5 kHz" in ran.out
+    plan = json.loads(rig("scan", wide_rig(tmp_path / "rig", SLOW), "--dry-run", "--json").out)["plan"]
+    assert (plan["windowed"], plan["frame_width_px"], plan["windows_px"], plan["link_bytes_per_s"]) == (
+        True,
+        192,
+        192,
+        1e8,
+    )
+    assert plan["bytes_per_s"] == 1e5 * (40 * 24 + 16)
+    assert plan["full_frames_hz"] == pytest.approx(1e8 / (40 * 40 + 16))
+    assert plan["windows_hz"] == pytest.approx(1e8 / (40 * 24 + 16))
 
 
 def test_a_link_too_slow_for_windows_is_refused_with_the_rate_it_carries(rig: Rig, tmp_path: Path) -> None:

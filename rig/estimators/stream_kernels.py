@@ -1,0 +1,175 @@
+"""Compiled counting and estimation in one pass over a block of frames: counts never leave the cache.
+
+Rows are worked through in chunks. A chunk's counters take the frames of a column as they come; with the first frame of
+the next column the rows of the finished one are read out of the bit planes into registers, judged, and forgotten. A
+column may lie in several blocks; its counters wait in memory in between.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.counting_kernels import CHUNK, FEW_FRAMES, PLANES, WORD_BYTES, WORD_PX, add_frames, clear
+from rig.estimators.row_search import Bench, Found, Judge, halvings, judge_row, keep_line, set_column, set_flux
+from rig.lane_order import STEPS, halve_counts, read_counts, read_planes, sum_counts
+
+
+class OpenColumn(NamedTuple):
+    """The column whose frames are being counted; the same for every chunk between two blocks.
+
+    column: -1 where none is open. first_word: of the frames' window. frames: counted so far.
+    """
+
+    column: int
+    first_word: int
+    frames: int
+
+
+@numba.njit(cache=True, nogil=True)
+def _take(words, frame, at, n, first, last, counted, planes):  # type: ignore[no-untyped-def]
+    """Add frames first..last-1 to a chunk's counters, of which only as many planes are valid as `counted` needs."""
+    here = last - first
+    if counted == 0 and here == 1:
+        start = first * frame + at
+        planes[:n] = words[start : start + n]
+        return
+    if counted == 0:
+        clear(0, 4, n, planes)
+    elif counted == 1:
+        clear(1, 4, n, planes)
+    if counted + here > FEW_FRAMES >= counted:
+        clear(4, PLANES, n, planes)
+    add_frames(words, frame, at, first, last, n, counted + here <= FEW_FRAMES, planes)
+
+
+@numba.njit(cache=True, nogil=True)
+def _move_window(by, row_words, n, planes):  # type: ignore[no-untyped-def]
+    """Let counters follow a window that moved `by` words to the right; what leaves it is dropped, what is new is 0."""
+    for q in range(PLANES):
+        p = planes[q * CHUNK : q * CHUNK + n]
+        for row in range(0, n, row_words):
+            old = p[row : row + row_words].copy()
+            for k in range(row_words):
+                p[row + k] = old[k + by] if 0 <= k + by < row_words else np.uint64(0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _finish(judge, bench, found, open_column, planes, at_byte, row_bytes, first_row, last_row):  # type: ignore[no-untyped-def]
+    """Judge rows first_row..last_row-1 of a finished column; planes: bytes, the chunk's counters from at_byte on."""
+    c, k = open_column.column, open_column.frames
+    halved = halvings(k)
+    exposures = np.float32(k / 2.0**halved)
+    n = bench.search.n
+    n_planes = 1 if k == 1 else (4 if k <= FEW_FRAMES else PLANES)
+    at = at_byte + (judge.x0[c] // WORD_PX - open_column.first_word) * WORD_BYTES
+    lane = judge.x0[c] // STEPS
+    has_lines = found.line_start[c] < found.line_start[c + 1]
+    band = -1
+    set_flux(exposures, bench.flux)
+    for y in range(first_row, last_row):
+        if y // judge.band_rows != band:
+            band = y // judge.band_rows
+            set_column(judge, bench, c, band, exposures)
+        read_planes(planes, at, CHUNK * WORD_BYTES, n_planes, judge.window, n)
+        at += row_bytes
+        sum_counts(n, lane, found.light[y])
+        if has_lines:
+            keep_line(n, y, c, found)
+        if halved:
+            halve_counts(n, halved)
+        judge_row(judge, bench, y, c, band, exposures, found)
+
+
+@numba.njit(cache=True, nogil=True)
+def carry_light(found: Found, first_row: int, last_row: int) -> None:
+    """Empty the 16-bit sums of light into the 32-bit ones."""
+    for y in range(first_row, last_row):
+        light, carried = found.light[y].ravel(), found.light_carried[y].ravel()
+        for i in range(light.shape[0]):
+            carried[i] += light[i]
+            light[i] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def search_frames(
+    words: NDArray[np.uint64],
+    bins: NDArray[np.int32],
+    first_word: NDArray[np.int32],
+    row_words: int,
+    open_column: OpenColumn,
+    end: bool,
+    judge: Judge,
+    bench: Bench,
+    found: Found,
+    planes: NDArray[np.uint64],
+    first_chunk: int,
+    last_chunk: int,
+) -> OpenColumn:
+    """Count and judge a block; returns the column that is open behind it.
+
+    words: (all words,) of the block's frames; bins: (n,), column of each frame, negative ones are passed over;
+    first_word: (n,) of each frame's window; row_words: words of a row; end: the sweep ends here, nothing stays open;
+    planes: see `new_planes`. Only the rows of chunks first_chunk..last_chunk-1 are touched.
+    """
+    rows = judge.x_lo.shape[0]
+    frame = rows * row_words
+    chunk_rows = max(CHUNK // row_words, 1)
+    as_bytes = planes.reshape(-1).view(np.uint8)
+    chunk_bytes = (PLANES + 1) * CHUNK * WORD_BYTES
+    state = open_column
+    for j in range(first_chunk, last_chunk):
+        first_row, last_row = j * chunk_rows, min((j + 1) * chunk_rows, rows)
+        at, n = first_row * row_words, (last_row - first_row) * row_words
+        counters = planes[j].ravel()
+        state = open_column
+        f = 0
+        while f < bins.shape[0]:
+            c = bins[f]
+            if c < 0:
+                f += 1
+                continue
+            g = f + 1
+            while g < bins.shape[0] and bins[g] == c and first_word[g] == first_word[f]:
+                g += 1
+            if c != state.column:
+                if state.column >= 0:
+                    _finish(judge, bench, found, state, as_bytes, j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)
+                state = OpenColumn(c, first_word[f], 0)
+            elif first_word[f] != state.first_word:
+                _move_window(first_word[f] - state.first_word, row_words, n, counters)
+            _take(words, frame, at, n, f, g, state.frames, counters)
+            state = OpenColumn(c, first_word[f], state.frames + g - f)
+            f = g
+        if end and state.column >= 0:
+            _finish(judge, bench, found, state, as_bytes, j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)
+    return OpenColumn(-1, 0, 0) if end else state
+
+
+@numba.njit(cache=True, nogil=True)
+def search_counts(
+    counts: NDArray[np.unsignedinteger],
+    n_frames: NDArray[np.int32],
+    judge: Judge,
+    bench: Bench,
+    found: Found,
+    first_row: int,
+    last_row: int,
+) -> None:
+    """Judge rows first_row..last_row-1 of counts (columns, rows, window); found.light and found.lines stay as they are."""
+    n = bench.search.n
+    for c in range(counts.shape[0]):
+        k = n_frames[c]
+        if k == 0:
+            continue
+        halved = halvings(k)
+        exposures = np.float32(k / 2.0**halved)
+        set_flux(exposures, bench.flux)
+        band = -1
+        for y in range(first_row, last_row):
+            if y // judge.band_rows != band:
+                band = y // judge.band_rows
+                set_column(judge, bench, c, band, exposures)
+            read_counts(counts[c, y], halved, n)
+            judge_row(judge, bench, y, c, band, exposures, found)
