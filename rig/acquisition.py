@@ -7,17 +7,13 @@ rig is made safe, on the caller's thread; what is in the ring by then is still c
 import logging
 import math
 from collections.abc import Callable, Generator
-from contextlib import closing
 from dataclasses import dataclass, fields
 from fractions import Fraction
 
-import numpy as np
-
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, DeviceTimeout
-from drivers.frames import packed_row_bytes
 from drivers.interfaces import SpadCounters, SpadTiming
-from rig.counting import SweepCounter
+from rig.counting import SweepLayout
 from rig.errors import DevicesError
 from rig.map_queue import AcquiredMap
 from rig.mapping import MakesMaps
@@ -79,7 +75,6 @@ class Acquisition:
         first_alone: bool = False,
         recording: Recording | None = None,
         watch: Watch | None = None,
-        threads: int = 2,
         on_progress: Callable[[ScanProgress], None] | None = None,
         silence_s: float = SILENCE_S,
     ) -> None:
@@ -95,7 +90,6 @@ class Acquisition:
         self._first_alone = first_alone
         self._recording = recording
         self._watch = watch
-        self._threads = threads
         self._on_progress = on_progress
         self._silence_s = silence_s
         self._pipeline: Pipeline | None = None
@@ -127,18 +121,16 @@ class Acquisition:
         is full, each after the maps that were whole by then; DevicesError where devices could not all be made safe.
         """
         plan = self._plan
-        counter = SweepCounter(plan.columns, plan.rows, plan.width, plan.x0, plan.window, self._threads, plan.used_px)
-        with closing(counter):
-            # Compiles the counting kernel now: a second of waiting in the run would overflow a real ring.
-            no_frames = np.zeros((0, plan.rows, packed_row_bytes(plan.width)), np.uint8)
-            counter.add(no_frames, np.zeros(0, np.int32), np.zeros(0, np.float64))
-            done = 0
-            while done < self._maps:
-                group = self._group(done)
-                assembler = SweepAssembler(plan, counter, group, done)
-                counter.reset()
-                yield from self._run_group(assembler, group, done)
-                done += group
+        counter = self._maker.counter(
+            SweepLayout(plan.columns, plan.rows, plan.width, plan.x0, plan.window, plan.exposures, plan.used_px)
+        )
+        done = 0
+        while done < self._maps:
+            group = self._group(done)
+            assembler = SweepAssembler(plan, counter, group, done)
+            counter.reset()
+            yield from self._run_group(assembler, group, done)
+            done += group
 
     def _group(self, done: int) -> int:
         """Sweeps of the next start of the SPAD: all in a stream, as many as its memory holds in a burst."""

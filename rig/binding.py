@@ -3,17 +3,24 @@
 Each frame is placed from the latest marker at or before it: that marker's point of the scanner clock is known from the
 plan, the way on from there is the SPAD's own clock times the ratio of the two clocks, which is fitted to the markers of
 every sweep and used in the next one. So a frame's column depends on earlier frames only and not on the size of blocks.
+
+    no sweep --scan marker--> sweep 0 --scan marker: its clock is fitted--> sweep 1 --> ...
+
+A compiled walk (`rig/binding_kernels.py`) places the frames; Python runs once a block and where a sweep begins.
+
+The lit frames of a sweep run through its columns in order. One that would fall back to a column already left, as it can
+by the residual where a marker corrects the way from the one before, is not used.
 """
 
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.frames import SUBFRAME_MASK, SUBFRAME_SHIFT, BlockHeader, FrameBlock, Mark
-from rig.counting import BIN_DARK, BIN_UNUSABLE
+from drivers.frames import FRAME_RECORD, SUBFRAME_MASK, SUBFRAME_SHIFT, BlockHeader, FrameBlock, Mark
 from rig.scan_plan import ScanPlan
 
 MAX_RESIDUAL_COLUMNS = 0.05
@@ -23,6 +30,19 @@ MAX_CLOCK_ERROR = 1e-3
 UNITS_PER_TICK = 2 * (SUBFRAME_MASK + 1)
 """Times are kept as whole numbers of this part of a tick, in which markers and exposure middles are exact: a frame's
 column is then the same to the last bit in whatever block it comes. Good for 200 days at 1 GHz."""
+BYTE_EXPOSURES = 200
+"""Up to so many exposures the frames of a column are counted in bytes."""
+BYTE_FRAMES = 255
+"""Most frames that such a column uses, however long the mirror stands still."""
+CARRIED = np.dtype(
+    [(name, np.int64) for name in ("sweep", "anchor_time", "anchor_point", "edges", "wrong_way", "column", "in_column")]
+)
+"""What the walk takes from block to block.
+
+sweep: the one that runs, -1 before the first marker. anchor_time, anchor_point: the latest marker, in units and in
+points since the first sweep; point -1: none yet. edges: markers of the sweep so far. wrong_way: as in `SweepClock`.
+column, in_column: the column that the sweep has come to, -1 before the first, and how many frames it has so far.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,13 +51,15 @@ class BoundFrames:
 
     sweep: int32, -1 before the first marker. direction: int8, +1 where the command rises, -1 where it falls, 0 unknown.
     column: float64, fractional column at the middle of the exposure; NaN before the first marker, continued linearly
-    outside the lit part. bins: int32, column index, BIN_DARK or BIN_UNUSABLE.
+    outside the lit part. bins: int32, column index, BIN_DARK or BIN_UNUSABLE. starts: index 0 and
+    those of the frames with which a sweep begins.
     """
 
     sweep: NDArray[np.int32]
     direction: NDArray[np.int8]
     column: NDArray[np.float64]
     bins: NDArray[np.int32]
+    starts: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,168 +90,175 @@ class SweepClock:
         )
 
 
+class PlanTerms(NamedTuple):
+    """What the walk needs of a plan; arrays (legs,). most_in_column: frames that a column may use."""
+
+    columns: int
+    column_s: float
+    point_rate_hz: float
+    sweep_points: int
+    marker_points: NDArray[np.int64]
+    lit_start_s: NDArray[np.float64]
+    columns_rise: NDArray[np.bool_]
+    direction: NDArray[np.int8]
+    most_in_column: int
+
+
+class BlockTerms(NamedTuple):
+    """What the walk needs of a header. start_ticks: from the run's first frame. middle: of an exposure, in units."""
+
+    sweep: int
+    start_ticks: int
+    period_ticks: int
+    middle: int
+    points_per_unit: float
+
+
 class FrameBinder:
     """Binds the blocks of one run, in order. Records count markers up to and including their own frame."""
 
     def __init__(self, plan: ScanPlan) -> None:
+        from rig.binding_kernels import walk
+
+        self._walk = walk
         self._plan = plan
+        self._terms = _plan_terms(plan)
         self._ratio = 1.0
+        self._nominal = math.nan
+        self._tick_hz: Fraction | None = None
         self._t0: int | None = None
-        self._anchor: tuple[int, int] | None = None  # the latest marker: its time and its point since the first sweep
-        self._sweep = -1
         self._first_frame = 0
         self._next_frame = 0
-        self._wrong_way = 0
-        self._edges: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+        self._carried = np.zeros(1, CARRIED)
+        self._carried["sweep"] = self._carried["anchor_point"] = self._carried["column"] = -1
+        self._edges = np.empty((2, 2 * len(plan.marker_points) + 2), np.int64)
+        self._records = np.empty(0, FRAME_RECORD)
 
     def bind(self, block: FrameBlock) -> tuple[BoundFrames, list[SweepClock]]:
         """Places of the block's frames, and the clocks of the sweeps whose closing scan marker lies in the block."""
-        header, records = block.header, block.records
-        marks = records["marks"]
-        sweep = _markers_seen(records, header) - 1
-        n = len(records)
-        start = self._start_times(block)
-        time, point = self._markers(block, sweep, start)
-        last = np.maximum.accumulate(np.where(point >= 0, np.arange(n), -1))
-        middle = start + header.exposure_ticks * (UNITS_PER_TICK // 2)
-        column = np.full(n, np.nan)
-        direction = np.zeros(n, np.int8)
-        closed: list[SweepClock] = []
-        starts = [0, *(np.flatnonzero(np.diff(sweep)) + 1).tolist()]
-        for a, b in zip(starts, [*starts[1:], n], strict=True):
-            number = int(sweep[a])
-            if number > self._sweep:
-                begins = bool(marks[a] & Mark.SCAN)
-                closed += self._begin(number, a, block, start, int(time[a]) if begins else None)
-            if number < 0:
-                continue
-            self._collect(time[a:b], point[a:b])
-            anchor_time, anchor_point, known = self._anchors(last[a:b], time, point)
-            since = (middle[a:b] - anchor_time) * self._points_per_unit(header.tick_hz)
-            tau = anchor_point - number * self._plan.sweep_points + since
-            leg = self._plan.leg(number)
-            column[a:b] = np.where(known, self._plan.column(tau / float(self._plan.point_rate_hz), leg), np.nan)
-            direction[a:b] = leg.direction
-            lit = (marks[a:b] & Mark.GATE_HIGH) != 0
-            backward = (marks[a:b] & Mark.BACKWARD) != 0
-            self._wrong_way += int(np.count_nonzero(lit & (backward != (leg.direction < 0))))
-            if last[b - 1] >= 0:
-                self._anchor = int(time[last[b - 1]]), int(point[last[b - 1]])
-        self._next_frame = header.first_frame + n * header.frame_step
-        bins = _bins(marks, column, self._plan.columns)
-        return BoundFrames(sweep.astype(np.int32), direction, column, bins), closed
-
-    def _start_times(self, block: FrameBlock) -> NDArray[np.int64]:
-        """Start of each exposure since the run's first frame, in units."""
+        header, n = block.header, block.n_frames
         if self._t0 is None:
-            self._t0 = block.header.t0_ticks
-        return (block.records["ticks"].astype(np.int64) + (block.header.t0_ticks - self._t0)) * UNITS_PER_TICK
+            self._t0 = header.t0_ticks
+        self._make_room(n)
+        records = self._records[:n]
+        # Always of one type, which memory of a ring, a file or a wire is not: each would be compiled by itself.
+        records.view(_WHOLE)[:] = block.records.view(_WHOLE)
+        places = np.empty(n, np.int32), np.empty(n, np.int8), np.empty(n, np.float64), np.empty(n, np.int32)
+        closed: list[SweepClock] = []
+        starts = [0]
+        at = 0
+        while True:
+            terms = self._block_terms(header)
+            at = self._walk(records, at, terms, self._terms, self._carried, self._edges, *places)
+            if at == n:
+                break
+            if at:
+                starts.append(at)
+            closed += self._begin(at, records[at], terms, header)
+        self._next_frame = header.first_frame + n * header.frame_step
+        return BoundFrames(*places, tuple(starts)), closed
 
-    def _markers(
-        self, block: FrameBlock, sweep: NDArray[np.int64], start: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Time in units and point since the first sweep of the marker in each frame; point -1: none that is usable."""
-        marks = block.records["marks"]
-        scan, line = (marks & Mark.SCAN) != 0, (marks & Mark.LINE) != 0
-        number = block.records["line"].astype(np.int64) - 1
-        line &= (number >= 0) & (number < len(self._plan.marker_points))
-        within = np.where(line, self._plan.marker_points[np.where(line, number, 0)], 0)
-        # A record has room for one position, the latest edge's: beside a gate edge it is not surely the marker's.
-        usable = (scan | line) & ((marks & Mark.GATE_EDGE) == 0) & (sweep >= 0)
-        # The middle of the 1/256 of the period that the position names.
-        position = ((marks >> SUBFRAME_SHIFT) & SUBFRAME_MASK).astype(np.int64)
-        time = start + (2 * position + 1) * _period(block.header)
-        return time, np.where(usable, sweep * self._plan.sweep_points + within, -1)
+    def _make_room(self, n: int) -> None:
+        """For n more frames, should there be a marker in each of them."""
+        if n > len(self._records):
+            self._records = np.empty(n, FRAME_RECORD)
+        have = self._edges.shape[1]
+        if self._carried["edges"][0] + n + 1 > have:
+            self._edges = np.concatenate([self._edges, np.empty((2, have + n), np.int64)], axis=1)
 
-    def _anchors(
-        self, last: NDArray[np.intp], time: NDArray[np.int64], point: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Time and point of the latest marker for each frame; from an earlier block where this one has none yet."""
-        here = last >= 0
-        index = np.where(here, last, 0)
-        if self._anchor is None:
-            return time[index], point[index], here
-        carried_time, carried_point = self._anchor
-        known = np.ones(len(last), np.bool_)
-        return np.where(here, time[index], carried_time), np.where(here, point[index], carried_point), known
+    def _block_terms(self, header: BlockHeader) -> BlockTerms:
+        return BlockTerms(
+            header.sweep,
+            header.t0_ticks - (self._t0 or 0),
+            _period(header),
+            header.exposure_ticks * (UNITS_PER_TICK // 2),
+            self._points_per_unit(header.tick_hz),
+        )
 
-    def _collect(self, time: NDArray[np.int64], point: NDArray[np.int64]) -> None:
-        usable = point >= 0
-        if usable.any():
-            self._edges.append((point[usable], time[usable]))
-
-    def _begin(
-        self, number: int, at: int, block: FrameBlock, start: NDArray[np.int64], scan_time: int | None
-    ) -> list[SweepClock]:
-        """Close the sweep that ran, begin `number` at frame index `at`, where its scan marker is if it was received."""
-        header = block.header
+    def _begin(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
+        """Close the sweep that ran, begin the next one at frame index `at`, where its scan marker is if received."""
+        now = self._carried[0]
+        running, number = int(now["sweep"]), _markers_seen(record, header) - 1
+        start = (int(record["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
+        received = bool(record["marks"] & Mark.SCAN)
         closed = []
-        if self._sweep >= 0:
-            if scan_time is not None and number == self._sweep + 1:
-                self._collect(np.array([scan_time]), np.array([number * self._plan.sweep_points]))
-            for missed in range(self._sweep, number):
-                exact = scan_time is not None and missed + 1 == number
-                end = header.first_frame + at if exact else self._boundary_frame(missed + 1, at, block, int(start[at]))
-                closed.append(self._close(missed, end, header.tick_hz))
-        else:
+        if running < 0:
             self._first_frame = header.first_frame + at
-        self._sweep = number
-        self._edges = []
+        elif received and number == running + 1:
+            position = (int(record["marks"]) >> SUBFRAME_SHIFT) & SUBFRAME_MASK
+            edge = number * self._plan.sweep_points, start + (2 * position + 1) * terms.period_ticks
+            self._edges[:, now["edges"]] = edge
+            now["edges"] += 1
+        for missed in range(running, number) if running >= 0 else ():
+            exact = received and missed + 1 == number
+            end = header.first_frame + at if exact else self._boundary_frame(missed + 1, at, header, start)
+            closed.append(self._close(missed, end, header.tick_hz))
+        now["sweep"], now["edges"], now["column"] = number, 0, -1
         return closed
 
-    def _boundary_frame(self, number: int, at: int, block: FrameBlock, start: int) -> int:
+    def _boundary_frame(self, number: int, at: int, header: BlockHeader, start: int) -> int:
         """Number of the frame in which sweep `number` began, from the scanner's clock where the marker was lost."""
-        here = block.header.first_frame + at
-        if self._anchor is None:
+        here = header.first_frame + at
+        time, point = (int(self._carried[name][0]) for name in ("anchor_time", "anchor_point"))
+        if point < 0:
             return here
-        time, point = self._anchor
-        ahead = (number * self._plan.sweep_points - point) / self._points_per_unit(block.header.tick_hz)
-        frame = here - math.ceil((start - time - ahead) / (_period(block.header) * UNITS_PER_TICK))
+        ahead = (number * self._plan.sweep_points - point) / self._points_per_unit(header.tick_hz)
+        frame = here - math.ceil((start - time - ahead) / (_period(header) * UNITS_PER_TICK))
         received = self._next_frame if at == 0 else here
         return min(max(frame, self._first_frame, min(received, here)), here)
 
     def _close(self, number: int, end_frame: int, tick_hz: Fraction) -> SweepClock:
+        now = self._carried[0]
         nominal = self._points_per_unit(tick_hz) / self._ratio
-        fit = _fit(self._edges, nominal, float(self._plan.points_per_column))
-        clock = SweepClock(number, *fit, self._first_frame, end_frame, self._wrong_way)
+        fit = _fit(*self._edges[:, : now["edges"]], nominal, float(self._plan.points_per_column))
+        clock = SweepClock(number, *fit, self._first_frame, end_frame, int(now["wrong_way"]))
         if fit[2] > 2 and clock.synchronised:
             self._ratio = 1 + clock.clock_error
-        self._first_frame, self._edges, self._wrong_way = end_frame, [], 0
+        self._first_frame = end_frame
+        now["edges"] = now["wrong_way"] = 0
         return clock
 
     def _points_per_unit(self, tick_hz: Fraction) -> float:
-        return float(self._plan.point_rate_hz / tick_hz / UNITS_PER_TICK) * self._ratio
+        if tick_hz != self._tick_hz:  # once a run: fractions take longer than all the rest of a block
+            self._tick_hz = tick_hz
+            self._nominal = float(self._plan.point_rate_hz / tick_hz / UNITS_PER_TICK)
+        return self._nominal * self._ratio
 
 
-def _markers_seen(records: NDArray[np.void], header: BlockHeader) -> NDArray[np.int64]:
-    """Scan markers since START at each frame, int64: the record's low 16 bits, continued from the header's 32."""
-    return header.sweep + ((records["sweep"].astype(np.int64) - header.sweep) & 0xFFFF)
+_WHOLE = np.dtype((np.void, FRAME_RECORD.itemsize))
+"""A record as bytes, which numpy copies at once instead of field by field."""
+
+
+def _plan_terms(plan: ScanPlan) -> PlanTerms:
+    return PlanTerms(
+        plan.columns,
+        float(plan.column_s),
+        float(plan.point_rate_hz),
+        plan.sweep_points,
+        np.array(plan.marker_points, np.int64),
+        np.array([plan.lit_start_s(leg) for leg in plan.legs], np.float64),
+        np.array([leg.columns_rise for leg in plan.legs], np.bool_),
+        np.array([leg.direction for leg in plan.legs], np.int8),
+        BYTE_FRAMES if plan.exposures <= BYTE_EXPOSURES else np.iinfo(np.int64).max,
+    )
+
+
+def _markers_seen(record: np.void, header: BlockHeader) -> int:
+    """Scan markers since START at a frame: the record's low 16 bits, continued from the header's 32."""
+    return header.sweep + ((int(record["sweep"]) - header.sweep) & 0xFFFF)
 
 
 def _period(header: BlockHeader) -> int:
     return header.frame_period_ticks or header.exposure_ticks
 
 
-def _bins(marks: NDArray[np.uint32], column: NDArray[np.float64], columns: int) -> NDArray[np.int32]:
-    gate, edge, lost = ((marks & bit) != 0 for bit in (Mark.GATE_HIGH, Mark.GATE_EDGE, Mark.WINDOW_LOST))
-    known = np.isfinite(column) & ~lost & ~edge
-    nearest = np.floor(np.where(known, column, -1.0) + 0.5)
-    on_column = known & gate & (nearest >= 0) & (nearest < columns)
-    bins = np.full(len(marks), BIN_UNUSABLE, np.int32)
-    bins[known & ~gate] = BIN_DARK
-    bins[on_column] = nearest[on_column]
-    return bins
-
-
 def _fit(
-    edges: list[tuple[NDArray[np.int64], NDArray[np.int64]]], points_per_unit: float, points_per_column: float
+    point: NDArray[np.int64], time: NDArray[np.int64], points_per_unit: float, points_per_column: float
 ) -> tuple[float, float, int]:
     """Relative clock error, largest residual in columns and number of markers of a sweep's marker points and times."""
-    count = sum(len(point) for point, _ in edges)
+    count = len(point)
     if count < 2:
         return 0.0, math.nan, count
-    point = np.concatenate([p for p, _ in edges])
-    time = np.concatenate([t for _, t in edges])
     x, y = (values - values[0] - (values - values[0]).mean() for values in (point, time))
     units_per_point = float(x @ y / (x @ x))
     residual = float(np.abs(y - units_per_point * x).max())

@@ -14,6 +14,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.lane_order import PAD, STEPS, new_counts, padded_lanes, read_planes, write_counts
+from rig.lanes import LANES
+
 WORD_PX: Final = 64
 WORD_BYTES: Final = 8
 CHUNK: Final = 256
@@ -25,12 +28,11 @@ FEW_FRAMES: Final = 15
 """Up to so many frames four planes do."""
 
 
-def new_planes(words: int) -> NDArray[np.uint64]:
-    """Counters, all zero, for `words` words of a frame: (chunks, PLANES + 1, CHUNK); the last plane is scratch.
+def new_planes(chunks: int) -> NDArray[np.uint64]:
+    """Counters, all zero, for so many chunks of a frame: (chunks, PLANES + 1, CHUNK); the last plane is scratch.
 
     Padded by two words, since kernels read 16 bytes at a time.
     """
-    chunks = -(-words // CHUNK)
     size = chunks * (PLANES + 1) * CHUNK
     return np.zeros(size + 2, np.uint64)[:size].reshape(chunks, PLANES + 1, CHUNK)
 
@@ -170,3 +172,66 @@ def clear(first_plane: int, last_plane: int, n: int, planes: NDArray[np.uint64])
     """Set planes first_plane..last_plane-1 of a chunk's first n counters to zero."""
     for q in range(first_plane, last_plane):
         planes[q * CHUNK : q * CHUNK + n] = np.uint64(0)
+
+
+@numba.njit(cache=True, nogil=True)
+def add_runs(
+    words: NDArray[np.uint64],
+    first_word: NDArray[np.int32],
+    row_words: int,
+    used_words: int,
+    bins: NDArray[np.int32],
+    x0: NDArray[np.int32],
+    counts: NDArray[np.unsignedinteger],
+    dark: NDArray[np.int32],
+    first_row: int,
+    last_row: int,
+) -> None:
+    """Add frames to `counts` (columns, rows, window), or to `dark` (rows, STEPS, lanes and LANES more) in lane order.
+
+    words: (all words,), `row_words` a row; first_word: (n,), word of the sensor at which a frame's used pixels begin,
+    used_words of them; bins: (n,) column, -1 dark, -2 skip. Only rows first_row..last_row-1 are touched, so that threads
+    may share the outputs. With counts of no columns lit frames are passed over.
+    """
+    rows, width_words = dark.shape[0], (dark.shape[2] - LANES) * STEPS // WORD_PX
+    window = counts.shape[2] if counts.shape[0] else WORD_PX
+    planes = np.zeros((PLANES + 1) * CHUNK + 2, np.uint64)
+    as_bytes = planes.view(np.uint8)
+    n_lit = new_counts(padded_lanes(window))
+    n_dark = new_counts(padded_lanes(used_words * WORD_PX))
+    chunk_rows = max(CHUNK // row_words, 1)
+    for y0 in range(first_row, last_row, chunk_rows):
+        y1 = min(y0 + chunk_rows, last_row)
+        n = (y1 - y0) * row_words
+        f = 0
+        while f < bins.shape[0]:
+            c, g = bins[f], f + 1
+            while g < bins.shape[0] and bins[g] == c and first_word[g] == first_word[f] and g - f < MOST_FRAMES:
+                g += 1
+            if c == -1 or (c >= 0 and counts.shape[0] > 0):
+                few = g - f <= FEW_FRAMES
+                clear(0, 4 if few else PLANES, n, planes)
+                add_frames(words, rows * row_words, y0 * row_words, f, g, n, few, planes)
+                # A frame of whole rows begins at the sensor's first word, a window where its used pixels do.
+                begins = 0 if row_words == width_words else first_word[f]
+                wanted = first_word[f] if c < 0 else x0[c] // WORD_PX
+                for y in range(y0, y1):
+                    at = ((y - y0) * row_words + wanted - begins) * WORD_BYTES
+                    if c < 0:
+                        read_planes(as_bytes, at, CHUNK * WORD_BYTES, 4 if few else PLANES, used_words * WORD_PX, n_dark)
+                        _add_dark(n_dark, wanted * (WORD_PX // STEPS), dark[y])
+                    else:
+                        read_planes(as_bytes, at, CHUNK * WORD_BYTES, 4 if few else PLANES, window, n_lit)
+                        write_counts(n_lit, counts[c, y])
+            f = g
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_dark(n: NDArray[np.int16], lane: int, sums: NDArray[np.int32]) -> None:
+    """Add a row of counts to sums (STEPS, lanes) from lane `lane` on."""
+    stride = n.shape[0] // STEPS
+    lanes = min(stride - 2 * PAD, sums.shape[1] - lane)
+    for s in range(STEPS):
+        to, counts = sums[s, lane : lane + lanes], n[s * stride + PAD : s * stride + PAD + lanes]
+        for i in range(lanes):
+            to[i] += counts[i]

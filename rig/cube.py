@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibration.model import RigModel
 from calibration.scanner import PlaneTable
 from rig.config import CubePlan
-from rig.counting import CountVolume, SweepCounter
+from rig.counting import Counter, FrameTally
 from rig.errors import UsageError
 
 CHUNK_BYTES = 16 << 20
@@ -71,7 +71,7 @@ def column_commands(plan: CubePlan) -> NDArray[np.float64]:
     return np.arange(plan.columns, dtype=np.float64)
 
 
-def count_map(cube: Cube, index: int, counter: SweepCounter) -> CountVolume:
+def count_map(cube: Cube, index: int, counter: Counter) -> FrameTally:
     """Counts of one map. `counter` is made for the cube's columns and size; it is reset first."""
     counter.reset()
     first = index * cube.frames_per_map
@@ -87,7 +87,7 @@ def count_map(cube: Cube, index: int, counter: SweepCounter) -> CountVolume:
         bits[:, :, :row_bytes] = cube.frames[first + start : first + stop]
         bits[:, :, row_bytes - 1] &= last_byte
         column = (np.arange(start, stop) // exposures).astype(np.int32)
-        counter.add(bits, column, column.astype(np.float64))
+        counter.add(bits, column, column.astype(np.float64), np.zeros(len(bits), np.int32))
     return counter.finish()
 
 

@@ -2,11 +2,10 @@
 
 import os
 import time
-from contextlib import closing
 
 from calibration.model import RigModel
 from rig.config import EstimateConfig
-from rig.counting import SweepCounter
+from rig.counting import SweepLayout
 from rig.cube import Cube, column_commands, count_map
 from rig.reconstruction import Reconstructor
 from rig.run import OutFolder, Progress, Run, RunResult
@@ -32,16 +31,20 @@ def reconstruct_cube(
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=False)
     geometry = reconstructor.geometry
     tally = MapTally(plan.columns, plan.exposures, estimate.estimator, estimate.filter)
-    counter = SweepCounter(plan.columns, geometry.rows, geometry.width, geometry.x0, geometry.window, threads)
-    with closing(counter), Run(out, tally) as run:
+    counter = reconstructor.counter(
+        SweepLayout(
+            plan.columns, geometry.rows, geometry.width, geometry.x0, geometry.window, plan.exposures, dark=False
+        )
+    )
+    with Run(out, tally) as run:
         run.rays = geometry.u, geometry.v
         verdict = Verdict.COMPLETE
         try:
             for index in range(cube.maps):
                 begun = time.perf_counter()
-                volume = count_map(cube, index, counter)
+                sweep = count_map(cube, index, counter)
                 count_s = time.perf_counter() - begun
-                result = reconstructor.map(volume)
+                result = reconstructor.map(sweep)
                 run.add(result, count_s + result.compute_s)
                 if progress is not None:
                     progress(tally.maps, cube.maps)

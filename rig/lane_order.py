@@ -18,6 +18,7 @@ PAD: Final = 16
 """Zeros on both sides of each step's lanes."""
 
 
+@numba.njit(cache=True, nogil=True)
 def padded_lanes(pixels: int) -> int:
     """Lanes of a row of so many pixels, whole vectors."""
     return -(-pixels // (STEPS * LANES)) * LANES

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from drivers.errors import DeviceFault
 from drivers.ring import RingReader
-from rig.counting import CountVolume
+from rig.counting import Counter, FrameTally, SweepLayout
 from rig.map_queue import AcquiredMap, MapQueue
 from rig.reconstruction import MapResult
 from rig.source import Source, blocks
@@ -17,8 +17,12 @@ from rig.sweeps import SweepAssembler, SweepData
 class MakesMaps(Protocol):
     """What the counting thread needs of a `Reconstructor`. It uses it from no other thread."""
 
-    def map(self, volume: CountVolume) -> MapResult:
-        """The map of one sweep's counts."""
+    def counter(self, layout: SweepLayout) -> Counter:
+        """A counter whose sweeps `map` takes."""
+        ...
+
+    def map(self, sweep: FrameTally) -> MapResult:
+        """The map of one counted sweep."""
         ...
 
 

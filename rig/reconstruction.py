@@ -4,12 +4,13 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.model import RigModel
-from rig.counting import CountVolume
+from rig.counting import Counter, FrameTally, SweepLayout
 from rig.depth import depth_map
 from rig.errors import UsageError
 from rig.estimators import ESTIMATORS, FILTERS, Learned, create_estimator
@@ -47,7 +48,7 @@ class MapResult:
 
 
 class Reconstructor:
-    """Turns count volumes into maps, one after the other; estimators that learn carry their state from map to map.
+    """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
 
     model: rig model, None for an uncalibrated rig (stripes only). column_commands: (columns,) mirror command of each
     column's centre. estimator, filter: of ESTIMATORS and FILTERS. Raises UsageError for what does not fit.
@@ -81,11 +82,18 @@ class Reconstructor:
         else:
             raise UsageError("without a calibration the sensor size (rows, width) must be given")
 
-    def map(self, volume: CountVolume) -> MapResult:
-        """Stripe table, depth and intensity of one sweep, with the time that estimation took."""
+    def counter(self, layout: SweepLayout) -> Counter:
+        """A counter whose sweeps `map` takes, one after the other and each before frames of the next are added."""
+        return self.estimator.counter(layout, self.geometry)
+
+    def map(self, sweep: Any) -> MapResult:
+        """Stripe table, depth and intensity of one counted sweep, with the time that estimation took.
+
+        sweep: what a `counter` gave, or a `CountVolume`.
+        """
         begun = time.perf_counter()
-        geometry = self._bound(volume)
-        stripe = self.estimator.estimate(volume, geometry)
+        stripe = self.estimator.estimate(sweep, self.geometry)
+        geometry = self._bound(sweep)
         if self._filter == "median":
             from rig.estimators.median import median_filter
 
@@ -95,14 +103,14 @@ class Reconstructor:
         else:
             depth = depth_map(stripe, geometry, self._min_confidence)
         compute_s = time.perf_counter() - begun
-        return MapResult(stripe, depth, volume.intensity(), self._fog(), compute_s, self.estimator.used)
+        return MapResult(stripe, depth, sweep.intensity(), self._fog(), compute_s, self.estimator.used)
 
-    def _bound(self, volume: CountVolume) -> SweepGeometry:
+    def _bound(self, sweep: FrameTally) -> SweepGeometry:
         """Geometry with the planes where the frames of each column really were."""
         if self._model is None:
             return self.geometry
         columns = np.arange(len(self._commands))
-        planes = self._model.planes(np.interp(volume.bound_column(), columns, self._commands))
+        planes = self._model.planes(np.interp(sweep.bound_column(), columns, self._commands))
         return replace(self.geometry, planes=planes, plane=planes[:, :3] / planes[:, 3:])
 
     def _fog(self) -> FogEstimate:

@@ -172,13 +172,16 @@ class ScanPlan:
             out[here] = leg.path.command(within[here])
         return out
 
+    def lit_start_s(self, leg: Leg) -> float:
+        """When the mirror enters the first column, from the scan marker of a sweep of this leg."""
+        return float(leg.path.lit_start / self.point_rate_hz) + leg.lag_s
+
     def column(self, tau_s: Array, leg: Leg) -> Array:
         """Fractional column the mirror stands at `tau_s` after the scan marker of a sweep of this leg.
 
         Continued linearly outside the lit part (below -0.5, above columns - 0.5), where the mirror is on no column.
         """
-        start_s = float(leg.path.lit_start / self.point_rate_hz) + leg.lag_s
-        done = (np.asarray(tau_s, np.float64) - start_s) / float(self.column_s)
+        done = (np.asarray(tau_s, np.float64) - self.lit_start_s(leg)) / float(self.column_s)
         return done - 0.5 if leg.columns_rise else self.columns - 0.5 - done
 
     def command_at(self, column: Array) -> Array:

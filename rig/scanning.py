@@ -66,7 +66,6 @@ def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, options: ScanOptions 
         first_alone=estimate.estimator in LEARNING and not rig.spad.info.can_wait,
         recording=run.start_recording() if options.record else None,
         watch=options.watch,
-        threads=threads,
         on_progress=options.live,
     )
     sweeps: list[SweepAccount] = []

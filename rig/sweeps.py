@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from drivers.errors import ProtocolError
 from drivers.frames import FrameBlock, Mark
 from rig.binding import BoundFrames, FrameBinder, SweepClock
-from rig.counting import BIN_DARK, BIN_UNUSABLE, CountVolume, SweepCounter
+from rig.counting import Counter, FrameTally
 from rig.geometry import WORD_PX
 from rig.scan_plan import ScanPlan
 
@@ -61,7 +61,7 @@ class SweepAccount:
 class SweepData(SweepAccount):
     """One sweep, counted. count_s: wall time spent on binding and counting."""
 
-    volume: CountVolume
+    volume: FrameTally
     count_s: float
 
     def account(self) -> SweepAccount:
@@ -72,8 +72,13 @@ class SweepData(SweepAccount):
 class SweepAssembler:
     """Turns the blocks of one run into sweeps. The result does not depend on how frames are grouped into blocks."""
 
-    def __init__(self, plan: ScanPlan, counter: SweepCounter, maps: int, first_index: int = 0) -> None:
+    def __init__(self, plan: ScanPlan, counter: Counter, maps: int, first_index: int = 0) -> None:
+        from rig.binding_kernels import cover
+
         self._plan = plan
+        self._cover = cover
+        self._column_x0 = np.array(plan.x0, np.int32)
+        self._used_px = plan.used_px or -(-plan.width // WORD_PX) * WORD_PX
         self._counter = counter
         self._maps = maps
         self._first_index = first_index
@@ -95,13 +100,10 @@ class SweepAssembler:
         begun = time.perf_counter()
         bound, clocks = self._binder.bind(block)
         x0 = self._windows(block, bound)
-        bins = _covered(bound.bins, x0, self._plan)
         self._count_s += time.perf_counter() - begun
         self.frames_seen += block.n_frames
-        sweeps = bound.sweep
-        starts = [0, *(np.flatnonzero(np.diff(sweeps)) + 1).tolist(), block.n_frames]
-        for a, b in pairwise(starts):
-            number = int(sweeps[a])
+        for a, b in pairwise((*bound.starts, block.n_frames)):
+            number = int(bound.sweep[a])
             while clocks and clocks[0].sweep < number:
                 yield self._finish(clocks.pop(0))
                 if self.complete:
@@ -109,10 +111,12 @@ class SweepAssembler:
             if number < 0:
                 continue
             begun = time.perf_counter()
+            bins = bound.bins[a:b]
+            lit, dark = self._cover(bins, x0[a:b], self._used_px, self._column_x0, self._plan.window)
             self._received += b - a
-            self._lit += int(np.count_nonzero(bins[a:b] >= 0))
-            self._dark += int(np.count_nonzero(bins[a:b] == BIN_DARK))
-            self._counter.add(block.bits[a:b], bins[a:b], bound.column[a:b], x0[a:b])
+            self._lit += lit
+            self._dark += dark
+            self._counter.add(block.bits[a:b], bins, bound.column[a:b], x0[a:b])
             self._count_s += time.perf_counter() - begun
 
     def _finish(self, clock: SweepClock) -> SweepData:
@@ -199,12 +203,3 @@ def _warn(sweep: SweepData) -> None:
         _log.warning("sweep %d: too few markers were received to check its clock", sweep.index)
     elif not sweep.synchronised:
         _log.warning("sweep %d: markers stray %.3g columns from its clock", sweep.index, sweep.residual_columns)
-
-
-def _covered(bins: NDArray[np.int32], x0: NDArray[np.int32], plan: ScanPlan) -> NDArray[np.int32]:
-    """The bins, without frames whose window does not hold all that their column counts: none is counted in part."""
-    if plan.windows is None:
-        return bins
-    first = plan.x0[np.maximum(bins, 0)]
-    held = (x0 <= first) & (first + plan.window <= x0 + plan.windows.width_px)
-    return np.where((bins >= 0) & ~held, np.int32(BIN_UNUSABLE), bins)

@@ -6,7 +6,7 @@ during a frame moves the window of the next one.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from drivers.frames import ROW_ALIGN_BYTES, Mark
 
 _WORD_PX = 8 * ROW_ALIGN_BYTES
 """Windows lie on whole 64-bit words, on which the counting runs."""
+_SCAN, _LINE = int(Mark.SCAN), int(Mark.LINE)
+"""Plain numbers: numpy takes microseconds to see what a flag is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +31,15 @@ class WindowTable:
 
     width_px: int
     x0: tuple[NDArray[np.int32], ...]
+    _joined: NDArray[np.int32] = field(init=False, repr=False)
+    _entries: NDArray[np.int64] = field(init=False, repr=False)
+    _begins: NDArray[np.int64] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Join the tables, so that a block is one look-up."""
+        object.__setattr__(self, "_joined", np.concatenate([np.zeros(0, np.int32), *self.x0]))
+        object.__setattr__(self, "_entries", np.array([len(x0) for x0 in self.x0], np.int64))
+        object.__setattr__(self, "_begins", np.cumsum(self._entries) - self._entries)
 
     def x0_of(
         self, marks: NDArray[np.integer], line: NDArray[np.integer], sweep: NDArray[np.integer]
@@ -38,16 +49,14 @@ class WindowTable:
         marks, line: of the frames' records, which count markers up to and including their own frame. sweep: number of
         the sweep they belong to from 0 on, -1 before the first scan marker.
         """
-        scan = (marks & Mark.SCAN) != 0
-        own = (marks & Mark.LINE) != 0
+        scan = (marks & _SCAN) != 0
+        own = (marks & _LINE) != 0
         begun = sweep.astype(np.int64) - scan  # the sweep that ran when the frame began
-        entries = np.array([len(x0) for x0 in self.x0], np.int64)
         which = np.maximum(begun, 0) % len(self.x0)
-        last = entries[which] - 1
+        last = self._entries[which] - 1
         entry = np.where(scan, last, np.minimum(line.astype(np.int64) - own, last))
         entry = np.where(begun < 0, 0, np.maximum(entry, 0))
-        first = np.concatenate([[0], np.cumsum(entries)[:-1]])
-        x0: NDArray[np.int32] = np.concatenate(self.x0)[first[which] + entry]
+        x0: NDArray[np.int32] = self._joined[self._begins[which] + entry]
         return x0
 
     def check(self, sensor_width: int, step_px: int) -> None:

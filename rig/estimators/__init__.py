@@ -1,11 +1,11 @@
 """Stripe estimators by name: counts of a sweep in, a stripe table out."""
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.counting import CountVolume
+from rig.counting import Counter, FrameTally, SweepLayout
 from rig.geometry import SweepGeometry
 from rig.stripes import StripeTable
 
@@ -41,8 +41,12 @@ class Estimator(Protocol):
         """State of the last map."""
         ...
 
-    def estimate(self, volume: CountVolume, geometry: SweepGeometry) -> StripeTable:
-        """Stripe table of one sweep."""
+    def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
+        """A counter whose sweeps `estimate` takes; geometry: as of every sweep, with columns at their centres."""
+        ...
+
+    def estimate(self, sweep: Any, geometry: SweepGeometry) -> StripeTable:
+        """Stripe table of what `counter` gave of one sweep, or of a `CountVolume`."""
         ...
 
 

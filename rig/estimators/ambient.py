@@ -5,12 +5,13 @@ its neighbours while the laser crosses the whole picture is hot, whatever the sc
 mean.
 """
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.counting import CountVolume
-from rig.estimators.ambient_kernels import window_sums
+from rig.counting import FrameTally
 from rig.estimators.row_kernels import FLUX_MAX
 from rig.geometry import SweepGeometry
 
@@ -21,22 +22,23 @@ HOT_SIGMA = 6.0
 """Excess over the neighbours, in standard deviations, that makes a pixel hot: 1e-9 of good pixels pass."""
 
 
-def ambient_map(volume: CountVolume, geometry: SweepGeometry, quiet: NDArray[np.uint32] | None) -> NDArray[np.float32]:
+def ambient_map(
+    tally: FrameTally, intensity: NDArray[np.uint32], geometry: SweepGeometry, quiet: NDArray[np.integer[Any]] | None
+) -> NDArray[np.float32]:
     """Photons per exposure (rows, width) float32 from dark frames, `quiet` (2, rows, width) counts and hot pixels.
 
-    quiet: ones and exposures of each pixel while clearly behind the stripe; None before any stripe is known.
+    intensity: (rows, width), ones of each pixel within the windows. quiet: ones and exposures of each pixel while
+    clearly behind the stripe; None before any stripe is known.
     """
     ones = np.zeros((geometry.rows, geometry.width))
     exposures = np.zeros_like(ones)
-    if volume.dark_counts is not None:
-        ones += volume.dark_counts
-        exposures += volume.n_dark if volume.dark_frames is None else volume.dark_frames
+    if tally.dark_counts is not None:
+        ones += tally.dark_counts
+        exposures += tally.n_dark if tally.dark_frames is None else tally.dark_frames
     if quiet is not None:
         ones += quiet[0]
         exposures += quiet[1]
-    totals = window_sums(
-        volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.rows, geometry.width
-    )
+    totals = np.stack([intensity, np.broadcast_to(_window_exposures(tally, geometry), intensity.shape)])
     if exposures.sum() < ones.size:
         level = _lowest_level(totals)
         base = np.full(ones.shape, level)
@@ -45,6 +47,14 @@ def ambient_map(volume: CountVolume, geometry: SweepGeometry, quiet: NDArray[np.
     ambient: NDArray[np.float32] = np.maximum(base, hot_pixels(totals)).astype(np.float32)
     ambient[geometry.defects] = DEFECT_FLUX
     return ambient
+
+
+def _window_exposures(tally: FrameTally, geometry: SweepGeometry) -> NDArray[np.uint32]:
+    """Exposures of each pixel of a row while it lay within the stored window (width,)."""
+    change = np.zeros(int(geometry.x0.max(initial=0)) + geometry.window + 1, np.int64)
+    np.add.at(change, geometry.x0, tally.n_frames)
+    np.add.at(change, geometry.x0 + geometry.window, -tally.n_frames)
+    return np.cumsum(change)[: geometry.width].astype(np.uint32)
 
 
 def _lowest_level(totals: NDArray[np.uint32]) -> float:
@@ -84,7 +94,7 @@ def _shrunk(ones: NDArray[np.float64], exposures: NDArray[np.float64]) -> NDArra
 def hot_pixels(totals: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Flux (rows, width) of pixels far above their neighbours over the whole sweep, 0 elsewhere.
 
-    totals: (2, rows, width), ones and exposures of each pixel while inside the search window.
+    totals: (2, rows, width), ones and exposures of each pixel while inside the stored window.
     """
     ones, exposures = totals[0].astype(np.float64), totals[1].astype(np.float64)
     rate = np.minimum(ones / np.maximum(exposures, 1.0), 1.0).astype(np.float32)

@@ -5,7 +5,6 @@ stripe; haze, pedestal, row gains, amplitudes and line width are set to what tho
 medium or the light is assumed beyond 'haze falls with the path length', and that only where data are few.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -14,12 +13,20 @@ from numpy.typing import NDArray
 
 from rig.counting import CountVolume
 from rig.estimators.likelihood_kernels import learn_rows
-from rig.estimators.row_input import state_of, sweep_of
+from rig.estimators.row_input import Lines, State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import AMPLITUDES, BINS, RowModel, fit_haze, stripe_scale
 from rig.geometry import SweepGeometry
+from rig.row_threads import RowWorkers
 
 LATTICE_LINES = 8192
 """Rows x columns of a sweep that a learning round reads: about 10^6 pixels."""
+NEXT_LINES = 2048
+"""The same of a sweep that carries a model on; what the sweeps before it taught fades by FADE with each."""
+FADE = 0.7
+WIDTH_STEP = 4
+"""Every 4th of those lines is asked for the line's width."""
+WIDTH_EVIDENCE = 3.0
+"""Natural logarithm of the odds from which the width moves."""
 FIRST_ROUNDS = 8
 LAST_ROUNDS = 3
 LEVELS = 14
@@ -44,6 +51,20 @@ class Expectation:
     amplitude_mass: NDArray[np.float64]
     evidence: float
 
+    def plus(self, other: "Expectation") -> "Expectation":
+        """Both together."""
+        return Expectation(
+            self.levels + other.levels, self.rows_seen + other.rows_seen, self.columns_seen + other.columns_seen,
+            self.amplitude_mass + other.amplitude_mass, self.evidence + other.evidence,
+        )  # fmt: skip
+
+    def faded(self, share: float) -> "Expectation":
+        """As if only this share of the lines had been seen."""
+        return Expectation(
+            share * self.levels, share * self.rows_seen, share * self.columns_seen, share * self.amplitude_mass,
+            share * self.evidence,
+        )  # fmt: skip
+
 
 def lattice(geometry: SweepGeometry, lines: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """About `lines` (row, column) pairs spread evenly over those with a window: a fixed pattern, no chance in it."""
@@ -59,71 +80,99 @@ def lattice(geometry: SweepGeometry, lines: int) -> tuple[NDArray[np.int32], NDA
     return y[pick].astype(np.int32), c[pick].astype(np.int32)
 
 
+def lines_of(volume: CountVolume, where: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Lines:
+    """The counts of a volume at (rows, columns), each one row of its column's window."""
+    rows, columns = where
+    return Lines(volume.counts[columns, rows].astype(np.int32), rows, columns, volume.n_frames[columns])
+
+
 def expect(
-    volume: CountVolume, geometry: SweepGeometry, model: RowModel, lines: tuple[NDArray[np.int32], NDArray[np.int32]]
+    lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers
 ) -> Expectation:
-    """Expectation step of `model` over the given (rows, columns)."""
+    """Expectation step of `model` over some lines."""
     typical = float(np.median(model.ambient))
-    sweep, state = sweep_of(volume, geometry), state_of(model)
-
-    def piece(rows: NDArray[np.int32], columns: NDArray[np.int32]) -> Expectation:
-        levels = np.zeros((BINS, LEVELS))
-        rows_seen, columns_seen = np.zeros((geometry.rows, 2)), np.zeros((geometry.columns, 2))
-        mass = np.zeros(len(model.amplitude) + 1)
-        evidence = learn_rows(sweep, state, rows, columns, 5.0 * typical + 1e-3, levels, rows_seen, columns_seen, mass)
-        return Expectation(levels, rows_seen, columns_seen, mass, float(evidence))
-
+    sweep, state = sweep_of(geometry), state_of(model)
+    hot_flux = 5.0 * typical + 1e-3
     # Fixed pieces, added in order: the sums do not depend on the number of threads.
-    with ThreadPoolExecutor(PIECES) as pool:
-        parts = list(pool.map(piece, np.array_split(lines[0], PIECES), np.array_split(lines[1], PIECES)))
-    return Expectation(
-        sum((p.levels for p in parts), np.zeros((BINS, LEVELS))),
-        sum((p.rows_seen for p in parts), np.zeros((geometry.rows, 2))),
-        sum((p.columns_seen for p in parts), np.zeros((geometry.columns, 2))),
-        sum((p.amplitude_mass for p in parts), np.zeros(len(model.amplitude) + 1)),
-        sum(p.evidence for p in parts),
-    )
+    edges = np.linspace(0, len(lines.row), PIECES + 1).astype(int)
+    parts: list[Expectation | None] = [None] * PIECES
+
+    def work(first: int, last: int) -> None:
+        for i in range(first, last):
+            part = Lines(*(array[edges[i] : edges[i + 1]] for array in lines))
+            parts[i] = _expect_piece(sweep, state, part, geometry, hot_flux)
+
+    workers.over(PIECES, work)
+    done = [part for part in parts if part is not None]
+    total = done[0]
+    for part in done[1:]:
+        total = total.plus(part)
+    return total
 
 
-def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: NDArray[np.float32]) -> RowModel:
+def _expect_piece(sweep: Sweep, state: State, lines: Lines, geometry: SweepGeometry, hot_flux: float) -> Expectation:
+    levels = np.zeros((BINS, LEVELS))
+    rows_seen, columns_seen = np.zeros((geometry.rows, 2)), np.zeros((geometry.columns, 2))
+    mass = np.zeros(len(state.amplitude) + 1)
+    evidence = learn_rows(sweep, state, lines, hot_flux, levels, rows_seen, columns_seen, mass)
+    return Expectation(levels, rows_seen, columns_seen, mass, float(evidence))
+
+
+def learn_first(
+    volume: CountVolume, geometry: SweepGeometry, ambient: NDArray[np.float32], workers: RowWorkers
+) -> RowModel:
     """Row model of a sweep that nothing is known about: several starts, the likeliest one refined."""
-    lines = lattice(geometry, LATTICE_LINES)
-    few = lattice(geometry, LATTICE_LINES // 4)
+    lines = lines_of(volume, lattice(geometry, LATTICE_LINES))
+    few = lines_of(volume, lattice(geometry, LATTICE_LINES // 4))
     guessed = volume.dark_counts is None
     best: tuple[float, RowModel] | None = None
     for extinction in START_EXTINCTIONS_PER_M:
         model = _start(volume, geometry, ambient, extinction)
         for _ in range(2):
-            model = maximise(model, expect(volume, geometry, model, few), spread=True, free_ambient=guessed)
-        evidence = expect(volume, geometry, model, few).evidence
+            model = maximise(model, expect(few, geometry, model, workers), spread=True, free_ambient=guessed)
+        evidence = expect(few, geometry, model, workers).evidence
         if best is None or evidence > best[0]:
             best = evidence, model
     assert best is not None
     model = best[1]
     for _ in range(FIRST_ROUNDS):
-        model = maximise(model, expect(volume, geometry, model, few), spread=True, free_ambient=guessed)
-        model = fit_line_width(volume, geometry, model, few)
+        model = maximise(model, expect(few, geometry, model, workers), spread=True, free_ambient=guessed)
+        model = fit_line_width(few, geometry, model, workers)
     for _ in range(LAST_ROUNDS):
-        model = maximise(model, expect(volume, geometry, model, lines), spread=False, free_ambient=guessed)
+        model = maximise(model, expect(lines, geometry, model, workers), spread=False, free_ambient=guessed)
     return model
 
 
-def learn_next(volume: CountVolume, geometry: SweepGeometry, model: RowModel) -> RowModel:
-    """The model carried on by one more sweep."""
-    lines = lattice(geometry, LATTICE_LINES)
-    model = maximise(model, expect(volume, geometry, model, lines), spread=False, gains=False)
-    return fit_line_width(volume, geometry, model, lattice(geometry, LATTICE_LINES // 4))
+def next_lattice(geometry: SweepGeometry) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """The (rows, columns) that carry a model on from sweep to sweep, sorted by column."""
+    rows, columns = lattice(geometry, NEXT_LINES)
+    order = np.lexsort((rows, columns))
+    return rows[order], columns[order]
 
 
-def fit_line_width(
-    volume: CountVolume, geometry: SweepGeometry, model: RowModel, lines: tuple[NDArray[np.int32], NDArray[np.int32]]
-) -> RowModel:
-    """Move the line width one step up or down where that makes the counts likelier."""
+def learn_next(
+    lines: Lines, geometry: SweepGeometry, model: RowModel, before: Expectation | None, workers: RowWorkers
+) -> tuple[RowModel, Expectation]:
+    """The model carried on by the lines of `next_lattice` of one more sweep.
+
+    before: what the sweeps before it taught; it is returned with this one's added, and fades by half a sweep.
+    """
+    seen = expect(lines, geometry, model, workers)
+    if before is not None:
+        seen = seen.plus(before.faded(FADE))
+    model = maximise(model, seen, spread=False, gains=False)
+    some = Lines(*(array[::WIDTH_STEP] for array in lines))
+    return fit_line_width(some, geometry, model, workers), seen
+
+
+def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> RowModel:
+    """Move the line width one step up or down where that makes the counts likelier, and clearly so."""
     tried = [
         replace(model, line_sigma_px=float(np.clip(model.line_sigma_px * f, 0.25, 2.4))) for f in (0.87, 1.0, 1.15)
     ]
-    evidence = [expect(volume, geometry, m, lines).evidence for m in tried]
-    return tried[int(np.argmax(evidence))]
+    evidence = [expect(lines, geometry, m, workers).evidence for m in tried]
+    best = int(np.argmax(evidence))
+    return tried[best] if evidence[best] > evidence[1] + WIDTH_EVIDENCE else model
 
 
 def _bins(geometry: SweepGeometry) -> tuple[float, float]:

@@ -1,8 +1,9 @@
 """Estimator `likelihood`: maximum likelihood of 'haze, stripe, then less' on every row, told nothing of the medium.
 
-Model and arithmetic: `row_kernels`; how haze, ambient, amplitudes and line width are learned: `learning`. The first map
-is estimated twice (the first pass finds which pixels were quiet behind the stripe); every later map is estimated with
-what the map before it taught, so a map depends on nothing inside itself and a live scan never waits.
+Search along a row: `row_search`; what it knows and how that is learned: `row_model`, `learning`. The first map is
+counted whole and estimated twice (the first pass finds which pixels were quiet behind the stripe). Every later map is
+judged column by column while its frames come in, with what the maps before it taught: it depends on nothing inside
+itself and a live scan never waits.
 """
 
 from dataclasses import replace
@@ -10,18 +11,24 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.counting import CountVolume
+from rig.counting import Counter, CountVolume, FrameTally, SweepCounter, SweepLayout
 from rig.estimators.ambient import ambient_map
-from rig.estimators.learning import learn_first, learn_next
-from rig.estimators.likelihood_kernels import estimate_rows
-from rig.estimators.row_input import state_of, sweep_of
+from rig.estimators.judging import judge_of, nothing_found
+from rig.estimators.learning import Expectation, learn_first, learn_next, lines_of, next_lattice
+from rig.estimators.row_input import Lines
 from rig.estimators.row_model import RowModel
+from rig.estimators.row_search import Judge, new_bench
+from rig.estimators.stream import MOST_EXPOSURES, ColumnJudge, SearchedSweep
+from rig.estimators.stream_kernels import search_counts
 from rig.geometry import SweepGeometry
-from rig.row_threads import over_rows
+from rig.lane_order import padded_lanes, pixel_order
+from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
 LEAST_SURE = 0.02
 """Share of confident answers below which a map teaches nothing: a closed shutter must not spoil the maps after it."""
+TEACH_FRAMES = 5000
+"""Lit frames that must have come before the model is carried on: at one exposure a column, every 10th map of 500."""
 
 
 class Likelihood:
@@ -31,38 +38,119 @@ class Likelihood:
     """
 
     def __init__(self, threads: int = 2, model: RowModel | None = None) -> None:
-        self.threads = threads
+        self._workers = RowWorkers(threads)
         self.model = model
         self.used: RowModel | None = None
         """The state that the last map was estimated with."""
+        self._judge: tuple[RowModel, SweepGeometry, int, bool, Judge] | None = None
+        self._taught: Expectation | None = None
+        self._since_taught = 0
 
-    def estimate(self, volume: CountVolume, geometry: SweepGeometry) -> StripeTable:
+    def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
+        """A counter whose sweeps `estimate` takes; geometry: nominal, as of every sweep."""
+        return _LikelihoodCounter(self, layout, geometry, self._workers)
+
+    def estimate(self, sweep: CountVolume | SearchedSweep, geometry: SweepGeometry) -> StripeTable:
         """Stripe table of one sweep; afterwards `model` is what the next sweep will be estimated with."""
-        if self.model is None:
-            model = learn_first(volume, geometry, ambient_map(volume, geometry, None))
-            _, quiet = self._sweep(volume, geometry, model)
-            model = replace(model, ambient=ambient_map(volume, geometry, quiet))
-            model = learn_next(volume, geometry, model)
+        if isinstance(sweep, SearchedSweep):
+            stripes, quiet, lines = sweep.stripe, sweep.quiet, sweep.lines
+            assert self.model is not None, "a sweep is judged under a model"
+            self.used = self.model
         else:
-            model = self.model
-        stripes, quiet = self._sweep(volume, geometry, model)
-        self.used = model
-        if np.mean(stripes.confidence > 0.5) >= LEAST_SURE:
-            self.model = learn_next(volume, geometry, replace(model, ambient=ambient_map(volume, geometry, quiet)))
+            if self.model is None:
+                self.model = self._first_model(sweep, geometry)
+            self.used = self.model
+            stripes, quiet = self._search(sweep, geometry, self.used)
+            lines = lines_of(sweep, next_lattice(geometry))
+        self._since_taught += int(sweep.n_frames.sum())
+        if self._since_taught >= TEACH_FRAMES and np.mean(stripes.confidence > 0.5) >= LEAST_SURE:
+            self._since_taught = 0
+            self._carry_on(sweep, sweep.intensity(), geometry, quiet, lines)
         return stripes
 
-    def _sweep(
+    def judge(self, geometry: SweepGeometry, exposures: int, *, dark: bool) -> Judge:
+        """What the search under the present model reads; made once per model."""
+        assert self.model is not None, "the first map is learned from counts"
+        return self._judge_of(self.model, geometry, exposures, dark=dark)
+
+    def _judge_of(self, model: RowModel, geometry: SweepGeometry, exposures: int, *, dark: bool) -> Judge:
+        if self._judge is not None:
+            of_model, of_geometry, of_exposures, of_dark, judge = self._judge
+            if of_model is model and of_geometry is geometry and (of_exposures, of_dark) == (exposures, dark):
+                return judge
+        judge = judge_of(model, geometry, exposures, self._workers, dark=dark)
+        self._judge = model, geometry, exposures, dark, judge
+        return judge
+
+    def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
+        intensity = volume.intensity()
+        model = learn_first(volume, geometry, ambient_map(volume, intensity, geometry, None), self._workers)
+        _, quiet = self._search(volume, geometry, model)
+        model = replace(model, ambient=ambient_map(volume, intensity, geometry, quiet))
+        lines = lines_of(volume, next_lattice(geometry))
+        return learn_next(lines, geometry, model, None, self._workers)[0]
+
+    def _carry_on(
+        self,
+        tally: FrameTally,
+        intensity: NDArray[np.uint32],
+        geometry: SweepGeometry,
+        quiet: NDArray[np.int32],
+        lines: Lines,
+    ) -> None:
+        assert self.model is not None
+        model = replace(self.model, ambient=ambient_map(tally, intensity, geometry, quiet))
+        self.model, self._taught = learn_next(lines, geometry, model, self._taught, self._workers)
+
+    def _search(
         self, volume: CountVolume, geometry: SweepGeometry, model: RowModel
-    ) -> tuple[StripeTable, NDArray[np.uint32]]:
+    ) -> tuple[StripeTable, NDArray[np.int32]]:
         """Stripes under `model`, and the ones and exposures of pixels behind clear stripes (2, rows, width)."""
-        rows, columns = geometry.rows, geometry.columns
-        out = np.full((5, rows, columns), np.nan, np.float32)
-        out[1] = 0.0
-        quiet = np.zeros((2, rows, geometry.width), np.uint32)
-        sweep, state = sweep_of(volume, geometry), state_of(model)
+        frames = volume.n_frames[volume.n_frames > 0]
+        exposures = int(np.median(frames)) if len(frames) else 1
+        judge = self._judge_of(model, geometry, exposures, dark=volume.dark_counts is not None)
+        found = nothing_found(geometry, None)
 
         def work(first: int, last: int) -> None:
-            estimate_rows(sweep, state, first, last, out, quiet)
+            bench = new_bench(padded_lanes(geometry.window))
+            search_counts(volume.counts, volume.n_frames, judge, bench, found, first, last)
 
-        over_rows(rows, self.threads, work)
-        return StripeTable(*out), quiet
+        self._workers.over(geometry.rows, work)
+        exposed = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), 8, axis=1)[:, : geometry.width]
+        return StripeTable(*found.stripe), np.stack([pixel_order(found.quiet, geometry.width), exposed])
+
+
+class _LikelihoodCounter:
+    """Counts the first sweep whole; judges the columns of every later one as they come."""
+
+    def __init__(self, of: Likelihood, layout: SweepLayout, geometry: SweepGeometry, workers: RowWorkers) -> None:
+        self._of = of
+        self._layout = layout
+        self._geometry = geometry
+        self._workers = workers
+        self._counter: SweepCounter | ColumnJudge | None = None
+
+    def reset(self) -> None:
+        """Begin the next sweep."""
+        self._counter = None
+
+    def add(
+        self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
+    ) -> None:
+        """Add frames, see `Counter`."""
+        self._present().add(bits, bins, column, x0)
+
+    def finish(self) -> CountVolume | SearchedSweep:
+        """What the sweep gave."""
+        return self._present().finish()
+
+    def _present(self) -> SweepCounter | ColumnJudge:
+        # Chosen with the first frames: only then has the sweep before this one been estimated and has taught.
+        if self._counter is None:
+            layout = self._layout
+            if self._of.model is None or layout.exposures > MOST_EXPOSURES:
+                self._counter = SweepCounter(layout, self._workers)
+            else:
+                judge = self._of.judge(self._geometry, layout.exposures, dark=layout.dark)
+                self._counter = ColumnJudge(layout, self._geometry, judge, self._workers)
+        return self._counter

@@ -1,4 +1,4 @@
-"""Compiled sweeps of the row likelihood: one pass that learns, one that estimates."""
+"""Compiled expectation step of the row likelihood: what rows of counts, each with its posterior, say of the model."""
 
 from typing import Final
 
@@ -6,8 +6,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.row_input import Row, State, Sweep, judge_row, row_buffers
-from rig.estimators.row_kernels import mode_of, refine
+from rig.estimators.row_input import Lines, Row, State, Sweep, judge_line, row_buffers
+from rig.estimators.row_kernels import mode_of
 
 CUT: Final = 0.05
 """Share of the depth range outside the picture up to which a row tells how often the stripe is missing."""
@@ -16,23 +16,20 @@ CERTAIN: Final = 0.6
 CLEAR: Final = 0.97
 CLEAR_PX: Final = 6
 """Rows as certain as this, and pixels as far before their stripe, measure the haze itself."""
-QUIET: Final = 0.9
-"""Probability within 1 px from which the pixels behind the stripe teach the ambient light."""
 
 
 @numba.njit(cache=True, nogil=True)
 def learn_rows(
     sweep: Sweep,
     state: State,
-    row_of: NDArray[np.int32],
-    column_of: NDArray[np.int32],
+    lines: Lines,
     hot_flux: float,
     levels: NDArray[np.float64],
     rows_seen: NDArray[np.float64],
     columns_seen: NDArray[np.float64],
     amplitude_mass: NDArray[np.float64],
 ) -> float:
-    """Expectation step over the listed (row, column) pairs; returns the log evidence.
+    """Expectation step over some lines; returns the log evidence.
 
     Adds to levels (bins, 14): ones, exposures, and exposures weighted with geometry factor and with ambient flux, of
     pixels before the stripe, then of those behind it, each with the probability of being there, then of those well
@@ -41,11 +38,10 @@ def learn_rows(
     amplitude, the last entry 'no stripe'. Pixels with more ambient flux than hot_flux are left out.
     """
     amplitudes = state.amplitude.shape[0]
-    row = row_buffers(sweep.counts.shape[2], amplitudes)
+    row = row_buffers(sweep.window, amplitudes)
     total = 0.0
-    for i in range(row_of.shape[0]):
-        y, c = row_of[i], column_of[i]
-        length, first, last, start, none, cut, evidence = judge_row(sweep, state, row, y, c)
+    for i in range(lines.row.shape[0]):
+        length, first, last, start, none, cut, evidence = judge_line(sweep, state, row, lines, i)
         if length == 0:
             continue
         total += evidence
@@ -58,7 +54,7 @@ def learn_rows(
                 levels[row.cell[j], 13] += (1.0 - none) / (last - first + 1)
         if none < 0.5:
             _learn_levels(
-                sweep, state, row, y, c, length, first, last, start, none, hot_flux, levels, rows_seen, columns_seen
+                sweep, state, row, lines.row[i], lines.column[i], lines.exposures[i], length, first, last, start, none, hot_flux, levels, rows_seen, columns_seen
             )
     return total
 
@@ -70,6 +66,7 @@ def _learn_levels(
     row: Row,
     y: int,
     c: int,
+    k: int,
     length: int,
     first: int,
     last: int,
@@ -81,7 +78,6 @@ def _learn_levels(
     columns_seen: NDArray[np.float64],
 ) -> None:
     """Add one row's pixels to the levels before and behind the stripe."""
-    k = sweep.n_frames[c]
     step = 1 if sweep.near_is_left else -1
     reach = state.psi.shape[0]
     # Doubtful rows would teach the level behind the stripe their own guess; haze before it is plentiful anyway.
@@ -123,43 +119,3 @@ def _learn_levels(
             levels[b, 5] += is_behind * k
             levels[b, 6] += is_behind * k * row.gain[t]
             levels[b, 7] += is_behind * k * ambient
-
-
-@numba.njit(cache=True, nogil=True)
-def estimate_rows(
-    sweep: Sweep, state: State, first_row: int, last_row: int, out: NDArray[np.float32], quiet: NDArray[np.uint32]
-) -> None:
-    """Best position of every column on rows first_row..last_row-1.
-
-    out: (5, rows, columns): x_px, confidence, x_sd_px, signal, haze (see StripeTable).
-    quiet: (2, rows, width): ones and exposures of each pixel while it lay behind a stripe that was hardly in doubt.
-    """
-    amplitudes = state.amplitude.shape[0]
-    row = row_buffers(sweep.counts.shape[2], amplitudes)
-    reach = state.psi.shape[0]
-    step = 1 if sweep.near_is_left else -1
-    for c in range(sweep.counts.shape[0]):
-        k = np.float32(sweep.n_frames[c])
-        for y in range(first_row, last_row):
-            length, first, last, start, _, _, _ = judge_row(sweep, state, row, y, c)
-            if length == 0:
-                continue
-            mode, near = mode_of(row.posterior, first, last)
-            offset, sd = refine(
-                row.n, k, row.before, row.behind, row.scale, length, mode, row.score, row.edge, row.taps,
-                state.amplitude, state.log_weight, state.fine, state.table, row.labels,
-            )  # fmt: skip
-            best = 0
-            for m in range(1, amplitudes):
-                if row.score[m, mode] + state.log_weight[m] > row.score[best, mode] + state.log_weight[best]:
-                    best = m
-            x = start + step * mode
-            out[0, y, c] = x + step * offset
-            out[1, y, c] = near
-            out[2, y, c] = sd
-            out[3, y, c] = state.amplitude[best] * row.scale[mode]
-            out[4, y, c] = max(row.before[mode] - state.ambient[y, x], np.float32(0.0))
-            if near > QUIET:
-                for t in range(mode + reach + 1, length):
-                    quiet[0, y, start + step * t] += np.uint32(row.n[t])
-                    quiet[1, y, start + step * t] += np.uint32(k)

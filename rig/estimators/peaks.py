@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rig.counting import CountVolume
+from rig.counting import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimators.peak_kernels import peak_rows
 from rig.geometry import SweepGeometry
-from rig.row_threads import over_rows
+from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
 
@@ -28,6 +28,10 @@ class Peaks:
         """Nothing is learned."""
         return None
 
+    def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
+        """A counter of whole sweeps."""
+        return SweepCounter(layout, RowWorkers(self.threads))
+
     def estimate(self, volume: CountVolume, geometry: SweepGeometry) -> StripeTable:
         """Stripe table of one sweep."""
         out = np.full((5, geometry.rows, geometry.columns), np.nan, np.float32)
@@ -39,5 +43,6 @@ class Peaks:
                 geometry.defects, self.with_edge, first, last, out,
             )  # fmt: skip
 
-        over_rows(geometry.rows, self.threads, work)
+        with RowWorkers(self.threads) as workers:
+            workers.over(geometry.rows, work)
         return StripeTable(*out)

@@ -6,11 +6,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.counting import CountVolume
 from rig.estimators.row_kernels import (
     FLUX_MAX,
     FLUX_MIN,
-    LABELS,
     logit_table,
     none_prior,
     row_posterior,
@@ -25,10 +23,9 @@ Float32 = NDArray[np.float32]
 
 
 class Sweep(NamedTuple):
-    """Counts and geometry of a sweep; arrays as in CountVolume and SweepGeometry, depth range as inverse depths."""
+    """Geometry of a sweep; arrays as in SweepGeometry, depth range as inverse depths."""
 
-    counts: NDArray[np.unsignedinteger]
-    n_frames: NDArray[np.int32]
+    window: int
     x0: NDArray[np.int32]
     x_lo: NDArray[np.int32]
     x_hi: NDArray[np.int32]
@@ -38,6 +35,18 @@ class Sweep(NamedTuple):
     v: Float32
     w_near: float
     w_far: float
+
+
+class Lines(NamedTuple):
+    """Some rows of some columns, with their counts.
+
+    counts: (lines, window) integers; row, column: int32 (lines,); exposures: int32 (lines,).
+    """
+
+    counts: NDArray[np.integer]
+    row: NDArray[np.int32]
+    column: NDArray[np.int32]
+    exposures: NDArray[np.int32]
 
 
 class State(NamedTuple):
@@ -58,11 +67,11 @@ class State(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Buffers of one row, filled by `judge_row` from index 0 (nearest pixel) on; made once per thread.
+    """Buffers of one row, filled by `row_fluxes` and `judge_line` from index 0 (nearest pixel) on; made once per thread.
 
     n: ones; before, behind: flux of each pixel in front of and behind the stripe; scale: stripe photons at amplitude 1;
     cell: nearest profile bin; gain: geometry factor of the haze; w: inverse depth; log_prior: of positions; taps, edge,
-    score, posterior, by_amplitude: see `row_scores` and `row_posterior`; labels: scratch of `refine`.
+    score, posterior, by_amplitude: see `row_scores` and `row_posterior`.
     """
 
     n: Float32
@@ -78,15 +87,14 @@ class Row(NamedTuple):
     score: Float32
     posterior: Float32
     by_amplitude: NDArray[np.float64]
-    labels: NDArray[np.float64]
 
 
-def sweep_of(volume: CountVolume, geometry: SweepGeometry) -> Sweep:
-    """Kernel input of one sweep."""
+def sweep_of(geometry: SweepGeometry) -> Sweep:
+    """Kernel input of a sweep's geometry."""
     near_m, far_m = geometry.depth_range_m
     return Sweep(
-        volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left, geometry.plane,
-        geometry.u, geometry.v, 1.0 / near_m, 1.0 / far_m,
+        geometry.window, geometry.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left, geometry.plane, geometry.u,
+        geometry.v, 1.0 / near_m, 1.0 / far_m,
     )  # fmt: skip
 
 
@@ -107,21 +115,8 @@ def row_buffers(window: int, amplitudes: int) -> Row:
         np.empty(window, np.float32), np.empty(window, np.int32), np.empty(window, np.float32),
         np.empty(window, np.float32), np.empty(window, np.float32), np.empty((3, window), np.float32),
         np.empty(window + 1, np.float32), np.empty((amplitudes, window), np.float32), np.empty(window, np.float32),
-        np.empty(amplitudes, np.float64), np.empty(LABELS, np.float64),
+        np.empty(amplitudes, np.float64),
     )  # fmt: skip
-
-
-@numba.njit(cache=True, nogil=True)
-def read_row(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[int, int, int, int]:
-    """Fill n to log_prior of `row` for row y of column c; returns what `row_fluxes` does."""
-    if sweep.n_frames[c] == 0:
-        return 0, 0, -1, 0
-    length, begin, end, start = row_fluxes(sweep, state, row, y, c)
-    counts, x0 = sweep.counts[c, y], sweep.x0[c]
-    step = 1 if sweep.near_is_left else -1
-    for t in range(length):
-        row.n[t] = counts[start + step * t - x0]
-    return length, begin, end, start
 
 
 @numba.njit(cache=True, nogil=True)
@@ -136,7 +131,7 @@ def row_fluxes(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[in
         return 0, 0, -1, 0
     plane, u, v, profile = sweep.plane[c], sweep.u, sweep.v, state.profile
     first = max(lo - MARGIN_PX, x0, 0)
-    last = min(hi + MARGIN_PX, x0 + sweep.counts.shape[2] - 1, u.shape[1] - 1)
+    last = min(hi + MARGIN_PX, x0 + sweep.window - 1, u.shape[1] - 1)
     while first < last and np.isnan(u[y, first]):
         first += 1
     while last > first and np.isnan(u[y, last]):
@@ -178,17 +173,23 @@ def row_fluxes(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[in
 
 
 @numba.njit(cache=True, nogil=True)
-def judge_row(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[int, int, int, int, float, float, float]:
-    """Posterior of row y of column c, in `row`.
+def judge_line(
+    sweep: Sweep, state: State, row: Row, lines: Lines, i: int
+) -> tuple[int, int, int, int, float, float, float]:
+    """Posterior of line i, in `row`.
 
-    Returns what `read_row` does, then the probability of 'no stripe', the share of its prior that the picture's border
+    Returns what `row_fluxes` does, then the probability of 'no stripe', the share of its prior that the picture's border
     accounts for, and the log evidence.
     """
-    length, first, last, start = read_row(sweep, state, row, y, c)
-    if length == 0:
+    c = lines.column[i]
+    length, first, last, start = row_fluxes(sweep, state, row, lines.row[i], c)
+    if length == 0 or lines.exposures[i] == 0:
         return 0, 0, -1, 0, 1.0, 0.0, 0.0
+    step = 1 if sweep.near_is_left else -1
+    for t in range(length):
+        row.n[t] = lines.counts[i, start + step * t - sweep.x0[c]]
     row_scores(
-        row.n, np.float32(sweep.n_frames[c]), row.before, row.behind, row.scale, length, state.amplitude, state.psi,
+        row.n, np.float32(lines.exposures[i]), row.before, row.behind, row.scale, length, state.amplitude, state.psi,
         state.table, row.taps, row.edge, row.score,
     )  # fmt: skip
     prior = none_prior(sweep.w_near, sweep.w_far, row.w[first], row.w[last], state.none_weight)

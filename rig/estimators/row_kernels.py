@@ -28,7 +28,6 @@ LABEL_PX: Final = 0.25
 """Spacing of the sub-pixel positions around the most probable pixel."""
 LABELS: Final = 13
 """Sub-pixel positions, 1.5 px each way: the mean of the peak, not of its neighbours."""
-AMPLITUDE_CUT: Final = np.float32(6.0)
 LOST: Final = np.float32(24.0)
 """Log-likelihood below the best at which a hypothesis no longer counts (exp(-24) = 4e-11)."""
 
@@ -217,69 +216,3 @@ def mode_of(posterior: NDArray[np.float32], first: int, last: int) -> tuple[int,
         if first <= j <= last:
             near += posterior[j]
     return mode, min(near, np.float32(1.0))
-
-
-@numba.njit(cache=True, nogil=True)
-def refine(
-    n: NDArray[np.float32],
-    k: Real,
-    before: NDArray[np.float32],
-    behind: NDArray[np.float32],
-    scale: NDArray[np.float32],
-    length: int,
-    mode: int,
-    score: NDArray[np.float32],
-    edge: NDArray[np.float32],
-    taps: NDArray[np.float32],
-    amplitude: NDArray[np.float32],
-    log_weight: NDArray[np.float32],
-    fine: NDArray[np.float32],
-    table: NDArray[np.float32],
-    likelihood: NDArray[np.float64],
-) -> tuple[float, float]:
-    """Offset of the stripe from `mode` in px and its standard deviation: posterior over places a quarter pixel apart.
-
-    fine: (labels, 2R + 1), share of the stripe in pixels -R..R from the mode for each label; the pixel that holds the
-    label sees haze on its near part only. Amplitudes far from the best one at the mode are left out.
-    """
-    labels, reach = fine.shape[0], (fine.shape[1] - 1) // 2
-    likeliest = 0
-    for m in range(1, amplitude.shape[0]):
-        if score[m, mode] + log_weight[m] > score[likeliest, mode] + log_weight[likeliest]:
-            likeliest = m
-    best = score[likeliest, mode] + log_weight[likeliest]
-    top = -np.inf
-    for i in range(labels):
-        likelihood[i] = 0.0
-    start, stop = max(mode - reach, 0), min(mode + reach, length - 1)
-    for m in range(amplitude.shape[0]):
-        # Away from the middle of the pixel the next amplitude may be the better one.
-        if abs(m - likeliest) > 1 and score[m, mode] + log_weight[m] < best - AMPLITUDE_CUT:
-            continue
-        light = amplitude[m] * scale[mode]
-        for i in range(labels):
-            offset = (i - labels // 2) * LABEL_PX
-            total = np.float32(edge[start] + log_weight[m] - best)
-            for t in range(start, stop + 1):
-                free = min(max(np.float32(offset - (t - mode) + 0.5), np.float32(0.0)), np.float32(1.0))
-                base = free * before[t] + (np.float32(1.0) - free) * behind[t]
-                flux = np.float32(min(base + light * fine[i, t - mode + reach], FLUX_MAX))
-                cell = cell_of(flux)
-                total += n[t] * table[0, cell] + k * table[1, cell] - taps[1, t]
-            if total > top:
-                # Sums are kept relative to the best term so far, so that none overflows.
-                shrink = np.exp(top - total)
-                for h in range(labels):
-                    likelihood[h] *= shrink
-                top = float(total)
-            likelihood[i] += np.exp(total - top)
-    mass = 0.0
-    mean = 0.0
-    for i in range(labels):
-        mass += likelihood[i]
-        mean += likelihood[i] * (i - labels // 2)
-    mean /= mass
-    variance = 0.0
-    for i in range(labels):
-        variance += likelihood[i] * (i - labels // 2 - mean) ** 2
-    return mean * LABEL_PX, LABEL_PX * np.sqrt(variance / mass + 1.0 / 12.0)

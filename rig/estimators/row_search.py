@@ -72,7 +72,7 @@ class Found(NamedTuple):
     stripe: float32 (FIELDS, rows, columns), NaN and confidence 0 where there is nothing. quiet: int32 (rows, STEPS,
     lanes of the sensor and LANES more), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures:
     int32 (rows, lanes + 1), their exposures as steps up and down. light: int16, like quiet, ones of every pixel within
-    the windows since they were last carried to light_carried, int32. lines: int16 (lines, window), counts of the rows
+    the windows since they were last carried to light_carried, int32. lines: int32 (lines, window), counts of the rows
     that the learning reads; line_start: int32 (columns + 1,) and line_row: int32, the rows of each column in order.
     """
 
@@ -81,7 +81,7 @@ class Found(NamedTuple):
     quiet_exposures: NDArray[np.int32]
     light: NDArray[np.int16]
     light_carried: NDArray[np.int32]
-    lines: NDArray[np.int16]
+    lines: NDArray[np.int32]
     line_start: NDArray[np.int32]
     line_row: NDArray[np.int32]
 

@@ -126,21 +126,21 @@ def search_frames(
         state = open_column
         f = 0
         while f < bins.shape[0]:
-            c = bins[f]
+            c, word = np.int64(bins[f]), np.int64(first_word[f])
             if c < 0:
                 f += 1
                 continue
             g = f + 1
-            while g < bins.shape[0] and bins[g] == c and first_word[g] == first_word[f]:
+            while g < bins.shape[0] and bins[g] == c and first_word[g] == word:
                 g += 1
             if c != state.column:
                 if state.column >= 0:
                     _finish(judge, bench, found, state, as_bytes, j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)
-                state = OpenColumn(c, first_word[f], 0)
-            elif first_word[f] != state.first_word:
-                _move_window(first_word[f] - state.first_word, row_words, n, counters)
+                state = OpenColumn(c, word, 0)
+            elif word != state.first_word:
+                _move_window(word - state.first_word, row_words, n, counters)
             _take(words, frame, at, n, f, g, state.frames, counters)
-            state = OpenColumn(c, first_word[f], state.frames + g - f)
+            state = OpenColumn(c, word, state.frames + g - f)
             f = g
         if end and state.column >= 0:
             _finish(judge, bench, found, state, as_bytes, j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)

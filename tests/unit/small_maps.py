@@ -38,7 +38,9 @@ def volume_of(counts, geometry: SweepGeometry, exposures, **other) -> CountVolum
         "dark_counts": None,
         "n_dark": 0,
     } | other
-    return CountVolume(windowed(counts, geometry.x0, geometry.window), geometry.x0, n_frames, width=width, **fields)
+    return CountVolume(
+        counts=windowed(counts, geometry.x0, geometry.window), x0=geometry.x0, n_frames=n_frames, width=width, **fields
+    )
 
 
 def rows_of(counts, exposures, *, near_is_left=True, x_lo=0, x_hi=None, x0=None) -> tuple[CountVolume, SweepGeometry]:

@@ -207,3 +207,12 @@ def stream_of(
     records["marks"] = marks | (position << 8)
     assert points == plan.sweep_points * plan.sweeps_per_period
     return Stream(records, ticks, mirror, scan_frames, exposure, period)
+
+
+def stand_still(stream: Stream, frames: int) -> int:
+    """Let the mirror stand at the third line marker for a while; returns the first of these frames."""
+    at = int(np.flatnonzero(stream.records["line"] == 3)[0])
+    there = stream.records[at : at + frames]
+    there["line"] = 3
+    there["marks"] = there["marks"] & 0xFF | np.uint32(Mark.LINE)
+    return at

@@ -11,7 +11,7 @@ from drivers.frames import Mark
 from rig.binding import FrameBinder, SweepClock
 from rig.counting import BIN_DARK, BIN_UNUSABLE
 from rig.errors import PlanError
-from tests.unit.rig.streams import Stream, plan_of, scan, scanner_limits, stream_of
+from tests.unit.rig.streams import Stream, plan_of, scan, scanner_limits, stand_still, stream_of
 
 
 def bind(plan, blocks):
@@ -25,6 +25,50 @@ def bind(plan, blocks):
         name: np.concatenate([getattr(b, name) for b in bound]) for name in ("sweep", "direction", "column", "bins")
     }
     return merged, clocks
+
+
+def placed_one_by_one(plan, blocks, clocks):
+    """Sweep, column and bin of each frame by the rule alone: one after the other, each from the latest marker.
+
+    clocks: what the binder found, of which the ratios are taken.
+    """
+    ratios = {clock.sweep + 1: 1 + clock.clock_error for clock in clocks if clock.synchronised and clock.markers > 2}
+    ratio, running, anchor, used, found = 1.0, -1, None, [], []
+    for block in blocks:
+        header = block.header
+        for record, tick in zip(block.records, block.start_ticks, strict=True):
+            sweep, line, marks = int(record["sweep"]) - 1, int(record["line"]), int(record["marks"])
+            while running < sweep:
+                running, used = running + 1, []
+                ratio = ratios.get(running, ratio)
+            time = (int(tick) - blocks[0].header.t0_ticks) * 512
+            numbered = marks & Mark.LINE and 1 <= line <= len(plan.marker_points)
+            if (numbered or marks & Mark.SCAN) and not marks & Mark.GATE_EDGE and sweep >= 0:
+                edge = time + (2 * (marks >> 8 & 255) + 1) * header.frame_period_ticks
+                anchor = edge, sweep * plan.sweep_points + (int(plan.marker_points[line - 1]) if numbered else 0)
+            column = np.nan
+            if anchor is not None and sweep >= 0:
+                rate = float(plan.point_rate_hz / header.tick_hz / 512) * ratio
+                since = (time + 256 * header.exposure_ticks - anchor[0]) * rate
+                tau_s = (anchor[1] - sweep * plan.sweep_points + since) / float(plan.point_rate_hz)
+                column = float(plan.column(tau_s, plan.leg(sweep)))
+            found.append((sweep, column, placed_in(plan, sweep, column, marks, used)))
+    return [np.array(values) for values in zip(*found, strict=True)]
+
+
+def placed_in(plan, sweep, column, marks, used):
+    """The bin of a frame behind those of its sweep that used columns, and notes it among them."""
+    if np.isnan(column) or marks & (Mark.GATE_EDGE | Mark.WINDOW_LOST):
+        return BIN_UNUSABLE
+    if not marks & Mark.GATE_HIGH:
+        return BIN_DARK
+    nearest = int(np.floor(column + 0.5))
+    left = used and (nearest < max(used) if plan.leg(sweep).columns_rise else nearest > min(used))
+    full = plan.exposures <= 200 and used.count(nearest) >= 255
+    if not 0 <= nearest < plan.columns or left or full:
+        return BIN_UNUSABLE
+    used.append(nearest)
+    return nearest
 
 
 def whole(stream: Stream, sizes=None, lost=()):
@@ -94,6 +138,69 @@ def test_places_do_not_depend_on_the_size_of_blocks(sizes, bidirectional):
     for name, values in one.items():
         np.testing.assert_array_equal(other[name], values)
     assert same_clocks == clocks
+
+
+@settings(max_examples=25, deadline=None)
+@given(cases(), st.lists(st.integers(1, 300), min_size=1, max_size=5), st.randoms(use_true_random=False), st.booleans())
+def test_every_frame_is_where_the_rule_puts_it_to_the_last_bit(case, sizes, rng, disturbed):
+    plan, stream = case
+    n = len(stream.records)
+    lost = [rng.randrange(n) for _ in range(rng.randrange(20))]
+    begin = rng.randrange(n)
+    lost += range(begin, min(n, begin + rng.randrange(n // 2)))
+    if disturbed:
+        for frame in (rng.randrange(n) for _ in range(n // 100)):
+            stream.records["marks"][frame] ^= np.uint32(1 << rng.randrange(16))
+            stream.records["line"][frame] = rng.randrange(plan.columns + 4)
+    blocks = whole(stream, itertools.cycle(sizes), lost)
+    assume(blocks)
+    bound, clocks = bind(plan, blocks)
+    sweep, column, bins = placed_one_by_one(plan, blocks, clocks)
+    np.testing.assert_array_equal(bound["sweep"], sweep)
+    np.testing.assert_array_equal(bound["column"], column)
+    np.testing.assert_array_equal(bound["bins"], bins)
+
+
+@pytest.mark.parametrize("sizes", [1, 64, 10**6])
+@pytest.mark.parametrize("sweep", [0, 1])
+def test_a_frame_that_would_fall_back_to_a_column_already_left_is_not_used(sweep, sizes):
+    plan = plan_of(scan(bidirectional=True, exposures=100))
+    stream = stream_of(plan, 2)
+    records = stream.records
+    at = np.flatnonzero((records["marks"] & Mark.LINE != 0) & (records["sweep"] == sweep + 1) & (records["line"] == 9))
+    marker = int(at[0])
+    # The edge seen 3 frames late, at the end of a frame: the frames before it have gone on to the next column.
+    records["marks"][marker] &= np.uint32(0xFF & ~Mark.LINE)
+    records["line"][marker : marker + 3] -= 1
+    late = marker + 3
+    records["marks"][late] = (records["marks"][late] & 0xFF) | Mark.LINE | 0xFF00
+    bound, clocks = bind(plan, whole(stream, itertools.repeat(sizes)))
+    assert all(clock.synchronised for clock in clocks)
+    left, entered = (7, 8) if sweep == 0 else (12, 11)
+    assert bound["bins"][late - 1] == entered
+    assert np.floor(bound["column"][late] + 0.5) == left
+    assert bound["bins"][late] == BIN_UNUSABLE
+    assert bound["bins"][late + 1] == entered
+    for number in (0, 1):
+        used = bound["bins"][(bound["bins"] >= 0) & (bound["sweep"] == number)]
+        assert (np.diff(used) * plan.leg(number).direction >= 0).all()
+        assert np.abs(np.bincount(used) - 100).max() <= 4
+
+
+@pytest.mark.parametrize(("exposures", "limited"), [(40, True), (200, True), (201, False)])
+def test_a_mirror_that_stands_still_fills_its_column_no_further_than_bytes_count(exposures, limited):
+    plan = plan_of(scan(exposures=exposures, columns=30))
+    stream = stream_of(plan, 1)
+    at = stand_still(stream, 700)
+    bound, clocks = bind(plan, whole(stream, itertools.repeat(64)))
+    there = bound["bins"][at : at + 700]
+    column = int(there[0])
+    assert np.count_nonzero(there == column) == (255 if limited else 700)
+    assert (there[:255] == column).all()
+    assert (there[255:] == (BIN_UNUSABLE if limited else column)).all()
+    assert np.bincount(bound["bins"][bound["bins"] >= 0]).max() == 255 or not limited
+    assert (bound["sweep"][at : at + 700] == 0).all()
+    assert not clocks[0].synchronised
 
 
 def test_frames_before_the_first_marker_are_not_used():

@@ -1,0 +1,175 @@
+"""Makes ready what the compiled search reads: tables per column and band of rows, from the learned model and geometry."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimators.closeup_kernels import closeup_tables
+from rig.estimators.row_input import TABLE, State, Sweep, state_of, sweep_of
+from rig.estimators.row_model import RowModel
+from rig.estimators.row_search import COUNT_LIMIT, FIELDS, QUIET_STEP, SIGNAL_REACH_PX, Found, Judge
+from rig.estimators.screen_tables import SCREENS, Tables, fill_tables
+from rig.geometry import SweepGeometry
+from rig.lane_order import STEPS, padded_lanes
+from rig.lanes import LANES
+from rig.row_threads import RowWorkers
+
+BAND_ROWS = (64, 32, 16, 8, 4)
+"""Rows that share a table: as many as a line crosses without leaving a pixel."""
+BAND_SHEAR_PX = 1
+TAP_SHARE = 0.06
+"""Share of the line in a pixel from which it takes part in the search."""
+SCORE_LIMIT = 12500
+"""Largest sum of taps times counts: less than half of the range of 16 bits, so that no sum of two wraps round."""
+MOST_HALVINGS = 6
+HOT_FACTOR, HOT_FLUX = 4.0, 0.02
+"""A pixel is hot for the search from this many times its neighbours' ambient light, and so much more, on."""
+
+
+def judge_of(
+    model: RowModel, geometry: SweepGeometry, exposures: int, workers: RowWorkers, *, dark: bool
+) -> Judge:
+    """All that the search needs to judge a sweep under `model`, for columns of about `exposures` frames.
+
+    dark: whether the sweep has dark frames, so that fewer columns need to teach the ambient light.
+    """
+    band_rows = rows_of_band(geometry)
+    sweep, state = _banded(sweep_of(geometry), state_of(model), band_rows)
+    light, log_share = _lights(model)
+    reach = max(1, int(np.count_nonzero(state.psi[1:] > TAP_SHARE)))
+    bands, columns = state.ambient.shape[0], geometry.columns
+    tables = _empty_tables(columns, bands, padded_lanes(geometry.window), reach)
+    most = min(exposures + 2, COUNT_LIMIT)
+    for shift in range(MOST_HALVINGS + 1):
+        if most * _largest_taps(sweep, state, light, reach, 128 >> shift) <= SCORE_LIMIT:
+            break
+
+    def work(first: int, last: int) -> None:
+        fill_tables(sweep, state, light, log_share, float(128 >> shift), first, last, tables)
+
+    workers.over(bands, work)
+    haze, rest = model.profile[:, 0], model.profile[:, 1]
+    closeup = closeup_tables(
+        float(np.median(state.ambient)), float(rest.sum() / max(haze.sum(), 1e-9)), geometry.near_is_left,
+        state.fine, TABLE,
+    )  # fmt: skip
+    expected = np.repeat(state.ambient, band_rows, axis=0)[: geometry.rows]
+    y, x = np.nonzero(model.ambient > HOT_FACTOR * expected + HOT_FLUX)
+    padded = np.zeros((bands, int(geometry.x0.max(initial=0)) + geometry.window), np.float32)
+    padded[:, : geometry.width] = state.ambient[:, : padded.shape[1]]
+    return Judge(
+        tables=tables,
+        closeup=closeup,
+        band_rows=band_rows,
+        x0=geometry.x0,
+        window=geometry.window,
+        x_lo=geometry.x_lo,
+        x_hi=geometry.x_hi,
+        near_is_left=geometry.near_is_left,
+        ambient=padded,
+        hot_start=np.searchsorted(y, np.arange(geometry.rows + 1)).astype(np.int32),
+        hot_x=x.astype(np.int32),
+        faintest=float(model.amplitude[0]),
+        brightest=float(model.amplitude[-1]),
+        reach=max(SIGNAL_REACH_PX, reach),
+        shift=shift,
+        quiet_step=QUIET_STEP if dark else 1,
+    )
+
+
+def nothing_found(
+    geometry: SweepGeometry, lines: tuple[NDArray[np.int32], NDArray[np.int32]] | None
+) -> Found:
+    """Empty results of a sweep; lines: (rows, columns) whose counts are to be kept, sorted by column."""
+    rows, columns = geometry.rows, geometry.columns
+    lanes = -(-geometry.width // 64) * 64 // STEPS + LANES
+    stripe = np.full((FIELDS, rows, columns), np.nan, np.float32)
+    stripe[1] = 0.0
+    line_row, line_column = (np.zeros(0, np.int32),) * 2 if lines is None else lines
+    return Found(
+        stripe=stripe,
+        quiet=np.zeros((rows, STEPS, lanes), np.int32),
+        quiet_exposures=np.zeros((rows, lanes + 1), np.int32),
+        light=np.zeros((rows, STEPS, lanes), np.int16),
+        light_carried=np.zeros((rows, STEPS, lanes), np.int32),
+        lines=np.zeros((len(line_row), geometry.window), np.int32),
+        line_start=np.searchsorted(line_column, np.arange(columns + 1)).astype(np.int32),
+        line_row=np.ascontiguousarray(line_row),
+    )
+
+
+def rows_of_band(geometry: SweepGeometry) -> int:
+    """The most rows out of BAND_ROWS that a column's window crosses without shifting by more than BAND_SHEAR_PX."""
+    inside = (geometry.x_lo <= geometry.x_hi) & (geometry.x_lo > 0) & (geometry.x_hi < geometry.width - 1)
+    for rows in BAND_ROWS:
+        first = np.arange(0, geometry.rows, rows)
+        last = np.minimum(first + rows, geometry.rows) - 1
+        both = inside[first] & inside[last]
+        shear = np.abs(geometry.x_lo[first] - geometry.x_lo[last])
+        if not both.any() or np.percentile(shear[both], 99) <= BAND_SHEAR_PX:
+            return rows
+    return BAND_ROWS[-1]
+
+
+def _lights(model: RowModel) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Amplitudes of the search and the logarithm of their shares: the dim and the bright half of the learned ones."""
+    log_q, weight = np.log(model.amplitude.astype(np.float64)), np.maximum(model.weight, 1e-6)
+    halves = np.array_split(np.arange(len(log_q)), SCREENS)
+    shares = np.array([weight[half].sum() for half in halves])
+    means = np.array([(log_q[half] * weight[half]).sum() for half in halves]) / shares
+    return np.exp(means).astype(np.float32), np.log(shares).astype(np.float32)
+
+
+def _banded(sweep: Sweep, state: State, band_rows: int) -> tuple[Sweep, State]:
+    """Sweep and state as if each band were one row: geometry of its middle row, windows of all, mean ambient light."""
+    rows = sweep.u.shape[0]
+    first = np.arange(0, rows, band_rows)
+    middle = np.minimum(first + band_rows // 2, rows - 1)
+    seen = sweep.x_lo <= sweep.x_hi
+    x_lo = np.minimum.reduceat(np.where(seen, sweep.x_lo, np.iinfo(np.int32).max), first, axis=0)
+    x_hi = np.maximum.reduceat(np.where(seen, sweep.x_hi, -1), first, axis=0)
+    ambient = np.stack([_usual_mean(state.ambient[a : a + band_rows]) for a in first])
+    gain = np.add.reduceat(state.row_gain, first) / np.diff(np.append(first, rows))
+    return (
+        sweep._replace(
+            u=np.ascontiguousarray(sweep.u[middle]), v=np.ascontiguousarray(sweep.v[middle]),
+            x_lo=x_lo.astype(np.int32), x_hi=x_hi.astype(np.int32),
+        ),
+        state._replace(ambient=ambient, row_gain=gain.astype(np.float32)),
+    )  # fmt: skip
+
+
+def _usual_mean(ambient: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mean over the rows (rows, width) of pixels that are not hot."""
+    usual = ambient <= HOT_FACTOR * np.median(ambient, axis=0) + HOT_FLUX
+    return np.asarray((np.where(usual, ambient, 0.0).sum(0) / usual.sum(0)).astype(np.float32))
+
+
+def _empty_tables(columns: int, bands: int, lanes: int, reach: int) -> Tables:
+    pixels = lanes * STEPS
+
+    def of(*shape: int, dtype: type = np.float32) -> NDArray[np.generic]:
+        return np.zeros((columns, bands, *shape), dtype)
+
+    return Tables(
+        edge=of(pixels, dtype=np.int16), tap=of(SCREENS, 2 * reach + 1, pixels, dtype=np.int16),
+        position=of(SCREENS, pixels), prior=of(SCREENS, pixels), lane=of(lanes), none=of(3), neutral=of(pixels),
+        before=of(pixels), scale=of(pixels), first=of(dtype=np.int32), last=of(dtype=np.int32),
+    )  # type: ignore[arg-type]  # fmt: skip
+
+
+def _largest_taps(sweep: Sweep, state: State, light: NDArray[np.float32], reach: int, units: int) -> float:
+    """Largest sum of a position's weights, from the tables of one band in the middle of every 16th column."""
+    columns = np.arange(0, sweep.plane.shape[0], 16)
+    middle = slice(sweep.u.shape[0] // 2, sweep.u.shape[0] // 2 + 1)
+    few = sweep._replace(
+        x0=sweep.x0[columns], plane=np.ascontiguousarray(sweep.plane[columns]),
+        x_lo=np.ascontiguousarray(sweep.x_lo[middle, columns]), x_hi=np.ascontiguousarray(sweep.x_hi[middle, columns]),
+        u=np.ascontiguousarray(sweep.u[middle]), v=np.ascontiguousarray(sweep.v[middle]),
+    )  # fmt: skip
+    part = state._replace(
+        ambient=np.ascontiguousarray(state.ambient[middle]), row_gain=np.ascontiguousarray(state.row_gain[middle]),
+        column_gain=np.ascontiguousarray(state.column_gain[columns]),
+    )  # fmt: skip
+    tables = _empty_tables(len(columns), 1, padded_lanes(sweep.window), reach)
+    fill_tables(few, part, light, np.zeros(SCREENS, np.float32), float(units), 0, 1, tables)
+    return float(np.abs(tables.tap.astype(np.int64)).sum(axis=3).max(initial=1))

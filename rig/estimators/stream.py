@@ -1,0 +1,128 @@
+"""The counter of `likelihood`: judges each column as soon as it is complete, so that a sweep's counts are never stored."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.counting import FrameTally, SweepLayout, SweepTally
+from rig.counting_kernels import CHUNK, add_runs, new_planes
+from rig.estimators.judging import nothing_found
+from rig.estimators.learning import next_lattice
+from rig.estimators.row_input import Lines
+from rig.estimators.row_search import Bench, Found, Judge, new_bench
+from rig.estimators.stream_kernels import OpenColumn, carry_light, search_frames
+from rig.geometry import SweepGeometry
+from rig.lane_order import padded_lanes, pixel_order
+from rig.row_threads import RowWorkers
+from rig.stripes import StripeTable
+
+MOST_EXPOSURES = 200
+"""Nominal exposures of a column up to which its counters (of 8 bits) have room for what it really gets."""
+NO_COLUMN = OpenColumn(-1, 0, 0)
+LIGHT_LIMIT = 30000
+"""Exposures after which the 16-bit sums of light are carried over."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SearchedSweep(FrameTally):
+    """A sweep whose columns have been judged.
+
+    stripe: the stripe table. light: uint32 (rows, width), counts summed over the columns. quiet: int32 (2, rows,
+    width), ones and exposures of pixels while clearly behind a stripe. lines: what the learning reads.
+    """
+
+    stripe: StripeTable
+    light: NDArray[np.uint32]
+    quiet: NDArray[np.int32]
+    lines: Lines
+
+    def intensity(self) -> NDArray[np.uint32]:
+        """Counts summed over the columns, (rows, width) uint32."""
+        return self.light
+
+
+class ColumnJudge:
+    """The `Counter` that judges: counts and estimates one sweep under one `Judge`."""
+
+    def __init__(self, layout: SweepLayout, geometry: SweepGeometry, judge: Judge, workers: RowWorkers) -> None:
+        self._layout = layout
+        self._judge = judge
+        self._workers = workers
+        self._lines = next_lattice(geometry)
+        self._found: Found = nothing_found(geometry, self._lines)
+        self._tally = SweepTally(layout)
+        self._open = NO_COLUMN
+        self._planes: dict[int, NDArray[np.uint64]] = {}
+        self._benches: dict[int, Bench] = {}
+        self._pending = 0
+        self._no_counts = np.zeros((0, layout.rows, layout.window), np.uint8)
+
+    def add(
+        self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
+    ) -> None:
+        """Add frames, see `Counter`; columns that they complete are judged."""
+        first_word = x0 // np.int32(64)
+        self._tally.note(bins, column, first_word)
+        words, row_words = bits.reshape(-1).view(np.uint64), bits.shape[2] // 8
+        self._judge_block(words, bins, first_word, row_words, end=False)
+        if np.any(bins == -1):
+            layout = self._layout
+
+            def work(first: int, last: int) -> None:
+                add_runs(
+                    words, first_word, row_words, layout.used_words, bins, layout.x0, self._no_counts,
+                    self._tally.dark, first, last,
+                )  # fmt: skip
+
+            self._workers.over(layout.rows, work)
+
+    def finish(self) -> SearchedSweep:
+        """What the sweep gave; the last column is judged now."""
+        layout, found = self._layout, self._found
+        if self._open.column >= 0:
+            row_words = next(iter(self._planes))
+            nothing = np.zeros(0, np.int32)
+            self._judge_block(np.zeros(0, np.uint64), nothing, nothing, row_words, end=True)
+        carry_light(found, 0, layout.rows)
+        exposures = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), 8, axis=1)[:, : layout.width]
+        rows, columns = self._lines
+        tally = self._tally.finish()
+        return SearchedSweep(
+            n_frames=tally.n_frames, column=tally.column, dark_counts=tally.dark_counts, n_dark=tally.n_dark,
+            width=tally.width, dark_frames=tally.dark_frames, stripe=StripeTable(*found.stripe),
+            light=pixel_order(found.light_carried, layout.width).astype(np.uint32),
+            quiet=np.stack([pixel_order(found.quiet, layout.width), exposures]),
+            lines=Lines(found.lines, rows, columns, tally.n_frames[columns]),
+        )  # fmt: skip
+
+    def _judge_block(
+        self, words: NDArray[np.uint64], bins: NDArray[np.int32], first_word: NDArray[np.int32], row_words: int, *,
+        end: bool,
+    ) -> None:  # fmt: skip
+        layout = self._layout
+        # Frames of whole rows begin at the sensor's first word, whatever part of them is used.
+        if row_words == layout.padded_width // 64:
+            first_word = np.zeros_like(first_word)
+        chunk_rows = max(CHUNK // row_words, 1)
+        chunks = -(-layout.rows // chunk_rows)
+        if row_words not in self._planes:
+            self._planes[row_words] = new_planes(chunks)
+        planes, opened = self._planes[row_words], self._open
+        after: list[OpenColumn] = []
+        if self._pending + len(bins) > LIGHT_LIMIT:
+            carry_light(self._found, 0, layout.rows)
+            self._pending = 0
+        self._pending += len(bins)
+
+        def work(first: int, last: int) -> None:
+            if first not in self._benches:
+                self._benches[first] = new_bench(padded_lanes(layout.window))
+            state = search_frames(
+                words, bins, first_word, row_words, opened, end, self._judge, self._benches[first], self._found, planes,
+                first, last,
+            )  # fmt: skip
+            after.append(state)
+
+        self._workers.over(chunks, work)
+        self._open = after[0]
