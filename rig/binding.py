@@ -210,7 +210,8 @@ class FrameBinder:
     def _close(self, number: int, end_frame: int, tick_hz: Fraction) -> SweepClock:
         now = self._carried[0]
         nominal = self._points_per_unit(tick_hz) / self._ratio
-        fit = _fit(*self._edges[:, : now["edges"]], nominal, float(self._plan.points_per_column))
+        point, time = self._edges[0, : now["edges"]], self._edges[1, : now["edges"]]
+        fit = _fit(point, time, nominal, float(self._plan.points_per_column))
         clock = SweepClock(number, *fit, self._first_frame, end_frame, int(now["wrong_way"]))
         if fit[2] > 2 and clock.synchronised:
             self._ratio = 1 + clock.clock_error

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.lane_order import PAD, STEPS, new_counts, padded_lanes, read_planes, write_counts
-from rig.lanes import LANES
+from rig.lanes import LANES, address_of
 
 WORD_PX: Final = 64
 WORD_BYTES: Final = 8
@@ -218,10 +218,16 @@ def add_runs(
                 for y in range(y0, y1):
                     at = ((y - y0) * row_words + wanted - begins) * WORD_BYTES
                     if c < 0:
-                        read_planes(as_bytes, at, CHUNK * WORD_BYTES, 4 if few else PLANES, used_words * WORD_PX, n_dark)
+                        read_planes(
+                            address_of(as_bytes), at, CHUNK * WORD_BYTES, 4 if few else PLANES, used_words * WORD_PX,
+                            address_of(n_dark), padded_lanes(used_words * WORD_PX),
+                        )  # fmt: skip
                         _add_dark(n_dark, wanted * (WORD_PX // STEPS), dark[y])
                     else:
-                        read_planes(as_bytes, at, CHUNK * WORD_BYTES, 4 if few else PLANES, window, n_lit)
+                        read_planes(
+                            address_of(as_bytes), at, CHUNK * WORD_BYTES, 4 if few else PLANES, window,
+                            address_of(n_lit), padded_lanes(window),
+                        )  # fmt: skip
                         write_counts(n_lit, counts[c, y])
             f = g
 

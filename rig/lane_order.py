@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.lanes import LANES, load_int8, load_int16, store, widen, zero_int16
+from rig.lanes import LANES, load_int8, load_int16, store_int16, widen, write_int16, zero_int16
 
 STEPS: Final = 8
 """Pixels per lane."""
@@ -31,9 +31,9 @@ def new_counts(lanes: int) -> NDArray[np.int16]:
 
 
 @numba.njit(inline="always")
-def place_of(n, x):  # type: ignore[no-untyped-def]
-    """Index of pixel x in the row of counts n."""
-    return (x % STEPS) * (n.shape[0] // STEPS) + PAD + x // STEPS
+def place_of(x, lanes):  # type: ignore[no-untyped-def]
+    """Index of pixel x in a row of counts of so many lanes; from -STEPS * PAD on."""
+    return (x & 7) * (lanes + 2 * PAD) + PAD + (x >> 3)
 
 
 @numba.njit(inline="always")
@@ -48,26 +48,25 @@ def _nibbles(b0, b1, b2, b3):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def read_planes(
-    planes: NDArray[np.uint8], at: int, plane_bytes: int, n_planes: int, window: int, n: NDArray[np.int16]
+    planes: int, at: int, plane_bytes: int, n_planes: int, window: int, n: int, lanes: int
 ) -> None:
     """Counts of a row of `window` pixels into n from its bit planes: bytes from `at` on, planes `plane_bytes` apart.
 
-    n_planes: 1, 4 or 8. Reads 16 bytes at a time, whatever the window.
+    planes, n: addresses. n_planes: 1, 4 or 8. Reads 16 bytes at a time, whatever the window.
     """
-    stride = n.shape[0] // STEPS
-    lanes = stride - 2 * PAD
+    stride = lanes + 2 * PAD
     for v in range(0, lanes, LANES):
         b0 = widen(load_int8(planes, at + v))
         to = PAD + v
         if n_planes == 1:
-            store(n, to, b0 >> 7)
-            store(n, to + stride, (b0 >> 6) & 1)
-            store(n, to + 2 * stride, (b0 >> 5) & 1)
-            store(n, to + 3 * stride, (b0 >> 4) & 1)
-            store(n, to + 4 * stride, (b0 >> 3) & 1)
-            store(n, to + 5 * stride, (b0 >> 2) & 1)
-            store(n, to + 6 * stride, (b0 >> 1) & 1)
-            store(n, to + 7 * stride, b0 & 1)
+            store_int16(n, to, b0 >> 7)
+            store_int16(n, to + stride, (b0 >> 6) & 1)
+            store_int16(n, to + 2 * stride, (b0 >> 5) & 1)
+            store_int16(n, to + 3 * stride, (b0 >> 4) & 1)
+            store_int16(n, to + 4 * stride, (b0 >> 3) & 1)
+            store_int16(n, to + 5 * stride, (b0 >> 2) & 1)
+            store_int16(n, to + 6 * stride, (b0 >> 1) & 1)
+            store_int16(n, to + 7 * stride, b0 & 1)
             continue
         b1 = widen(load_int8(planes, at + v + plane_bytes))
         b2 = widen(load_int8(planes, at + v + 2 * plane_bytes))
@@ -81,28 +80,29 @@ def read_planes(
             h0, h1, h2, h3, h4, h5, h6, h7 = _nibbles(b4, b5, b6, b7)
             n0, n1, n2, n3 = n0 | (h0 << 4), n1 | (h1 << 4), n2 | (h2 << 4), n3 | (h3 << 4)
             n4, n5, n6, n7 = n4 | (h4 << 4), n5 | (h5 << 4), n6 | (h6 << 4), n7 | (h7 << 4)
-        store(n, to, n0)
-        store(n, to + stride, n1)
-        store(n, to + 2 * stride, n2)
-        store(n, to + 3 * stride, n3)
-        store(n, to + 4 * stride, n4)
-        store(n, to + 5 * stride, n5)
-        store(n, to + 6 * stride, n6)
-        store(n, to + 7 * stride, n7)
+        store_int16(n, to, n0)
+        store_int16(n, to + stride, n1)
+        store_int16(n, to + 2 * stride, n2)
+        store_int16(n, to + 3 * stride, n3)
+        store_int16(n, to + 4 * stride, n4)
+        store_int16(n, to + 5 * stride, n5)
+        store_int16(n, to + 6 * stride, n6)
+        store_int16(n, to + 7 * stride, n7)
     if window < lanes * STEPS:
         # What was read beyond the window belongs to other pixels.
         for s in range(STEPS):
-            store(n, s * stride + PAD + window // STEPS, zero_int16())
+            store_int16(n, s * stride + PAD + window // STEPS, zero_int16())
 
 
 @numba.njit(cache=True, nogil=True)
-def read_counts(counts: NDArray[np.unsignedinteger], halved: int, n: NDArray[np.int16]) -> None:
-    """Counts of a row in pixel order (window,) into n, divided by 2^halved and rounded, as `halve_counts` does."""
-    stride = n.shape[0] // STEPS
+def read_counts(counts: NDArray[np.unsignedinteger], halved: int, n: int, lanes: int) -> None:
+    """Counts of a row in pixel order (window,) into the row at address n, divided by 2^halved as `halve_counts` does."""
+    stride = lanes + 2 * PAD
     half = (1 << halved) >> 1
     for s in range(STEPS):
         for i in range(counts.shape[0] // STEPS):
-            n[s * stride + PAD + i] = np.int16((np.int64(counts[STEPS * i + s]) + half) >> halved)
+            count = np.int16((np.int64(counts[STEPS * i + s]) + half) >> halved)
+            write_int16(n, s * stride + PAD + i, count)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -115,23 +115,21 @@ def write_counts(n: NDArray[np.int16], counts: NDArray[np.unsignedinteger]) -> N
 
 
 @numba.njit(cache=True, nogil=True)
-def halve_counts(n: NDArray[np.int16], times: int) -> None:
-    """Divide all counts by 2^times, rounded."""
+def halve_counts(n: int, lanes: int, times: int) -> None:
+    """Divide all counts of the row at address n by 2^times, rounded."""
     half = np.int16((1 << times) >> 1)
-    for i in range(n.shape[0]):
-        n[i] = (n[i] + half) >> times
+    for v in range(0, STEPS * (lanes + 2 * PAD), LANES):
+        store_int16(n, v, (load_int16(n, v) + half) >> times)
 
 
 @numba.njit(cache=True, nogil=True)
-def sum_counts(n: NDArray[np.int16], lane: int, sums: NDArray[np.int16]) -> None:
-    """Add the counts of n to `sums` (STEPS, lanes of the sensor and LANES more) from lane `lane` on."""
-    stride = n.shape[0] // STEPS
-    width = sums.shape[1]
-    flat = sums.ravel()
-    for v in range(0, stride - 2 * PAD, LANES):
+def sum_counts(n: int, lanes: int, sums: int, sum_lanes: int) -> None:
+    """Add the counts of the row at address n to int16 sums (STEPS, sum_lanes), of which address `sums` is the lane."""
+    stride = lanes + 2 * PAD
+    for v in range(0, lanes, LANES):
         for s in range(STEPS):
-            at = s * width + lane + v
-            store(flat, at, load_int16(flat, at) + load_int16(n, s * stride + PAD + v))
+            at = s * sum_lanes + v
+            store_int16(sums, at, load_int16(sums, at) + load_int16(n, s * stride + PAD + v))
 
 
 def pixel_order(sums: NDArray[np.generic], width: int) -> NDArray[np.generic]:

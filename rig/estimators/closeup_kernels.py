@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, LABEL_PX, LABELS, cell_of
 from rig.lane_order import place_of
-from rig.lanes import LANES, highest, larger_float, load_float32, total, truncated, two_to
+from rig.lanes import LANES, larger_float, load_float32, read_int16, smaller_float, spread, total, truncated, two_to
 
 LEVEL_SHIFT: Final = np.uint32(22)
 """Two levels an octave: the exponent and the first bit behind it of a float32."""
@@ -22,6 +22,7 @@ LEVEL_BASE: Final = np.uint32((127 + LOWEST_OCTAVE) << 1)
 LEVELS: Final = 36
 """2^-14 to 2^4 photons per exposure."""
 IMPOSSIBLE: Final = np.float32(-1e30)
+LOWEST_POWER, HIGHEST_POWER = np.float32(-100.0), np.float32(60.0)
 PER_NAT: Final = np.float32(1.4426950408889634)
 
 
@@ -88,7 +89,7 @@ def level_flux(level):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def _power(a):  # type: ignore[no-untyped-def]
-    """2^a for a from -120 to 0: a cubic within each octave, exact to 1e-4."""
+    """2^a for a from -100 to 100: a cubic within each octave, exact to 1e-4."""
     whole = truncated(a)
     f = a - whole
     return two_to(whole) * (((f * np.float32(0.0433) + np.float32(0.2348)) * f + np.float32(0.6913)) * f + np.float32(0.99993))
@@ -96,21 +97,26 @@ def _power(a):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def place_line(
-    n: NDArray[np.int16], x: int, exposures: float, haze_level: int, line_level: int, closeup: Closeup
+    n: int, lanes: int, x: int, exposures: float, weight: int, pixels: int, index: int, square: int
 ) -> tuple[float, float]:
-    """Offset of the line from the middle of pixel x in px, to the right, and its standard deviation; n: the counts."""
-    weight = closeup.weight[haze_level, line_level]
-    pixels = weight.shape[0] - 1
-    flat = weight.ravel()
-    score = load_float32(flat, pixels * LANES) * np.float32(exposures)
+    """Offset of the line from the middle of pixel x in px, to the right, and its standard deviation.
+
+    n: address of the row's counts, of so many lanes; weight: of the F + 1 vectors of the two levels, F = pixels; index,
+    square: as in `Closeup`.
+    """
+    score = load_float32(weight, pixels * LANES) * np.float32(exposures)
     first = x - (pixels - 1) // 2
-    for t in range(pixels):
-        count = np.float32(n[place_of(n, first + t)])
-        score = score + load_float32(flat, t * LANES) * count
-    score = larger_float(score - highest(score), np.float32(-100.0))
-    likelihood = _power(score)
+    other = load_float32(weight, 0) * np.float32(read_int16(n, place_of(first, lanes)))
+    for t in range(1, pixels, 2):
+        score = score + load_float32(weight, t * LANES) * np.float32(read_int16(n, place_of(first + t, lanes)))
+        t += 1
+        other = other + load_float32(weight, t * LANES) * np.float32(read_int16(n, place_of(first + t, lanes)))
+    score = score + other
+    # Against the middle label, which is never far below the best one: x is the best pixel.
+    score = score - spread(score, LABELS // 2)
+    likelihood = _power(smaller_float(larger_float(score, LOWEST_POWER), HIGHEST_POWER))
     mass = total(likelihood)
-    mean = total(likelihood * load_float32(closeup.index, 0)) / mass
-    square = total(likelihood * load_float32(closeup.square, 0)) / mass
+    mean = total(likelihood * load_float32(index, 0)) / mass
+    square = total(likelihood * load_float32(square, 0)) / mass
     variance = max(square - mean * mean, np.float32(0.0))
     return LABEL_PX * mean, LABEL_PX * np.sqrt(variance + np.float32(1.0 / 12.0))

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from rig.estimators.closeup_kernels import closeup_tables
 from rig.estimators.row_input import TABLE, State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
-from rig.estimators.row_search import COUNT_LIMIT, FIELDS, QUIET_STEP, SIGNAL_REACH_PX, Found, Judge
+from rig.estimators.row_search import COUNT_LIMIT, FIELDS, QUIET_STEP, SIGNAL_REACH_PX, Found, Judge, count_fluxes
 from rig.estimators.screen_tables import SCREENS, Tables, fill_tables
 from rig.geometry import SweepGeometry
 from rig.lane_order import STEPS, padded_lanes
@@ -73,6 +73,7 @@ def judge_of(
         reach=max(SIGNAL_REACH_PX, reach),
         shift=shift,
         quiet_step=QUIET_STEP if dark else 1,
+        flux=count_fluxes(),
     )
 
 

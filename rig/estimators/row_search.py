@@ -1,7 +1,7 @@
-"""Compiled estimate of rows: search, close look, and what each row teaches of the light, from counters or from counts.
+"""Compiled estimate of one image row: search, close look, and what the row teaches of the light.
 
-The same `judge_row` serves frames as they come (counters in bit planes, `search_frames`) and counts that are there
-already (`search_counts`): the answers are the same bit for bit.
+The same `judge_row` serves frames as they come and counts that are there already (`stream_kernels`): the answers are
+the same bit for bit.
 """
 
 from typing import Final, NamedTuple
@@ -10,21 +10,23 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.counting_kernels import CHUNK, FEW_FRAMES, PLANES, add_frames, clear
-from rig.estimators.closeup_kernels import Closeup, level_of, place_line
-from rig.estimators.screen_tables import Tables
+from rig.estimators.closeup_kernels import LEVELS, Closeup, level_of, place_line
+from rig.estimators.screen_tables import SCREENS, Tables
 from rig.estimators.search_kernels import (
     MEAN_EXCESS,
     Search,
     best_position,
+    best_score,
     mass_of,
-    none_mass,
     power,
-    score_row,
-    search_buffers,
+    score_rows,
+    search_in,
+    search_memory,
     set_exposures,
+    sum_edges,
 )
-from rig.lane_order import PAD, STEPS, halve_counts, place_of, read_counts, read_planes, sum_counts
+from rig.lane_order import PAD, STEPS, place_of
+from rig.lanes import LANES, address_of, read_float32, read_int16, read_int32, write_float32, write_int16, write_int32
 
 QUIET: Final = 0.9
 """Probability within 1 px from which the pixels behind the stripe teach the ambient light."""
@@ -36,7 +38,6 @@ FIELDS: Final = 5
 """x_px, confidence, x_sd_px, signal, haze: see `StripeTable`."""
 SIGNAL_REACH_PX: Final = 2
 """Pixels on either side whose light is the stripe's, where the line is narrower."""
-NO_COLUMN: Final = -1
 
 
 class Judge(NamedTuple):
@@ -45,7 +46,8 @@ class Judge(NamedTuple):
     x0: int32 (columns,), first stored pixel; window: stored pixels; x_lo, x_hi: int32 (rows, columns), search windows.
     ambient: float32 (bands, width padded to whole words). hot_start: int32 (rows + 1,) and hot_x: int32, pixels of each
     row whose counts say nothing. faintest, brightest: photons of a stripe at scale 1. reach: half the line's width in
-    px. shift: units of the scores are 128 >> shift an octave. quiet_step: every so manieth column teaches the ambient light.
+    px. shift: units of the scores are 128 >> shift an octave. quiet_step: every so manieth column teaches the ambient
+    light. flux: see `count_fluxes`.
     """
 
     tables: Tables
@@ -64,6 +66,7 @@ class Judge(NamedTuple):
     reach: int
     shift: int
     quiet_step: int
+    flux: NDArray[np.float32]
 
 
 class Found(NamedTuple):
@@ -87,19 +90,91 @@ class Found(NamedTuple):
 
 
 class Bench(NamedTuple):
-    """A thread's own buffers. flux: float32 (COUNT_LIMIT + 1,), photons that each count speaks for."""
+    """A thread's own memory. ambient: float32 (P,), of the band's stored pixels."""
+
+    search: NDArray[np.int16]
+    ambient: NDArray[np.float32]
+
+
+class Desk(NamedTuple):
+    """Judge, Found and Bench as addresses and sizes, made once per call: see `rig.lanes` for why."""
 
     search: Search
-    ambient: NDArray[np.float32]
-    flux: NDArray[np.float32]
+    columns: int
+    rows: int
+    bands: int
+    taps: int
+    edge: int
+    tap: int
+    position: int
+    prior: int
+    lane: int
+    none: int
+    neutral: int
+    before: int
+    scale: int
+    first: int
+    last: int
+    weight: int
+    weight_px: int
+    index: int
+    square: int
+    x0: int
+    x_lo: int
+    x_hi: int
+    ambient: int
+    ambient_px: int
+    hot_start: int
+    hot_x: int
+    own_ambient: int
+    flux: int
+    stripe: int
+    quiet: int
+    quiet_exposures: int
+    light: int
+    sum_lanes: int
+    lines: int
+    line_start: int
+    line_row: int
+    band_rows: int
+    window: int
+    reach: int
+    shift: int
+    quiet_step: int
+    near_is_left: bool
+    faintest: np.float32
+    brightest: np.float32
+
+
+@numba.njit(cache=True, nogil=True)
+def desk_of(judge: Judge, found: Found, bench: Bench) -> Desk:
+    """Addresses of everything; the arrays must outlive it."""
+    tables, closeup = judge.tables, judge.closeup
+    return Desk(
+        search_in(bench.search, tables.lane.shape[2]), judge.x0.shape[0], judge.x_lo.shape[0], tables.lane.shape[1],
+        tables.tap.shape[3], address_of(tables.edge), address_of(tables.tap), address_of(tables.position),
+        address_of(tables.prior), address_of(tables.lane), address_of(tables.none), address_of(tables.neutral),
+        address_of(tables.before), address_of(tables.scale), address_of(tables.first), address_of(tables.last),
+        address_of(closeup.weight), closeup.weight.shape[2] - 1, address_of(closeup.index), address_of(closeup.square),
+        address_of(judge.x0), address_of(judge.x_lo), address_of(judge.x_hi), address_of(judge.ambient),
+        judge.ambient.shape[1], address_of(judge.hot_start), address_of(judge.hot_x), address_of(bench.ambient),
+        address_of(judge.flux), address_of(found.stripe), address_of(found.quiet), address_of(found.quiet_exposures),
+        address_of(found.light), found.light.shape[2], address_of(found.lines), address_of(found.line_start),
+        address_of(found.line_row), judge.band_rows, judge.window, judge.reach, judge.shift,
+        judge.quiet_step, judge.near_is_left, np.float32(judge.faintest), np.float32(judge.brightest),
+    )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
 def new_bench(lanes: int) -> Bench:
-    """Buffers for rows of `lanes` lanes."""
-    return Bench(
-        search_buffers(lanes), np.zeros(lanes * STEPS, np.float32), np.zeros(COUNT_LIMIT + 1, np.float32)
-    )
+    """Memory for rows of `lanes` lanes."""
+    return Bench(search_memory(lanes), np.zeros(lanes * STEPS, np.float32))
+
+
+def count_fluxes() -> NDArray[np.float32]:
+    """Photons per exposure that n ones in k exposures speak for, (k, n) float32: nearly unbiased, finite also at n = k."""
+    k, n = np.mgrid[: COUNT_LIMIT + 1, : COUNT_LIMIT + 1]
+    return np.log((k + 0.5) / (np.maximum(k - n, 0) + 0.5)).astype(np.float32)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -112,99 +187,137 @@ def halvings(exposures: int) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def set_column(judge: Judge, bench: Bench, c: int, b: int, exposures: float) -> None:
+def set_column(desk: Desk, c: int, b: int, exposures: float) -> None:
     """Make ready for rows of band b of column c."""
-    set_exposures(judge.tables, c, b, exposures, bench.search)
-    x0 = judge.x0[c]
-    for x in range(judge.window):
-        bench.ambient[x] = judge.ambient[b, x0 + x]
+    pixels, table = STEPS * desk.search.lanes, c * desk.bands + b
+    positions = 4 * SCREENS * pixels * table
+    lane = desk.lane + 4 * desk.search.lanes * table
+    none = desk.none + 12 * table
+    set_exposures(desk.position + positions, desk.prior + positions, lane, none, exposures, desk.search)
+    first = b * desk.ambient_px + read_int32(desk.x0, c)
+    for x in range(desk.window):
+        write_float32(desk.own_ambient, x, read_float32(desk.ambient, first + x))
 
 
 @numba.njit(cache=True, nogil=True)
-def set_flux(exposures: float, flux: NDArray[np.float32]) -> None:
-    """Photons per exposure that each count speaks for: nearly unbiased, and finite also where every frame fired."""
-    for n in range(flux.shape[0]):
-        flux[n] = np.log((exposures + 0.5) / (max(exposures - n, 0.0) + 0.5))
-
-
-@numba.njit(cache=True, nogil=True)
-def mute_hot(judge: Judge, search: Search, y: int, c: int, b: int, exposures: float) -> None:
+def _mute_hot(desk: Desk, n: int, y: int, c: int, table: int, exposures: float) -> None:
     """Give the hot pixels of row y counts that speak for no position."""
-    for h in range(judge.hot_start[y], judge.hot_start[y + 1]):
-        x = judge.hot_x[h]
-        at = x - judge.x0[c]
-        if 0 <= at < judge.window:
+    x0, lanes = read_int32(desk.x0, c), desk.search.lanes
+    for h in range(read_int32(desk.hot_start, y), read_int32(desk.hot_start, y + 1)):
+        x = np.int64(read_int32(desk.hot_x, h))
+        at = x - x0
+        if 0 <= at < desk.window:
             # Rounded up or down as by chance, so that hot pixels lean to neither side on average.
             chance = ((x * 40503 + y * 30011 + c * 20011) & 0xFFFF) / 65536.0
-            neutral = np.int16(exposures * judge.tables.neutral[c, b, at] + chance)
-            search.n[place_of(search.n, at)] = neutral
+            neutral = read_float32(desk.neutral, table * STEPS * lanes + at)
+            write_int16(n, place_of(at, lanes), np.int16(exposures * neutral + chance))
 
 
 @numba.njit(cache=True, nogil=True)
-def judge_row(judge: Judge, bench: Bench, y: int, c: int, b: int, exposures: float, found: Found) -> None:
-    """Estimate row y of column c from the counts in bench.search, made ready by `set_column`."""
-    low, high = judge.x_lo[y, c] - judge.x0[c], judge.x_hi[y, c] - judge.x0[c]
-    tables, search = judge.tables, bench.search
-    if low > high or tables.first[c, b] > tables.last[c, b]:
+def judge_rows(desk: Desk, first: int, rows: int, c: int, b: int, exposures: float) -> None:
+    """Estimate rows first..first+rows-1 (at most BATCH) of column c, all of band b.
+
+    Their counts are the rows of the batch in desk.search, made ready by `set_column`.
+    """
+    search = desk.search
+    pixels, table = STEPS * search.lanes, c * desk.bands + b
+    if read_int32(desk.first, table) > read_int32(desk.last, table):
         return
-    if judge.hot_start[y] < judge.hot_start[y + 1]:
-        mute_hot(judge, search, y, c, b, exposures)
-    lanes = search.start.shape[0]
-    best, all_left = score_row(tables.edge[c, b], tables.tap[c, b], search)
-    x = best_position(search, best)
-    near = np.float32(0.0)
-    if x > 0:
-        near += power(np.int64(search.score[((x - 1) % STEPS) * lanes + (x - 1) // STEPS]) - best, judge.shift)
-    if x + 1 < judge.window:
-        near += power(np.int64(search.score[((x + 1) % STEPS) * lanes + (x + 1) // STEPS]) - best, judge.shift)
-    # The best position's own term is exactly 1, the others are too large by the same share on average.
-    others = mass_of(search, best, judge.shift) - np.float32(1.0)
-    others += none_mass(search, tables.none[c, b], all_left, best, judge.shift)
-    confidence = (MEAN_EXCESS + near) / (MEAN_EXCESS + others)
-    x = min(max(x, low, 0), high, judge.window - 1)
-    light = np.float32(0.0)
-    for at in range(x - judge.reach, x + judge.reach + 1):
-        light += bench.flux[min(search.n[place_of(search.n, at)], COUNT_LIMIT)]
-    before, ambient, scale = tables.before[c, b, x], bench.ambient[x], tables.scale[c, b, x]
-    light -= np.float32(0.5) * (before + ambient) * np.float32(2 * judge.reach + 1)
-    signal = min(max(light, judge.faintest * scale), judge.brightest * scale)
-    offset, sd = place_line(search.n, x, exposures, level_of(before), level_of(signal), judge.closeup)
-    stripe = found.stripe
-    stripe[0, y, c] = judge.x0[c] + x + offset
-    stripe[1, y, c] = min(confidence, np.float32(1.0))
-    stripe[2, y, c] = sd
-    stripe[3, y, c] = signal
-    stripe[4, y, c] = max(before - ambient, np.float32(0.0))
-    if confidence > QUIET and c % judge.quiet_step == 0:
-        _learn_quiet(judge, search.n, y, c, x, exposures, found)
+    edge, tap = desk.edge + 2 * pixels * table, desk.tap + 2 * SCREENS * desk.taps * pixels * table
+    if read_int32(desk.hot_start, first) < read_int32(desk.hot_start, first + rows):
+        for r in range(rows):
+            _mute_hot(desk, search.n + r * search.n_bytes, first + r, c, table, exposures)
+    for r in range(rows):
+        sum_edges(edge, search, r)
+    score_rows(edge, tap, (desk.taps - 1) // 2, search, rows)
+    # Each part for all rows before the next: one row's parts wait for one another, different rows' do not.
+    _find(search, rows, desk.window, desk.shift)
+    _look_closely(desk, first, rows, c, table, exposures)
 
 
 @numba.njit(cache=True, nogil=True)
-def _learn_quiet(judge: Judge, n: NDArray[np.int16], y: int, c: int, x: int, exposures: float, found: Found) -> None:
+def _find(search: Search, rows: int, window: int, shift: int) -> None:
+    """Best position of each row of the batch, and the probability of lying within 1 px of it."""
+    lanes = search.lanes
+    for r in range(rows):
+        score = search.score + r * search.score_bytes
+        best = best_score(search, r)
+        x = np.int64(best_position(search, r, best))
+        near = np.float32(0.0)
+        if x > 0:
+            near += power(np.int64(read_int16(score, ((x - 1) & 7) * lanes + ((x - 1) >> 3))) - best, shift)
+        if x + 1 < window:
+            near += power(np.int64(read_int16(score, ((x + 1) & 7) * lanes + ((x + 1) >> 3))) - best, shift)
+        # The best position's own term is exactly 1, the others are too large by the same share on average.
+        others = mass_of(search, r, best, shift) - np.float32(1.0)
+        write_int32(search.x, r, np.int32(x))
+        write_float32(search.confidence, r, min((MEAN_EXCESS + near) / (MEAN_EXCESS + others), np.float32(1.0)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _look_closely(desk: Desk, first: int, rows: int, c: int, table: int, exposures: float) -> None:
+    """Place the lines of the batch's rows, from row `first` of the picture on, and write their answers."""
+    search = desk.search
+    lanes = search.lanes
+    pixels = STEPS * lanes
+    x0 = np.int64(read_int32(desk.x0, c))
+    field = 4 * desk.rows * desk.columns
+    flux = desk.flux + 4 * (COUNT_LIMIT + 1) * np.int64(exposures)
+    for r in range(rows):
+        n = search.n + r * search.n_bytes
+        to = (first + r) * desk.columns + c
+        low, high = np.int64(read_int32(desk.x_lo, to)) - x0, np.int64(read_int32(desk.x_hi, to)) - x0
+        if low > high:
+            continue
+        x = min(max(np.int64(read_int32(search.x, r)), low, 0), high, desk.window - 1)
+        light = np.float32(0.0)
+        for at in range(x - desk.reach, x + desk.reach + 1):
+            light += read_float32(flux, min(np.int64(read_int16(n, place_of(at, lanes))), COUNT_LIMIT))
+        before, scale = read_float32(desk.before, table * pixels + x), read_float32(desk.scale, table * pixels + x)
+        ambient = read_float32(desk.own_ambient, x)
+        light -= np.float32(0.5) * (before + ambient) * np.float32(2 * desk.reach + 1)
+        signal = min(max(light, desk.faintest * scale), desk.brightest * scale)
+        levels = level_of(before) * LEVELS + level_of(signal)
+        weight = desk.weight + 4 * LANES * (desk.weight_px + 1) * levels
+        offset, sd = place_line(n, lanes, x, exposures, weight, desk.weight_px, desk.index, desk.square)
+        confidence = read_float32(search.confidence, r)
+        write_float32(desk.stripe, to, np.float32(x0 + x + offset))
+        write_float32(desk.stripe + field, to, confidence)
+        write_float32(desk.stripe + 2 * field, to, np.float32(sd))
+        write_float32(desk.stripe + 3 * field, to, signal)
+        write_float32(desk.stripe + 4 * field, to, max(before - ambient, np.float32(0.0)))
+        if confidence > QUIET and c % desk.quiet_step == 0:
+            _learn_quiet(desk, n, first + r, c, x, exposures)
+
+
+@numba.njit(cache=True, nogil=True)
+def _learn_quiet(desk: Desk, n: int, y: int, c: int, x: int, exposures: float) -> None:
     """Add the whole lanes behind the stripe at stored pixel x to the quiet counts."""
-    stride = n.shape[0] // STEPS
-    lane = judge.x0[c] // STEPS
-    begin, end = 0, judge.window // STEPS
-    if judge.near_is_left:
-        begin = (x + judge.reach + 1) // STEPS + 1
+    stride, lane = desk.search.lanes + 2 * PAD, read_int32(desk.x0, c) // STEPS
+    begin, end = 0, desk.window // STEPS
+    if desk.near_is_left:
+        begin = ((x + desk.reach + 1) >> 3) + 1
     else:
-        end = (x - judge.reach) // STEPS
+        end = (x - desk.reach) >> 3
     if begin >= end:
         return
+    sums = desk.quiet + 4 * (y * STEPS * desk.sum_lanes + lane)
     for s in range(STEPS):
-        counts = n[s * stride + PAD + begin : s * stride + PAD + end]
-        sums = found.quiet[y, s, lane + begin : lane + end]
-        for i in range(counts.shape[0]):
-            sums[i] += counts[i]
-    found.quiet_exposures[y, lane + begin] += np.int32(exposures)
-    found.quiet_exposures[y, lane + end] -= np.int32(exposures)
+        for i in range(begin, end):
+            at = s * desk.sum_lanes + i
+            count = np.int32(read_int16(n, s * stride + PAD + i))
+            write_int32(sums, at, read_int32(sums, at) + count)
+    steps = desk.quiet_exposures + 4 * (y * (desk.sum_lanes + 1) + lane)
+    write_int32(steps, begin, read_int32(steps, begin) + np.int32(exposures))
+    write_int32(steps, end, read_int32(steps, end) - np.int32(exposures))
 
 
 @numba.njit(cache=True, nogil=True)
-def keep_line(n: NDArray[np.int16], y: int, c: int, found: Found) -> None:
-    """Keep the counts of row y of column c where the learning reads them."""
-    for i in range(found.line_start[c], found.line_start[c + 1]):
-        if found.line_row[i] == y:
-            line = found.lines[i]
-            for x in range(line.shape[0]):
-                line[x] = n[place_of(n, x)]
+def keep_lines(desk: Desk, n: int, y: int, line: int, end: int) -> int:
+    """Keep the counts of row y where the learning reads them; line: the column's next one, which is returned."""
+    while line < end and read_int32(desk.line_row, line) == y:
+        for x in range(desk.window):
+            count = np.int32(read_int16(n, place_of(x, desk.search.lanes)))
+            write_int32(desk.lines, line * desk.window + x, count)
+        line += 1
+    return line

@@ -11,11 +11,12 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.screen_tables import SCREENS, Tables
-from rig.lane_order import PAD, STEPS, new_counts
+from rig.estimators.screen_tables import SCREENS
+from rig.lane_order import PAD, STEPS
 from rig.lanes import (
     LANES,
     add_saturated,
+    address_of,
     equal_mask,
     from_bfloat16,
     larger,
@@ -23,15 +24,21 @@ from rig.lanes import (
     last_lane,
     load_int16,
     lowest_bit,
+    read_float32,
+    read_int16,
     running_sum,
     smaller,
-    store,
+    store_int16,
     sub_saturated,
     total,
     up_1,
+    write_int16,
     zero_float32,
+    zero_int16,
 )
 
+BATCH: Final = 8
+"""Rows that go through each part of the search together: what one row waits for, the others fill."""
 START: Final = -20000
 """Score of 'everything is as right of the stripe': most of the range lies above it."""
 BIAS: Final = np.int16(127 << 7)
@@ -43,167 +50,225 @@ MOST_OCTAVES: Final = 60
 
 
 class Search(NamedTuple):
-    """Buffers of the search, one per thread; in lane order, see `search_buffers`.
+    """Addresses of a thread's buffers for BATCH rows of `lanes` lanes, and the bytes from row to row of each.
 
-    n: int16 ((STEPS * stride,)), counts; score: int16 (STEPS * lanes,); start: int16 (lanes,), score of a change at
-    the lane's first pixel; best: int16 (lanes,), best score of each lane; constant: int16 (SCREENS * STEPS * lanes,)
-    and lane: int16 (lanes,), the tables' parts per exposure times the exposures.
+    n: counts, see `rig.lane_order`. In lane order without padding, int16: score (STEPS * lanes,); start (lanes,), score
+    of a change at the lane's first pixel; best (lanes,), best score of each lane. For all rows of a batch together:
+    constant (SCREENS * STEPS * lanes,) and lane (lanes,), the tables' parts per exposure times the exposures; none (3,)
+    as in `Tables`. all_left (BATCH,), score of all pixels lying left. What was found in each row: int32 x (BATCH,) and
+    float32 confidence (BATCH,).
     """
 
-    n: NDArray[np.int16]
-    score: NDArray[np.int16]
-    start: NDArray[np.int16]
-    best: NDArray[np.int16]
-    constant: NDArray[np.int16]
-    lane: NDArray[np.int16]
+    lanes: int
+    n: int
+    n_bytes: int
+    score: int
+    score_bytes: int
+    start: int
+    best: int
+    constant: int
+    lane: int
+    none: int
+    all_left: int
+    x: int
+    confidence: int
 
 
 @numba.njit(cache=True, nogil=True)
-def search_buffers(lanes: int) -> Search:
-    """Buffers for rows of `lanes` lanes."""
-    pixels = STEPS * lanes
+def search_memory(lanes: int) -> NDArray[np.int16]:
+    """Memory for the buffers of a `Search`."""
+    of_row = STEPS * (lanes + 2 * PAD) + STEPS * lanes + 2 * lanes
+    # x and confidence are of 32 bits and come last, behind an even number of 16-bit ones.
+    return np.zeros(BATCH * of_row + SCREENS * STEPS * lanes + lanes + 4 + BATCH + 4 * BATCH, np.int16)
+
+
+@numba.njit(cache=True, nogil=True)
+def search_in(memory: NDArray[np.int16], lanes: int) -> Search:
+    """The buffers in that memory, which the caller keeps."""
+    n = address_of(memory)
+    n_bytes, score_bytes = 2 * STEPS * (lanes + 2 * PAD), 2 * STEPS * lanes
+    score = n + BATCH * n_bytes
+    start = score + BATCH * score_bytes
+    best = start + BATCH * 2 * lanes
+    constant = best + BATCH * 2 * lanes
+    lane = constant + 2 * SCREENS * STEPS * lanes
+    none = lane + 2 * lanes
+    all_left = none + 2 * 4
+    x = all_left + 2 * BATCH
     return Search(
-        new_counts(lanes), np.zeros(pixels, np.int16), np.zeros(lanes, np.int16),
-        np.zeros(lanes, np.int16), np.zeros(SCREENS * pixels, np.int16), np.zeros(lanes, np.int16),
-    )  # fmt: skip
+        lanes, n, n_bytes, score, score_bytes, start, best, constant, lane, none, all_left, x, x + 4 * BATCH
+    )
 
 
 @numba.njit(cache=True, nogil=True)
-def set_exposures(tables: Tables, c: int, b: int, exposures: float, search: Search) -> None:
-    """Make the constants of one table for columns of so many exposures."""
-    pixels = search.score.shape[0]
+def set_exposures(position: int, prior: int, lane: int, none: int, exposures: float, search: Search) -> None:
+    """Make the constants of one table, given by addresses, for columns of so many exposures."""
+    for i in range(3):
+        write_int16(search.none, i, np.int16(max(read_float32(none, i), np.float32(-32000))))
     exposures = np.float32(exposures)
-    for m in range(SCREENS):
-        position, prior = tables.position[c, b, m], tables.prior[c, b, m]
-        constant = search.constant[m * pixels : (m + 1) * pixels]
-        for i in range(pixels):
-            constant[i] = np.int16(min(max(exposures * position[i] + prior[i], np.float32(-32000)), np.float32(32000)))
-    lane = tables.lane[c, b]
-    for i in range(lane.shape[0]):
-        search.lane[i] = np.int16(min(max(exposures * lane[i], np.float32(-32000)), np.float32(32000)))
-
-
-@numba.njit(inline="always")
-def _edge(n, at, edge, s, lanes, v):  # type: ignore[no-untyped-def]
-    return load_int16(n, at) * load_int16(edge, s * lanes + v)
+    for i in range(SCREENS * STEPS * search.lanes):
+        constant = exposures * read_float32(position, i) + read_float32(prior, i)
+        write_int16(search.constant, i, np.int16(min(max(constant, np.float32(-32000)), np.float32(32000))))
+    for i in range(search.lanes):
+        constant = exposures * read_float32(lane, i)
+        write_int16(search.lane, i, np.int16(min(max(constant, np.float32(-32000)), np.float32(32000))))
 
 
 @numba.njit(cache=True, nogil=True)
-def score_row(edge: NDArray[np.int16], tap: NDArray[np.int16], search: Search) -> tuple[int, int]:
-    """Score every position of the row in search.n; returns the best score and the sum of all pixels lying left.
-
-    edge: (P,) and tap: (SCREENS, 2T + 1, P) of the row's table.
-    """
-    lanes = search.start.shape[0]
+def sum_edges(edge: int, search: Search, r: int) -> None:
+    """Fill start and all_left of row r of the batch; edge: address of the table's."""
+    lanes = search.lanes
     stride = lanes + 2 * PAD
-    n = search.n
-    pixels = STEPS * lanes
-    constant, score = search.constant, search.score
-    taps = tap.shape[1]
-    flat = tap.ravel()
-    reach = (taps - 1) // 2
+    n = search.n + r * search.n_bytes
     carry = np.int16(START)
-    best = np.int16(-32768)
     for v in range(0, lanes, LANES):
         at = PAD + v
-        sums = _edge(n, at, edge, 0, lanes, v) + _edge(n, at + stride, edge, 1, lanes, v)
-        sums = sums + (_edge(n, at + 2 * stride, edge, 2, lanes, v) + _edge(n, at + 3 * stride, edge, 3, lanes, v))
-        sums = sums + (_edge(n, at + 4 * stride, edge, 4, lanes, v) + _edge(n, at + 5 * stride, edge, 5, lanes, v))
-        sums = sums + (_edge(n, at + 6 * stride, edge, 6, lanes, v) + _edge(n, at + 7 * stride, edge, 7, lanes, v))
-        through = running_sum(sums + load_int16(search.lane, v))
-        level = add_saturated(up_1(through), carry)
+        a = load_int16(n, at) * load_int16(edge, v)
+        a = a + load_int16(n, at + stride) * load_int16(edge, lanes + v)
+        b = load_int16(n, at + 2 * stride) * load_int16(edge, 2 * lanes + v)
+        b = b + load_int16(n, at + 3 * stride) * load_int16(edge, 3 * lanes + v)
+        c = load_int16(n, at + 4 * stride) * load_int16(edge, 4 * lanes + v)
+        c = c + load_int16(n, at + 5 * stride) * load_int16(edge, 5 * lanes + v)
+        d = load_int16(n, at + 6 * stride) * load_int16(edge, 6 * lanes + v)
+        d = d + load_int16(n, at + 7 * stride) * load_int16(edge, 7 * lanes + v)
+        through = running_sum(((a + b) + (c + d)) + load_int16(search.lane, v))
+        store_int16(search.start, r * lanes + v, add_saturated(up_1(through), carry))
         carry = last_lane(add_saturated(through, carry))
-        store(search.start, v, level)
-        if reach == 1:
-            top = _score_narrow(n, at, stride, edge, flat, constant, score, level, lanes, pixels, v)
-        else:
-            top = _score_wide(n, at, stride, edge, flat, constant, score, level, lanes, pixels, v, reach)
-        store(search.best, v, top)
-        best = max(best, largest(top))
-    return best, carry
-
-
-@numba.njit(inline="always")
-def _narrow(before, here, after, flat, constant, level, place, pixels):  # type: ignore[no-untyped-def]
-    """Scores of one step of a line that lights one pixel on either side, at the likelier of two amplitudes."""
-    dim = before * load_int16(flat, place) + here * load_int16(flat, place + pixels)
-    dim = dim + after * load_int16(flat, place + 2 * pixels)
-    bright = before * load_int16(flat, place + 3 * pixels) + here * load_int16(flat, place + 4 * pixels)
-    bright = bright + after * load_int16(flat, place + 5 * pixels)
-    dim = add_saturated(dim, load_int16(constant, place))
-    bright = add_saturated(bright, load_int16(constant, place + pixels))
-    return add_saturated(level, larger(dim, bright))
-
-
-@numba.njit(inline="always")
-def _score_narrow(n, at, stride, edge, flat, constant, score, level, lanes, pixels, v):  # type: ignore[no-untyped-def]
-    n0, n1 = load_int16(n, at), load_int16(n, at + stride)
-    n2, n3 = load_int16(n, at + 2 * stride), load_int16(n, at + 3 * stride)
-    n4, n5 = load_int16(n, at + 4 * stride), load_int16(n, at + 5 * stride)
-    n6, n7 = load_int16(n, at + 6 * stride), load_int16(n, at + 7 * stride)
-    # Step 7 of the lane before, step 0 of the lane behind.
-    n_before, n_after = load_int16(n, at + 7 * stride - 1), load_int16(n, at + 1)
-    s0 = _narrow(n_before, n0, n1, flat, constant, level, v, pixels)
-    level = add_saturated(level, n0 * load_int16(edge, v))
-    s1 = _narrow(n0, n1, n2, flat, constant, level, lanes + v, pixels)
-    level = add_saturated(level, n1 * load_int16(edge, lanes + v))
-    s2 = _narrow(n1, n2, n3, flat, constant, level, 2 * lanes + v, pixels)
-    level = add_saturated(level, n2 * load_int16(edge, 2 * lanes + v))
-    s3 = _narrow(n2, n3, n4, flat, constant, level, 3 * lanes + v, pixels)
-    level = add_saturated(level, n3 * load_int16(edge, 3 * lanes + v))
-    s4 = _narrow(n3, n4, n5, flat, constant, level, 4 * lanes + v, pixels)
-    level = add_saturated(level, n4 * load_int16(edge, 4 * lanes + v))
-    s5 = _narrow(n4, n5, n6, flat, constant, level, 5 * lanes + v, pixels)
-    level = add_saturated(level, n5 * load_int16(edge, 5 * lanes + v))
-    s6 = _narrow(n5, n6, n7, flat, constant, level, 6 * lanes + v, pixels)
-    level = add_saturated(level, n6 * load_int16(edge, 6 * lanes + v))
-    s7 = _narrow(n6, n7, n_after, flat, constant, level, 7 * lanes + v, pixels)
-    store(score, v, s0)
-    store(score, lanes + v, s1)
-    store(score, 2 * lanes + v, s2)
-    store(score, 3 * lanes + v, s3)
-    store(score, 4 * lanes + v, s4)
-    store(score, 5 * lanes + v, s5)
-    store(score, 6 * lanes + v, s6)
-    store(score, 7 * lanes + v, s7)
-    return larger(larger(larger(s0, s1), larger(s2, s3)), larger(larger(s4, s5), larger(s6, s7)))
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _score_wide(n, at, stride, edge, flat, constant, score, level, lanes, pixels, v, reach):  # type: ignore[no-untyped-def]
-    """As `_score_narrow` for a line that lights `reach` pixels on either side."""
-    taps = 2 * reach + 1
-    top = load_int16(constant, v) * 0 - 32768
-    for s in range(STEPS):
-        place = s * lanes + v
-        dim, bright = load_int16(constant, place), load_int16(constant, place + pixels)
-        for d in range(taps):
-            x = s + d - reach
-            lane, step = x // STEPS, x % STEPS
-            count = load_int16(n, at + step * stride + lane)
-            dim = add_saturated(dim, count * load_int16(flat, place + d * pixels))
-            bright = add_saturated(bright, count * load_int16(flat, place + (taps + d) * pixels))
-        scored = add_saturated(level, larger(dim, bright))
-        store(score, place, scored)
-        top = larger(top, scored)
-        level = add_saturated(level, load_int16(n, at + s * stride) * load_int16(edge, place))
-    return top
+    write_int16(search.all_left, r, carry)
 
 
 @numba.njit(cache=True, nogil=True)
-def best_position(search: Search, best: int) -> int:
-    """Stored pixel of the best score, one of the lowest lane that has it."""
-    lanes = search.start.shape[0]
+def score_rows(edge: int, tap: int, reach: int, search: Search, rows: int) -> None:
+    """Score every position of the batch's first rows, after `sum_edges`.
+
+    edge, tap: addresses of the rows' table, see `Tables`; reach: T of its taps.
+    """
+    if reach == 1:
+        # In pairs: what bounds the speed is reading the table, which serves both. An odd last row has a stale partner.
+        for r in range(0, rows, 2):
+            _score_pair(edge, tap, search, r)
+    else:
+        for r in range(rows):
+            _score_wide(edge, tap, reach, search, r)
+
+
+@numba.njit(inline="always")
+def _score_step(n, before, here, after, tap, constant, edge, place, pixels, levels, tops, score, other):  # type: ignore[no-untyped-def]
+    """One step of two rows: scores at the likelier of two amplitudes, then the levels behind it.
+
+    before, here, after: places of the neighbours' counts in n; the second row's lie `other` numbers behind.
+    """
+    weight = load_int16(tap, place)
+    dim, other_dim = load_int16(n, before) * weight, load_int16(n, before + other) * weight
+    weight = load_int16(tap, place + pixels)
+    dim = dim + load_int16(n, here) * weight
+    other_dim = other_dim + load_int16(n, here + other) * weight
+    weight = load_int16(tap, place + 2 * pixels)
+    dim = dim + load_int16(n, after) * weight
+    other_dim = other_dim + load_int16(n, after + other) * weight
+    weight = load_int16(constant, place)
+    dim, other_dim = add_saturated(dim, weight), add_saturated(other_dim, weight)
+    weight = load_int16(tap, place + 3 * pixels)
+    bright, other_bright = load_int16(n, before) * weight, load_int16(n, before + other) * weight
+    weight = load_int16(tap, place + 4 * pixels)
+    bright = bright + load_int16(n, here) * weight
+    other_bright = other_bright + load_int16(n, here + other) * weight
+    weight = load_int16(tap, place + 5 * pixels)
+    bright = bright + load_int16(n, after) * weight
+    other_bright = other_bright + load_int16(n, after + other) * weight
+    weight = load_int16(constant, place + pixels)
+    bright, other_bright = add_saturated(bright, weight), add_saturated(other_bright, weight)
+    dim = add_saturated(levels[0], larger(dim, bright))
+    other_dim = add_saturated(levels[1], larger(other_dim, other_bright))
+    store_int16(score, place, dim)
+    store_int16(score, place + pixels, other_dim)
+    weight = load_int16(edge, place)
+    level = add_saturated(levels[0], load_int16(n, here) * weight)
+    other_level = add_saturated(levels[1], load_int16(n, here + other) * weight)
+    return (level, other_level), (larger(tops[0], dim), larger(tops[1], other_dim))
+
+
+@numba.njit(cache=True, nogil=True)
+def _score_pair(edge: int, tap: int, search: Search, r: int) -> None:
+    """Score rows r and r + 1 of a line that lights one pixel on either side."""
+    lanes = search.lanes
+    stride = lanes + 2 * PAD
+    n, score, constant = search.n + r * search.n_bytes, search.score + r * search.score_bytes, search.constant
+    pixels, other = STEPS * lanes, STEPS * stride
+    for v in range(0, lanes, LANES):
+        at, end = PAD + v, PAD + v + 7 * stride
+        levels = load_int16(search.start, r * lanes + v), load_int16(search.start, (r + 1) * lanes + v)
+        lowest = zero_int16() - 32768
+        tops = lowest, lowest
+        # The first step's neighbour is step 7 of the lane before, the last one's step 0 of the lane behind.
+        levels, tops = _score_step(
+            n, end - 1, at, at + stride, tap, constant, edge, v, pixels, levels, tops, score, other
+        )
+        for s in range(1, STEPS - 1):
+            here = at + s * stride
+            levels, tops = _score_step(
+                n, here - stride, here, here + stride, tap, constant, edge, s * lanes + v, pixels, levels, tops, score,
+                other,
+            )  # fmt: skip
+        levels, tops = _score_step(
+            n, end - stride, end, at + 1, tap, constant, edge, 7 * lanes + v, pixels, levels, tops, score, other
+        )
+        store_int16(search.best, r * lanes + v, tops[0])
+        store_int16(search.best, (r + 1) * lanes + v, tops[1])
+
+
+@numba.njit(cache=True, nogil=True)
+def _score_wide(edge: int, tap: int, reach: int, search: Search, r: int) -> None:
+    """Score row r of a line that lights `reach` pixels on either side."""
+    lanes = search.lanes
+    stride = lanes + 2 * PAD
+    n, score, constant = search.n + r * search.n_bytes, search.score + r * search.score_bytes, search.constant
+    pixels = STEPS * lanes
+    taps = 2 * reach + 1
+    for v in range(0, lanes, LANES):
+        at = PAD + v
+        level = load_int16(search.start, r * lanes + v)
+        top = zero_int16() - 32768
+        for s in range(STEPS):
+            place = s * lanes + v
+            dim, bright = load_int16(constant, place), load_int16(constant, place + pixels)
+            for d in range(taps):
+                x = s + d - reach
+                count = load_int16(n, at + (x & 7) * stride + (x >> 3))
+                dim = add_saturated(dim, count * load_int16(tap, place + d * pixels))
+                bright = add_saturated(bright, count * load_int16(tap, place + (taps + d) * pixels))
+            scored = add_saturated(level, larger(dim, bright))
+            store_int16(score, place, scored)
+            top = larger(top, scored)
+            level = add_saturated(level, load_int16(n, at + s * stride) * load_int16(edge, place))
+        store_int16(search.best, r * lanes + v, top)
+
+
+@numba.njit(cache=True, nogil=True)
+def best_score(search: Search, r: int) -> int:
+    """The best score of row r."""
+    best = np.int16(-32768)
+    for v in range(0, search.lanes, LANES):
+        best = max(best, largest(load_int16(search.best, r * search.lanes + v)))
+    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def best_position(search: Search, r: int, best: int) -> int:
+    """Stored pixel of row r with the best score, the first of the lowest lane that has it."""
+    lanes = search.lanes
+    score = search.score + r * search.score_bytes
     lane = 0
     for v in range(0, lanes, LANES):
-        mask = equal_mask(load_int16(search.best, v), np.int16(best))
+        mask = equal_mask(load_int16(search.best, r * lanes + v), np.int16(best))
         if mask != 0:
             lane = v + lowest_bit(mask)
             break
-    for s in range(STEPS - 1):
-        if search.score[s * lanes + lane] == best:
-            return STEPS * lane + s
-    return STEPS * lane + STEPS - 1
+    # One bit a step, without a branch: which step it is cannot be foreseen.
+    found = 0
+    for s in range(STEPS):
+        found |= np.int64(read_int16(score, s * lanes + lane) == best) << s
+    return STEPS * lane + lowest_bit(np.uint32(found))
 
 
 @numba.njit(inline="always")
@@ -221,37 +286,29 @@ def power(difference, shift):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def mass_of(search: Search, best: int, shift: int) -> float:
-    """Sum of 2^((score - best) / units) over all positions; units = 128 >> shift."""
-    lanes = search.start.shape[0]
-    score = search.score
-    low = np.int16(-(np.int64(BIAS) >> shift))
-    best = np.int16(best)
-    lot = zero_float32()
-    for v in range(0, lanes, LANES):
-        a = _power(load_int16(score, v), best, low, shift) + _power(load_int16(score, lanes + v), best, low, shift)
-        b = _power(load_int16(score, 2 * lanes + v), best, low, shift)
-        b = b + _power(load_int16(score, 3 * lanes + v), best, low, shift)
-        c = _power(load_int16(score, 4 * lanes + v), best, low, shift)
-        c = c + _power(load_int16(score, 5 * lanes + v), best, low, shift)
-        d = _power(load_int16(score, 6 * lanes + v), best, low, shift)
-        d = d + _power(load_int16(score, 7 * lanes + v), best, low, shift)
-        lot = lot + ((a + b) + (c + d))
-    return total(lot)
+def mass_of(search: Search, r: int, best: int, shift: int) -> float:
+    """Sum of 2^((score - best) / units) over all positions of row r and all hypotheses without a stripe.
 
-
-@numba.njit(cache=True, nogil=True)
-def none_mass(search: Search, none: NDArray[np.float32], all_left: int, best: int, shift: int) -> float:
-    """The same sum over the hypotheses without a stripe; none: (3,) of the row's table."""
-    lanes = search.start.shape[0]
+    units = 128 >> shift.
+    """
+    lanes = search.lanes
+    score = search.score + r * search.score_bytes
     low = np.int16(-(np.int64(BIAS) >> shift))
     most = (MOST_OCTAVES * 128) >> shift
-    highest = np.int16(min(best + most, 32767))
+    change = read_int16(search.none, 2)
+    ceiling = np.int16(min(best + most, 32767))
+    floor = np.int16(best)
     lot = zero_float32()
-    change = np.int16(max(none[2], np.float32(-32000.0)))
     for v in range(0, lanes, LANES):
-        level = smaller(add_saturated(load_int16(search.start, v), change), highest)
-        lot = lot + _power(level, np.int16(best), low, shift)
-    ends = power(min(START + np.int64(max(none[0], np.float32(-32000.0))) - best, most), shift)
-    ends += power(min(all_left + np.int64(max(none[1], np.float32(-32000.0))) - best, most), shift)
+        a = _power(load_int16(score, v), floor, low, shift) + _power(load_int16(score, lanes + v), floor, low, shift)
+        b = _power(load_int16(score, 2 * lanes + v), floor, low, shift)
+        b = b + _power(load_int16(score, 3 * lanes + v), floor, low, shift)
+        c = _power(load_int16(score, 4 * lanes + v), floor, low, shift)
+        c = c + _power(load_int16(score, 5 * lanes + v), floor, low, shift)
+        d = _power(load_int16(score, 6 * lanes + v), floor, low, shift)
+        d = d + _power(load_int16(score, 7 * lanes + v), floor, low, shift)
+        nowhere = smaller(add_saturated(load_int16(search.start, r * lanes + v), change), ceiling)
+        lot = lot + (((a + b) + (c + d)) + _power(nowhere, floor, low, shift))
+    ends = power(min(START + np.int64(read_int16(search.none, 0)) - best, most), shift)
+    ends += power(min(np.int64(read_int16(search.all_left, r)) + read_int16(search.none, 1) - best, most), shift)
     return total(lot) + ends

@@ -12,8 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting_kernels import CHUNK, FEW_FRAMES, PLANES, WORD_BYTES, WORD_PX, add_frames, clear
-from rig.estimators.row_search import Bench, Found, Judge, halvings, judge_row, keep_line, set_column, set_flux
+from rig.estimators.row_search import (
+    Bench,
+    Found,
+    Judge,
+    desk_of,
+    halvings,
+    judge_rows,
+    keep_lines,
+    set_column,
+)
+from rig.estimators.search_kernels import BATCH
 from rig.lane_order import STEPS, halve_counts, read_counts, read_planes, sum_counts
+from rig.lanes import address_of, read_int32
 
 
 class OpenColumn(NamedTuple):
@@ -56,30 +67,36 @@ def _move_window(by, row_words, n, planes):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _finish(judge, bench, found, open_column, planes, at_byte, row_bytes, first_row, last_row):  # type: ignore[no-untyped-def]
-    """Judge rows first_row..last_row-1 of a finished column; planes: bytes, the chunk's counters from at_byte on."""
-    c, k = open_column.column, open_column.frames
+def _finish(desk, state, planes, row_bytes, first_row, last_row):  # type: ignore[no-untyped-def]
+    """Judge rows first_row..last_row-1 of a finished column; planes: address of the chunk's counters."""
+    c, k = state.column, state.frames
     halved = halvings(k)
     exposures = np.float32(k / 2.0**halved)
-    n = bench.search.n
+    n, lanes = desk.search.n, desk.search.lanes
     n_planes = 1 if k == 1 else (4 if k <= FEW_FRAMES else PLANES)
-    at = at_byte + (judge.x0[c] // WORD_PX - open_column.first_word) * WORD_BYTES
-    lane = judge.x0[c] // STEPS
-    has_lines = found.line_start[c] < found.line_start[c + 1]
+    x0 = np.int64(read_int32(desk.x0, c))
+    at = (x0 // WORD_PX - state.first_word) * WORD_BYTES
+    light = desk.light + 2 * (x0 // STEPS)
+    line, last_line = np.int64(read_int32(desk.line_start, c)), np.int64(read_int32(desk.line_start, c + 1))
+    while line < last_line and read_int32(desk.line_row, line) < first_row:
+        line += 1
+    y = first_row
     band = -1
-    set_flux(exposures, bench.flux)
-    for y in range(first_row, last_row):
-        if y // judge.band_rows != band:
-            band = y // judge.band_rows
-            set_column(judge, bench, c, band, exposures)
-        read_planes(planes, at, CHUNK * WORD_BYTES, n_planes, judge.window, n)
-        at += row_bytes
-        sum_counts(n, lane, found.light[y])
-        if has_lines:
-            keep_line(n, y, c, found)
-        if halved:
-            halve_counts(n, halved)
-        judge_row(judge, bench, y, c, band, exposures, found)
+    while y < last_row:
+        if y // desk.band_rows != band:
+            band = y // desk.band_rows
+            set_column(desk, c, band, exposures)
+        rows = min(BATCH, last_row - y, (band + 1) * desk.band_rows - y)
+        for r in range(rows):
+            counts = n + r * desk.search.n_bytes
+            read_planes(planes, at, CHUNK * WORD_BYTES, n_planes, desk.window, counts, lanes)
+            at += row_bytes
+            sum_counts(counts, lanes, light + 2 * (y + r) * STEPS * desk.sum_lanes, desk.sum_lanes)
+            line = keep_lines(desk, counts, y + r, line, last_line)
+            if halved:
+                halve_counts(counts, lanes, halved)
+        judge_rows(desk, y, rows, c, band, exposures)
+        y += rows
 
 
 @numba.njit(cache=True, nogil=True)
@@ -116,7 +133,8 @@ def search_frames(
     rows = judge.x_lo.shape[0]
     frame = rows * row_words
     chunk_rows = max(CHUNK // row_words, 1)
-    as_bytes = planes.reshape(-1).view(np.uint8)
+    desk = desk_of(judge, found, bench)
+    counted = address_of(planes)
     chunk_bytes = (PLANES + 1) * CHUNK * WORD_BYTES
     state = open_column
     for j in range(first_chunk, last_chunk):
@@ -135,7 +153,7 @@ def search_frames(
                 g += 1
             if c != state.column:
                 if state.column >= 0:
-                    _finish(judge, bench, found, state, as_bytes, j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)
+                    _finish(desk, state, counted + j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)
                 state = OpenColumn(c, word, 0)
             elif word != state.first_word:
                 _move_window(word - state.first_word, row_words, n, counters)
@@ -143,7 +161,7 @@ def search_frames(
             state = OpenColumn(c, word, state.frames + g - f)
             f = g
         if end and state.column >= 0:
-            _finish(judge, bench, found, state, as_bytes, j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)
+            _finish(desk, state, counted + j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)
     return OpenColumn(-1, 0, 0) if end else state
 
 
@@ -158,18 +176,21 @@ def search_counts(
     last_row: int,
 ) -> None:
     """Judge rows first_row..last_row-1 of counts (columns, rows, window); found.light and found.lines stay as they are."""
-    n = bench.search.n
+    desk = desk_of(judge, found, bench)
     for c in range(counts.shape[0]):
         k = n_frames[c]
         if k == 0:
             continue
         halved = halvings(k)
         exposures = np.float32(k / 2.0**halved)
-        set_flux(exposures, bench.flux)
+        y = first_row
         band = -1
-        for y in range(first_row, last_row):
-            if y // judge.band_rows != band:
-                band = y // judge.band_rows
-                set_column(judge, bench, c, band, exposures)
-            read_counts(counts[c, y], halved, n)
-            judge_row(judge, bench, y, c, band, exposures, found)
+        while y < last_row:
+            if y // desk.band_rows != band:
+                band = y // desk.band_rows
+                set_column(desk, c, band, exposures)
+            rows = min(BATCH, last_row - y, (band + 1) * desk.band_rows - y)
+            for r in range(rows):
+                read_counts(counts[c, y + r], halved, desk.search.n + r * desk.search.n_bytes, desk.search.lanes)
+            judge_rows(desk, y, rows, c, band, exposures)
+            y += rows
