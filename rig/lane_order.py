@@ -123,12 +123,12 @@ def halve_counts(n: int, lanes: int, times: int) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def sum_counts(n: int, lanes: int, sums: int, sum_lanes: int) -> None:
-    """Add the counts of the row at address n to int16 sums (STEPS, sum_lanes), of which address `sums` is the lane."""
+def sum_counts(n: int, lanes: int, sums: int) -> None:
+    """Add the counts of the row at address n to int16 sums (STEPS, lanes) at address `sums`."""
     stride = lanes + 2 * PAD
     for v in range(0, lanes, LANES):
         for s in range(STEPS):
-            at = s * sum_lanes + v
+            at = s * lanes + v
             store_int16(sums, at, load_int16(sums, at) + load_int16(n, s * stride + PAD + v))
 
 

@@ -51,7 +51,8 @@ def ambient_map(
 
 def _window_exposures(tally: FrameTally, geometry: SweepGeometry) -> NDArray[np.uint32]:
     """Exposures of each pixel of a row while it lay within the stored window (width,)."""
-    change = np.zeros(int(geometry.x0.max(initial=0)) + geometry.window + 1, np.int64)
+    reached = int(geometry.x0.max(initial=0)) + geometry.window
+    change = np.zeros(max(geometry.width, reached) + 1, np.int64)
     np.add.at(change, geometry.x0, tally.n_frames)
     np.add.at(change, geometry.x0 + geometry.window, -tally.n_frames)
     return np.cumsum(change)[: geometry.width].astype(np.uint32)

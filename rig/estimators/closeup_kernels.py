@@ -11,9 +11,22 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.estimators.powers import nothing_below, powers
 from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, LABEL_PX, LABELS, cell_of
+from rig.estimators.screen_tables import LN2
 from rig.lane_order import place_of
-from rig.lanes import LANES, larger_float, load_float32, read_int16, smaller_float, spread, total, truncated, two_to
+from rig.lanes import (
+    LANES,
+    UNPACKED,
+    add_saturated,
+    larger_float,
+    largest,
+    load_float32,
+    load_int16,
+    read_int16,
+    to_int16,
+    total,
+)
 
 LEVEL_SHIFT: Final = np.uint32(22)
 """Two levels an octave: the exponent and the first bit behind it of a float32."""
@@ -22,25 +35,25 @@ LEVEL_BASE: Final = np.uint32((127 + LOWEST_OCTAVE) << 1)
 LEVELS: Final = 36
 """2^-14 to 2^4 photons per exposure."""
 IMPOSSIBLE: Final = np.float32(-1e30)
-LOWEST_POWER, HIGHEST_POWER = np.float32(-100.0), np.float32(60.0)
-PER_NAT: Final = np.float32(1.4426950408889634)
+LOWEST_SCORE: Final = np.float32(-32000.0)
 
 
 class Closeup(NamedTuple):
     """Tables of the close look.
 
-    weight: float32 (LEVELS, LEVELS, F + 1, LANES) over haze, line, pixel from -R to R, label: octaves per count; the
-    last of the F + 1 is per exposure. index, square: float32 (LANES,), label number from the middle one, and squared.
+    weight: int16 (LEVELS, LEVELS, F, LANES) over haze, line, pixel from -R to R, label: units per count; constant:
+    float32 (LEVELS, LEVELS, LANES), units per exposure. Units as of the search, 128 >> shift an octave. index, square: float32 (LANES,), label number from the middle one, and squared, in the order UNPACKED.
     """
 
-    weight: NDArray[np.float32]
+    weight: NDArray[np.int16]
+    constant: NDArray[np.float32]
     index: NDArray[np.float32]
     square: NDArray[np.float32]
 
 
 @numba.njit(cache=True, nogil=True)
 def closeup_tables(
-    ambient: float, share: float, near_is_left: bool, fine: NDArray[np.float32], table: NDArray[np.float32]
+    ambient: float, share: float, near_is_left: bool, fine: NDArray[np.float32], table: NDArray[np.float32], units: float
 ) -> Closeup:
     """Tables for ambient light of so many photons per exposure and a pedestal of so large a share of the haze.
 
@@ -48,7 +61,9 @@ def closeup_tables(
     """
     pixels = fine.shape[1]
     reach = (pixels - 1) // 2
-    weight = np.zeros((LEVELS, LEVELS, pixels + 1, LANES), np.float32)
+    weight = np.zeros((LEVELS, LEVELS, pixels, LANES), np.int16)
+    constant = np.zeros((LEVELS, LEVELS, LANES), np.float32)
+    per_nat = np.float32(units / LN2)
     gain, loss = table[0], table[1]
     for a in range(LEVELS):
         before = np.float32(level_flux(a))
@@ -57,7 +72,7 @@ def closeup_tables(
         for b in range(LEVELS):
             light = np.float32(level_flux(b))
             out = weight[a, b]
-            out[pixels, LABELS:] = IMPOSSIBLE
+            constant[a, b, LABELS:] = IMPOSSIBLE
             for i in range(LABELS):
                 offset = (i - LABELS // 2) * LABEL_PX
                 for t in range(pixels):
@@ -65,13 +80,15 @@ def closeup_tables(
                     flux = of_left * left + (np.float32(1.0) - of_left) * right + light * fine[i, t]
                     cell = cell_of(min(max(flux, FLUX_MIN), FLUX_MAX))
                     own = cell_of(min(max(right, FLUX_MIN), FLUX_MAX))
-                    out[t, i] = (gain[cell] - gain[own]) * PER_NAT
-                    out[pixels, i] += (loss[cell] - loss[own]) * PER_NAT
+                    out[t, i] = np.int16(round((gain[cell] - gain[own]) * per_nat))
+                    constant[a, b, i] += (loss[cell] - loss[own]) * per_nat
     index, square = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
-    for i in range(LABELS):
-        index[i] = i - LABELS // 2
-        square[i] = (i - LABELS // 2) ** 2
-    return Closeup(weight, index, square)
+    for i in range(LANES):
+        label = UNPACKED[i]
+        if label < LABELS:
+            index[i] = label - LABELS // 2
+            square[i] = (label - LABELS // 2) ** 2
+    return Closeup(weight, constant, index, square)
 
 
 @numba.njit(inline="always")
@@ -87,36 +104,24 @@ def level_flux(level):  # type: ignore[no-untyped-def]
     return (1.25 + 0.5 * (level & 1)) * 2.0 ** (LOWEST_OCTAVE + (level >> 1))
 
 
-@numba.njit(inline="always")
-def _power(a):  # type: ignore[no-untyped-def]
-    """2^a for a from -100 to 100: a cubic within each octave, exact to 1e-4."""
-    whole = truncated(a)
-    f = a - whole
-    return two_to(whole) * (((f * np.float32(0.0433) + np.float32(0.2348)) * f + np.float32(0.6913)) * f + np.float32(0.99993))
-
-
 @numba.njit(cache=True, nogil=True)
 def place_line(
-    n: int, lanes: int, x: int, exposures: float, weight: int, pixels: int, index: int, square: int
-) -> tuple[float, float]:
+    n: int, lanes: int, x: int, exposures: float, weight: int, constant: int, pixels: int, index: int, square: int,
+    shift: int,
+) -> tuple[float, float]:  # fmt: skip
     """Offset of the line from the middle of pixel x in px, to the right, and its standard deviation.
 
-    n: address of the row's counts, of so many lanes; weight: of the F + 1 vectors of the two levels, F = pixels; index,
-    square: as in `Closeup`.
+    n: address of the row's counts, of so many lanes; weight: of the F = `pixels` vectors of the two levels, constant: of
+    theirs; index, square: as in `Closeup`.
     """
-    score = load_float32(weight, pixels * LANES) * np.float32(exposures)
+    score = to_int16(larger_float(load_float32(constant, 0) * np.float32(exposures), LOWEST_SCORE))
     first = x - (pixels - 1) // 2
-    other = load_float32(weight, 0) * np.float32(read_int16(n, place_of(first, lanes)))
-    for t in range(1, pixels, 2):
-        score = score + load_float32(weight, t * LANES) * np.float32(read_int16(n, place_of(first + t, lanes)))
-        t += 1
-        other = other + load_float32(weight, t * LANES) * np.float32(read_int16(n, place_of(first + t, lanes)))
-    score = score + other
-    # Against the middle label, which is never far below the best one: x is the best pixel.
-    score = score - spread(score, LABELS // 2)
-    likelihood = _power(smaller_float(larger_float(score, LOWEST_POWER), HIGHEST_POWER))
+    for t in range(pixels):
+        count = read_int16(n, place_of(first + t, lanes))
+        score = add_saturated(score, load_int16(weight, t * LANES) * count)
+    likelihood = powers(score, nothing_below(largest(score), shift), shift)
     mass = total(likelihood)
     mean = total(likelihood * load_float32(index, 0)) / mass
-    square = total(likelihood * load_float32(square, 0)) / mass
-    variance = max(square - mean * mean, np.float32(0.0))
-    return LABEL_PX * mean, LABEL_PX * np.sqrt(variance + np.float32(1.0 / 12.0))
+    variance = total(likelihood * load_float32(square, 0)) / mass - mean * mean
+    label_px = np.float32(LABEL_PX)
+    return label_px * mean, label_px * np.sqrt(max(variance, np.float32(0.0)) + np.float32(1.0 / 12.0))

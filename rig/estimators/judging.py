@@ -50,7 +50,7 @@ def judge_of(
     haze, rest = model.profile[:, 0], model.profile[:, 1]
     closeup = closeup_tables(
         float(np.median(state.ambient)), float(rest.sum() / max(haze.sum(), 1e-9)), geometry.near_is_left,
-        state.fine, TABLE,
+        state.fine, TABLE, float(128 >> shift),
     )  # fmt: skip
     expected = np.repeat(state.ambient, band_rows, axis=0)[: geometry.rows]
     y, x = np.nonzero(model.ambient > HOT_FACTOR * expected + HOT_FLUX)
@@ -90,8 +90,9 @@ def nothing_found(
         stripe=stripe,
         quiet=np.zeros((rows, STEPS, lanes), np.int32),
         quiet_exposures=np.zeros((rows, lanes + 1), np.int32),
-        light=np.zeros((rows, STEPS, lanes), np.int16),
-        light_carried=np.zeros((rows, STEPS, lanes), np.int32),
+        light=np.zeros((rows, STEPS, lanes), np.int32),
+        quiet_here=np.zeros((rows, STEPS, padded_lanes(geometry.window)), np.int16),
+        light_here=np.zeros((rows, STEPS, padded_lanes(geometry.window)), np.int16),
         lines=np.zeros((len(line_row), geometry.window), np.int32),
         line_start=np.searchsorted(line_column, np.arange(columns + 1)).astype(np.int32),
         line_row=np.ascontiguousarray(line_row),

@@ -32,7 +32,7 @@ TEACH_FRAMES = 5000
 
 
 class Likelihood:
-    """Row likelihood with the state it has learned so far; `model` is None before the first map.
+    """Row likelihood with the state it has learned so far; `model` is None before the first map that taught anything.
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
     """
@@ -57,13 +57,14 @@ class Likelihood:
             assert self.model is not None, "a sweep is judged under a model"
             self.used = self.model
         else:
-            if self.model is None:
-                self.model = self._first_model(sweep, geometry)
-            self.used = self.model
+            self.used = self.model if self.model is not None else self._first_model(sweep, geometry)
             stripes, quiet = self._search(sweep, geometry, self.used)
             lines = lines_of(sweep, next_lattice(geometry))
         self._since_taught += int(sweep.n_frames.sum())
-        if self._since_taught >= TEACH_FRAMES and np.mean(stripes.confidence > 0.5) >= LEAST_SURE:
+        sure = bool(np.mean(stripes.confidence > 0.5) >= LEAST_SURE)
+        if sure and self.model is None:
+            self.model = self.used
+        if sure and self._since_taught >= TEACH_FRAMES:
             self._since_taught = 0
             self._carry_on(sweep, sweep.intensity(), geometry, quiet, lines)
         return stripes

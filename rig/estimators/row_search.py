@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.closeup_kernels import LEVELS, Closeup, level_of, place_line
+from rig.estimators.powers import MEAN_EXCESS, nothing_below, power
 from rig.estimators.screen_tables import SCREENS, Tables
 from rig.estimators.search_kernels import (
-    MEAN_EXCESS,
     Search,
     best_position,
     best_score,
     mass_of,
-    power,
     score_rows,
     search_in,
     search_memory,
@@ -26,7 +25,19 @@ from rig.estimators.search_kernels import (
     sum_edges,
 )
 from rig.lane_order import PAD, STEPS, place_of
-from rig.lanes import LANES, address_of, read_float32, read_int16, read_int32, write_float32, write_int16, write_int32
+from rig.lanes import (
+    LANES,
+    address_of,
+    lanes_between,
+    load_int16,
+    read_float32,
+    read_int16,
+    read_int32,
+    store_int16,
+    write_float32,
+    write_int16,
+    write_int32,
+)
 
 QUIET: Final = 0.9
 """Probability within 1 px from which the pixels behind the stripe teach the ambient light."""
@@ -36,6 +47,10 @@ COUNT_LIMIT: Final = 63
 """Largest count the search works with; counts of more exposures are halved until they fit."""
 FIELDS: Final = 5
 """x_px, confidence, x_sd_px, signal, haze: see `StripeTable`."""
+NO_NAN: Final = {"nnan", "nsz"}
+"""For min and max without a branch, which could not be foreseen."""
+NOWHERE: Final = -1
+"""Position of a row without a search window."""
 SIGNAL_REACH_PX: Final = 2
 """Pixels on either side whose light is the stripe's, where the line is narrower."""
 
@@ -74,16 +89,18 @@ class Found(NamedTuple):
 
     stripe: float32 (FIELDS, rows, columns), NaN and confidence 0 where there is nothing. quiet: int32 (rows, STEPS,
     lanes of the sensor and LANES more), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures:
-    int32 (rows, lanes + 1), their exposures as steps up and down. light: int16, like quiet, ones of every pixel within
-    the windows since they were last carried to light_carried, int32. lines: int32 (lines, window), counts of the rows
+    int32 (rows, lanes + 1), their exposures as steps up and down. light: int32, like quiet, ones of every pixel within
+    the windows; those since the window last moved are still in light_here, int16 (rows, STEPS, lanes of the window).
+    lines: int32 (lines, window), counts of the rows
     that the learning reads; line_start: int32 (columns + 1,) and line_row: int32, the rows of each column in order.
     """
 
     stripe: NDArray[np.float32]
     quiet: NDArray[np.int32]
     quiet_exposures: NDArray[np.int32]
-    light: NDArray[np.int16]
-    light_carried: NDArray[np.int32]
+    light: NDArray[np.int32]
+    quiet_here: NDArray[np.int16]
+    light_here: NDArray[np.int16]
     lines: NDArray[np.int32]
     line_start: NDArray[np.int32]
     line_row: NDArray[np.int32]
@@ -116,6 +133,7 @@ class Desk(NamedTuple):
     first: int
     last: int
     weight: int
+    weight_constant: int
     weight_px: int
     index: int
     square: int
@@ -155,11 +173,12 @@ def desk_of(judge: Judge, found: Found, bench: Bench) -> Desk:
         tables.tap.shape[3], address_of(tables.edge), address_of(tables.tap), address_of(tables.position),
         address_of(tables.prior), address_of(tables.lane), address_of(tables.none), address_of(tables.neutral),
         address_of(tables.before), address_of(tables.scale), address_of(tables.first), address_of(tables.last),
-        address_of(closeup.weight), closeup.weight.shape[2] - 1, address_of(closeup.index), address_of(closeup.square),
+        address_of(closeup.weight), address_of(closeup.constant), closeup.weight.shape[2], address_of(closeup.index),
+        address_of(closeup.square),
         address_of(judge.x0), address_of(judge.x_lo), address_of(judge.x_hi), address_of(judge.ambient),
         judge.ambient.shape[1], address_of(judge.hot_start), address_of(judge.hot_x), address_of(bench.ambient),
-        address_of(judge.flux), address_of(found.stripe), address_of(found.quiet), address_of(found.quiet_exposures),
-        address_of(found.light), found.light.shape[2], address_of(found.lines), address_of(found.line_start),
+        address_of(judge.flux), address_of(found.stripe), address_of(found.quiet_here), address_of(found.quiet_exposures),
+        address_of(found.light_here), found.light.shape[2], address_of(found.lines), address_of(found.line_start),
         address_of(found.line_row), judge.band_rows, judge.window, judge.reach, judge.shift,
         judge.quiet_step, judge.near_is_left, np.float32(judge.faintest), np.float32(judge.brightest),
     )  # fmt: skip
@@ -172,8 +191,11 @@ def new_bench(lanes: int) -> Bench:
 
 
 def count_fluxes() -> NDArray[np.float32]:
-    """Photons per exposure that n ones in k exposures speak for, (k, n) float32: nearly unbiased, finite also at n = k."""
-    k, n = np.mgrid[: COUNT_LIMIT + 1, : COUNT_LIMIT + 1]
+    """Photons per exposure that n ones in k exposures speak for, (k, n) float32: nearly unbiased, finite also at n = k.
+
+    Halved counts are rounded up, so that n may exceed the limit by one.
+    """
+    k, n = np.mgrid[: COUNT_LIMIT + 1, : COUNT_LIMIT + 2]
     return np.log((k + 0.5) / (np.maximum(k - n, 0) + 0.5)).astype(np.float32)
 
 
@@ -227,73 +249,96 @@ def judge_rows(desk: Desk, first: int, rows: int, c: int, b: int, exposures: flo
     if read_int32(desk.hot_start, first) < read_int32(desk.hot_start, first + rows):
         for r in range(rows):
             _mute_hot(desk, search.n + r * search.n_bytes, first + r, c, table, exposures)
-    for r in range(rows):
-        sum_edges(edge, search, r)
+    sum_edges(edge, search, rows)
     score_rows(edge, tap, (desk.taps - 1) // 2, search, rows)
     # Each part for all rows before the next: one row's parts wait for one another, different rows' do not.
     _find(search, rows, desk.window, desk.shift)
-    _look_closely(desk, first, rows, c, table, exposures)
+    _measure_light(desk, first, rows, c, table, exposures)
+    _look_closely(desk, first, rows, c, exposures)
+    if c % desk.quiet_step == 0:
+        for r in range(rows):
+            x = np.int64(read_int32(search.x, r))
+            if x != NOWHERE and read_float32(search.confidence, r) > QUIET:
+                _learn_quiet(desk, search.n + r * search.n_bytes, first + r, c, x, exposures)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=NO_NAN)
 def _find(search: Search, rows: int, window: int, shift: int) -> None:
     """Best position of each row of the batch, and the probability of lying within 1 px of it."""
     lanes = search.lanes
     for r in range(rows):
-        score = search.score + r * search.score_bytes
-        best = best_score(search, r)
-        x = np.int64(best_position(search, r, best))
-        near = np.float32(0.0)
+        write_int32(search.x, r, np.int32(best_position(search, r, best_score(search, r))))
+    for r in range(rows):
+        score, x = search.score + r * search.score_bytes, np.int64(read_int32(search.x, r))
+        best = np.int64(read_int16(score, (x & 7) * lanes + (x >> 3)))
+        nothing = nothing_below(best, shift)
+        own, near = power(best, nothing, shift), np.float32(0.0)
         if x > 0:
-            near += power(np.int64(read_int16(score, ((x - 1) & 7) * lanes + ((x - 1) >> 3))) - best, shift)
+            near += power(read_int16(score, ((x - 1) & 7) * lanes + ((x - 1) >> 3)), nothing, shift)
         if x + 1 < window:
-            near += power(np.int64(read_int16(score, ((x + 1) & 7) * lanes + ((x + 1) >> 3))) - best, shift)
-        # The best position's own term is exactly 1, the others are too large by the same share on average.
-        others = mass_of(search, r, best, shift) - np.float32(1.0)
-        write_int32(search.x, r, np.int32(x))
-        write_float32(search.confidence, r, min((MEAN_EXCESS + near) / (MEAN_EXCESS + others), np.float32(1.0)))
+            near += power(read_int16(score, ((x + 1) & 7) * lanes + ((x + 1) >> 3)), nothing, shift)
+        # The best position's own term is exact, the others are too large by the same share on average.
+        others = mass_of(search, r, best, nothing, shift) - own
+        own *= MEAN_EXCESS
+        write_float32(search.confidence, r, min((own + near) / (own + others), np.float32(1.0)))
 
 
-@numba.njit(cache=True, nogil=True)
-def _look_closely(desk: Desk, first: int, rows: int, c: int, table: int, exposures: float) -> None:
-    """Place the lines of the batch's rows, from row `first` of the picture on, and write their answers."""
+@numba.njit(cache=True, nogil=True, fastmath=NO_NAN)
+def _measure_light(desk: Desk, first: int, rows: int, c: int, table: int, exposures: float) -> None:
+    """Signal and haze of the batch's rows, from row `first` of the picture on, and what their close-up needs of them."""
     search = desk.search
     lanes = search.lanes
     pixels = STEPS * lanes
     x0 = np.int64(read_int32(desk.x0, c))
     field = 4 * desk.rows * desk.columns
-    flux = desk.flux + 4 * (COUNT_LIMIT + 1) * np.int64(exposures)
+    flux = desk.flux + 4 * (COUNT_LIMIT + 2) * np.int64(exposures)
     for r in range(rows):
         n = search.n + r * search.n_bytes
         to = (first + r) * desk.columns + c
         low, high = np.int64(read_int32(desk.x_lo, to)) - x0, np.int64(read_int32(desk.x_hi, to)) - x0
         if low > high:
+            write_int32(search.x, r, np.int32(NOWHERE))
             continue
         x = min(max(np.int64(read_int32(search.x, r)), low, 0), high, desk.window - 1)
         light = np.float32(0.0)
         for at in range(x - desk.reach, x + desk.reach + 1):
-            light += read_float32(flux, min(np.int64(read_int16(n, place_of(at, lanes))), COUNT_LIMIT))
+            light += read_float32(flux, read_int16(n, place_of(at, lanes)))
         before, scale = read_float32(desk.before, table * pixels + x), read_float32(desk.scale, table * pixels + x)
         ambient = read_float32(desk.own_ambient, x)
         light -= np.float32(0.5) * (before + ambient) * np.float32(2 * desk.reach + 1)
         signal = min(max(light, desk.faintest * scale), desk.brightest * scale)
-        levels = level_of(before) * LEVELS + level_of(signal)
-        weight = desk.weight + 4 * LANES * (desk.weight_px + 1) * levels
-        offset, sd = place_line(n, lanes, x, exposures, weight, desk.weight_px, desk.index, desk.square)
-        confidence = read_float32(search.confidence, r)
-        write_float32(desk.stripe, to, np.float32(x0 + x + offset))
-        write_float32(desk.stripe + field, to, confidence)
-        write_float32(desk.stripe + 2 * field, to, np.float32(sd))
+        write_int32(search.x, r, np.int32(x))
+        write_int32(search.levels, r, np.int32(level_of(before) * LEVELS + level_of(signal)))
         write_float32(desk.stripe + 3 * field, to, signal)
         write_float32(desk.stripe + 4 * field, to, max(before - ambient, np.float32(0.0)))
-        if confidence > QUIET and c % desk.quiet_step == 0:
-            _learn_quiet(desk, n, first + r, c, x, exposures)
+
+
+@numba.njit(cache=True, nogil=True)
+def _look_closely(desk: Desk, first: int, rows: int, c: int, exposures: float) -> None:
+    """Place the lines of the batch's rows, and write the answers."""
+    search = desk.search
+    x0 = np.int64(read_int32(desk.x0, c))
+    field = 4 * desk.rows * desk.columns
+    for r in range(rows):
+        x = np.int64(read_int32(search.x, r))
+        if x == NOWHERE:
+            continue
+        n, to = search.n + r * search.n_bytes, (first + r) * desk.columns + c
+        levels = np.int64(read_int32(search.levels, r))
+        offset, sd = place_line(
+            n, search.lanes, x, exposures, desk.weight + 2 * LANES * desk.weight_px * levels,
+            desk.weight_constant + 4 * LANES * levels, desk.weight_px, desk.index, desk.square, desk.shift,
+        )  # fmt: skip
+        write_float32(desk.stripe, to, np.float32(x0 + x + offset))
+        write_float32(desk.stripe + field, to, read_float32(search.confidence, r))
+        write_float32(desk.stripe + 2 * field, to, np.float32(sd))
 
 
 @numba.njit(cache=True, nogil=True)
 def _learn_quiet(desk: Desk, n: int, y: int, c: int, x: int, exposures: float) -> None:
     """Add the whole lanes behind the stripe at stored pixel x to the quiet counts."""
-    stride, lane = desk.search.lanes + 2 * PAD, read_int32(desk.x0, c) // STEPS
+    lanes = desk.search.lanes
+    stride = lanes + 2 * PAD
     begin, end = 0, desk.window // STEPS
     if desk.near_is_left:
         begin = ((x + desk.reach + 1) >> 3) + 1
@@ -301,13 +346,14 @@ def _learn_quiet(desk: Desk, n: int, y: int, c: int, x: int, exposures: float) -
         end = (x - desk.reach) >> 3
     if begin >= end:
         return
-    sums = desk.quiet + 4 * (y * STEPS * desk.sum_lanes + lane)
-    for s in range(STEPS):
-        for i in range(begin, end):
-            at = s * desk.sum_lanes + i
-            count = np.int32(read_int16(n, s * stride + PAD + i))
-            write_int32(sums, at, read_int32(sums, at) + count)
-    steps = desk.quiet_exposures + 4 * (y * (desk.sum_lanes + 1) + lane)
+    sums = desk.quiet + 2 * y * STEPS * lanes
+    for v in range(0, lanes, LANES):
+        quiet = lanes_between(begin - v, end - v)
+        for s in range(STEPS):
+            at = s * lanes + v
+            counts = load_int16(n, s * stride + PAD + v) & quiet
+            store_int16(sums, at, load_int16(sums, at) + counts)
+    steps = desk.quiet_exposures + 4 * (y * (desk.sum_lanes + 1) + np.int64(read_int32(desk.x0, c)) // STEPS)
     write_int32(steps, begin, read_int32(steps, begin) + np.int32(exposures))
     write_int32(steps, end, read_int32(steps, end) - np.int32(exposures))
 

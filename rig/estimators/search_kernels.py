@@ -1,8 +1,7 @@
 """Compiled search along a row: every position scored at once, sixteen to a vector, then the best one looked at closely.
 
 A row of 128 pixels is eight vectors of counts (`rig.lane_order`). Prefix sums run over the steps within a lane and then
-once over the lanes. Scores are saturating 16-bit numbers (`screen_tables`); the probability
-of a place is summed with 2^x read off the bits of a bfloat16, exact to 6 % a term and unbiased.
+once over the lanes. Scores are saturating 16-bit numbers (`screen_tables`).
 """
 
 from typing import Final, NamedTuple
@@ -11,6 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.estimators.powers import nothing_below, power, powers
 from rig.estimators.screen_tables import SCREENS
 from rig.lane_order import PAD, STEPS
 from rig.lanes import (
@@ -18,7 +18,6 @@ from rig.lanes import (
     add_saturated,
     address_of,
     equal_mask,
-    from_bfloat16,
     larger,
     largest,
     last_lane,
@@ -29,7 +28,6 @@ from rig.lanes import (
     running_sum,
     smaller,
     store_int16,
-    sub_saturated,
     total,
     up_1,
     write_int16,
@@ -39,12 +37,8 @@ from rig.lanes import (
 
 BATCH: Final = 8
 """Rows that go through each part of the search together: what one row waits for, the others fill."""
-START: Final = -20000
+START: Final = -12000
 """Score of 'everything is as right of the stripe': most of the range lies above it."""
-BIAS: Final = np.int16(127 << 7)
-"""Exponent of 1.0 as a bfloat16."""
-MEAN_EXCESS: Final = np.float32(1.040684)
-"""Mean of (1 + f) / 2^f over f in 0..1: by so much a term is too large on average."""
 MOST_OCTAVES: Final = 60
 """A hypothesis without a stripe counts no more than 2^60 times the best position."""
 
@@ -55,7 +49,7 @@ class Search(NamedTuple):
     n: counts, see `rig.lane_order`. In lane order without padding, int16: score (STEPS * lanes,); start (lanes,), score
     of a change at the lane's first pixel; best (lanes,), best score of each lane. For all rows of a batch together:
     constant (SCREENS * STEPS * lanes,) and lane (lanes,), the tables' parts per exposure times the exposures; none (3,)
-    as in `Tables`. all_left (BATCH,), score of all pixels lying left. What was found in each row: int32 x (BATCH,) and
+    as in `Tables`. all_left (BATCH,), score of all pixels lying left. What was found in each row, 32 bits each: x, the close-up's levels, and
     float32 confidence (BATCH,).
     """
 
@@ -71,6 +65,7 @@ class Search(NamedTuple):
     none: int
     all_left: int
     x: int
+    levels: int
     confidence: int
 
 
@@ -78,8 +73,8 @@ class Search(NamedTuple):
 def search_memory(lanes: int) -> NDArray[np.int16]:
     """Memory for the buffers of a `Search`."""
     of_row = STEPS * (lanes + 2 * PAD) + STEPS * lanes + 2 * lanes
-    # x and confidence are of 32 bits and come last, behind an even number of 16-bit ones.
-    return np.zeros(BATCH * of_row + SCREENS * STEPS * lanes + lanes + 4 + BATCH + 4 * BATCH, np.int16)
+    # What is of 32 bits comes last, behind an even number of 16-bit ones.
+    return np.zeros(BATCH * of_row + SCREENS * STEPS * lanes + lanes + 4 + BATCH + 6 * BATCH, np.int16)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -96,8 +91,9 @@ def search_in(memory: NDArray[np.int16], lanes: int) -> Search:
     all_left = none + 2 * 4
     x = all_left + 2 * BATCH
     return Search(
-        lanes, n, n_bytes, score, score_bytes, start, best, constant, lane, none, all_left, x, x + 4 * BATCH
-    )
+        lanes, n, n_bytes, score, score_bytes, start, best, constant, lane, none, all_left, x, x + 4 * BATCH,
+        x + 8 * BATCH,
+    )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
@@ -115,9 +111,19 @@ def set_exposures(position: int, prior: int, lane: int, none: int, exposures: fl
 
 
 @numba.njit(cache=True, nogil=True)
-def sum_edges(edge: int, search: Search, r: int) -> None:
-    """Fill start and all_left of row r of the batch; edge: address of the table's."""
-    lanes = search.lanes
+def sum_edges(edge: int, search: Search, rows: int) -> None:
+    """Fill start and all_left of the batch's first rows; edge: address of their table's."""
+    # With the usual number of lanes as a constant all offsets are, and no register is spent on them.
+    if search.lanes == LANES:
+        for r in range(rows):
+            _sum_row(edge, search, r, LANES)
+    else:
+        for r in range(rows):
+            _sum_row(edge, search, r, search.lanes)
+
+
+@numba.njit(inline="always")
+def _sum_row(edge, search, r, lanes):  # type: ignore[no-untyped-def]
     stride = lanes + 2 * PAD
     n = search.n + r * search.n_bytes
     carry = np.int16(START)
@@ -145,8 +151,12 @@ def score_rows(edge: int, tap: int, reach: int, search: Search, rows: int) -> No
     """
     if reach == 1:
         # In pairs: what bounds the speed is reading the table, which serves both. An odd last row has a stale partner.
-        for r in range(0, rows, 2):
-            _score_pair(edge, tap, search, r)
+        if search.lanes == LANES:
+            for r in range(0, rows, 2):
+                _score_pair(edge, tap, search, r, LANES)
+        else:
+            for r in range(0, rows, 2):
+                _score_pair(edge, tap, search, r, search.lanes)
     else:
         for r in range(rows):
             _score_wide(edge, tap, reach, search, r)
@@ -188,10 +198,9 @@ def _score_step(n, before, here, after, tap, constant, edge, place, pixels, leve
     return (level, other_level), (larger(tops[0], dim), larger(tops[1], other_dim))
 
 
-@numba.njit(cache=True, nogil=True)
-def _score_pair(edge: int, tap: int, search: Search, r: int) -> None:
+@numba.njit(inline="always")
+def _score_pair(edge, tap, search, r, lanes):  # type: ignore[no-untyped-def]
     """Score rows r and r + 1 of a line that lights one pixel on either side."""
-    lanes = search.lanes
     stride = lanes + 2 * PAD
     n, score, constant = search.n + r * search.n_bytes, search.score + r * search.score_bytes, search.constant
     pixels, other = STEPS * lanes, STEPS * stride
@@ -203,16 +212,28 @@ def _score_pair(edge: int, tap: int, search: Search, r: int) -> None:
         # The first step's neighbour is step 7 of the lane before, the last one's step 0 of the lane behind.
         levels, tops = _score_step(
             n, end - 1, at, at + stride, tap, constant, edge, v, pixels, levels, tops, score, other
-        )
-        for s in range(1, STEPS - 1):
-            here = at + s * stride
-            levels, tops = _score_step(
-                n, here - stride, here, here + stride, tap, constant, edge, s * lanes + v, pixels, levels, tops, score,
-                other,
-            )  # fmt: skip
+        )  # fmt: skip
         levels, tops = _score_step(
-            n, end - stride, end, at + 1, tap, constant, edge, 7 * lanes + v, pixels, levels, tops, score, other
-        )
+            n, at, at + stride, at + 2 * stride, tap, constant, edge, lanes + v, pixels, levels, tops, score, other
+        )  # fmt: skip
+        levels, tops = _score_step(
+            n, at + stride, at + 2 * stride, at + 3 * stride, tap, constant, edge, 2 * lanes + v, pixels, levels, tops, score, other
+        )  # fmt: skip
+        levels, tops = _score_step(
+            n, at + 2 * stride, at + 3 * stride, at + 4 * stride, tap, constant, edge, 3 * lanes + v, pixels, levels, tops, score, other
+        )  # fmt: skip
+        levels, tops = _score_step(
+            n, at + 3 * stride, at + 4 * stride, at + 5 * stride, tap, constant, edge, 4 * lanes + v, pixels, levels, tops, score, other
+        )  # fmt: skip
+        levels, tops = _score_step(
+            n, at + 4 * stride, at + 5 * stride, at + 6 * stride, tap, constant, edge, 5 * lanes + v, pixels, levels, tops, score, other
+        )  # fmt: skip
+        levels, tops = _score_step(
+            n, at + 5 * stride, at + 6 * stride, end, tap, constant, edge, 6 * lanes + v, pixels, levels, tops, score, other
+        )  # fmt: skip
+        levels, tops = _score_step(
+            n, at + 6 * stride, end, at + 1, tap, constant, edge, 7 * lanes + v, pixels, levels, tops, score, other
+        )  # fmt: skip
         store_int16(search.best, r * lanes + v, tops[0])
         store_int16(search.best, (r + 1) * lanes + v, tops[1])
 
@@ -271,44 +292,24 @@ def best_position(search: Search, r: int, best: int) -> int:
     return STEPS * lane + lowest_bit(np.uint32(found))
 
 
-@numba.njit(inline="always")
-def _power(scores, best, low, shift):  # type: ignore[no-untyped-def]
-    """2^((scores - best) / units), 0 below the range."""
-    down = larger(sub_saturated(scores, best), low)
-    return from_bfloat16((down << shift) + BIAS)
-
-
-@numba.njit(inline="always")
-def power(difference, shift):  # type: ignore[no-untyped-def]
-    """The same of one whole number, at most 0."""
-    bits = max((np.int64(difference) << shift) + BIAS, 0)
-    return np.uint32(bits << 16).view(np.float32)
-
-
 @numba.njit(cache=True, nogil=True)
-def mass_of(search: Search, r: int, best: int, shift: int) -> float:
-    """Sum of 2^((score - best) / units) over all positions of row r and all hypotheses without a stripe.
-
-    units = 128 >> shift.
-    """
+def mass_of(search: Search, r: int, best: int, nothing: int, shift: int) -> float:
+    """Sum of likelihoods over all positions of row r and all hypotheses without a stripe; nothing: see `powers`."""
     lanes = search.lanes
     score = search.score + r * search.score_bytes
-    low = np.int16(-(np.int64(BIAS) >> shift))
-    most = (MOST_OCTAVES * 128) >> shift
-    change = read_int16(search.none, 2)
-    ceiling = np.int16(min(best + most, 32767))
-    floor = np.int16(best)
+    most = np.int64(best) + ((MOST_OCTAVES * 128) >> shift)
+    change, ceiling, none = read_int16(search.none, 2), np.int16(min(most, 32767)), np.int16(nothing)
     lot = zero_float32()
     for v in range(0, lanes, LANES):
-        a = _power(load_int16(score, v), floor, low, shift) + _power(load_int16(score, lanes + v), floor, low, shift)
-        b = _power(load_int16(score, 2 * lanes + v), floor, low, shift)
-        b = b + _power(load_int16(score, 3 * lanes + v), floor, low, shift)
-        c = _power(load_int16(score, 4 * lanes + v), floor, low, shift)
-        c = c + _power(load_int16(score, 5 * lanes + v), floor, low, shift)
-        d = _power(load_int16(score, 6 * lanes + v), floor, low, shift)
-        d = d + _power(load_int16(score, 7 * lanes + v), floor, low, shift)
+        a = powers(load_int16(score, v), none, shift) + powers(load_int16(score, lanes + v), none, shift)
+        b = powers(load_int16(score, 2 * lanes + v), none, shift)
+        b = b + powers(load_int16(score, 3 * lanes + v), none, shift)
+        c = powers(load_int16(score, 4 * lanes + v), none, shift)
+        c = c + powers(load_int16(score, 5 * lanes + v), none, shift)
+        d = powers(load_int16(score, 6 * lanes + v), none, shift)
+        d = d + powers(load_int16(score, 7 * lanes + v), none, shift)
         nowhere = smaller(add_saturated(load_int16(search.start, r * lanes + v), change), ceiling)
-        lot = lot + (((a + b) + (c + d)) + _power(nowhere, floor, low, shift))
-    ends = power(min(START + np.int64(read_int16(search.none, 0)) - best, most), shift)
-    ends += power(min(np.int64(read_int16(search.all_left, r)) + read_int16(search.none, 1) - best, most), shift)
+        lot = lot + (((a + b) + (c + d)) + powers(nowhere, none, shift))
+    ends = power(min(START + np.int64(read_int16(search.none, 0)), most), nothing, shift)
+    ends += power(min(np.int64(read_int16(search.all_left, r)) + read_int16(search.none, 1), most), nothing, shift)
     return total(lot) + ends

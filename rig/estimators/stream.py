@@ -11,7 +11,7 @@ from rig.estimators.judging import nothing_found
 from rig.estimators.learning import next_lattice
 from rig.estimators.row_input import Lines
 from rig.estimators.row_search import Bench, Found, Judge, new_bench
-from rig.estimators.stream_kernels import OpenColumn, carry_light, search_frames
+from rig.estimators.stream_kernels import SUM_LIMIT, OpenColumn, carry_sums, search_frames
 from rig.geometry import SweepGeometry
 from rig.lane_order import padded_lanes, pixel_order
 from rig.row_threads import RowWorkers
@@ -19,9 +19,7 @@ from rig.stripes import StripeTable
 
 MOST_EXPOSURES = 200
 """Nominal exposures of a column up to which its counters (of 8 bits) have room for what it really gets."""
-NO_COLUMN = OpenColumn(-1, 0, 0)
-LIGHT_LIMIT = 30000
-"""Exposures after which the 16-bit sums of light are carried over."""
+NO_COLUMN = OpenColumn(-1, 0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,14 +82,14 @@ class ColumnJudge:
             row_words = next(iter(self._planes))
             nothing = np.zeros(0, np.int32)
             self._judge_block(np.zeros(0, np.uint64), nothing, nothing, row_words, end=True)
-        carry_light(found, 0, layout.rows)
+        carry_sums(found, self._open.sums_x0, 0, layout.rows)
         exposures = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), 8, axis=1)[:, : layout.width]
         rows, columns = self._lines
         tally = self._tally.finish()
         return SearchedSweep(
             n_frames=tally.n_frames, column=tally.column, dark_counts=tally.dark_counts, n_dark=tally.n_dark,
             width=tally.width, dark_frames=tally.dark_frames, stripe=StripeTable(*found.stripe),
-            light=pixel_order(found.light_carried, layout.width).astype(np.uint32),
+            light=pixel_order(found.light, layout.width).astype(np.uint32),
             quiet=np.stack([pixel_order(found.quiet, layout.width), exposures]),
             lines=Lines(found.lines, rows, columns, tally.n_frames[columns]),
         )  # fmt: skip
@@ -110,8 +108,8 @@ class ColumnJudge:
             self._planes[row_words] = new_planes(chunks)
         planes, opened = self._planes[row_words], self._open
         after: list[OpenColumn] = []
-        if self._pending + len(bins) > LIGHT_LIMIT:
-            carry_light(self._found, 0, layout.rows)
+        if self._pending + len(bins) > SUM_LIMIT:
+            carry_sums(self._found, opened.sums_x0, 0, layout.rows)
             self._pending = 0
         self._pending += len(bins)
 

@@ -5,7 +5,7 @@ the next column the rows of the finished one are read out of the bit planes into
 column may lie in several blocks; its counters wait in memory in between.
 """
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numba
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rig.counting_kernels import CHUNK, FEW_FRAMES, PLANES, WORD_BYTES, WORD_PX, add_frames, clear
 from rig.estimators.row_search import (
+    COUNT_LIMIT,
     Bench,
     Found,
     Judge,
@@ -27,15 +28,21 @@ from rig.lane_order import STEPS, halve_counts, read_counts, read_planes, sum_co
 from rig.lanes import address_of, read_int32
 
 
+SUM_LIMIT: Final = 30000
+"""Exposures after which the 16-bit sums are carried over."""
+
+
 class OpenColumn(NamedTuple):
     """The column whose frames are being counted; the same for every chunk between two blocks.
 
-    column: -1 where none is open. first_word: of the frames' window. frames: counted so far.
+    column: -1 where none is open. first_word: of the frames' window. frames: counted so far. sums_x0: where the window
+    of `Found.light_here` and `quiet_here` begins.
     """
 
     column: int
     first_word: int
     frames: int
+    sums_x0: int
 
 
 @numba.njit(cache=True, nogil=True)
@@ -67,7 +74,25 @@ def _move_window(by, row_words, n, planes):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _finish(desk, state, planes, row_bytes, first_row, last_row):  # type: ignore[no-untyped-def]
+def carry_sums(found: Found, x0: int, first_row: int, last_row: int) -> None:
+    """Add the light of the window that began at x0 to the picture's, and begin anew."""
+    _carry(found.light_here, found.light, x0 // STEPS, first_row, last_row)
+    _carry(found.quiet_here, found.quiet, x0 // STEPS, first_row, last_row)
+
+
+@numba.njit(cache=True, nogil=True)
+def _carry(here, picture, lane, first_row, last_row):  # type: ignore[no-untyped-def]
+    lanes = min(here.shape[2], picture.shape[2] - lane)
+    for y in range(first_row, last_row):
+        for s in range(STEPS):
+            some, lot = here[y, s], picture[y, s, lane : lane + lanes]
+            for i in range(lanes):
+                lot[i] += some[i]
+                some[i] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _finish(desk, found, state, planes, row_bytes, first_row, last_row):  # type: ignore[no-untyped-def]
     """Judge rows first_row..last_row-1 of a finished column; planes: address of the chunk's counters."""
     c, k = state.column, state.frames
     halved = halvings(k)
@@ -76,7 +101,9 @@ def _finish(desk, state, planes, row_bytes, first_row, last_row):  # type: ignor
     n_planes = 1 if k == 1 else (4 if k <= FEW_FRAMES else PLANES)
     x0 = np.int64(read_int32(desk.x0, c))
     at = (x0 // WORD_PX - state.first_word) * WORD_BYTES
-    light = desk.light + 2 * (x0 // STEPS)
+    if x0 != state.sums_x0:
+        carry_sums(found, state.sums_x0, first_row, last_row)
+    light = desk.light + 2 * STEPS * lanes * first_row
     line, last_line = np.int64(read_int32(desk.line_start, c)), np.int64(read_int32(desk.line_start, c + 1))
     while line < last_line and read_int32(desk.line_row, line) < first_row:
         line += 1
@@ -91,22 +118,13 @@ def _finish(desk, state, planes, row_bytes, first_row, last_row):  # type: ignor
             counts = n + r * desk.search.n_bytes
             read_planes(planes, at, CHUNK * WORD_BYTES, n_planes, desk.window, counts, lanes)
             at += row_bytes
-            sum_counts(counts, lanes, light + 2 * (y + r) * STEPS * desk.sum_lanes, desk.sum_lanes)
+            sum_counts(counts, lanes, light)
+            light += 2 * STEPS * lanes
             line = keep_lines(desk, counts, y + r, line, last_line)
             if halved:
                 halve_counts(counts, lanes, halved)
         judge_rows(desk, y, rows, c, band, exposures)
         y += rows
-
-
-@numba.njit(cache=True, nogil=True)
-def carry_light(found: Found, first_row: int, last_row: int) -> None:
-    """Empty the 16-bit sums of light into the 32-bit ones."""
-    for y in range(first_row, last_row):
-        light, carried = found.light[y].ravel(), found.light_carried[y].ravel()
-        for i in range(light.shape[0]):
-            carried[i] += light[i]
-            light[i] = 0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -152,17 +170,21 @@ def search_frames(
             while g < bins.shape[0] and bins[g] == c and first_word[g] == word:
                 g += 1
             if c != state.column:
+                sums_x0 = state.sums_x0
                 if state.column >= 0:
-                    _finish(desk, state, counted + j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)
-                state = OpenColumn(c, word, 0)
+                    sums_x0 = np.int64(judge.x0[state.column])
+                    _finish(desk, found, state, counted + j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)
+                state = OpenColumn(c, word, 0, sums_x0)
             elif word != state.first_word:
                 _move_window(word - state.first_word, row_words, n, counters)
             _take(words, frame, at, n, f, g, state.frames, counters)
-            state = OpenColumn(c, word, state.frames + g - f)
+            state = OpenColumn(c, word, state.frames + g - f, state.sums_x0)
             f = g
         if end and state.column >= 0:
-            _finish(desk, state, counted + j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)
-    return OpenColumn(-1, 0, 0) if end else state
+            _finish(desk, found, state, counted + j * chunk_bytes, row_words * WORD_BYTES, first_row, last_row)
+    if not end:
+        return state
+    return OpenColumn(-1, 0, 0, np.int64(judge.x0[state.column]) if state.column >= 0 else state.sums_x0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -177,10 +199,16 @@ def search_counts(
 ) -> None:
     """Judge rows first_row..last_row-1 of counts (columns, rows, window); found.light and found.lines stay as they are."""
     desk = desk_of(judge, found, bench)
+    sums_x0, pending = np.int64(0), 0
     for c in range(counts.shape[0]):
         k = n_frames[c]
         if k == 0:
             continue
+        x0 = np.int64(judge.x0[c])
+        pending += min(k, COUNT_LIMIT)
+        if x0 != sums_x0 or pending > SUM_LIMIT:
+            carry_sums(found, sums_x0, first_row, last_row)
+            sums_x0, pending = x0, 0
         halved = halvings(k)
         exposures = np.float32(k / 2.0**halved)
         y = first_row
@@ -194,3 +222,4 @@ def search_counts(
                 read_counts(counts[c, y + r], halved, desk.search.n + r * desk.search.n_bytes, desk.search.lanes)
             judge_rows(desk, y, rows, c, band, exposures)
             y += rows
+    carry_sums(found, sums_x0, first_row, last_row)

@@ -6,18 +6,29 @@ import numpy as np
 import pytest
 
 from rig.estimators.ambient import ambient_map
-from rig.estimators.learning import flux, lattice, learn_first, learn_next
+from rig.estimators.learning import FADE, flux, lattice, learn_first, learn_next, lines_of, next_lattice
 from rig.estimators.row_model import BINS, RowModel, fit_haze, stripe_scale
+from rig.row_threads import RowWorkers
 from tests.reference.geometry import Geometry
 from tests.unit.small_maps import RIGS, geometry_of, simulated, volume_of
 
+WORKERS = RowWorkers(1)
 PATH_M = 1.0 / np.linspace(0.08, 1.1, BINS)
 
 
 @cache
 def learned(light="report", exposures=10, rig="left") -> RowModel:
     sweep = simulated(light, exposures, rig)
-    return learn_first(sweep.volume, sweep.geometry, ambient_map(sweep.volume, sweep.geometry, None))
+    return first_model(sweep.volume, sweep.geometry)
+
+
+def first_model(volume, geometry, workers=WORKERS) -> RowModel:
+    return learn_first(volume, geometry, ambient_map(volume, volume.intensity(), geometry, None), workers)
+
+
+def next_model(sweep, model, before=None, workers=WORKERS):
+    lines = lines_of(sweep.volume, next_lattice(sweep.geometry))
+    return learn_next(lines, sweep.geometry, model, before, workers)
 
 
 def noisy_haze(rng, extinction, amplitude=0.3, photons=2000.0):
@@ -149,7 +160,7 @@ def test_learned_numbers_are_in_range():
 
 def test_one_more_sweep_of_the_same_light_moves_the_model_little():
     sweep, model = simulated(seed=2), learned()
-    after = learn_next(sweep.volume, sweep.geometry, model)
+    after, _ = next_model(sweep, model)
     assert after.extinction_per_m == pytest.approx(model.extinction_per_m, rel=0.25)
     assert abs(np.log(after.line_sigma_px / model.line_sigma_px)) < 0.15
     far = (model.path_m() > 1.0) & (model.path_m() < 4.0)
@@ -164,7 +175,7 @@ def test_rows_with_a_weaker_line_get_a_smaller_gain():
     falls = []
     for picture in (sweep.counts, counts):
         volume = volume_of(picture, sweep.geometry, 10)
-        model = learn_first(volume, sweep.geometry, ambient_map(volume, sweep.geometry, None))
+        model = first_model(volume, sweep.geometry)
         falls.append(model.row_gain[-30:].mean() / model.row_gain[:30].mean())
     assert falls[1] < 0.75 * falls[0]
 
@@ -172,6 +183,37 @@ def test_rows_with_a_weaker_line_get_a_smaller_gain():
 def test_learning_does_not_change_the_model_it_started_from():
     sweep, model = simulated(seed=2), learned()
     kept = replace(model, profile=model.profile.copy(), ambient=model.ambient.copy(), row_gain=model.row_gain.copy())
-    learn_next(sweep.volume, sweep.geometry, model)
+    next_model(sweep, model)
     for name in ("profile", "ambient", "row_gain"):
         np.testing.assert_array_equal(getattr(model, name), getattr(kept, name))
+
+
+def test_threads_change_nothing_of_what_is_learned():
+    sweep = simulated(seed=2)
+    with RowWorkers(3) as three:
+        one, other = learned(), first_model(simulated().volume, simulated().geometry, three)
+        (next_one, seen), (next_other, also) = next_model(sweep, one), next_model(sweep, other, workers=three)
+    for a, b in ((one, other), (next_one, next_other)):
+        for name, value in a.arrays().items():
+            np.testing.assert_array_equal(b.arrays()[name], value, err_msg=name)
+    np.testing.assert_array_equal(seen.levels, also.levels)
+
+
+def test_what_the_sweeps_before_taught_fades_with_each():
+    sweep, model = simulated(seed=2), learned()
+    _, alone = next_model(sweep, model)
+    _, both = next_model(sweep, model, before=alone)
+    np.testing.assert_allclose(both.levels, (1 + FADE) * alone.levels, rtol=1e-12)
+    np.testing.assert_allclose(both.amplitude_mass, (1 + FADE) * alone.amplitude_mass, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_lines_are_the_counts_of_their_row_and_column_sorted_by_column(rig):
+    sweep = simulated(rig=rig)
+    rows, columns = next_lattice(sweep.geometry)
+    lines = lines_of(sweep.volume, (rows, columns))
+    assert np.all(np.diff(columns) >= 0)
+    assert np.all(np.diff(rows)[np.diff(columns) == 0] > 0)
+    for i in (0, len(rows) // 2, len(rows) - 1):
+        np.testing.assert_array_equal(lines.counts[i], sweep.volume.counts[columns[i], rows[i]])
+    np.testing.assert_array_equal(lines.exposures, np.full(len(rows), 10))

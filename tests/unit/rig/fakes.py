@@ -13,7 +13,9 @@ from drivers.errors import DeviceTimeout
 from drivers.frames import BlockFlag
 from drivers.interfaces import LaserLimits, LaserStatus, SpadCounters, SpadTiming
 from rig.acquisition import Acquisition
+from rig.counting import SweepCounter
 from rig.reconstruction import FogEstimate, MapResult
+from rig.row_threads import RowWorkers
 from rig.session import OpenRig
 from rig.stripes import StripeTable
 from tests.unit.rig.streams import SPAD, scan
@@ -150,6 +152,9 @@ class FakeMaker:
         self.before = before
         self.volumes = []
 
+    def counter(self, layout):
+        return SweepCounter(layout, RowWorkers(1))
+
     def map(self, volume):
         self.before(len(self.volumes))
         self.volumes.append(volume)
@@ -181,7 +186,7 @@ def acquisition(rig, plan, maps, maker=None, **options):
     """An acquisition with the fakes, and little patience with silence."""
     period = int(100_000_000 / plan.frame_rate_hz)
     timing = SpadTiming(Fraction(100_000_000), period, period, STRIDE)
-    options = {"threads": 1, "silence_s": 0.2, **options}
+    options = {"silence_s": 0.2, **options}
     return Acquisition(rig, plan, timing, maps, maker or FakeMaker(), **options)
 
 

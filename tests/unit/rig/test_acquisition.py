@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from calibration.model import Lag
 from drivers.errors import DeviceDisconnected, DeviceFault, DeviceTimeout, ProtocolError
 from drivers.interfaces import BurstMode
-from rig.counting import SweepCounter
+from rig.counting import SweepCounter, SweepLayout
 from rig.errors import DevicesError
+from rig.row_threads import RowWorkers
 from rig.sweeps import SweepAssembler
 from tests.unit.rig.fakes import START, STOP, acquisition, fake_rig
 from tests.unit.rig.streams import HEIGHT, SPAD, WIDTH, plan_of, scan, stream_of
@@ -172,14 +173,14 @@ def test_bursts_are_taken_in_groups_and_numbered_through():
 
 
 def sweeps_of(plan, blocks, maps):
-    counter = SweepCounter(plan.columns, HEIGHT, WIDTH, plan.x0, plan.window, 1)
+    layout = SweepLayout(plan.columns, HEIGHT, WIDTH, plan.x0, plan.window, plan.exposures)
+    counter = SweepCounter(layout, RowWorkers(1))
     assembler = SweepAssembler(plan, counter, maps)
     found = []
     for block in blocks:
         found += assembler.add(block)
         if assembler.complete:
             break
-    counter.close()
     return found
 
 

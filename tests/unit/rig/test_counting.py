@@ -1,11 +1,15 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.counting import BIN_DARK, BIN_UNUSABLE, CountVolume, SweepCounter
+from rig.counting import BIN_DARK, BIN_UNUSABLE, CountVolume, SweepCounter, SweepLayout
+from rig.row_threads import RowWorkers
 
 WORD = 64
+VOLUME = [field.name for field in dataclasses.fields(CountVolume)]
 
 
 def packed(frames):
@@ -23,18 +27,27 @@ def expected_counts(frames, bins, x0, window):
     return np.stack([wide[c, :, x : x + window] for c, x in enumerate(x0)])
 
 
-def count(frames, bins, column, x0, window, *, threads=2, blocks=(10**9,)):
-    """The project's volume, the stream cut into blocks of the given sizes (the last one repeated)."""
+def layout_of(frames, x0, window, used_px=None):
     _, rows, width = frames.shape
-    counter = SweepCounter(len(x0), rows, width, np.asarray(x0, np.int32), window, threads)
-    bits, first, sizes = packed(frames), 0, list(blocks)
-    while first < len(bits):
-        size = sizes.pop(0) if len(sizes) > 1 else sizes[0]
-        part = slice(first, first + size)
-        counter.add(np.ascontiguousarray(bits[part]), bins[part], column[part])
-        first += size
-    counter.close()
-    return counter.finish()
+    return SweepLayout(len(x0), rows, width, np.asarray(x0, np.int32), window, 1, used_px)
+
+
+def count(frames, bins, column, x0, window, *, threads=2, blocks=(10**9,)):
+    """The project's volume of whole frames, see `counted`."""
+    nowhere = np.zeros(len(frames), np.int32)
+    return counted(packed(frames), bins, column, nowhere, layout_of(frames, x0, window), threads, blocks)
+
+
+def counted(bits, bins, column, frame_x0, layout, threads, blocks):
+    """The project's volume, the stream cut into blocks of the given sizes (the last one repeated)."""
+    first, sizes = 0, list(blocks)
+    with RowWorkers(threads) as workers:
+        counter = SweepCounter(layout, workers)
+        while first < len(bits):
+            part = slice(first, first + (sizes.pop(0) if len(sizes) > 1 else sizes[0]))
+            counter.add(np.ascontiguousarray(bits[part]), bins[part], column[part], frame_x0[part])
+            first = part.stop
+        return counter.finish()
 
 
 def stream(seed, n, rows, width, n_columns, rate=0.3):
@@ -95,16 +108,15 @@ def test_every_number_of_exposures_up_to_255_fits_a_byte(k):
 def test_counts_widen_before_they_overflow(k, dtype):
     frames, _, _ = stream(1, 100, 2, 70, 1)
     frames[:, 0] = True
-    bits = packed(frames)
-    counter = SweepCounter(2, 2, 70, np.zeros(2, np.int32), 128)
+    bits, nowhere = packed(frames), np.zeros(100, np.int32)
+    counter = SweepCounter(layout_of(frames, [0, 0], 128), RowWorkers(1))
     # The neighbour was counted while the counts were still narrow.
-    counter.add(bits, np.ones(100, np.int32), np.ones(100))
+    counter.add(bits, np.ones(100, np.int32), np.ones(100), nowhere)
     expected = np.zeros((2, 70), np.int64)
     for first in range(0, k, 100):
         n = min(100, k - first)
-        counter.add(bits[:n], np.zeros(n, np.int32), np.zeros(n))
+        counter.add(bits[:n], np.zeros(n, np.int32), np.zeros(n), nowhere[:n])
         expected += frames[:n].sum(axis=0)
-    counter.close()
     volume = counter.finish()
     assert volume.counts.dtype == dtype
     np.testing.assert_array_equal(volume.counts[0, :, :70], expected)
@@ -129,7 +141,7 @@ def test_neither_threads_nor_blocks_change_a_bit(threads, blocks):
     x0 = [0, 64, 64, 0, 64]
     one = count(frames, bins, column, x0, 128, threads=1)
     other = count(frames, bins, column, x0, 128, threads=threads, blocks=blocks)
-    for name in CountVolume.__slots__:
+    for name in VOLUME:
         np.testing.assert_array_equal(getattr(other, name), getattr(one, name))
 
 
@@ -144,8 +156,9 @@ def test_a_column_without_frames_has_no_position_and_no_counts():
 
 def test_a_volume_outlives_the_next_sweep():
     frames, bins, column = stream(1, 60, 3, 64, 3)
-    counter = SweepCounter(3, 3, 64, np.zeros(3, np.int32), 64)
-    counter.add(packed(frames), bins, column)
+    nowhere = np.zeros(60, np.int32)
+    counter = SweepCounter(layout_of(frames, [0, 0, 0], 64), RowWorkers(1))
+    counter.add(packed(frames), bins, column, nowhere)
     first = counter.finish()
     kept = first.counts.copy(), first.n_frames.copy(), first.dark_counts.copy()
     counter.reset()
@@ -153,9 +166,8 @@ def test_a_volume_outlives_the_next_sweep():
     assert not empty.counts.any()
     assert not empty.n_frames.any()
     assert empty.n_dark == 0
-    counter.add(packed(frames), bins, column)
+    counter.add(packed(frames), bins, column, nowhere)
     second = counter.finish()
-    counter.close()
     for volume in (first, second):
         for got, wanted in zip((volume.counts, volume.n_frames, volume.dark_counts), kept, strict=True):
             np.testing.assert_array_equal(got, wanted)
@@ -174,17 +186,9 @@ def test_frames_cut_to_their_used_pixels_are_counted_as_whole_ones(blocks, threa
     assert len(np.unique(bins)) == 8
     whole = packed(frames)
     cut = np.stack([frame[:, at // 8 : (at + used) // 8] for frame, at in zip(whole, used_x0, strict=True)])
-    volumes = []
-    for bits in (whole, cut):
-        counter = SweepCounter(6, 5, 300, x0, window, threads, used)
-        first, sizes = 0, list(blocks)
-        while first < len(bits):
-            part = slice(first, first + (sizes.pop(0) if len(sizes) > 1 else sizes[0]))
-            counter.add(np.ascontiguousarray(bits[part]), bins[part], column[part], used_x0[part])
-            first = part.stop
-        counter.close()
-        volumes.append(counter.finish())
-    for name in CountVolume.__slots__:
+    layout = layout_of(frames, x0, window, used)
+    volumes = [counted(bits, bins, column, used_x0, layout, threads, blocks) for bits in (whole, cut)]
+    for name in VOLUME:
         np.testing.assert_array_equal(getattr(volumes[0], name), getattr(volumes[1], name))
     np.testing.assert_array_equal(volumes[0].counts, expected_counts(frames, bins, x0, window))
     seen = (used_x0[:, None] <= np.arange(300)) & (np.arange(300) < used_x0[:, None] + used)
@@ -197,7 +201,7 @@ def test_frames_cut_to_their_used_pixels_are_counted_as_whole_ones(blocks, threa
 @pytest.mark.parametrize(("window", "x0"), [(100, 0), (64, 32), (64, 1)])
 def test_windows_off_the_word_grid_are_refused(window, x0):
     with pytest.raises(ValueError, match="multiples of 64"):
-        SweepCounter(1, 2, 200, np.array([x0], np.int32), window)
+        SweepLayout(1, 2, 200, np.array([x0], np.int32), window, 10)
 
 
 def test_intensity_is_the_sum_over_columns_at_their_place():
@@ -214,6 +218,9 @@ def test_intensity_is_the_sum_over_columns_at_their_place():
 def test_intensity_of_wide_counts_does_not_wrap():
     counts = np.full((3, 2, 64), 65_535, np.uint16)
     full = np.full(3, 65_535, np.int32)
-    volume = CountVolume(counts, np.zeros(3, np.int32), full, np.arange(3.0), None, 0, 50)
+    volume = CountVolume(
+        counts=counts, x0=np.zeros(3, np.int32), n_frames=full, column=np.arange(3.0), dark_counts=None, n_dark=0,
+        width=50,
+    )  # fmt: skip
     assert np.all(volume.intensity() == 3 * 65_535)
     assert volume.intensity().shape == (2, 50)

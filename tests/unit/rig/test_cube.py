@@ -1,6 +1,5 @@
 """Bare cubes: every bit is counted once, in its column, whatever the sizes."""
 
-from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,9 +11,10 @@ from hypothesis import strategies as st
 from calibration import Camera, PivotScanner, PlaneTable, RigModel
 from rig import cube as cube_module
 from rig.config import CubePlan
-from rig.counting import SweepCounter
+from rig.counting import SweepCounter, SweepLayout
 from rig.cube import column_commands, count_map, open_cube
 from rig.errors import UsageError
+from rig.row_threads import RowWorkers
 
 
 def plan(columns: int, exposures: int) -> CubePlan:
@@ -57,8 +57,9 @@ def test_counts_are_the_sums_of_the_bits(
     cube = open_cube(file, plan(columns, exposures), model(columns, width, rows))
     assert cube.maps == maps
     window = -(-width // 64) * 64
-    counter = SweepCounter(columns, rows, width, np.zeros(columns, np.int32), window)
-    with closing(counter), pytest.MonkeyPatch.context() as patch:
+    layout = SweepLayout(columns, rows, width, np.zeros(columns, np.int32), window, exposures)
+    with RowWorkers(2) as workers, pytest.MonkeyPatch.context() as patch:
+        counter = SweepCounter(layout, workers)
         patch.setattr(cube_module, "CHUNK_BYTES", chunk)
         for index in range(maps):
             volume = count_map(cube, index, counter)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rig.errors import UsageError
+from rig.estimators import likelihood
 from rig.reconstruction import MapResult, Reconstructor
 from tests.reference.geometry import DEPTH_RANGE_M, Geometry
 from tests.reference.scene import Scene
@@ -143,7 +144,8 @@ def test_the_median_filter_leaves_light_alone_and_brings_positions_nearer():
     assert np.nanmean(errors(filtered.stripe.x_px)) < 0.8 * np.nanmean(errors(plain.stripe.x_px))
 
 
-def test_what_a_map_taught_serves_the_next_one():
+def test_what_maps_taught_serves_the_next_one_once_they_are_enough(monkeypatch):
+    monkeypatch.setattr(likelihood, "TEACH_FRAMES", 2 * 96)
     sweep, later = simulated(exposures=1), simulated(exposures=1, seed=2)
     rebuilt = reconstructor(sweep)
     assert rebuilt.estimator.model is None
@@ -151,6 +153,7 @@ def test_what_a_map_taught_serves_the_next_one():
     taught = rebuilt.estimator.model
     second = rebuilt.map(later.volume)
     assert taught is not None
+    assert first.learned is second.learned is taught
     assert rebuilt.estimator.model is not taught
     for result in (first, second):
         assert np.mean(sweep.errors(result.stripe.x_px) < 1.0) > 0.3

@@ -1,0 +1,134 @@
+"""How long after a column's last frame its estimate is there.
+
+A source thread copies blocks of a millisecond into the ring and publishes each when its last frame has been exposed, at
+100 kHz. The other thread takes them from the ring and judges them with the workers it was given; where a sweep ends it
+takes the result and makes a new counter, as a scan does. A frame's time is its block's minus the frames behind it: the
+wait for the block to fill is included, and so is that of a block's last column for the next block, whose first frame
+says that the column is complete. Binding frames to columns and making the map are not included.
+"""
+
+import threading
+import time
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
+from drivers.ring import BlockRing
+from rig.bench.frames import COLUMNS, PLACE_FRAMES, ROWS, WIDTH, BenchFrames
+from rig.estimators.likelihood import Likelihood
+from rig.estimators.stream import ColumnJudge
+from rig.row_threads import RowWorkers
+
+FRAME_S = 1e-5
+SECONDS = 3.0
+SLOTS = 64
+"""A ring of 64 ms, so that nothing is dropped where the host pauses; a pause is seen in the figures."""
+SPIN_S = 2e-4
+"""Before a block is due the source stops sleeping, which may take longer than asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """Microseconds from a column's last frame to its estimate. late_max_us: latest block behind its own time."""
+
+    median: float
+    p999: float
+    max: float
+    columns: int
+    late_max_us: float
+
+
+def measure_latency(
+    frames: BenchFrames, exposures: int, workers: RowWorkers, likelihood: Likelihood, seconds: float = SECONDS
+) -> Latency:
+    """Latency of a stream of `seconds` at 100 kHz."""
+    n_blocks = max(2, round(seconds / (PLACE_FRAMES * FRAME_S)))
+    ring = BlockRing(SLOTS, PLACE_FRAMES * frames.frame_bytes)
+    reader = ring.reader("counting")
+    published = np.zeros(n_blocks)
+    late = np.zeros(n_blocks)
+
+    source = threading.Thread(target=_play, args=(frames, ring, published, late), name="bench source", daemon=True)
+    judge = likelihood.judge(frames.geometry, exposures, dark=True)
+    layout = frames.layout(exposures)
+    sweep_blocks = COLUMNS * exposures // PLACE_FRAMES
+    bins = np.repeat(np.arange(COLUMNS, dtype=np.int32), exposures)
+    column = bins.astype(np.float64)
+    x0 = np.full(PLACE_FRAMES, frames.geometry.x0[0], np.int32)
+    judged = np.zeros(n_blocks)
+    """When all columns but the last one of each block were judged."""
+    ended = np.zeros(n_blocks)
+    """When a block's last column was."""
+    counter = ColumnJudge(layout, frames.geometry, judge, workers)
+    source.start()
+    for i, block in enumerate(reader):
+        at = i % sweep_blocks * PLACE_FRAMES
+        counter.add(block.bits, bins[at : at + PLACE_FRAMES], column[at : at + PLACE_FRAMES], x0)
+        judged[i] = time.perf_counter()
+        if at:
+            ended[i - 1] = judged[i]
+        if at + PLACE_FRAMES == len(bins):
+            counter.finish()
+            ended[i] = time.perf_counter()
+            counter = ColumnJudge(layout, frames.geometry, judge, workers)
+    source.join()
+    return _summary(published, judged, ended, exposures, float(late.max()))
+
+
+def _play(frames: BenchFrames, ring: BlockRing, published: NDArray[np.float64], late: NDArray[np.float64]) -> None:
+    """Publish blocks as time passes, the bench's frames over and over."""
+    places = len(frames.bits) // PLACE_FRAMES
+    shape = (PLACE_FRAMES, *frames.bits.shape[1:])
+    records = np.zeros(PLACE_FRAMES, FRAME_RECORD)
+    try:
+        start = time.perf_counter()
+        for i in range(len(published)):
+            memory = ring.claim(1.0)
+            if memory is None:
+                raise RuntimeError("the ring was full for a second; nothing reads it")
+            bits = memory.reshape(shape)
+            place = i % places * PLACE_FRAMES
+            np.copyto(bits, frames.bits[place : place + PLACE_FRAMES])
+            due = start + (i + 1) * PLACE_FRAMES * FRAME_S
+            _wait_until(due)
+            published[i] = time.perf_counter()
+            late[i] = published[i] - due
+            ring.publish(FrameBlock(_header(i, shape[2] * 8), records, bits))
+        ring.finish()
+    except BaseException as error:  # raised again by the reader
+        ring.finish(error)
+
+
+def _wait_until(due: float) -> None:
+    left = due - time.perf_counter()
+    if left > SPIN_S:
+        time.sleep(left - SPIN_S)
+    while time.perf_counter() < due:
+        time.sleep(0)
+
+
+def _summary(
+    published: NDArray[np.float64],
+    judged: NDArray[np.float64],
+    ended: NDArray[np.float64],
+    exposures: int,
+    late_s: float,
+) -> Latency:
+    last_frame = np.arange(exposures, PLACE_FRAMES + 1, exposures)
+    exposed = published[:, None] - (PLACE_FRAMES - last_frame) * FRAME_S
+    there = np.repeat(judged[:, None], len(last_frame), axis=1)
+    there[:, -1] = ended
+    waited_us = 1e6 * (there - exposed)[there > 0]
+    median, p999 = np.quantile(waited_us, [0.5, 0.999])
+    return Latency(float(median), float(p999), float(waited_us.max()), waited_us.size, 1e6 * late_s)
+
+
+def _header(seq: int, width: int) -> BlockHeader:
+    return BlockHeader(
+        flags=BlockFlag(0), run_id=1, block_seq=seq, first_frame=seq * PLACE_FRAMES, t0_ticks=0, lost_before=0,
+        tick_hz=Fraction(100_000), frame_period_ticks=1, exposure_ticks=1, sweep=0, frame_step=1, width=width,
+        height=ROWS, sensor_width=WIDTH, sensor_height=ROWS,
+    )  # fmt: skip

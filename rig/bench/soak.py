@@ -1,0 +1,264 @@
+"""A long stream at the sensor's rate through the acquisition of `rig scan`, from memory: what is lost, what grows.
+
+The bundled simulated rig records a few sweeps, once. A SPAD that cannot wait plays them in real time, with running
+frame numbers; all else is as in a scan: ring, binding, counting, estimation, maps, a monitor, and the overload policy.
+"""
+
+import math
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.errors import RingOverflow
+from drivers.frames import FrameBlock, frame_bytes
+from drivers.interfaces import SpadCounters
+from drivers.spb1 import walk_blocks
+from rig.acquisition import Acquisition, ScanProgress
+from rig.bench.looped_spad import Loop, LoopedSpad
+from rig.bench.machine import machine
+from rig.config_files import load_config
+from rig.counting import Counter, FrameTally, SweepLayout
+from rig.errors import UsageError
+from rig.mapping import MakesMaps
+from rig.monitor import MonitorView
+from rig.overload import Overload, require_policy
+from rig.reconstruction import MapResult, Reconstructor
+from rig.recording import Recording
+from rig.scan_plan import ScanPlan
+from rig.session import OpenRig, open_rig, prepare
+from rig.stages import PipelineStats
+from rig.warm_up import warm_up
+
+CONFIG = "simulated"
+LOOP_S = 0.2
+"""Least time that the recorded sweeps last: many times what a cache holds."""
+LINK_MARGIN = 1.02
+"""A link that carries windows of the line, but no whole frames, carries so many times what they need."""
+SETTLED = 0.1
+"""Share of the run after which memory is to grow no more."""
+_STATM = Path("/proc/self/statm")
+
+
+@dataclass(frozen=True, slots=True)
+class SoakFrames:
+    """Frames by the SPAD's own count (exposed = delivered + lost) and by that of the sweeps' markers.
+
+    agree: whether both add up, and the SPAD lost what the ring dropped, to the frame.
+    """
+
+    exposed: int
+    delivered: int
+    lost: int
+    expected_in_sweeps: int
+    received_in_sweeps: int
+    lost_in_sweeps: int
+    agree: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SoakReport:
+    """What a soak found.
+
+    seconds: of stream played. maps: of maps_planned. resident_*: memory of the process when a tenth of the maps was
+    made, and at the end; None where the system does not say. times_real_time: length of a sweep over the mean time in
+    which its frames were counted and its map made. source_late_max_s: latest block behind its own time. ended_by: what
+    ended the run early.
+    """
+
+    seconds: float
+    frame_width: int
+    on_overload: str
+    slow_consumer_ms: float
+    maps: int
+    maps_planned: int
+    frames: SoakFrames
+    times_real_time: float | None
+    resident_settled_bytes: int | None
+    resident_end_bytes: int | None
+    resident_growth: float | None
+    source_late_max_s: float
+    ended_by: str | None
+    stages: PipelineStats
+    machine: dict[str, Any]
+
+    def as_json(self) -> dict[str, Any]:
+        """For programs."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
+class SoakOptions:
+    """seconds: of stream. window: windows that move with the line, instead of whole frames. slow_s: added to each map."""
+
+    seconds: float = 60.0
+    window: bool = False
+    policy: Overload = Overload.ABORT
+    slow_s: float = 0.0
+    threads: int | None = None
+
+
+class _Watched:
+    """Makes the maps, as slowly as asked, and keeps account of memory and progress."""
+
+    def __init__(self, maker: MakesMaps, slow_s: float) -> None:
+        self._maker = maker
+        self._slow_s = slow_s
+
+    def counter(self, layout: SweepLayout) -> Counter:
+        """The maker's own."""
+        return self._maker.counter(layout)
+
+    def map(self, sweep: FrameTally) -> MapResult:
+        """The maker's map, later."""
+        result = self._maker.map(sweep)
+        if self._slow_s:
+            time.sleep(self._slow_s)
+        return result
+
+
+def soak(options: SoakOptions, progress: Callable[[int, int], None] | None = None) -> SoakReport:
+    """Play a stream through the acquisition. progress: told frames done and planned.
+
+    Raises UsageError for what cannot be asked for. A stream that ends by its policy is a report, not an error.
+    """
+    if not (options.seconds > 0 and options.slow_s >= 0):
+        raise UsageError(f"a soak of {options.seconds:g} s, slowed by {options.slow_s:g} s; ask for more than 0 s")
+    with _looped_rig(options.window) as (rig, plan, spad):
+        require_policy(options.policy, spad.info)
+        return _run(rig, plan, spad, options, progress)
+
+
+@contextmanager
+def _looped_rig(window: bool) -> Iterator[tuple[OpenRig, ScanPlan, LoopedSpad]]:
+    """The simulated rig, its plan, and in its SPAD's place one that plays what that recorded."""
+    # Clocks that agree to the last bit: the loop then closes without a jump.
+    settings: dict[str, object] = {"scanner.clock_error": "0 ppm"}
+    if window:
+        settings["spad.link"] = f"{_window_bytes_per_s(settings) / 1e6:.6f} MB/s"
+    with open_rig(load_config(CONFIG, settings)) as rig:
+        plan, timing = prepare(rig)
+        spad = LoopedSpad(_recorded(rig, plan), rig.spad.info, timing)
+        looped = replace(rig, spad=spad)
+        plan, _ = prepare(looped)
+        with spad:
+            yield looped, plan, spad
+
+
+def _window_bytes_per_s(settings: dict[str, object]) -> float:
+    with open_rig(load_config(CONFIG, settings)) as rig:
+        plan, _ = prepare(rig)
+    assert plan.windows is not None, "the bundled rig has moving windows"
+    return LINK_MARGIN * float(plan.frame_rate_hz) * frame_bytes(plan.windows.width_px, plan.rows)
+
+
+def _recorded(rig: OpenRig, plan: ScanPlan) -> Loop:
+    """Sweeps of the simulated rig that end where they began, to the frame."""
+    _, timing = prepare(rig)
+    whole = plan.frames_per_sweep.denominator
+    sweeps = math.ceil(math.ceil(LOOP_S / float(plan.sweep_s)) / whole) * whole
+    with tempfile.TemporaryDirectory(prefix="spadrig-bench-") as folder:
+        recording = Recording(Path(folder) / "frames.spb")
+        maker = _reconstructor(rig, plan, "argmax", 1)
+        for _ in Acquisition(rig, plan, timing, sweeps, maker, recording=recording).run():
+            pass
+        recording.close()
+        file = np.memmap(recording.path, np.uint8, "r")
+        blocks = (block for block in walk_blocks(file, None, check_payload=False) if isinstance(block, FrameBlock))
+        return Loop.of(blocks, sweeps)
+
+
+def _reconstructor(rig: OpenRig, plan: ScanPlan, estimator: str, threads: int) -> Reconstructor:
+    return Reconstructor(
+        rig.model, plan.commands, plan.depth_range_m, sensor=(plan.rows, plan.width), estimator=estimator,
+        threads=threads,
+    )  # fmt: skip
+
+
+def _run(
+    rig: OpenRig,
+    plan: ScanPlan,
+    spad: LoopedSpad,
+    options: SoakOptions,
+    progress: Callable[[int, int], None] | None,
+) -> SoakReport:
+    _, timing = prepare(rig)
+    maps = max(2, 1 + math.ceil(options.seconds / float(plan.sweep_s)))  # the first one is taken alone
+    threads = options.threads or os.cpu_count() or 1
+    warm_up("likelihood", "none", plan.exposures, dark=True)
+    resident: list[int] = []
+    settled = 0
+
+    def tell(done: ScanProgress) -> None:
+        if progress is not None:
+            progress(done.frames, done.frames_planned)
+
+    acquisition = Acquisition(
+        rig, plan, timing, maps, _Watched(_reconstructor(rig, plan, "likelihood", threads), options.slow_s),
+        policy=options.policy, first_alone=True, watch=_look, on_progress=tell,
+    )  # fmt: skip
+    expected = received = lost = made = 0
+    compute_s = 0.0
+    ended_by: str | None = None
+    try:
+        for found in acquisition.run():
+            made += 1
+            frames = found.sweep.frames
+            expected, received, lost = expected + frames.expected, received + frames.received, lost + frames.lost
+            compute_s += found.compute_s if made > 1 else 0.0
+            resident.append(_resident_bytes())
+            if made <= max(1, SETTLED * maps):
+                settled = made - 1
+    except RingOverflow as error:
+        ended_by = str(error)
+    counters, stages = acquisition.counters, acquisition.stages
+    first, last = (resident[settled], resident[-1]) if resident and resident[-1] else (None, None)
+    return SoakReport(
+        seconds=(counters.exposed or 0) / float(plan.frame_rate_hz),
+        frame_width=plan.frame_width,
+        on_overload=options.policy.value,
+        slow_consumer_ms=1e3 * options.slow_s,
+        maps=made,
+        maps_planned=maps,
+        frames=_account(counters, stages, expected, received, lost),
+        times_real_time=(made - 1) * float(plan.sweep_s) / compute_s if compute_s else None,
+        resident_settled_bytes=first,
+        resident_end_bytes=last,
+        resident_growth=None if first is None or last is None else last / first - 1,
+        source_late_max_s=spad.late_max_s,
+        ended_by=ended_by,
+        stages=stages,
+        machine=machine(),
+    )
+
+
+def _account(counters: SpadCounters, stages: PipelineStats, expected: int, received: int, lost: int) -> SoakFrames:
+    exposed, gone = counters.exposed or 0, counters.lost or 0
+    agree = (
+        exposed == counters.delivered + gone
+        and expected == received + lost
+        and gone == stages.dropped_frames
+        and lost <= gone
+        and received <= counters.delivered
+    )
+    return SoakFrames(exposed, counters.delivered, gone, expected, received, lost, agree)
+
+
+def _look(view: MonitorView) -> None:
+    """A monitor as of a viewer: it makes the row profile that one would show."""
+    view.row_profile()
+
+
+def _resident_bytes() -> int:
+    """Resident memory of this process; 0 where the system does not say it so."""
+    try:
+        pages = int(_STATM.read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")

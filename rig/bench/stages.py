@@ -1,0 +1,235 @@
+"""The stages that are measured: each works on frames for a moment and says how many it did in how long.
+
+count: frames of just the window into bit planes, column after column; turning planes into counts is part of an
+estimate and left out. numpy: what one writes first: unpackbits, sum, argmax. likelihood: `ColumnJudge`, the counter of
+`rig scan --estimator likelihood`, fed blocks of about a millisecond; making it anew for each sweep is not timed, with
+sweep it is, and so is taking its result. disk: the same from SPB1 blocks in a file mapped into memory, which the
+system most likely holds in its page cache. parse: blocks of that recording in memory, read without an estimate.
+full: whole frames of the sensor, of which only the window is searched. crc: payload checksums are verified.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.frames import FrameBlock
+from drivers.spb1 import walk_blocks
+from rig.bench.bench_kernels import count_columns
+from rig.bench.frames import COLUMNS, PLACE_FRAMES, BenchFrames
+from rig.counting_kernels import CHUNK, new_planes
+from rig.estimators.likelihood import Likelihood
+from rig.estimators.stream import ColumnJudge, SearchedSweep
+from rig.row_threads import RowWorkers
+
+Bits = NDArray[np.uint8]
+
+COUNT_PIECE = 1000
+"""Frames that are counted at a time: handing work to threads then takes no share of it."""
+NUMPY_PIECE = 20
+"""Frames that numpy unpacks at a time, or one column of more: a naive program keeps its memory small too."""
+
+
+@dataclass(frozen=True, slots=True)
+class StripeError:
+    """How far estimates are from the truth, over rows x columns; missing: share without an estimate."""
+
+    mean_abs_px: float
+    median_abs_px: float
+    missing: float
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Work of one moment; error where it estimates."""
+
+    frames: int
+    seconds: float
+    error: StripeError | None = None
+
+
+Stage = Callable[[float], Measured]
+"""Works for about so many seconds."""
+
+
+class Walk:
+    """Where in the frames the next measurement begins, so that none finds its frames in a cache."""
+
+    def __init__(self, places: int) -> None:
+        self._places = places
+        self._at = 0
+
+    def next(self, places: int = 1) -> int:
+        """The first of the next places, each of PLACE_FRAMES frames; they follow one another."""
+        at = self._at if self._at + places <= self._places else 0
+        self._at = (at + places) % self._places
+        return at
+
+
+def count_stage(frames: BenchFrames, walk: Walk, exposures: int, workers: RowWorkers) -> Stage:
+    """Counting alone."""
+    _, rows, row_bytes = frames.bits.shape
+    row_words = row_bytes // 8
+    chunks = -(-rows // max(CHUNK // row_words, 1))
+    planes = new_planes(chunks)
+    n = COUNT_PIECE // exposures * exposures
+
+    def measure(seconds: float) -> Measured:
+        done, spent = 0, 0.0
+        while spent < seconds or not done:
+            first = walk.next(-(-n // PLACE_FRAMES)) * PLACE_FRAMES
+            words = frames.bits[first : first + n].reshape(-1).view(np.uint64)
+            begun = time.perf_counter()
+            workers.over(chunks, lambda a, b, w=words: count_columns(w, rows, row_words, exposures, planes, a, b))  # type: ignore[misc]
+            spent += time.perf_counter() - begun
+            done += n
+        return Measured(done, spent)
+
+    return measure
+
+
+def numpy_stage(frames: BenchFrames, walk: Walk, exposures: int) -> Stage:
+    """The naive way, one thread."""
+    columns = max(NUMPY_PIECE // exposures, 1)
+    n = columns * exposures
+    rows = frames.bits.shape[1]
+    x0 = int(frames.geometry.x0[0])
+
+    def measure(seconds: float) -> Measured:
+        done, spent = 0, 0.0
+        errors: list[NDArray[np.float32]] = []
+        while spent < seconds or not done:
+            place = walk.next()
+            bits = frames.bits[place * PLACE_FRAMES : place * PLACE_FRAMES + n]
+            begun = time.perf_counter()
+            pixels = np.unpackbits(bits, axis=2).reshape(columns, exposures, rows, frames.window)
+            brightest = pixels.sum(axis=1).argmax(axis=2)
+            spent += time.perf_counter() - begun
+            done += len(bits)
+            errors.append((brightest + x0 - frames.truth_px[place]).astype(np.float32))
+        return Measured(done, spent, _error(np.concatenate(errors)))
+
+    return measure
+
+
+def search_stage(
+    frames: BenchFrames,
+    walk: Walk,
+    exposures: int,
+    workers: RowWorkers,
+    likelihood: Likelihood,
+    source: "Callable[[BenchFrames, Walk], Iterator[tuple[int, Bits]]] | None" = None,
+    *,
+    whole_sweeps: bool = False,
+) -> Stage:
+    """Counting and `likelihood`. source: gives places and their frames for ever; from memory where None.
+
+    whole_sweeps: time also what is done once a sweep.
+    """
+    bins, column, x0 = _sweep_frames(frames, exposures)
+    layout = frames.layout(exposures)
+    source = source or from_memory
+
+    def measure(seconds: float) -> Measured:
+        judge = likelihood.judge(frames.geometry, exposures, dark=True)
+        blocks = source(frames, walk)
+        done, spent = 0, 0.0
+        error: StripeError | None = None
+        while spent < seconds or not done:
+            made = time.perf_counter()
+            counter = ColumnJudge(layout, frames.geometry, judge, workers)
+            spent += time.perf_counter() - made if whole_sweeps else 0.0
+            places: list[int] = []
+            for at in range(0, len(bins), PLACE_FRAMES):
+                begun = time.perf_counter()
+                place, bits = next(blocks)
+                counter.add(bits, bins[at : at + PLACE_FRAMES], column[at : at + PLACE_FRAMES], x0[: len(bits)])
+                spent += time.perf_counter() - begun
+                done += len(bits)
+                places.append(place)
+                if spent >= seconds and not whole_sweeps:
+                    break
+            if error is None or whole_sweeps:
+                ended = time.perf_counter()
+                sweep = counter.finish()
+                spent += time.perf_counter() - ended if whole_sweeps else 0.0
+                error = error or _search_error(sweep, frames, places, exposures)
+        return Measured(done, spent, error)
+
+    return measure
+
+
+def parse_stage(recording: NDArray[np.uint8], stride: int, *, check_payload: bool) -> Stage:
+    """Reading SPB1 blocks (all bytes,) in memory, header checksums always checked."""
+    start = 0
+
+    def measure(seconds: float) -> Measured:
+        nonlocal start
+        done, spent = 0, 0.0
+        while spent < seconds or not done:
+            begun = time.perf_counter()
+            for block in walk_blocks(recording[start:], stride, check_payload=check_payload):
+                start += stride
+                done += _sound(block).n_frames
+                if spent + time.perf_counter() - begun >= seconds:
+                    break
+            spent += time.perf_counter() - begun
+            start %= len(recording)
+        return Measured(done, spent)
+
+    return measure
+
+
+def from_memory(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
+    """Places and their frames, as they lie in memory."""
+    while True:
+        place = walk.next()
+        yield place, frames.bits[place * PLACE_FRAMES : (place + 1) * PLACE_FRAMES]
+
+
+def from_file(
+    path: Path, stride: int, *, check_payload: bool
+) -> Callable[[BenchFrames, Walk], Iterator[tuple[int, Bits]]]:
+    """The same from the blocks of a recording, one for each place."""
+
+    def blocks(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
+        # Copy-on-write: kernels are compiled for memory that may be written.
+        mapped = np.memmap(path, np.uint8, "c")
+        place = walk.next()
+        while True:
+            for block in walk_blocks(mapped[place * stride :], stride, check_payload=check_payload):
+                yield place, _sound(block).bits
+                place += 1
+            place = 0
+
+    return blocks
+
+
+def _sound(block: object) -> FrameBlock:
+    if not isinstance(block, FrameBlock):
+        raise RuntimeError(f"the bench's own recording is damaged: {block}")
+    return block
+
+
+def _sweep_frames(
+    frames: BenchFrames, exposures: int
+) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
+    """Bins and fractional columns of a sweep's frames, and where the windows of a block's begin."""
+    bins = np.repeat(np.arange(COLUMNS, dtype=np.int32), exposures)
+    return bins, bins.astype(np.float64), np.full(PLACE_FRAMES, frames.geometry.x0[0], np.int32)
+
+
+def _search_error(sweep: SearchedSweep, frames: BenchFrames, places: list[int], exposures: int) -> StripeError:
+    columns = len(places) * PLACE_FRAMES // exposures
+    place = np.repeat(np.array(places), PLACE_FRAMES // exposures)
+    return _error(sweep.stripe.x_px[:, :columns] - frames.truth_px[place].T)
+
+
+def _error(difference: NDArray[np.float32]) -> StripeError:
+    found = np.abs(difference[np.isfinite(difference)])
+    if not len(found):
+        return StripeError(float("nan"), float("nan"), 1.0)
+    return StripeError(float(found.mean()), float(np.median(found)), 1.0 - found.size / difference.size)
