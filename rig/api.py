@@ -22,12 +22,14 @@ from rig.saving import SavePolicy
 
 if TYPE_CHECKING:
     from rig.acquisition import ScanProgress
+    from rig.bench.soak import SoakReport
+    from rig.bench.speed import SpeedReport
     from rig.effects import Effect
     from rig.monitor import Watch
     from rig.overload import Overload
     from rig.scan_plan import ScanPlan
 
-__all__ = ["RunResult", "configure", "effects", "plan_scan", "reconstruct", "scan"]
+__all__ = ["RunResult", "bench", "configure", "effects", "plan_scan", "reconstruct", "scan", "soak", "warm_up"]
 
 PathLike = str | os.PathLike[str]
 Config = RigConfig | PathLike
@@ -188,6 +190,49 @@ def effects(config: Config = SIMULATED, *, scene: str | None = None) -> "tuple[E
     from rig.effects import scene_effects
 
     return scene_effects(configure(config, scene=scene))
+
+
+def bench(*, threads: int | None = None, progress: Progress | None = None) -> "SpeedReport":
+    """How fast this machine counts and estimates, within a minute (`rig bench`).
+
+    threads: the most to measure, by default one for each core. progress: called with rows done and all, of all rounds.
+    """
+    from rig.bench.speed import measure_speed
+
+    if threads is not None and threads < 1:
+        raise UsageError(f"threads is {threads}; it must be at least 1")
+    return measure_speed(threads, progress=progress)
+
+
+def soak(
+    seconds: float = 60.0,
+    *,
+    threads: int | None = None,
+    window: bool = False,
+    slow_consumer_s: float = 0.0,
+    on_overload: str = "abort",
+    progress: Progress | None = None,
+) -> "SoakReport":
+    """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`).
+
+    window: windows that move with the line, instead of whole frames. slow_consumer_s: added to every map. on_overload:
+    as of `scan`; a stream that it ends is a report too. progress: called with frames done and planned.
+    """
+    from rig.bench.soak import SoakOptions
+    from rig.bench.soak import soak as play
+    from rig.overload import Overload
+
+    return play(SoakOptions(seconds, window, Overload.parse(on_overload), slow_consumer_s, threads), progress)
+
+
+def warm_up(config: Config = SIMULATED) -> float:
+    """Compile every kernel that a scan with this config can need (`rig warmup`); the seconds it took.
+
+    Real devices are not opened.
+    """
+    from rig.warm_rig import warm_rig
+
+    return warm_rig(configure(config))
 
 
 def _checked_policies(

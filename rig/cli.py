@@ -1,4 +1,4 @@
-"""The command line: `rig scan`, `rig reconstruct`, `rig effects`, `rig config`.
+"""The command line: `rig scan`, `rig reconstruct`, `rig effects`, `rig bench`, `rig warmup`, `rig config`.
 
 Each command is one call of `rig.api` and some printing. Results go to stdout, everything else to stderr. Exit codes:
 0 done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted, 70 an error in the program itself.
@@ -264,6 +264,66 @@ def effects_command(
         from rig.report_text import effects_table
 
         effects_table(effects)
+    return 0
+
+
+@app.command("bench")
+@_command
+def bench_command(
+    threads: Annotated[
+        int | None, typer.Option("--threads", help="most threads to measure", show_default="one a core", min=1)
+    ] = None,
+    soak: Annotated[
+        float | None,
+        typer.Option("--soak", help="also play so many seconds of stream in real time", show_default=False),
+    ] = None,
+    window: Annotated[bool, typer.Option("--window", help="soak: moving windows instead of whole frames")] = False,
+    slow_consumer: Annotated[
+        float, typer.Option("--slow-consumer", metavar="MS", help="soak: milliseconds added to every map")
+    ] = 0.0,
+    on_overload: Annotated[
+        str, typer.Option("--on-overload", help="soak: frames come too fast: abort, drop or block")
+    ] = "abort",
+    as_json: JsonOption = False,
+) -> int:
+    """How fast this machine counts and estimates, beside how fast it reads its memory."""
+    from rig import api
+
+    with _progress("rows") as bar:
+        report = api.bench(threads=threads, progress=bar)
+    content = report.as_json()
+    if not as_json:
+        from rig.bench.table import speed_table
+
+        speed_table(report)
+    if soak is not None:
+        with _progress("frames") as bar:
+            found = api.soak(
+                soak, threads=threads, window=window, slow_consumer_s=slow_consumer / 1e3, on_overload=on_overload,
+                progress=bar,
+            )  # fmt: skip
+        content["soak"] = found.as_json()
+        if not as_json:
+            from rig.bench.table import soak_table
+
+            print()
+            soak_table(found)
+    if as_json:
+        _print_json(content)
+    return 0
+
+
+@app.command("warmup")
+@_command
+def warmup_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
+    """Compile everything that is compiled, so that no scan waits for it."""
+    from rig import api
+
+    seconds = api.warm_up(config)
+    if as_json:
+        _print_json({"seconds": seconds})
+    else:
+        print(f"warm after {seconds:.1f} s; compiled code is kept on disk, once more takes seconds")
     return 0
 
 

@@ -94,6 +94,8 @@ load_float32 = _reader(FLOAT32, _F32, FLOAT32.llvm, 4)
 """load_float32(address, index): the same of float32."""
 store_int16 = _writer(INT16, _I16, INT16.llvm, 2)
 """store_int16(address, index, lanes): write 16 int16."""
+store_float32 = _writer(FLOAT32, _F32, FLOAT32.llvm, 4)
+"""store_float32(address, index, lanes): write 16 float32."""
 read_int16 = _reader(types.int16, _I16, _I16, 2)
 read_int32 = _reader(types.int32, _INT32, _INT32, 4)
 read_float32 = _reader(types.float32, _F32, _F32, 4)

@@ -16,7 +16,7 @@ def read_all(words: NDArray[np.uint64]) -> int:
     total = np.uint64(0)
     for i in range(words.shape[0]):
         total ^= words[i]
-    return total
+    return int(total)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -113,4 +113,4 @@ def _thresholds(window: int, place: NDArray[np.float32], photons: NDArray[np.flo
     away = (x - place[:, None]) / LINE_SD_PX
     line = photons[:, None] * np.exp(-0.5 * away**2) / (LINE_SD_PX * np.sqrt(2 * np.pi))
     flux = np.where(x < place[:, None], haze, BEHIND * haze) + AMBIENT + line
-    return np.round(-np.expm1(-flux) * 2**BITS_OF_CHANCE).astype(np.uint32)
+    return np.asarray(np.round(-np.expm1(-flux) * 2**BITS_OF_CHANCE), np.uint32)

@@ -26,6 +26,8 @@ FRAME_S = 1e-5
 SECONDS = 3.0
 SLOTS = 64
 """A ring of 64 ms, so that nothing is dropped where the host pauses; a pause is seen in the figures."""
+QUEUE_US = 1e4
+"""A median of more than ten blocks is that of a queue which grows."""
 SPIN_S = 2e-4
 """Before a block is due the source stops sleeping, which may take longer than asked for."""
 
@@ -38,7 +40,15 @@ class Latency:
     p999: float
     max: float
     columns: int
+    threads: int
     late_max_us: float
+
+    @property
+    def kept_up(self) -> bool:
+        """Whether the estimate kept up with the stream, so that the figures are of it and not of a queue."""
+        return (
+            self.late_max_us < 1e6 * SLOTS * PLACE_FRAMES * FRAME_S and self.median < 1e6 * 10 * PLACE_FRAMES * FRAME_S
+        )
 
 
 def measure_latency(
@@ -75,7 +85,7 @@ def measure_latency(
             ended[i] = time.perf_counter()
             counter = ColumnJudge(layout, frames.geometry, judge, workers)
     source.join()
-    return _summary(published, judged, ended, exposures, float(late.max()))
+    return _summary(published, judged, ended, exposures, workers.threads, float(late.max()))
 
 
 def _play(frames: BenchFrames, ring: BlockRing, published: NDArray[np.float64], late: NDArray[np.float64]) -> None:
@@ -115,6 +125,7 @@ def _summary(
     judged: NDArray[np.float64],
     ended: NDArray[np.float64],
     exposures: int,
+    threads: int,
     late_s: float,
 ) -> Latency:
     last_frame = np.arange(exposures, PLACE_FRAMES + 1, exposures)
@@ -123,7 +134,7 @@ def _summary(
     there[:, -1] = ended
     waited_us = 1e6 * (there - exposed)[there > 0]
     median, p999 = np.quantile(waited_us, [0.5, 0.999])
-    return Latency(float(median), float(p999), float(waited_us.max()), waited_us.size, 1e6 * late_s)
+    return Latency(float(median), float(p999), float(waited_us.max()), waited_us.size, threads, 1e6 * late_s)
 
 
 def _header(seq: int, width: int) -> BlockHeader:

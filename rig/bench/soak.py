@@ -95,7 +95,7 @@ class SoakReport:
 
 @dataclass(frozen=True, slots=True)
 class SoakOptions:
-    """seconds: of stream. window: windows that move with the line, instead of whole frames. slow_s: added to each map."""
+    """seconds: of stream. window: moving windows instead of whole frames. slow_s: added to each map."""
 
     seconds: float = 60.0
     window: bool = False
@@ -104,8 +104,8 @@ class SoakOptions:
     threads: int | None = None
 
 
-class _Watched:
-    """Makes the maps, as slowly as asked, and keeps account of memory and progress."""
+class _SlowMaker:
+    """Makes the maps, as slowly as asked."""
 
     def __init__(self, maker: MakesMaps, slow_s: float) -> None:
         self._maker = maker
@@ -200,7 +200,7 @@ def _run(
             progress(done.frames, done.frames_planned)
 
     acquisition = Acquisition(
-        rig, plan, timing, maps, _Watched(_reconstructor(rig, plan, "likelihood", threads), options.slow_s),
+        rig, plan, timing, maps, _SlowMaker(_reconstructor(rig, plan, "likelihood", threads), options.slow_s),
         policy=options.policy, first_alone=True, watch=_look, on_progress=tell,
     )  # fmt: skip
     expected = received = lost = made = 0

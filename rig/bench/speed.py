@@ -64,7 +64,7 @@ class Extent:
     windows: tuple[int, ...] = WINDOWS
     exposures: tuple[int, ...] = EXPOSURES
     rounds: int = 3
-    moment_s: float = 0.06
+    moment_s: float = 0.05
     count_moment_s: float = 0.015
     latency_s: float = SECONDS
     frames_bytes: int = FRAMES_BYTES
@@ -132,11 +132,17 @@ def measure_speed(
         cases = _cases(frames, learned, workers, extent, folder)
         memory, measured = _in_turn(cases, frames[extent.windows[-1]], extent, progress)
         window = _usual_window(extent)
-        latency = measure_latency(
-            frames[window], LEARN_EXPOSURES, workers[most], learned[window], extent.latency_s
-        )
+        latency = measure_latency(frames[window], LEARN_EXPOSURES, workers[most], learned[window], extent.latency_s)
     read = float(np.median(memory))
     return SpeedReport(found, read / 1e9, _rows(cases, measured, read), latency, time.perf_counter() - begun)
+
+
+def warm_bench() -> None:
+    """Compile what the bench alone needs."""
+    with RowWorkers(1) as workers:
+        frames = window_frames(WINDOWS[0], workers, 1)
+        count_stage(frames, Walk(1), PLACE_FRAMES, workers)(0.0)
+    read_all(frames.bits.reshape(-1).view(np.uint64))
 
 
 def learn(frames: BenchFrames, threads: int) -> Likelihood:
@@ -169,9 +175,7 @@ def _cases(
         walk = Walk(len(these.bits) // PLACE_FRAMES)
         size = these.frame_bytes
         for k in sorted({*COUNT_EXPOSURES, *extent.exposures}):
-            cases += [
-                _Case("count", window, k, n, size, count_stage(these, walk, k, w)) for n, w in workers.items()
-            ]
+            cases += [_Case("count", window, k, n, size, count_stage(these, walk, k, w)) for n, w in workers.items()]
         for k in extent.exposures:
             cases.append(_Case("numpy", window, k, 1, size, numpy_stage(these, walk, k)))
             cases += [
@@ -272,9 +276,7 @@ def _read_bytes_per_s(words: NDArray[np.uint64]) -> float:
 def _rows(cases: list[_Case], measured: list[list[Measured]], read: float) -> tuple[Row, ...]:
     speeds = [float(np.median([each.frames / each.seconds for each in these])) for these in measured]
     naive = {
-        (case.window, case.exposures): speed
-        for case, speed in zip(cases, speeds, strict=True)
-        if case.stage == "numpy"
+        (case.window, case.exposures): speed for case, speed in zip(cases, speeds, strict=True) if case.stage == "numpy"
     }
     rows = []
     for case, speed, these in zip(cases, speeds, measured, strict=True):

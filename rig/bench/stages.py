@@ -75,7 +75,7 @@ def count_stage(frames: BenchFrames, walk: Walk, exposures: int, workers: RowWor
     row_words = row_bytes // 8
     chunks = -(-rows // max(CHUNK // row_words, 1))
     planes = new_planes(chunks)
-    n = COUNT_PIECE // exposures * exposures
+    n = min(COUNT_PIECE, len(frames.bits)) // exposures * exposures
 
     def measure(seconds: float) -> Measured:
         done, spent = 0, 0.0

@@ -104,22 +104,27 @@ def level_flux(level):  # type: ignore[no-untyped-def]
     return (1.25 + 0.5 * (level & 1)) * 2.0 ** (LOWEST_OCTAVE + (level >> 1))
 
 
-@numba.njit(cache=True, nogil=True)
-def place_line(
-    n: int, lanes: int, x: int, exposures: float, weight: int, constant: int, pixels: int, index: int, square: int,
-    shift: int,
-) -> tuple[float, float]:  # fmt: skip
-    """Offset of the line from the middle of pixel x in px, to the right, and its standard deviation.
+@numba.njit(inline="always")
+def label_likelihoods(n, lanes, x, exposures, weight, constant, pixels, shift):  # type: ignore[no-untyped-def]
+    """Likelihood of each label as float32 lanes in the order UNPACKED, for a line near pixel x.
 
     n: address of the row's counts, of so many lanes; weight: of the F = `pixels` vectors of the two levels, constant: of
-    theirs; index, square: as in `Closeup`.
+    theirs.
     """
     score = to_int16(larger_float(load_float32(constant, 0) * np.float32(exposures), LOWEST_SCORE))
     first = x - (pixels - 1) // 2
     for t in range(pixels):
         count = read_int16(n, place_of(first + t, lanes))
         score = add_saturated(score, load_int16(weight, t * LANES) * count)
-    likelihood = powers(score, nothing_below(largest(score), shift), shift)
+    return powers(score, nothing_below(largest(score), shift), shift)
+
+
+@numba.njit(inline="always")
+def place_line(likelihood, index, square):  # type: ignore[no-untyped-def]
+    """Offset of the line from the middle of its pixel in px, to the right, and its standard deviation.
+
+    index, square: addresses of those of `Closeup`.
+    """
     mass = total(likelihood)
     mean = total(likelihood * load_float32(index, 0)) / mass
     variance = total(likelihood * load_float32(square, 0)) / mass - mean * mean

@@ -10,14 +10,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.closeup_kernels import LEVELS, Closeup, level_of, place_line
+from rig.estimators.closeup_kernels import LEVELS, Closeup, label_likelihoods, level_of, place_line
 from rig.estimators.powers import MEAN_EXCESS, nothing_below, power
 from rig.estimators.screen_tables import SCREENS, Tables
 from rig.estimators.search_kernels import (
     Search,
     best_position,
+    add_likelihoods,
     best_score,
-    mass_of,
+    end_likelihoods,
     score_rows,
     search_in,
     search_memory,
@@ -29,11 +30,14 @@ from rig.lanes import (
     LANES,
     address_of,
     lanes_between,
+    load_float32,
     load_int16,
     read_float32,
     read_int16,
     read_int32,
+    store_float32,
     store_int16,
+    total,
     write_float32,
     write_int16,
     write_int32,
@@ -269,6 +273,10 @@ def _find(search: Search, rows: int, window: int, shift: int) -> None:
     for r in range(rows):
         write_int32(search.x, r, np.int32(best_position(search, r, best_score(search, r))))
     for r in range(rows):
+        x = np.int64(read_int32(search.x, r))
+        best = np.int64(read_int16(search.score + r * search.score_bytes, (x & 7) * lanes + (x >> 3)))
+        add_likelihoods(search, r, best, shift)
+    for r in range(rows):
         score, x = search.score + r * search.score_bytes, np.int64(read_int32(search.x, r))
         best = np.int64(read_int16(score, (x & 7) * lanes + (x >> 3)))
         nothing = nothing_below(best, shift)
@@ -278,7 +286,7 @@ def _find(search: Search, rows: int, window: int, shift: int) -> None:
         if x + 1 < window:
             near += power(read_int16(score, ((x + 1) & 7) * lanes + ((x + 1) >> 3)), nothing, shift)
         # The best position's own term is exact, the others are too large by the same share on average.
-        others = mass_of(search, r, best, nothing, shift) - own
+        others = total(load_float32(search.mass, r * LANES)) + end_likelihoods(search, r, best, shift) - own
         own *= MEAN_EXCESS
         write_float32(search.confidence, r, min((own + near) / (own + others), np.float32(1.0)))
 
@@ -313,25 +321,28 @@ def _measure_light(desk: Desk, first: int, rows: int, c: int, table: int, exposu
         write_float32(desk.stripe + 4 * field, to, max(before - ambient, np.float32(0.0)))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=NO_NAN)
 def _look_closely(desk: Desk, first: int, rows: int, c: int, exposures: float) -> None:
     """Place the lines of the batch's rows, and write the answers."""
     search = desk.search
     x0 = np.int64(read_int32(desk.x0, c))
     field = 4 * desk.rows * desk.columns
     for r in range(rows):
-        x = np.int64(read_int32(search.x, r))
-        if x == NOWHERE:
-            continue
-        n, to = search.n + r * search.n_bytes, (first + r) * desk.columns + c
-        levels = np.int64(read_int32(search.levels, r))
-        offset, sd = place_line(
-            n, search.lanes, x, exposures, desk.weight + 2 * LANES * desk.weight_px * levels,
-            desk.weight_constant + 4 * LANES * levels, desk.weight_px, desk.index, desk.square, desk.shift,
-        )  # fmt: skip
-        write_float32(desk.stripe, to, np.float32(x0 + x + offset))
-        write_float32(desk.stripe + field, to, read_float32(search.confidence, r))
-        write_float32(desk.stripe + 2 * field, to, np.float32(sd))
+        x, levels = np.int64(read_int32(search.x, r)), np.int64(read_int32(search.levels, r))
+        if x != NOWHERE:
+            likelihood = label_likelihoods(
+                search.n + r * search.n_bytes, search.lanes, x, exposures,
+                desk.weight + 2 * LANES * desk.weight_px * levels, desk.weight_constant + 4 * LANES * levels,
+                desk.weight_px, desk.shift,
+            )  # fmt: skip
+            store_float32(search.mass, r * LANES, likelihood)
+    for r in range(rows):
+        x, to = np.int64(read_int32(search.x, r)), (first + r) * desk.columns + c
+        if x != NOWHERE:
+            offset, sd = place_line(load_float32(search.mass, r * LANES), desk.index, desk.square)
+            write_float32(desk.stripe, to, np.float32(x0 + x) + offset)
+            write_float32(desk.stripe + field, to, read_float32(search.confidence, r))
+            write_float32(desk.stripe + 2 * field, to, sd)
 
 
 @numba.njit(cache=True, nogil=True)

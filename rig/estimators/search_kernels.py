@@ -27,8 +27,8 @@ from rig.lanes import (
     read_int16,
     running_sum,
     smaller,
+    store_float32,
     store_int16,
-    total,
     up_1,
     write_int16,
     zero_float32,
@@ -50,7 +50,7 @@ class Search(NamedTuple):
     of a change at the lane's first pixel; best (lanes,), best score of each lane. For all rows of a batch together:
     constant (SCREENS * STEPS * lanes,) and lane (lanes,), the tables' parts per exposure times the exposures; none (3,)
     as in `Tables`. all_left (BATCH,), score of all pixels lying left. What was found in each row, 32 bits each: x, the close-up's levels, and
-    float32 confidence (BATCH,).
+    float32 confidence (BATCH,). mass: float32 (BATCH, LANES), sums to be taken across.
     """
 
     lanes: int
@@ -67,6 +67,7 @@ class Search(NamedTuple):
     x: int
     levels: int
     confidence: int
+    mass: int
 
 
 @numba.njit(cache=True, nogil=True)
@@ -74,7 +75,7 @@ def search_memory(lanes: int) -> NDArray[np.int16]:
     """Memory for the buffers of a `Search`."""
     of_row = STEPS * (lanes + 2 * PAD) + STEPS * lanes + 2 * lanes
     # What is of 32 bits comes last, behind an even number of 16-bit ones.
-    return np.zeros(BATCH * of_row + SCREENS * STEPS * lanes + lanes + 4 + BATCH + 6 * BATCH, np.int16)
+    return np.zeros(BATCH * of_row + SCREENS * STEPS * lanes + lanes + 4 + BATCH + (6 + 2 * LANES) * BATCH, np.int16)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -92,7 +93,7 @@ def search_in(memory: NDArray[np.int16], lanes: int) -> Search:
     x = all_left + 2 * BATCH
     return Search(
         lanes, n, n_bytes, score, score_bytes, start, best, constant, lane, none, all_left, x, x + 4 * BATCH,
-        x + 8 * BATCH,
+        x + 8 * BATCH, x + 12 * BATCH,
     )  # fmt: skip
 
 
@@ -293,12 +294,12 @@ def best_position(search: Search, r: int, best: int) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def mass_of(search: Search, r: int, best: int, nothing: int, shift: int) -> float:
-    """Sum of likelihoods over all positions of row r and all hypotheses without a stripe; nothing: see `powers`."""
+def add_likelihoods(search: Search, r: int, best: int, shift: int) -> None:
+    """Fill row r of search.mass: likelihoods of all positions, and of a change at each lane's start without a stripe."""
     lanes = search.lanes
     score = search.score + r * search.score_bytes
     most = np.int64(best) + ((MOST_OCTAVES * 128) >> shift)
-    change, ceiling, none = read_int16(search.none, 2), np.int16(min(most, 32767)), np.int16(nothing)
+    change, ceiling, none = read_int16(search.none, 2), np.int16(min(most, 32767)), nothing_below(best, shift)
     lot = zero_float32()
     for v in range(0, lanes, LANES):
         a = powers(load_int16(score, v), none, shift) + powers(load_int16(score, lanes + v), none, shift)
@@ -310,6 +311,13 @@ def mass_of(search: Search, r: int, best: int, nothing: int, shift: int) -> floa
         d = d + powers(load_int16(score, 7 * lanes + v), none, shift)
         nowhere = smaller(add_saturated(load_int16(search.start, r * lanes + v), change), ceiling)
         lot = lot + (((a + b) + (c + d)) + powers(nowhere, none, shift))
+    store_float32(search.mass, r * LANES, lot)
+
+
+@numba.njit(cache=True, nogil=True)
+def end_likelihoods(search: Search, r: int, best: int, shift: int) -> float:
+    """Likelihoods of the two hypotheses that the row holds no change at all."""
+    most, nothing = np.int64(best) + ((MOST_OCTAVES * 128) >> shift), nothing_below(best, shift)
     ends = power(min(START + np.int64(read_int16(search.none, 0)), most), nothing, shift)
-    ends += power(min(np.int64(read_int16(search.all_left, r)) + read_int16(search.none, 1), most), nothing, shift)
-    return total(lot) + ends
+    all_left = np.int64(read_int16(search.all_left, r)) + read_int16(search.none, 1)
+    return ends + power(min(all_left, most), nothing, shift)

@@ -252,7 +252,7 @@ def test_a_map_teaches_when_enough_frames_have_come_and_only_then():
     assert taught == [False, False, False, False, True, True, True]
 
 
-@pytest.mark.parametrize("level", [0, 5, 10])
+@pytest.mark.parametrize("level", [0, 10])
 def test_a_first_map_without_contrast_teaches_nothing(level):
     sweep = simulated()
     estimator = Likelihood()
@@ -263,10 +263,9 @@ def test_a_first_map_without_contrast_teaches_nothing(level):
     assert_same(estimator.estimate(sweep.volume, sweep.geometry), estimated()[0])
 
 
-@pytest.mark.parametrize("level", [0, 10])
-def test_a_later_map_without_contrast_teaches_nothing(monkeypatch, level):
+def test_a_later_map_of_a_closed_shutter_teaches_nothing(monkeypatch):
     monkeypatch.setattr(likelihood, "TEACH_FRAMES", 1)
     sweep, model = simulated(), estimated()[1].model
     estimator = Likelihood(model=model)
-    estimator.estimate(volume_of(np.full_like(sweep.counts, level), sweep.geometry, 10), sweep.geometry)
+    estimator.estimate(volume_of(np.zeros_like(sweep.counts), sweep.geometry, 10), sweep.geometry)
     assert estimator.model is model

@@ -18,7 +18,6 @@ from rig.estimators.row_kernels import (
     logit_table,
     mode_of,
     none_prior,
-    refine,
     row_posterior,
     row_scores,
 )
@@ -97,12 +96,6 @@ class Lines:
             self.score, self.edge, len(self.n), first, last, log_weight, log_prior, none, out, by_amplitude
         )
         return out, by_amplitude, p_none, evidence
-
-    def refined(self, mode, log_weight):
-        return refine(
-            self.n, np.float32(self.k), self.before, self.behind, self.scale, len(self.n), mode, self.score, self.edge,
-            self.taps, self.amplitude, log_weight, fine_profiles(self.sigma_px), TABLE, np.empty(LABELS),
-        )  # fmt: skip
 
 
 def random_row(seed, *, length=60, k=10, stripe_at=None, signal=0.7, sigma_px=0.6, haze=0.15, amplitudes=6):
@@ -288,63 +281,6 @@ def test_the_prior_of_no_stripe_is_what_the_border_cuts_off():
     behind, before, _ = none_prior(near, far, 1.2, 0.4, none)
     assert before == pytest.approx(0.01 + 0.97 * 0.25)
     assert behind == pytest.approx(0.01)
-
-
-def brute_refinement(row, mode, log_weight):
-    """Posterior mean and sd over positions a quarter pixel apart, in float64, amplitudes summed over."""
-    t = np.arange(len(row.n))
-    offsets = (np.arange(LABELS) - LABELS // 2) * LABEL_PX
-    total = np.empty((len(row.amplitude), LABELS))
-    fine = fine_profiles(row.sigma_px).astype(float)
-    reach = fine.shape[1] // 2
-    near = np.abs(t - mode) <= reach
-    for m, q in enumerate(row.amplitude):
-        for i, offset in enumerate(offsets):
-            free = np.clip(mode + offset - t + 0.5, 0, 1)
-            flux = free * row.before + (1 - free) * row.behind
-            flux[near] += float(q) * row.scale[mode] * fine[i, t[near] - mode + reach]
-            total[m, i] = log_likelihood(row.n, row.k, flux).sum() + log_weight[m]
-    weight = np.exp(total - total.max()).sum(axis=0)
-    mean = np.average(offsets, weights=weight)
-    variance = np.average((offsets - mean) ** 2, weights=weight)
-    return mean, np.sqrt(variance + LABEL_PX**2 / 12)
-
-
-@pytest.mark.parametrize("k", [1, 3, 10, 100, 1000])
-@pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
-def test_refinement_is_the_posterior_mean_of_quarter_pixels(k, sigma_px):
-    worst = []
-    for seed in range(20):
-        row = random_row(seed, k=k, sigma_px=sigma_px, signal=1.0)
-        log_weight = np.full(6, -np.log(6), np.float32)
-        mode = int(np.clip(row.score.max(axis=0).argmax(), 6, 53))
-        mean, sd = row.refined(mode, log_weight)
-        wanted_mean, wanted_sd = brute_refinement(row, mode, log_weight)
-        worst.append([abs(mean - wanted_mean), abs(sd - wanted_sd)])
-    # Amplitudes 400 times less likely than the best may be left out.
-    assert np.max(worst) < 0.06
-
-
-@pytest.mark.parametrize("k", [10, 300, 3000, 60_000])
-@pytest.mark.parametrize("offset", [-0.4, -0.25, 0.0, 0.1, 0.4])
-def test_refinement_finds_the_sub_pixel_centre_at_any_number_of_exposures(k, offset):
-    errors = []
-    for seed in range(8):
-        row = random_row(seed, k=k, signal=1.5, stripe_at=30 + offset)
-        mean, sd = row.refined(30, np.full(6, -np.log(6), np.float32))
-        assert abs(mean) <= 1.5
-        assert 0.05 < sd < 1.0
-        errors.append(mean - offset)
-    # The labels are a quarter pixel apart.
-    assert abs(np.mean(errors)) < 0.5 * LABEL_PX + 0.3 / np.sqrt(k)
-
-
-@pytest.mark.parametrize("mode", [0, 1, 58, 59])
-def test_refinement_at_the_ends_of_the_row_stays_finite(mode):
-    row = random_row(1, stripe_at=float(mode), signal=2.0)
-    mean, sd = row.refined(mode, np.full(6, -np.log(6), np.float32))
-    assert abs(mean) <= 1.5
-    assert 0 < sd < 1.5
 
 
 @pytest.mark.parametrize("sigma_px", SIGMAS_PX)

@@ -1,0 +1,113 @@
+"""The figures of `rig bench` for people, in 100 columns."""
+
+from collections.abc import Iterable
+from itertools import groupby
+
+from rich.console import Console
+from rich.table import Table
+
+from rig.bench.soak import SoakReport
+from rig.bench.speed import Row, SpeedReport
+
+WIDTH = 100
+"""Characters; no line here is longer."""
+
+_TITLES = {
+    "count": "counting alone, frames of just the window",
+    "likelihood": "counting + likelihood, frames of just the window",
+    "likelihood-sweep": "the same with what is done once a sweep",
+    "count-full": "counting alone, whole frames",
+    "likelihood-full": "counting + likelihood in a window of whole frames",
+    "disk": "counting + likelihood from a recording (page cache), header checksums",
+    "disk-crc": "the same, payload checksums too",
+    "parse": "reading SPB1 blocks in memory, header checksums",
+    "parse-crc": "the same, payload checksums too",
+    "numpy": "numpy: unpackbits, sum, argmax",
+}
+
+
+def speed_table(report: SpeedReport) -> None:
+    """Print the rows, grouped by stage, to stdout."""
+    console = Console(highlight=False, width=WIDTH)
+    _print_machine(console, report.machine)
+    console.print(f"memory read, one thread: {report.memory_read_gb_per_s:.1f} GB/s")
+    order = list(_TITLES)
+    rows = sorted(report.rows, key=lambda row: (order.index(row.stage), row.window, row.exposures or 0, row.threads))
+    for stage, group in groupby(rows, key=lambda row: row.stage):
+        console.print(f"\n[bold]{stage}[/bold]: {_TITLES[stage]}")
+        console.print(_table(group))
+    latency = report.latency_us
+    console.print(
+        f"\nlatency of a column's estimate: median {latency.median:.0f} us, 99.9 % {latency.p999:.0f} us, "
+        f"most {latency.max:.0f} us"
+    )
+    console.print("(from its last frame on, waiting for its block of 1 ms to fill included)")
+    if not latency.kept_up:
+        console.print("the estimate did not keep up with 100 kHz: this is the latency of a full ring")
+    console.print(f"measured in {report.seconds:.0f} s")
+
+
+def soak_table(report: SoakReport) -> None:
+    """Print what a soak found to stdout."""
+    console = Console(highlight=False, width=WIDTH)
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="bold")
+    table.add_column()
+    frames, stages = report.frames, report.stages
+    added = "adds up" if frames.agree else "does NOT add up"
+    table.add_row("stream", f"{report.seconds:.1f} s of frames {report.frame_width} pixels wide")
+    table.add_row(
+        "frames",
+        f"{frames.exposed} exposed, {frames.delivered} delivered, {frames.lost} lost: {added}",
+    )
+    table.add_row(
+        "in sweeps",
+        f"{frames.expected_in_sweeps} expected, {frames.received_in_sweeps} received, {frames.lost_in_sweeps} lost",
+    )
+    table.add_row("maps", f"{report.maps} of {report.maps_planned}, real time x {_number(report.times_real_time)}")
+    table.add_row(
+        "ring",
+        f"{stages.ring_high_water} of {stages.ring_slots} slots used at most, {stages.dropped_blocks} blocks dropped",
+    )
+    table.add_row("source", f"{1e3 * report.source_late_max_s:.1f} ms late at most")
+    if report.resident_growth is not None and report.resident_end_bytes is not None:
+        table.add_row(
+            "memory", f"{report.resident_end_bytes / 1e6:.0f} MB at the end, {report.resident_growth:+.2%} since 10 %"
+        )
+    table.add_row("overload", f"{report.on_overload}, consumer slowed by {report.slow_consumer_ms:g} ms a map")
+    if report.ended_by is not None:
+        table.add_row("ended by", report.ended_by)
+    console.print(table)
+
+
+def _print_machine(console: Console, found: dict[str, object]) -> None:
+    caches = found["caches"]
+    assert isinstance(caches, dict)
+    named = ", ".join(f"{level} {size}" for level, size in caches.items())
+    console.print(f"{found['processor']}, {found['cores']} cores" + (f", {named}" if named else ""))
+    console.print(f"Python {found['python']}, numpy {found['numpy']}, numba {found['numba']}")
+
+
+def _table(rows: Iterable[Row]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in (
+        "window", "K", "threads", "kframes/s", "real time", "of memory", "x numpy", "error px", "median px",
+    ):  # fmt: skip
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(
+            str(row.window),
+            "-" if row.exposures is None else str(row.exposures),
+            str(row.threads),
+            f"{row.frames_per_s / 1e3:.4g}",
+            f"{row.times_real_time:.2f}",
+            _number(row.of_memory_bandwidth, 2),
+            _number(row.times_numpy),
+            _number(row.error_px),
+            _number(row.median_error_px),
+        )
+    return table
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}g}"

@@ -1,0 +1,59 @@
+"""Compiles every kernel that a rig's scans can need: estimators and filters, and, where it is simulated, its world's.
+
+Each is run once on little; what numba compiles it keeps on disk, so that a second time takes seconds.
+"""
+
+import time
+from contextlib import closing
+
+import numpy as np
+
+from rig.acquisition import Acquisition, ScanProgress
+from rig.bench.speed import warm_bench
+from rig.config import RigConfig
+from rig.estimators import ESTIMATORS
+from rig.reconstruction import Reconstructor
+from rig.session import OpenRig, open_rig, prepare
+from rig.warm_up import warm_up
+
+ENOUGH_FRAMES = 1000
+"""Simulated frames, the first columns of a sweep among them."""
+
+
+def warm_rig(config: RigConfig) -> float:
+    """Compile everything; the seconds it took. Real devices are not opened."""
+    begun = time.perf_counter()
+    for estimator in ESTIMATORS:
+        for dark in (True, False):  # a scan has dark frames, a bare cube has none
+            warm_up(estimator, "median", config.scan.exposures, dark=dark)
+    warm_bench()
+    if config.world is not None:
+        with open_rig(config) as rig:
+            _simulate(rig)
+    return time.perf_counter() - begun
+
+
+class _EnoughError(Exception):
+    """Enough frames were simulated."""
+
+
+def _simulate(rig: OpenRig) -> None:
+    """Let the world make the frames of a scan's beginning, bind and count them, and tell the truth of two columns."""
+    plan, timing = prepare(rig)
+    maker = Reconstructor(
+        rig.model, plan.commands, plan.depth_range_m, sensor=(plan.rows, plan.width), estimator="argmax", threads=1
+    )
+
+    def tell(done: ScanProgress) -> None:
+        if done.frames >= ENOUGH_FRAMES:
+            raise _EnoughError
+
+    running = Acquisition(rig, plan, timing, 1, maker, on_progress=tell).run()
+    with closing(running):
+        try:
+            for _ in running:
+                pass
+        except _EnoughError:
+            pass
+    assert rig.world is not None, "only a simulated rig is asked for frames"
+    rig.world.truth(plan.command_at(np.arange(2.0)))

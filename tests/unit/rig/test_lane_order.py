@@ -1,0 +1,126 @@
+"""Counts in lane order against unpacked bits: from planes, from counts in pixel order, and back."""
+
+import numpy as np
+import pytest
+
+from rig.lane_order import (
+    PAD,
+    STEPS,
+    halve_counts,
+    new_counts,
+    padded_lanes,
+    pixel_order,
+    place_of,
+    read_counts,
+    read_planes,
+    sum_counts,
+    write_counts,
+)
+from rig.lanes import LANES
+
+PLANE_BYTES = 256
+
+
+def address(array):
+    return array.ctypes.data
+
+
+def pixels_of(n, lanes):
+    """A row of counts (STEPS * (lanes + 2 PAD),) in pixel order (8 lanes,)."""
+    steps = n.reshape(STEPS, lanes + 2 * PAD)
+    return steps[:, PAD : PAD + lanes].T.ravel()
+
+
+def padding_of(n, lanes):
+    steps = n.reshape(STEPS, lanes + 2 * PAD)
+    return np.concatenate([steps[:, :PAD].ravel(), steps[:, PAD + lanes :].ravel()])
+
+
+@pytest.mark.parametrize(("pixels", "lanes"), [(1, 16), (64, 16), (128, 16), (192, 32), (256, 32), (320, 48), (512, 64)])
+def test_rows_are_whole_vectors(pixels, lanes):
+    assert padded_lanes(pixels) == lanes
+    assert new_counts(lanes).shape == (STEPS * (lanes + 2 * PAD),)
+
+
+@pytest.mark.parametrize("window", range(64, 513, 64))
+@pytest.mark.parametrize("n_planes", [1, 4, 8])
+@pytest.mark.parametrize("at", [0, 8, 40])
+def test_planes_are_read_as_the_bits_that_they_hold(n_planes, window, at):
+    rng = np.random.default_rng(window + n_planes)
+    planes = rng.integers(0, 256, (8, PLANE_BYTES), np.uint8)
+    lanes = padded_lanes(window)
+    n = new_counts(lanes)
+    read_planes(address(planes), at, PLANE_BYTES, n_planes, window, address(n), lanes)
+    bits = np.unpackbits(planes[:, at : at + window // 8], axis=1).astype(int)
+    wanted = (bits[:n_planes] << np.arange(n_planes)[:, None]).sum(axis=0)
+    np.testing.assert_array_equal(pixels_of(n, lanes)[:window], wanted)
+    # Beyond the window lie other pixels' bits.
+    assert not pixels_of(n, lanes)[window:].any()
+    assert not padding_of(n, lanes).any()
+
+
+def test_every_count_of_eight_planes_is_read():
+    planes = np.zeros((8, PLANE_BYTES), np.uint8)
+    counts = np.arange(256)
+    for q in range(8):
+        planes[q, :32] = np.packbits((counts >> q) & 1)
+    n = new_counts(32)
+    read_planes(address(planes), 0, PLANE_BYTES, 8, 256, address(n), 32)
+    np.testing.assert_array_equal(pixels_of(n, 32), counts)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
+@pytest.mark.parametrize("window", [64, 128, 192, 448])
+def test_counts_come_back_as_they_went_in(window, dtype):
+    rng = np.random.default_rng(window)
+    counts = rng.integers(0, 200, window).astype(dtype)
+    lanes = padded_lanes(window)
+    n = new_counts(lanes)
+    read_counts(counts, 0, address(n), lanes)
+    np.testing.assert_array_equal(pixels_of(n, lanes)[:window], counts)
+    assert not padding_of(n, lanes).any()
+    for x in (0, 1, 7, 8, window - 1):
+        assert n[place_of(x, lanes)] == counts[x]
+    for x in (-1, -8, lanes * STEPS, lanes * STEPS + 7):
+        assert n[place_of(x, lanes)] == 0
+    out = np.full(window, 3, dtype)
+    write_counts(n, out)
+    np.testing.assert_array_equal(out, counts + 3)
+
+
+@pytest.mark.parametrize("times", [0, 1, 2, 5, 10])
+def test_halving_rounds_the_same_from_planes_and_from_counts(times):
+    counts = np.random.default_rng(times).integers(0, 60 << times, 128).astype(np.uint32)
+    counts[:2] = 0, (60 << times) - 1
+    one, other = new_counts(16), new_counts(16)
+    read_counts(counts, times, address(one), 16)
+    np.testing.assert_array_equal(pixels_of(one, 16), (counts + ((1 << times) >> 1)) >> times)
+    if counts.max() <= 32767:
+        read_counts(counts, 0, address(other), 16)
+        halve_counts(address(other), 16, times)
+        np.testing.assert_array_equal(other, one)
+
+
+def test_the_largest_counts_are_halved_without_running_over():
+    counts = np.full(64, 2**31, np.uint32)
+    n = new_counts(16)
+    read_counts(counts, 26, address(n), 16)
+    assert set(pixels_of(n, 16)[:64].tolist()) == {32}
+
+
+def test_sums_of_counts_are_in_pixel_order_when_asked():
+    rng = np.random.default_rng(1)
+    sums = np.zeros((3, STEPS, 16), np.int16)
+    wanted = np.zeros((3, 128), np.int64)
+    for _ in range(10):
+        for y in range(3):
+            counts, n = rng.integers(0, 200, 128).astype(np.uint8), new_counts(16)
+            read_counts(counts, 0, address(n), 16)
+            sum_counts(address(n), 16, address(sums[y]))
+            wanted[y] += counts
+    for width in (128, 100, 1):
+        np.testing.assert_array_equal(pixel_order(sums, width), wanted[:, :width])
+
+
+def test_room_of_a_vector_is_kept_on_both_sides():
+    assert PAD >= LANES
