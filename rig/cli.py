@@ -292,6 +292,7 @@ def bench_command(
     with _progress("rows") as bar:
         report = api.bench(threads=threads, progress=bar)
     content = report.as_json()
+    code = 0
     if not as_json:
         from rig.bench.table import speed_table
 
@@ -308,9 +309,10 @@ def bench_command(
 
             print()
             soak_table(found)
+        code = found.exit_code
     if as_json:
         _print_json(content)
-    return 0
+    return code
 
 
 @app.command("warmup")

@@ -19,7 +19,7 @@ from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views
 
 LEAD_FRAMES = 200
-"""Frames before the first scan marker: the end of a sweep, as of a scanner that runs already."""
+"""Most frames before the first scan marker: the end of a sweep, as of a scanner that runs already."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +56,7 @@ class LoopedSpad(SpadArray):
         self._frame_s = float(timing.frame_period_ticks / timing.tick_hz)
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._run_id = 0
+        self._lead = min(LEAD_FRAMES, len(loop.records) // (2 * loop.sweeps))
         self.late_max_s = 0.0
         """How far the latest block was behind its own time: the source, too, needs its share of the processor."""
 
@@ -129,7 +130,7 @@ class LoopedSpad(SpadArray):
         records, bits = block_views(memory, self._layout(n))
         done = 0
         while done < n:
-            cycle, at = divmod(first + done + length - LEAD_FRAMES, length)
+            cycle, at = divmod(first + done + length - self._lead, length)
             size = min(n - done, length - at)
             records[done : done + size] = loop.records[at : at + size]
             # Before the first marker, cycle 0, the sweeps that the loop counts from 1 on are over or have not begun.

@@ -4,12 +4,13 @@ The bundled simulated rig records a few sweeps, once. A SPAD that cannot wait pl
 frame numbers; all else is as in a scan: ring, binding, counting, estimation, maps, a monitor, and the overload policy.
 """
 
+import logging
 import math
 import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,8 @@ from rig.stages import PipelineStats
 from rig.warm_up import warm_up
 
 CONFIG = "simulated"
+EXIT_DEVICE = 3
+"""Exit code of a scan that the overload policy ended."""
 LOOP_S = 0.2
 """Least time that the recorded sweeps last: many times what a cache holds."""
 LINK_MARGIN = 1.02
@@ -48,13 +51,13 @@ _STATM = Path("/proc/self/statm")
 
 @dataclass(frozen=True, slots=True)
 class SoakFrames:
-    """Frames by the SPAD's own count (exposed = delivered + lost) and by that of the sweeps' markers.
+    """Frames by the SPAD's own count (exposed = received + lost) and by that of the sweeps, from marker to marker.
 
     agree: whether both add up, and the SPAD lost what the ring dropped, to the frame.
     """
 
     exposed: int
-    delivered: int
+    received: int
     lost: int
     expected_in_sweeps: int
     received_in_sweeps: int
@@ -66,10 +69,10 @@ class SoakFrames:
 class SoakReport:
     """What a soak found.
 
-    seconds: of stream played. maps: of maps_planned. resident_*: memory of the process when a tenth of the maps was
-    made, and at the end; None where the system does not say. times_real_time: length of a sweep over the mean time in
-    which its frames were counted and its map made. source_late_max_s: latest block behind its own time. ended_by: what
-    ended the run early.
+    seconds: of stream played. maps: of maps_planned. times_real_time: time that the frames received took over that in
+    which they were bound, counted and made maps of, without the first map. resident_*: memory of the process when a
+    tenth of the maps was made, and at the end; None where the system does not say. source_late_max_s: latest block
+    behind its own time. ended_by: what ended the run early.
     """
 
     seconds: float
@@ -87,6 +90,13 @@ class SoakReport:
     ended_by: str | None
     stages: PipelineStats
     machine: dict[str, Any]
+
+    @property
+    def exit_code(self) -> int:
+        """As of a scan: 3 where the stream was ended by the ring, 1 where frames were lost or do not add up."""
+        if self.ended_by is not None:
+            return EXIT_DEVICE
+        return int(self.frames.lost > 0 or not self.frames.agree)
 
     def as_json(self) -> dict[str, Any]:
         """For programs."""
@@ -132,7 +142,20 @@ def soak(options: SoakOptions, progress: Callable[[int, int], None] | None = Non
         raise UsageError(f"a soak of {options.seconds:g} s, slowed by {options.slow_s:g} s; ask for more than 0 s")
     with _looped_rig(options.window) as (rig, plan, spad):
         require_policy(options.policy, spad.info)
-        return _run(rig, plan, spad, options, progress)
+        with _quiet_sweeps():
+            return _run(rig, plan, spad, options, progress)
+
+
+@contextmanager
+def _quiet_sweeps() -> Iterator[None]:
+    """Without a line for every sweep that lost frames: there may be thousands, and the report counts them."""
+    log = logging.getLogger("rig.sweeps")
+    before = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
 
 
 @contextmanager
@@ -164,11 +187,10 @@ def _recorded(rig: OpenRig, plan: ScanPlan) -> Loop:
     whole = plan.frames_per_sweep.denominator
     sweeps = math.ceil(math.ceil(LOOP_S / float(plan.sweep_s)) / whole) * whole
     with tempfile.TemporaryDirectory(prefix="spadrig-bench-") as folder:
-        recording = Recording(Path(folder) / "frames.spb")
         maker = _reconstructor(rig, plan, "argmax", 1)
-        for _ in Acquisition(rig, plan, timing, sweeps, maker, recording=recording).run():
-            pass
-        recording.close()
+        with closing(Recording(Path(folder) / "frames.spb")) as recording:
+            for _ in Acquisition(rig, plan, timing, sweeps, maker, recording=recording).run():
+                pass
         file = np.memmap(recording.path, np.uint8, "r")
         blocks = (block for block in walk_blocks(file, None, check_payload=False) if isinstance(block, FrameBlock))
         return Loop.of(blocks, sweeps)
@@ -203,7 +225,7 @@ def _run(
         rig, plan, timing, maps, _SlowMaker(_reconstructor(rig, plan, "likelihood", threads), options.slow_s),
         policy=options.policy, first_alone=True, watch=_look, on_progress=tell,
     )  # fmt: skip
-    expected = received = lost = made = 0
+    expected = received = lost = made = worked_off = 0
     compute_s = 0.0
     ended_by: str | None = None
     try:
@@ -211,7 +233,8 @@ def _run(
             made += 1
             frames = found.sweep.frames
             expected, received, lost = expected + frames.expected, received + frames.received, lost + frames.lost
-            compute_s += found.compute_s if made > 1 else 0.0
+            if made > 1:  # the first map is learned from, which is done once
+                worked_off, compute_s = worked_off + frames.received, compute_s + found.compute_s
             resident.append(_resident_bytes())
             if made <= max(1, SETTLED * maps):
                 settled = made - 1
@@ -227,7 +250,7 @@ def _run(
         maps=made,
         maps_planned=maps,
         frames=_account(counters, stages, expected, received, lost),
-        times_real_time=(made - 1) * float(plan.sweep_s) / compute_s if compute_s else None,
+        times_real_time=worked_off / float(plan.frame_rate_hz) / compute_s if compute_s else None,
         resident_settled_bytes=first,
         resident_end_bytes=last,
         resident_growth=None if first is None or last is None else last / first - 1,

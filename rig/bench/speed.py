@@ -175,9 +175,9 @@ def _cases(
         walk = Walk(len(these.bits) // PLACE_FRAMES)
         size = these.frame_bytes
         for k in sorted({*COUNT_EXPOSURES, *extent.exposures}):
+            cases.append(_Case("numpy", window, k, 1, size, numpy_stage(these, walk, k)))
             cases += [_Case("count", window, k, n, size, count_stage(these, walk, k, w)) for n, w in workers.items()]
         for k in extent.exposures:
-            cases.append(_Case("numpy", window, k, 1, size, numpy_stage(these, walk, k)))
             cases += [
                 _Case("likelihood", window, k, n, size, search_stage(these, walk, k, w, learned[window]))
                 for n, w in workers.items()

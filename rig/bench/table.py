@@ -58,7 +58,7 @@ def soak_table(report: SoakReport) -> None:
     table.add_row("stream", f"{report.seconds:.1f} s of frames {report.frame_width} pixels wide")
     table.add_row(
         "frames",
-        f"{frames.exposed} exposed, {frames.delivered} delivered, {frames.lost} lost: {added}",
+        f"{frames.exposed} exposed, {frames.received} received, {frames.lost} lost: {added}",
     )
     table.add_row(
         "in sweeps",

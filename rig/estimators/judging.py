@@ -6,12 +6,13 @@ from numpy.typing import NDArray
 from rig.estimators.closeup_kernels import closeup_tables
 from rig.estimators.row_input import TABLE, State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
-from rig.estimators.row_search import COUNT_LIMIT, FIELDS, QUIET_STEP, SIGNAL_REACH_PX, Found, Judge, count_fluxes
+from rig.estimators.row_search import COUNT_LIMIT, FIELDS, QUIET_STEP, SIGNAL_REACH_PX, Found, Judge, count_fluxes, halvings, turned
 from rig.estimators.screen_tables import SCREENS, Tables, fill_tables
 from rig.geometry import SweepGeometry
 from rig.lane_order import STEPS, padded_lanes
 from rig.lanes import LANES
 from rig.row_threads import RowWorkers
+from rig.stripes import StripeTable
 
 BAND_ROWS = (64, 32, 16, 8, 4)
 """Rows that share a table: as many as a line crosses without leaving a pixel."""
@@ -39,12 +40,13 @@ def judge_of(
     bands, columns = state.ambient.shape[0], geometry.columns
     tables = _empty_tables(columns, bands, padded_lanes(geometry.window), reach)
     most = min(exposures + 2, COUNT_LIMIT)
+    nominal = exposures / 2.0 ** halvings(exposures)
     for shift in range(MOST_HALVINGS + 1):
         if most * _largest_taps(sweep, state, light, reach, 128 >> shift) <= SCORE_LIMIT:
             break
 
     def work(first: int, last: int) -> None:
-        fill_tables(sweep, state, light, log_share, float(128 >> shift), first, last, tables)
+        fill_tables(sweep, state, light, log_share, float(128 >> shift), nominal, first, last, tables)
 
     workers.over(bands, work)
     haze, rest = model.profile[:, 0], model.profile[:, 1]
@@ -62,12 +64,13 @@ def judge_of(
         band_rows=band_rows,
         x0=geometry.x0,
         window=geometry.window,
-        x_lo=geometry.x_lo,
-        x_hi=geometry.x_hi,
+        rows=geometry.rows,
+        limits=_limits(geometry),
         near_is_left=geometry.near_is_left,
         ambient=padded,
         hot_start=np.searchsorted(y, np.arange(geometry.rows + 1)).astype(np.int32),
         hot_x=x.astype(np.int32),
+        nominal=nominal,
         faintest=float(model.amplitude[0]),
         brightest=float(model.amplitude[-1]),
         reach=max(SIGNAL_REACH_PX, reach),
@@ -83,8 +86,8 @@ def nothing_found(
     """Empty results of a sweep; lines: (rows, columns) whose counts are to be kept, sorted by column."""
     rows, columns = geometry.rows, geometry.columns
     lanes = -(-geometry.width // 64) * 64 // STEPS + LANES
-    stripe = np.full((FIELDS, rows, columns), np.nan, np.float32)
-    stripe[1] = 0.0
+    stripe = np.full((columns, FIELDS, rows), np.nan, np.float32)
+    stripe[:, 1] = 0.0
     line_row, line_column = (np.zeros(0, np.int32),) * 2 if lines is None else lines
     return Found(
         stripe=stripe,
@@ -97,6 +100,21 @@ def nothing_found(
         line_start=np.searchsorted(line_column, np.arange(columns + 1)).astype(np.int32),
         line_row=np.ascontiguousarray(line_row),
     )
+
+
+def stripes_of(found: Found, workers: RowWorkers) -> StripeTable:
+    """The stripe table of a sweep that has been judged."""
+    columns, fields, rows = found.stripe.shape
+    out = np.empty((fields, rows, columns), np.float32)
+    workers.over(rows, lambda first, last: turned(found.stripe, first, last, out))
+    return StripeTable(*out)
+
+
+def _limits(geometry: SweepGeometry) -> NDArray[np.int16]:
+    low = np.maximum(geometry.x_lo - geometry.x0, 0)
+    high = np.minimum(geometry.x_hi - geometry.x0, geometry.window - 1)
+    limits = np.where(geometry.x_lo <= geometry.x_hi, np.stack([low, high]), [[[1]], [[0]]])
+    return np.ascontiguousarray(limits.transpose(2, 1, 0), dtype=np.int16)
 
 
 def rows_of_band(geometry: SweepGeometry) -> int:
@@ -154,7 +172,7 @@ def _empty_tables(columns: int, bands: int, lanes: int, reach: int) -> Tables:
 
     return Tables(
         edge=of(pixels, dtype=np.int16), tap=of(SCREENS, 2 * reach + 1, pixels, dtype=np.int16),
-        position=of(SCREENS, pixels), prior=of(SCREENS, pixels), lane=of(lanes), none=of(3), neutral=of(pixels),
+        position=of(SCREENS, pixels, dtype=np.int16), slope=of(SCREENS, pixels, dtype=np.int16), lane=of(lanes), none=of(3), neutral=of(pixels),
         before=of(pixels), scale=of(pixels), first=of(dtype=np.int32), last=of(dtype=np.int32),
     )  # type: ignore[arg-type]  # fmt: skip
 
@@ -173,5 +191,5 @@ def _largest_taps(sweep: Sweep, state: State, light: NDArray[np.float32], reach:
         column_gain=np.ascontiguousarray(state.column_gain[columns]),
     )  # fmt: skip
     tables = _empty_tables(len(columns), 1, padded_lanes(sweep.window), reach)
-    fill_tables(few, part, light, np.zeros(SCREENS, np.float32), float(units), 0, 1, tables)
+    fill_tables(few, part, light, np.zeros(SCREENS, np.float32), float(units), 1.0, 0, 1, tables)
     return float(np.abs(tables.tap.astype(np.int64)).sum(axis=3).max(initial=1))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rig.counting import Counter, CountVolume, FrameTally, SweepCounter, SweepLayout
 from rig.estimators.ambient import ambient_map
-from rig.estimators.judging import judge_of, nothing_found
+from rig.estimators.judging import judge_of, nothing_found, stripes_of
 from rig.estimators.learning import Expectation, learn_first, learn_next, lines_of, next_lattice
 from rig.estimators.row_input import Lines
 from rig.estimators.row_model import RowModel
@@ -118,7 +118,7 @@ class Likelihood:
 
         self._workers.over(geometry.rows, work)
         exposed = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), 8, axis=1)[:, : geometry.width]
-        return StripeTable(*found.stripe), np.stack([pixel_order(found.quiet, geometry.width), exposed])
+        return stripes_of(found, self._workers), np.stack([pixel_order(found.quiet, geometry.width), exposed])
 
 
 class _LikelihoodCounter:

@@ -62,9 +62,10 @@ SIGNAL_REACH_PX: Final = 2
 class Judge(NamedTuple):
     """All that is needed to judge the rows of a sweep; fixed while the sweep lasts.
 
-    x0: int32 (columns,), first stored pixel; window: stored pixels; x_lo, x_hi: int32 (rows, columns), search windows.
+    x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, rows, 2), first and last
+    stored pixel of each search window, the first behind the last where there is none. rows: of the picture.
     ambient: float32 (bands, width padded to whole words). hot_start: int32 (rows + 1,) and hot_x: int32, pixels of each
-    row whose counts say nothing. faintest, brightest: photons of a stripe at scale 1. reach: half the line's width in
+    row whose counts say nothing. nominal: exposures the tables are for. faintest, brightest: photons of a stripe at scale 1. reach: half the line's width in
     px. shift: units of the scores are 128 >> shift an octave. quiet_step: every so manieth column teaches the ambient
     light. flux: see `count_fluxes`.
     """
@@ -74,12 +75,13 @@ class Judge(NamedTuple):
     band_rows: int
     x0: NDArray[np.int32]
     window: int
-    x_lo: NDArray[np.int32]
-    x_hi: NDArray[np.int32]
+    rows: int
+    limits: NDArray[np.int16]
     near_is_left: bool
     ambient: NDArray[np.float32]
     hot_start: NDArray[np.int32]
     hot_x: NDArray[np.int32]
+    nominal: float
     faintest: float
     brightest: float
     reach: int
@@ -91,7 +93,7 @@ class Judge(NamedTuple):
 class Found(NamedTuple):
     """What a sweep gives, to be filled.
 
-    stripe: float32 (FIELDS, rows, columns), NaN and confidence 0 where there is nothing. quiet: int32 (rows, STEPS,
+    stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 where there is nothing. quiet: int32 (rows, STEPS,
     lanes of the sensor and LANES more), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures:
     int32 (rows, lanes + 1), their exposures as steps up and down. light: int32, like quiet, ones of every pixel within
     the windows; those since the window last moved are still in light_here, int16 (rows, STEPS, lanes of the window).
@@ -128,7 +130,7 @@ class Desk(NamedTuple):
     edge: int
     tap: int
     position: int
-    prior: int
+    slope: int
     lane: int
     none: int
     neutral: int
@@ -142,8 +144,7 @@ class Desk(NamedTuple):
     index: int
     square: int
     x0: int
-    x_lo: int
-    x_hi: int
+    limits: int
     ambient: int
     ambient_px: int
     hot_start: int
@@ -164,6 +165,7 @@ class Desk(NamedTuple):
     shift: int
     quiet_step: int
     near_is_left: bool
+    nominal: np.float32
     faintest: np.float32
     brightest: np.float32
 
@@ -173,18 +175,18 @@ def desk_of(judge: Judge, found: Found, bench: Bench) -> Desk:
     """Addresses of everything; the arrays must outlive it."""
     tables, closeup = judge.tables, judge.closeup
     return Desk(
-        search_in(bench.search, tables.lane.shape[2]), judge.x0.shape[0], judge.x_lo.shape[0], tables.lane.shape[1],
+        search_in(bench.search, tables.lane.shape[2]), judge.x0.shape[0], judge.rows, tables.lane.shape[1],
         tables.tap.shape[3], address_of(tables.edge), address_of(tables.tap), address_of(tables.position),
-        address_of(tables.prior), address_of(tables.lane), address_of(tables.none), address_of(tables.neutral),
+        address_of(tables.slope), address_of(tables.lane), address_of(tables.none), address_of(tables.neutral),
         address_of(tables.before), address_of(tables.scale), address_of(tables.first), address_of(tables.last),
         address_of(closeup.weight), address_of(closeup.constant), closeup.weight.shape[2], address_of(closeup.index),
         address_of(closeup.square),
-        address_of(judge.x0), address_of(judge.x_lo), address_of(judge.x_hi), address_of(judge.ambient),
+        address_of(judge.x0), address_of(judge.limits), address_of(judge.ambient),
         judge.ambient.shape[1], address_of(judge.hot_start), address_of(judge.hot_x), address_of(bench.ambient),
         address_of(judge.flux), address_of(found.stripe), address_of(found.quiet_here), address_of(found.quiet_exposures),
         address_of(found.light_here), found.light.shape[2], address_of(found.lines), address_of(found.line_start),
         address_of(found.line_row), judge.band_rows, judge.window, judge.reach, judge.shift,
-        judge.quiet_step, judge.near_is_left, np.float32(judge.faintest), np.float32(judge.brightest),
+        judge.quiet_step, judge.near_is_left, np.float32(judge.nominal), np.float32(judge.faintest), np.float32(judge.brightest),
     )  # fmt: skip
 
 
@@ -216,10 +218,12 @@ def halvings(exposures: int) -> int:
 def set_column(desk: Desk, c: int, b: int, exposures: float) -> None:
     """Make ready for rows of band b of column c."""
     pixels, table = STEPS * desk.search.lanes, c * desk.bands + b
-    positions = 4 * SCREENS * pixels * table
+    positions = 2 * SCREENS * pixels * table
     lane = desk.lane + 4 * desk.search.lanes * table
     none = desk.none + 12 * table
-    set_exposures(desk.position + positions, desk.prior + positions, lane, none, exposures, desk.search)
+    set_exposures(
+        desk.position + positions, desk.slope + positions, lane, none, exposures, desk.nominal, desk.search
+    )
     first = b * desk.ambient_px + read_int32(desk.x0, c)
     for x in range(desk.window):
         write_float32(desk.own_ambient, x, read_float32(desk.ambient, first + x))
@@ -297,17 +301,17 @@ def _measure_light(desk: Desk, first: int, rows: int, c: int, table: int, exposu
     search = desk.search
     lanes = search.lanes
     pixels = STEPS * lanes
-    x0 = np.int64(read_int32(desk.x0, c))
-    field = 4 * desk.rows * desk.columns
+    stripe = desk.stripe + 4 * FIELDS * desk.rows * c
+    limits = desk.limits + 4 * desk.rows * c
     flux = desk.flux + 4 * (COUNT_LIMIT + 2) * np.int64(exposures)
     for r in range(rows):
         n = search.n + r * search.n_bytes
-        to = (first + r) * desk.columns + c
-        low, high = np.int64(read_int32(desk.x_lo, to)) - x0, np.int64(read_int32(desk.x_hi, to)) - x0
+        y = first + r
+        low, high = np.int64(read_int16(limits, 2 * y)), np.int64(read_int16(limits, 2 * y + 1))
         if low > high:
             write_int32(search.x, r, np.int32(NOWHERE))
             continue
-        x = min(max(np.int64(read_int32(search.x, r)), low, 0), high, desk.window - 1)
+        x = min(max(np.int64(read_int32(search.x, r)), low), high)
         light = np.float32(0.0)
         for at in range(x - desk.reach, x + desk.reach + 1):
             light += read_float32(flux, read_int16(n, place_of(at, lanes)))
@@ -317,8 +321,8 @@ def _measure_light(desk: Desk, first: int, rows: int, c: int, table: int, exposu
         signal = min(max(light, desk.faintest * scale), desk.brightest * scale)
         write_int32(search.x, r, np.int32(x))
         write_int32(search.levels, r, np.int32(level_of(before) * LEVELS + level_of(signal)))
-        write_float32(desk.stripe + 3 * field, to, signal)
-        write_float32(desk.stripe + 4 * field, to, max(before - ambient, np.float32(0.0)))
+        write_float32(stripe, 3 * desk.rows + y, signal)
+        write_float32(stripe, 4 * desk.rows + y, max(before - ambient, np.float32(0.0)))
 
 
 @numba.njit(cache=True, nogil=True, fastmath=NO_NAN)
@@ -326,7 +330,7 @@ def _look_closely(desk: Desk, first: int, rows: int, c: int, exposures: float) -
     """Place the lines of the batch's rows, and write the answers."""
     search = desk.search
     x0 = np.int64(read_int32(desk.x0, c))
-    field = 4 * desk.rows * desk.columns
+    stripe = desk.stripe + 4 * FIELDS * desk.rows * c
     for r in range(rows):
         x, levels = np.int64(read_int32(search.x, r)), np.int64(read_int32(search.levels, r))
         if x != NOWHERE:
@@ -337,12 +341,12 @@ def _look_closely(desk: Desk, first: int, rows: int, c: int, exposures: float) -
             )  # fmt: skip
             store_float32(search.mass, r * LANES, likelihood)
     for r in range(rows):
-        x, to = np.int64(read_int32(search.x, r)), (first + r) * desk.columns + c
+        x, y = np.int64(read_int32(search.x, r)), first + r
         if x != NOWHERE:
             offset, sd = place_line(load_float32(search.mass, r * LANES), desk.index, desk.square)
-            write_float32(desk.stripe, to, np.float32(x0 + x) + offset)
-            write_float32(desk.stripe + field, to, read_float32(search.confidence, r))
-            write_float32(desk.stripe + 2 * field, to, sd)
+            write_float32(stripe, y, np.float32(x0 + x) + offset)
+            write_float32(stripe, desk.rows + y, read_float32(search.confidence, r))
+            write_float32(stripe, 2 * desk.rows + y, sd)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -370,11 +374,19 @@ def _learn_quiet(desk: Desk, n: int, y: int, c: int, x: int, exposures: float) -
 
 
 @numba.njit(cache=True, nogil=True)
-def keep_lines(desk: Desk, n: int, y: int, line: int, end: int) -> int:
-    """Keep the counts of row y where the learning reads them; line: the column's next one, which is returned."""
-    while line < end and read_int32(desk.line_row, line) == y:
-        for x in range(desk.window):
-            count = np.int32(read_int16(n, place_of(x, desk.search.lanes)))
-            write_int32(desk.lines, line * desk.window + x, count)
-        line += 1
-    return line
+def keep_line(n: int, lanes: int, window: int, to: int) -> None:
+    """Write the counts of a row in pixel order, int32, where the learning reads them; n, to: addresses."""
+    for x in range(window):
+        write_int32(to, x, np.int32(read_int16(n, place_of(x, lanes))))
+
+
+@numba.njit(cache=True, nogil=True)
+def turned(stripe: NDArray[np.float32], first_row: int, last_row: int, out: NDArray[np.float32]) -> None:
+    """Rows first_row..last_row-1 of (columns, FIELDS, rows) answers as (FIELDS, rows, columns), in blocks that fit caches."""
+    columns, fields, _ = stripe.shape
+    for y0 in range(first_row, last_row, 16):
+        for c0 in range(0, columns, 16):
+            for f in range(fields):
+                for y in range(y0, min(y0 + 16, last_row)):
+                    for c in range(c0, min(c0 + 16, columns)):
+                        out[f, y, c] = stripe[c, f, y]

@@ -21,8 +21,9 @@ from rig.lane_order import STEPS
 
 SCREENS: Final = 2
 """Stripe amplitudes of the search; all of them take part in what follows it."""
-OUTSIDE: Final = np.float32(-1e6)
-"""Log prior of a position where the column's stripe cannot lie."""
+OUTSIDE: Final = -32000
+"""Score of a position where the column's stripe cannot lie."""
+SLOPE: Final = 8
 LN2: Final = 0.6931471805599453
 WEIGHT_LIMIT: Final = 30000.0
 """Largest sum of products of counts and weights, with room to 32767."""
@@ -33,8 +34,8 @@ class Tables(NamedTuple):
 
     edge: int16 (columns, bands, P), weight of a count left of the stripe.
     tap: int16 (columns, bands, SCREENS, 2T + 1, P), weight at position x of a count at x - T .. x + T.
-    position: float32 (columns, bands, SCREENS, P), units per exposure of position x.
-    prior: float32 (columns, bands, SCREENS, P), units of position x and amplitude, whatever the exposures.
+    position: int16 (columns, bands, SCREENS, P), units of position x at the nominal number of exposures, its prior
+    included; slope: int16, the same shape, by how many 1 / SLOPE of a unit it grows with each exposure more.
     lane: float32 (columns, bands, lanes), units per exposure of all pixels of a lane lying left of the stripe.
     none: float32 (columns, bands, 3), units of 'no stripe': all as right, all as left, a change somewhere (per lane).
     neutral: float32 (columns, bands, P), ones per exposure that say nothing, in pixel order.
@@ -44,8 +45,8 @@ class Tables(NamedTuple):
 
     edge: NDArray[np.int16]
     tap: NDArray[np.int16]
-    position: NDArray[np.float32]
-    prior: NDArray[np.float32]
+    position: NDArray[np.int16]
+    slope: NDArray[np.int16]
     lane: NDArray[np.float32]
     none: NDArray[np.float32]
     neutral: NDArray[np.float32]
@@ -62,6 +63,7 @@ def fill_tables(
     light: NDArray[np.float32],
     log_share: NDArray[np.float32],
     units: float,
+    nominal: float,
     first_band: int,
     last_band: int,
     out: Tables,
@@ -69,7 +71,7 @@ def fill_tables(
     """Tables of bands first_band..last_band-1.
 
     sweep, state: as of a sweep whose rows are the bands (see `banded`), its counts unused. light, log_share:
-    (SCREENS,), amplitudes of the search and the logarithm of their probability. units: per octave.
+    (SCREENS,), amplitudes of the search and the logarithm of their probability. units: per octave. nominal: exposures.
     """
     columns = sweep.plane.shape[0]
     pixels = out.edge.shape[2]
@@ -82,14 +84,14 @@ def fill_tables(
     gain, loss = state.table[0], state.table[1]
     for b in range(first_band, last_band):
         for c in range(columns):
-            edge, tap, position, prior = out.edge[c, b], out.tap[c, b], out.position[c, b], out.prior[c, b]
+            edge, tap = out.edge[c, b], out.tap[c, b]
             edge[:] = 0
             tap[:] = 0
-            position[:] = 0.0
-            prior[:] = OUTSIDE
+            out.position[c, b] = OUTSIDE
+            out.slope[c, b] = 0
             out.lane[c, b] = 0.0
             out.neutral[c, b] = 0.0
-            out.none[c, b] = OUTSIDE
+            out.none[c, b] = np.float32(OUTSIDE)
             out.first[c, b], out.last[c, b] = 0, -1
             length, begin, end, start = row_fluxes(sweep, state, row, b, c)
             if length == 0:
@@ -112,20 +114,20 @@ def fill_tables(
                 if abs(weight) > 1e-3:
                     out.neutral[c, b, x] = min(max(-constant / weight, np.float32(0.0)), np.float32(1.0))
             _positions(
-                sweep, state, light, log_share, per_nat, b, c, low, length, reach, row, begin, end, step, start, left,
-                right, flux_left, flux_right, out,
+                sweep, state, light, log_share, per_nat, nominal, b, c, low, length, reach, row, begin, end, step, start,
+                left, right, flux_left, flux_right, out,
             )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
 def _positions(
-    sweep, state, light, log_share, per_nat, b, c, low, length, reach, row, begin, end, step, start, left, right,
-    flux_left, flux_right, out,
+    sweep, state, light, log_share, per_nat, nominal, b, c, low, length, reach, row, begin, end, step, start, left,
+    right, flux_left, flux_right, out,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Taps, constants and priors of every position of one table."""
     gain, loss = state.table[0], state.table[1]
     lanes = out.lane.shape[2]
-    tap, position, prior = out.tap[c, b], out.position[c, b], out.prior[c, b]
+    tap = out.tap[c, b]
     first = (start + step * (begin if step > 0 else end)) - sweep.x0[c]
     last = (start + step * (end if step > 0 else begin)) - sweep.x0[c]
     out.first[c, b], out.last[c, b] = first, last
@@ -150,10 +152,11 @@ def _positions(
                 cell = cell_of(min(base + extra, FLUX_MAX))
                 tap[m, d + reach, place] = np.int16(round((gain[cell] - own_gain) * per_nat))
                 constant += (loss[cell] - own_loss) * per_nat
-            position[m, place] = constant
             if first <= x <= last:
                 t = x - low if step > 0 else length - 1 - (x - low)
-                prior[m, place] = (row.log_prior[t] + log_share[m]) * per_nat
+                prior = (row.log_prior[t] + log_share[m]) * per_nat
+                out.position[c, b, m, place] = _within(nominal * constant + prior, OUTSIDE, -OUTSIDE)
+                out.slope[c, b, m, place] = _within(SLOPE * constant, -32767.0, 32767.0)
         within += (left[1, x] - right[1, x]) * per_nat
         out.lane[c, b, x // STEPS] += (left[1, x] - right[1, x]) * per_nat
     mass = 0.0
@@ -167,6 +170,11 @@ def _positions(
     out.none[c, b, 0] = (np.log(all_right) - share) * per_nat
     out.none[c, b, 1] = (np.log(all_left) - share) * per_nat
     out.none[c, b, 2] = (np.log(change * STEPS / (length + 1)) - share) * per_nat
+
+
+@numba.njit(inline="always")
+def _within(value, low, high):  # type: ignore[no-untyped-def]
+    return np.int16(round(min(max(value, low), high)))
 
 
 @numba.njit(inline="always")

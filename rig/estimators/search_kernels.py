@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.powers import nothing_below, power, powers
-from rig.estimators.screen_tables import SCREENS
+from rig.estimators.screen_tables import OUTSIDE, SCREENS, SLOPE
 from rig.lane_order import PAD, STEPS
 from rig.lanes import (
     LANES,
@@ -98,16 +98,25 @@ def search_in(memory: NDArray[np.int16], lanes: int) -> Search:
 
 
 @numba.njit(cache=True, nogil=True)
-def set_exposures(position: int, prior: int, lane: int, none: int, exposures: float, search: Search) -> None:
+def set_exposures(
+    position: int, slope: int, lane: int, none: int, exposures: float, nominal: float, search: Search
+) -> None:
     """Make the constants of one table, given by addresses, for columns of so many exposures."""
     for i in range(3):
         write_int16(search.none, i, np.int16(max(read_float32(none, i), np.float32(-32000))))
-    exposures = np.float32(exposures)
-    for i in range(SCREENS * STEPS * search.lanes):
-        constant = exposures * read_float32(position, i) + read_float32(prior, i)
-        write_int16(search.constant, i, np.int16(min(max(constant, np.float32(-32000)), np.float32(32000))))
+    more = np.float32(exposures) - np.float32(nominal)
+    places = SCREENS * STEPS * search.lanes
+    if more == 0:
+        for i in range(0, places, LANES):
+            store_int16(search.constant, i, load_int16(position, i))
+    else:
+        for i in range(places):
+            constant = np.float32(read_int16(position, i)) + more / np.float32(SLOPE) * np.float32(read_int16(slope, i))
+            inside = read_int16(position, i) > OUTSIDE
+            constant = min(max(constant, np.float32(OUTSIDE)), np.float32(-OUTSIDE))
+            write_int16(search.constant, i, np.int16(constant) if inside else np.int16(OUTSIDE))
     for i in range(search.lanes):
-        constant = exposures * read_float32(lane, i)
+        constant = np.float32(exposures) * read_float32(lane, i)
         write_int16(search.lane, i, np.int16(min(max(constant, np.float32(-32000)), np.float32(32000))))
 
 

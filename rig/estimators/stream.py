@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rig.counting import FrameTally, SweepLayout, SweepTally
 from rig.counting_kernels import CHUNK, add_runs, new_planes
-from rig.estimators.judging import nothing_found
+from rig.estimators.judging import nothing_found, stripes_of
 from rig.estimators.learning import next_lattice
 from rig.estimators.row_input import Lines
 from rig.estimators.row_search import Bench, Found, Judge, new_bench
@@ -63,7 +63,12 @@ class ColumnJudge:
         first_word = x0 // np.int32(64)
         self._tally.note(bins, column, first_word)
         words, row_words = bits.reshape(-1).view(np.uint64), bits.shape[2] // 8
-        self._judge_block(words, bins, first_word, row_words, end=False)
+        frame_words = self._layout.rows * row_words
+        # In pieces that the 16-bit sums have room for: blocks of small sensors hold very many frames.
+        for first in range(0, len(bins), SUM_LIMIT):
+            last = first + SUM_LIMIT
+            piece = words[first * frame_words : last * frame_words]
+            self._judge_block(piece, bins[first:last], first_word[first:last], row_words, end=False)
         if np.any(bins == -1):
             layout = self._layout
 
@@ -88,7 +93,7 @@ class ColumnJudge:
         tally = self._tally.finish()
         return SearchedSweep(
             n_frames=tally.n_frames, column=tally.column, dark_counts=tally.dark_counts, n_dark=tally.n_dark,
-            width=tally.width, dark_frames=tally.dark_frames, stripe=StripeTable(*found.stripe),
+            width=tally.width, dark_frames=tally.dark_frames, stripe=stripes_of(found, self._workers),
             light=pixel_order(found.light, layout.width).astype(np.uint32),
             quiet=np.stack([pixel_order(found.quiet, layout.width), exposures]),
             lines=Lines(found.lines, rows, columns, tally.n_frames[columns]),

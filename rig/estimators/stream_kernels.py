@@ -20,7 +20,7 @@ from rig.estimators.row_search import (
     desk_of,
     halvings,
     judge_rows,
-    keep_lines,
+    keep_line,
     set_column,
 )
 from rig.estimators.search_kernels import BATCH
@@ -120,7 +120,9 @@ def _finish(desk, found, state, planes, row_bytes, first_row, last_row):  # type
             at += row_bytes
             sum_counts(counts, lanes, light)
             light += 2 * STEPS * lanes
-            line = keep_lines(desk, counts, y + r, line, last_line)
+            while line < last_line and read_int32(desk.line_row, line) == y + r:
+                keep_line(counts, lanes, desk.window, desk.lines + 4 * desk.window * line)
+                line += 1
             if halved:
                 halve_counts(counts, lanes, halved)
         judge_rows(desk, y, rows, c, band, exposures)
@@ -148,7 +150,7 @@ def search_frames(
     first_word: (n,) of each frame's window; row_words: words of a row; end: the sweep ends here, nothing stays open;
     planes: see `new_planes`. Only the rows of chunks first_chunk..last_chunk-1 are touched.
     """
-    rows = judge.x_lo.shape[0]
+    rows = judge.rows
     frame = rows * row_words
     chunk_rows = max(CHUNK // row_words, 1)
     desk = desk_of(judge, found, bench)

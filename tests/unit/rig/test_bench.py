@@ -1,0 +1,288 @@
+"""The bench: its frames are what it says, its rows are complete, its stream accounts for every frame."""
+
+import itertools
+import json
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from drivers.clock import VirtualClock
+from drivers.errors import LimitExceeded
+from drivers.frames import Mark
+from drivers.interfaces import SpadRequest, SpadTiming
+from drivers.ring import BlockRing, OnFull
+from drivers.spb1 import walk_blocks
+from rig import api, cli
+from rig.bench import looped_spad, speed
+from rig.bench.bench_kernels import count_columns, draw_frames, read_all
+from rig.bench.frames import EDGE_PX, PLACE_FRAMES, ROWS, WIDTH, full_frames, window_frames
+from rig.bench.looped_spad import LEAD_FRAMES, Loop, LoopedSpad
+from rig.bench.recorded import recording_of
+from rig.bench.soak import SoakOptions, soak
+from rig.bench.speed import Extent, measure_speed
+from rig.counting import SweepCounter, SweepLayout
+from rig.counting_kernels import CHUNK, PLANES, new_planes
+from rig.errors import UsageError
+from rig.row_threads import RowWorkers
+from rig.sweeps import SweepAssembler
+from tests.unit.rig.streams import SPAD, plan_of, scan, stream_of
+
+SMALL = Extent(
+    windows=(64, 128), exposures=(1, 10), rounds=2, moment_s=1e-3, count_moment_s=1e-3, latency_s=0.02,
+    frames_bytes=2**22, read_bytes=2**20,
+)  # fmt: skip
+KEYS = {
+    "stage", "window", "exposures", "threads", "frames_per_s", "times_real_time", "of_memory_bandwidth", "times_numpy",
+    "error_px", "median_error_px", "missing",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def frames():
+    with RowWorkers(2) as workers:
+        return window_frames(64, workers, 2**22)
+
+
+@pytest.fixture(scope="module")
+def report():
+    return measure_speed(2, SMALL)
+
+
+# Frames
+
+
+def test_pixels_detect_as_often_as_their_threshold_says():
+    threshold = np.full((16, 64), 2**14, np.uint32)
+    threshold[:, 32:] = 0
+    bits = np.zeros((200, 16, 8), np.uint8)
+    draw_frames(threshold, 1, bits)
+    pixels = np.unpackbits(bits, axis=2)
+    assert not pixels[:, :, 32:].any()
+    share = pixels[:, :, :32].mean()
+    assert share == pytest.approx(0.25, abs=5 * math.sqrt(0.25 * 0.75 / pixels[:, :, :32].size))
+
+
+def test_the_brightest_pixel_over_many_frames_is_where_the_truth_is(frames):
+    x0 = int(frames.geometry.x0[0])
+    pixels = np.unpackbits(frames.bits[:PLACE_FRAMES], axis=2)
+    off = pixels.sum(axis=0, dtype=np.int64).argmax(axis=1) + x0 - frames.truth_px[0]
+    assert np.median(np.abs(off)) < 0.5
+    inside = frames.truth_px - x0
+    assert inside.min() >= EDGE_PX
+    assert inside.max() <= 64 - EDGE_PX
+
+
+def test_frames_do_not_depend_on_threads(frames):
+    with RowWorkers(1) as workers:
+        again = window_frames(64, workers, 2**22)
+    np.testing.assert_array_equal(frames.bits, again.bits)
+
+
+def test_whole_frames_hold_the_window_where_the_geometry_says(frames):
+    full = full_frames(frames, 2**23)
+    first = int(frames.geometry.x0[0]) // 8
+    assert full.bits.shape[1:] == (ROWS, WIDTH // 8)
+    np.testing.assert_array_equal(full.bits[:, :, first : first + 8], frames.bits[: len(full.bits)])
+    assert full.layout(10).used_words == WIDTH // 64
+
+
+def test_every_column_of_the_geometry_spans_its_window_and_the_depth_range(frames):
+    geometry = frames.geometry
+    x0 = int(geometry.x0[0])
+    near_m, far_m = geometry.depth_range_m
+    for x, depth_m in ((x0, near_m), (x0 + 63, far_m)):
+        ray = np.array([geometry.u[0, x], geometry.v[0, x], 1.0])
+        assert 1.0 / float(geometry.plane[0] @ ray) == pytest.approx(depth_m, rel=1e-3)
+
+
+# Stages
+
+
+@pytest.mark.parametrize("exposures", [1, 3, 10, 20])
+def test_counting_alone_counts_all_frames_of_a_column(frames, exposures):
+    rows, row_words = ROWS, 1
+    planes = new_planes(ROWS * row_words // CHUNK)
+    words = frames.bits[: 2 * exposures].reshape(-1).view(np.uint64)
+    count_columns(words, rows, row_words, exposures, planes, 0, len(planes))
+    used = PLANES if exposures > 15 else 4
+    bits = np.unpackbits(planes[:, :used].copy().view(np.uint8), axis=2).astype(np.int64)
+    counts = (bits << np.arange(used)[:, None]).sum(axis=1).reshape(rows, 64)
+    last = np.unpackbits(frames.bits[exposures : 2 * exposures], axis=2).sum(axis=0)
+    np.testing.assert_array_equal(counts, last)
+
+
+def test_reading_reads_every_word():
+    words = np.random.default_rng(0).integers(0, 2**63, 1001).astype(np.uint64)
+    assert read_all(words) == int(np.bitwise_xor.reduce(words))
+
+
+def test_the_recording_holds_the_frames(frames):
+    recording, stride = recording_of(frames)
+    blocks = list(walk_blocks(recording, stride, check_payload=True))
+    assert len(blocks) == len(frames.bits) // PLACE_FRAMES
+    np.testing.assert_array_equal(np.concatenate([block.bits for block in blocks]), frames.bits)
+    assert blocks[0].records["x0"][0] == frames.geometry.x0[0]
+
+
+# The report
+
+
+def test_the_report_has_a_row_for_every_stage_window_exposures_and_threads(report):
+    content = json.loads(json.dumps(report.as_json()))
+    assert {"machine", "memory_read_gb_per_s", "rows", "latency_us"} <= set(content)
+    assert all(set(row) == KEYS for row in content["rows"])
+    rows = {(row["stage"], row["window"], row["exposures"], row["threads"]) for row in content["rows"]}
+    assert len(rows) == len(content["rows"])
+    for window, k, threads in itertools.product((64, 128), (1, 10), (1, 2)):
+        assert {("count", window, k, threads), ("likelihood", window, k, threads)} <= rows
+        assert ("numpy", window, k, 1) in rows
+    assert {row[0] for row in rows} == {
+        "count", "count-full", "likelihood", "likelihood-full", "likelihood-sweep", "disk", "disk-crc", "parse",
+        "parse-crc", "numpy",
+    }  # fmt: skip
+
+
+def test_quotients_are_of_the_run_itself(report):
+    rows = {(row.stage, row.window, row.exposures, row.threads): row for row in report.rows}
+    row, naive = rows["likelihood", 128, 10, 1], rows["numpy", 128, 10, 1]
+    assert row.times_real_time == pytest.approx(row.frames_per_s / 1e5)
+    assert row.times_numpy == pytest.approx(row.frames_per_s / naive.frames_per_s)
+    assert naive.times_numpy == 1
+    assert row.of_memory_bandwidth == pytest.approx(row.frames_per_s * ROWS * 16 / 1e9 / report.memory_read_gb_per_s)
+    assert rows["parse", 128, None, 1].of_memory_bandwidth is None
+
+
+def test_estimating_rows_tell_their_error_and_others_none(report):
+    for row in report.rows:
+        assert (row.error_px is None) == (row.stage.startswith(("count", "parse")))
+    rows = {(row.stage, row.window, row.exposures, row.threads): row for row in report.rows}
+    for stage in ("likelihood", "likelihood-full", "likelihood-sweep", "disk", "disk-crc"):
+        row = rows[stage, 128, 10, 1]
+        assert row.error_px < 1
+        assert row.error_px < rows["numpy", 128, 10, 1].error_px
+        assert row.missing == 0
+
+
+def test_latency_counts_every_column(report):
+    latency = report.latency_us
+    assert latency.columns == 20 * PLACE_FRAMES // 10 - 1  # nothing came behind the last one
+    assert 0 < latency.median <= latency.p999 <= latency.max
+
+
+# The command
+
+
+def test_the_command_prints_one_json_object_or_a_table_of_100_columns(report, monkeypatch, capsys):
+    monkeypatch.setattr(speed, "measure_speed", lambda threads, progress: report)
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["bench", "--json"])
+    assert caught.value.code == 0
+    assert len(json.loads(capsys.readouterr().out)["rows"]) == len(report.rows)
+    with pytest.raises(SystemExit):
+        cli.main(["bench"])
+    told = capsys.readouterr().out.splitlines()
+    assert max(map(len, told)) <= 100
+    assert any("GB/s" in line for line in told)
+
+
+def test_what_cannot_be_asked_for_is_refused():
+    with pytest.raises(UsageError, match="threads is 0"):
+        api.bench(threads=0)
+    with pytest.raises(UsageError, match="more than 0 s"):
+        soak(SoakOptions(seconds=0))
+    with pytest.raises(UsageError, match="on-overload"):
+        api.soak(1, on_overload="wait")
+
+
+# The looped SPAD
+
+PLAN = plan_of(scan())
+SWEEPS = 2
+TICKS = 1000
+
+
+def looped(rate_hz=100_000):
+    """A loop of two sweeps, and a SPAD that plays it."""
+    loop = Loop.of(stream_of(PLAN, SWEEPS + 1).blocks(itertools.repeat(16)), SWEEPS)
+    spad = LoopedSpad(loop, SPAD, SpadTiming(Fraction(rate_hz * TICKS), TICKS, TICKS, 4096))
+    spad.configure(SpadRequest(Fraction(rate_hz), 1 / rate_hz, "stream", 16))
+    return loop, spad
+
+
+@pytest.fixture
+def in_no_time(monkeypatch):
+    """Time that passes only while the SPAD sleeps."""
+    clock = VirtualClock()
+    monkeypatch.setattr(looped_spad.time, "perf_counter", lambda: clock.now_ns() / 1e9)
+    monkeypatch.setattr(looped_spad.time, "sleep", clock.sleep)
+    return clock
+
+
+def test_frames_go_on_across_the_ends_of_the_loop(in_no_time):
+    loop, spad = looped()
+    counter = SweepCounter(SweepLayout(PLAN.columns, PLAN.rows, PLAN.width, PLAN.x0, PLAN.window, 4), RowWorkers(1))
+    assembler = SweepAssembler(PLAN, counter, 3 * SWEEPS)
+    ring = BlockRing(8, spad.configure(SpadRequest(Fraction(100_000), 1e-5, "stream", 16)).stride)
+    reader = ring.reader("counting")
+    spad.start(None)
+    found = []
+    while not assembler.complete:
+        assert spad.fill(ring, 1.0)
+        found += assembler.add(reader.next(1.0))
+    assert [sweep.index for sweep in found] == list(range(3 * SWEEPS))
+    assert all(sweep.frames.lost == 0 and sweep.frames.expected == sweep.frames.received for sweep in found)
+    assert found[SWEEPS].first_frame - found[0].first_frame == len(loop.records)
+    np.testing.assert_array_equal(found[0].volume.counts, found[SWEEPS].volume.counts)
+    spad.close()
+
+
+def test_the_stream_keeps_real_time(in_no_time):
+    _, spad = looped()
+    ring = BlockRing(8, 2**16)
+    ring.reader("counting", required=False)
+    spad.start(160)
+    begun_s = in_no_time.now_ns() / 1e9
+    while spad.fill(ring, 1.0):
+        pass
+    assert in_no_time.now_ns() / 1e9 - begun_s == pytest.approx(160e-5, rel=1e-3)
+    assert spad.late_max_s == pytest.approx(0, abs=1e-6)
+
+
+def test_every_frame_that_finds_no_slot_is_counted(in_no_time):
+    _, spad = looped()
+    ring = BlockRing(3, 2**16, on_full=OnFull.DROP)
+    reader = ring.reader("counting")
+    spad.start(320)
+    while spad.fill(ring, 1.0):
+        pass
+    counters = spad.counters
+    assert (counters.exposed, counters.delivered, counters.lost) == (320, 48, 272)
+    assert ring.dropped_frames == 272
+    assert [reader.next().header.first_frame for _ in range(3)] == [0, 16, 32]
+
+
+def test_the_stream_begins_at_the_end_of_a_sweep(in_no_time):
+    loop, spad = looped()
+    ring = BlockRing(64, 2**16)
+    reader = ring.reader("counting")
+    lead = len(loop.records) // (2 * SWEEPS)
+    assert lead < LEAD_FRAMES
+    spad.start(lead + 16)
+    records = []
+    while spad.fill(ring, 1.0):
+        pass
+    ring.finish()
+    while (block := reader.next()) is not None:
+        records.append(block.records.copy())
+    joined = np.concatenate(records)
+    assert np.flatnonzero(joined["marks"] & int(Mark.SCAN)).tolist() == [lead]
+    assert set(joined["sweep"][:lead]) == {0}
+    assert joined["sweep"][lead] == 1
+
+
+def test_a_plan_of_another_rate_is_refused():
+    _, spad = looped()
+    with pytest.raises(LimitExceeded, match="100000 Hz"):
+        spad.configure(SpadRequest(Fraction(50_000), 2e-5, "stream", 16))
