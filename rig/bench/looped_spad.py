@@ -46,12 +46,12 @@ class Loop:
 
 
 class LoopedSpad(SpadArray):
-    """Plays a loop. timing: that the frames were taken with; info: of the SPAD that took them."""
+    """Plays a loop. timing: that the frames were taken with; info: as of the SPAD that took them."""
 
     def __init__(self, loop: Loop, info: SpadInfo, timing: SpadTiming) -> None:
         super().__init__("looped SPAD")
         self._loop = loop
-        self._info = replace(info, model="looped", can_wait=False)
+        self._info = info
         self._timing = timing
         self._frame_s = float(timing.frame_period_ticks / timing.tick_hz)
         self._counters = SpadCounters(0, 0, 0, 0, 0)

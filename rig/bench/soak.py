@@ -140,10 +140,8 @@ def soak(options: SoakOptions, progress: Callable[[int, int], None] | None = Non
     """
     if not (options.seconds > 0 and options.slow_s >= 0):
         raise UsageError(f"a soak of {options.seconds:g} s, slowed by {options.slow_s:g} s; ask for more than 0 s")
-    with _looped_rig(options.window) as (rig, plan, spad):
-        require_policy(options.policy, spad.info)
-        with _quiet_sweeps():
-            return _run(rig, plan, spad, options, progress)
+    with _looped_rig(options) as (rig, plan, spad), _quiet_sweeps():
+        return _run(rig, plan, spad, options, progress)
 
 
 @contextmanager
@@ -159,15 +157,17 @@ def _quiet_sweeps() -> Iterator[None]:
 
 
 @contextmanager
-def _looped_rig(window: bool) -> Iterator[tuple[OpenRig, ScanPlan, LoopedSpad]]:
+def _looped_rig(options: SoakOptions) -> Iterator[tuple[OpenRig, ScanPlan, LoopedSpad]]:
     """The simulated rig, its plan, and in its SPAD's place one that plays what that recorded."""
     # Clocks that agree to the last bit: the loop then closes without a jump.
     settings: dict[str, object] = {"scanner.clock_error": "0 ppm"}
-    if window:
+    if options.window:
         settings["spad.link"] = f"{_window_bytes_per_s(settings) / 1e6:.6f} MB/s"
     with open_rig(load_config(CONFIG, settings)) as rig:
+        info = replace(rig.spad.info, model="looped", can_wait=False)
+        require_policy(options.policy, info)
         plan, timing = prepare(rig)
-        spad = LoopedSpad(_recorded(rig, plan), rig.spad.info, timing)
+        spad = LoopedSpad(_recorded(rig, plan), info, timing)
         looped = replace(rig, spad=spad)
         plan, _ = prepare(looped)
         with spad:

@@ -87,8 +87,8 @@ def agreement(volume, geometry, learned):
 def test_sure_answers_are_those_of_the_exact_likelihood(light, rig, exposures):
     sweep = simulated(light, exposures, rig)
     sure, also, difference = agreement(sweep.volume, sweep.geometry, model(light, rig))
-    assert min(sure, also) > 0.99
-    assert abs(difference.mean()) < 0.03
+    assert min(sure, also) > 0.985
+    assert abs(difference.mean()) < 0.04
     assert np.abs(difference).mean() < 0.04
 
 
@@ -193,6 +193,7 @@ def scores(judge, c, band, counts, exposures):
         level = START + through[:-1, None] + np.cumsum(of_lane, axis=1) - of_lane
         # Sums over some lanes stop at the limits as well.
         kept = np.maximum.accumulate(through) - np.minimum.accumulate(through) < 32767
+        kept &= np.logical_and.accumulate(np.abs(START + through) < 32767)
         taps = sum(tap[:, d] * n[d : d + STEPS * lanes] for d in range(2 * reach + 1))
         assert np.abs(taps).max() < 32768
         wanted[r] = level.ravel() + (taps + constant).max(axis=0)

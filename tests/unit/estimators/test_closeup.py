@@ -1,0 +1,143 @@
+"""Where within its pixel the line lies: the compiled close-up against a posterior summed label by label."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rig.estimators.closeup_kernels import (
+    LEVELS,
+    LOWEST_OCTAVE,
+    closeup_tables,
+    level_flux,
+    level_of,
+    place_line,
+)
+from rig.estimators.row_kernels import FLOOR, LABEL_PX, LABELS, logit_table
+from rig.estimators.row_model import fine_profiles
+from rig.lane_order import new_counts, place_of
+from rig.lanes import LANES
+
+TABLE = logit_table()
+AMBIENT, SHARE = 0.004, 0.1
+OFFSETS = (np.arange(LABELS) - LABELS // 2) * LABEL_PX
+LANE_COUNT = 16
+SHIFT = 3
+"""Units of a sixteenth of an octave, as at about ten exposures."""
+
+
+@cache
+def tables(near_is_left, sigma_px, shift=SHIFT):
+    return closeup_tables(AMBIENT, SHARE, near_is_left, fine_profiles(sigma_px), TABLE, float(128 >> shift))
+
+
+def fluxes(haze, line, near_is_left, sigma_px):
+    """Flux (LABELS, pixels) of every label by the definition, float64, levels as given."""
+    fine = fine_profiles(sigma_px).astype(float)
+    reach = fine.shape[1] // 2
+    t = np.arange(-reach, reach + 1)
+    behind = min(AMBIENT + SHARE * max(haze - AMBIENT, 0.0), haze)
+    left, right = (haze, behind) if near_is_left else (behind, haze)
+    of_left = np.clip(OFFSETS[:, None] - t + 0.5, 0, 1)
+    return of_left * left + (1 - of_left) * right + line * fine
+
+
+def posterior(counts, k, haze, line, near_is_left, sigma_px):
+    """Mean and sd of the position over the labels, brute force."""
+    flux = fluxes(haze, line, near_is_left, sigma_px)
+    q = (1 - FLOOR) * np.exp(-flux) + FLOOR / 2
+    score = (counts * np.log(1 - q) + (k - counts) * np.log(q)).sum(axis=1)
+    weight = np.exp(score - score.max())
+    mean = np.average(OFFSETS, weights=weight)
+    return mean, np.sqrt(np.average((OFFSETS - mean) ** 2, weights=weight) + LABEL_PX**2 / 12)
+
+
+def placed(counts, k, haze_level, line_level, near_is_left, sigma_px, shift=SHIFT, x=37):
+    """The compiled answer for counts (pixels,) around pixel x."""
+    made = tables(near_is_left, sigma_px, shift)
+    reach, n = len(counts) // 2, new_counts(LANE_COUNT)
+    for t, count in enumerate(counts):
+        n[place_of(x - reach + t, LANE_COUNT)] = count
+    weight, constant = made.weight[haze_level, line_level].copy(), made.constant[haze_level, line_level].copy()
+    return place_line(
+        n.ctypes.data, LANE_COUNT, x, float(k), weight.ctypes.data, constant.ctypes.data, made.weight.shape[2],
+        made.index.ctypes.data, made.square.ctypes.data, shift,
+    )  # fmt: skip
+
+
+def test_levels_are_two_to_the_octave_and_their_middle_lies_in_them():
+    for level in range(LEVELS):
+        assert level_of(np.float32(level_flux(level))) == level
+    assert level_of(np.float32(2.0**LOWEST_OCTAVE)) == 0
+    assert level_of(np.float32(1.5 * 2.0**LOWEST_OCTAVE)) == 1
+    for flux in (0.0, 1e-30, 1e-6):
+        assert level_of(np.float32(flux)) == 0
+    for flux in (16.0, 1e3, 1e30):
+        assert level_of(np.float32(flux)) == LEVELS - 1
+    ratio = [level_flux(i + 1) / level_flux(i) for i in range(LEVELS - 1)]
+    assert 1.4 <= min(ratio) <= max(ratio) <= 1.45
+
+
+@pytest.mark.parametrize("near_is_left", [True, False])
+@pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
+@pytest.mark.parametrize("k", [1, 3, 10, 40, 63])
+def test_the_answer_is_the_posterior_mean_and_sd_over_quarter_pixels(k, sigma_px, near_is_left):
+    rng = np.random.default_rng(k)
+    mean_error, sd_error = [], []
+    for _ in range(60):
+        haze_level, line_level = level_of(np.float32(rng.uniform(0.01, 0.4))), level_of(np.float32(rng.uniform(0.2, 3)))
+        haze, line = level_flux(haze_level), level_flux(line_level)
+        truth = fluxes(haze, line, near_is_left, sigma_px)[rng.integers(3, LABELS - 3)]
+        counts = rng.binomial(k, -np.expm1(-truth))
+        mean, sd = placed(counts, k, haze_level, line_level, near_is_left, sigma_px)
+        wanted_mean, wanted_sd = posterior(counts, k, haze, line, near_is_left, sigma_px)
+        mean_error.append(mean - wanted_mean)
+        sd_error.append(sd - wanted_sd)
+    # Sixteen units to the octave, and likelihoods up to 6 % too large.
+    assert np.abs(mean_error).max() < 0.06
+    assert np.abs(sd_error).max() < 0.06
+    assert abs(np.mean(mean_error)) < 0.015
+
+
+@pytest.mark.parametrize("near_is_left", [True, False])
+@pytest.mark.parametrize("offset", [-0.5, -0.25, 0.0, 0.25, 0.5])
+@pytest.mark.parametrize("k", [20, 60])
+def test_the_expected_answer_is_where_the_line_is(k, offset, near_is_left):
+    rng = np.random.default_rng(1)
+    haze_level, line_level = level_of(np.float32(0.1)), level_of(np.float32(1.5))
+    label = int(np.argmin(np.abs(OFFSETS - offset)))
+    truth = fluxes(level_flux(haze_level), level_flux(line_level), near_is_left, 0.6)[label]
+    answers = np.array(
+        [placed(c, k, haze_level, line_level, near_is_left, 0.6) for c in rng.binomial(k, -np.expm1(-truth), (400, len(truth)))]
+    )
+    assert abs(answers[:, 0].mean() - offset) < 0.03
+    # What is stated is what happens.
+    assert 0.75 < answers[:, 0].std() / np.sqrt(np.mean(answers[:, 1] ** 2)) < 1.25
+
+
+@pytest.mark.parametrize("near_is_left", [True, False])
+@pytest.mark.parametrize("shift", range(7))
+def test_answers_to_any_counts_lie_among_the_labels(near_is_left, shift):
+    rng = np.random.default_rng(shift)
+    pixels = fine_profiles(0.6).shape[1]
+    for k in (1, 10, 64):
+        for counts in (np.zeros(pixels, int), np.full(pixels, k), *rng.integers(0, k + 1, (10, pixels))):
+            for haze_level in (0, 20, LEVELS - 1):
+                for line_level in (0, 20, LEVELS - 1):
+                    offset, sd = placed(counts, k, haze_level, line_level, near_is_left, 0.6, shift)
+                    assert abs(offset) <= 1.5
+                    assert 0.07 < sd < 1.5
+
+
+@pytest.mark.parametrize("x", [0, 1, 63, 126, 127])
+def test_lines_at_the_ends_of_a_row_are_placed_as_elsewhere(x):
+    counts = np.array([0, 0, 1, 3, 9, 6, 1, 0, 0])[: fine_profiles(0.6).shape[1]]
+    level = level_of(np.float32(0.1)), level_of(np.float32(1.0))
+    assert placed(counts, 10, *level, True, 0.6, x=x) == placed(counts, 10, *level, True, 0.6, x=40)
+
+
+def test_spare_lanes_are_no_labels():
+    made = tables(True, 0.6)
+    assert LABELS < LANES
+    assert np.all(made.constant[:, :, LABELS:] < -1e20)
+    assert np.count_nonzero(made.index) == LABELS - 1
