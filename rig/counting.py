@@ -128,12 +128,17 @@ class SweepTally:
         from rig.lanes import LANES
 
         self._layout = layout
-        self.n_frames = np.zeros(layout.columns, np.int32)
-        self._column_sum = np.zeros(layout.columns, np.float64)
         self.dark = np.zeros((layout.rows, 8, layout.padded_width // 8 + LANES), np.int32)
         """Ones of dark frames, in lane order, with room for a whole vector behind each row."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin the next sweep."""
+        self.n_frames = np.zeros(self._layout.columns, np.int32)
+        self._column_sum = np.zeros(self._layout.columns, np.float64)
+        self.dark.fill(0)
         self._n_dark = 0
-        self._dark_frames = np.zeros(layout.padded_width, np.int32)
+        self._dark_frames = np.zeros(self._layout.padded_width, np.int32)
 
     def note(self, bins: NDArray[np.int32], column: NDArray[np.float64], first_word: NDArray[np.int32]) -> None:
         """Note the frames of a block; first_word: (n,), word at which each one's used pixels begin."""

@@ -102,6 +102,14 @@ def nothing_found(
     )
 
 
+def clear_found(found: Found) -> None:
+    """Make `found` as `nothing_found` gave it."""
+    found.stripe.fill(np.nan)
+    found.stripe[:, 1] = 0.0
+    for sums in (found.quiet, found.quiet_exposures, found.light, found.quiet_here, found.light_here, found.lines):
+        sums.fill(0)
+
+
 def stripes_of(found: Found, workers: RowWorkers) -> StripeTable:
     """The stripe table of a sweep that has been judged."""
     columns, fields, rows = found.stripe.shape

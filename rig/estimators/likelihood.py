@@ -2,11 +2,13 @@
 
 Search along a row: `row_search`; what it knows and how that is learned: `row_model`, `learning`. The first map is
 counted whole and estimated twice (the first pass finds which pixels were quiet behind the stripe). Every later map is
-judged column by column while its frames come in, with what the maps before it taught: it depends on nothing inside
-itself and a live scan never waits.
+judged column by column while its frames come in, with what earlier maps taught: it depends on nothing inside itself. Now
+and then a map teaches, on a thread beside the stream, and is heeded a fixed number of frames later, so that a live scan
+never waits and results do not depend on speed.
 """
 
-from dataclasses import replace
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +29,14 @@ from rig.stripes import StripeTable
 
 LEAST_SURE = 0.02
 """Share of confident answers below which a map teaches nothing: a closed shutter must not spoil the maps after it."""
-TEACH_FRAMES = 5000
-"""Lit frames that must have come before the model is carried on: at one exposure a column, every 10th map of 500."""
+TEACH_FRAMES = 100_000
+"""Lit frames from one map that teaches to the next: a second at 100 kHz. Learning costs some 0.2 s of one core."""
+LAG_FRAMES = 50_000
+"""Lit frames from a map that teaches to the first one judged with what it taught: time to learn beside the stream."""
 
 
 class Likelihood:
-    """Row likelihood with the state it has learned so far; `model` is None before the first map that taught anything.
+    """Row likelihood with the state it has learned so far; `model` is None before the first map.
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
     """
@@ -42,9 +46,12 @@ class Likelihood:
         self.model = model
         self.used: RowModel | None = None
         """The state that the last map was estimated with."""
-        self._judge: tuple[RowModel, SweepGeometry, int, bool, Judge] | None = None
+        self._judge: tuple[_JudgeKey, Judge] | None = None
         self._taught: Expectation | None = None
-        self._since_taught = 0
+        self._lesson: Future[_Lesson] | None = None
+        self._tutor = ThreadPoolExecutor(1, thread_name_prefix="learning")
+        self._frames_since = 0
+        """Lit frames since the last map that taught."""
 
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
         """A counter whose sweeps `estimate` takes; geometry: nominal, as of every sweep."""
@@ -57,16 +64,22 @@ class Likelihood:
             assert self.model is not None, "a sweep is judged under a model"
             self.used = self.model
         else:
-            self.used = self.model if self.model is not None else self._first_model(sweep, geometry)
+            if self.model is None:
+                self.model = self._first_model(sweep, geometry)
+            self.used = self.model
             stripes, quiet = self._search(sweep, geometry, self.used)
             lines = lines_of(sweep, next_lattice(geometry))
-        self._since_taught += int(sweep.n_frames.sum())
-        sure = bool(np.mean(stripes.confidence > 0.5) >= LEAST_SURE)
-        if sure and self.model is None:
-            self.model = self.used
-        if sure and self._since_taught >= TEACH_FRAMES:
-            self._since_taught = 0
-            self._carry_on(sweep, sweep.intensity(), geometry, quiet, lines)
+        self._frames_since += int(sweep.n_frames.sum())
+        if self._lesson is None:
+            if self._frames_since >= TEACH_FRAMES and np.mean(stripes.confidence > 0.5) >= LEAST_SURE:
+                self._frames_since = 0
+                self._lesson = self._tutor.submit(
+                    _teach, self.used, self._taught, sweep, sweep.intensity(), geometry, quiet, lines
+                )
+        elif self._frames_since >= LAG_FRAMES:
+            # Waits where the lesson is not over: which map is judged with what never depends on speed.
+            self.model, self._taught = self._lesson.result()
+            self._lesson = None
         return stripes
 
     def judge(self, geometry: SweepGeometry, exposures: int, *, dark: bool) -> Judge:
@@ -75,13 +88,10 @@ class Likelihood:
         return self._judge_of(self.model, geometry, exposures, dark=dark)
 
     def _judge_of(self, model: RowModel, geometry: SweepGeometry, exposures: int, *, dark: bool) -> Judge:
-        if self._judge is not None:
-            of_model, of_geometry, of_exposures, of_dark, judge = self._judge
-            if of_model is model and of_geometry is geometry and (of_exposures, of_dark) == (exposures, dark):
-                return judge
-        judge = judge_of(model, geometry, exposures, self._workers, dark=dark)
-        self._judge = model, geometry, exposures, dark, judge
-        return judge
+        key = _JudgeKey(model, geometry, exposures, dark)
+        if self._judge is None or not self._judge[0].same(key):
+            self._judge = key, judge_of(model, geometry, exposures, self._workers, dark=dark)
+        return self._judge[1]
 
     def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
         intensity = volume.intensity()
@@ -90,18 +100,6 @@ class Likelihood:
         model = replace(model, ambient=ambient_map(volume, intensity, geometry, quiet))
         lines = lines_of(volume, next_lattice(geometry))
         return learn_next(lines, geometry, model, None, self._workers)[0]
-
-    def _carry_on(
-        self,
-        tally: FrameTally,
-        intensity: NDArray[np.uint32],
-        geometry: SweepGeometry,
-        quiet: NDArray[np.int32],
-        lines: Lines,
-    ) -> None:
-        assert self.model is not None
-        model = replace(self.model, ambient=ambient_map(tally, intensity, geometry, quiet))
-        self.model, self._taught = learn_next(lines, geometry, model, self._taught, self._workers)
 
     def _search(
         self, volume: CountVolume, geometry: SweepGeometry, model: RowModel
@@ -121,6 +119,39 @@ class Likelihood:
         return stripes_of(found, self._workers), np.stack([pixel_order(found.quiet, geometry.width), exposed])
 
 
+_Lesson = tuple[RowModel, Expectation]
+
+
+def _teach(
+    model: RowModel,
+    before: Expectation | None,
+    tally: FrameTally,
+    intensity: NDArray[np.uint32],
+    geometry: SweepGeometry,
+    quiet: NDArray[np.int32],
+    lines: Lines,
+) -> _Lesson:
+    """The model carried on by one sweep, on one thread beside the stream."""
+    model = replace(model, ambient=ambient_map(tally, intensity, geometry, quiet))
+    with RowWorkers(1) as workers:
+        return learn_next(lines, geometry, model, before, workers)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _JudgeKey:
+    """What a judge was made of."""
+
+    model: RowModel
+    geometry: SweepGeometry
+    exposures: int
+    dark: bool
+
+    def same(self, other: "_JudgeKey") -> bool:
+        """Whether the other's judge would be the same one."""
+        made = self.model is other.model and self.geometry is other.geometry
+        return made and (self.exposures, self.dark) == (other.exposures, other.dark)
+
+
 class _LikelihoodCounter:
     """Counts the first sweep whole; judges the columns of every later one as they come."""
 
@@ -130,6 +161,7 @@ class _LikelihoodCounter:
         self._geometry = geometry
         self._workers = workers
         self._counter: SweepCounter | ColumnJudge | None = None
+        self._memory: ColumnJudge | None = None
 
     def reset(self) -> None:
         """Begin the next sweep."""
@@ -153,5 +185,9 @@ class _LikelihoodCounter:
                 self._counter = SweepCounter(layout, self._workers)
             else:
                 judge = self._of.judge(self._geometry, layout.exposures, dark=layout.dark)
-                self._counter = ColumnJudge(layout, self._geometry, judge, self._workers)
+                if self._memory is None:
+                    self._memory = ColumnJudge(layout, self._geometry, judge, self._workers)
+                else:
+                    self._memory.begin(judge)
+                self._counter = self._memory
         return self._counter

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rig.counting import FrameTally, SweepLayout, SweepTally
 from rig.counting_kernels import CHUNK, add_runs, new_planes
-from rig.estimators.judging import nothing_found, stripes_of
+from rig.estimators.judging import clear_found, nothing_found, stripes_of
 from rig.estimators.learning import next_lattice
 from rig.estimators.row_input import Lines
 from rig.estimators.row_search import Bench, Found, Judge, new_bench
@@ -41,7 +41,10 @@ class SearchedSweep(FrameTally):
 
 
 class ColumnJudge:
-    """The `Counter` that judges: counts and estimates one sweep under one `Judge`."""
+    """The `Counter` that judges: counts and estimates one sweep after the other, each under one `Judge`.
+
+    Its memory is made once; `begin` clears it for the next sweep.
+    """
 
     def __init__(self, layout: SweepLayout, geometry: SweepGeometry, judge: Judge, workers: RowWorkers) -> None:
         self._layout = layout
@@ -55,6 +58,13 @@ class ColumnJudge:
         self._benches: dict[int, Bench] = {}
         self._pending = 0
         self._no_counts = np.zeros((0, layout.rows, layout.window), np.uint8)
+
+    def begin(self, judge: Judge) -> None:
+        """Begin the next sweep, under `judge`."""
+        self._judge = judge
+        clear_found(self._found)
+        self._tally.reset()
+        self._open, self._pending = NO_COLUMN, 0
 
     def add(
         self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
@@ -96,7 +106,7 @@ class ColumnJudge:
             width=tally.width, dark_frames=tally.dark_frames, stripe=stripes_of(found, self._workers),
             light=pixel_order(found.light, layout.width).astype(np.uint32),
             quiet=np.stack([pixel_order(found.quiet, layout.width), exposures]),
-            lines=Lines(found.lines, rows, columns, tally.n_frames[columns]),
+            lines=Lines(found.lines.copy(), rows, columns, tally.n_frames[columns]),
         )  # fmt: skip
 
     def _judge_block(

@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import numba
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ from rig.estimators.closeup_kernels import (
     LEVELS,
     LOWEST_OCTAVE,
     closeup_tables,
+    label_likelihoods,
     level_flux,
     level_of,
     place_line,
@@ -24,6 +26,12 @@ OFFSETS = (np.arange(LABELS) - LABELS // 2) * LABEL_PX
 LANE_COUNT = 16
 SHIFT = 3
 """Units of a sixteenth of an octave, as at about ten exposures."""
+
+
+@numba.njit
+def look(n, lanes, x, exposures, weight, constant, pixels, index, square, shift):
+    """The close-up; lanes cannot leave a kernel."""
+    return place_line(label_likelihoods(n, lanes, x, exposures, weight, constant, pixels, shift), index, square)
 
 
 @cache
@@ -59,7 +67,7 @@ def placed(counts, k, haze_level, line_level, near_is_left, sigma_px, shift=SHIF
     for t, count in enumerate(counts):
         n[place_of(x - reach + t, LANE_COUNT)] = count
     weight, constant = made.weight[haze_level, line_level].copy(), made.constant[haze_level, line_level].copy()
-    return place_line(
+    return look(
         n.ctypes.data, LANE_COUNT, x, float(k), weight.ctypes.data, constant.ctypes.data, made.weight.shape[2],
         made.index.ctypes.data, made.square.ctypes.data, shift,
     )  # fmt: skip
@@ -78,25 +86,45 @@ def test_levels_are_two_to_the_octave_and_their_middle_lies_in_them():
     assert 1.4 <= min(ratio) <= max(ratio) <= 1.45
 
 
-@pytest.mark.parametrize("near_is_left", [True, False])
-@pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
-@pytest.mark.parametrize("k", [1, 3, 10, 40, 63])
-def test_the_answer_is_the_posterior_mean_and_sd_over_quarter_pixels(k, sigma_px, near_is_left):
+def compared(k, shift, sigma_px, near_is_left):
+    """Answers (mean, sd), those of the posterior, and the truth (n,), of lines of any brightness in any haze."""
     rng = np.random.default_rng(k)
-    mean_error, sd_error = [], []
-    for _ in range(60):
+    found, wanted, where = [], [], []
+    for _ in range(300):
         haze_level, line_level = level_of(np.float32(rng.uniform(0.01, 0.4))), level_of(np.float32(rng.uniform(0.2, 3)))
         haze, line = level_flux(haze_level), level_flux(line_level)
-        truth = fluxes(haze, line, near_is_left, sigma_px)[rng.integers(3, LABELS - 3)]
-        counts = rng.binomial(k, -np.expm1(-truth))
-        mean, sd = placed(counts, k, haze_level, line_level, near_is_left, sigma_px)
-        wanted_mean, wanted_sd = posterior(counts, k, haze, line, near_is_left, sigma_px)
-        mean_error.append(mean - wanted_mean)
-        sd_error.append(sd - wanted_sd)
-    # Sixteen units to the octave, and likelihoods up to 6 % too large.
-    assert np.abs(mean_error).max() < 0.06
-    assert np.abs(sd_error).max() < 0.06
-    assert abs(np.mean(mean_error)) < 0.015
+        label = rng.integers(4, LABELS - 4)
+        flux = fluxes(haze, line, near_is_left, sigma_px)[label]
+        counts = rng.binomial(k, -np.expm1(-flux))
+        found.append(placed(counts, k, haze_level, line_level, near_is_left, sigma_px, shift))
+        wanted.append(posterior(counts, k, haze, line, near_is_left, sigma_px))
+        where.append(OFFSETS[label])
+    return np.array(found), np.array(wanted), np.array(where)
+
+
+@pytest.mark.parametrize("near_is_left", [True, False])
+@pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
+@pytest.mark.parametrize(("k", "shift"), [(1, 1), (3, 1), (10, 3)])
+def test_the_answer_is_the_posterior_mean_and_sd_over_quarter_pixels(k, shift, sigma_px, near_is_left):
+    found, wanted, _ = compared(k, shift, sigma_px, near_is_left)
+    # Whole units of an octave a count, and likelihoods up to 6 % too large.
+    assert np.abs(found - wanted).max() < 0.07
+    assert np.abs((found - wanted).mean(axis=0)).max() < 0.01
+
+
+@pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
+@pytest.mark.parametrize(
+    ("k", "shift"),
+    [
+        (1, 1), (3, 1), (10, 3), (20, 4),
+        pytest.param(63, 5, marks=pytest.mark.xfail(strict=True, reason="four units to the octave are too coarse")),
+    ],
+)  # fmt: skip
+def test_whole_units_cost_hardly_any_accuracy(k, shift, sigma_px):
+    # Units as the search takes them at so many exposures.
+    found, wanted, where = compared(k, shift, sigma_px, True)
+    errors = [np.sqrt(np.mean((answers[:, 0] - where) ** 2)) for answers in (found, wanted)]
+    assert errors[0] < 1.05 * errors[1]
 
 
 @pytest.mark.parametrize("near_is_left", [True, False])
@@ -111,8 +139,9 @@ def test_the_expected_answer_is_where_the_line_is(k, offset, near_is_left):
         [placed(c, k, haze_level, line_level, near_is_left, 0.6) for c in rng.binomial(k, -np.expm1(-truth), (400, len(truth)))]
     )
     assert abs(answers[:, 0].mean() - offset) < 0.03
-    # What is stated is what happens.
-    assert 0.75 < answers[:, 0].std() / np.sqrt(np.mean(answers[:, 1] ** 2)) < 1.25
+    # What is stated is what happens, with the width of a label, in whose middle these lines lie.
+    happened = np.hypot(answers[:, 0].std(), LABEL_PX / np.sqrt(12))
+    assert 0.8 < happened / np.sqrt(np.mean(answers[:, 1] ** 2)) < 1.25
 
 
 @pytest.mark.parametrize("near_is_left", [True, False])
@@ -125,7 +154,7 @@ def test_answers_to_any_counts_lie_among_the_labels(near_is_left, shift):
             for haze_level in (0, 20, LEVELS - 1):
                 for line_level in (0, 20, LEVELS - 1):
                     offset, sd = placed(counts, k, haze_level, line_level, near_is_left, 0.6, shift)
-                    assert abs(offset) <= 1.5
+                    assert abs(offset) <= 1.5 + 1e-6
                     assert 0.07 < sd < 1.5
 
 

@@ -72,11 +72,11 @@ def exact(volume, geometry, learned):
     return x, confidence
 
 
-def agreement(volume, geometry, learned):
+def agreement(volume, geometry, learned, near_px=NEAR_PX):
     """Share of the rows that the exact posterior is sure of with the same answer, the other way round, and the
     differences of confidence where the answers are the same."""
     found, (x, confidence) = searched(volume, geometry, learned), exact(volume, geometry, learned)
-    same = np.abs(found[0] - x) <= NEAR_PX
+    same = np.abs(found[0] - x) <= near_px
     sure, also = confidence > SURE, found[1] > SURE
     return same[sure].mean(), same[also].mean(), (found[1] - confidence)[sure & same]
 
@@ -141,7 +141,8 @@ def drawn(seed, rig, exposures):
 def test_random_models_are_searched_as_exactly(rig, exposures):
     sure, also, difference = [], [], []
     for seed in range(6):
-        parts = agreement(*drawn(seed, rig, exposures))
+        # Lines of up to 1.8 px: their middle is not known to the pixel.
+        parts = agreement(*drawn(seed, rig, exposures), near_px=1.0 + NEAR_PX)
         for kept, part in zip((sure, also, difference), parts, strict=True):
             kept.append(part)
     assert np.nanmean(sure) > 0.985
