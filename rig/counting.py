@@ -26,8 +26,8 @@ class SweepLayout:
     """Which pixels of which column are counted.
 
     columns of `window` pixels from x0 (columns,) on, multiples of 64, on a sensor of rows x width pixels. exposures:
-    frames nominally taken per column. used_px: pixels of each frame that are used; None: whole rows. dark: whether there
-    will be frames with the gate low.
+    frames nominally taken per column. used_px: pixels of each frame that are used; None: whole rows. dark: whether
+    there will be frames with the gate low.
     """
 
     columns: int
@@ -72,6 +72,10 @@ class FrameTally:
     n_dark: int
     width: int
     dark_frames: NDArray[np.int32] | None = None
+
+    def intensity(self) -> NDArray[np.uint32]:
+        """Counts summed over the columns, (rows, width) uint32."""
+        raise NotImplementedError
 
     def bound_column(self) -> NDArray[np.float64]:
         """Fractional column of each bin (columns,), its own centre where it has no frames."""

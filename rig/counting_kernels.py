@@ -145,8 +145,8 @@ def add_frames(
 ) -> None:
     """Add words at..at+n-1 of frames first..last-1 to counters.
 
-    words: (all words,), `frame` of them a frame; n: at most CHUNK; planes: ((PLANES + 1) * CHUNK,), one chunk's. few: no
-    count will exceed FEW_FRAMES.
+    words: (all words,), `frame` of them a frame; n: at most CHUNK; planes: ((PLANES + 1) * CHUNK,), one chunk's. few:
+    no count will exceed FEW_FRAMES.
     """
     f = first
     while f < last:
@@ -190,8 +190,8 @@ def add_runs(
     """Add frames to `counts` (columns, rows, window), or to `dark` (rows, STEPS, lanes and LANES more) in lane order.
 
     words: (all words,), `row_words` a row; first_word: (n,), word of the sensor at which a frame's used pixels begin,
-    used_words of them; bins: (n,) column, -1 dark, -2 skip. Only rows first_row..last_row-1 are touched, so that threads
-    may share the outputs. With counts of no columns lit frames are passed over.
+    used_words of them; bins: (n,) column, -1 dark, -2 skip. Only rows first_row..last_row-1 are touched, so that
+    threads may share the outputs. With counts of no columns lit frames are passed over.
     """
     rows, width_words = dark.shape[0], (dark.shape[2] - LANES) * STEPS // WORD_PX
     window = counts.shape[2] if counts.shape[0] else WORD_PX

@@ -47,9 +47,7 @@ def _nibbles(b0, b1, b2, b3):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def read_planes(
-    planes: int, at: int, plane_bytes: int, n_planes: int, window: int, n: int, lanes: int
-) -> None:
+def read_planes(planes: int, at: int, plane_bytes: int, n_planes: int, window: int, n: int, lanes: int) -> None:
     """Counts of a row of `window` pixels into n from its bit planes: bytes from `at` on, planes `plane_bytes` apart.
 
     planes, n: addresses. n_planes: 1, 4 or 8. Reads 16 bytes at a time, whatever the window.
@@ -96,7 +94,7 @@ def read_planes(
 
 @numba.njit(cache=True, nogil=True)
 def read_counts(counts: NDArray[np.unsignedinteger], halved: int, n: int, lanes: int) -> None:
-    """Counts of a row in pixel order (window,) into the row at address n, divided by 2^halved as `halve_counts` does."""
+    """Counts of a row in pixel order (window,) to address n, divided by 2^halved as `halve_counts` does."""
     stride = lanes + 2 * PAD
     half = (1 << halved) >> 1
     for s in range(STEPS):

@@ -23,11 +23,12 @@ from numba.extending import intrinsic, overload, register_model
 LANES: Final = 16
 
 _INT32 = ir.IntType(32)
+_compiled: Any = intrinsic
 _Signature = Any
 _Codegen = Callable[[Any, Any, Any, Any], Any]
 
 
-class Lanes(types.Type):  # type: ignore[misc]
+class Lanes(types.Type):
     """Numba type of 16 integers of `bits` bits, or of 16 float32."""
 
     def __init__(self, bits: int, *, real: bool = False) -> None:
@@ -42,11 +43,11 @@ class Lanes(types.Type):  # type: ignore[misc]
 
 
 @register_model(Lanes)
-class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
+class _LanesModel(models.PrimitiveModel):
     """Lanes are passed about as the LLVM vector itself."""
 
     def __init__(self, manager: Any, lanes: Lanes) -> None:
-        super().__init__(manager, lanes, lanes.llvm)
+        super().__init__(manager, lanes, lanes.llvm)  # type: ignore[no-untyped-call]
 
 
 INT8 = Lanes(8)
@@ -60,7 +61,7 @@ def _pointer(builder: Any, address: Any, index: Any, element: Any, whole: Any) -
 
 
 def _reader(numba_type: Any, element: Any, whole: Any, align: int) -> Any:
-    @intrinsic  # type: ignore[untyped-decorator]
+    @_compiled
     def read(typing: Any, address: Any, index: Any) -> tuple[_Signature, _Codegen]:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             loaded = builder.load(_pointer(builder, args[0], args[1], element, whole))
@@ -73,7 +74,7 @@ def _reader(numba_type: Any, element: Any, whole: Any, align: int) -> Any:
 
 
 def _writer(numba_type: Any, element: Any, whole: Any, align: int) -> Any:
-    @intrinsic  # type: ignore[untyped-decorator]
+    @_compiled
     def write(typing: Any, address: Any, index: Any, value: Any) -> tuple[_Signature, _Codegen]:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             stored = builder.store(args[2], _pointer(builder, args[0], args[1], element, whole))
@@ -126,13 +127,14 @@ def _llvm_name(vector: ir.VectorType) -> str:
 
 def _call(builder: Any, name: str, result: Any, *args: Any) -> Any:
     function_type = ir.FunctionType(result, [arg.type for arg in args])
-    return builder.call(cgutils.get_or_insert_function(builder.module, function_type, name), args)
+    function = cgutils.get_or_insert_function(builder.module, function_type, name)  # type: ignore[no-untyped-call]
+    return builder.call(function, args)
 
 
 def _binary(emit: Callable[[Any, Any, Any], Any]) -> Any:
     """An operation of lanes with lanes or with a number."""
 
-    @intrinsic  # type: ignore[untyped-decorator]
+    @_compiled
     def operation(typing: Any, a: Any, b: Any) -> tuple[_Signature, _Codegen]:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             left, right = args
@@ -189,7 +191,7 @@ for _operator, _operation in (
 
 
 def _conversion(to: Lanes, emit: Callable[[Any, Any], Any]) -> Any:
-    @intrinsic  # type: ignore[untyped-decorator]
+    @_compiled
     def convert(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             return emit(builder, args[0])
@@ -200,7 +202,7 @@ def _conversion(to: Lanes, emit: Callable[[Any, Any], Any]) -> Any:
 
 
 UNPACKED: Final = (0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15)
-"""Which lane stands where after `from_bfloat16`: the order that costs a processor with 128-bit lanes one instruction."""
+"""Which lane stands where after `from_bfloat16`: the order that costs an x86 processor one instruction."""
 
 
 def _as_float(builder: Any, bits: Any) -> Any:
@@ -222,7 +224,7 @@ to_int16 = _conversion(INT16, lambda b, a: b.trunc(b.fptosi(a, ir.VectorType(_IN
 def _shifted(by: int) -> Any:
     """Lane i takes what lane i - by had, and 0 where there is none."""
 
-    @intrinsic  # type: ignore[untyped-decorator]
+    @_compiled
     def shift(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             zeros = ir.Constant(signature.args[0].llvm, [0] * LANES)
@@ -247,7 +249,7 @@ def running_sum(a):  # type: ignore[no-untyped-def]
 
 
 def _reduction(name: str, result: Any) -> Any:
-    @intrinsic  # type: ignore[untyped-decorator]
+    @_compiled
     def reduce(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             vector = args[0].type
@@ -262,7 +264,7 @@ largest = _reduction("smax", types.int16)
 """largest(a): the largest of 16 integers of 16 bits."""
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_compiled
 def total(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
     """total(a): sum of 16 float32 lanes, by halves: the order is fixed."""
 
@@ -280,7 +282,7 @@ def total(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
     return types.float32(a), code
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_compiled
 def last_lane(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
     """last_lane(a): the highest lane of 16-bit lanes."""
 
@@ -290,7 +292,7 @@ def last_lane(typing: Any, a: Any) -> tuple[_Signature, _Codegen]:
     return types.int16(a), code
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_compiled
 def equal_mask(typing: Any, a: Any, b: Any) -> tuple[_Signature, _Codegen]:
     """equal_mask(a, number): bit i is set where lane i equals the number."""
 
@@ -302,7 +304,7 @@ def equal_mask(typing: Any, a: Any, b: Any) -> tuple[_Signature, _Codegen]:
     return types.uint32(a, b), code
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_compiled
 def lowest_bit(typing: Any, mask: Any) -> tuple[_Signature, _Codegen]:
     """lowest_bit(mask): number of the lowest bit that is set; 32 where none is."""
 
@@ -312,7 +314,7 @@ def lowest_bit(typing: Any, mask: Any) -> tuple[_Signature, _Codegen]:
     return types.uint32(types.uint32), code
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_compiled
 def lanes_between(typing: Any, first: Any, end: Any) -> tuple[_Signature, _Codegen]:
     """lanes_between(first, end): all bits of lanes first to end - 1 set, the others' clear; 16-bit lanes."""
 
@@ -327,7 +329,7 @@ def lanes_between(typing: Any, first: Any, end: Any) -> tuple[_Signature, _Codeg
 
 
 def _constant(lanes: Lanes, number: float) -> Any:
-    @intrinsic  # type: ignore[untyped-decorator]
+    @_compiled
     def constant(typing: Any) -> tuple[_Signature, _Codegen]:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             return ir.Constant(lanes.llvm, [number] * LANES)

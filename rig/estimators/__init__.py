@@ -5,7 +5,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.counting import Counter, FrameTally, SweepLayout
+from rig.counting import Counter, SweepLayout
 from rig.geometry import SweepGeometry
 from rig.stripes import StripeTable
 

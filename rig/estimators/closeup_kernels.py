@@ -42,18 +42,24 @@ class Closeup(NamedTuple):
     """Tables of the close look.
 
     weight: int16 (LEVELS, LEVELS, F, LANES) over haze, line, pixel from -R to R, label: units per count; constant:
-    float32 (LEVELS, LEVELS, LANES), units per exposure. Units as of the search, 128 >> shift an octave. index, square: float32 (LANES,), label number from the middle one, and squared, in the order UNPACKED.
+    float32 (LEVELS, LEVELS, LANES), units per exposure. Units as of the search, 128 >> shift an octave. label, square:
+    float32 (LANES,), number of the label from the middle one, and squared, in the order UNPACKED.
     """
 
     weight: NDArray[np.int16]
     constant: NDArray[np.float32]
-    index: NDArray[np.float32]
+    label: NDArray[np.float32]
     square: NDArray[np.float32]
 
 
 @numba.njit(cache=True, nogil=True)
 def closeup_tables(
-    ambient: float, share: float, near_is_left: bool, fine: NDArray[np.float32], table: NDArray[np.float32], units: float
+    ambient: float,
+    share: float,
+    near_is_left: bool,
+    fine: NDArray[np.float32],
+    table: NDArray[np.float32],
+    units: float,
 ) -> Closeup:
     """Tables for ambient light of so many photons per exposure and a pedestal of so large a share of the haze.
 
@@ -108,8 +114,8 @@ def level_flux(level):  # type: ignore[no-untyped-def]
 def label_likelihoods(n, lanes, x, exposures, weight, constant, pixels, shift):  # type: ignore[no-untyped-def]
     """Likelihood of each label as float32 lanes in the order UNPACKED, for a line near pixel x.
 
-    n: address of the row's counts, of so many lanes; weight: of the F = `pixels` vectors of the two levels, constant: of
-    theirs.
+    n: address of the row's counts, of so many lanes; weight: of the F = `pixels` vectors of the two levels, constant:
+    of theirs.
     """
     score = to_int16(larger_float(load_float32(constant, 0) * np.float32(exposures), LOWEST_SCORE))
     first = x - (pixels - 1) // 2

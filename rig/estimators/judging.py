@@ -1,4 +1,6 @@
-"""Makes ready what the compiled search reads: tables per column and band of rows, from the learned model and geometry."""
+"""Makes ready what the compiled search reads: tables per column and band of rows, from model and geometry."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,7 +8,17 @@ from numpy.typing import NDArray
 from rig.estimators.closeup_kernels import closeup_tables
 from rig.estimators.row_input import TABLE, State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
-from rig.estimators.row_search import COUNT_LIMIT, FIELDS, QUIET_STEP, SIGNAL_REACH_PX, Found, Judge, count_fluxes, halvings, turned
+from rig.estimators.row_search import (
+    COUNT_LIMIT,
+    FIELDS,
+    QUIET_STEP,
+    SIGNAL_REACH_PX,
+    Found,
+    Judge,
+    count_fluxes,
+    halvings,
+    turned,
+)
 from rig.estimators.screen_tables import SCREENS, Tables, fill_tables
 from rig.geometry import SweepGeometry
 from rig.lane_order import STEPS, padded_lanes
@@ -26,9 +38,7 @@ HOT_FACTOR, HOT_FLUX = 4.0, 0.02
 """A pixel is hot for the search from this many times its neighbours' ambient light, and so much more, on."""
 
 
-def judge_of(
-    model: RowModel, geometry: SweepGeometry, exposures: int, workers: RowWorkers, *, dark: bool
-) -> Judge:
+def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: RowWorkers, *, dark: bool) -> Judge:
     """All that the search needs to judge a sweep under `model`, for columns of about `exposures` frames.
 
     dark: whether the sweep has dark frames, so that fewer columns need to teach the ambient light.
@@ -42,7 +52,7 @@ def judge_of(
     most = min(exposures + 2, COUNT_LIMIT)
     nominal = exposures / 2.0 ** halvings(exposures)
     for shift in range(MOST_HALVINGS + 1):
-        if most * _largest_taps(sweep, state, light, reach, 128 >> shift) <= SCORE_LIMIT:
+        if most * _largest_sum(sweep, state, light, reach, 128 >> shift) <= SCORE_LIMIT:
             break
 
     def work(first: int, last: int) -> None:
@@ -80,9 +90,7 @@ def judge_of(
     )
 
 
-def nothing_found(
-    geometry: SweepGeometry, lines: tuple[NDArray[np.int32], NDArray[np.int32]] | None
-) -> Found:
+def nothing_found(geometry: SweepGeometry, lines: tuple[NDArray[np.int32], NDArray[np.int32]] | None) -> Found:
     """Empty results of a sweep; lines: (rows, columns) whose counts are to be kept, sorted by column."""
     rows, columns = geometry.rows, geometry.columns
     lanes = -(-geometry.width // 64) * 64 // STEPS + LANES
@@ -175,18 +183,29 @@ def _usual_mean(ambient: NDArray[np.float32]) -> NDArray[np.float32]:
 def _empty_tables(columns: int, bands: int, lanes: int, reach: int) -> Tables:
     pixels = lanes * STEPS
 
-    def of(*shape: int, dtype: type = np.float32) -> NDArray[np.generic]:
+    def of(*shape: int, dtype: type = np.float32) -> Any:
         return np.zeros((columns, bands, *shape), dtype)
 
     return Tables(
-        edge=of(pixels, dtype=np.int16), tap=of(SCREENS, 2 * reach + 1, pixels, dtype=np.int16),
-        position=of(SCREENS, pixels, dtype=np.int16), slope=of(SCREENS, pixels, dtype=np.int16), lane=of(lanes), none=of(3), neutral=of(pixels),
-        before=of(pixels), scale=of(pixels), first=of(dtype=np.int32), last=of(dtype=np.int32),
-    )  # type: ignore[arg-type]  # fmt: skip
+        edge=of(pixels, dtype=np.int16),
+        tap=of(SCREENS, 2 * reach + 1, pixels, dtype=np.int16),
+        position=of(SCREENS, pixels, dtype=np.int16),
+        slope=of(SCREENS, pixels, dtype=np.int16),
+        lane=of(lanes),
+        none=of(3),
+        neutral=of(pixels),
+        before=of(pixels),
+        scale=of(pixels),
+        first=of(dtype=np.int32),
+        last=of(dtype=np.int32),
+    )
 
 
-def _largest_taps(sweep: Sweep, state: State, light: NDArray[np.float32], reach: int, units: int) -> float:
-    """Largest sum of a position's weights, from the tables of one band in the middle of every 16th column."""
+def _largest_sum(sweep: Sweep, state: State, light: NDArray[np.float32], reach: int, units: int) -> float:
+    """Largest sum of a position's taps, or half of that of a lane's edge weights, which stand alone.
+
+    From the tables of one band in the middle of every 16th column.
+    """
     columns = np.arange(0, sweep.plane.shape[0], 16)
     middle = slice(sweep.u.shape[0] // 2, sweep.u.shape[0] // 2 + 1)
     few = sweep._replace(
@@ -200,4 +219,6 @@ def _largest_taps(sweep: Sweep, state: State, light: NDArray[np.float32], reach:
     )  # fmt: skip
     tables = _empty_tables(len(columns), 1, padded_lanes(sweep.window), reach)
     fill_tables(few, part, light, np.zeros(SCREENS, np.float32), float(units), 1.0, 0, 1, tables)
-    return float(np.abs(tables.tap.astype(np.int64)).sum(axis=3).max(initial=1))
+    taps = np.abs(tables.tap.astype(np.int64)).sum(axis=3).max(initial=1)
+    edges = np.abs(tables.edge.astype(np.int64)).reshape(len(columns), STEPS, -1).sum(axis=1).max(initial=1)
+    return float(max(taps, edges / 2))

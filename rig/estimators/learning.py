@@ -86,9 +86,7 @@ def lines_of(volume: CountVolume, where: tuple[NDArray[np.int32], NDArray[np.int
     return Lines(volume.counts[columns, rows].astype(np.int32), rows, columns, volume.n_frames[columns])
 
 
-def expect(
-    lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers
-) -> Expectation:
+def expect(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> Expectation:
     """Expectation step of `model` over some lines."""
     typical = float(np.median(model.ambient))
     sweep, state = sweep_of(geometry), state_of(model)
@@ -99,8 +97,8 @@ def expect(
 
     def work(first: int, last: int) -> None:
         for i in range(first, last):
-            part = Lines(*(array[edges[i] : edges[i + 1]] for array in lines))
-            parts[i] = _expect_piece(sweep, state, part, geometry, hot_flux)
+            part = slice(edges[i], edges[i + 1])
+            parts[i] = _expect_piece(sweep, state, _some(lines, part), geometry, hot_flux)
 
     workers.over(PIECES, work)
     done = [part for part in parts if part is not None]
@@ -108,6 +106,10 @@ def expect(
     for part in done[1:]:
         total = total.plus(part)
     return total
+
+
+def _some(lines: Lines, part: slice) -> Lines:
+    return Lines(lines.counts[part], lines.row[part], lines.column[part], lines.exposures[part])
 
 
 def _expect_piece(sweep: Sweep, state: State, lines: Lines, geometry: SweepGeometry, hot_flux: float) -> Expectation:
@@ -161,8 +163,7 @@ def learn_next(
     if before is not None:
         seen = seen.plus(before.faded(FADE))
     model = maximise(model, seen, spread=False, gains=False)
-    some = Lines(*(array[::WIDTH_STEP] for array in lines))
-    return fit_line_width(some, geometry, model, workers), seen
+    return fit_line_width(_some(lines, slice(None, None, WIDTH_STEP)), geometry, model, workers), seen
 
 
 def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> RowModel:

@@ -2,9 +2,9 @@
 
 Search along a row: `row_search`; what it knows and how that is learned: `row_model`, `learning`. The first map is
 counted whole and estimated twice (the first pass finds which pixels were quiet behind the stripe). Every later map is
-judged column by column while its frames come in, with what earlier maps taught: it depends on nothing inside itself. Now
-and then a map teaches, on a thread beside the stream, and is heeded a fixed number of frames later, so that a live scan
-never waits and results do not depend on speed.
+judged column by column while its frames come in, with what earlier maps taught: it depends on nothing inside itself.
+Now and then a map teaches, on a thread beside the stream, and is heeded a fixed number of frames later, so that a live
+scan never waits and results do not depend on speed.
 """
 
 from concurrent.futures import Future, ThreadPoolExecutor

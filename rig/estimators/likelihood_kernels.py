@@ -54,7 +54,21 @@ def learn_rows(
                 levels[row.cell[j], 13] += (1.0 - none) / (last - first + 1)
         if none < 0.5:
             _learn_levels(
-                sweep, state, row, lines.row[i], lines.column[i], lines.exposures[i], length, first, last, start, none, hot_flux, levels, rows_seen, columns_seen
+                sweep,
+                state,
+                row,
+                lines.row[i],
+                lines.column[i],
+                lines.exposures[i],
+                length,
+                first,
+                last,
+                start,
+                none,
+                hot_flux,
+                levels,
+                rows_seen,
+                columns_seen,
             )
     return total
 

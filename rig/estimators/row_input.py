@@ -67,7 +67,7 @@ class State(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Buffers of one row, filled by `row_fluxes` and `judge_line` from index 0 (nearest pixel) on; made once per thread.
+    """Buffers of one row, filled by `row_fluxes` and `judge_line`, nearest pixel first; made once per thread.
 
     n: ones; before, behind: flux of each pixel in front of and behind the stripe; scale: stripe photons at amplitude 1;
     cell: nearest profile bin; gain: geometry factor of the haze; w: inverse depth; log_prior: of positions; taps, edge,
@@ -178,8 +178,8 @@ def judge_line(
 ) -> tuple[int, int, int, int, float, float, float]:
     """Posterior of line i, in `row`.
 
-    Returns what `row_fluxes` does, then the probability of 'no stripe', the share of its prior that the picture's border
-    accounts for, and the log evidence.
+    Returns what `row_fluxes` does, then the probability of 'no stripe', the share of its prior that the picture's
+    border accounts for, and the log evidence.
     """
     c = lines.column[i]
     length, first, last, start = row_fluxes(sweep, state, row, lines.row[i], c)

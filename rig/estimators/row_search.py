@@ -15,8 +15,8 @@ from rig.estimators.powers import MEAN_EXCESS, nothing_below, power
 from rig.estimators.screen_tables import SCREENS, Tables
 from rig.estimators.search_kernels import (
     Search,
-    best_position,
     add_likelihoods,
+    best_position,
     best_score,
     end_likelihoods,
     score_rows,
@@ -63,11 +63,11 @@ class Judge(NamedTuple):
     """All that is needed to judge the rows of a sweep; fixed while the sweep lasts.
 
     x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, rows, 2), first and last
-    stored pixel of each search window, the first behind the last where there is none. rows: of the picture.
-    ambient: float32 (bands, width padded to whole words). hot_start: int32 (rows + 1,) and hot_x: int32, pixels of each
-    row whose counts say nothing. nominal: exposures the tables are for. faintest, brightest: photons of a stripe at scale 1. reach: half the line's width in
-    px. shift: units of the scores are 128 >> shift an octave. quiet_step: every so manieth column teaches the ambient
-    light. flux: see `count_fluxes`.
+    stored pixel of each search window, the first behind the last where there is none. rows: of the picture. ambient:
+    float32 (bands, width padded to whole words). hot_start: int32 (rows + 1,) and hot_x: int32, pixels of each row
+    whose counts say nothing. nominal: exposures the tables are for. faintest, brightest: photons of a stripe at scale
+    1. reach: half the line's width in px. shift: units of the scores are 128 >> shift an octave. quiet_step: every so
+    manieth column teaches the ambient light. flux: see `count_fluxes`.
     """
 
     tables: Tables
@@ -141,7 +141,7 @@ class Desk(NamedTuple):
     weight: int
     weight_constant: int
     weight_px: int
-    index: int
+    label: int
     square: int
     x0: int
     limits: int
@@ -179,14 +179,14 @@ def desk_of(judge: Judge, found: Found, bench: Bench) -> Desk:
         tables.tap.shape[3], address_of(tables.edge), address_of(tables.tap), address_of(tables.position),
         address_of(tables.slope), address_of(tables.lane), address_of(tables.none), address_of(tables.neutral),
         address_of(tables.before), address_of(tables.scale), address_of(tables.first), address_of(tables.last),
-        address_of(closeup.weight), address_of(closeup.constant), closeup.weight.shape[2], address_of(closeup.index),
-        address_of(closeup.square),
-        address_of(judge.x0), address_of(judge.limits), address_of(judge.ambient),
-        judge.ambient.shape[1], address_of(judge.hot_start), address_of(judge.hot_x), address_of(bench.ambient),
-        address_of(judge.flux), address_of(found.stripe), address_of(found.quiet_here), address_of(found.quiet_exposures),
-        address_of(found.light_here), found.light.shape[2], address_of(found.lines), address_of(found.line_start),
-        address_of(found.line_row), judge.band_rows, judge.window, judge.reach, judge.shift,
-        judge.quiet_step, judge.near_is_left, np.float32(judge.nominal), np.float32(judge.faintest), np.float32(judge.brightest),
+        address_of(closeup.weight), address_of(closeup.constant), closeup.weight.shape[2],
+        address_of(closeup.label), address_of(closeup.square), address_of(judge.x0), address_of(judge.limits),
+        address_of(judge.ambient), judge.ambient.shape[1], address_of(judge.hot_start), address_of(judge.hot_x),
+        address_of(bench.ambient), address_of(judge.flux), address_of(found.stripe), address_of(found.quiet_here),
+        address_of(found.quiet_exposures), address_of(found.light_here), found.light.shape[2],
+        address_of(found.lines), address_of(found.line_start), address_of(found.line_row), judge.band_rows,
+        judge.window, judge.reach, judge.shift, judge.quiet_step, judge.near_is_left, np.float32(judge.nominal),
+        np.float32(judge.faintest), np.float32(judge.brightest),
     )  # fmt: skip
 
 
@@ -221,9 +221,7 @@ def set_column(desk: Desk, c: int, b: int, exposures: float) -> None:
     positions = 2 * SCREENS * pixels * table
     lane = desk.lane + 4 * desk.search.lanes * table
     none = desk.none + 12 * table
-    set_exposures(
-        desk.position + positions, desk.slope + positions, lane, none, exposures, desk.nominal, desk.search
-    )
+    set_exposures(desk.position + positions, desk.slope + positions, lane, none, exposures, desk.nominal, desk.search)
     first = b * desk.ambient_px + read_int32(desk.x0, c)
     for x in range(desk.window):
         write_float32(desk.own_ambient, x, read_float32(desk.ambient, first + x))
@@ -297,7 +295,7 @@ def _find(search: Search, rows: int, window: int, shift: int) -> None:
 
 @numba.njit(cache=True, nogil=True, fastmath=NO_NAN)
 def _measure_light(desk: Desk, first: int, rows: int, c: int, table: int, exposures: float) -> None:
-    """Signal and haze of the batch's rows, from row `first` of the picture on, and what their close-up needs of them."""
+    """Signal and haze of the batch's rows, from row `first` of the picture on, for answers and close-up."""
     search = desk.search
     lanes = search.lanes
     pixels = STEPS * lanes
@@ -343,7 +341,7 @@ def _look_closely(desk: Desk, first: int, rows: int, c: int, exposures: float) -
     for r in range(rows):
         x, y = np.int64(read_int32(search.x, r)), first + r
         if x != NOWHERE:
-            offset, sd = place_line(load_float32(search.mass, r * LANES), desk.index, desk.square)
+            offset, sd = place_line(load_float32(search.mass, r * LANES), desk.label, desk.square)
             write_float32(stripe, y, np.float32(x0 + x) + offset)
             write_float32(stripe, desk.rows + y, read_float32(search.confidence, r))
             write_float32(stripe, 2 * desk.rows + y, sd)
@@ -382,7 +380,7 @@ def keep_line(n: int, lanes: int, window: int, to: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def turned(stripe: NDArray[np.float32], first_row: int, last_row: int, out: NDArray[np.float32]) -> None:
-    """Rows first_row..last_row-1 of (columns, FIELDS, rows) answers as (FIELDS, rows, columns), in blocks that fit caches."""
+    """Rows first_row..last_row-1 of answers (columns, FIELDS, rows) as (FIELDS, rows, columns)."""
     columns, fields, _ = stripe.shape
     for y0 in range(first_row, last_row, 16):
         for c0 in range(0, columns, 16):

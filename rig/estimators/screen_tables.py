@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.row_input import Row, State, Sweep, row_buffers, row_fluxes
+from rig.estimators.row_input import State, Sweep, row_buffers, row_fluxes
 from rig.estimators.row_kernels import FLUX_MAX, cell_of, none_prior
 from rig.lane_order import STEPS
 
@@ -25,8 +25,8 @@ OUTSIDE: Final = -32000
 """Score of a position where the column's stripe cannot lie."""
 SLOPE: Final = 8
 LN2: Final = 0.6931471805599453
-WEIGHT_LIMIT: Final = 30000.0
-"""Largest sum of products of counts and weights, with room to 32767."""
+FLUX_LEFT, FLUX_RIGHT, GAIN_LEFT, GAIN_RIGHT, LOSS_LEFT, LOSS_RIGHT = range(6)
+"""Rows of what is kept of each pixel: flux on either side of a stripe, and its entries of the logit table."""
 
 
 class Tables(NamedTuple):
@@ -76,11 +76,9 @@ def fill_tables(
     columns = sweep.plane.shape[0]
     pixels = out.edge.shape[2]
     lanes = pixels // STEPS
-    reach = (out.tap.shape[3] - 1) // 2
     per_nat = np.float32(units / LN2)
     row = row_buffers(pixels + 2, 1)
-    left, right = np.empty((2, pixels), np.float32), np.empty((2, pixels), np.float32)
-    flux_left, flux_right = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+    levels = np.empty((6, pixels), np.float32)
     gain, loss = state.table[0], state.table[1]
     for b in range(first_band, last_band):
         for c in range(columns):
@@ -96,37 +94,33 @@ def fill_tables(
             length, begin, end, start = row_fluxes(sweep, state, row, b, c)
             if length == 0:
                 continue
-            step = 1 if sweep.near_is_left else -1
             low = (start if sweep.near_is_left else start - length + 1) - sweep.x0[c]
             for i in range(length):
                 t = i if sweep.near_is_left else length - 1 - i
                 x = low + i
                 near, far = row.before[t], row.behind[t]
-                flux_left[x], flux_right[x] = (near, far) if sweep.near_is_left else (far, near)
+                levels[FLUX_LEFT, x], levels[FLUX_RIGHT, x] = (near, far) if sweep.near_is_left else (far, near)
                 out.before[c, b, x], out.scale[c, b, x] = near, row.scale[t]
-                at = cell_of(flux_left[x])
-                left[0, x], left[1, x] = gain[at], loss[at]
-                at = cell_of(flux_right[x])
-                right[0, x], right[1, x] = gain[at], loss[at]
-                weight = left[0, x] - right[0, x]
-                constant = left[1, x] - right[1, x]
+                at = cell_of(levels[FLUX_LEFT, x])
+                levels[GAIN_LEFT, x], levels[LOSS_LEFT, x] = gain[at], loss[at]
+                at = cell_of(levels[FLUX_RIGHT, x])
+                levels[GAIN_RIGHT, x], levels[LOSS_RIGHT, x] = gain[at], loss[at]
+                weight = levels[GAIN_LEFT, x] - levels[GAIN_RIGHT, x]
+                constant = levels[LOSS_LEFT, x] - levels[LOSS_RIGHT, x]
                 edge[_place(x, lanes)] = np.int16(round(weight * per_nat))
                 if abs(weight) > 1e-3:
                     out.neutral[c, b, x] = min(max(-constant / weight, np.float32(0.0)), np.float32(1.0))
-            _positions(
-                sweep, state, light, log_share, per_nat, nominal, b, c, low, length, reach, row, begin, end, step, start,
-                left, right, flux_left, flux_right, out,
-            )  # fmt: skip
+            span = low, length, begin, end, start
+            _positions(sweep, state, light, log_share, per_nat, nominal, b, c, span, row, levels, out)
 
 
 @numba.njit(cache=True, nogil=True)
-def _positions(
-    sweep, state, light, log_share, per_nat, nominal, b, c, low, length, reach, row, begin, end, step, start, left,
-    right, flux_left, flux_right, out,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+def _positions(sweep, state, light, log_share, per_nat, nominal, b, c, span, row, levels, out):  # type: ignore[no-untyped-def]
     """Taps, constants and priors of every position of one table."""
+    low, length, begin, end, start = span
+    step = 1 if sweep.near_is_left else -1
     gain, loss = state.table[0], state.table[1]
-    lanes = out.lane.shape[2]
+    lanes, reach = out.lane.shape[2], (out.tap.shape[3] - 1) // 2
     tap = out.tap[c, b]
     first = (start + step * (begin if step > 0 else end)) - sweep.x0[c]
     last = (start + step * (end if step > 0 else begin)) - sweep.x0[c]
@@ -144,11 +138,11 @@ def _positions(
                     continue
                 extra = light[m] * state.psi[abs(d)] * out.scale[c, b, at]
                 if d < 0:
-                    base, own_gain, own_loss = flux_left[at], left[0, at], left[1, at]
+                    base, own_gain, own_loss = levels[FLUX_LEFT, at], levels[GAIN_LEFT, at], levels[LOSS_LEFT, at]
                 else:
-                    base, own_gain, own_loss = flux_right[at], right[0, at], right[1, at]
+                    base, own_gain, own_loss = levels[FLUX_RIGHT, at], levels[GAIN_RIGHT, at], levels[LOSS_RIGHT, at]
                 if d == 0:
-                    base = np.float32(0.5) * (flux_left[at] + flux_right[at])
+                    base = np.float32(0.5) * (levels[FLUX_LEFT, at] + levels[FLUX_RIGHT, at])
                 cell = cell_of(min(base + extra, FLUX_MAX))
                 tap[m, d + reach, place] = np.int16(round((gain[cell] - own_gain) * per_nat))
                 constant += (loss[cell] - own_loss) * per_nat
@@ -157,14 +151,13 @@ def _positions(
                 prior = (row.log_prior[t] + log_share[m]) * per_nat
                 out.position[c, b, m, place] = _within(nominal * constant + prior, OUTSIDE, -OUTSIDE)
                 out.slope[c, b, m, place] = _within(SLOPE * constant, -32767.0, 32767.0)
-        within += (left[1, x] - right[1, x]) * per_nat
-        out.lane[c, b, x // STEPS] += (left[1, x] - right[1, x]) * per_nat
+        own = (levels[LOSS_LEFT, x] - levels[LOSS_RIGHT, x]) * per_nat
+        within += own
+        out.lane[c, b, x // STEPS] += own
     mass = 0.0
     for t in range(begin, end + 1):
         mass += np.exp(row.log_prior[t])
-    behind, before, change = none_prior(
-        sweep.w_near, sweep.w_far, row.w[begin], row.w[end], state.none_weight
-    )
+    behind, before, change = none_prior(sweep.w_near, sweep.w_far, row.w[begin], row.w[end], state.none_weight)
     share = np.log((1.0 - behind - before - change) / mass)
     all_right, all_left = (behind, before) if step > 0 else (before, behind)
     out.none[c, b, 0] = (np.log(all_right) - share) * per_nat

@@ -46,11 +46,12 @@ MOST_OCTAVES: Final = 60
 class Search(NamedTuple):
     """Addresses of a thread's buffers for BATCH rows of `lanes` lanes, and the bytes from row to row of each.
 
-    n: counts, see `rig.lane_order`. In lane order without padding, int16: score (STEPS * lanes,); start (lanes,), score
-    of a change at the lane's first pixel; best (lanes,), best score of each lane. For all rows of a batch together:
-    constant (SCREENS * STEPS * lanes,) and lane (lanes,), the tables' parts per exposure times the exposures; none (3,)
-    as in `Tables`. all_left (BATCH,), score of all pixels lying left. What was found in each row, 32 bits each: x, the close-up's levels, and
-    float32 confidence (BATCH,). mass: float32 (BATCH, LANES), sums to be taken across.
+    n: counts, see `rig.lane_order`. In lane order without padding, int16: score (STEPS * lanes,); start (lanes,),
+    score of a change at the lane's first pixel; best (lanes,), best score of each lane. For all rows of a batch
+    together: constant (SCREENS * STEPS * lanes,) and lane (lanes,), the tables' parts per exposure times the
+    exposures; none (3,) as in `Tables`. all_left (BATCH,), score of all pixels lying left. What was found in each row,
+    32 bits each: x, the close-up's levels, and float32 confidence (BATCH,). mass: float32 (BATCH, LANES), sums to be
+    taken across.
     """
 
     lanes: int
@@ -227,19 +228,24 @@ def _score_pair(edge, tap, search, r, lanes):  # type: ignore[no-untyped-def]
             n, at, at + stride, at + 2 * stride, tap, constant, edge, lanes + v, pixels, levels, tops, score, other
         )  # fmt: skip
         levels, tops = _score_step(
-            n, at + stride, at + 2 * stride, at + 3 * stride, tap, constant, edge, 2 * lanes + v, pixels, levels, tops, score, other
+            n, at + stride, at + 2 * stride, at + 3 * stride, tap, constant, edge, 2 * lanes + v, pixels, levels, tops,
+            score, other
         )  # fmt: skip
         levels, tops = _score_step(
-            n, at + 2 * stride, at + 3 * stride, at + 4 * stride, tap, constant, edge, 3 * lanes + v, pixels, levels, tops, score, other
+            n, at + 2 * stride, at + 3 * stride, at + 4 * stride, tap, constant, edge, 3 * lanes + v, pixels, levels,
+            tops, score, other
         )  # fmt: skip
         levels, tops = _score_step(
-            n, at + 3 * stride, at + 4 * stride, at + 5 * stride, tap, constant, edge, 4 * lanes + v, pixels, levels, tops, score, other
+            n, at + 3 * stride, at + 4 * stride, at + 5 * stride, tap, constant, edge, 4 * lanes + v, pixels, levels,
+            tops, score, other
         )  # fmt: skip
         levels, tops = _score_step(
-            n, at + 4 * stride, at + 5 * stride, at + 6 * stride, tap, constant, edge, 5 * lanes + v, pixels, levels, tops, score, other
+            n, at + 4 * stride, at + 5 * stride, at + 6 * stride, tap, constant, edge, 5 * lanes + v, pixels, levels,
+            tops, score, other
         )  # fmt: skip
         levels, tops = _score_step(
-            n, at + 5 * stride, at + 6 * stride, end, tap, constant, edge, 6 * lanes + v, pixels, levels, tops, score, other
+            n, at + 5 * stride, at + 6 * stride, end, tap, constant, edge, 6 * lanes + v, pixels, levels, tops, score,
+            other
         )  # fmt: skip
         levels, tops = _score_step(
             n, at + 6 * stride, end, at + 1, tap, constant, edge, 7 * lanes + v, pixels, levels, tops, score, other
@@ -304,7 +310,7 @@ def best_position(search: Search, r: int, best: int) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def add_likelihoods(search: Search, r: int, best: int, shift: int) -> None:
-    """Fill row r of search.mass: likelihoods of all positions, and of a change at each lane's start without a stripe."""
+    """Fill row r of search.mass: likelihoods of all positions, and of a change without a stripe at each lane."""
     lanes = search.lanes
     score = search.score + r * search.score_bytes
     most = np.int64(best) + ((MOST_OCTAVES * 128) >> shift)

@@ -1,4 +1,4 @@
-"""The counter of `likelihood`: judges each column as soon as it is complete, so that a sweep's counts are never stored."""
+"""The counter of `likelihood`: judges each column as soon as it is complete and stores no counts of it."""
 
 from dataclasses import dataclass
 

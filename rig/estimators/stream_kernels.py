@@ -27,7 +27,6 @@ from rig.estimators.search_kernels import BATCH
 from rig.lane_order import STEPS, halve_counts, read_counts, read_planes, sum_counts
 from rig.lanes import address_of, read_int32
 
-
 SUM_LIMIT: Final = 30000
 """Exposures after which the 16-bit sums are carried over."""
 
@@ -199,7 +198,7 @@ def search_counts(
     first_row: int,
     last_row: int,
 ) -> None:
-    """Judge rows first_row..last_row-1 of counts (columns, rows, window); found.light and found.lines stay as they are."""
+    """Judge rows first_row..last_row-1 of counts (columns, rows, window); no light and no lines are kept."""
     desk = desk_of(judge, found, bench)
     sums_x0, pending = np.int64(0), 0
     for c in range(counts.shape[0]):

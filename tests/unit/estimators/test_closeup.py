@@ -69,7 +69,7 @@ def placed(counts, k, haze_level, line_level, near_is_left, sigma_px, shift=SHIF
     weight, constant = made.weight[haze_level, line_level].copy(), made.constant[haze_level, line_level].copy()
     return look(
         n.ctypes.data, LANE_COUNT, x, float(k), weight.ctypes.data, constant.ctypes.data, made.weight.shape[2],
-        made.index.ctypes.data, made.square.ctypes.data, shift,
+        made.label.ctypes.data, made.square.ctypes.data, shift,
     )  # fmt: skip
 
 
@@ -136,7 +136,10 @@ def test_the_expected_answer_is_where_the_line_is(k, offset, near_is_left):
     label = int(np.argmin(np.abs(OFFSETS - offset)))
     truth = fluxes(level_flux(haze_level), level_flux(line_level), near_is_left, 0.6)[label]
     answers = np.array(
-        [placed(c, k, haze_level, line_level, near_is_left, 0.6) for c in rng.binomial(k, -np.expm1(-truth), (400, len(truth)))]
+        [
+            placed(c, k, haze_level, line_level, near_is_left, 0.6)
+            for c in rng.binomial(k, -np.expm1(-truth), (400, len(truth)))
+        ]
     )
     assert abs(answers[:, 0].mean() - offset) < 0.03
     # What is stated is what happens, with the width of a label, in whose middle these lines lie.
@@ -169,4 +172,4 @@ def test_spare_lanes_are_no_labels():
     made = tables(True, 0.6)
     assert LABELS < LANES
     assert np.all(made.constant[:, :, LABELS:] < -1e20)
-    assert np.count_nonzero(made.index) == LABELS - 1
+    assert np.count_nonzero(made.label) == LABELS - 1

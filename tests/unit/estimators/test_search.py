@@ -161,9 +161,10 @@ def scores(judge, c, band, counts, exposures):
     lanes = tables.lane.shape[2]
     memory = search_memory(lanes)
     search = search_in(memory, lanes)
-    part = [getattr(tables, name)[c, band] for name in ("position", "prior", "lane", "none", "edge", "tap")]
-    position, prior, lane, none, edge, tap = (np.ascontiguousarray(a) for a in part)
-    set_exposures(*(a.ctypes.data for a in (position, prior, lane, none)), float(exposures), search)
+    part = [getattr(tables, name)[c, band] for name in ("position", "slope", "lane", "none", "edge", "tap")]
+    position, slope, lane, none, edge, tap = (np.ascontiguousarray(a) for a in part)
+    addresses = (a.ctypes.data for a in (position, slope, lane, none))
+    set_exposures(*addresses, float(exposures), float(judge.nominal), search)
     for r, row in enumerate(counts):
         read_counts(row, 0, search.n + r * search.n_bytes, lanes)
     sum_edges(edge.ctypes.data, search, len(counts))
@@ -299,7 +300,9 @@ def test_extreme_models_neither_wrap_round_nor_leave_the_numbers(rig, name):
         for c in range(0, sweep.geometry.columns, 31):
             found, wanted, inside = scores(judge, c, 0, hard_rows(rng, judge.window, exposures), exposures)
             np.testing.assert_array_equal(found[inside], np.clip(wanted, -32768, 32767)[inside])
-        stripe = searched(volume_of(simulated("report", exposures, rig).counts, sweep.geometry, exposures), sweep.geometry, learned)
+        stripe = searched(
+            volume_of(simulated("report", exposures, rig).counts, sweep.geometry, exposures), sweep.geometry, learned
+        )
         assert np.isfinite(stripe[:, sweep.geometry.x_lo <= sweep.geometry.x_hi]).all()
 
 

@@ -1,5 +1,7 @@
 """Bit-sliced counting against unpacked sums: every number of frames, ragged chunks, dark frames, moving windows."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -71,11 +73,11 @@ def test_words_beside_a_chunk_are_left_alone():
 
 
 def runs(words, first_word, row_words, used_words, bins, x0, window, rows, width_words, pieces=(0, 1), dtype=np.uint16):
-    """Counts (columns, rows, window) and dark sums (rows, width) of `add_runs`, rows in pieces as of several threads."""
+    """Counts (columns, rows, window) and dark sums (rows, width) of `add_runs`, rows in pieces as of threads."""
     counts = np.zeros((len(x0), rows, window), dtype)
     dark = np.zeros((rows, 8, width_words * WORD // 8 + LANES), np.int32)
     edges = [round(share * rows) for share in pieces]
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in pairwise(edges):
         add_runs(
             words.ravel(), np.asarray(first_word, np.int32), row_words, used_words, np.asarray(bins, np.int32),
             np.asarray(x0, np.int32), counts, dark, first, last,

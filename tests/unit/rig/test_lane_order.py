@@ -36,7 +36,9 @@ def padding_of(n, lanes):
     return np.concatenate([steps[:, :PAD].ravel(), steps[:, PAD + lanes :].ravel()])
 
 
-@pytest.mark.parametrize(("pixels", "lanes"), [(1, 16), (64, 16), (128, 16), (192, 32), (256, 32), (320, 48), (512, 64)])
+@pytest.mark.parametrize(
+    ("pixels", "lanes"), [(1, 16), (64, 16), (128, 16), (192, 32), (256, 32), (320, 48), (512, 64)]
+)
 def test_rows_are_whole_vectors(pixels, lanes):
     assert padded_lanes(pixels) == lanes
     assert new_counts(lanes).shape == (STEPS * (lanes + 2 * PAD),)

@@ -23,7 +23,9 @@ def compiled(operation):
 
     @numba.njit
     def kernel(a, b, out):
-        lanes.store_int16(address_of(out), 0, operation(lanes.load_int16(address_of(a), 0), lanes.load_int16(address_of(b), 0)))
+        lanes.store_int16(
+            address_of(out), 0, operation(lanes.load_int16(address_of(a), 0), lanes.load_int16(address_of(b), 0))
+        )
 
     return kernel
 
@@ -139,7 +141,9 @@ def test_unsigned_bytes_are_widened():
 @numba.njit
 def float_lanes(a, b, weight):
     one, other = lanes.load_float32(address_of(a), 0), lanes.load_float32(address_of(b), 0)
-    return lanes.total((lanes.larger_float(one, other) + one * other - other) * lanes.load_float32(address_of(weight), 0))
+    return lanes.total(
+        (lanes.larger_float(one, other) + one * other - other) * lanes.load_float32(address_of(weight), 0)
+    )
 
 
 def test_float_lanes_do_what_numpy_does():
@@ -157,7 +161,9 @@ def test_float_lanes_do_what_numpy_does():
 def test_bfloat16_patterns_become_numbers_in_the_order_that_is_said():
     @numba.njit
     def number(a, only):
-        return lanes.total(lanes.from_bfloat16(lanes.load_int16(address_of(a), 0)) * lanes.load_float32(address_of(only), 0))
+        return lanes.total(
+            lanes.from_bfloat16(lanes.load_int16(address_of(a), 0)) * lanes.load_float32(address_of(only), 0)
+        )
 
     numbers = np.array([0, 1, 2, 0.5, -3, 1e30, 1e-30, 7, 1.5, 2.5, 100, -0.25, 3e5, 1e-5, 96, 12], np.float32)
     patterns = (numbers.view(np.uint32) >> 16).astype(np.uint16).view(np.int16)
@@ -174,7 +180,9 @@ def test_floats_lose_their_fraction_on_the_way_to_integers():
     def cut(a, out):
         lanes.store_int16(address_of(out), 0, lanes.to_int16(lanes.load_float32(address_of(a), 0)))
 
-    a = np.array([-32000, -1.9, -1, -0.5, 0, 0.5, 0.99, 1, 1.5, 2.999, 100, 255.5, 1e4, 31999.9, -12345.6, 3], np.float32)
+    a = np.array(
+        [-32000, -1.9, -1, -0.5, 0, 0.5, 0.99, 1, 1.5, 2.999, 100, 255.5, 1e4, 31999.9, -12345.6, 3], np.float32
+    )
     out = np.empty(LANES, np.int16)
     cut(a, out)
     np.testing.assert_array_equal(out, np.trunc(a))
