@@ -118,6 +118,13 @@ class EstimateConfig(Section):
     min_confidence: float = Field(
         default=0.5, ge=0, le=1, description="answers below this confidence do not enter the depth map", examples=[0.5]
     )
+    threads: int | None = Field(
+        default=None,
+        ge=1,
+        le=256,
+        description="threads that count and estimate, null for one a core; results do not depend on it",
+        examples=[2],
+    )
 
 
 def _of_slot(slot: str) -> BeforeValidator:

@@ -18,7 +18,7 @@ def reconstruct_cube(
 ) -> RunResult:
     """All maps of a checked cube. An interrupt ends the run after its last whole map, with verdict 'aborted'."""
     plan = cube.plan
-    threads = os.cpu_count() or 1
+    threads = estimate.threads or os.cpu_count() or 1
     reconstructor = Reconstructor(
         model,
         column_commands(plan),

@@ -4,10 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.geometry import SweepGeometry
+from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
 
-def depth_map(stripes: StripeTable, geometry: SweepGeometry, min_confidence: float) -> NDArray[np.float32]:
+def depth_map(
+    stripes: StripeTable, geometry: SweepGeometry, min_confidence: float, workers: RowWorkers | None = None
+) -> NDArray[np.float32]:
     """Depth z in metres (rows, width) float32, NaN where two confident neighbouring stripes do not enclose the pixel.
 
     Only stripes of at least `min_confidence` take part; nothing else is filled. Depth outside the depth range by more
@@ -15,15 +18,19 @@ def depth_map(stripes: StripeTable, geometry: SweepGeometry, min_confidence: flo
     """
     from rig.depth_kernels import fill_rows
 
-    shape = (geometry.rows, geometry.width)
-    inverse_depth = np.full(shape, np.nan, np.float32)
-    fill_rows(
-        stripes.x_px, stripes.confidence, stripes.x_sd_px, min_confidence, geometry.plane, geometry.u, geometry.v,
-        inverse_depth, np.full(shape, -1.0, np.float32),
-    )  # fmt: skip
     near_m, far_m = geometry.depth_range_m
-    with np.errstate(invalid="ignore"):
-        inside = (inverse_depth <= 1.1 / near_m) & (inverse_depth >= 0.9 / far_m)
-    depth = np.full(shape, np.nan, np.float32)
-    depth[inside] = 1.0 / inverse_depth[inside]
+    depth = np.full((geometry.rows, geometry.width), np.nan, np.float32)
+
+    def work(first: int, last: int) -> None:
+        rows = slice(first, last)
+        inverse_depth = np.full((last - first, geometry.width), np.nan, np.float32)
+        fill_rows(
+            stripes.x_px[rows], stripes.confidence[rows], stripes.x_sd_px[rows], min_confidence, geometry.plane,
+            geometry.u[rows], geometry.v[rows], inverse_depth, np.full(inverse_depth.shape, -1.0, np.float32),
+        )  # fmt: skip
+        with np.errstate(invalid="ignore"):
+            inside = (inverse_depth <= 1.1 / near_m) & (inverse_depth >= 0.9 / far_m)
+        depth[rows][inside] = 1.0 / inverse_depth[inside]
+
+    (workers or RowWorkers(1)).over(geometry.rows, work)
     return depth

@@ -15,6 +15,7 @@ from rig.depth import depth_map
 from rig.errors import UsageError
 from rig.estimators import ESTIMATORS, FILTERS, Learned, create_estimator
 from rig.geometry import SweepGeometry, sweep_geometry, uncalibrated_geometry
+from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
 VISIBILITY_CONTRAST = 3.912
@@ -74,6 +75,7 @@ class Reconstructor:
         self._commands = np.asarray(column_commands, dtype=np.float64)
         self._min_confidence = min_confidence
         self._filter = filter
+        self._workers = RowWorkers(threads)
         self.estimator = create_estimator(estimator, threads)
         if model is not None:
             self.geometry = sweep_geometry(model, model.planes(self._commands), depth_range_m)
@@ -101,7 +103,7 @@ class Reconstructor:
         if self._model is None:
             depth = np.full((geometry.rows, geometry.width), np.nan, np.float32)
         else:
-            depth = depth_map(stripe, geometry, self._min_confidence)
+            depth = depth_map(stripe, geometry, self._min_confidence, self._workers)
         compute_s = time.perf_counter() - begun
         return MapResult(stripe, depth, sweep.intensity(), self._fog(), compute_s, self.estimator.used)
 

@@ -48,7 +48,7 @@ def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, options: ScanOptions 
     options = options or ScanOptions()
     require_policy(options.policy, rig.spad.info)
     plan, timing = prepare(rig)
-    threads = os.cpu_count() or 1
+    threads = rig.config.estimate.threads or os.cpu_count() or 1
     reconstructor = _reconstructor(rig, plan, threads)
     geometry = reconstructor.geometry
     run.rays = (geometry.u, geometry.v) if rig.model is not None else None

@@ -36,7 +36,7 @@ LAG_FRAMES = 50_000
 
 
 class Likelihood:
-    """Row likelihood with the state it has learned so far; `model` is None before the first map.
+    """Row likelihood with the state it has learned so far; `model` is None before a map that taught.
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
     """
@@ -64,14 +64,15 @@ class Likelihood:
             assert self.model is not None, "a sweep is judged under a model"
             self.used = self.model
         else:
-            if self.model is None:
-                self.model = self._first_model(sweep, geometry)
-            self.used = self.model
+            self.used = self.model if self.model is not None else self._first_model(sweep, geometry)
             stripes, quiet = self._search(sweep, geometry, self.used)
             lines = lines_of(sweep, next_lattice(geometry))
         self._frames_since += int(sweep.n_frames.sum())
+        sure = bool(np.mean(stripes.confidence > 0.5) >= LEAST_SURE)
+        if sure and self.model is None:
+            self.model = self.used
         if self._lesson is None:
-            if self._frames_since >= TEACH_FRAMES and np.mean(stripes.confidence > 0.5) >= LEAST_SURE:
+            if sure and self._frames_since >= TEACH_FRAMES:
                 self._frames_since = 0
                 self._lesson = self._tutor.submit(
                     _teach, self.used, self._taught, sweep, sweep.intensity(), geometry, quiet, lines

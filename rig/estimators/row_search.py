@@ -53,8 +53,6 @@ FIELDS: Final = 5
 """x_px, confidence, x_sd_px, signal, haze: see `StripeTable`."""
 NO_NAN: Final = {"nnan", "nsz"}
 """For min and max without a branch, which could not be foreseen."""
-INSIDE: Final = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-"""For functions that only compiled code calls: handing a tuple of 60 numbers in from Python takes longest to compile."""
 NOWHERE: Final = -1
 """Position of a row without a search window."""
 SIGNAL_REACH_PX: Final = 2
@@ -172,7 +170,7 @@ class Desk(NamedTuple):
     brightest: np.float32
 
 
-@numba.njit(cache=True, nogil=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def desk_of(judge: Judge, found: Found, bench: Bench) -> Desk:
     """Addresses of everything; the arrays must outlive it."""
     tables, closeup = judge.tables, judge.closeup
@@ -216,7 +214,7 @@ def halvings(exposures: int) -> int:
     return times
 
 
-@numba.njit(cache=True, nogil=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def set_column(desk: Desk, c: int, b: int, exposures: float) -> None:
     """Make ready for rows of band b of column c."""
     pixels, table = STEPS * desk.search.lanes, c * desk.bands + b
@@ -229,7 +227,7 @@ def set_column(desk: Desk, c: int, b: int, exposures: float) -> None:
         write_float32(desk.own_ambient, x, read_float32(desk.ambient, first + x))
 
 
-@numba.njit(cache=True, nogil=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def _mute_hot(desk: Desk, n: int, y: int, c: int, table: int, exposures: float) -> None:
     """Give the hot pixels of row y counts that speak for no position."""
     x0, lanes = read_int32(desk.x0, c), desk.search.lanes
@@ -243,7 +241,7 @@ def _mute_hot(desk: Desk, n: int, y: int, c: int, table: int, exposures: float) 
             write_int16(n, place_of(at, lanes), np.int16(exposures * neutral + chance))
 
 
-@numba.njit(cache=True, nogil=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def judge_rows(desk: Desk, first: int, rows: int, c: int, b: int, exposures: float) -> None:
     """Estimate rows first..first+rows-1 (at most BATCH) of column c, all of band b.
 
@@ -270,7 +268,7 @@ def judge_rows(desk: Desk, first: int, rows: int, c: int, b: int, exposures: flo
                 _learn_quiet(desk, search.n + r * search.n_bytes, first + r, c, x, exposures)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=NO_NAN, **INSIDE)
+@numba.njit(cache=True, nogil=True, fastmath=NO_NAN)
 def _find(search: Search, rows: int, window: int, shift: int) -> None:
     """Best position of each row of the batch, and the probability of lying within 1 px of it."""
     lanes = search.lanes
@@ -295,7 +293,7 @@ def _find(search: Search, rows: int, window: int, shift: int) -> None:
         write_float32(search.confidence, r, min((own + near) / (own + others), np.float32(1.0)))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=NO_NAN, **INSIDE)
+@numba.njit(cache=True, nogil=True, fastmath=NO_NAN)
 def _measure_light(desk: Desk, first: int, rows: int, c: int, table: int, exposures: float) -> None:
     """Signal and haze of the batch's rows, from row `first` of the picture on, for answers and close-up."""
     search = desk.search
@@ -325,7 +323,7 @@ def _measure_light(desk: Desk, first: int, rows: int, c: int, table: int, exposu
         write_float32(stripe, 4 * desk.rows + y, max(before - ambient, np.float32(0.0)))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=NO_NAN, **INSIDE)
+@numba.njit(cache=True, nogil=True, fastmath=NO_NAN)
 def _look_closely(desk: Desk, first: int, rows: int, c: int, exposures: float) -> None:
     """Place the lines of the batch's rows, and write the answers."""
     search = desk.search
@@ -349,7 +347,7 @@ def _look_closely(desk: Desk, first: int, rows: int, c: int, exposures: float) -
             write_float32(stripe, 2 * desk.rows + y, sd)
 
 
-@numba.njit(cache=True, nogil=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def _learn_quiet(desk: Desk, n: int, y: int, c: int, x: int, exposures: float) -> None:
     """Add the whole lanes behind the stripe at stored pixel x to the quiet counts."""
     lanes = desk.search.lanes

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from rig.counting_kernels import CHUNK, FEW_FRAMES, PLANES, WORD_BYTES, WORD_PX, add_frames, clear
 from rig.estimators.row_search import (
     COUNT_LIMIT,
-    INSIDE,
     Bench,
     Found,
     Judge,
@@ -91,7 +90,7 @@ def _carry(here, picture, lane, first_row, last_row):  # type: ignore[no-untyped
                 some[i] = 0
 
 
-@numba.njit(cache=True, nogil=True, **INSIDE)
+@numba.njit(cache=True, nogil=True)
 def _finish(desk, found, state, planes, row_bytes, first_row, last_row):  # type: ignore[no-untyped-def]
     """Judge rows first_row..last_row-1 of a finished column; planes: address of the chunk's counters."""
     c, k = state.column, state.frames

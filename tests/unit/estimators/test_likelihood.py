@@ -55,13 +55,13 @@ def test_threads_change_nothing():
 def test_the_saved_model_gives_the_very_same_table_again(monkeypatch):
     _, estimator = estimated()
     monkeypatch.setattr(likelihood, "TEACH_FRAMES", 1)
+    monkeypatch.setattr(likelihood, "LAG_FRAMES", 1)
     saved, later = estimator.model, simulated(seed=2)
-    again = Likelihood(model=saved)
-    once = again.estimate(later.volume, later.geometry)
-    assert again.model is not saved
-    twice = Likelihood(3, model=saved)
-    assert_same(once, twice.estimate(later.volume, later.geometry))
-    assert_same_model(again.model, twice.model)
+    again, twice = Likelihood(model=saved), Likelihood(3, model=saved)
+    for _ in range(3):
+        assert_same(*(one.estimate(later.volume, later.geometry) for one in (again, twice)))
+        assert_same_model(again.model, twice.model)
+    assert again.used is not saved
 
 
 def test_the_very_first_map_is_estimated_again_from_the_state_it_used():
@@ -239,17 +239,18 @@ def test_a_second_map_is_no_worse_than_the_first():
     assert shares[1] > shares[0] - 0.03
 
 
-def test_a_map_teaches_when_enough_frames_have_come_and_only_then():
-    sweep, later = simulated(), simulated(seed=2)
-    estimator = Likelihood()
-    estimator.estimate(sweep.volume, sweep.geometry)
-    first = estimator.model
-    taught = []
-    for _ in range(7):
-        estimator.estimate(later.volume, later.geometry)
-        taught.append(estimator.model is not first)
-    # 960 frames a map: the sixth one makes 5000.
-    assert taught == [False, False, False, False, True, True, True]
+def test_a_map_teaches_when_enough_frames_have_come_and_is_heeded_some_later(monkeypatch):
+    # 960 frames a map: the third one teaches, the one after the next has waited long enough.
+    monkeypatch.setattr(likelihood, "TEACH_FRAMES", 2000)
+    monkeypatch.setattr(likelihood, "LAG_FRAMES", 1000)
+    sweep = simulated()
+    estimator, models = Likelihood(), []
+    for _ in range(6):
+        estimator.estimate(sweep.volume, sweep.geometry)
+        models.append(estimator.model)
+    assert all(model is models[0] for model in models[:4])
+    assert models[4] is models[5] is not models[0]
+    assert estimator.used is models[4]
 
 
 @pytest.mark.parametrize("level", [0, 10])
@@ -265,7 +266,9 @@ def test_a_first_map_without_contrast_teaches_nothing(level):
 
 def test_a_later_map_of_a_closed_shutter_teaches_nothing(monkeypatch):
     monkeypatch.setattr(likelihood, "TEACH_FRAMES", 1)
+    monkeypatch.setattr(likelihood, "LAG_FRAMES", 1)
     sweep, model = simulated(), estimated()[1].model
     estimator = Likelihood(model=model)
-    estimator.estimate(volume_of(np.zeros_like(sweep.counts), sweep.geometry, 10), sweep.geometry)
+    for _ in range(3):
+        estimator.estimate(volume_of(np.zeros_like(sweep.counts), sweep.geometry, 10), sweep.geometry)
     assert estimator.model is model

@@ -58,7 +58,8 @@ def frames_of(rig="left", exposures=10, seed=1) -> Frames:
     bits, bins = [], []
     for c in range(COLUMNS):
         rate = -np.expm1(-scene(rig).point.flux_of_column(c))
-        taken = exposures + int(rng.integers(-1, 2)) if exposures > 2 else exposures
+        # Most columns get what is nominal: a sweep that is there already is judged for its median.
+        taken = exposures + int(rng.choice([0, 0, 0, 0, -1, 1])) if exposures > 2 else exposures
         kinds = np.full(taken, c)
         for other, share in ((BIN_DARK, 0.5), (BIN_UNUSABLE, 0.2)):
             if rng.random() < share:
@@ -121,16 +122,17 @@ def assert_same(found, wanted):
 @pytest.fixture(autouse=True)
 def every_map_teaches(monkeypatch):
     monkeypatch.setattr(likelihood, "TEACH_FRAMES", 1)
+    monkeypatch.setattr(likelihood, "LAG_FRAMES", 1)
 
 
 @pytest.mark.parametrize("rig", RIGS)
 @pytest.mark.parametrize("exposures", [1, 10, 20, 100])
 def test_judged_on_the_way_is_judged_afterwards(rig, exposures):
     layout = layout_of(rig, exposures)
-    sweeps = [frames_of(rig, exposures, seed) for seed in (1, 2)]
+    sweeps = [frames_of(rig, exposures, seed) for seed in (1, 2, 3)]
     found = judged(rig, layout, sweeps, 2, [37])
     assert all(isinstance(sweep, SearchedSweep) for _, sweep, _ in found)
-    assert found[0][2] is not found[1][2]
+    assert found[1][2] is not found[0][2], "the third sweep is judged with what the first one taught"
     assert_same(found, counted(rig, layout, sweeps))
 
 
@@ -158,7 +160,7 @@ def test_gaps_leave_the_other_columns_alone(missing, exposures):
         "first": ~lit | (whole.bins > 2),
         "last": ~lit | (whole.bins < COLUMNS - 3),
         "some": ~lit | (whole.bins % 4 != 1),
-        "parts": number % 11 != 1,
+        "parts": number % 40 != 1,
         "all": ~lit,
     }[missing]
     layout, sweeps = layout_of(exposures=exposures), [whole[keep], whole]

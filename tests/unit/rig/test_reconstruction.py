@@ -144,8 +144,9 @@ def test_the_median_filter_leaves_light_alone_and_brings_positions_nearer():
     assert np.nanmean(errors(filtered.stripe.x_px)) < 0.8 * np.nanmean(errors(plain.stripe.x_px))
 
 
-def test_what_maps_taught_serves_the_next_one_once_they_are_enough(monkeypatch):
-    monkeypatch.setattr(likelihood, "TEACH_FRAMES", 2 * 96)
+def test_what_a_map_taught_serves_the_ones_after_the_next(monkeypatch):
+    monkeypatch.setattr(likelihood, "TEACH_FRAMES", 1)
+    monkeypatch.setattr(likelihood, "LAG_FRAMES", 1)
     sweep, later = simulated(exposures=1), simulated(exposures=1, seed=2)
     rebuilt = reconstructor(sweep)
     assert rebuilt.estimator.model is None
