@@ -34,6 +34,12 @@ TAP_SHARE = 0.06
 SCORE_LIMIT = 12500
 """Largest sum of taps times counts: less than half of the range of 16 bits, so that no sum of two wraps round."""
 MOST_HALVINGS = 6
+CLOSE_LIMIT = 30000
+"""Largest product of a count and a weight of the close-up, whose sums saturate."""
+LOGIT_OCTAVES = 22
+"""The logit of a detection probability, floor and all, lies within 11 octaves of 0 either way."""
+SPARE_FRAMES = 8
+"""A column may have this many frames more than twice the nominal number before its counts are halved."""
 HOT_FACTOR, HOT_FLUX = 4.0, 0.02
 """A pixel is hot for the search from this many times its neighbours' ambient light, and so much more, on."""
 
@@ -49,8 +55,8 @@ def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: 
     reach = max(1, int(np.count_nonzero(state.psi[1:] > TAP_SHARE)))
     bands, columns = state.ambient.shape[0], geometry.columns
     tables = _empty_tables(columns, bands, padded_lanes(geometry.window), reach)
-    most = min(exposures + 2, COUNT_LIMIT)
-    nominal = exposures / 2.0 ** halvings(exposures)
+    most = min(2 * exposures + SPARE_FRAMES, COUNT_LIMIT)
+    nominal = exposures / 2.0 ** halvings(exposures, most)
     for shift in range(MOST_HALVINGS + 1):
         if most * _largest_sum(sweep, state, light, reach, 128 >> shift) <= SCORE_LIMIT:
             break
@@ -59,10 +65,11 @@ def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: 
         fill_tables(sweep, state, light, log_share, float(128 >> shift), nominal, first, last, tables)
 
     workers.over(bands, work)
+    close_shift = next(i for i in range(MOST_HALVINGS + 1) if most * LOGIT_OCTAVES * (128 >> i) <= CLOSE_LIMIT)
     haze, rest = model.profile[:, 0], model.profile[:, 1]
     closeup = closeup_tables(
         float(np.median(state.ambient)), float(rest.sum() / max(haze.sum(), 1e-9)), geometry.near_is_left,
-        state.fine, TABLE, float(128 >> shift),
+        state.fine, TABLE, float(128 >> close_shift),
     )  # fmt: skip
     expected = np.repeat(state.ambient, band_rows, axis=0)[: geometry.rows]
     y, x = np.nonzero(model.ambient > HOT_FACTOR * expected + HOT_FLUX)
@@ -85,6 +92,8 @@ def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: 
         brightest=float(model.amplitude[-1]),
         reach=max(SIGNAL_REACH_PX, reach),
         shift=shift,
+        close_shift=close_shift,
+        most=most,
         quiet_step=QUIET_STEP if dark else 1,
         flux=count_fluxes(),
     )

@@ -66,8 +66,9 @@ class Judge(NamedTuple):
     stored pixel of each search window, the first behind the last where there is none. rows: of the picture. ambient:
     float32 (bands, width padded to whole words). hot_start: int32 (rows + 1,) and hot_x: int32, pixels of each row
     whose counts say nothing. nominal: exposures the tables are for. faintest, brightest: photons of a stripe at scale
-    1. reach: half the line's width in px. shift: units of the scores are 128 >> shift an octave. quiet_step: every so
-    manieth column teaches the ambient light. flux: see `count_fluxes`.
+    1. reach: half the line's width in px. shift: units of the scores are 128 >> shift an octave, close_shift: of the
+    close-up's. most: largest count. quiet_step: every so manieth column teaches the ambient light. flux: see
+    `count_fluxes`.
     """
 
     tables: Tables
@@ -86,6 +87,8 @@ class Judge(NamedTuple):
     brightest: float
     reach: int
     shift: int
+    close_shift: int
+    most: int
     quiet_step: int
     flux: NDArray[np.float32]
 
@@ -163,6 +166,8 @@ class Desk(NamedTuple):
     window: int
     reach: int
     shift: int
+    close_shift: int
+    most: int
     quiet_step: int
     near_is_left: bool
     nominal: np.float32
@@ -185,8 +190,8 @@ def desk_of(judge: Judge, found: Found, bench: Bench) -> Desk:
         address_of(bench.ambient), address_of(judge.flux), address_of(found.stripe), address_of(found.quiet_here),
         address_of(found.quiet_exposures), address_of(found.light_here), found.light.shape[2],
         address_of(found.lines), address_of(found.line_start), address_of(found.line_row), judge.band_rows,
-        judge.window, judge.reach, judge.shift, judge.quiet_step, judge.near_is_left, np.float32(judge.nominal),
-        np.float32(judge.faintest), np.float32(judge.brightest),
+        judge.window, judge.reach, judge.shift, judge.close_shift, judge.most, judge.quiet_step, judge.near_is_left,
+        np.float32(judge.nominal), np.float32(judge.faintest), np.float32(judge.brightest),
     )  # fmt: skip
 
 
@@ -206,10 +211,10 @@ def count_fluxes() -> NDArray[np.float32]:
 
 
 @numba.njit(cache=True, nogil=True)
-def halvings(exposures: int) -> int:
+def halvings(exposures: int, most: int) -> int:
     """How often counts of so many exposures are halved."""
     times = 0
-    while (exposures >> times) > COUNT_LIMIT:
+    while (exposures >> times) > most:
         times += 1
     return times
 
@@ -335,7 +340,7 @@ def _look_closely(desk: Desk, first: int, rows: int, c: int, exposures: float) -
             likelihood = label_likelihoods(
                 search.n + r * search.n_bytes, search.lanes, x, exposures,
                 desk.weight + 2 * LANES * desk.weight_px * levels, desk.weight_constant + 4 * LANES * levels,
-                desk.weight_px, desk.shift,
+                desk.weight_px, desk.close_shift,
             )  # fmt: skip
             store_float32(search.mass, r * LANES, likelihood)
     for r in range(rows):

