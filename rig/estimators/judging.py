@@ -21,7 +21,7 @@ from rig.estimators.row_search import (
 )
 from rig.estimators.screen_tables import SCREENS, Tables, fill_tables
 from rig.geometry import SweepGeometry
-from rig.lane_order import STEPS, padded_lanes
+from rig.lane_order import STEPS, padded_lanes, pixel_order
 from rig.lanes import LANES
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
@@ -133,6 +133,12 @@ def stripes_of(found: Found, workers: RowWorkers) -> StripeTable:
     out = np.empty((fields, rows, columns), np.float32)
     workers.over(rows, lambda first, last: turned(found.stripe, first, last, out))
     return StripeTable(*out)
+
+
+def quiet_of(found: Found, width: int) -> NDArray[np.int32]:
+    """Ones and exposures of pixels while clearly behind a stripe, int32 (2, rows, width)."""
+    exposures = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), STEPS, axis=1)[:, :width]
+    return np.stack([pixel_order(found.quiet, width), exposures])
 
 
 def _limits(geometry: SweepGeometry) -> NDArray[np.int16]:

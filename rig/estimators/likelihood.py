@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rig.counting import Counter, CountVolume, FrameTally, SweepCounter, SweepLayout
 from rig.estimators.ambient import ambient_map
-from rig.estimators.judging import judge_of, nothing_found, stripes_of
+from rig.estimators.judging import judge_of, nothing_found, quiet_of, stripes_of
 from rig.estimators.learning import Expectation, learn_first, learn_next, lines_of, next_lattice
 from rig.estimators.row_input import Lines
 from rig.estimators.row_model import RowModel
@@ -23,7 +23,7 @@ from rig.estimators.row_search import Judge, new_bench
 from rig.estimators.stream import MOST_EXPOSURES, ColumnJudge, SearchedSweep
 from rig.estimators.stream_kernels import search_counts
 from rig.geometry import SweepGeometry
-from rig.lane_order import padded_lanes, pixel_order
+from rig.lane_order import padded_lanes
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
@@ -116,8 +116,7 @@ class Likelihood:
             search_counts(volume.counts, volume.n_frames, judge, bench, found, first, last)
 
         self._workers.over(geometry.rows, work)
-        exposed = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), 8, axis=1)[:, : geometry.width]
-        return stripes_of(found, self._workers), np.stack([pixel_order(found.quiet, geometry.width), exposed])
+        return stripes_of(found, self._workers), quiet_of(found, geometry.width)
 
 
 _Lesson = tuple[RowModel, Expectation]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rig.counting import FrameTally, SweepLayout, SweepTally
 from rig.counting_kernels import CHUNK, add_runs, new_planes
-from rig.estimators.judging import clear_found, nothing_found, stripes_of
+from rig.estimators.judging import clear_found, nothing_found, quiet_of, stripes_of
 from rig.estimators.learning import next_lattice
 from rig.estimators.row_input import Lines
 from rig.estimators.row_search import Bench, Found, Judge, new_bench
@@ -98,14 +98,13 @@ class ColumnJudge:
             nothing = np.zeros(0, np.int32)
             self._judge_block(np.zeros(0, np.uint64), nothing, nothing, row_words, end=True)
         carry_sums(found, self._open.sums_x0, 0, layout.rows)
-        exposures = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), 8, axis=1)[:, : layout.width]
         rows, columns = self._lines
         tally = self._tally.finish()
         return SearchedSweep(
             n_frames=tally.n_frames, column=tally.column, dark_counts=tally.dark_counts, n_dark=tally.n_dark,
             width=tally.width, dark_frames=tally.dark_frames, stripe=stripes_of(found, self._workers),
             light=pixel_order(found.light, layout.width).astype(np.uint32),
-            quiet=np.stack([pixel_order(found.quiet, layout.width), exposures]),
+            quiet=quiet_of(found, layout.width),
             lines=Lines(found.lines.copy(), rows, columns, tally.n_frames[columns]),
         )  # fmt: skip
 
