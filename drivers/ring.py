@@ -89,8 +89,10 @@ class BlockRing:
         """Whether the source published its last block."""
         return self._finished
 
-    def reader(self, name: str, *, required: bool = True) -> "RingReader":
+    def reader(self, name: str, *, required: bool = True, holds: int = 1) -> "RingReader":
         """A new reader; before the first claim, so that all readers see all blocks.
+
+        holds: blocks that it keeps at a time, the newest ones, for work that is still under way.
 
         A reader with required=False (a monitor) never makes the source wait: it holds one slot at most, gets the
         newest block when it asks, and counts the ones it missed in `skipped`.
@@ -103,7 +105,7 @@ class BlockRing:
                 raise ValueError(
                     f"ring: optional reader {name!r} could hold the last of {self.slots} slots; make the ring longer"
                 )
-            reader = RingReader(self, name, required)
+            reader = RingReader(self, name, required, holds)
             self._readers.append(reader)
             return reader
 
@@ -201,18 +203,19 @@ class BlockRing:
 class RingReader:
     """One reader's place in the ring; `BlockRing.reader` makes it."""
 
-    def __init__(self, ring: BlockRing, name: str, required: bool) -> None:
+    def __init__(self, ring: BlockRing, name: str, required: bool, holds: int) -> None:
         self.name = name
         self.required = required
+        self.holds = holds
         self.skipped = 0
         """Blocks an optional reader did not get."""
         self._ring = ring
         self._waiting: deque[tuple[int, FrameBlock]] = deque()
-        self._held: int | None = None
+        self._held: deque[int] = deque()
         self._closed = False
 
     def next(self, timeout_s: float | None = None) -> FrameBlock | None:
-        """The next block, whose memory stays as it is until the next call; the block before it is released.
+        """The next block, whose memory stays as it is for as many calls as the reader holds blocks.
 
         None after the last block, or the source's error raised; `DeviceTimeout` after `timeout_s` (None: no limit).
         """
@@ -220,18 +223,19 @@ class RingReader:
         with ring._changed:
             if self._closed:
                 raise WrongState(f"ring: reader {self.name!r} is closed")
-            self._release_held()
+            self._release_held(self.holds - 1)
             if not ring._changed.wait_for(lambda: bool(self._waiting) or ring._finished, timeout_s):
                 raise DeviceTimeout(f"ring: no block for reader {self.name!r} within {timeout_s} s")
             if self._waiting:
-                self._held, block = self._waiting.popleft()
+                slot, block = self._waiting.popleft()
+                self._held.append(slot)
                 return block
             if ring._error is not None:
                 raise ring._error
             return None
 
     def release(self) -> None:
-        """Give the present block back before the next one is asked for; its memory is then the source's again."""
+        """Give all blocks back before the next one is asked for; their memory is then the source's again."""
         with self._ring._changed:
             self._release_held()
 
@@ -263,7 +267,7 @@ class RingReader:
         if self._closed:
             return False
         if not self.required:
-            if self._held is not None:
+            if self._held:
                 self.skipped += 1
                 return False
             if self._waiting:
@@ -272,10 +276,9 @@ class RingReader:
         self._waiting.append((slot, block))
         return True
 
-    def _release_held(self) -> None:
-        if self._held is not None:
-            self._ring._release(self._held)
-            self._held = None
+    def _release_held(self, but: int = 0) -> None:
+        while len(self._held) > but:
+            self._ring._release(self._held.popleft())
 
 
 def _aligned(n_bytes: int) -> NDArray[np.uint8]:

@@ -117,7 +117,12 @@ class Counter(Protocol):
         Row bytes are a multiple of 8; bins are a column index, BIN_DARK or BIN_UNUSABLE; the frames of a column follow
         one another. x0: (n,) int32, first used pixel of each frame, a multiple of 64; with rows shorter than the
         sensor's, their first pixel. The used pixels of a frame with a column index must hold that column's window.
+        The frames may be read on after this returns, see `settle`.
         """
+        ...
+
+    def settle(self, under_way: int = 0) -> None:
+        """Wait until none but the frames of the last `under_way` calls of `add` will be read any more."""
         ...
 
     def finish(self) -> FrameTally:
@@ -129,10 +134,11 @@ class SweepTally:
     """Adds up a sweep's `FrameTally`: frames per column, their mean column, and dark counts."""
 
     def __init__(self, layout: SweepLayout) -> None:
+        from rig.lane_order import PAIRS
         from rig.lanes import LANES
 
         self._layout = layout
-        self.dark = np.zeros((layout.rows, 8, layout.padded_width // 8 + LANES), np.int32)
+        self.dark = np.zeros((layout.rows, PAIRS, layout.padded_width // 8 + LANES, 2), np.int32)
         """Ones of dark frames, in lane order, with room for a whole vector behind each row."""
         self.reset()
 
@@ -204,6 +210,9 @@ class SweepCounter:
             )  # fmt: skip
 
         self._workers.over(layout.rows, work)
+
+    def settle(self, under_way: int = 0) -> None:
+        """Nothing is left over by `add`."""
 
     def _make_room(self) -> None:
         """Widen the counts before they can overflow."""

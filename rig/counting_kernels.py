@@ -14,7 +14,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.lane_order import PAD, STEPS, new_counts, padded_lanes, read_planes, write_counts
+from rig.aligned import aligned_zeros
+from rig.lane_order import PAD, PAIRS, STEPS, new_counts, padded_lanes, read_planes, write_counts
 from rig.lanes import LANES, address_of
 
 WORD_PX: Final = 64
@@ -34,7 +35,7 @@ def new_planes(chunks: int) -> NDArray[np.uint64]:
     Padded by two words, since kernels read 16 bytes at a time.
     """
     size = chunks * (PLANES + 1) * CHUNK
-    return np.zeros(size + 2, np.uint64)[:size].reshape(chunks, PLANES + 1, CHUNK)
+    return aligned_zeros((size + 2,), np.uint64)[:size].reshape(chunks, PLANES + 1, CHUNK)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -187,7 +188,7 @@ def add_runs(
     first_row: int,
     last_row: int,
 ) -> None:
-    """Add frames to `counts` (columns, rows, window), or to `dark` (rows, STEPS, lanes and LANES more) in lane order.
+    """Add frames to `counts` (columns, rows, window), or to `dark` (rows, PAIRS, lanes and LANES more, 2) in lane order.
 
     words: (all words,), `row_words` a row; first_word: (n,), word of the sensor at which a frame's used pixels begin,
     used_words of them; bins: (n,) column, -1 dark, -2 skip. Only rows first_row..last_row-1 are touched, so that
@@ -197,8 +198,8 @@ def add_runs(
     window = counts.shape[2] if counts.shape[0] else WORD_PX
     planes = np.zeros((PLANES + 1) * CHUNK + 2, np.uint64)
     as_bytes = planes.view(np.uint8)
-    n_lit = new_counts(padded_lanes(window))
-    n_dark = new_counts(padded_lanes(used_words * WORD_PX))
+    n_lit = new_counts(2, padded_lanes(window))
+    n_dark = new_counts(2, padded_lanes(used_words * WORD_PX))
     chunk_rows = max(CHUNK // row_words, 1)
     for y0 in range(first_row, last_row, chunk_rows):
         y1 = min(y0 + chunk_rows, last_row)
@@ -215,29 +216,30 @@ def add_runs(
                 # A frame of whole rows begins at the sensor's first word, a window where its used pixels do.
                 begins = 0 if row_words == width_words else first_word[f]
                 wanted = first_word[f] if c < 0 else x0[c] // WORD_PX
-                for y in range(y0, y1):
+                row_bytes, few_planes = row_words * WORD_BYTES, 4 if few else PLANES
+                used_px = used_words * WORD_PX if c < 0 else window
+                n_row = n_dark if c < 0 else n_lit
+                for y in range(y0, y1, 2):
                     at = ((y - y0) * row_words + wanted - begins) * WORD_BYTES
-                    if c < 0:
-                        read_planes(
-                            address_of(as_bytes), at, CHUNK * WORD_BYTES, 4 if few else PLANES, used_words * WORD_PX,
-                            address_of(n_dark), padded_lanes(used_words * WORD_PX),
-                        )  # fmt: skip
-                        _add_dark(n_dark, wanted * (WORD_PX // STEPS), dark[y])
-                    else:
-                        read_planes(
-                            address_of(as_bytes), at, CHUNK * WORD_BYTES, 4 if few else PLANES, window,
-                            address_of(n_lit), padded_lanes(window),
-                        )  # fmt: skip
-                        write_counts(n_lit, counts[c, y])
+                    read_planes(
+                        address_of(as_bytes), at, at + row_bytes if y + 1 < y1 else at, CHUNK * WORD_BYTES, few_planes,
+                        used_px, address_of(n_row), padded_lanes(used_px),
+                    )  # fmt: skip
+                    for r in range(min(2, y1 - y)):
+                        if c < 0:
+                            _add_dark(n_row[r], wanted * (WORD_PX // STEPS), dark[y + r])
+                        else:
+                            write_counts(n_row[r], counts[c, y + r])
             f = g
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_dark(n: NDArray[np.int16], lane: int, sums: NDArray[np.int32]) -> None:
-    """Add a row of counts to sums (STEPS, lanes) from lane `lane` on."""
-    stride = n.shape[0] // STEPS
-    lanes = min(stride - 2 * PAD, sums.shape[1] - lane)
-    for s in range(STEPS):
-        to, counts = sums[s, lane : lane + lanes], n[s * stride + PAD : s * stride + PAD + lanes]
+def _add_dark(n: NDArray[np.uint8], lane: int, sums: NDArray[np.int32]) -> None:
+    """Add a row of counts to sums (PAIRS, lanes, 2) from lane `lane` on."""
+    pair = n.shape[0] // PAIRS
+    lanes = min(pair // 2 - 2 * PAD, sums.shape[1] - lane)
+    for q in range(PAIRS):
         for i in range(lanes):
-            to[i] += counts[i]
+            at = q * pair + 2 * (PAD + i)
+            sums[q, lane + i, 0] += n[at]
+            sums[q, lane + i, 1] += n[at + 1]

@@ -89,6 +89,7 @@ class Mapping:
                 self._estimate(sweep)
             if self._assembler.complete or self._queue.closed:
                 return
+            self._settle()
         raise DeviceFault(
             f"{self._source.name}: the stream ended after {self._assembler.sweeps_done} of {self._sweeps} sweeps, "
             "without the scan marker that closes the last one; check the scanner and its marker line"
@@ -100,6 +101,11 @@ class Mapping:
             return next(sweeps, None)
         finally:
             self.counting_s += time.perf_counter() - begun
+
+    def _settle(self) -> None:
+        begun = time.perf_counter()
+        self._assembler.settle(self._reader.holds - 1)
+        self.counting_s += time.perf_counter() - begun
 
     def _estimate(self, sweep: SweepData) -> None:
         begun = time.perf_counter()

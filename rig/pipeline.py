@@ -14,7 +14,7 @@ from rig.monitor import Monitor, Watch
 from rig.recording import Recorder, Recording
 from rig.source import Source
 from rig.stages import PipelineStats
-from rig.sweeps import SweepAssembler
+from rig.sweeps import MOST_UNDER_WAY, SweepAssembler
 
 MAPS_AHEAD = 2
 """Maps that may wait for the caller before counting waits too."""
@@ -51,7 +51,7 @@ class Pipeline:
         self._queue = MapQueue(MAPS_AHEAD)
         self._source = Source(spad, ring, silence_s, self._queue.end_stream)
         self._mapping = Mapping(
-            ring.reader("counting"),
+            ring.reader("counting", holds=max(1, min(MOST_UNDER_WAY, ring.slots // 4))),
             assembler,
             sweeps,
             maker,

@@ -3,6 +3,7 @@
 import logging
 import math
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from itertools import pairwise
@@ -18,6 +19,9 @@ from rig.geometry import WORD_PX
 from rig.scan_plan import ScanPlan
 
 _log = logging.getLogger(__name__)
+
+MOST_UNDER_WAY = 4
+"""Blocks that the counting may hold at a time: threads are at work on some while the next one is bound."""
 
 Gap = tuple[int, int]
 
@@ -83,6 +87,7 @@ class SweepAssembler:
         self._maps = maps
         self._first_index = first_index
         self._binder = FrameBinder(plan)
+        self._adds: deque[int] = deque(maxlen=MOST_UNDER_WAY)
         self._next_frame: int | None = None
         self._gaps: list[Gap] = []
         self._received = self._lit = self._dark = 0
@@ -102,6 +107,7 @@ class SweepAssembler:
         x0 = self._windows(block, bound)
         self._count_s += time.perf_counter() - begun
         self.frames_seen += block.n_frames
+        self._adds.append(0)
         for a, b in pairwise((*bound.starts, block.n_frames)):
             number = int(bound.sweep[a])
             while clocks and clocks[0].sweep < number:
@@ -117,7 +123,12 @@ class SweepAssembler:
             self._lit += lit
             self._dark += dark
             self._counter.add(block.bits[a:b], bins, bound.column[a:b], x0[a:b])
+            self._adds[-1] += 1
             self._count_s += time.perf_counter() - begun
+
+    def settle(self, blocks: int) -> None:
+        """Wait until none but the last `blocks` blocks, fewer than MOST_UNDER_WAY, will be read any more."""
+        self._counter.settle(sum(list(self._adds)[-blocks:]) if blocks else 0)
 
     def _finish(self, clock: SweepClock) -> SweepData:
         expected = clock.end_frame - clock.first_frame

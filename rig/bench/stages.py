@@ -152,6 +152,9 @@ def search_stage(
                 places.append(place)
                 if spent >= seconds and not whole_sweeps:
                     break
+            settled = time.perf_counter()
+            counter.settle()
+            spent += time.perf_counter() - settled
             if error is None or whole_sweeps:
                 ended = time.perf_counter()
                 sweep = counter.finish()

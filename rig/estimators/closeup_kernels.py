@@ -11,21 +11,26 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.powers import nothing_below, powers
+from rig.aligned import aligned_zeros
 from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, LABEL_PX, LABELS, cell_of
 from rig.estimators.screen_tables import LN2
-from rig.lane_order import place_of
+from rig.estimators.search_kernels import count_place
 from rig.lanes import (
     LANES,
     UNPACKED,
     add_saturated,
+    as_bytes,
+    dot_pairs,
+    larger,
     larger_float,
-    largest,
+    load_bytes,
     load_float32,
-    load_int16,
     read_int16,
+    smaller,
+    square_root,
+    to_bfloat16,
     to_int16,
-    total,
+    zero_int16,
 )
 
 LEVEL_SHIFT: Final = np.uint32(22)
@@ -41,60 +46,73 @@ LOWEST_SCORE: Final = np.float32(-32000.0)
 class Closeup(NamedTuple):
     """Tables of the close look.
 
-    weight: int16 (LEVELS, LEVELS, F, LANES) over haze, line, pixel from -R to R, label: units per count; constant:
-    float32 (LEVELS, LEVELS, LANES), units per exposure. Units as of the search, 128 >> shift an octave. label, square:
-    float32 (LANES,), number of the label from the middle one, and squared, in the order UNPACKED.
+    weight: int8 (LEVELS, LEVELS, 2, R + 1, LANES, 2) over haze, line, last bit of the pixel looked at, pair of pixels
+    from `first_px` on, label: units per count; constant: float32 (LEVELS, LEVELS, LANES), units per exposure. Both less
+    their mean over the labels. Units are 128 >> shift an octave. label, square: float32 (LANES,), number of the label
+    from the middle one, and squared, in the order UNPACKED.
     """
 
-    weight: NDArray[np.int16]
+    weight: NDArray[np.int8]
     constant: NDArray[np.float32]
     label: NDArray[np.float32]
     square: NDArray[np.float32]
 
 
 @numba.njit(cache=True, nogil=True)
-def closeup_tables(
-    ambient: float,
-    share: float,
-    near_is_left: bool,
-    fine: NDArray[np.float32],
-    table: NDArray[np.float32],
-    units: float,
-) -> Closeup:
-    """Tables for ambient light of so many photons per exposure and a pedestal of so large a share of the haze.
+def label_weights(
+    ambient: float, share: float, near_is_left: bool, fine: NDArray[np.float32], table: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What a count says of each label, octaves (LEVELS, LEVELS, F, LABELS), and an exposure (LEVELS, LEVELS, LABELS).
 
-    fine: (LABELS, F) as `row_model.fine_profiles`; table: `logit_table`.
+    Both less their mean over the labels. For ambient light of so many photons per exposure and a pedestal of so large a
+    share of the haze; fine: (LABELS, F) as `row_model.fine_profiles`; table: `logit_table`.
     """
     pixels = fine.shape[1]
     reach = (pixels - 1) // 2
-    weight = np.zeros((LEVELS, LEVELS, pixels, LANES), np.int16)
-    constant = np.zeros((LEVELS, LEVELS, LANES), np.float32)
-    per_nat = np.float32(units / LN2)
-    gain, loss = table[0], table[1]
+    weight = np.zeros((LEVELS, LEVELS, pixels, LABELS), np.float32)
+    constant = np.zeros((LEVELS, LEVELS, LABELS), np.float32)
+    octave = np.float32(1.0 / LN2)
     for a in range(LEVELS):
         before = np.float32(level_flux(a))
         behind = np.float32(min(ambient + share * max(before - ambient, 0.0), before))
         left, right = (before, behind) if near_is_left else (behind, before)
         for b in range(LEVELS):
             light = np.float32(level_flux(b))
-            out = weight[a, b]
-            constant[a, b, LABELS:] = IMPOSSIBLE
-            for i in range(LABELS):
-                offset = (i - LABELS // 2) * LABEL_PX
-                for t in range(pixels):
+            for t in range(pixels):
+                for i in range(LABELS):
+                    offset = (i - LABELS // 2) * LABEL_PX
                     of_left = np.float32(min(max(offset - (t - reach) + 0.5, 0.0), 1.0))
                     flux = of_left * left + (np.float32(1.0) - of_left) * right + light * fine[i, t]
                     cell = cell_of(min(max(flux, FLUX_MIN), FLUX_MAX))
-                    own = cell_of(min(max(right, FLUX_MIN), FLUX_MAX))
-                    out[t, i] = np.int16(round((gain[cell] - gain[own]) * per_nat))
-                    constant[a, b, i] += (loss[cell] - loss[own]) * per_nat
-    index, square = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
-    for i in range(LANES):
-        label = UNPACKED[i]
-        if label < LABELS:
-            index[i] = label - LABELS // 2
-            square[i] = (label - LABELS // 2) ** 2
-    return Closeup(weight, constant, index, square)
+                    weight[a, b, t, i] = table[0, cell] * octave
+                    constant[a, b, i] += table[1, cell] * octave
+                weight[a, b, t] -= weight[a, b, t].mean()
+            constant[a, b] -= constant[a, b].mean()
+    return weight, constant
+
+
+def closeup_tables(weight: NDArray[np.float32], constant: NDArray[np.float32], units: int) -> Closeup:
+    """Tables in so many units an octave, from `label_weights`."""
+    pixels = weight.shape[2]
+    reach = (pixels - 1) // 2
+    whole = np.rint(weight * units).astype(np.int8)
+    pairs = aligned_zeros((LEVELS, LEVELS, 2, reach + 1, LANES, 2), np.int8)
+    for odd in range(2):
+        for t in range(pixels):
+            at = t - reach - first_px(odd, reach)
+            pairs[:, :, odd, at // 2, :LABELS, at % 2] = whole[:, :, t]
+    padded = aligned_zeros((LEVELS, LEVELS, LANES), np.float32)
+    padded[...] = IMPOSSIBLE
+    padded[:, :, :LABELS] = constant * units
+    number = np.array(UNPACKED)
+    index = np.where(number < LABELS, number - LABELS // 2, 0).astype(np.float32)
+    return Closeup(pairs, padded, index, index * index)
+
+
+@numba.njit(inline="always")
+def first_px(odd, reach):  # type: ignore[no-untyped-def]
+    """First pixel of the pairs that hold `reach` pixels around one, from that one on; odd: its last bit."""
+    return (odd - reach) // 2 * 2 - odd
 
 
 @numba.njit(inline="always")
@@ -111,28 +129,41 @@ def level_flux(level):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def label_likelihoods(n, lanes, x, exposures, weight, constant, pixels, shift):  # type: ignore[no-untyped-def]
-    """Likelihood of each label as float32 lanes in the order UNPACKED, for a line near pixel x.
-
-    n: address of the row's counts, of so many lanes; weight: of the F = `pixels` vectors of the two levels, constant:
-    of theirs.
-    """
-    score = to_int16(larger_float(load_float32(constant, 0) * np.float32(exposures), LOWEST_SCORE))
-    first = x - (pixels - 1) // 2
-    for t in range(pixels):
-        count = read_int16(n, place_of(first + t, lanes))
-        score = add_saturated(score, load_int16(weight, t * LANES) * count)
-    return powers(score, nothing_below(largest(score), shift), shift)
+def levels_of(before, signal):  # type: ignore[no-untyped-def]
+    """Index of the two levels among the tables', of float32 lanes of fluxes: 16-bit lanes."""
+    return _level_of_each(before) * np.int16(LEVELS) + _level_of_each(signal)
 
 
 @numba.njit(inline="always")
-def place_line(likelihood, index, square):  # type: ignore[no-untyped-def]
-    """Offset of the line from the middle of its pixel in px, to the right, and its standard deviation.
+def _level_of_each(flux):  # type: ignore[no-untyped-def]
+    # The upper half of a float32 holds all bits that count.
+    octave = (to_bfloat16(flux) >> np.int16(LEVEL_SHIFT - 16)) - np.int16(LEVEL_BASE)
+    return smaller(larger(octave, np.int16(0)), np.int16(LEVELS - 1))
 
-    index, square: addresses of those of `Closeup`.
+
+@numba.njit(forceinline=True)
+def label_scores(search, r, x, exposures, weight, constant, pairs):  # type: ignore[no-untyped-def]
+    """Score of each label, 16-bit lanes, for a line near pixel x of row r of the batch.
+
+    weight: address of the weights of the two levels, for even x; constant: of theirs; pairs: R + 1.
     """
-    mass = total(likelihood)
-    mean = total(likelihood * load_float32(index, 0)) / mass
-    variance = total(likelihood * load_float32(square, 0)) / mass - mean * mean
+    n = search.n + r * search.n_bytes
+    score = to_int16(larger_float(load_float32(constant, 0) * np.float32(exposures), LOWEST_SCORE))
+    weight += 2 * LANES * pairs * (x & 1)
+    first = x + first_px(x & 1, pairs - 1)
+    for p in range(pairs):
+        two = as_bytes(zero_int16() + read_int16(n + count_place(search, first + 2 * p), 0))
+        score = add_saturated(score, dot_pairs(two, load_bytes(weight, 2 * LANES * p)))
+    return score
+
+
+@numba.njit(forceinline=True)
+def offsets(mass, moment, square):  # type: ignore[no-untyped-def]
+    """Offset of each line from the middle of its pixel in px, to the right, and its standard deviation; float32 lanes.
+
+    mass, moment, square: sums over the labels of their likelihoods, times their numbers, times those squared.
+    """
+    mean = moment / mass
+    variance = larger_float(square / mass - mean * mean, np.float32(0.0))
     label_px = np.float32(LABEL_PX)
-    return label_px * mean, label_px * np.sqrt(max(variance, np.float32(0.0)) + np.float32(1.0 / 12.0))
+    return mean * label_px, square_root(variance + np.float32(1.0 / 12.0)) * label_px

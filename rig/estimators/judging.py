@@ -5,7 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.closeup_kernels import closeup_tables
+from rig.aligned import aligned_zeros
+from rig.counting_kernels import WORD_PX
+from rig.estimators.closeup_kernels import closeup_tables, label_weights
 from rig.estimators.row_input import TABLE, State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
 from rig.estimators.row_search import (
@@ -19,9 +21,9 @@ from rig.estimators.row_search import (
     halvings,
     turned,
 )
-from rig.estimators.screen_tables import SCREENS, Tables, fill_tables
+from rig.estimators.screen_tables import SCREENS, WEIGHT_LIMIT, Tables, fill_tables
 from rig.geometry import SweepGeometry
-from rig.lane_order import STEPS, padded_lanes, pixel_order
+from rig.lane_order import PAIRS, STEPS, padded_lanes, pair_bytes, pixel_order, places_of
 from rig.lanes import LANES
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
@@ -36,8 +38,10 @@ SCORE_LIMIT = 12500
 MOST_HALVINGS = 6
 CLOSE_LIMIT = 30000
 """Largest product of a count and a weight of the close-up, whose sums saturate."""
-LOGIT_OCTAVES = 22
-"""The logit of a detection probability, floor and all, lies within 11 octaves of 0 either way."""
+ROUGH_UNITS = 4.0
+"""Units per octave in which no weight reaches its limit: a logit lies within 11 octaves of 0 either way."""
+CUT = 1.25
+"""By so much the largest weights may exceed their limit, where they are cut."""
 SPARE_FRAMES = 8
 """A column may have this many frames more than twice the nominal number before its counts are halved."""
 HOT_FACTOR, HOT_FLUX = 4.0, 0.02
@@ -57,22 +61,27 @@ def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: 
     tables = _empty_tables(columns, bands, padded_lanes(geometry.window), reach)
     most = min(2 * exposures + SPARE_FRAMES, COUNT_LIMIT)
     nominal = exposures / 2.0 ** halvings(exposures, most)
+    largest_sum, largest = _largest(sweep, state, light, reach)
     for shift in range(MOST_HALVINGS + 1):
-        if most * _largest_sum(sweep, state, light, reach, 128 >> shift) <= SCORE_LIMIT:
+        units = 128 >> shift
+        if most * largest_sum * units <= SCORE_LIMIT and largest * units <= CUT * WEIGHT_LIMIT:
             break
 
     def work(first: int, last: int) -> None:
         fill_tables(sweep, state, light, log_share, float(128 >> shift), nominal, first, last, tables)
 
     workers.over(bands, work)
-    close_shift = next(i for i in range(MOST_HALVINGS + 1) if most * LOGIT_OCTAVES * (128 >> i) <= CLOSE_LIMIT)
     haze, rest = model.profile[:, 0], model.profile[:, 1]
-    closeup = closeup_tables(
-        float(np.median(state.ambient)), float(rest.sum() / max(haze.sum(), 1e-9)), geometry.near_is_left,
-        state.fine, TABLE, float(128 >> close_shift),
+    share = float(rest.sum() / max(haze.sum(), 1e-9))
+    weight, constant = label_weights(float(np.median(state.ambient)), share, geometry.near_is_left, state.fine, TABLE)
+    most_of_one, most_of_all = (float(a.max()) for a in (np.abs(weight), np.abs(weight).sum(axis=2)))
+    close_shift = next(
+        i for i in range(MOST_HALVINGS + 1)
+        if (128 >> i) * most_of_one <= WEIGHT_LIMIT and most * (128 >> i) * most_of_all <= CLOSE_LIMIT
     )  # fmt: skip
+    closeup = closeup_tables(weight, constant, 128 >> close_shift)
     expected = np.repeat(state.ambient, band_rows, axis=0)[: geometry.rows]
-    y, x = np.nonzero(model.ambient > HOT_FACTOR * expected + HOT_FLUX)
+    hot_start, hot_at, hot_place = _hot_of_windows(model.ambient > HOT_FACTOR * expected + HOT_FLUX, geometry)
     padded = np.zeros((bands, int(geometry.x0.max(initial=0)) + geometry.window), np.float32)
     padded[:, : geometry.width] = state.ambient[:, : padded.shape[1]]
     return Judge(
@@ -85,8 +94,9 @@ def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: 
         limits=_limits(geometry),
         near_is_left=geometry.near_is_left,
         ambient=padded,
-        hot_start=np.searchsorted(y, np.arange(geometry.rows + 1)).astype(np.int32),
-        hot_x=x.astype(np.int32),
+        hot_start=hot_start,
+        hot_at=hot_at,
+        hot_place=hot_place,
         nominal=nominal,
         faintest=float(model.amplitude[0]),
         brightest=float(model.amplitude[-1]),
@@ -99,6 +109,24 @@ def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: 
     )
 
 
+def _hot_of_windows(
+    hot: NDArray[np.bool_], geometry: SweepGeometry
+) -> tuple[NDArray[np.int32], NDArray[np.int16], NDArray[np.int32]]:
+    """hot_start, hot_at and hot_place of a `Judge`; hot: (rows, width)."""
+    lanes, rows = padded_lanes(geometry.window), geometry.rows
+    starts, at, places = [], [np.zeros(0, np.int16)], [np.zeros(0, np.int32)]
+    before = 0
+    for x0 in range(0, int(geometry.x0.max(initial=0)) + 1, WORD_PX):
+        # Hot pixels of windows that no column has are left out.
+        inside = hot[:, x0 : x0 + geometry.window] if x0 in geometry.x0 else hot[:, :0]
+        y, x = np.nonzero(inside)
+        starts.append(before + np.searchsorted(y, np.arange(rows + 1)))
+        at.append(x.astype(np.int16))
+        places.append(PAIRS * pair_bytes(lanes) * y.astype(np.int32) + places_of(x, lanes))
+        before += len(y)
+    return np.array(starts, np.int32), np.concatenate(at), np.concatenate(places)
+
+
 def nothing_found(geometry: SweepGeometry, lines: tuple[NDArray[np.int32], NDArray[np.int32]] | None) -> Found:
     """Empty results of a sweep; lines: (rows, columns) whose counts are to be kept, sorted by column."""
     rows, columns = geometry.rows, geometry.columns
@@ -108,11 +136,11 @@ def nothing_found(geometry: SweepGeometry, lines: tuple[NDArray[np.int32], NDArr
     line_row, line_column = (np.zeros(0, np.int32),) * 2 if lines is None else lines
     return Found(
         stripe=stripe,
-        quiet=np.zeros((rows, STEPS, lanes), np.int32),
+        quiet=np.zeros((rows, PAIRS, lanes, 2), np.int32),
         quiet_exposures=np.zeros((rows, lanes + 1), np.int32),
-        light=np.zeros((rows, STEPS, lanes), np.int32),
-        quiet_here=np.zeros((rows, STEPS, padded_lanes(geometry.window)), np.int16),
-        light_here=np.zeros((rows, STEPS, padded_lanes(geometry.window)), np.int16),
+        light=np.zeros((rows, PAIRS, lanes, 2), np.int32),
+        quiet_here=aligned_zeros((rows, PAIRS, padded_lanes(geometry.window), 2), np.uint8),
+        light_here=aligned_zeros((rows, PAIRS, padded_lanes(geometry.window), 2), np.uint8),
         lines=np.zeros((len(line_row), geometry.window), np.int32),
         line_start=np.searchsorted(line_column, np.arange(columns + 1)).astype(np.int32),
         line_row=np.ascontiguousarray(line_row),
@@ -127,11 +155,11 @@ def clear_found(found: Found) -> None:
         sums.fill(0)
 
 
-def stripes_of(found: Found, workers: RowWorkers) -> StripeTable:
-    """The stripe table of a sweep that has been judged."""
+def stripes_of(found: Found, judge: Judge, workers: RowWorkers) -> StripeTable:
+    """The stripe table of a sweep that has been judged by `judge`."""
     columns, fields, rows = found.stripe.shape
     out = np.empty((fields, rows, columns), np.float32)
-    workers.over(rows, lambda first, last: turned(found.stripe, first, last, out))
+    workers.over(rows, lambda first, last: turned(found.stripe, judge.limits, first, last, out))
     return StripeTable(*out)
 
 
@@ -144,8 +172,11 @@ def quiet_of(found: Found, width: int) -> NDArray[np.int32]:
 def _limits(geometry: SweepGeometry) -> NDArray[np.int16]:
     low = np.maximum(geometry.x_lo - geometry.x0, 0)
     high = np.minimum(geometry.x_hi - geometry.x0, geometry.window - 1)
-    limits = np.where(geometry.x_lo <= geometry.x_hi, np.stack([low, high]), [[[1]], [[0]]])
-    return np.ascontiguousarray(limits.transpose(2, 1, 0), dtype=np.int16)
+    limits = np.zeros((geometry.columns, 2, geometry.rows + LANES), np.int16)
+    limits[:, 0] = 1
+    both = np.where(geometry.x_lo <= geometry.x_hi, np.stack([low, high]), [[[1]], [[0]]])
+    limits[:, :, : geometry.rows] = both.transpose(2, 0, 1)
+    return limits
 
 
 def rows_of_band(geometry: SweepGeometry) -> int:
@@ -199,11 +230,11 @@ def _empty_tables(columns: int, bands: int, lanes: int, reach: int) -> Tables:
     pixels = lanes * STEPS
 
     def of(*shape: int, dtype: type = np.float32) -> Any:
-        return np.zeros((columns, bands, *shape), dtype)
+        return aligned_zeros((columns, bands, *shape), dtype)
 
     return Tables(
-        edge=of(pixels, dtype=np.int16),
-        tap=of(SCREENS, 2 * reach + 1, pixels, dtype=np.int16),
+        edge=of(PAIRS, lanes, 2, dtype=np.int8),
+        tap=of(SCREENS, STEPS, reach + 1, lanes, 2, dtype=np.int8),
         position=of(SCREENS, pixels, dtype=np.int16),
         slope=of(SCREENS, pixels, dtype=np.int16),
         lane=of(lanes),
@@ -216,10 +247,10 @@ def _empty_tables(columns: int, bands: int, lanes: int, reach: int) -> Tables:
     )
 
 
-def _largest_sum(sweep: Sweep, state: State, light: NDArray[np.float32], reach: int, units: int) -> float:
-    """Largest sum of a position's taps, or half of that of a lane's edge weights, which stand alone.
+def _largest(sweep: Sweep, state: State, light: NDArray[np.float32], reach: int) -> tuple[float, float]:
+    """Largest sum of a position's taps, or half of that of a lane's edge weights, which stand alone, and largest tap.
 
-    From the tables of one band in the middle of every 16th column.
+    In octaves, from the tables of one band in the middle of every 16th column.
     """
     columns = np.arange(0, sweep.plane.shape[0], 16)
     middle = slice(sweep.u.shape[0] // 2, sweep.u.shape[0] // 2 + 1)
@@ -233,7 +264,8 @@ def _largest_sum(sweep: Sweep, state: State, light: NDArray[np.float32], reach: 
         column_gain=np.ascontiguousarray(state.column_gain[columns]),
     )  # fmt: skip
     tables = _empty_tables(len(columns), 1, padded_lanes(sweep.window), reach)
-    fill_tables(few, part, light, np.zeros(SCREENS, np.float32), float(units), 1.0, 0, 1, tables)
-    taps = np.abs(tables.tap.astype(np.int64)).sum(axis=3).max(initial=1)
-    edges = np.abs(tables.edge.astype(np.int64)).reshape(len(columns), STEPS, -1).sum(axis=1).max(initial=1)
-    return float(max(taps, edges / 2))
+    fill_tables(few, part, light, np.zeros(SCREENS, np.float32), ROUGH_UNITS, 1.0, 0, 1, tables)
+    tap, edge = np.abs(tables.tap.astype(np.int64)), np.abs(tables.edge.astype(np.int64))
+    taps = tap.sum(axis=(4, 6)).max(initial=1)
+    edges = edge.sum(axis=(2, 4)).max(initial=1)
+    return float(max(taps, edges / 2)) / ROUGH_UNITS, float(tap.max(initial=1)) / ROUGH_UNITS

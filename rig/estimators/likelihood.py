@@ -116,7 +116,7 @@ class Likelihood:
             search_counts(volume.counts, volume.n_frames, judge, bench, found, first, last)
 
         self._workers.over(geometry.rows, work)
-        return stripes_of(found, self._workers), quiet_of(found, geometry.width)
+        return stripes_of(found, judge, self._workers), quiet_of(found, geometry.width)
 
 
 _Lesson = tuple[RowModel, Expectation]
@@ -172,6 +172,11 @@ class _LikelihoodCounter:
     ) -> None:
         """Add frames, see `Counter`."""
         self._present().add(bits, bins, column, x0)
+
+    def settle(self, under_way: int = 0) -> None:
+        """See `Counter`."""
+        if self._counter is not None:
+            self._counter.settle(under_way)
 
     def finish(self) -> CountVolume | SearchedSweep:
         """What the sweep gave."""

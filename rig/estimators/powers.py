@@ -9,7 +9,7 @@ from typing import Final
 import numba
 import numpy as np
 
-from rig.lanes import from_bfloat16, larger, sub_saturated
+from rig.lanes import add_saturated, from_bfloat16, from_bfloat16_unpacked, larger, smaller, zero_int16
 
 BIAS: Final = np.int16(127 << 7)
 """Exponent of 1.0 as a bfloat16."""
@@ -18,21 +18,22 @@ MEAN_EXCESS: Final = np.float32(1.040684)
 
 
 @numba.njit(inline="always")
-def nothing_below(best, shift):  # type: ignore[no-untyped-def]
-    """Score that counts as nothing: 127 octaves below the best one, or the lowest there is."""
-    return np.int16(max(np.int64(best) - (np.int64(BIAS) >> shift), -32768))
+def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
+    """What to add to scores so that nothing is at 0, 127 octaves below each lane's best score or at the lowest."""
+    # The negative of the lowest number does not exist.
+    return smaller((zero_int16() - best) + np.int16(np.int64(BIAS) >> shift), np.int16(32767))
 
 
 @numba.njit(inline="always")
-def powers(scores, nothing, shift):  # type: ignore[no-untyped-def]
-    """2^(score / units) of 16-bit lanes as float32 in the order of `from_bfloat16`, up to a factor common to all.
+def powers(scores, lift, shift):  # type: ignore[no-untyped-def]
+    """2^(score / units) of 16-bit lanes as float32 in the order UNPACKED, up to a factor common to all.
 
-    nothing: see `nothing_below`; 0 from there down.
+    lift: see `lift_to_powers`; what is below nothing is 0.
     """
-    return from_bfloat16(larger(sub_saturated(scores, nothing), np.int16(0)) << shift)
+    return from_bfloat16_unpacked(larger(add_saturated(scores, lift), np.int16(0)) << shift)
 
 
 @numba.njit(inline="always")
-def power(score, nothing, shift):  # type: ignore[no-untyped-def]
-    """The same of one score."""
-    return np.uint32((max(np.int64(score) - nothing, 0) << shift) << 16).view(np.float32)
+def powers_in_order(scores, lift, shift):  # type: ignore[no-untyped-def]
+    """The same in order."""
+    return from_bfloat16(larger(add_saturated(scores, lift), np.int16(0)) << shift)

@@ -10,36 +10,50 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.closeup_kernels import LEVELS, Closeup, label_likelihoods, level_of, place_line
-from rig.estimators.powers import MEAN_EXCESS, nothing_below, power
-from rig.estimators.screen_tables import SCREENS, Tables
+from rig.aligned import CACHE_LINE
+from rig.counting_kernels import WORD_PX
+from rig.estimators.closeup_kernels import Closeup, label_scores, levels_of, offsets
+from rig.estimators.powers import lift_to_powers, powers
+from rig.estimators.screen_tables import OUTSIDE, SCREENS, Tables
 from rig.estimators.search_kernels import (
+    BATCH,
+    START,
     Search,
+    Table,
     add_likelihoods,
-    best_position,
-    best_score,
-    end_likelihoods,
+    certainties,
+    count_place,
+    find_best,
+    fit_lanes,
+    fit_positions,
     score_rows,
-    search_in,
     search_memory,
-    set_exposures,
-    sum_edges,
 )
-from rig.lane_order import PAD, STEPS, place_of
+from rig.lane_order import PAD, PAIRS, STEPS, pair_bytes, place_of
+from rig.lane_reductions import largest_of_rows, store_folded, totals_of_rows
 from rig.lanes import (
     LANES,
     address_of,
+    as_bytes,
     lanes_between,
+    larger,
+    larger_float,
+    load_bytes,
     load_float32,
     load_int16,
+    prefetch,
+    read_byte,
     read_float32,
     read_int16,
     read_int32,
+    smaller,
+    smaller_float,
+    store_bytes,
     store_float32,
     store_int16,
-    total,
+    to_float32,
+    write_byte,
     write_float32,
-    write_int16,
     write_int32,
 )
 
@@ -51,21 +65,20 @@ COUNT_LIMIT: Final = 63
 """Largest count the search works with; counts of more exposures are halved until they fit."""
 FIELDS: Final = 5
 """x_px, confidence, x_sd_px, signal, haze: see `StripeTable`."""
-NO_NAN: Final = {"nnan", "nsz"}
-"""For min and max without a branch, which could not be foreseen."""
-NOWHERE: Final = -1
-"""Position of a row without a search window."""
 SIGNAL_REACH_PX: Final = 2
 """Pixels on either side whose light is the stripe's, where the line is narrower."""
+USUAL_PAIRS: Final = 4
+"""Pairs of pixels that the close-up looks at, where the line is no wider than usual."""
 
 
 class Judge(NamedTuple):
     """All that is needed to judge the rows of a sweep; fixed while the sweep lasts.
 
-    x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, rows, 2), first and last
-    stored pixel of each search window, the first behind the last where there is none. rows: of the picture. ambient:
-    float32 (bands, width padded to whole words). hot_start: int32 (rows + 1,) and hot_x: int32, pixels of each row
-    whose counts say nothing. nominal: exposures the tables are for. faintest, brightest: photons of a stripe at scale
+    x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, 2, rows and LANES
+    more), first and last stored pixel of each search window, the first behind the last where there is none. rows: of the picture. ambient:
+    float32 (bands, width padded to whole words). hot_start: int32 (words, rows + 1), for windows that
+    begin at each word the first entry of each row in hot_at, int16, stored pixels whose counts say nothing, and
+    hot_place, int32, their places in the counts of all rows of the picture. nominal: exposures the tables are for. faintest, brightest: photons of a stripe at scale
     1. reach: half the line's width in px. shift: units of the scores are 128 >> shift an octave, close_shift: of the
     close-up's. most: largest count. quiet_step: every so manieth column teaches the ambient light. flux: see
     `count_fluxes`.
@@ -81,7 +94,8 @@ class Judge(NamedTuple):
     near_is_left: bool
     ambient: NDArray[np.float32]
     hot_start: NDArray[np.int32]
-    hot_x: NDArray[np.int32]
+    hot_at: NDArray[np.int16]
+    hot_place: NDArray[np.int32]
     nominal: float
     faintest: float
     brightest: float
@@ -96,10 +110,10 @@ class Judge(NamedTuple):
 class Found(NamedTuple):
     """What a sweep gives, to be filled.
 
-    stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 where there is nothing. quiet: int32 (rows, STEPS,
-    lanes of the sensor and LANES more), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures:
+    stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 where there is nothing. quiet: int32 (rows, PAIRS,
+    lanes of the sensor and LANES more, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures:
     int32 (rows, lanes + 1), their exposures as steps up and down. light: int32, like quiet, ones of every pixel within
-    the windows; those since the window last moved are still in light_here, int16 (rows, STEPS, lanes of the window).
+    the windows; the last ones are still in light_here, uint8 (rows, PAIRS, lanes of the window, 2).
     lines: int32 (lines, window), counts of the rows
     that the learning reads; line_start: int32 (columns + 1,) and line_row: int32, the rows of each column in order.
     """
@@ -108,24 +122,24 @@ class Found(NamedTuple):
     quiet: NDArray[np.int32]
     quiet_exposures: NDArray[np.int32]
     light: NDArray[np.int32]
-    quiet_here: NDArray[np.int16]
-    light_here: NDArray[np.int16]
+    quiet_here: NDArray[np.uint8]
+    light_here: NDArray[np.uint8]
     lines: NDArray[np.int32]
     line_start: NDArray[np.int32]
     line_row: NDArray[np.int32]
 
 
 class Bench(NamedTuple):
-    """A thread's own memory. ambient: float32 (P,), of the band's stored pixels."""
+    """A thread's own memory."""
 
-    search: NDArray[np.int16]
-    ambient: NDArray[np.float32]
+    search: NDArray[np.uint8]
 
 
 class Desk(NamedTuple):
     """Judge, Found and Bench as addresses and sizes, made once per call: see `rig.lanes` for why."""
 
-    search: Search
+    memory: int
+    lanes: int
     columns: int
     rows: int
     bands: int
@@ -143,21 +157,24 @@ class Desk(NamedTuple):
     last: int
     weight: int
     weight_constant: int
-    weight_px: int
+    weight_pairs: int
     label: int
     square: int
     x0: int
     limits: int
+    limit_rows: int
     ambient: int
     ambient_px: int
     hot_start: int
-    hot_x: int
-    own_ambient: int
+    hot_at: int
+    hot_place: int
     flux: int
     stripe: int
     quiet: int
     quiet_exposures: int
     light: int
+    quiet_sum: int
+    light_sum: int
     sum_lanes: int
     lines: int
     line_start: int
@@ -180,15 +197,17 @@ def desk_of(judge: Judge, found: Found, bench: Bench) -> Desk:
     """Addresses of everything; the arrays must outlive it."""
     tables, closeup = judge.tables, judge.closeup
     return Desk(
-        search_in(bench.search, tables.lane.shape[2]), judge.x0.shape[0], judge.rows, tables.lane.shape[1],
-        tables.tap.shape[3], address_of(tables.edge), address_of(tables.tap), address_of(tables.position),
+        address_of(bench.search), tables.lane.shape[2], judge.x0.shape[0], judge.rows, tables.lane.shape[1],
+        tables.tap.shape[4], address_of(tables.edge), address_of(tables.tap), address_of(tables.position),
         address_of(tables.slope), address_of(tables.lane), address_of(tables.none), address_of(tables.neutral),
         address_of(tables.before), address_of(tables.scale), address_of(tables.first), address_of(tables.last),
-        address_of(closeup.weight), address_of(closeup.constant), closeup.weight.shape[2],
+        address_of(closeup.weight), address_of(closeup.constant), closeup.weight.shape[3],
         address_of(closeup.label), address_of(closeup.square), address_of(judge.x0), address_of(judge.limits),
-        address_of(judge.ambient), judge.ambient.shape[1], address_of(judge.hot_start), address_of(judge.hot_x),
-        address_of(bench.ambient), address_of(judge.flux), address_of(found.stripe), address_of(found.quiet_here),
-        address_of(found.quiet_exposures), address_of(found.light_here), found.light.shape[2],
+        judge.limits.shape[2], address_of(judge.ambient), judge.ambient.shape[1], address_of(judge.hot_start),
+        address_of(judge.hot_at), address_of(judge.hot_place),
+        address_of(judge.flux), address_of(found.stripe), address_of(found.quiet_here),
+        address_of(found.quiet_exposures), address_of(found.light_here), address_of(found.quiet),
+        address_of(found.light), found.light.shape[2],
         address_of(found.lines), address_of(found.line_start), address_of(found.line_row), judge.band_rows,
         judge.window, judge.reach, judge.shift, judge.close_shift, judge.most, judge.quiet_step, judge.near_is_left,
         np.float32(judge.nominal), np.float32(judge.faintest), np.float32(judge.brightest),
@@ -198,7 +217,7 @@ def desk_of(judge: Judge, found: Found, bench: Bench) -> Desk:
 @numba.njit(cache=True, nogil=True)
 def new_bench(lanes: int) -> Bench:
     """Memory for rows of `lanes` lanes."""
-    return Bench(search_memory(lanes), np.zeros(lanes * STEPS, np.float32))
+    return Bench(search_memory(lanes))
 
 
 def count_fluxes() -> NDArray[np.float32]:
@@ -219,144 +238,182 @@ def halvings(exposures: int, most: int) -> int:
     return times
 
 
-@numba.njit(cache=True, nogil=True)
-def set_column(desk: Desk, c: int, b: int, exposures: float) -> None:
-    """Make ready for rows of band b of column c."""
-    pixels, table = STEPS * desk.search.lanes, c * desk.bands + b
-    positions = 2 * SCREENS * pixels * table
-    lane = desk.lane + 4 * desk.search.lanes * table
-    none = desk.none + 12 * table
-    set_exposures(desk.position + positions, desk.slope + positions, lane, none, exposures, desk.nominal, desk.search)
-    first = b * desk.ambient_px + read_int32(desk.x0, c)
-    for x in range(desk.window):
-        write_float32(desk.own_ambient, x, read_float32(desk.ambient, first + x))
+@numba.njit(forceinline=True)
+def _fetch_ahead(desk: Desk, pixels: int, table: int) -> None:
+    """Have a table in the cache by the time it is needed: no more than a few numbers of each line are, here and there.
 
-
-@numba.njit(cache=True, nogil=True)
-def _mute_hot(desk: Desk, n: int, y: int, c: int, table: int, exposures: float) -> None:
-    """Give the hot pixels of row y counts that speak for no position."""
-    x0, lanes = read_int32(desk.x0, c), desk.search.lanes
-    for h in range(read_int32(desk.hot_start, y), read_int32(desk.hot_start, y + 1)):
-        x = np.int64(read_int32(desk.hot_x, h))
-        at = x - x0
-        if 0 <= at < desk.window:
-            # Rounded up or down as by chance, so that hot pixels lean to neither side on average.
-            chance = ((x * 40503 + y * 30011 + c * 20011) & 0xFFFF) / 65536.0
-            neutral = read_float32(desk.neutral, table * STEPS * lanes + at)
-            write_int16(n, place_of(at, lanes), np.int16(exposures * neutral + chance))
-
-
-@numba.njit(cache=True, nogil=True)
-def judge_rows(desk: Desk, first: int, rows: int, c: int, b: int, exposures: float) -> None:
-    """Estimate rows first..first+rows-1 (at most BATCH) of column c, all of band b.
-
-    Their counts are the rows of the batch in desk.search, made ready by `set_column`.
+    Measured: TODO.
     """
-    search = desk.search
+    taps = 2 * SCREENS * desk.taps * pixels
+    for at in range(0, taps, CACHE_LINE):
+        prefetch(desk.tap + taps * table + at)
+    for at in range(0, pixels, CACHE_LINE):
+        prefetch(desk.edge + pixels * table + at)
+    for at in range(0, 4 * pixels, CACHE_LINE):
+        here = 4 * pixels * table + at
+        prefetch(desk.position + here)
+        prefetch(desk.before + here)
+        prefetch(desk.scale + here)
+        prefetch(desk.neutral + here)
+
+
+@numba.njit(forceinline=True)
+def table_for(desk: Desk, search: Search, c: int, b: int, exposures: float) -> Table:
+    """Make the table of column c and band b ready for columns of so many exposures."""
     pixels, table = STEPS * search.lanes, c * desk.bands + b
-    if read_int32(desk.first, table) > read_int32(desk.last, table):
+    constant = desk.position + 2 * SCREENS * pixels * table
+    if exposures != desk.nominal:
+        slope = desk.slope + 2 * SCREENS * pixels * table
+        fit_positions(constant, slope, SCREENS * pixels, exposures - desk.nominal, search.constant)
+        constant = search.constant
+    _fetch_ahead(desk, pixels, table + desk.bands)
+    fit_lanes(desk.lane + 4 * search.lanes * table, exposures, search)
+    x0, neutral = np.int64(read_int32(desk.x0, c)), desk.neutral + 4 * pixels * table
+    band_end = min((b + 1) * desk.band_rows, desk.rows)
+    if _hot_of_row(desk, x0, b * desk.band_rows) < _hot_of_row(desk, x0, band_end):
+        _neutral_counts(neutral, exposures, c, desk.window, search.neutral)
+    lowest = np.float32(OUTSIDE)
+    all_right = max(read_float32(desk.none, 3 * table) + np.float32(START), lowest)
+    return Table(
+        desk.edge + pixels * table, desk.tap + 2 * SCREENS * desk.taps * pixels * table, constant,
+        desk.before + 4 * pixels * table, desk.scale + 4 * pixels * table,
+        desk.ambient + 4 * (b * desk.ambient_px + x0), np.int16(all_right),
+        np.int16(max(read_float32(desk.none, 3 * table + 1), lowest)),
+        np.int16(max(read_float32(desk.none, 3 * table + 2), lowest)),
+        read_int32(desk.first, table) <= read_int32(desk.last, table),
+    )  # fmt: skip
+
+
+@numba.njit(forceinline=True)
+def _hot_of_row(desk, x0, y):  # type: ignore[no-untyped-def]
+    """The first hot pixel of row y, and where those before it end, among all of windows that begin at x0."""
+    return np.int64(read_int32(desk.hot_start, (x0 // WORD_PX) * (desk.rows + 1) + y))
+
+
+@numba.njit(cache=True, nogil=True)
+def _neutral_counts(neutral: int, exposures: float, c: int, window: int, to: int) -> None:
+    """Write counts that speak for no position, a byte for each stored pixel; neutral, to: addresses."""
+    for x in range(window):
+        # Rounded up or down as by chance, so that hot pixels lean to neither side on average.
+        chance = np.float32((np.int32(x) * np.int32(40503) + np.int32(c) * np.int32(20011)) & np.int32(0xFFFF))
+        count = np.float32(exposures) * read_float32(neutral, x) + chance * np.float32(1.0 / 65536.0)
+        write_byte(to, x, np.uint8(count))
+
+
+@numba.njit(forceinline=True)
+def _mute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
+    """Give the hot pixels of the batch's rows counts that speak for no position."""
+    n = search.n - first * search.n_bytes
+    for h in range(_hot_of_row(desk, x0, first), _hot_of_row(desk, x0, first + rows)):
+        write_byte(n, read_int32(desk.hot_place, h), read_byte(search.neutral, read_int16(desk.hot_at, h)))
+
+
+@numba.njit(forceinline=True)
+def judge_rows(desk: Desk, search: Search, table: Table, first: int, rows: int, c: int, exposures: float) -> None:
+    """Estimate rows first..first+rows-1 (at most BATCH) of column c, all of the band that `table` is of.
+
+    Their counts are the rows of the batch.
+    """
+    if not table.searched:
         return
-    edge, tap = desk.edge + 2 * pixels * table, desk.tap + 2 * SCREENS * desk.taps * pixels * table
-    if read_int32(desk.hot_start, first) < read_int32(desk.hot_start, first + rows):
-        for r in range(rows):
-            _mute_hot(desk, search.n + r * search.n_bytes, first + r, c, table, exposures)
-    sum_edges(edge, search, rows)
-    score_rows(edge, tap, (desk.taps - 1) // 2, search, rows)
+    _mute_hot(desk, search, first, rows, np.int64(read_int32(desk.x0, c)))
     # Each part for all rows before the next: one row's parts wait for one another, different rows' do not.
-    _find(search, rows, desk.window, desk.shift)
-    _measure_light(desk, first, rows, c, table, exposures)
-    _look_closely(desk, first, rows, c, exposures)
+    score_rows(table, desk.taps - 1, search, rows)
+    find_best(search, rows, desk.shift)
+    add_likelihoods(table, search, rows, desk.window, desk.shift)
+    stripe = desk.stripe + 4 * (FIELDS * desk.rows * c + first)
+    certainty = certainties(table, search, desk.shift)
+    _answer(certainty, stripe + 4 * desk.rows, rows, search)
+    _measure_light(desk, search, table, first, rows, c, exposures, stripe)
+    _look_closely(desk, search, rows, c, exposures, stripe)
     if c % desk.quiet_step == 0:
         for r in range(rows):
-            x = np.int64(read_int32(search.x, r))
-            if x != NOWHERE and read_float32(search.confidence, r) > QUIET:
-                _learn_quiet(desk, search.n + r * search.n_bytes, first + r, c, x, exposures)
+            if read_float32(stripe, desk.rows + r) > QUIET:
+                _learn_quiet(desk, search.lanes, search.n + r * search.n_bytes, first + r, c, search.x + 2 * r, exposures)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=NO_NAN)
-def _find(search: Search, rows: int, window: int, shift: int) -> None:
-    """Best position of each row of the batch, and the probability of lying within 1 px of it."""
-    lanes = search.lanes
-    for r in range(rows):
-        write_int32(search.x, r, np.int32(best_position(search, r, best_score(search, r))))
-    for r in range(rows):
-        x = np.int64(read_int32(search.x, r))
-        best = np.int64(read_int16(search.score + r * search.score_bytes, (x & 7) * lanes + (x >> 3)))
-        add_likelihoods(search, r, best, shift)
-    for r in range(rows):
-        score, x = search.score + r * search.score_bytes, np.int64(read_int32(search.x, r))
-        best = np.int64(read_int16(score, (x & 7) * lanes + (x >> 3)))
-        nothing = nothing_below(best, shift)
-        own, near = power(best, nothing, shift), np.float32(0.0)
-        if x > 0:
-            near += power(read_int16(score, ((x - 1) & 7) * lanes + ((x - 1) >> 3)), nothing, shift)
-        if x + 1 < window:
-            near += power(read_int16(score, ((x + 1) & 7) * lanes + ((x + 1) >> 3)), nothing, shift)
-        # The best position's own term is exact, the others are too large by the same share on average.
-        others = total(load_float32(search.mass, r * LANES)) + end_likelihoods(search, r, best, shift) - own
-        own *= MEAN_EXCESS
-        write_float32(search.confidence, r, min((own + near) / (own + others), np.float32(1.0)))
+@numba.njit(forceinline=True)
+def _answer(lanes, to, rows, search):  # type: ignore[no-untyped-def]
+    """Write one field of the answers for so many rows to address `to`."""
+    if rows == BATCH:
+        store_float32(to, 0, lanes)
+    else:
+        # What lies behind may be another thread's.
+        store_float32(search.answer, 0, lanes)
+        for r in range(rows):
+            write_float32(to, r, read_float32(search.answer, r))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=NO_NAN)
-def _measure_light(desk: Desk, first: int, rows: int, c: int, table: int, exposures: float) -> None:
+@numba.njit(forceinline=True)
+def _measure_light(desk, search, table, first, rows, c, exposures, stripe):  # type: ignore[no-untyped-def]
     """Signal and haze of the batch's rows, from row `first` of the picture on, for answers and close-up."""
-    search = desk.search
-    lanes = search.lanes
-    pixels = STEPS * lanes
-    stripe = desk.stripe + 4 * FIELDS * desk.rows * c
-    limits = desk.limits + 4 * desk.rows * c
+    limits = desk.limits + 4 * desk.limit_rows * c
+    low, high = load_int16(limits, first), load_int16(limits, desk.limit_rows + first)
+    store_int16(search.x, 0, smaller(larger(load_int16(search.x, 0), low), high))
+    # The usual reach as a constant: its loop is unrolled.
+    if desk.reach == SIGNAL_REACH_PX:
+        _read_light(desk, search, table, rows, exposures, SIGNAL_REACH_PX)
+    else:
+        _read_light(desk, search, table, rows, exposures, desk.reach)
+    before, ambient = load_float32(search.before, 0), load_float32(search.ambient, 0)
+    scale = load_float32(search.scale, 0)
+    light = load_float32(search.light, 0) - (before + ambient) * np.float32(desk.reach + 0.5)
+    signal = smaller_float(larger_float(light, scale * desk.faintest), scale * desk.brightest)
+    store_int16(search.levels, 0, levels_of(before, signal))
+    _answer(signal, stripe + 12 * desk.rows, rows, search)
+    _answer(larger_float(before - ambient, np.float32(0.0)), stripe + 16 * desk.rows, rows, search)
+
+
+@numba.njit(forceinline=True)
+def _read_light(desk, search, table, rows, exposures, reach):  # type: ignore[no-untyped-def]
     flux = desk.flux + 4 * (COUNT_LIMIT + 2) * np.int64(exposures)
     for r in range(rows):
-        n = search.n + r * search.n_bytes
-        y = first + r
-        low, high = np.int64(read_int16(limits, 2 * y)), np.int64(read_int16(limits, 2 * y + 1))
-        if low > high:
-            write_int32(search.x, r, np.int32(NOWHERE))
-            continue
-        x = min(max(np.int64(read_int32(search.x, r)), low), high)
+        n, x = search.n + r * search.n_bytes, np.int64(read_int16(search.x, r))
         light = np.float32(0.0)
-        for at in range(x - desk.reach, x + desk.reach + 1):
-            light += read_float32(flux, read_int16(n, place_of(at, lanes)))
-        before, scale = read_float32(desk.before, table * pixels + x), read_float32(desk.scale, table * pixels + x)
-        ambient = read_float32(desk.own_ambient, x)
-        light -= np.float32(0.5) * (before + ambient) * np.float32(2 * desk.reach + 1)
-        signal = min(max(light, desk.faintest * scale), desk.brightest * scale)
-        write_int32(search.x, r, np.int32(x))
-        write_int32(search.levels, r, np.int32(level_of(before) * LEVELS + level_of(signal)))
-        write_float32(stripe, 3 * desk.rows + y, signal)
-        write_float32(stripe, 4 * desk.rows + y, max(before - ambient, np.float32(0.0)))
+        for t in range(-reach, reach + 1):
+            light += read_float32(flux, np.int64(read_byte(n, count_place(search, x + t))))
+        write_float32(search.light, r, light)
+        write_float32(search.before, r, read_float32(table.before, x))
+        write_float32(search.scale, r, read_float32(table.scale, x))
+        write_float32(search.ambient, r, read_float32(table.ambient, x))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=NO_NAN)
-def _look_closely(desk: Desk, first: int, rows: int, c: int, exposures: float) -> None:
+@numba.njit(forceinline=True)
+def _look_closely(desk, search, rows, c, exposures, stripe):  # type: ignore[no-untyped-def]
     """Place the lines of the batch's rows, and write the answers."""
-    search = desk.search
-    x0 = np.int64(read_int32(desk.x0, c))
-    stripe = desk.stripe + 4 * FIELDS * desk.rows * c
+    # The usual width as a constant: its loop is unrolled.
+    if desk.weight_pairs == USUAL_PAIRS:
+        _compare_labels(desk, search, rows, exposures, USUAL_PAIRS)
+    else:
+        _compare_labels(desk, search, rows, exposures, desk.weight_pairs)
+    lift = lift_to_powers(largest_of_rows(search.label), desk.close_shift)
+    store_int16(search.lift, 0, lift)
     for r in range(rows):
-        x, levels = np.int64(read_int32(search.x, r)), np.int64(read_int32(search.levels, r))
-        if x != NOWHERE:
-            likelihood = label_likelihoods(
-                search.n + r * search.n_bytes, search.lanes, x, exposures,
-                desk.weight + 2 * LANES * desk.weight_px * levels, desk.weight_constant + 4 * LANES * levels,
-                desk.weight_px, desk.close_shift,
-            )  # fmt: skip
-            store_float32(search.mass, r * LANES, likelihood)
+        likelihood = powers(load_int16(search.label, r * LANES), read_int16(search.lift, r), desk.close_shift)
+        store_folded(search.mass, r, likelihood)
+        store_folded(search.moment, r, likelihood * load_float32(desk.label, 0))
+        store_folded(search.square, r, likelihood * load_float32(desk.square, 0))
+    mass, moment, square = (totals_of_rows(search.mass), totals_of_rows(search.moment), totals_of_rows(search.square))
+    offset, sd = offsets(mass, moment, square)
+    x = to_float32(load_int16(search.x, 0)) + np.float32(read_int32(desk.x0, c))
+    _answer(x + offset, stripe, rows, search)
+    _answer(sd, stripe + 8 * desk.rows, rows, search)
+
+
+@numba.njit(forceinline=True)
+def _compare_labels(desk, search, rows, exposures, pairs):  # type: ignore[no-untyped-def]
     for r in range(rows):
-        x, y = np.int64(read_int32(search.x, r)), first + r
-        if x != NOWHERE:
-            offset, sd = place_line(load_float32(search.mass, r * LANES), desk.label, desk.square)
-            write_float32(stripe, y, np.float32(x0 + x) + offset)
-            write_float32(stripe, desk.rows + y, read_float32(search.confidence, r))
-            write_float32(stripe, 2 * desk.rows + y, sd)
+        x, levels = np.int64(read_int16(search.x, r)), np.int64(read_int16(search.levels, r))
+        weight, constant = desk.weight + 4 * LANES * pairs * levels, desk.weight_constant + 4 * LANES * levels
+        store_int16(search.label, r * LANES, label_scores(search, r, x, exposures, weight, constant, pairs))
 
 
 @numba.njit(cache=True, nogil=True)
-def _learn_quiet(desk: Desk, n: int, y: int, c: int, x: int, exposures: float) -> None:
-    """Add the whole lanes behind the stripe at stored pixel x to the quiet counts."""
-    lanes = desk.search.lanes
-    stride = lanes + 2 * PAD
+def _learn_quiet(desk: Desk, lanes: int, n: int, y: int, c: int, x_at: int, exposures: float) -> None:
+    """Add the whole lanes behind the stripe at the stored pixel that address x_at holds to the quiet counts."""
+    limits, x = desk.limits + 4 * desk.limit_rows * c, np.int64(read_int16(x_at, 0))
+    if read_int16(limits, y) > read_int16(limits, desk.limit_rows + y):
+        return
     begin, end = 0, desk.window // STEPS
     if desk.near_is_left:
         begin = ((x + desk.reach + 1) >> 3) + 1
@@ -364,13 +421,13 @@ def _learn_quiet(desk: Desk, n: int, y: int, c: int, x: int, exposures: float) -
         end = (x - desk.reach) >> 3
     if begin >= end:
         return
-    sums = desk.quiet + 2 * y * STEPS * lanes
+    sums = desk.quiet + 2 * PAIRS * lanes * y
     for v in range(0, lanes, LANES):
-        quiet = lanes_between(begin - v, end - v)
-        for s in range(STEPS):
-            at = s * lanes + v
-            counts = load_int16(n, s * stride + PAD + v) & quiet
-            store_int16(sums, at, load_int16(sums, at) + counts)
+        quiet = as_bytes(lanes_between(begin - v, end - v))
+        for q in range(PAIRS):
+            at = 2 * (q * lanes + v)
+            counts = load_bytes(n, q * pair_bytes(lanes) + 2 * (PAD + v)) & quiet
+            store_bytes(sums, at, load_bytes(sums, at) + counts)
     steps = desk.quiet_exposures + 4 * (y * (desk.sum_lanes + 1) + np.int64(read_int32(desk.x0, c)) // STEPS)
     write_int32(steps, begin, read_int32(steps, begin) + np.int32(exposures))
     write_int32(steps, end, read_int32(steps, end) - np.int32(exposures))
@@ -380,16 +437,23 @@ def _learn_quiet(desk: Desk, n: int, y: int, c: int, x: int, exposures: float) -
 def keep_line(n: int, lanes: int, window: int, to: int) -> None:
     """Write the counts of a row in pixel order, int32, where the learning reads them; n, to: addresses."""
     for x in range(window):
-        write_int32(to, x, np.int32(read_int16(n, place_of(x, lanes))))
+        write_int32(to, x, np.int32(read_byte(n, place_of(x, lanes))))
 
 
 @numba.njit(cache=True, nogil=True)
-def turned(stripe: NDArray[np.float32], first_row: int, last_row: int, out: NDArray[np.float32]) -> None:
-    """Rows first_row..last_row-1 of answers (columns, FIELDS, rows) as (FIELDS, rows, columns)."""
+def turned(
+    stripe: NDArray[np.float32], limits: NDArray[np.int16], first_row: int, last_row: int, out: NDArray[np.float32]
+) -> None:
+    """Rows first_row..last_row-1 of answers (columns, FIELDS, rows) as (FIELDS, rows, columns).
+
+    limits: as of `Judge`; rows without a search window have no answer.
+    """
     columns, fields, _ = stripe.shape
     for y0 in range(first_row, last_row, 16):
         for c0 in range(0, columns, 16):
             for f in range(fields):
+                nothing = np.float32(0.0) if f == 1 else np.float32(np.nan)
                 for y in range(y0, min(y0 + 16, last_row)):
                     for c in range(c0, min(c0 + 16, columns)):
-                        out[f, y, c] = stripe[c, f, y]
+                        asked = limits[c, 0, y] <= limits[c, 1, y]
+                        out[f, y, c] = stripe[c, f, y] if asked else nothing

@@ -1,8 +1,8 @@
 """Tables of the search along a row: what a count at each pixel says of every stripe position, per column and band.
 
 Haze and pedestal vary slowly from row to row, so the rows of a band share one table per column. Weights are whole
-numbers of 1 / `units` octaves of likelihood (16 bits: sixteen fit one vector register); what does not depend on the
-counts is kept per exposure, since the number of frames differs from column to column.
+numbers of 1 / `units` octaves of likelihood, of 8 bits, for what a processor multiplies and adds at once; what does not
+depend on the counts is kept per exposure, since the number of frames differs from column to column.
 
 Left and right: the flux of a pixel left and right of the stripe. Where near is left, left is haze and ambient light,
 right is the pedestal; with the scanner on the other side it is the other way round. Scores are relative to 'everything
@@ -24,16 +24,19 @@ SCREENS: Final = 2
 OUTSIDE: Final = -32000
 """Score of a position where the column's stripe cannot lie."""
 SLOPE: Final = 8
+WEIGHT_LIMIT: Final = 127
+"""Weights are cut there: a count that would say more says this much."""
 LN2: Final = 0.6931471805599453
 FLUX_LEFT, FLUX_RIGHT, GAIN_LEFT, GAIN_RIGHT, LOSS_LEFT, LOSS_RIGHT = range(6)
 """Rows of what is kept of each pixel: flux on either side of a stripe, and its entries of the logit table."""
 
 
 class Tables(NamedTuple):
-    """See the module. P: stored pixels per row, padded to whole vectors; in lane order (step, lane) unless said.
+    """See the module. P: stored pixels per row, padded to whole vectors; in order of step and lane unless said.
 
-    edge: int16 (columns, bands, P), weight of a count left of the stripe.
-    tap: int16 (columns, bands, SCREENS, 2T + 1, P), weight at position x of a count at x - T .. x + T.
+    edge: int8 (columns, bands, PAIRS, lanes, 2), weight of a count left of the stripe.
+    tap: int8 (columns, bands, SCREENS, STEPS, T + 1, lanes, 2), weights at each position of the counts of T + 1 pairs
+    from `first_pair` on, which hold those T px around it; at odd positions also of the pixel before, left of the stripe.
     position: int16 (columns, bands, SCREENS, P), units of position x at the nominal number of exposures, its prior
     included; slope: int16, the same shape, by how many 1 / SLOPE of a unit it grows with each exposure more.
     lane: float32 (columns, bands, lanes), units per exposure of all pixels of a lane lying left of the stripe.
@@ -43,8 +46,8 @@ class Tables(NamedTuple):
     first, last: int32 (columns, bands), first and last position in stored pixels.
     """
 
-    edge: NDArray[np.int16]
-    tap: NDArray[np.int16]
+    edge: NDArray[np.int8]
+    tap: NDArray[np.int8]
     position: NDArray[np.int16]
     slope: NDArray[np.int16]
     lane: NDArray[np.float32]
@@ -74,8 +77,8 @@ def fill_tables(
     (SCREENS,), amplitudes of the search and the logarithm of their probability. units: per octave. nominal: exposures.
     """
     columns = sweep.plane.shape[0]
-    pixels = out.edge.shape[2]
-    lanes = pixels // STEPS
+    lanes = out.lane.shape[2]
+    pixels = STEPS * lanes
     per_nat = np.float32(units / LN2)
     row = row_buffers(pixels + 2, 1)
     levels = np.empty((6, pixels), np.float32)
@@ -95,6 +98,7 @@ def fill_tables(
             if length == 0:
                 continue
             low = (start if sweep.near_is_left else start - length + 1) - sweep.x0[c]
+            over = np.float32(0.0)
             for i in range(length):
                 t = i if sweep.near_is_left else length - 1 - i
                 x = low + i
@@ -107,7 +111,10 @@ def fill_tables(
                 levels[GAIN_RIGHT, x], levels[LOSS_RIGHT, x] = gain[at], loss[at]
                 weight = levels[GAIN_LEFT, x] - levels[GAIN_RIGHT, x]
                 constant = levels[LOSS_LEFT, x] - levels[LOSS_RIGHT, x]
-                edge[_place(x, lanes)] = np.int16(round(weight * per_nat))
+                # What rounding leaves over goes to the next pixel: sums over many pixels must not drift.
+                wanted = weight * per_nat + over
+                edge[_pair(x), x // STEPS, x & 1] = _weight(wanted)
+                over = wanted - edge[_pair(x), x // STEPS, x & 1] if abs(wanted) < WEIGHT_LIMIT else np.float32(0.0)
                 if abs(weight) > 1e-3:
                     out.neutral[c, b, x] = min(max(-constant / weight, np.float32(0.0)), np.float32(1.0))
             span = low, length, begin, end, start
@@ -120,8 +127,8 @@ def _positions(sweep, state, light, log_share, per_nat, nominal, b, c, span, row
     low, length, begin, end, start = span
     step = 1 if sweep.near_is_left else -1
     gain, loss = state.table[0], state.table[1]
-    lanes, reach = out.lane.shape[2], (out.tap.shape[3] - 1) // 2
-    tap = out.tap[c, b]
+    lanes, reach = out.lane.shape[2], out.tap.shape[4] - 1
+    edge, tap = out.edge[c, b], out.tap[c, b]
     first = (start + step * (begin if step > 0 else end)) - sweep.x0[c]
     last = (start + step * (end if step > 0 else begin)) - sweep.x0[c]
     out.first[c, b], out.last[c, b] = first, last
@@ -129,9 +136,15 @@ def _positions(sweep, state, light, log_share, per_nat, nominal, b, c, span, row
     for x in range(low, low + length):
         if x % STEPS == 0:
             within = np.float32(0.0)
-        place = _place(x, lanes)
+        s, lane = x % STEPS, x // STEPS
+        place = s * lanes + lane
+        # Of the first one of the pairs that the taps are of.
+        first_px = 2 * (x // 2 + first_pair(s, reach))
         for m in range(light.shape[0]):
             constant = within
+            weights = tap[m, s, :, lane]
+            if s & 1:
+                weights[(x - 1 - first_px) >> 1, 0] = edge[_pair(x - 1), lane, 0]
             for d in range(-reach, reach + 1):
                 at = x + d
                 if at < low or at >= low + length:
@@ -144,7 +157,9 @@ def _positions(sweep, state, light, log_share, per_nat, nominal, b, c, span, row
                 if d == 0:
                     base = np.float32(0.5) * (levels[FLUX_LEFT, at] + levels[FLUX_RIGHT, at])
                 cell = cell_of(min(base + extra, FLUX_MAX))
-                tap[m, d + reach, place] = np.int16(round((gain[cell] - own_gain) * per_nat))
+                here = (at - first_px) >> 1
+                before = np.float32(weights[here, at & 1])
+                weights[here, at & 1] = _weight(before + (gain[cell] - own_gain) * per_nat)
                 constant += (loss[cell] - own_loss) * per_nat
             if first <= x <= last:
                 t = x - low if step > 0 else length - 1 - (x - low)
@@ -171,6 +186,16 @@ def _within(value, low, high):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def _place(x, lanes):  # type: ignore[no-untyped-def]
-    """Index of stored pixel x in lane order."""
-    return (x % STEPS) * lanes + x // STEPS
+def _weight(value):  # type: ignore[no-untyped-def]
+    return np.int8(round(min(max(value, np.float32(-WEIGHT_LIMIT)), np.float32(WEIGHT_LIMIT))))
+
+
+@numba.njit(inline="always")
+def _pair(x):  # type: ignore[no-untyped-def]
+    return (x % STEPS) // 2
+
+
+@numba.njit(inline="always")
+def first_pair(s, reach):  # type: ignore[no-untyped-def]
+    """Where the taps of step s begin, in pairs from that of the step itself on."""
+    return ((s - reach) >> 1) - (s >> 1)

@@ -10,48 +10,79 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.powers import nothing_below, power, powers
-from rig.estimators.screen_tables import OUTSIDE, SCREENS, SLOPE
-from rig.lane_order import PAD, STEPS
+from rig.aligned import CACHE_LINE
+from rig.estimators.powers import MEAN_EXCESS, lift_to_powers, powers, powers_in_order
+from rig.estimators.screen_tables import OUTSIDE, SCREENS, SLOPE, first_pair
+from rig.lane_order import PAD, PAIRS, STEPS, pair_bytes, place_of
+from rig.lane_reductions import FOLDED, largest_of_rows, store_folded, totals_of_rows
 from rig.lanes import (
     LANES,
     add_saturated,
     address_of,
+    dot_pairs,
+    equal_bits,
     equal_mask,
     larger,
-    largest,
+    larger_float,
     last_lane,
+    load_bytes,
+    load_float32,
     load_int16,
     lowest_bit,
-    read_float32,
     read_int16,
     running_sum,
     smaller,
-    store_float32,
+    smaller_float,
     store_int16,
+    to_int16,
     up_1,
     write_int16,
     zero_float32,
     zero_int16,
 )
 
-BATCH: Final = 8
-"""Rows that go through each part of the search together: what one row waits for, the others fill."""
+BATCH: Final = LANES
+"""Rows that go through each part of the search together: what one row waits for, the others fill, and what is one
+number a row fills the lanes."""
+PLACE_BEFORE: Final = 8
+"""Pixels before the first one, and behind the last one, of which the place is known."""
 START: Final = -12000
 """Score of 'everything is as right of the stripe': most of the range lies above it."""
 MOST_OCTAVES: Final = 60
 """A hypothesis without a stripe counts no more than 2^60 times the best position."""
 
 
+class Table(NamedTuple):
+    """One table made ready for a number of exposures.
+
+    Addresses, in lane order: edge, tap as in `Tables`, constant as in `Search`; in pixel order, float32 of the stored
+    pixels: before, scale, ambient. Numbers: all_right, all_left, change: scores of 'no stripe' as of
+    `Tables.none`, that of all pixels lying right complete. searched: whether there is any position to find.
+    """
+
+    edge: int
+    tap: int
+    constant: int
+    before: int
+    scale: int
+    ambient: int
+    all_right: np.int16
+    all_left: np.int16
+    change: np.int16
+    searched: bool
+
+
 class Search(NamedTuple):
     """Addresses of a thread's buffers for BATCH rows of `lanes` lanes, and the bytes from row to row of each.
 
-    n: counts, see `rig.lane_order`. In lane order without padding, int16: score (STEPS * lanes,); start (lanes,),
-    score of a change at the lane's first pixel; best (lanes,), best score of each lane. For all rows of a batch
-    together: constant (SCREENS * STEPS * lanes,) and lane (lanes,), the tables' parts per exposure times the
-    exposures; none (3,) as in `Tables`. all_left (BATCH,), score of all pixels lying left. What was found in each row,
-    32 bits each: x, the close-up's levels, and float32 confidence (BATCH,). mass: float32 (BATCH, LANES), sums to be
-    taken across.
+    n: counts, see `rig.lane_order`. int16: score (STEPS, lanes); start (lanes,), score of a change at the lane's first
+    pixel; tops (LANES,), best scores of some lanes each; constant (SCREENS, STEPS, lanes), the tables' part per exposure
+    times the exposures; lane (lanes,), the same; label (LANES,), scores of the close-up; place: index of pixel
+    -PLACE_BEFORE on in a row of counts. neutral: bytes, counts of hot pixels, see `row_search`. Of each row of the batch, int16: all_left, score of all pixels lying left;
+    best, x: best score and its pixel; left, right: the scores beside it; levels: of the close-up; lift: what makes a
+    score a power; ceiling: what no score exceeds. float32: light, before, scale, ambient: see `row_search`; answer: one
+    field of the answers on its way out. Folded (`lane_reductions`): mass, sum of all likelihoods; moment, square: sums
+    of the close-up.
     """
 
     lanes: int
@@ -60,279 +91,284 @@ class Search(NamedTuple):
     score: int
     score_bytes: int
     start: int
-    best: int
+    tops: int
     constant: int
     lane: int
-    none: int
+    label: int
+    place: int
+    neutral: int
     all_left: int
+    best: int
     x: int
+    left: int
+    right: int
     levels: int
-    confidence: int
+    lift: int
+    ceiling: int
+    light: int
+    before: int
+    scale: int
+    ambient: int
+    answer: int
     mass: int
+    moment: int
+    square: int
 
 
-@numba.njit(cache=True, nogil=True)
-def search_memory(lanes: int) -> NDArray[np.int16]:
-    """Memory for the buffers of a `Search`."""
-    of_row = STEPS * (lanes + 2 * PAD) + STEPS * lanes + 2 * lanes
-    # What is of 32 bits comes last, behind an even number of 16-bit ones.
-    return np.zeros(BATCH * of_row + SCREENS * STEPS * lanes + lanes + 4 + BATCH + (6 + 2 * LANES) * BATCH, np.int16)
-
-
-@numba.njit(cache=True, nogil=True)
-def search_in(memory: NDArray[np.int16], lanes: int) -> Search:
-    """The buffers in that memory, which the caller keeps."""
-    n = address_of(memory)
-    n_bytes, score_bytes = 2 * STEPS * (lanes + 2 * PAD), 2 * STEPS * lanes
+@numba.njit(forceinline=True)
+def _search_at(n, lanes):  # type: ignore[no-untyped-def]
+    """The buffers from address n on, and where they end."""
+    n_bytes, score_bytes = PAIRS * pair_bytes(lanes), 2 * STEPS * lanes
     score = n + BATCH * n_bytes
     start = score + BATCH * score_bytes
-    best = start + BATCH * 2 * lanes
-    constant = best + BATCH * 2 * lanes
+    tops = start + BATCH * 2 * lanes
+    constant = tops + BATCH * 2 * LANES
     lane = constant + 2 * SCREENS * STEPS * lanes
-    none = lane + 2 * lanes
-    all_left = none + 2 * 4
-    x = all_left + 2 * BATCH
-    return Search(
-        lanes, n, n_bytes, score, score_bytes, start, best, constant, lane, none, all_left, x, x + 4 * BATCH,
-        x + 8 * BATCH, x + 12 * BATCH,
+    label = lane + 2 * lanes
+    row = label + BATCH * 2 * LANES
+    number = row + 8 * 2 * BATCH
+    folded = number + 5 * 4 * BATCH
+    fold = 4 * FOLDED * BATCH
+    place = folded + 3 * fold
+    neutral = place + 2 * (STEPS * lanes + 2 * PLACE_BEFORE)
+    search = Search(
+        lanes, n, n_bytes, score, score_bytes, start, tops, constant, lane, label, place, neutral, row, row + 2 * BATCH,
+        row + 4 * BATCH, row + 6 * BATCH, row + 8 * BATCH, row + 10 * BATCH, row + 12 * BATCH, row + 14 * BATCH, number,
+        number + 4 * BATCH, number + 8 * BATCH, number + 12 * BATCH, number + 16 * BATCH, folded, folded + fold,
+        folded + 2 * fold,
     )  # fmt: skip
+    return search, neutral + STEPS * lanes
 
 
 @numba.njit(cache=True, nogil=True)
-def set_exposures(
-    position: int, slope: int, lane: int, none: int, exposures: float, nominal: float, search: Search
-) -> None:
-    """Make the constants of one table, given by addresses, for columns of so many exposures."""
-    for i in range(3):
-        write_int16(search.none, i, np.int16(max(read_float32(none, i), np.float32(-32000))))
-    more = np.float32(exposures) - np.float32(nominal)
-    places = SCREENS * STEPS * search.lanes
-    if more == 0:
-        for i in range(0, places, LANES):
-            store_int16(search.constant, i, load_int16(position, i))
-    else:
-        for i in range(places):
-            constant = np.float32(read_int16(position, i)) + more / np.float32(SLOPE) * np.float32(read_int16(slope, i))
-            inside = read_int16(position, i) > OUTSIDE
-            constant = min(max(constant, np.float32(OUTSIDE)), np.float32(-OUTSIDE))
-            write_int16(search.constant, i, np.int16(constant) if inside else np.int16(OUTSIDE))
-    for i in range(search.lanes):
-        constant = np.float32(exposures) * read_float32(lane, i)
-        write_int16(search.lane, i, np.int16(min(max(constant, np.float32(-32000)), np.float32(32000))))
+def search_memory(lanes: int) -> NDArray[np.uint8]:
+    """Memory for the buffers of a `Search`, at whole cache lines."""
+    _, end = _search_at(0, lanes)
+    whole = np.zeros(end + CACHE_LINE, np.uint8)
+    begin = -address_of(whole) % CACHE_LINE
+    memory = whole[begin : begin + end]
+    search = search_in(address_of(memory), lanes)
+    for i in range(STEPS * lanes + 2 * PLACE_BEFORE):
+        write_int16(search.place, i, np.int16(place_of(i - PLACE_BEFORE, lanes)))
+    return memory
+
+
+@numba.njit(forceinline=True)
+def search_in(memory: int, lanes: int) -> Search:
+    """The buffers in `search_memory` at that address."""
+    return _search_at(memory, lanes)[0]
+
+
+@numba.njit(forceinline=True)
+def count_place(search: Search, x: int) -> int:
+    """Index of pixel x in a row of counts, from -PLACE_BEFORE on."""
+    return np.int64(read_int16(search.place, x + PLACE_BEFORE))
 
 
 @numba.njit(cache=True, nogil=True)
-def sum_edges(edge: int, search: Search, rows: int) -> None:
-    """Fill start and all_left of the batch's first rows; edge: address of their table's."""
-    # With the usual number of lanes as a constant all offsets are, and no register is spent on them.
-    if search.lanes == LANES:
+def fit_positions(position: int, slope: int, places: int, more: float, to: int) -> None:
+    """Constants of a table's positions for columns of `more` exposures than nominal; all but the numbers addresses."""
+    for i in range(places):
+        constant = np.float32(read_int16(position, i)) + more / np.float32(SLOPE) * np.float32(read_int16(slope, i))
+        inside = read_int16(position, i) > OUTSIDE
+        constant = min(max(constant, np.float32(OUTSIDE)), np.float32(-OUTSIDE))
+        write_int16(to, i, np.int16(constant) if inside else np.int16(OUTSIDE))
+
+
+@numba.njit(forceinline=True)
+def fit_lanes(per_exposure: int, exposures: float, search: Search) -> None:
+    """Constants of the lanes; per_exposure: address of the table's."""
+    for v in range(0, search.lanes, LANES):
+        units = load_float32(per_exposure, v) * np.float32(exposures)
+        units = smaller_float(larger_float(units, np.float32(-32000)), np.float32(32000))
+        store_int16(search.lane, v, to_int16(units))
+
+
+@numba.njit(forceinline=True)
+def score_rows(table: Table, reach: int, search: Search, rows: int) -> None:
+    """Score every position of the batch's first rows; reach: T of the table's taps."""
+    for r in range(rows):
+        _sum_edges(table, search, r)
+    # Apart from the sums, which wait for one another: those of several rows are under way at once.
+    if reach == 1:
         for r in range(rows):
-            _sum_row(edge, search, r, LANES)
+            _score_narrow(table, search, r)
     else:
         for r in range(rows):
-            _sum_row(edge, search, r, search.lanes)
+            _score_wide(table, reach, search, r)
 
 
-@numba.njit(inline="always")
-def _sum_row(edge, search, r, lanes):  # type: ignore[no-untyped-def]
-    stride = lanes + 2 * PAD
-    n = search.n + r * search.n_bytes
+@numba.njit(forceinline=True)
+def _rise(table, search, r, q, v):  # type: ignore[no-untyped-def]
+    """What pair q of lanes v.. of row r adds to the score of what lies right of it."""
+    n = search.n + r * search.n_bytes + 2 * (PAD + v) + q * pair_bytes(search.lanes)
+    return dot_pairs(load_bytes(n, 0), load_bytes(table.edge, 2 * (q * search.lanes + v)))
+
+
+@numba.njit(forceinline=True)
+def _sum_edges(table, search, r):  # type: ignore[no-untyped-def]
+    """Fill start and all_left of row r."""
     carry = np.int16(START)
-    for v in range(0, lanes, LANES):
-        at = PAD + v
-        a = load_int16(n, at) * load_int16(edge, v)
-        a = a + load_int16(n, at + stride) * load_int16(edge, lanes + v)
-        b = load_int16(n, at + 2 * stride) * load_int16(edge, 2 * lanes + v)
-        b = b + load_int16(n, at + 3 * stride) * load_int16(edge, 3 * lanes + v)
-        c = load_int16(n, at + 4 * stride) * load_int16(edge, 4 * lanes + v)
-        c = c + load_int16(n, at + 5 * stride) * load_int16(edge, 5 * lanes + v)
-        d = load_int16(n, at + 6 * stride) * load_int16(edge, 6 * lanes + v)
-        d = d + load_int16(n, at + 7 * stride) * load_int16(edge, 7 * lanes + v)
-        through = running_sum(((a + b) + (c + d)) + load_int16(search.lane, v))
-        store_int16(search.start, r * lanes + v, add_saturated(up_1(through), carry))
+    for v in range(0, search.lanes, LANES):
+        lane = add_saturated(_rise(table, search, r, 0, v), _rise(table, search, r, 1, v))
+        lane = add_saturated(lane, add_saturated(_rise(table, search, r, 2, v), _rise(table, search, r, 3, v)))
+        through = running_sum(add_saturated(lane, load_int16(search.lane, v)))
+        store_int16(search.start, r * search.lanes + v, add_saturated(up_1(through), carry))
         carry = last_lane(add_saturated(through, carry))
     write_int16(search.all_left, r, carry)
 
 
-@numba.njit(cache=True, nogil=True)
-def score_rows(edge: int, tap: int, reach: int, search: Search, rows: int) -> None:
-    """Score every position of the batch's first rows, after `sum_edges`.
-
-    edge, tap: addresses of the rows' table, see `Tables`; reach: T of its taps.
-    """
-    if reach == 1:
-        # In pairs: what bounds the speed is reading the table, which serves both. An odd last row has a stale partner.
-        if search.lanes == LANES:
-            for r in range(0, rows, 2):
-                _score_pair(edge, tap, search, r, LANES)
-        else:
-            for r in range(0, rows, 2):
-                _score_pair(edge, tap, search, r, search.lanes)
-    else:
-        for r in range(rows):
-            _score_wide(edge, tap, reach, search, r)
+@numba.njit(forceinline=True)
+def _position_score(first, second, tap, constant, s, v, lanes, level):  # type: ignore[no-untyped-def]
+    """Score of the positions of step s at the likelier of two amplitudes; first, second: the pairs of their taps."""
+    at, screen = 4 * s * lanes + 2 * v, 4 * STEPS * lanes
+    dim = dot_pairs(first, load_bytes(tap, at)) + dot_pairs(second, load_bytes(tap, at + 2 * lanes))
+    dim = add_saturated(dim, load_int16(constant, s * lanes + v))
+    bright = dot_pairs(first, load_bytes(tap, screen + at)) + dot_pairs(second, load_bytes(tap, screen + at + 2 * lanes))
+    bright = add_saturated(bright, load_int16(constant, (STEPS + s) * lanes + v))
+    return add_saturated(level, larger(dim, bright))
 
 
-@numba.njit(inline="always")
-def _score_step(n, before, here, after, tap, constant, edge, place, pixels, levels, tops, score, other):  # type: ignore[no-untyped-def]
-    """One step of two rows: scores at the likelier of two amplitudes, then the levels behind it.
-
-    before, here, after: places of the neighbours' counts in n; the second row's lie `other` numbers behind.
-    """
-    weight = load_int16(tap, place)
-    dim, other_dim = load_int16(n, before) * weight, load_int16(n, before + other) * weight
-    weight = load_int16(tap, place + pixels)
-    dim = dim + load_int16(n, here) * weight
-    other_dim = other_dim + load_int16(n, here + other) * weight
-    weight = load_int16(tap, place + 2 * pixels)
-    dim = dim + load_int16(n, after) * weight
-    other_dim = other_dim + load_int16(n, after + other) * weight
-    weight = load_int16(constant, place)
-    dim, other_dim = add_saturated(dim, weight), add_saturated(other_dim, weight)
-    weight = load_int16(tap, place + 3 * pixels)
-    bright, other_bright = load_int16(n, before) * weight, load_int16(n, before + other) * weight
-    weight = load_int16(tap, place + 4 * pixels)
-    bright = bright + load_int16(n, here) * weight
-    other_bright = other_bright + load_int16(n, here + other) * weight
-    weight = load_int16(tap, place + 5 * pixels)
-    bright = bright + load_int16(n, after) * weight
-    other_bright = other_bright + load_int16(n, after + other) * weight
-    weight = load_int16(constant, place + pixels)
-    bright, other_bright = add_saturated(bright, weight), add_saturated(other_bright, weight)
-    dim = add_saturated(levels[0], larger(dim, bright))
-    other_dim = add_saturated(levels[1], larger(other_dim, other_bright))
-    store_int16(score, place, dim)
-    store_int16(score, place + pixels, other_dim)
-    weight = load_int16(edge, place)
-    level = add_saturated(levels[0], load_int16(n, here) * weight)
-    other_level = add_saturated(levels[1], load_int16(n, here + other) * weight)
-    return (level, other_level), (larger(tops[0], dim), larger(tops[1], other_dim))
-
-
-@numba.njit(inline="always")
-def _score_pair(edge, tap, search, r, lanes):  # type: ignore[no-untyped-def]
-    """Score rows r and r + 1 of a line that lights one pixel on either side."""
-    stride = lanes + 2 * PAD
-    n, score, constant = search.n + r * search.n_bytes, search.score + r * search.score_bytes, search.constant
-    pixels, other = STEPS * lanes, STEPS * stride
+@numba.njit(forceinline=True)
+def _score_narrow(table, search, r):  # type: ignore[no-untyped-def]
+    """Score row r of a line that lights one pixel on either side: its taps lie in two pairs."""
+    lanes, tap, constant = search.lanes, table.tap, table.constant
+    pair = pair_bytes(lanes)
+    n, score = search.n + r * search.n_bytes, search.score + r * search.score_bytes
+    top = zero_int16() - 32768
     for v in range(0, lanes, LANES):
-        at, end = PAD + v, PAD + v + 7 * stride
-        levels = load_int16(search.start, r * lanes + v), load_int16(search.start, (r + 1) * lanes + v)
-        lowest = zero_int16() - 32768
-        tops = lowest, lowest
-        # The first step's neighbour is step 7 of the lane before, the last one's step 0 of the lane behind.
-        levels, tops = _score_step(
-            n, end - 1, at, at + stride, tap, constant, edge, v, pixels, levels, tops, score, other
-        )  # fmt: skip
-        levels, tops = _score_step(
-            n, at, at + stride, at + 2 * stride, tap, constant, edge, lanes + v, pixels, levels, tops, score, other
-        )  # fmt: skip
-        levels, tops = _score_step(
-            n, at + stride, at + 2 * stride, at + 3 * stride, tap, constant, edge, 2 * lanes + v, pixels, levels, tops,
-            score, other
-        )  # fmt: skip
-        levels, tops = _score_step(
-            n, at + 2 * stride, at + 3 * stride, at + 4 * stride, tap, constant, edge, 3 * lanes + v, pixels, levels,
-            tops, score, other
-        )  # fmt: skip
-        levels, tops = _score_step(
-            n, at + 3 * stride, at + 4 * stride, at + 5 * stride, tap, constant, edge, 4 * lanes + v, pixels, levels,
-            tops, score, other
-        )  # fmt: skip
-        levels, tops = _score_step(
-            n, at + 4 * stride, at + 5 * stride, at + 6 * stride, tap, constant, edge, 5 * lanes + v, pixels, levels,
-            tops, score, other
-        )  # fmt: skip
-        levels, tops = _score_step(
-            n, at + 5 * stride, at + 6 * stride, end, tap, constant, edge, 6 * lanes + v, pixels, levels, tops, score,
-            other
-        )  # fmt: skip
-        levels, tops = _score_step(
-            n, at + 6 * stride, end, at + 1, tap, constant, edge, 7 * lanes + v, pixels, levels, tops, score, other
-        )  # fmt: skip
-        store_int16(search.best, r * lanes + v, tops[0])
-        store_int16(search.best, (r + 1) * lanes + v, tops[1])
-
-
-@numba.njit(cache=True, nogil=True)
-def _score_wide(edge: int, tap: int, reach: int, search: Search, r: int) -> None:
-    """Score row r of a line that lights `reach` pixels on either side."""
-    lanes = search.lanes
-    stride = lanes + 2 * PAD
-    n, score, constant = search.n + r * search.n_bytes, search.score + r * search.score_bytes, search.constant
-    pixels = STEPS * lanes
-    taps = 2 * reach + 1
-    for v in range(0, lanes, LANES):
-        at = PAD + v
         level = load_int16(search.start, r * lanes + v)
-        top = zero_int16() - 32768
+        at = 2 * (PAD + v)
+        # The first step's neighbour is in the last pair of the lane before, the last one's in the first of that behind.
+        before, p0, p1 = load_bytes(n, at + 3 * pair - 2), load_bytes(n, at), load_bytes(n, at + pair)
+        p2, p3, behind = load_bytes(n, at + 2 * pair), load_bytes(n, at + 3 * pair), load_bytes(n, at + 2)
+        s0 = _position_score(before, p0, tap, constant, 0, v, lanes, level)
+        s1 = _position_score(p0, p1, tap, constant, 1, v, lanes, level)
+        level = add_saturated(level, _rise(table, search, r, 0, v))
+        s2 = _position_score(p0, p1, tap, constant, 2, v, lanes, level)
+        s3 = _position_score(p1, p2, tap, constant, 3, v, lanes, level)
+        level = add_saturated(level, _rise(table, search, r, 1, v))
+        s4 = _position_score(p1, p2, tap, constant, 4, v, lanes, level)
+        s5 = _position_score(p2, p3, tap, constant, 5, v, lanes, level)
+        level = add_saturated(level, _rise(table, search, r, 2, v))
+        s6 = _position_score(p2, p3, tap, constant, 6, v, lanes, level)
+        s7 = _position_score(p3, behind, tap, constant, 7, v, lanes, level)
+        store_int16(score, v, s0)
+        store_int16(score, lanes + v, s1)
+        store_int16(score, 2 * lanes + v, s2)
+        store_int16(score, 3 * lanes + v, s3)
+        store_int16(score, 4 * lanes + v, s4)
+        store_int16(score, 5 * lanes + v, s5)
+        store_int16(score, 6 * lanes + v, s6)
+        store_int16(score, 7 * lanes + v, s7)
+        top = larger(top, larger(larger(larger(s0, s1), larger(s2, s3)), larger(larger(s4, s5), larger(s6, s7))))
+    store_int16(search.tops, r * LANES, top)
+
+
+@numba.njit(cache=True, nogil=True)
+def _score_wide(table: Table, reach: int, search: Search, r: int) -> None:
+    """Score row r of a line that lights `reach` pixels on either side."""
+    lanes, pairs = search.lanes, reach + 1
+    pair = pair_bytes(lanes)
+    n, score = search.n + r * search.n_bytes, search.score + r * search.score_bytes
+    top = zero_int16() - 32768
+    for v in range(0, lanes, LANES):
+        level = load_int16(search.start, r * lanes + v)
         for s in range(STEPS):
-            place = s * lanes + v
-            dim, bright = load_int16(constant, place), load_int16(constant, place + pixels)
-            for d in range(taps):
-                x = s + d - reach
-                count = load_int16(n, at + (x & 7) * stride + (x >> 3))
-                dim = add_saturated(dim, count * load_int16(tap, place + d * pixels))
-                bright = add_saturated(bright, count * load_int16(tap, place + (taps + d) * pixels))
+            dim = load_int16(table.constant, s * lanes + v)
+            bright = load_int16(table.constant, (STEPS + s) * lanes + v)
+            first = (s >> 1) + first_pair(s, reach)
+            for d in range(pairs):
+                p = first + d
+                counts = load_bytes(n, (p & 3) * pair + 2 * (PAD + v + (p >> 2)))
+                at = 2 * ((s * pairs + d) * lanes + v)
+                dim = add_saturated(dim, dot_pairs(counts, load_bytes(table.tap, at)))
+                at += 2 * STEPS * pairs * lanes
+                bright = add_saturated(bright, dot_pairs(counts, load_bytes(table.tap, at)))
             scored = add_saturated(level, larger(dim, bright))
-            store_int16(score, place, scored)
+            store_int16(score, s * lanes + v, scored)
             top = larger(top, scored)
-            level = add_saturated(level, load_int16(n, at + s * stride) * load_int16(edge, place))
-        store_int16(search.best, r * lanes + v, top)
+            if s & 1:
+                level = add_saturated(level, _rise(table, search, r, s >> 1, v))
+    store_int16(search.tops, r * LANES, top)
 
 
-@numba.njit(cache=True, nogil=True)
-def best_score(search: Search, r: int) -> int:
-    """The best score of row r."""
-    best = np.int16(-32768)
-    for v in range(0, search.lanes, LANES):
-        best = max(best, largest(load_int16(search.best, r * search.lanes + v)))
-    return best
+@numba.njit(forceinline=True)
+def find_best(search: Search, rows: int, shift: int) -> None:
+    """Fill best, lift, ceiling and x of the batch's first rows.
 
-
-@numba.njit(cache=True, nogil=True)
-def best_position(search: Search, r: int, best: int) -> int:
-    """Stored pixel of row r with the best score, the first of the lowest lane that has it."""
+    Of pixels that share the best score the one of the lowest lane counts, of its steps the first.
+    """
     lanes = search.lanes
-    score = search.score + r * search.score_bytes
-    lane = 0
-    for v in range(0, lanes, LANES):
-        mask = equal_mask(load_int16(search.best, r * lanes + v), np.int16(best))
-        if mask != 0:
-            lane = v + lowest_bit(mask)
-            break
-    # One bit a step, without a branch: which step it is cannot be foreseen.
-    found = 0
-    for s in range(STEPS):
-        found |= np.int64(read_int16(score, s * lanes + lane) == best) << s
-    return STEPS * lane + lowest_bit(np.uint32(found))
+    best = largest_of_rows(search.tops)
+    store_int16(search.best, 0, best)
+    store_int16(search.lift, 0, lift_to_powers(best, shift))
+    store_int16(search.ceiling, 0, add_saturated(best, np.int16(min(np.int64(MOST_OCTAVES * 128) >> shift, 32767))))
+    for r in range(rows):
+        score, wanted, lane = search.score + r * search.score_bytes, read_int16(search.best, r), 0
+        if lanes == LANES:
+            lane = np.int64(lowest_bit(equal_mask(load_int16(search.tops, r * LANES), wanted)))
+        else:
+            lane = _lane_with(score, lanes, wanted)
+        # Which step it is cannot be foreseen: all are compared at once.
+        step = np.int64(lowest_bit(equal_bits(score, lane, lanes, wanted)))
+        write_int16(search.x, r, np.int16(STEPS * lane + step))
 
 
 @numba.njit(cache=True, nogil=True)
-def add_likelihoods(search: Search, r: int, best: int, shift: int) -> None:
-    """Fill row r of search.mass: likelihoods of all positions, and of a change without a stripe at each lane."""
+def _lane_with(score: int, lanes: int, wanted: np.int16) -> int:
+    """The lowest lane that has that score."""
+    for v in range(0, lanes, LANES):
+        mask = np.uint32(0)
+        for s in range(STEPS):
+            mask |= equal_mask(load_int16(score, s * lanes + v), wanted)
+        if mask:
+            return v + np.int64(lowest_bit(mask))
+    return 0
+
+
+@numba.njit(forceinline=True)
+def add_likelihoods(table: Table, search: Search, rows: int, window: int, shift: int) -> None:
+    """Fill mass, left and right of the batch's first rows, after `find_best`.
+
+    mass: likelihoods of all positions, and of a change without a stripe at each lane, up to a factor for each row.
+    """
     lanes = search.lanes
-    score = search.score + r * search.score_bytes
-    most = np.int64(best) + ((MOST_OCTAVES * 128) >> shift)
-    change, ceiling, none = read_int16(search.none, 2), np.int16(min(most, 32767)), nothing_below(best, shift)
-    lot = zero_float32()
-    for v in range(0, lanes, LANES):
-        a = powers(load_int16(score, v), none, shift) + powers(load_int16(score, lanes + v), none, shift)
-        b = powers(load_int16(score, 2 * lanes + v), none, shift)
-        b = b + powers(load_int16(score, 3 * lanes + v), none, shift)
-        c = powers(load_int16(score, 4 * lanes + v), none, shift)
-        c = c + powers(load_int16(score, 5 * lanes + v), none, shift)
-        d = powers(load_int16(score, 6 * lanes + v), none, shift)
-        d = d + powers(load_int16(score, 7 * lanes + v), none, shift)
-        nowhere = smaller(add_saturated(load_int16(search.start, r * lanes + v), change), ceiling)
-        lot = lot + (((a + b) + (c + d)) + powers(nowhere, none, shift))
-    store_float32(search.mass, r * LANES, lot)
+    for r in range(rows):
+        score = search.score + r * search.score_bytes
+        lift, ceiling = read_int16(search.lift, r), read_int16(search.ceiling, r)
+        lot = zero_float32()
+        for v in range(0, lanes, LANES):
+            a = powers(load_int16(score, v), lift, shift) + powers(load_int16(score, lanes + v), lift, shift)
+            b = powers(load_int16(score, 2 * lanes + v), lift, shift)
+            b = b + powers(load_int16(score, 3 * lanes + v), lift, shift)
+            c = powers(load_int16(score, 4 * lanes + v), lift, shift)
+            c = c + powers(load_int16(score, 5 * lanes + v), lift, shift)
+            d = powers(load_int16(score, 6 * lanes + v), lift, shift)
+            d = d + powers(load_int16(score, 7 * lanes + v), lift, shift)
+            nowhere = smaller(add_saturated(load_int16(search.start, r * lanes + v), table.change), ceiling)
+            lot = lot + (((a + b) + (c + d)) + powers(nowhere, lift, shift))
+        store_folded(search.mass, r, lot)
+        x = np.int64(read_int16(search.x, r))
+        before, behind = max(x - 1, 0), min(x + 1, window - 1)
+        left = read_int16(score, (before & 7) * lanes + (before >> 3))
+        right = read_int16(score, (behind & 7) * lanes + (behind >> 3))
+        write_int16(search.left, r, left if x > 0 else np.int16(-32768))
+        write_int16(search.right, r, right if x + 1 < window else np.int16(-32768))
 
 
-@numba.njit(cache=True, nogil=True)
-def end_likelihoods(search: Search, r: int, best: int, shift: int) -> float:
-    """Likelihoods of the two hypotheses that the row holds no change at all."""
-    most, nothing = np.int64(best) + ((MOST_OCTAVES * 128) >> shift), nothing_below(best, shift)
-    ends = power(min(START + np.int64(read_int16(search.none, 0)), most), nothing, shift)
-    all_left = np.int64(read_int16(search.all_left, r)) + read_int16(search.none, 1)
-    return ends + power(min(all_left, most), nothing, shift)
+@numba.njit(forceinline=True)
+def certainties(table: Table, search: Search, shift: int):  # type: ignore[no-untyped-def]
+    """Probability of each row of the batch to have its stripe within 1 px of x, float32 lanes; the model's."""
+    lift, ceiling = load_int16(search.lift, 0), load_int16(search.ceiling, 0)
+    all_left = add_saturated(load_int16(search.all_left, 0), table.all_left)
+    all_right = zero_int16() + table.all_right
+    ends = powers_in_order(smaller(all_left, ceiling), lift, shift)
+    ends = ends + powers_in_order(smaller(all_right, ceiling), lift, shift)
+    own = powers_in_order(load_int16(search.best, 0), lift, shift)
+    near = powers_in_order(load_int16(search.left, 0), lift, shift)
+    near = near + powers_in_order(load_int16(search.right, 0), lift, shift)
+    # The best position's own term is exact, the others are too large by the same share on average.
+    others = totals_of_rows(search.mass) + ends - own
+    own = own * MEAN_EXCESS
+    return smaller_float((own + near) / (own + others), np.float32(1.0))
