@@ -25,6 +25,8 @@ CHUNK: Final = 256
 PLANES: Final = 8
 MOST_FRAMES: Final = (1 << PLANES) - 1
 """Frames that a set of planes can count."""
+PAIR_FRAMES: Final = 3
+"""Up to so many frames two planes do."""
 FEW_FRAMES: Final = 15
 """Up to so many frames four planes do."""
 
@@ -39,94 +41,113 @@ def new_planes(chunks: int) -> NDArray[np.uint64]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_7(words, at, frame, n, p):  # type: ignore[no-untyped-def]
+def planes_for(frames: int) -> int:
+    """How many planes hold the counts of so many frames: 1, 2, 4 or 8."""
+    if frames <= 1:
+        return 1
+    if frames <= PAIR_FRAMES:
+        return 2
+    return 4 if frames <= FEW_FRAMES else PLANES
+
+
+@numba.njit(inline="always")
+def _sum_3(a, b, c):  # type: ignore[no-untyped-def]
+    """Ones and twos of three bits."""
+    u = a ^ b
+    return u ^ c, (a & b) | (u & c)
+
+
+@numba.njit(inline="always")
+def _sum_5(a, b, c, d, e):  # type: ignore[no-untyped-def]
+    """Ones, twos and fours of five bits."""
+    ones, t = _sum_3(a, b, c)
+    ones, v = _sum_3(ones, d, e)
+    return ones, t ^ v, t & v
+
+
+@numba.njit(inline="always")
+def _sum_7(a, b, c, d, e, g, h):  # type: ignore[no-untyped-def]
+    """Ones, twos and fours of seven bits."""
+    ones, t = _sum_3(a, b, c)
+    ones, v = _sum_3(ones, d, e)
+    ones, w = _sum_3(ones, g, h)
+    twos, fours = _sum_3(t, v, w)
+    return ones, twos, fours
+
+
+@numba.njit(inline="always")
+def _add_number(p, i, ones, twos, fours, few):  # type: ignore[no-untyped-def]
+    """Add a 3-bit number to the first four planes; what overflows them goes to the last one, unless there is none."""
+    x = p[i]
+    p[i] = x ^ ones
+    p[CHUNK + i], carry = _sum_3(p[CHUNK + i], twos, x & ones)
+    p[2 * CHUNK + i], carry = _sum_3(p[2 * CHUNK + i], fours, carry)
+    x = p[3 * CHUNK + i]
+    p[3 * CHUNK + i] = x ^ carry
+    if not few:
+        p[PLANES * CHUNK + i] = x & carry
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_7(words, at, frame, n, few, p):  # type: ignore[no-untyped-def]
     a, b, c = words[at : at + n], words[at + frame : at + frame + n], words[at + 2 * frame : at + 2 * frame + n]
     d, e = words[at + 3 * frame : at + 3 * frame + n], words[at + 4 * frame : at + 4 * frame + n]
     g, h = words[at + 5 * frame : at + 5 * frame + n], words[at + 6 * frame : at + 6 * frame + n]
     for i in range(n):
-        u = a[i] ^ b[i]
-        ones = u ^ c[i]
-        t = (a[i] & b[i]) | (u & c[i])
-        u = ones ^ d[i]
-        v = (ones & d[i]) | (u & e[i])
-        ones = u ^ e[i]
-        u = ones ^ g[i]
-        w = (ones & g[i]) | (u & h[i])
-        ones = u ^ h[i]
-        u = t ^ v
-        twos = u ^ w
-        fours = (t & v) | (u & w)
-        x = p[i]
-        carry = x & ones
-        p[i] = x ^ ones
-        x = p[CHUNK + i]
-        u = x ^ twos
-        p[CHUNK + i] = u ^ carry
-        carry = (x & twos) | (u & carry)
-        x = p[2 * CHUNK + i]
-        u = x ^ fours
-        p[2 * CHUNK + i] = u ^ carry
-        carry = (x & fours) | (u & carry)
-        x = p[3 * CHUNK + i]
-        p[3 * CHUNK + i] = x ^ carry
-        p[PLANES * CHUNK + i] = x & carry
+        ones, twos, fours = _sum_7(a[i], b[i], c[i], d[i], e[i], g[i], h[i])
+        _add_number(p, i, ones, twos, fours, few)
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_3(words, at, frame, n, p):  # type: ignore[no-untyped-def]
+def _add_3(words, at, frame, n, few, p):  # type: ignore[no-untyped-def]
     a, b, c = words[at : at + n], words[at + frame : at + frame + n], words[at + 2 * frame : at + 2 * frame + n]
     for i in range(n):
-        u = a[i] ^ b[i]
-        ones = u ^ c[i]
-        twos = (a[i] & b[i]) | (u & c[i])
-        x = p[i]
-        carry = x & ones
-        p[i] = x ^ ones
-        x = p[CHUNK + i]
-        u = x ^ twos
-        p[CHUNK + i] = u ^ carry
-        carry = (x & twos) | (u & carry)
-        x = p[2 * CHUNK + i]
-        p[2 * CHUNK + i] = x ^ carry
-        carry = x & carry
-        x = p[3 * CHUNK + i]
-        p[3 * CHUNK + i] = x ^ carry
-        p[PLANES * CHUNK + i] = x & carry
+        ones, twos = _sum_3(a[i], b[i], c[i])
+        _add_number(p, i, ones, twos, np.uint64(0), few)
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_2(words, at, frame, n, p):  # type: ignore[no-untyped-def]
+def _add_2(words, at, frame, n, few, p):  # type: ignore[no-untyped-def]
     a, b = words[at : at + n], words[at + frame : at + frame + n]
     for i in range(n):
-        ones = a[i] ^ b[i]
-        twos = a[i] & b[i]
-        x = p[i]
-        carry = x & ones
-        p[i] = x ^ ones
-        x = p[CHUNK + i]
-        u = x ^ twos
-        p[CHUNK + i] = u ^ carry
-        carry = (x & twos) | (u & carry)
-        x = p[2 * CHUNK + i]
-        p[2 * CHUNK + i] = x ^ carry
-        carry = x & carry
-        x = p[3 * CHUNK + i]
-        p[3 * CHUNK + i] = x ^ carry
-        p[PLANES * CHUNK + i] = x & carry
+        _add_number(p, i, a[i] ^ b[i], a[i] & b[i], np.uint64(0), few)
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_1(words, at, n, p):  # type: ignore[no-untyped-def]
+def _add_1(words, at, n, few, p):  # type: ignore[no-untyped-def]
     a = words[at : at + n]
     for i in range(n):
-        x = p[i]
-        carry = x & a[i]
-        p[i] = x ^ a[i]
-        for q in range(1, 4):
-            x = p[q * CHUNK + i]
-            p[q * CHUNK + i] = x ^ carry
-            carry = x & carry
-        p[PLANES * CHUNK + i] = carry
+        _add_number(p, i, a[i], np.uint64(0), np.uint64(0), few)
+
+
+@numba.njit(cache=True, nogil=True)
+def _set_first(words, at, frame, n, frames, p):  # type: ignore[no-untyped-def]
+    """Set planes to the counts of the first frames, up to 7 of them; says of how many, and 2^planes is above that."""
+    a = words[at : at + n]
+    if frames < 2:
+        p[:n] = a
+        return 1
+    b = words[at + frame : at + frame + n]
+    if frames < 3:
+        for i in range(n):
+            p[i], p[CHUNK + i] = a[i] ^ b[i], a[i] & b[i]
+        return 2
+    c = words[at + 2 * frame : at + 2 * frame + n]
+    if frames < 5:
+        for i in range(n):
+            p[i], p[CHUNK + i] = _sum_3(a[i], b[i], c[i])
+        return 3
+    d, e = words[at + 3 * frame : at + 3 * frame + n], words[at + 4 * frame : at + 4 * frame + n]
+    if frames < 7:
+        for i in range(n):
+            p[i], p[CHUNK + i], p[2 * CHUNK + i] = _sum_5(a[i], b[i], c[i], d[i], e[i])
+            p[3 * CHUNK + i] = np.uint64(0)
+        return 5
+    g, h = words[at + 5 * frame : at + 5 * frame + n], words[at + 6 * frame : at + 6 * frame + n]
+    for i in range(n):
+        p[i], p[CHUNK + i], p[2 * CHUNK + i] = _sum_7(a[i], b[i], c[i], d[i], e[i], g[i], h[i])
+        p[3 * CHUNK + i] = np.uint64(0)
+    return 7
 
 
 @numba.njit(cache=True, nogil=True)
@@ -142,34 +163,48 @@ def _carry_on(n, p):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def add_frames(
-    words: NDArray[np.uint64], frame: int, at: int, first: int, last: int, n: int, few: bool, planes: NDArray[np.uint64]
+    words: NDArray[np.uint64],
+    frame: int,
+    at: int,
+    first: int,
+    last: int,
+    n: int,
+    counted: int,
+    planes: NDArray[np.uint64],
 ) -> None:
-    """Add words at..at+n-1 of frames first..last-1 to counters.
+    """Add words at..at+n-1 of frames first..last-1 to counters that have counted `counted` frames so far.
 
-    words: (all words,), `frame` of them a frame; n: at most CHUNK; planes: ((PLANES + 1) * CHUNK,), one chunk's. few:
-    no count will exceed FEW_FRAMES.
+    words: (all words,), `frame` of them a frame; n: at most CHUNK; planes: ((PLANES + 1) * CHUNK,), one chunk's, of
+    which only as many are valid as `planes_for` says: before the first frame none.
     """
-    f = first
+    f, all_frames = first, counted + last - first
+    if counted == 0:
+        f += _set_first(words, f * frame + at, frame, n, last - first, planes)
+    if f == last:
+        return
+    few = all_frames <= FEW_FRAMES
+    # Whatever is added goes into four planes at least.
+    _clear(planes_for(counted + f - first), 4 if few else PLANES, n, planes)
     while f < last:
         here = f * frame + at
         if f + 7 <= last:
-            _add_7(words, here, frame, n, planes)
+            _add_7(words, here, frame, n, few, planes)
             f += 7
         elif f + 3 <= last:
-            _add_3(words, here, frame, n, planes)
+            _add_3(words, here, frame, n, few, planes)
             f += 3
         elif f + 2 <= last:
-            _add_2(words, here, frame, n, planes)
+            _add_2(words, here, frame, n, few, planes)
             f += 2
         else:
-            _add_1(words, here, n, planes)
+            _add_1(words, here, n, few, planes)
             f += 1
         if not few:
             _carry_on(n, planes)
 
 
 @numba.njit(cache=True, nogil=True)
-def clear(first_plane: int, last_plane: int, n: int, planes: NDArray[np.uint64]) -> None:
+def _clear(first_plane: int, last_plane: int, n: int, planes: NDArray[np.uint64]) -> None:
     """Set planes first_plane..last_plane-1 of a chunk's first n counters to zero."""
     for q in range(first_plane, last_plane):
         planes[q * CHUNK : q * CHUNK + n] = np.uint64(0)
@@ -188,7 +223,7 @@ def add_runs(
     first_row: int,
     last_row: int,
 ) -> None:
-    """Add frames to `counts` (columns, rows, window), or to `dark` (rows, PAIRS, lanes and LANES more, 2) in lane order.
+    """Add frames to `counts` (columns, rows, window), or to `dark` (rows, PAIRS, lanes + LANES, 2) in lane order.
 
     words: (all words,), `row_words` a row; first_word: (n,), word of the sensor at which a frame's used pixels begin,
     used_words of them; bins: (n,) column, -1 dark, -2 skip. Only rows first_row..last_row-1 are touched, so that
@@ -210,19 +245,17 @@ def add_runs(
             while g < bins.shape[0] and bins[g] == c and first_word[g] == first_word[f] and g - f < MOST_FRAMES:
                 g += 1
             if c == -1 or (c >= 0 and counts.shape[0] > 0):
-                few = g - f <= FEW_FRAMES
-                clear(0, 4 if few else PLANES, n, planes)
-                add_frames(words, rows * row_words, y0 * row_words, f, g, n, few, planes)
+                add_frames(words, rows * row_words, y0 * row_words, f, g, n, 0, planes)
                 # A frame of whole rows begins at the sensor's first word, a window where its used pixels do.
                 begins = 0 if row_words == width_words else first_word[f]
                 wanted = first_word[f] if c < 0 else x0[c] // WORD_PX
-                row_bytes, few_planes = row_words * WORD_BYTES, 4 if few else PLANES
+                row_bytes, n_planes = row_words * WORD_BYTES, planes_for(g - f)
                 used_px = used_words * WORD_PX if c < 0 else window
                 n_row = n_dark if c < 0 else n_lit
                 for y in range(y0, y1, 2):
                     at = ((y - y0) * row_words + wanted - begins) * WORD_BYTES
                     read_planes(
-                        address_of(as_bytes), at, at + row_bytes if y + 1 < y1 else at, CHUNK * WORD_BYTES, few_planes,
+                        address_of(as_bytes), at, at + row_bytes if y + 1 < y1 else at, CHUNK * WORD_BYTES, n_planes,
                         used_px, address_of(n_row), padded_lanes(used_px),
                     )  # fmt: skip
                     for r in range(min(2, y1 - y)):

@@ -79,8 +79,8 @@ def read_planes(
 ) -> None:
     """Counts of two rows of `window` pixels, to n and to the row behind it, from their bit planes.
 
-    planes, n: addresses. first, second: bytes at which the rows begin; planes lie `plane_bytes` apart, n_planes: 1, 4
-    or 8 of them. Reads 16 bytes at a time, whatever the window.
+    planes, n: addresses. first, second: bytes at which the rows begin; planes lie `plane_bytes` apart, n_planes: 1, 2,
+    4 or 8 of them. Reads 16 bytes at a time, whatever the window.
     """
     pair = pair_bytes(lanes)
     for v in range(0, lanes, LANES):
@@ -91,8 +91,10 @@ def read_planes(
             n4, n5, n6, n7 = (b0 >> 3) & 1, (b0 >> 2) & 1, (b0 >> 1) & 1, b0 & 1
         else:
             b1 = load_two_rows(planes, a + plane_bytes, b + plane_bytes)
-            b2 = load_two_rows(planes, a + 2 * plane_bytes, b + 2 * plane_bytes)
-            b3 = load_two_rows(planes, a + 3 * plane_bytes, b + 3 * plane_bytes)
+            b2, b3 = zero_bytes(), zero_bytes()
+            if n_planes > 2:
+                b2 = load_two_rows(planes, a + 2 * plane_bytes, b + 2 * plane_bytes)
+                b3 = load_two_rows(planes, a + 3 * plane_bytes, b + 3 * plane_bytes)
             n0, n1, n2, n3, n4, n5, n6, n7 = _nibbles(b0, b1, b2, b3)
         if n_planes == 8:
             a, b = a + 4 * plane_bytes, b + 4 * plane_bytes

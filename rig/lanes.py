@@ -150,10 +150,12 @@ def place_list(indices: Iterable[int]) -> Any:
 
 
 def vector_name(vector: ir.VectorType) -> str:
+    """What LLVM calls a vector in the names of its intrinsics."""
     return f"v{vector.count}" + ("f32" if isinstance(vector.element, ir.FloatType) else f"i{vector.element.width}")
 
 
 def called(builder: Any, name: str, result: Any, *args: Any) -> Any:
+    """The result of a call of an LLVM intrinsic."""
     function_type = ir.FunctionType(result, [arg.type for arg in args])
     function = cgutils.get_or_insert_function(builder.module, function_type, name)  # type: ignore[no-untyped-call]
     return builder.call(function, args)
@@ -318,9 +320,10 @@ first_row_pairs, second_row_pairs = _interleaved(0), _interleaved(LANES)
 
 def _has_avx2() -> bool:
     """Whether numba compiles for a processor with AVX2: this one, unless its settings name another."""
-    if config.CPU_NAME is None and config.CPU_FEATURES is None:
+    settings: Any = config
+    if settings.CPU_NAME is None and settings.CPU_FEATURES is None:
         return bool(binding.get_host_cpu_features().get("avx2", False))
-    return "+avx2" in (config.CPU_FEATURES or "")
+    return "+avx2" in (settings.CPU_FEATURES or "")
 
 
 @intrinsic_of
@@ -384,39 +387,6 @@ def running_sum(a):  # type: ignore[no-untyped-def]
     a = add_saturated(a, _up_2_in_halves(a))
     a = add_saturated(a, _up_4_in_halves(a))
     return add_saturated(a, _lower_end(a))
-
-
-def _reduction(name: str, result: Any) -> Any:
-    @intrinsic_of
-    def reduce(typing: Any, a: Any) -> VectorCode:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            vector = args[0].type
-            return called(builder, f"llvm.vector.reduce.{name}.{vector_name(vector)}", vector.element, args[0])
-
-        return result(a), code
-
-    return reduce
-
-
-largest = _reduction("smax", types.int16)
-"""largest(a): the largest of 16 integers of 16 bits."""
-
-
-@intrinsic_of
-def total(typing: Any, a: Any) -> VectorCode:
-    """total(a): sum of 16 float32 lanes, by halves: the order is fixed."""
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = args[0]
-        half = LANES // 2
-        while half:
-            low = builder.shuffle_vector(value, value, place_list(range(half)))
-            high = builder.shuffle_vector(value, value, place_list(range(half, 2 * half)))
-            value = builder.fadd(low, high)
-            half //= 2
-        return builder.extract_element(value, ir.Constant(_INT32, 0))
-
-    return types.float32(a), code
 
 
 @intrinsic_of

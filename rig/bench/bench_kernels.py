@@ -4,7 +4,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.counting_kernels import CHUNK, FEW_FRAMES, PLANES, add_frames, clear
+from rig.counting_kernels import CHUNK, add_frames
 
 BITS_OF_CHANCE = 16
 """A pixel detects where a random number of so many bits is below its threshold."""
@@ -59,11 +59,9 @@ def count_columns(
     frame = rows * row_words
     frames = words.shape[0] // frame
     chunk_rows = max(CHUNK // row_words, 1)
-    few = exposures <= FEW_FRAMES
     for j in range(first_chunk, last_chunk):
         at = j * chunk_rows * row_words
         n = (min((j + 1) * chunk_rows, rows) - j * chunk_rows) * row_words
         counters = planes[j].ravel()
         for first in range(0, frames, exposures):
-            clear(0, 4 if few else PLANES, n, counters)
-            add_frames(words, frame, at, first, min(first + exposures, frames), n, few, counters)
+            add_frames(words, frame, at, first, min(first + exposures, frames), n, 0, counters)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rig.aligned import aligned_zeros
 from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, LABEL_PX, LABELS, cell_of
-from rig.estimators.screen_tables import LN2
+from rig.estimators.screen_tables import LN2, WEIGHT_LIMIT
 from rig.estimators.search_kernels import count_place
 from rig.lanes import (
     LANES,
@@ -95,7 +95,7 @@ def closeup_tables(weight: NDArray[np.float32], constant: NDArray[np.float32], u
     """Tables in so many units an octave, from `label_weights`."""
     pixels = weight.shape[2]
     reach = (pixels - 1) // 2
-    whole = np.rint(weight * units).astype(np.int8)
+    whole = _cut(weight, units).astype(np.int8)
     pairs = aligned_zeros((LEVELS, LEVELS, 2, reach + 1, LANES, 2), np.int8)
     for odd in range(2):
         for t in range(pixels):
@@ -107,6 +107,16 @@ def closeup_tables(weight: NDArray[np.float32], constant: NDArray[np.float32], u
     number = np.array(UNPACKED)
     index = np.where(number < LABELS, number - LABELS // 2, 0).astype(np.float32)
     return Closeup(pairs, padded, index, index * index)
+
+
+def largest_score(weight: NDArray[np.float32], units: int) -> float:
+    """Largest sum of the weights of a label, in so many units an octave, from `label_weights`."""
+    return float(np.abs(_cut(weight, units)).sum(axis=2).max())
+
+
+def _cut(weight: NDArray[np.float32], units: int) -> NDArray[np.float32]:
+    """Weights in whole units, cut to what 8 bits hold."""
+    return np.clip(np.rint(weight * np.float32(units)), -WEIGHT_LIMIT, WEIGHT_LIMIT)
 
 
 @numba.njit(inline="always")

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rig.aligned import aligned_zeros
 from rig.counting_kernels import WORD_PX
-from rig.estimators.closeup_kernels import closeup_tables, label_weights
+from rig.estimators.closeup_kernels import closeup_tables, label_weights, largest_score
 from rig.estimators.row_input import TABLE, State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
 from rig.estimators.row_search import (
@@ -36,8 +36,10 @@ TAP_SHARE = 0.06
 SCORE_LIMIT = 12500
 """Largest sum of taps times counts: less than half of the range of 16 bits, so that no sum of two wraps round."""
 MOST_HALVINGS = 6
+CLOSE_SHIFT = 3
+"""Weights of the close-up are of 16 units an octave: what 8 bits then cut says as much as 8 octaves."""
 CLOSE_LIMIT = 30000
-"""Largest product of a count and a weight of the close-up, whose sums saturate."""
+"""Largest sum of a label's weights times counts, which saturates."""
 ROUGH_UNITS = 4.0
 """Units per octave in which no weight reaches its limit: a logit lies within 11 octaves of 0 either way."""
 CUT = 1.25
@@ -74,10 +76,9 @@ def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: 
     haze, rest = model.profile[:, 0], model.profile[:, 1]
     share = float(rest.sum() / max(haze.sum(), 1e-9))
     weight, constant = label_weights(float(np.median(state.ambient)), share, geometry.near_is_left, state.fine, TABLE)
-    most_of_one, most_of_all = (float(a.max()) for a in (np.abs(weight), np.abs(weight).sum(axis=2)))
     close_shift = next(
-        i for i in range(MOST_HALVINGS + 1)
-        if (128 >> i) * most_of_one <= WEIGHT_LIMIT and most * (128 >> i) * most_of_all <= CLOSE_LIMIT
+        i for i in range(CLOSE_SHIFT, MOST_HALVINGS + 1)
+        if most * largest_score(weight, 128 >> i) <= CLOSE_LIMIT or i == MOST_HALVINGS
     )  # fmt: skip
     closeup = closeup_tables(weight, constant, 128 >> close_shift)
     expected = np.repeat(state.ambient, band_rows, axis=0)[: geometry.rows]

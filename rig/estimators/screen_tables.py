@@ -36,7 +36,7 @@ class Tables(NamedTuple):
 
     edge: int8 (columns, bands, PAIRS, lanes, 2), weight of a count left of the stripe.
     tap: int8 (columns, bands, SCREENS, STEPS, T + 1, lanes, 2), weights at each position of the counts of T + 1 pairs
-    from `first_pair` on, which hold those T px around it; at odd positions also of the pixel before, left of the stripe.
+    from `first_pair` on, which hold those T px around it; at odd positions that of the pixel before as left as well.
     position: int16 (columns, bands, SCREENS, P), units of position x at the nominal number of exposures, its prior
     included; slope: int16, the same shape, by how many 1 / SLOPE of a unit it grows with each exposure more.
     lane: float32 (columns, bands, lanes), units per exposure of all pixels of a lane lying left of the stripe.

@@ -76,13 +76,13 @@ class Search(NamedTuple):
     """Addresses of a thread's buffers for BATCH rows of `lanes` lanes, and the bytes from row to row of each.
 
     n: counts, see `rig.lane_order`. int16: score (STEPS, lanes); start (lanes,), score of a change at the lane's first
-    pixel; tops (LANES,), best scores of some lanes each; constant (SCREENS, STEPS, lanes), the tables' part per exposure
-    times the exposures; lane (lanes,), the same; label (LANES,), scores of the close-up; place: index of pixel
-    -PLACE_BEFORE on in a row of counts. neutral: bytes, counts of hot pixels, see `row_search`. Of each row of the batch, int16: all_left, score of all pixels lying left;
-    best, x: best score and its pixel; left, right: the scores beside it; levels: of the close-up; lift: what makes a
-    score a power; ceiling: what no score exceeds. float32: light, before, scale, ambient: see `row_search`; answer: one
-    field of the answers on its way out. Folded (`lane_reductions`): mass, sum of all likelihoods; moment, square: sums
-    of the close-up.
+    pixel; tops (LANES,), best scores of some lanes each; constant (SCREENS, STEPS, lanes), the tables' part per
+    exposure times the exposures; lane (lanes,), the same; label (LANES,), scores of the close-up; place: index of pixel
+    -PLACE_BEFORE on in a row of counts. neutral: bytes, counts of hot pixels, see `row_search`. Of each row of the
+    batch, int16: all_left, score of all pixels lying left; best, x: best score and its pixel; left, right: the scores
+    beside it; levels: of the close-up; lift: what makes a score a power; ceiling: what no score exceeds. float32:
+    light, before, scale, ambient: see `row_search`; answer: one field of the answers on its way out. Folded
+    (`lane_reductions`): mass, sum of all likelihoods; moment, square: sums of the close-up.
     """
 
     lanes: int
@@ -224,7 +224,9 @@ def _position_score(first, second, tap, constant, s, v, lanes, level):  # type: 
     at, screen = 4 * s * lanes + 2 * v, 4 * STEPS * lanes
     dim = dot_pairs(first, load_bytes(tap, at)) + dot_pairs(second, load_bytes(tap, at + 2 * lanes))
     dim = add_saturated(dim, load_int16(constant, s * lanes + v))
-    bright = dot_pairs(first, load_bytes(tap, screen + at)) + dot_pairs(second, load_bytes(tap, screen + at + 2 * lanes))
+    bright = dot_pairs(first, load_bytes(tap, screen + at)) + dot_pairs(
+        second, load_bytes(tap, screen + at + 2 * lanes)
+    )
     bright = add_saturated(bright, load_int16(constant, (STEPS + s) * lanes + v))
     return add_saturated(level, larger(dim, bright))
 

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.counting_kernels import CHUNK, FEW_FRAMES, PLANES, WORD_BYTES, WORD_PX, add_frames, clear
+from rig.counting_kernels import CHUNK, PLANES, WORD_BYTES, WORD_PX, add_frames, planes_for
 from rig.estimators.row_search import (
     Bench,
     Desk,
@@ -43,23 +43,6 @@ class OpenColumn(NamedTuple):
     frames: int
     sums_x0: int
     summed: int
-
-
-@numba.njit(cache=True, nogil=True)
-def _take(words, frame, at, n, first, last, counted, planes):  # type: ignore[no-untyped-def]
-    """Add frames first..last-1 to a chunk's counters, of which only as many planes are valid as `counted` needs."""
-    here = last - first
-    if counted == 0 and here == 1:
-        start = first * frame + at
-        planes[:n] = words[start : start + n]
-        return
-    if counted == 0:
-        clear(0, 4, n, planes)
-    elif counted == 1:
-        clear(1, 4, n, planes)
-    if counted + here > FEW_FRAMES >= counted:
-        clear(4, PLANES, n, planes)
-    add_frames(words, frame, at, first, last, n, counted + here <= FEW_FRAMES, planes)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -107,7 +90,7 @@ def _finish_rows(desk, search, state, planes, row_bytes, first_row, last_row):  
     halved = halvings(k, desk.most)
     exposures = np.float32(k / 2.0**halved)
     n, lanes = search.n, search.lanes
-    n_planes = 1 if k == 1 else (4 if k <= FEW_FRAMES else PLANES)
+    n_planes = planes_for(k)
     x0 = np.int64(read_int32(desk.x0, c))
     at = (x0 // WORD_PX - state.first_word) * WORD_BYTES
     if x0 != state.sums_x0 or state.summed + k > SUM_LIMIT:
@@ -157,7 +140,7 @@ def search_frames(
 
     words: (all words,) of the block's frames; bins: (n,), column of each frame, negative ones are passed over;
     first_word: (n,) of each frame's window; row_words: words of a row; end: the sweep ends here, nothing stays open;
-    desk: with a thread's own bench; planes: see `new_planes`. Only the rows of chunks first_chunk..last_chunk-1 are touched.
+    desk: with a thread's own bench; planes: see `new_planes`. Only chunks first_chunk..last_chunk-1 are touched.
     """
     rows = desk.rows
     frame = rows * row_words
@@ -185,7 +168,7 @@ def search_frames(
                 state = _after(state, desk, c, word)
             elif word != state.first_word:
                 _move_window(word - state.first_word, row_words, n, counters)
-            _take(words, frame, at, n, f, g, state.frames, counters)
+            add_frames(words, frame, at, f, g, n, state.frames, counters)
             state = OpenColumn(c, word, state.frames + g - f, state.sums_x0, state.summed)
             f = g
         if end and state.column >= 0:

@@ -6,11 +6,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rig.estimators.judging import BAND_ROWS, BAND_SHEAR_PX, SCORE_LIMIT, judge_of, nothing_found, rows_of_band
+from rig.estimators.judging import (
+    BAND_ROWS,
+    BAND_SHEAR_PX,
+    CLOSE_SHIFT,
+    SCORE_LIMIT,
+    judge_of,
+    nothing_found,
+    rows_of_band,
+)
 from rig.estimators.learning import next_lattice
 from rig.estimators.likelihood import Likelihood
 from rig.estimators.row_search import COUNT_LIMIT, count_fluxes, halvings
-from rig.lane_order import STEPS
+from rig.estimators.screen_tables import WEIGHT_LIMIT
 from rig.row_threads import RowWorkers
 from tests.reference.geometry import Geometry
 from tests.unit.small_maps import RIGS, geometry_of, simulated
@@ -63,14 +71,15 @@ def test_units_are_as_fine_as_leaves_room_for_every_sum(light, rig, exposures):
     judge = judge_of(model(light, rig), simulated(light, 10, rig).geometry, exposures, WORKERS, dark=False)
     tables, most = judge.tables, judge.most
     assert min(2 * exposures, COUNT_LIMIT) <= most <= COUNT_LIMIT
-    taps = np.abs(tables.tap.astype(np.int64)).sum(axis=3).max()
-    columns, bands, pixels = tables.edge.shape
-    edges = np.abs(tables.edge.astype(np.int64)).reshape(columns, bands, STEPS, pixels // STEPS).sum(axis=2).max()
+    tap, edge = np.abs(tables.tap.astype(np.int64)), np.abs(tables.edge.astype(np.int64))
+    taps, edges = tap.sum(axis=(4, 6)).max(), edge.sum(axis=(2, 4)).max()
     # Chosen by every 16th column and one band: others may have a little more.
     assert most * taps < 1.2 * SCORE_LIMIT
     assert most * edges < 2.4 * SCORE_LIMIT
+    assert max(tap.max(), edge.max()) <= WEIGHT_LIMIT
     if judge.shift > 0:
-        assert 2.6 * most * max(taps, edges / 2) > SCORE_LIMIT
+        assert 2.6 * most * max(taps, edges / 2) > SCORE_LIMIT or tap.max() > WEIGHT_LIMIT / 2
+    assert judge.close_shift == CLOSE_SHIFT
 
 
 def test_thick_haze_takes_coarser_units_where_its_edge_would_not_fit():

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 
+import numba
 import numpy as np
 import pytest
 
@@ -12,18 +13,11 @@ from rig.estimators.likelihood import Likelihood
 from rig.estimators.row_input import judge_line, row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimators.row_kernels import mode_of
 from rig.estimators.row_model import RowModel, line_profile, stripe_scale
-from rig.estimators.row_search import new_bench
-from rig.estimators.search_kernels import (
-    BATCH,
-    START,
-    score_rows,
-    search_in,
-    search_memory,
-    set_exposures,
-    sum_edges,
-)
+from rig.estimators.row_search import desk_of, new_bench, table_for
+from rig.estimators.search_kernels import BATCH, START, score_rows, search_in
 from rig.estimators.stream_kernels import search_counts
 from rig.lane_order import STEPS, padded_lanes, read_counts
+from rig.lanes import read_int16
 from rig.row_threads import RowWorkers
 from tests.unit.small_maps import simulated, volume_of
 
@@ -51,7 +45,7 @@ def searched(volume, geometry, learned, exposures=None):
     found = nothing_found(geometry, None)
     bench = new_bench(padded_lanes(geometry.window))
     search_counts(volume.counts, volume.n_frames, judge, bench, found, 0, geometry.rows)
-    table = stripes_of(found, WORKERS)
+    table = stripes_of(found, judge, WORKERS)
     return np.stack([table.x_px, table.confidence, table.x_sd_px, table.signal, table.haze])
 
 
@@ -152,6 +146,23 @@ def test_random_models_are_searched_as_exactly(rig, exposures):
     assert np.abs(difference).mean() < 0.06
 
 
+@numba.njit
+def compiled_scores(desk, c, band, counts, exposures, out, lane, constant):
+    """The search's own scores (rows, STEPS, lanes) of counts (rows, window), and the constants that it used."""
+    search = search_in(desk.memory, desk.lanes)
+    table = table_for(desk, search, c, band, exposures)
+    for r in range(counts.shape[0]):
+        read_counts(counts[r], 0, search.n + r * search.n_bytes, search.lanes)
+    score_rows(table, desk.taps - 1, search, counts.shape[0])
+    for r in range(counts.shape[0]):
+        for i in range(STEPS * desk.lanes):
+            out[r, i] = read_int16(search.score + r * search.score_bytes, i)
+    for i in range(desk.lanes):
+        lane[i] = read_int16(search.lane, i)
+    for i in range(2 * STEPS * desk.lanes):
+        constant[i] = read_int16(table.constant, i)
+
+
 def scores(judge, c, band, counts, exposures):
     """Scores (rows, pixels) of the search for rows of counts (rows, window), and those of whole numbers without limits.
 
@@ -159,44 +170,44 @@ def scores(judge, c, band, counts, exposures):
     """
     tables = judge.tables
     lanes = tables.lane.shape[2]
-    memory = search_memory(lanes)
-    search = search_in(memory, lanes)
-    part = [getattr(tables, name)[c, band] for name in ("position", "slope", "lane", "none", "edge", "tap")]
-    position, slope, lane, none, edge, tap = (np.ascontiguousarray(a) for a in part)
-    addresses = (a.ctypes.data for a in (position, slope, lane, none))
-    set_exposures(*addresses, float(exposures), float(judge.nominal), search)
-    for r, row in enumerate(counts):
-        read_counts(row, 0, search.n + r * search.n_bytes, lanes)
-    sum_edges(edge.ctypes.data, search, len(counts))
-    score_rows(edge.ctypes.data, tap.ctypes.data, (tap.shape[1] - 1) // 2, search, len(counts))
-
-    def at(address, n):
-        begin = (address - search.n) // 2
-        return memory[begin : begin + n].astype(np.int64)
+    bench, found = new_bench(lanes), nothing_found(simulated().geometry, None)
+    desk = desk_of(judge, found, bench)
+    raw, lane, constant = (np.zeros(n, np.int16) for n in (len(counts) * STEPS * lanes, lanes, 2 * STEPS * lanes))
+    compiled_scores(desk, c, band, counts, np.float32(exposures), raw.reshape(len(counts), -1), lane, constant)
 
     def pixels(a):
+        """Numbers (..., STEPS * lanes) in pixel order, 64 bits."""
         return a.reshape(*a.shape[:-1], STEPS, lanes).swapaxes(-1, -2).reshape(*a.shape[:-1], -1).astype(np.int64)
 
-    found = np.stack([pixels(at(search.score + r * search.score_bytes, STEPS * lanes)) for r in range(len(counts))])
-    edge, tap = pixels(edge), pixels(tap)
-    constant = pixels(at(search.constant, 2 * STEPS * lanes).reshape(2, -1))
+    found = pixels(raw.reshape(len(counts), -1))
+    constant, lane = pixels(constant.reshape(2, -1)), lane.astype(np.int64)
+    edge = tables.edge[c, band].transpose(1, 0, 2).reshape(-1).astype(np.int64)
+    tap = tables.tap[c, band].astype(np.int64)
+    reach = tap.shape[2] - 1
     wanted, inside = np.empty_like(found), np.empty(found.shape, bool)
-    reach = tap.shape[1] // 2
+    pad = 2 * (reach + 2)
     for r, row in enumerate(counts):
-        n = np.zeros(STEPS * lanes + 2 * reach, np.int64)
-        n[reach : reach + len(row)] = row
-        own = n[reach : reach + STEPS * lanes]
-        of_lane = (own * edge).reshape(lanes, STEPS)
-        rises = of_lane.sum(axis=1) + at(search.lane, lanes)
-        # These sums are not saturated: they must fit, whatever the counts.
+        n = np.zeros(STEPS * lanes + 2 * pad, np.int64)
+        n[pad : pad + len(row)] = row
+        own = n[pad : pad + STEPS * lanes]
+        of_pixel = own * edge
+        of_lane = of_pixel.reshape(lanes, STEPS)
+        rises = of_lane.sum(axis=1) + lane
+        within = np.cumsum(of_lane, axis=1) - of_lane
+        # The level of the pair: what the odd pixel adds stands in its taps.
+        level_in = np.repeat(within[:, ::2], 2, axis=1)
         assert np.abs(of_lane.sum(axis=1)).max() < 32768
-        assert np.abs(rises).max() < 32768
         through = np.append(0, np.cumsum(rises))
-        level = START + through[:-1, None] + np.cumsum(of_lane, axis=1) - of_lane
-        # Sums over some lanes stop at the limits as well.
+        level = START + through[:-1, None] + level_in
         kept = np.maximum.accumulate(through) - np.minimum.accumulate(through) < 32767
         kept &= np.logical_and.accumulate(np.abs(START + through) < 32767)
-        taps = sum(tap[:, d] * n[d : d + STEPS * lanes] for d in range(2 * reach + 1))
+        kept[1:] &= np.abs(rises) < 32768
+        taps = np.zeros((2, STEPS * lanes), np.int64)
+        for x in range(STEPS * lanes):
+            s, i = x % STEPS, x // STEPS
+            first = 2 * (x // 2 + ((s - reach) // 2 - s // 2)) + pad
+            pairs = n[first : first + 2 * (reach + 1)].reshape(reach + 1, 2)
+            taps[:, x] = (tap[:, s, :, i] * pairs).sum(axis=(1, 2))
         assert np.abs(taps).max() < 32768
         wanted[r] = level.ravel() + (taps + constant).max(axis=0)
         # Positions that are not searched have a constant of -32000: they only must not win.
@@ -310,7 +321,7 @@ def test_the_sum_of_taps_has_room_for_any_count():
     for light in LIGHTS:
         for exposures in (1, 3, 10, 40, 63, 200):
             judge, _ = judged_rows("left", exposures, light)
-            most = judge.most * np.abs(judge.tables.tap.astype(np.int64)).sum(axis=3).max()
+            most = judge.most * np.abs(judge.tables.tap.astype(np.int64)).sum(axis=(4, 6)).max()
             assert most < 2 * SCORE_LIMIT
 
 

@@ -23,7 +23,7 @@ from rig.bench.recorded import recording_of
 from rig.bench.soak import SoakOptions, soak
 from rig.bench.speed import Extent, measure_speed
 from rig.counting import SweepCounter, SweepLayout
-from rig.counting_kernels import CHUNK, PLANES, new_planes
+from rig.counting_kernels import CHUNK, new_planes, planes_for
 from rig.errors import UsageError
 from rig.row_threads import RowWorkers
 from rig.sweeps import SweepAssembler
@@ -106,7 +106,7 @@ def test_counting_alone_counts_all_frames_of_a_column(frames, exposures):
     planes = new_planes(ROWS * row_words // CHUNK)
     words = frames.bits[: 2 * exposures].reshape(-1).view(np.uint64)
     count_columns(words, rows, row_words, exposures, planes, 0, len(planes))
-    used = PLANES if exposures > 15 else 4
+    used = planes_for(exposures)
     bits = np.unpackbits(planes[:, :used].copy().view(np.uint8), axis=2).astype(np.int64)
     counts = (bits << np.arange(used)[:, None]).sum(axis=1).reshape(rows, 64)
     last = np.unpackbits(frames.bits[exposures : 2 * exposures], axis=2).sum(axis=0)

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.counting_kernels import CHUNK, FEW_FRAMES, PLANES, add_frames, add_runs, clear, new_planes
-from rig.lane_order import pixel_order
+from rig.counting_kernels import CHUNK, PLANES, add_frames, add_runs, new_planes, planes_for
+from rig.lane_order import PAIRS, pixel_order
 from rig.lanes import LANES
 
 WORD = 64
@@ -24,10 +24,15 @@ def bits_of(words):
     return np.unpackbits(np.ascontiguousarray(words).view(np.uint8), axis=-1).astype(bool)
 
 
-def planes_counts(planes, n):
-    """Counts (n * 64,) that a chunk's planes hold for its first n words."""
-    planes = planes.reshape(PLANES + 1, CHUNK)[:PLANES, :n]
-    return sum(bits_of(planes[q]).astype(np.int64) << q for q in range(PLANES))
+def planes_counts(planes, n, frames):
+    """Counts (n * 64,) of so many frames that a chunk's planes hold for its first n words."""
+    planes = planes.reshape(PLANES + 1, CHUNK)[: planes_for(frames), :n]
+    return sum(bits_of(plane).astype(np.int64) << q for q, plane in enumerate(planes))
+
+
+def used_planes():
+    """A chunk's planes as an earlier column left them."""
+    return np.full((PLANES + 1) * CHUNK, 2**64 - 1, np.uint64)
 
 
 @pytest.mark.parametrize("k", [*range(1, 41), 63, 64, 255])
@@ -36,37 +41,36 @@ def test_frames_are_added_exactly(k, n):
     frame, at = n + 5, 3
     words = random_words(k, k, frame)
     words[:, at] = 2**64 - 1  # the largest count there can be
-    few = k <= FEW_FRAMES
-    planes = new_planes(1)[0].ravel()
-    add_frames(words.ravel(), frame, at, 0, k, n, few, planes)
+    planes = used_planes()
+    add_frames(words.ravel(), frame, at, 0, k, n, 0, planes)
     wanted = bits_of(words[:, at : at + n]).sum(axis=0)
-    np.testing.assert_array_equal(planes_counts(planes, n), wanted)
+    np.testing.assert_array_equal(planes_counts(planes, n, k), wanted)
     assert wanted[0] == k
 
 
-@pytest.mark.parametrize("pieces", [(1, 1, 1, 12), (7, 8), (14, 1), (3, 2, 10)])
+@pytest.mark.parametrize(
+    "pieces", [(1, 1, 1, 12), (7, 8), (14, 1), (3, 2, 10), (1, 2), (2, 1), (3, 1), (5, 2), (15, 185), (1, 30), (2, 253)]
+)
 def test_frames_may_come_in_pieces(pieces):
     words = random_words(1, sum(pieces), 20)
-    planes, first = new_planes(1)[0].ravel(), 0
+    planes, first = used_planes(), 0
     for piece in pieces:
-        add_frames(words.ravel(), 20, 0, first, first + piece, 20, True, planes)
+        add_frames(words.ravel(), 20, 0, first, first + piece, 20, first, planes)
         first += piece
-    np.testing.assert_array_equal(planes_counts(planes, 20), bits_of(words).sum(axis=0))
+    np.testing.assert_array_equal(planes_counts(planes, 20, first), bits_of(words).sum(axis=0))
 
 
-def test_more_than_few_frames_go_on_from_few():
-    words = random_words(2, 200, 9)
-    planes = new_planes(1)[0].ravel()
-    add_frames(words.ravel(), 9, 0, 0, 15, 9, True, planes)
-    add_frames(words.ravel(), 9, 0, 15, 200, 9, False, planes)
-    np.testing.assert_array_equal(planes_counts(planes, 9), bits_of(words).sum(axis=0))
+def test_new_planes_begin_at_cache_lines():
+    planes = new_planes(3)
+    assert planes.shape == (3, PLANES + 1, CHUNK)
+    assert planes.ctypes.data % 64 == 0
+    assert not planes.any()
 
 
 def test_words_beside_a_chunk_are_left_alone():
-    planes = np.full((PLANES + 1) * CHUNK, 2**64 - 1, np.uint64)
-    clear(0, PLANES, 10, planes)
+    planes = random_words(4, (PLANES + 1) * CHUNK)
     before = planes.copy()
-    add_frames(random_words(3, 30, 10).ravel(), 10, 0, 0, 30, 10, False, planes)
+    add_frames(random_words(3, 30, 10).ravel(), 10, 0, 0, 30, 10, 0, planes)
     untouched = np.ones((PLANES + 1, CHUNK), bool)
     untouched[:, :10] = False
     np.testing.assert_array_equal(planes[untouched.ravel()], before[untouched.ravel()])
@@ -75,7 +79,7 @@ def test_words_beside_a_chunk_are_left_alone():
 def runs(words, first_word, row_words, used_words, bins, x0, window, rows, width_words, pieces=(0, 1), dtype=np.uint16):
     """Counts (columns, rows, window) and dark sums (rows, width) of `add_runs`, rows in pieces as of threads."""
     counts = np.zeros((len(x0), rows, window), dtype)
-    dark = np.zeros((rows, 8, width_words * WORD // 8 + LANES), np.int32)
+    dark = np.zeros((rows, PAIRS, width_words * WORD // 8 + LANES, 2), np.int32)
     edges = [round(share * rows) for share in pieces]
     for first, last in pairwise(edges):
         add_runs(
@@ -143,7 +147,7 @@ def test_windows_that_move_within_a_column_are_counted_at_their_place():
 def test_without_columns_only_dark_frames_are_counted():
     words = random_words(6, 12, 3, 2)
     bins = np.array([-1, 0, 1, -2] * 3)
-    dark = np.zeros((3, 8, 16 + LANES), np.int32)
+    dark = np.zeros((3, PAIRS, 16 + LANES, 2), np.int32)
     none = np.zeros((0, 3, WORD), np.uint8)
     add_runs(
         words.ravel(), np.zeros(12, np.int32), 2, 2, bins.astype(np.int32), np.zeros(2, np.int32), none, dark, 0, 3

@@ -60,9 +60,6 @@ OPERATIONS = {
     "shift left": (numba.njit(lambda a, b: a << 3), lambda a, b: wide(a) << 3),
     "with a number": (numba.njit(lambda a, b: (a & 0x55) + 7), lambda a, b: (a & 0x55) + 7),
     "one lane up": (numba.njit(lambda a, b: lanes.up_1(a)), lambda a, b: np.append(0, a[:-1])),
-    "two lanes up": (numba.njit(lambda a, b: lanes.up_2(a)), lambda a, b: np.append([0] * 2, a[:-2])),
-    "four lanes up": (numba.njit(lambda a, b: lanes.up_4(a)), lambda a, b: np.append([0] * 4, a[:-4])),
-    "eight lanes up": (numba.njit(lambda a, b: lanes.up_8(a)), lambda a, b: np.append([0] * 8, a[:-8])),
 }
 
 
@@ -94,10 +91,9 @@ def test_running_sums_stop_at_the_limits(sign):
     np.testing.assert_array_equal(out, saturated(np.cumsum(a.astype(np.int64))))
 
 
-def test_reductions():
-    largest, last = reduced(lanes.largest), reduced(lanes.last_lane)
+def test_the_last_lane():
+    last = reduced(lanes.last_lane)
     for a, _ in samples():
-        assert largest(a) == a.max()
         assert last(a) == a[-1]
 
 
@@ -127,52 +123,156 @@ def test_lanes_between(first, end):
     np.testing.assert_array_equal(out, np.where(inside, -1, 0))
 
 
-def test_unsigned_bytes_are_widened():
+def bytes_kernel(operation):
+    """A kernel that applies an operation to 32 bytes of each of two arrays."""
+
     @numba.njit
-    def widened(a, at, out):
-        lanes.store_int16(address_of(out), 0, lanes.widen(lanes.load_int8(address_of(a), at)))
+    def kernel(a, b, out):
+        one, other = lanes.load_bytes(address_of(a), 0), lanes.load_bytes(address_of(b), 0)
+        lanes.store_bytes(address_of(out), 0, operation(one, other))
 
-    a, out = np.arange(256, dtype=np.uint8), np.empty(LANES, np.int16)
-    for at in (0, 1, 113, 240):
-        widened(a, at, out)
-        np.testing.assert_array_equal(out, a[at : at + LANES])
+    return kernel
 
 
-@numba.njit
-def float_lanes(a, b, weight):
-    one, other = lanes.load_float32(address_of(a), 0), lanes.load_float32(address_of(b), 0)
-    return lanes.total(
-        (lanes.larger_float(one, other) + one * other - other) * lanes.load_float32(address_of(weight), 0)
-    )
+def random_bytes(seed, n=2 * LANES):
+    return np.random.default_rng(seed).integers(0, 256, n).astype(np.uint8)
 
 
-def test_float_lanes_do_what_numpy_does():
+@pytest.mark.parametrize(
+    ("operation", "wanted"),
+    [
+        (numba.njit(lambda a, b: a + b), lambda a, b: a + b),
+        (numba.njit(lambda a, b: (a >> 3) & 0x55), lambda a, b: (a >> 3) & 0x55),
+        (numba.njit(lambda a, b: (a & 0xAA) | (b << 2)), lambda a, b: (a & 0xAA) | (b << 2)),
+        (
+            numba.njit(lambda a, b: lanes.first_row_pairs(a, b)),
+            lambda a, b: np.stack([a[:LANES], b[:LANES]], axis=1).ravel(),
+        ),
+        (
+            numba.njit(lambda a, b: lanes.second_row_pairs(a, b)),
+            lambda a, b: np.stack([a[LANES:], b[LANES:]], axis=1).ravel(),
+        ),
+    ],
+)
+def test_bytes_do_what_numpy_does(operation, wanted):
+    kernel = bytes_kernel(operation)
+    for seed in range(5):
+        a, b, out = random_bytes(seed), random_bytes(seed + 100), np.empty(2 * LANES, np.uint8)
+        kernel(a, b, out)
+        np.testing.assert_array_equal(out, wanted(a, b))
+
+
+def test_two_rows_of_bytes_are_loaded_side_by_side():
+    @numba.njit
+    def loaded(a, first, second, out):
+        lanes.store_bytes(address_of(out), 0, lanes.load_two_rows(address_of(a), first, second))
+
+    a, out = random_bytes(1, 100), np.empty(2 * LANES, np.uint8)
+    for first, second in ((0, 16), (3, 77), (50, 50)):
+        loaded(a, first, second, out)
+        np.testing.assert_array_equal(out, np.concatenate([a[first : first + LANES], a[second : second + LANES]]))
+
+
+@pytest.mark.parametrize("one_instruction", [True, False])
+def test_products_of_pairs_are_added_and_stop_at_the_limits(one_instruction, monkeypatch):
+    if one_instruction and not lanes._has_avx2():
+        pytest.skip("this processor has no AVX2")
+    monkeypatch.setattr(lanes, "_has_avx2", lambda: one_instruction)
+
+    @numba.njit
+    def dot(counts, weights, out):
+        pairs = lanes.dot_pairs(lanes.load_bytes(address_of(counts), 0), lanes.load_bytes(address_of(weights), 0))
+        lanes.store_int16(address_of(out), 0, pairs)
+
+    rng = np.random.default_rng(2)
+    for largest in (1, 64, 255):
+        counts = rng.integers(0, largest + 1, 2 * LANES).astype(np.uint8)
+        weights = rng.integers(-128, 128, 2 * LANES).astype(np.int8)
+        counts[:4], weights[:4] = largest, (127, 127, -128, -128)
+        out = np.empty(LANES, np.int16)
+        dot(counts, weights, out)
+        sums = (counts.astype(int) * weights).reshape(LANES, 2).sum(axis=1)
+        np.testing.assert_array_equal(out, np.clip(sums, -32768, 32767))
+
+
+def test_bytes_are_added_to_wide_numbers():
+    @numba.njit
+    def add(sums, a):
+        lanes.add_bytes(address_of(sums), 3, lanes.load_bytes(address_of(a), 0))
+
+    sums, a = np.arange(40, dtype=np.int32) * 10**6, random_bytes(5)
+    wanted = sums.copy()
+    wanted[3:35] += a
+    add(sums, a)
+    np.testing.assert_array_equal(sums, wanted)
+
+
+def test_bytes_of_16_bit_lanes_and_equal_numbers_a_step_apart():
+    @numba.njit
+    def split(a, out):
+        lanes.store_bytes(address_of(out), 0, lanes.as_bytes(lanes.load_int16(address_of(a), 0)))
+
+    @numba.njit
+    def mask(a, at, step, number):
+        return lanes.equal_bits(address_of(a), at, step, number)
+
+    out = np.empty(2 * LANES, np.uint8)
+    split(EDGES, out)
+    np.testing.assert_array_equal(out, EDGES.view(np.uint8))
+    a = np.random.default_rng(3).integers(0, 4, 200).astype(np.int16)
+    for at, step in ((0, 16), (5, 7), (100, 1)):
+        equal = a[at : at + 8 * step : step] == 2
+        assert mask(a, at, step, np.int16(2)) == sum(1 << i for i in range(8) if equal[i])
+
+
+FLOATS = {
+    "arithmetic": (
+        numba.njit(lambda a, b: lanes.larger_float(a, b) + a * b - b),
+        lambda a, b: np.maximum(a, b) + a * b - b,
+    ),
+    "smaller": (numba.njit(lambda a, b: lanes.smaller_float(a, b)), np.minimum),
+    "quotient": (numba.njit(lambda a, b: a / (b * b + np.float32(1.0))), lambda a, b: a / (b * b + 1.0)),
+    "root": (numba.njit(lambda a, b: lanes.square_root(a * a)), lambda a, b: np.abs(a)),
+    "halves and back": (
+        numba.njit(lambda a, b: lanes.from_bfloat16(lanes.to_bfloat16(a))),
+        lambda a, b: (a.astype(np.float32).view(np.uint32) & 0xFFFF0000).view(np.float32),
+    ),
+    "whole numbers and back": (numba.njit(lambda a, b: lanes.to_float32(lanes.to_int16(a))), lambda a, b: np.trunc(a)),
+}
+
+
+@pytest.mark.parametrize("name", FLOATS)
+def test_float_lanes_do_what_numpy_does(name):
+    operation, wanted = FLOATS[name]
+
+    @numba.njit
+    def kernel(a, b, out):
+        one, other = lanes.load_float32(address_of(a), 0), lanes.load_float32(address_of(b), 0)
+        lanes.store_float32(address_of(out), 0, operation(one, other))
+
     rng = np.random.default_rng(3)
     for _ in range(20):
         a, b = rng.normal(0, 100, (2, LANES)).astype(np.float32)
-        wanted = np.maximum(a, b) + a.astype(float) * b - b
-        for lane in range(LANES):
-            only = np.zeros(LANES, np.float32)
-            only[lane] = 1.0
-            assert float_lanes(a, b, only) == pytest.approx(wanted[lane], rel=1e-5, abs=1e-2)
-        assert float_lanes(a, b, np.ones(LANES, np.float32)) == pytest.approx(wanted.sum(), rel=1e-4, abs=1e-1)
+        out = np.empty(LANES, np.float32)
+        kernel(a, b, out)
+        np.testing.assert_allclose(out, wanted(a.astype(float), b.astype(float)), rtol=1e-5, atol=1e-2)
 
 
 def test_bfloat16_patterns_become_numbers_in_the_order_that_is_said():
     @numba.njit
-    def number(a, only):
-        return lanes.total(
-            lanes.from_bfloat16(lanes.load_int16(address_of(a), 0)) * lanes.load_float32(address_of(only), 0)
-        )
+    def numbers_of(a, out, unpacked):
+        patterns = lanes.load_int16(address_of(a), 0)
+        lanes.store_float32(address_of(out), 0, lanes.from_bfloat16(patterns))
+        lanes.store_float32(address_of(unpacked), 0, lanes.from_bfloat16_unpacked(patterns))
 
     numbers = np.array([0, 1, 2, 0.5, -3, 1e30, 1e-30, 7, 1.5, 2.5, 100, -0.25, 3e5, 1e-5, 96, 12], np.float32)
     patterns = (numbers.view(np.uint32) >> 16).astype(np.uint16).view(np.int16)
     rounded = (patterns.view(np.uint16).astype(np.uint32) << 16).view(np.float32)
+    out, unpacked = np.empty((2, LANES), np.float32)
+    numbers_of(patterns, out, unpacked)
+    np.testing.assert_array_equal(out, rounded)
     assert sorted(UNPACKED) == list(range(LANES))
-    for place, lane in enumerate(UNPACKED):
-        only = np.zeros(LANES, np.float32)
-        only[place] = 1.0
-        assert number(patterns, only) == rounded[lane]
+    np.testing.assert_array_equal(unpacked, rounded[list(UNPACKED)])
 
 
 def test_floats_lose_their_fraction_on_the_way_to_integers():
@@ -205,10 +305,11 @@ def test_single_numbers_are_read_and_written_where_they_are_said_to_be():
 
 def test_constants():
     @numba.njit
-    def zeros(out):
-        lanes.store_int16(address_of(out), 0, lanes.zero_int16())
-        return lanes.total(lanes.zero_float32())
+    def zeros(numbers, fractions, counts):
+        lanes.store_int16(address_of(numbers), 0, lanes.zero_int16())
+        lanes.store_float32(address_of(fractions), 0, lanes.zero_float32())
+        lanes.store_bytes(address_of(counts), 0, lanes.zero_bytes())
 
-    out = np.ones(LANES, np.int16)
-    assert zeros(out) == 0.0
-    assert not out.any()
+    out = np.ones(LANES, np.int16), np.ones(LANES, np.float32), np.ones(2 * LANES, np.uint8)
+    zeros(*out)
+    assert not any(a.any() for a in out)
