@@ -38,8 +38,8 @@ SCORE_LIMIT = 12500
 MOST_HALVINGS = 6
 CLOSE_SHIFT = 3
 """Weights of the close-up are of 16 units an octave: what 8 bits then cut says as much as 8 octaves."""
-CLOSE_LIMIT = 30000
-"""Largest sum of a label's weights times counts, which saturates."""
+CLOSE_LIMIT = 60000
+"""Largest sum of a label's weights times counts if all pixels were full, which no line's are. Sums saturate at half."""
 ROUGH_UNITS = 4.0
 """Units per octave in which no weight reaches its limit: a logit lies within 11 octaves of 0 either way."""
 CUT = 1.25
