@@ -55,6 +55,10 @@ class UnsupportedBlock(ProtocolError):
     """Raised by a sound block of a sort this reader does not take: other major version, sparse, summed or skipping."""
 
 
+class GuardLost(DeviceError):
+    """Raised by a guarded laser or gate when the guard process that owns their ports is gone; says what was lowered."""
+
+
 class RingOverflow(DeviceError):
     """Raised when a source had to drop blocks because the ring was full and the overload policy is to abort."""
 

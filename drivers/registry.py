@@ -1,15 +1,16 @@
 """Kinds of devices and worlds by name, found through entry points, so that any installed package can add one."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict
 
 from drivers.clock import Clock
 from drivers.errors import UnknownKind
 from drivers.interfaces import World
+from drivers.transports.endpoints import Endpoint
 
 SLOTS = ("spad", "scanner", "laser", "sync", "world")
 """The parts of a rig. The kinds of slot `spad` are the entry points of group `spadrig.spad`, and so on."""
@@ -20,16 +21,21 @@ class KindConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    real_time: ClassVar[bool] = True
+    """Whether it lives in the host's time. A world that does not lets the whole rig run on virtual time."""
+
     kind: str
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What a device is created in. Real devices take the clock only; simulated ones share the world and the seed."""
+    """What a device is created in. Real devices take clock and ports; simulated ones share the world and the seed."""
 
     clock: Clock
     world: World | None
     seed: int
+    ports: Mapping[str, Endpoint] = field(default_factory=dict)
+    """Ports that an emulating world created, by name; a device's `port: emulated:NAME` means one of them."""
 
 
 @dataclass(frozen=True, slots=True)

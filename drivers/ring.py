@@ -52,6 +52,8 @@ class BlockRing:
         """Most slots that were published and not yet released at one time."""
         self.waited_s = 0.0
         """Time the source spent in `claim` because no slot was free."""
+        self.last_frame = -1
+        """Number of the last frame that was published or dropped; -1 before the first."""
         self.dropped_blocks = 0
         self.dropped_frames = 0
         """Blocks, and the frames in them, that the source dropped because no slot was free."""
@@ -129,6 +131,7 @@ class BlockRing:
         with self._changed:
             self._require_unfinished("publish")
             slot = self._oldest_claimed("publish")
+            self.last_frame = block.header.first_frame + block.n_frames - 1
             for reader in self._readers:
                 if reader._offer(slot, block):
                     self._holders[slot] += 1
@@ -151,6 +154,7 @@ class BlockRing:
         """
         with self._changed:
             self._overflowed = True
+            self.last_frame += n_frames
             self.dropped_blocks += 1
             self.dropped_frames += n_frames
         if self._on_full is OnFull.FAIL:

@@ -86,6 +86,7 @@ _ALL = (
         "400 MB/s",
     ),
     Dimension("rate", {"/s": Fraction(1), "1/s": Fraction(1), "/ms": Fraction(10**3)}, "5 /s"),
+    Dimension("acceleration", {"/s2": Fraction(1), "/ms2": Fraction(10**6)}, "1e6 /s2"),
 )
 
 DIMENSIONS: Mapping[str, Dimension] = {dimension.name: dimension for dimension in _ALL}
@@ -202,4 +203,6 @@ Ppm = Annotated[float, _Text("ratio")]
 MetresPerHour = Annotated[float, _Text("rain rate")]
 CountsPerSecond = Annotated[float, _Text("count rate")]
 PerSecond = Annotated[float, _Text("rate")]
+PerSecondSquared = Annotated[float, _Text("acceleration")]
+"""Of a normalised drive: full ranges of -1 to 1 are 2."""
 BytesPerSecond = Annotated[float, _Text("data rate")]

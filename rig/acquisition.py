@@ -10,8 +10,9 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass, fields
 from fractions import Fraction
 
-from drivers.clock import Clock
+from drivers.clock import Clock, VirtualClock
 from drivers.errors import DeviceFault, DeviceTimeout
+from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
 from rig.counting import SweepLayout
 from rig.errors import DevicesError
@@ -32,8 +33,9 @@ SILENCE_S = 5.0
 """A SPAD that sends nothing for so long, with the ring empty, has failed."""
 WARM_UP_S = 120.0
 """Longest wait for a laser to warm up."""
-BURST_LEAD_S = 5e-3
-"""Time between the SPAD's start and the first scan marker that a burst must have room for."""
+BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
+"""Time between the SPAD's start and the first scan marker that a burst must have room for, on virtual time and where a
+host starts one device after the other over USB and serial ports."""
 TELL_S = 0.1
 """Time from one report of progress to the next."""
 
@@ -132,6 +134,10 @@ class Acquisition:
             yield from self._run_group(assembler, group, done)
             done += group
 
+    @property
+    def _lead_s(self) -> float:
+        return BURST_LEAD_S if isinstance(self._rig.clock, VirtualClock) else HOST_LEAD_S
+
     def _group(self, done: int) -> int:
         """Sweeps of the next start of the SPAD: all in a stream, as many as its memory holds in a burst."""
         left = self._maps - done
@@ -139,13 +145,13 @@ class Acquisition:
             return 1
         if self._plan.burst_frames is None:
             return left
-        spare = self._plan.burst_frames - BURST_LEAD_S * float(self._plan.frame_rate_hz)
+        spare = self._plan.burst_frames - self._lead_s * float(self._plan.frame_rate_hz)
         return max(1, min(left, int(spare / float(self._plan.frames_per_sweep))))
 
     def _burst_frames(self, sweeps: int) -> int | None:
         if self._plan.burst_frames is None:
             return None
-        lead = Fraction(BURST_LEAD_S) * self._plan.frame_rate_hz
+        lead = Fraction(self._lead_s) * self._plan.frame_rate_hz
         return min(self._plan.burst_frames, math.ceil(sweeps * self._plan.frames_per_sweep + lead))
 
     def _run_group(self, assembler: SweepAssembler, sweeps: int, done: int) -> Generator[AcquiredMap, None, None]:
@@ -166,7 +172,10 @@ class Acquisition:
             self._silence_s,
             recording=self._recording,
             watch=self._watch,
+            on_frame=None if rig.guard is None else rig.guard.beat,
         )
+        if rig.guard is not None:
+            rig.guard.expect(self._guard_limits(sweeps))
         trouble: list[str] = []
         try:
             try:
@@ -198,6 +207,17 @@ class Acquisition:
             raise
         finally:
             self._end_group(pipeline, assembler)
+
+    def _guard_limits(self, sweeps: int) -> GuardLimits:
+        """What the guard may expect of the frames: a burst is silent until it is read out."""
+        usual, plan = GuardLimits(), self._plan
+        block_s = 3 * self._timing.stride / plan.link_bytes_per_s if plan.link_bytes_per_s else 0.0
+        exposed_s = (self._burst_frames(sweeps) or 0) / float(plan.frame_rate_hz)
+        return GuardLimits(
+            frames_within_s=max(usual.frames_within_s, block_s),
+            busy_within_s=max(usual.busy_within_s, block_s),
+            first_frame_s=usual.first_frame_s + exposed_s,
+        )
 
     def _end_group(self, pipeline: Pipeline, assembler: SweepAssembler) -> None:
         pipeline.close()

@@ -5,6 +5,8 @@ counting and recorder, counting for the caller, and `end_source` and `close` let
 for.
 """
 
+from collections.abc import Callable
+
 from drivers.interfaces import SpadArray
 from drivers.ring import BlockRing
 from rig.errors import RecordingError
@@ -46,10 +48,11 @@ class Pipeline:
         *,
         recording: Recording | None = None,
         watch: Watch | None = None,
+        on_frame: Callable[[int], None] | None = None,
     ) -> None:
         self._ring = ring
         self._queue = MapQueue(MAPS_AHEAD)
-        self._source = Source(spad, ring, silence_s, self._queue.end_stream)
+        self._source = Source(spad, ring, silence_s, self._queue.end_stream, on_frame)
         self._mapping = Mapping(
             ring.reader("counting", holds=max(1, min(MOST_UNDER_WAY, ring.slots // 4))),
             assembler,

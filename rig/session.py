@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -15,8 +15,10 @@ from calibration.files import load_rig_model
 from calibration.model import RigModel
 from drivers.clock import Clock, SystemClock, VirtualClock
 from drivers.errors import DeviceError
+from drivers.guard import Guard
 from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SpadTiming, SyncSource, World
 from drivers.registry import KindConfig, Surroundings, lookup
+from drivers.transports.endpoints import Endpoint
 from rig.config import RigConfig, ScanConfig
 from rig.cube import cube_columns
 from rig.errors import DevicesError, PlanError, UsageError
@@ -25,6 +27,8 @@ from rig.scan_plan import ScanPlan
 
 _log = logging.getLogger(__name__)
 
+GUARDED = ("laser", "sync")
+"""Slots whose devices a process of its own owns, since they let light out."""
 HOLD_EXPOSURES = 10
 """From so many frames per column on, simulated light is held at the column's centre; with fewer, at parts of it."""
 
@@ -41,6 +45,8 @@ class OpenRig:
     laser: LineLaser
     sync: SyncSource
     model: RigModel | None
+    guard: Guard | None = None
+    """What owns the ports of a real laser and its gate."""
 
 
 @runtime_checkable
@@ -50,6 +56,20 @@ class HoldsColumns(Protocol):
     def hold_columns(self, commands: NDArray[np.float64]) -> None:
         """Hold the light at these mirror commands (columns,)."""
         ...
+
+
+@runtime_checkable
+class EmulatesDevices(Protocol):
+    """A world that plugs in devices of its own, until its `with` block ends."""
+
+    @property
+    def ports(self) -> Mapping[str, Endpoint]:
+        """Where they are, by the names that `port: emulated:NAME` means."""
+        ...
+
+    def __enter__(self) -> "EmulatesDevices": ...
+
+    def __exit__(self, *exit: object) -> None: ...
 
 
 @contextmanager
@@ -90,20 +110,26 @@ def _open(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -
     usage: list[str] = []
     devices: list[str] = []
     model = _load_model(config, usage)
-    clock = clock or (SystemClock() if config.world is None else VirtualClock())
+    virtual = config.world is not None and not config.world.real_time
+    clock = clock or (VirtualClock() if virtual else SystemClock())
     world: World | None = None
+    ports: Mapping[str, Endpoint] = {}
     if config.world is not None:
         try:
             world = _create("world", config.world, Surroundings(clock, None, seed))
+            if isinstance(world, EmulatesDevices):
+                ports = stack.enter_context(world).ports
         except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
             usage.append(f"world: {error}")
     opened: dict[str, Any] = {}
+    guard: Guard | None = None
     if config.world is None or world is not None:
-        surroundings = Surroundings(clock, world, seed)
+        surroundings = Surroundings(clock, world, seed, ports)
+        guard = _guard_of(config, ports, stack)
         # Closing runs backwards: the gate goes low before the laser pauses, the mirror parks and the SPAD stops.
         for slot in ("spad", "scanner", "laser", "sync"):
             try:
-                opened[slot] = stack.enter_context(_create(slot, getattr(config, slot), surroundings))
+                opened[slot] = stack.enter_context(_open_device(slot, getattr(config, slot), surroundings, guard))
             except DeviceError as error:
                 devices.append(f"{slot}: {error}")
     if "laser" in opened:
@@ -112,7 +138,19 @@ def _open(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -
         raise UsageError(*usage, *devices)
     if devices:
         raise DevicesError("\n".join(devices))
-    return OpenRig(config=config, clock=clock, world=world, model=model, **opened)
+    return OpenRig(config=config, clock=clock, world=world, model=model, guard=guard, **opened)
+
+
+def _guard_of(config: RigConfig, ports: Mapping[str, Endpoint], stack: ExitStack) -> Guard | None:
+    """The guard of a laser and a gate that are not simulated, at work until the rig is closed; None: there are none."""
+    guarded = {slot: kind for slot in GUARDED if (kind := getattr(config, slot)).real_time}
+    return stack.enter_context(Guard(**guarded, ports=ports)) if guarded else None
+
+
+def _open_device(slot: str, kind: KindConfig, surroundings: Surroundings, guard: Guard | None) -> Any:
+    if guard is not None and slot in GUARDED and kind.real_time:
+        return guard.laser if slot == "laser" else guard.sync
+    return _create(slot, kind, surroundings)
 
 
 def _create(slot: str, kind: KindConfig, surroundings: Surroundings) -> Any:

@@ -16,14 +16,23 @@ HANG_S = 180.0
 class Source:
     """The thread that fills the ring. on_end: called on that thread when it ends, for whatever reason.
 
-    What the SPAD raises is handed to the readers, behind the blocks that came before it.
+    on_frame: told the number of the last frame on that thread whenever there are new ones; what it raises ends the
+    source. What the SPAD raises is handed to the readers, behind the blocks that came before it.
     """
 
-    def __init__(self, spad: SpadArray, ring: BlockRing, silence_s: float, on_end: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        spad: SpadArray,
+        ring: BlockRing,
+        silence_s: float,
+        on_end: Callable[[], None],
+        on_frame: Callable[[int], None] | None = None,
+    ) -> None:
         self._spad = spad
         self._ring = ring
         self._silence_s = silence_s
         self._on_end = on_end
+        self._on_frame = on_frame
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="spad source", daemon=True)
         self._busy_s = 0.0
@@ -70,7 +79,10 @@ class Source:
         """Whether more may come."""
         begun = time.perf_counter()
         try:
-            return self._spad.fill(self._ring, self._silence_s / 2)
+            more = self._spad.fill(self._ring, self._silence_s / 2)
+            if self._on_frame is not None:
+                self._on_frame(self._ring.last_frame)
+            return more
         except DeviceTimeout as error:
             if not self._ring.full:  # else it is no silence: it waits for a reader that is slow
                 self.silences.append(error)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from calibration.model import Lag
 from drivers.clock import NS_PER_S, Clock
-from drivers.interfaces import MARKER_LINE, MARKER_SCAN, OUT_GATE, Pulse, ScanWaveform
-from sim_backend.gate_program import GateProgram
+from drivers.interfaces import MARKER_LINE, MARKER_SCAN, Pulse, ScanWaveform
+from sim_backend.gate_program import GateProgram, gate_shares
 from sim_backend.mirror_motion import Motion, Playing, Resting
 
 Array = NDArray[np.float64]
@@ -139,18 +139,7 @@ class Bench:
         program.advance(until_s, self._trigger)
         program.forget(float(start_s[0]) - exposure_s)
         times, words = program.levels(float(start_s[0]), until_s)
-        high = (words & OUT_GATE) != 0
-        changes = times[1:][np.diff(high.astype(np.int8)) != 0]
-        end_s = start_s + exposure_s
-        edge = np.searchsorted(changes, end_s, side="left") > np.searchsorted(changes, start_s, side="right")
-        at_start = high[np.searchsorted(times, start_s, side="right") - 1]
-        share = at_start.astype(np.float64)
-        # Partly lit frames are two per sweep; their share is the time the gate was high.
-        ends = np.append(times[1:], np.inf)
-        for i in np.flatnonzero(edge):
-            overlap = np.minimum(ends, end_s[i]) - np.maximum(times, start_s[i])
-            share[i] = float(np.sum(np.clip(overlap, 0, None) * high)) / exposure_s
-        return share, edge
+        return gate_shares(times, words, start_s, exposure_s)
 
     def _catch_up(self) -> None:
         assert self._program is not None

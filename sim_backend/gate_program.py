@@ -91,3 +91,23 @@ class GateProgram:
         past = int(np.searchsorted(np.array(self._times), at_s, side="left"))
         self._times = [*self._times[:past], at_s, *times[1:].tolist()]
         self._levels = [*self._levels[:past], *(change(int(word)) for word in words)]
+
+
+def gate_shares(
+    times: Array, words: NDArray[np.int64], start_s: Array, exposure_s: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Part of each exposure (n,) with the gate high, and whether the gate changed during it.
+
+    times, words: (m,), outputs from each time on; the first is not after the first exposure's start.
+    """
+    high = (words & OUT_GATE) != 0
+    changes = times[1:][np.diff(high.astype(np.int8)) != 0]
+    end_s = start_s + exposure_s
+    edge = np.searchsorted(changes, end_s, side="left") > np.searchsorted(changes, start_s, side="right")
+    share = high[np.searchsorted(times, start_s, side="right") - 1].astype(np.float64)
+    # Partly lit frames are two per sweep; their share is the time the gate was high.
+    ends = np.append(times[1:], np.inf)
+    for i in np.flatnonzero(edge):
+        overlap = np.minimum(ends, end_s[i]) - np.maximum(times, start_s[i])
+        share[i] = float(np.sum(np.clip(overlap, 0, None) * high)) / exposure_s
+    return share, edge

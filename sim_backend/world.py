@@ -1,7 +1,7 @@
 """The simulated world: a scene in front of a rig, the bench its devices stand on, and the truth of a sweep."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,9 @@ class CommandGridConfig(BaseModel):
 class WorldConfig(KindConfig):
     """Config of the simulated world."""
 
-    kind: Literal["simulated"] = "simulated"
+    real_time: ClassVar[bool] = False
+
+    kind: str = "simulated"
     geometry: str | None = None
     """Rig-model file of the rig as it really is; the bundled simulated rig by default."""
     scene: str = "street"

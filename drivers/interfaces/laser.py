@@ -33,6 +33,10 @@ class LaserStatus:
     warming_up: bool
     input_mode: str
     """How the gate input acts, e.g. "digital"."""
+    temperature_c: float | None = None
+    """Of the laser's base plate. None: the laser does not say."""
+    power_w: float | None = None
+    """Measured mean, gated light and all. None: the laser does not say."""
 
 
 class LineLaser(Device):
@@ -48,7 +52,7 @@ class LineLaser(Device):
 
     @property
     def status(self) -> LaserStatus:
-        """Ask the laser. `WrongState` after close."""
+        """Ask the laser. `WrongState` after close. Any thread."""
         self._require("status", *OPEN_STATES)
         return self._do_status()
 
@@ -75,7 +79,10 @@ class LineLaser(Device):
         self._state = DeviceState.RUNNING
 
     def pause(self) -> None:
-        """Stop emission in the way that needs no key to resume. In any state; does nothing where nothing is armed."""
+        """Stop emission in the way that needs no key to resume. In any state; does nothing where nothing is armed.
+
+        Any thread, also while another one arms: whoever overtakes an `arm` in this way pauses again behind it.
+        """
         self._require("pause", *OPEN_STATES)
         _log.info("%s: pause", self._name)
         self._do_pause()

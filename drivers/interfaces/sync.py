@@ -33,8 +33,9 @@ class SyncStatus:
     """What the device says of itself, asked afresh each time."""
 
     state: Literal["stopped", "waiting", "running", "aborted"]
-    outputs: int
-    """Levels read back from the pins."""
+    """A device that cannot tell whether its program waits for the scan marker says "running" then, too."""
+    outputs: int | None
+    """Levels read back from the pins; None: this device cannot read them while a program runs."""
 
 
 class SyncSource(Device):
@@ -100,7 +101,10 @@ class SyncSource(Device):
             self._state = DeviceState.CONFIGURED
 
     def _check_low(self, outputs: int, verb: str) -> None:
-        high = self._do_status().outputs & outputs
+        read = self._do_status().outputs
+        if read is None:
+            raise DeviceFault(f"{self._name}: still runs a program after {verb}; turn the laser off by its key")
+        high = read & outputs
         if high:
             raise DeviceFault(
                 f"{self._name}: outputs read back 0x{high:x} after {verb}, not low; turn the laser off by its key"

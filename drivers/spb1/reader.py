@@ -7,6 +7,7 @@ that would cost a live path a good part of a core.
 import zlib
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -42,6 +43,9 @@ _PAYLOADS: Final = {
 
 _MAX_COUNT: Final = 2**63 - 2**32
 """Frame numbers and ticks stay within int64 also after adding what a block's records span."""
+
+_LSB_FIRST: Final = int(BlockFlag.LSB_FIRST)
+"""A plain number: arithmetic with flags takes microseconds, and this is done for every block."""
 
 _BITS_REVERSED: Final = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8), bitorder="little"))
 
@@ -98,13 +102,13 @@ def read_header(buffer: NDArray[np.uint8]) -> HeaderFields:
     (lost_before, tick_hz, tick_hz_den, period, exposure, sweep, n_frames, frame_step, width, height) = fields[10:20]
     (sensor_width, sensor_height, payload_bytes, pixels_offset) = fields[20:24]
     header = BlockHeader(
-        BlockFlag(flags & ~BlockFlag.LSB_FIRST),
+        BlockFlag(flags & ~_LSB_FIRST),
         run_id,
         block_seq,
         first_frame,
         t0_ticks,
         lost_before,
-        Fraction(tick_hz, tick_hz_den) if tick_hz_den else Fraction(0),
+        _rate(tick_hz, tick_hz_den),
         period,
         exposure,
         sweep,
@@ -116,7 +120,7 @@ def read_header(buffer: NDArray[np.uint8]) -> HeaderFields:
         bits_per_px,
         payload_type,
     )
-    lsb_first = bool(flags & BlockFlag.LSB_FIRST)
+    lsb_first = bool(flags & _LSB_FIRST)
     return HeaderFields(header, version, lsb_first, n_frames, header_bytes, payload_bytes, pixels_offset)
 
 
@@ -134,6 +138,23 @@ def read_frames(buffer: NDArray[np.uint8], fields: HeaderFields, *, check_payloa
         whole = max(0, valid_pixel_bytes) // layout.frame_bytes
         records, bits = records[:whole], bits[:whole]
     return FrameBlock(fields.block, records, _BITS_REVERSED[bits] if fields.lsb_first else bits, status)
+
+
+def read_control(buffer: NDArray[np.uint8], fields: HeaderFields) -> bytes:
+    """The payload of a control block whose header was read, its CRC checked. `CorruptBlock` where it is damaged."""
+    if fields.block_bytes > len(buffer):
+        raise CorruptBlock(f"control block cut off: {len(buffer)} of {fields.block_bytes} bytes")
+    _, valid_bytes, payload_crc = _read_trailer(buffer, fields)
+    payload = bytes(buffer.data[fields.header_bytes : fields.header_bytes + valid_bytes])
+    if payload_crc:
+        _check_crc("control block", zlib.crc32(payload), payload_crc)
+    return payload
+
+
+@lru_cache(maxsize=16)
+def _rate(tick_hz: int, denominator: int) -> Fraction:
+    """The same few rates come with every block; a fraction takes microseconds to make."""
+    return Fraction(tick_hz, denominator) if denominator else Fraction(0)
 
 
 def _refuse_unsupported(fields: HeaderFields) -> None:

@@ -16,11 +16,13 @@ from drivers.spb1.layout import (
     MAJOR,
     MINOR,
     PACKED,
+    PIXELS_ALIGN,
     TRAILER,
     TRAILER_BYTES,
     TRAILER_MAGIC,
     BlockLayout,
     block_views,
+    round_up,
 )
 
 
@@ -48,6 +50,32 @@ def seal_block(
     _pack(raw[:HEADER_BYTES], raw[end : end + TRAILER_BYTES], header, layout, status, frames_lost, crc)
     buffer[end + TRAILER_BYTES :] = 0
     return FrameBlock(header, records, bits, status)
+
+
+def seal_control(buffer: NDArray[np.uint8], payload_type: int, run_id: int, payload: bytes) -> None:
+    """Write a control block (`REGISTER_ACK`, `IDLE`) without frames. buffer: uint8 (stride,), all of it is written."""
+    end = HEADER_BYTES + len(payload)
+    raw = buffer.data
+    pixels_offset = round_up(end, PIXELS_ALIGN)
+    numbers = (
+        MAGIC,
+        MAJOR << 8 | MINOR,
+        HEADER_BYTES,
+        0,
+        1,
+        payload_type,
+        run_id,
+        *(0,) * 15,
+        len(payload),
+        pixels_offset,
+    )
+    HEADER.pack_into(raw, 0, *numbers, 0, 0)
+    raw[HEADER_BYTES:end] = payload
+    trailer = raw[end : end + TRAILER_BYTES]
+    TRAILER.pack_into(trailer, 0, TRAILER_MAGIC, BlockStatus.OK, 0, len(payload), zlib.crc32(payload), 0, 0)
+    _sign(raw[:HEADER_BYTES])
+    _sign(trailer)
+    buffer[end + TRAILER_BYTES :] = 0
 
 
 def block_parts(block: FrameBlock) -> tuple[memoryview, ...]:

@@ -1,6 +1,6 @@
 """The simulated line laser: no key, no warm-up, emission follows arm and pause at once."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -13,6 +13,8 @@ from sim_backend.devices.place import bench_of
 
 class SimulatedLaserConfig(KindConfig):
     """Config of the simulated laser."""
+
+    real_time: ClassVar[bool] = False
 
     kind: Literal["simulated"] = "simulated"
     max_power: Annotated[Watts, Field(gt=0)] = 0.1

@@ -2,7 +2,7 @@
 
 import math
 from fractions import Fraction
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -29,6 +29,8 @@ LIMITS = ScannerLimits(
 
 class SimulatedScannerConfig(KindConfig):
     """Config of the simulated scanner."""
+
+    real_time: ClassVar[bool] = False
 
     kind: Literal["simulated"] = "simulated"
     clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 20e-6

@@ -5,7 +5,7 @@ exposed. Its tick counter is the rig's time base: the clock's own rate, without 
 
 import os
 from fractions import Fraction
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,8 @@ MAX_THREADS = 4
 
 class SimulatedSpadConfig(KindConfig):
     """Config of the simulated SPAD array. Its size is that of the world's camera."""
+
+    real_time: ClassVar[bool] = False
 
     kind: Literal["simulated"] = "simulated"
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000)

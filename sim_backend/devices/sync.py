@@ -1,7 +1,7 @@
 """The simulated pattern generator: its gate output lets laser light out, its trigger input hears the scan marker."""
 
 from collections.abc import Sequence
-from typing import Literal, cast
+from typing import ClassVar, Literal, cast
 
 from drivers.interfaces import Pulse, SyncSource, SyncStatus
 from drivers.registry import Kind, KindConfig, Surroundings
@@ -16,6 +16,8 @@ State = Literal["stopped", "waiting", "running", "aborted"]
 
 class SimulatedSyncConfig(KindConfig):
     """Config of the simulated sync source."""
+
+    real_time: ClassVar[bool] = False
 
     kind: Literal["simulated"] = "simulated"
 

@@ -35,12 +35,21 @@ class LaserCase:
 
 @dataclass(frozen=True)
 class SyncCase:
-    """A sync source, open. `trigger` gives its input one scan marker; `pins` reads the outputs, also after close."""
+    """A sync source, open. `trigger` gives its input one scan marker; `pins` reads the outputs, also after close.
+
+    tells_waiting: its status tells a program that waits from one that plays.
+    """
 
     device: SyncSource
     clock: Clock
     trigger: Callable[[], None]
     pins: Callable[[], int]
+    tells_waiting: bool = True
+
+    @property
+    def waiting(self) -> str:
+        """The state that it tells while a program waits."""
+        return "waiting" if self.tells_waiting else "running"
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,10 @@ from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_SCAN, ScanWaveform, SpadRequest, WindowTable
 from drivers.registry import Surroundings, lookup
 from tests.conformance.cases import LaserCase, ScannerCase, SpadCase, SyncCase, WorldCase
+from tests.conformance.emulated_lasers import EMULATED_LASERS
+from tests.conformance.emulated_scanners import EMULATED_SCANNERS
+from tests.conformance.emulated_spads import EMULATED_SPADS
+from tests.conformance.emulated_syncs import EMULATED_SYNCS, GUARDED_LASERS
 
 ROWS, WIDTH = 24, 100
 """A small camera, its width no multiple of 64."""
@@ -120,10 +124,11 @@ SPADS: dict[str, Factory] = {
     "simulated": simulated_spad,
     "simulated, lossy": simulated_lossy_spad,
     "simulated, windows": simulated_window_spad,
+    **EMULATED_SPADS,
 }
-SCANNERS: dict[str, Factory] = {"simulated": simulated_scanner}
-LASERS: dict[str, Factory] = {"simulated": simulated_laser}
-SYNCS: dict[str, Factory] = {"simulated": simulated_sync}
+SCANNERS: dict[str, Factory] = {"simulated": simulated_scanner, **EMULATED_SCANNERS}
+LASERS: dict[str, Factory] = {"simulated": simulated_laser, **EMULATED_LASERS, **GUARDED_LASERS}
+SYNCS: dict[str, Factory] = {"simulated": simulated_sync, **EMULATED_SYNCS}
 WORLDS: dict[str, Factory] = {"simulated": simulated_world}
 
 

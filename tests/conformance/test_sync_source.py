@@ -81,7 +81,7 @@ def test_a_program_that_was_refused_does_not_replace_the_one_that_was_taken(sync
     with pytest.raises(LimitExceeded):
         sync.device.program([], 1)
     sync.device.run()
-    assert sync.device.status.state == "waiting"
+    assert sync.device.status.state == sync.waiting
 
 
 def test_loading_a_program_plays_nothing(sync: SyncCase) -> None:
@@ -96,7 +96,8 @@ def test_it_waits_dark_for_the_scan_marker_however_long(sync: SyncCase) -> None:
     for _ in range(3):
         sync.clock.sleep(STEP_S)
         status = sync.device.status
-        assert (status.state, status.outputs) == ("waiting", OUT_MARKER)
+        assert status.state == sync.waiting
+        assert status.outputs in (None, OUT_MARKER)
         assert sync.pins() == OUT_MARKER
     assert sync.device.state is DeviceState.RUNNING
 
@@ -110,18 +111,19 @@ def test_each_scan_marker_plays_the_program_once_and_the_end_is_low(sync: SyncCa
         assert (sync.device.status.state, sync.pins()) == ("running", 0)
         sync.clock.sleep(STEP_S)
         status = sync.device.status
-        assert (status.state, status.outputs) == ("running", OUT_GATE | OUT_FRAME)
+        assert status.state == "running"
+        assert status.outputs in (None, OUT_GATE | OUT_FRAME)
         assert sync.pins() == OUT_GATE | OUT_FRAME
         sync.clock.sleep(STEP_S)
         assert sync.pins() == 0
         sync.clock.sleep(STEP_S)
-        assert sync.device.status.state == ("waiting", "stopped")[sweep]
+        assert sync.device.status.state == (sync.waiting, "stopped")[sweep]
     assert sync.pins() == 0
     sync.trigger()
     sync.clock.sleep(1.5 * STEP_S)
     assert sync.pins() == 0
     sync.device.run()  # a program that has ended may run again
-    assert sync.device.status.state == "waiting"
+    assert sync.device.status.state == sync.waiting
 
 
 def test_a_program_that_ends_on_a_high_word_ends_low(sync: SyncCase) -> None:
@@ -154,7 +156,7 @@ def test_abort_is_possible_in_any_state_and_the_program_may_run_again(sync: Sync
     sync.device.abort()
     sync.device.abort()
     sync.device.run()
-    assert sync.device.status.state == "waiting"
+    assert sync.device.status.state == sync.waiting
 
 
 def test_gate_low_is_low_until_the_next_run(sync: SyncCase) -> None:

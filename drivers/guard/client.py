@@ -1,0 +1,303 @@
+"""The application's side of the guard: starts it, speaks with it, beats for it, and steps in where it is gone."""
+
+import itertools
+import logging
+import os
+import queue
+import select
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from drivers.errors import DeviceError, DeviceTimeout, GuardLost
+from drivers.guard.channel import Channel, Message, error_from, plain_ports
+from drivers.guard.heartbeat import Heartbeat
+from drivers.guard.proxies import GuardedLaser, GuardedSync
+from drivers.guard.rescue import Rescue
+from drivers.guard.watch import GuardLimits
+from drivers.guard.watched_process import WatchedProcess
+from drivers.interfaces import LineLaser, SyncSource
+from drivers.registry import KindConfig
+from drivers.transports.endpoints import Endpoint
+
+_log = logging.getLogger(__name__)
+
+OPEN_S = 30.0
+"""Time for the guard to start and open its devices: a laser that takes ten commands a second has much to be asked."""
+ANSWER_S = {"arm": 180.0, "program": 20.0}
+"""Time for a verb; a laser may warm up while it is armed."""
+USUAL_ANSWER_S = 10.0
+LOWER_S = 5.0
+"""Time for the rescue, where the guard is gone."""
+SILENCE_S = 1.0
+"""A guard that gives no sign of life for so long, in time that this process was awake, hangs: it is ended..."""
+BUSY_SILENCE_S = 5.0
+"""...or after this where it is at work or waits for a processor or a disk."""
+_TICK_S = 0.05
+_MAX_STEP_S = 0.1
+_LOWERING = ("pause", "disarm", "gate_low", "abort")
+_ENABLING = ("arm", "program", "run")
+
+
+class Guard:
+    """Owns laser and sync source in a process of its own, from its creation to `close`.
+
+    `laser` and `sync` raise what opening them raised, so that a rig can list all its troubles. A config of None is a
+    device that is not guarded. Thread-safe.
+    """
+
+    def __init__(
+        self,
+        *,
+        laser: KindConfig | None = None,
+        sync: KindConfig | None = None,
+        ports: Mapping[str, Endpoint] | None = None,
+        limits: GuardLimits | None = None,
+    ) -> None:
+        """Start the guard, which opens the devices meanwhile. `UnknownKind` for a kind that is not installed."""
+        configs = {slot: config for slot, config in (("laser", laser), ("sync", sync)) if config is not None}
+        ports = ports or {}
+        self._rescue = Rescue(configs, ports)
+        self._lock = threading.Lock()
+        self._numbers = itertools.count()
+        self._answers: dict[int, queue.SimpleQueue[Message | None]] = {}
+        self._opened: dict[str, Message] = {}
+        self._opening = {slot: threading.Event() for slot in configs}
+        self._proxies: dict[str, Any] = {}
+        self._armed = False
+        self._failure: DeviceError | None = None
+        self._lost = threading.Event()
+        self._rescued = threading.Event()
+        self._outcome = ""
+        self._closing = False
+        self._parted = False
+        self._heartbeat = Heartbeat.create()
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = _start(theirs, self._heartbeat)
+        self._seen = WatchedProcess(self._process.pid)
+        self._channel = Channel(ours)
+        self._channel.send(
+            {
+                "open": {slot: config.model_dump(mode="json") for slot, config in configs.items()},
+                "ports": plain_ports(ports),
+                "limits": asdict(limits or GuardLimits()),
+                "pid": os.getpid(),
+            },
+            within_s=1.0,
+        )
+        self._reader = threading.Thread(target=self._listen, name="guard listener", daemon=True)
+        self._reader.start()
+
+    @property
+    def laser(self) -> LineLaser:
+        """The guarded laser. Waits until it is open; raises what opening it raised."""
+        proxy: LineLaser = self._proxy("laser", GuardedLaser)
+        return proxy
+
+    @property
+    def sync(self) -> SyncSource:
+        """The guarded sync source. Waits until it is open; raises what opening it raised."""
+        proxy: SyncSource = self._proxy("sync", GuardedSync)
+        return proxy
+
+    @property
+    def failure(self) -> DeviceError | None:
+        """Why the guard took the light, or `GuardLost`; None while all is well."""
+        return self._failure
+
+    @property
+    def lost(self) -> bool:
+        """Whether the guard's process is gone."""
+        return self._lost.is_set()
+
+    @property
+    def pid(self) -> int:
+        """Of the guard's process."""
+        return self._process.pid
+
+    def beat(self, frame: int) -> None:
+        """Tell the last frame number received: one store. On the source thread, for every block.
+
+        Raises the guard's `failure`, so that a scan whose light was taken ends with the reason.
+        """
+        self._heartbeat.frame = frame
+        if self._failure is not None:
+            raise self._failure
+
+    def expect(self, limits: GuardLimits) -> None:
+        """Other limits from now on, as for a burst, which is silent until it is read out."""
+        self._channel.send({"limits": asdict(limits)}, within_s=1.0)
+
+    def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
+        """For the proxies: have the guard do a verb; returns its result or raises its error.
+
+        `GuardLost` where there is no guard: at once, but for verbs that lower, which wait for the application's own
+        attempt at it.
+        """
+        if self._failure is not None and verb in _ENABLING:
+            raise self._failure
+        self._armed = self._armed or verb == "arm"
+        number = next(self._numbers)
+        inbox: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+        with self._lock:
+            self._answers[number] = inbox
+        try:
+            if self.lost:
+                raise self._gone(verb)
+            request = {"id": number, "slot": slot, "verb": verb, "arguments": arguments}
+            self._channel.send(request, within_s=1.0)
+            deadline_s = ANSWER_S.get(verb, USUAL_ANSWER_S)
+            try:
+                answer = inbox.get(timeout=deadline_s)
+            except queue.Empty:
+                raise DeviceTimeout(f"{slot}: {verb} is not done after {deadline_s:g} s; check the device") from None
+        finally:
+            with self._lock:
+                del self._answers[number]
+        if answer is None:
+            raise self._gone(verb)
+        if "error" in answer:
+            raise error_from(answer["error"])
+        return answer["result"]
+
+    def close(self) -> None:
+        """Close both devices, which leaves them safe, and end the guard; again: nothing happens."""
+        if self._closing:
+            return
+        self._closing = True
+        try:
+            for proxy in (self._proxies.get("sync"), self._proxies.get("laser")):
+                if proxy is not None and not self.lost:
+                    proxy.close()
+        finally:
+            self._channel.send({"bye": True}, within_s=1.0)
+            self._reader.join(timeout=OPEN_S)
+            if self._process.poll() is None:
+                self._process.kill()
+                self._process.wait()
+            self._channel.close()
+            self._heartbeat.close()
+            self._seen.close()
+
+    def __enter__(self) -> Self:
+        """The guard, at work."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close, whatever happened."""
+        self.close()
+
+    def _proxy(self, slot: str, make: Any) -> Any:
+        if slot not in self._opening:
+            raise DeviceError(f"{slot}: not guarded; open it by itself")
+        if not self._opening[slot].wait(OPEN_S):
+            raise DeviceTimeout(f"{slot}: the guard has not opened it after {OPEN_S:g} s; check the device")
+        answer = self._opened.get(slot)
+        if answer is None:
+            raise self._gone("open")
+        if "error" in answer:
+            raise error_from(answer["error"])
+        with self._lock:
+            if slot not in self._proxies:
+                self._proxies[slot] = make(self, answer["about"])
+            return self._proxies[slot]
+
+    def _gone(self, verb: str) -> GuardLost:
+        if verb in _LOWERING:
+            self._rescued.wait(LOWER_S)
+        outcome = f" ({self._outcome})" if self._outcome else ""
+        return GuardLost(f"{verb}: the process that guards the laser is gone{outcome}; check the laser, start again")
+
+    # On the listener's thread
+
+    def _listen(self) -> None:
+        silent_s, before, begun, noted = 0.0, time.monotonic(), False, False
+        while True:
+            ready, _, _ = select.select([self._channel], [], [], _TICK_S)
+            messages = self._channel.receive() if ready else []
+            if messages is None:
+                return self._end()
+            for message in messages:
+                self._take(message)
+            self._channel.flush()
+            now = time.monotonic()
+            silent_s += min(now - before, _MAX_STEP_S)
+            before = now
+            if messages:
+                silent_s, begun, noted = 0.0, True, False
+            elif not noted:
+                noted = True
+                self._seen.note_progress()
+            elif self._hangs(silent_s, begun):
+                _log.error("the laser guard hangs; ending it")
+                self._process.kill()
+                silent_s = 0.0
+
+    def _hangs(self, silent_s: float, begun: bool) -> bool:
+        if not begun:
+            return silent_s > OPEN_S
+        if self._seen.stopped or silent_s > BUSY_SILENCE_S:
+            return True
+        return silent_s > SILENCE_S and not self._seen.busy()
+
+    def _take(self, message: Message) -> None:
+        if "opened" in message:
+            self._opened[message["opened"]] = message
+            self._opening[message["opened"]].set()
+        elif "tripped" in message:
+            self._failure = error_from(message["tripped"])
+        elif "id" in message:
+            with self._lock:
+                inbox = self._answers.get(message["id"])
+            if inbox is not None:
+                inbox.put(message)
+        elif "bye" in message:
+            self._parted = True
+
+    def _end(self) -> None:
+        """The guard has ended: as asked, after it made all safe, or by force."""
+        self._process.wait()
+        if self._parted:
+            self._lost.set()
+        else:
+            self._failure = self._failure or GuardLost("the process that guards the laser is gone; check the laser")
+            self._lost.set()
+            self._release()
+            slots = {slot for slot, answer in self._opened.items() if "about" in answer}
+            self._outcome = self._rescue.run(slots, self._armed)
+            _log.error("the laser guard is gone; %s", self._outcome)
+        self._rescued.set()
+        self._release()
+
+    def _release(self) -> None:
+        """Whoever waits for an answer learns that none will come."""
+        with self._lock:
+            waiting = list(self._answers.values())
+        for inbox in waiting:
+            inbox.put(None)
+        for event in self._opening.values():
+            event.set()
+
+
+def _start(theirs: socket.socket, heartbeat: Heartbeat) -> "subprocess.Popen[bytes]":
+    """In a session of its own: no Ctrl-C, no closed terminal reaches it."""
+    package_root = str(Path(__file__).parents[2])
+    paths = [package_root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    return subprocess.Popen(
+        [sys.executable, "-m", "drivers.guard", str(theirs.fileno()), str(heartbeat.handle)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        pass_fds=(theirs.fileno(), heartbeat.handle),
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))},
+    )

@@ -1,0 +1,132 @@
+"""A device that the guard owns: opened from its config, asked by the application's messages, made safe at the end."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from drivers.clock import SystemClock
+from drivers.errors import DeviceError
+from drivers.guard.lane import Lane
+from drivers.interfaces import DeviceState, LineLaser, Pulse, SyncSource
+from drivers.registry import Surroundings, lookup
+from drivers.transports.endpoints import Endpoint
+
+_log = logging.getLogger(__name__)
+
+RETRY_S = 0.1
+"""Between attempts to make a device safe that does not answer or is not there."""
+
+
+class Owned:
+    """One slot of the rig, with a lane for its ordinary jobs and one for those that must not wait for them."""
+
+    def __init__(self, slot: str, config: dict[str, Any], ports: dict[str, str]) -> None:
+        self.slot = slot
+        self.device: Any = None
+        self.armed = False
+        self.lane = Lane(slot)
+        self.urgent = Lane(f"{slot}, urgent")
+        self.enabling = False
+        """A verb that may end in light is under way on `lane`."""
+        self.unsafe = False
+        self.trying = False
+        self.finished = threading.Event()
+        """Set once the device was made safe."""
+        self._next_try = 0.0
+        self._trouble = ""
+        kind = lookup(slot, config["kind"])
+        endpoints = {name: Endpoint(address, emulated=True) for name, address in ports.items()}
+        surroundings = Surroundings(SystemClock(), None, 0, endpoints)
+        model = kind.config.model_validate(config)
+        self._create: Callable[[], Any] = lambda: kind.create(model, surroundings)
+
+    def open(self) -> dict[str, Any]:
+        """Open the device; returns what its proxy tells of it without asking. DeviceError."""
+        self.device = self._create()
+        about: dict[str, Any] = {"name": self.device.name}
+        if isinstance(self.device, LineLaser):
+            limits = self.device.limits
+            about["limits"] = [limits.min_power_w, limits.max_power_w]
+        else:
+            about["resolution_s"] = self.device.resolution_s
+        return about
+
+    @property
+    def port_lost(self) -> bool:
+        """Whether the device's port has hung up, as far as its driver can tell without asking it."""
+        device = self.device
+        if device is None or device.state is DeviceState.CLOSED:
+            return False
+        return bool(getattr(device, "port_lost", False))
+
+    def call(self, verb: str, arguments: list[Any]) -> Any:
+        """Do what a proxy asks; the result as JSON. DeviceError."""
+        device = self.device
+        if isinstance(device, LineLaser):
+            self.armed = (self.armed or verb == "arm") and verb != "disarm"
+        match verb:
+            case "status":
+                return asdict(device.status)
+            case "arm":
+                device.arm(*arguments)
+            case "program":
+                pulses, repeats = arguments
+                device.program([Pulse(outputs, duration_s) for outputs, duration_s in pulses], repeats)
+            case "pause" | "disarm" | "run" | "gate_low" | "abort" | "close":
+                getattr(device, verb)()
+            case _:
+                raise DeviceError(f"the guard knows no {self.slot}.{verb}")
+        return None
+
+    def want_safe(self) -> None:
+        """From now on `try_safe` is to be called until `finished`."""
+        self.unsafe = True
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to try (again), and nothing of it is under way."""
+        return self.unsafe and not self.trying and time.monotonic() >= self._next_try
+
+    def try_safe(self) -> None:
+        """Gate: all outputs low. Laser: paused, then disarmed if it was armed. One attempt, on a lane."""
+        try:
+            if self.port_lost:
+                self._reopen()
+            self._make_safe()
+            self.unsafe = False
+            self.finished.set()
+        except DeviceError as error:
+            if str(error) != self._trouble:
+                _log.error("%s: %s", self.slot, error)
+            self._trouble = str(error)
+        finally:
+            self._next_try = time.monotonic() + RETRY_S
+            self.trying = False
+
+    def calm(self) -> None:
+        """Beside a verb that may end in light: dark now, `try_safe` follows it."""
+        try:
+            if isinstance(self.device, SyncSource):
+                self.device.abort()
+            else:
+                self.device.pause()
+        except DeviceError as error:
+            _log.error("%s: %s", self.slot, error)
+
+    def _make_safe(self) -> None:
+        if self.device is None or self.device.state is DeviceState.CLOSED:
+            return
+        if isinstance(self.device, SyncSource):
+            self.device.abort()
+            return
+        self.device.pause()
+        if self.armed:
+            self.device.disarm()
+            self.armed = False
+
+    def _reopen(self) -> None:
+        """The port is gone: the device may have been plugged in again. DeviceError while it is not."""
+        self.device = self._create()

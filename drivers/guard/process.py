@@ -1,0 +1,304 @@
+"""The guard's own process: does what the application asks, and watches it meanwhile.
+
+The main thread never touches a device: it reads messages, looks at the application every 10 ms and gives jobs to lanes.
+What ends the light ("trip"): the application ended, was stopped or takes no frames; a port hung up; the laser reports
+an open interlock or a fault, or stops answering. Then, at the same time: all outputs of the gate low, the laser paused.
+After it: an application that cannot help itself is killed, the laser disarmed, the ports closed.
+"""
+
+import logging
+import select
+import signal
+import socket
+import sys
+import threading
+import time
+from functools import partial
+
+from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault, DeviceTimeout, InterlockOpen
+from drivers.guard.channel import Channel, Message, error_message
+from drivers.guard.heartbeat import Heartbeat
+from drivers.guard.owned import Owned
+from drivers.guard.watch import TICK_S, FrameWatch, GuardLimits
+from drivers.guard.watched_process import WatchedProcess
+from drivers.interfaces import LineLaser
+
+_log = logging.getLogger(__name__)
+
+SIGN_OF_LIFE_S = 0.05
+"""Between the guard's own signs of life."""
+POLL_S = 1.0
+"""Between questions to an armed laser about interlock and faults (hardware.md section 4: at 1 Hz or more)."""
+CHECK_S = 0.05
+"""Time for the gate to say whether its program has ended, before it is taken for still running."""
+HELP_ITSELF_S = 0.5
+"""Time for an application that lives but takes no frames to make its rig safe, before it is killed."""
+GATE_FIRST_S = 0.1
+"""Most that a kill waits for the low gate: a mirror whose program dies must not be lit."""
+GIVE_UP_S = 10.0
+"""Attempts to make a device safe that does not answer end here."""
+
+_URGENT = ("gate_low", "abort", "pause", "disarm")
+_ENABLING = ("arm", "program", "run")
+
+
+class GuardProcess:
+    """One session. `run` returns the exit code: 0 after a normal end, 1 where the guard had to act."""
+
+    def __init__(self, channel: Channel, heartbeat: Heartbeat) -> None:
+        self._channel = channel
+        self._heartbeat = heartbeat
+        self._watch = FrameWatch(GuardLimits())
+        self._owned: dict[str, Owned] = {}
+        self._application: WatchedProcess | None = None
+        self._tripped: DeviceError | None = None
+        self._trip_lock = threading.Lock()
+        self._application_lives = True
+        self._kill_at: float | None = None
+        self._safe_asked = False
+        self._ending = False
+        self._check_until: float | None = None
+        self._silence_noted = False
+        self._next_poll = 0.0
+        self._terminated = False
+
+    def run(self) -> int:
+        """Until the application says goodbye or is gone."""
+        signal.signal(signal.SIGTERM, self._on_terminate)
+        before = seen = time.monotonic()
+        while not self._ending:
+            for message in self._receive():
+                self._take(message)
+            now = time.monotonic()
+            self._look(now - before)
+            before = now
+            if now - seen >= SIGN_OF_LIFE_S:
+                seen = now
+                self._channel.send({"alive": True})
+            self._channel.flush()
+        return self._end()
+
+    def _on_terminate(self, number: int, frame: object) -> None:
+        self._terminated = True
+
+    # Messages
+
+    def _receive(self) -> list[Message]:
+        """Messages that come within a tick."""
+        sources = [self._channel.fileno()]
+        if self._application is not None and self._application.handle is not None:
+            sources.append(self._application.handle)
+        ready, _, _ = select.select(sources, [], [], TICK_S)
+        messages = self._channel.receive() if self._channel.fileno() in ready else []
+        gone = self._application is not None and self._application.ended
+        if messages is None or gone:
+            self._application_lives = False
+            self._trip(DeviceDisconnected("the application is gone"))
+            self._ending = True
+            return []
+        return messages
+
+    def _take(self, message: Message) -> None:
+        if "open" in message:
+            self._open(message)
+        elif "limits" in message:
+            self._watch.limits = GuardLimits(**message["limits"])
+        elif "bye" in message:
+            self._ending = True
+        else:
+            self._request(message)
+
+    def _open(self, message: Message) -> None:
+        self._application = WatchedProcess(message["pid"])
+        self._watch.limits = GuardLimits(**message["limits"])
+        for slot, config in message["open"].items():
+            try:
+                owned = Owned(slot, config, message["ports"])
+            except Exception as error:  # a config of a kind that this process cannot make: told, not died of
+                self._channel.send({"opened": slot, "error": error_message(error)})
+                continue
+            self._owned[slot] = owned
+            owned.lane.do(partial(self._open_one, owned))
+
+    def _open_one(self, owned: Owned) -> None:
+        answer: Message
+        try:
+            answer = {"opened": owned.slot, "about": owned.open()}
+        except Exception as error:
+            answer = {"opened": owned.slot, "error": _told(error)}
+        self._channel.send(answer)
+
+    def _request(self, message: Message) -> None:
+        slot, verb = message["slot"], message["verb"]
+        owned = self._owned[slot]
+        if verb == "run":
+            self._watch.start(self._heartbeat.frame)
+        if verb in _URGENT or verb == "close":
+            self._safe_asked = True
+        lane = owned.urgent if verb in _URGENT else owned.lane
+        lane.do(lambda: self._answer(owned, message))
+        if verb in _URGENT and owned.enabling:
+            owned.lane.do(owned.calm)  # what the overtaken verb still does is undone behind it
+
+    def _answer(self, owned: Owned, message: Message) -> None:
+        """On the device's lane."""
+        verb = message["verb"]
+        answer: Message = {"id": message["id"]}
+        with self._trip_lock:
+            refused = self._tripped if verb in _ENABLING else None
+            owned.enabling = owned.enabling or (verb in _ENABLING and refused is None)
+        try:
+            if refused is not None:
+                raise refused
+            answer["result"] = owned.call(verb, message["arguments"])
+        except Exception as error:
+            answer["error"] = _told(error)
+        finally:
+            if verb in _ENABLING:
+                owned.enabling = False
+        if owned.slot == "sync" and (verb in ("gate_low", "abort", "close") or (verb == "run" and "error" in answer)):
+            self._watch.stop()
+        self._channel.send(answer)
+
+    # Watching
+
+    def _look(self, elapsed_s: float) -> None:
+        """One tick."""
+        if self._terminated:
+            self._trip(DeviceFault("the guard was told to end"))
+            self._ending = True
+        for owned in self._owned.values():
+            if self._tripped is None and owned.port_lost:
+                self._trip(DeviceDisconnected(f"{owned.device.name}: its port is lost; plug it in again"))
+        if self._application is not None:
+            self._look_at(self._application, elapsed_s)
+        self._make_safe()
+        self._poll_laser(time.monotonic())
+
+    def _look_at(self, application: WatchedProcess, elapsed_s: float) -> None:
+        watch, frame = self._watch, self._heartbeat.frame
+        if frame != watch.last:
+            self._silence_noted = False
+        elif watch.watching and not self._silence_noted:  # a look at every thread, and seldom needed
+            self._silence_noted = True
+            application.note_progress()
+        stopped = watch.watching and application.stopped
+        trouble = watch.look(elapsed_s, frame, stopped, application.busy)
+        now = time.monotonic()
+        if trouble is not None:
+            self._suspect(trouble, stopped, now)
+        if self._kill_at is not None and now >= self._kill_at:
+            self._kill_at = None
+            if not self._safe_asked:
+                _log.error("guard: killing the application")
+                application.kill()
+
+    def _suspect(self, trouble: str, stopped: bool, now: float) -> None:
+        """No frames: unless the program has come to its end by itself, which its gate can tell."""
+        sync = self._owned.get("sync")
+        if stopped or sync is None or (self._check_until is not None and now > self._check_until):
+            self._trip_application(trouble, stopped)
+        elif self._check_until is None:
+            self._check_until = now + CHECK_S
+            sync.urgent.do(lambda: self._check_end(sync, trouble), first=True)
+
+    def _check_end(self, sync: Owned, trouble: str) -> None:
+        """On the gate's lane."""
+        try:
+            status = sync.device.status
+            ended = status.state == "stopped" and status.outputs == 0
+        except DeviceError:
+            ended = False
+        if ended:
+            self._watch.stop()
+        else:
+            self._trip_application(trouble, stopped=False)
+        self._check_until = None
+
+    def _trip_application(self, trouble: str, stopped: bool) -> None:
+        self._safe_asked = False
+        if self._trip(DeviceTimeout(f"the application {trouble}; the guard took its light")):
+            self._kill_at = time.monotonic() + (GATE_FIRST_S if stopped else HELP_ITSELF_S)
+
+    def _poll_laser(self, now: float) -> None:
+        laser = self._owned.get("laser")
+        if laser is None or not laser.armed or now < self._next_poll or not laser.lane.idle:
+            return
+        self._next_poll = now + POLL_S
+        laser.lane.do(lambda: self._ask_laser(laser))
+
+    def _ask_laser(self, laser: Owned) -> None:
+        """On the laser's lane. A single answer that is missing or garbled is asked for again."""
+        device: LineLaser = laser.device
+        for attempt in range(2):
+            try:
+                status = device.status
+            except DeviceError as error:
+                if attempt:
+                    self._trip(error)
+                continue
+            if not status.interlock_closed:
+                self._trip(InterlockOpen(f"{device.name}: the interlock is open; close it and start again"))
+            elif status.fault is not None:
+                self._trip(DeviceFault(f"{device.name}: fault {status.fault}; clear it at the laser and start again"))
+            return
+
+    # Ending the light
+
+    def _trip(self, cause: DeviceError) -> bool:
+        """Gate low and laser paused, at once and whatever else is under way. False: it was done before."""
+        with self._trip_lock:
+            if self._tripped is not None:
+                return False
+            self._tripped = cause
+        for owned in self._owned.values():
+            if owned.enabling:  # dark at once; what is still being switched on is switched off behind it
+                owned.urgent.do(owned.calm, first=True)
+            owned.want_safe()
+        self._make_safe()
+        _log.error("guard: %s", cause)
+        self._channel.send({"tripped": error_message(cause)})
+        return True
+
+    def _make_safe(self) -> None:
+        """Give the lanes what is due."""
+        with self._trip_lock:
+            due = [owned for owned in self._owned.values() if owned.due]
+            for owned in due:
+                owned.trying = True
+        for owned in due:
+            lane = owned.lane if owned.enabling else owned.urgent
+            lane.do(owned.try_safe, first=True)
+
+    def _end(self) -> int:
+        """Everything safe and closed."""
+        ends_at = time.monotonic() + GIVE_UP_S
+        while any(owned.unsafe for owned in self._owned.values()) and time.monotonic() < ends_at:
+            self._make_safe()
+            time.sleep(TICK_S)
+        for owned in self._owned.values():
+            if owned.device is None:
+                continue
+            try:
+                owned.device.close()
+            except DeviceError as error:
+                _log.error("%s: %s", owned.slot, error)
+        self._channel.send({"bye": True}, within_s=0.1)
+        return 0 if self._tripped is None else 1
+
+
+def _told(error: Exception) -> list[str]:
+    """The error for the application; one that is none of a device's is a fault of ours, with all there is to know."""
+    if not isinstance(error, DeviceError):
+        _log.exception("guard")
+    return error_message(error)
+
+
+def main(arguments: list[str]) -> int:
+    """arguments: handles of the socket and of the heartbeat's page."""
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
+        signal.signal(number, signal.SIG_IGN)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
+    logging.raiseExceptions = False  # the terminal may be gone before the light is
+    end, page = (int(argument) for argument in arguments)
+    return GuardProcess(Channel(socket.socket(fileno=end)), Heartbeat(page)).run()

@@ -1,0 +1,108 @@
+"""Another process, seen from outside: has it ended, is it stopped, is any of its threads at work, and its end by force.
+
+From /proc (proc(5), the fields of `stat`; Documentation/scheduler/sched-stats.rst of Linux, the first two numbers of
+`schedstat`: nanoseconds on a processor and waiting for one) and a pidfd, which names the process for good and tells its
+end at once, also where a child that it forked still holds its sockets open.
+"""
+
+import os
+import select
+import signal
+import time
+from contextlib import suppress
+
+_STOPPED = ("T", "t")
+_AT_WORK = ("R", "D")
+"""Running or waiting for a processor; waiting for a disk."""
+_BUSY_SHARE = 0.15
+"""Share of a time that all threads together have run, or waited to, in a process at work. One that hangs wakes some
+service thread for microseconds now and then."""
+
+
+class WatchedProcess:
+    """One process of this user. Its own pidfd is closed with `close`."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._ended = False
+        self._worked_ns = 0
+        self._since = 0.0
+        self.handle: int | None = None
+        """Readable once the process has ended; None where the kernel has no pidfd (before Linux 5.3)."""
+        if hasattr(os, "pidfd_open"):
+            try:
+                self.handle = os.pidfd_open(pid)
+            except ProcessLookupError:
+                self._ended = True
+            except OSError:
+                self.handle = None
+
+    @property
+    def ended(self) -> bool:
+        """Whether it is gone."""
+        if not self._ended and self.handle is not None:
+            ready = select.poll()
+            ready.register(self.handle, select.POLLIN)
+            self._ended = bool(ready.poll(0))
+        return self._ended
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it is held, by a signal or a debugger."""
+        return _state(f"/proc/{self._pid}/stat") in _STOPPED
+
+    def note_progress(self) -> None:
+        """Work is counted from now on."""
+        self._worked_ns = sum(_work_ns(task) for task in self._tasks())
+        self._since = time.monotonic()
+
+    def busy(self) -> bool:
+        """Whether its threads have worked since `note_progress`, or would have if they could, or are about to."""
+        tasks = self._tasks()
+        worked_s = 1e-9 * (sum(_work_ns(task) for task in tasks) - self._worked_ns)
+        if worked_s > _BUSY_SHARE * (time.monotonic() - self._since):
+            return True
+        return any(_state(f"{task}/stat") in _AT_WORK for task in tasks)
+
+    def _tasks(self) -> list[str]:
+        """Folders of its threads."""
+        folder = f"/proc/{self._pid}/task"
+        try:
+            return [f"{folder}/{task}" for task in os.listdir(folder)]
+        except OSError:
+            return []
+
+    def kill(self) -> None:
+        """End it; nothing happens where it has ended."""
+        if self.ended:
+            return
+        with suppress(ProcessLookupError):
+            if self.handle is not None:
+                signal.pidfd_send_signal(self.handle, signal.SIGKILL)
+            else:
+                os.kill(self._pid, signal.SIGKILL)
+
+    def close(self) -> None:
+        """Give the pidfd back; again: nothing happens."""
+        if self.handle is not None:
+            os.close(self.handle)
+            self.handle = None
+
+
+def _state(stat: str) -> str:
+    """The state in a `stat` file; "X" of what is gone."""
+    try:
+        with open(stat, "rb") as file:
+            return file.read().rpartition(b")")[2].split()[0].decode()
+    except OSError:
+        return "X"
+
+
+def _work_ns(task: str) -> int:
+    """Nanoseconds that a thread ran or waited to; 0 of one that is gone, or where the kernel keeps no such count."""
+    try:
+        with open(f"{task}/schedstat", "rb") as file:
+            ran, waited, *_ = file.read().split()
+    except (OSError, ValueError):
+        return 0
+    return int(ran) + int(waited)

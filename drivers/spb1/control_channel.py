@@ -1,0 +1,139 @@
+"""Commands to an SPB1 device and what it answers, over an endpoint of its own or inside the stream."""
+
+import time
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from drivers.errors import CorruptBlock, DeviceTimeout, ProtocolError
+from drivers.spb1.control import ACK, ACK_BLOCK_BYTES, Ack, Command, Op, read_acks, require_ok
+from drivers.spb1.layout import REGISTER_ACK
+from drivers.spb1.reader import read_control, read_header
+from drivers.transports.bulk_link import BulkLink
+
+_ANSWER_S = 1.0
+"""Longest wait for an acknowledgement."""
+_AT_ONCE = 32
+"""Commands that share a transfer."""
+_ACK_READ_BYTES = 1024
+"""One packet of the fastest USB: reads are whole packets."""
+_DRAIN_BYTES = 1 << 16
+_QUIET_S = 0.003
+"""A stream that gives nothing for so long is empty: what the device has ready comes within microseconds."""
+_DRAIN_S = 1.0
+
+
+class ControlChannel:
+    """The control plane over a link. For one thread at a time. ack_in: None where acknowledgements come as blocks."""
+
+    def __init__(self, link: BulkLink, command_out: int, ack_in: int | None, stream_in: int) -> None:
+        self._link = link
+        self._command_out = command_out
+        self._ack_in = ack_in
+        self._stream_in = stream_in
+        self._request_id = 0
+        self._received: list[Ack] = []
+
+    @property
+    def has_acks(self) -> bool:
+        """Whether it can answer while a run streams."""
+        return self._ack_in is not None
+
+    def read(self, register: int) -> int:
+        """A register."""
+        return self.read_all((register,))[0]
+
+    def read_all(self, registers: Sequence[int]) -> list[int]:
+        """Several registers."""
+        return [ack.value for ack in self._ask([(Op.READ, register, 0) for register in registers])]
+
+    def read64(self, register: int) -> int:
+        """A value of 64 bits."""
+        low, high = self.read_all((register, register + 4))
+        return low | high << 32
+
+    def read_text(self, register: int, size: int) -> str:
+        """Zero-padded text."""
+        words = self.read_all([register + at for at in range(0, size, 4)])
+        raw = b"".join(word.to_bytes(4, "little") for word in words)
+        return raw.split(b"\0")[0].decode("utf-8", "replace").strip()
+
+    def write_all(self, values: Iterable[tuple[int, int]]) -> None:
+        """Several registers. `DeviceFault` where the device refuses one."""
+        self._ask([(Op.WRITE, register, value) for register, value in values])
+
+    def send(self, op: Op, value: int = 0) -> Ack:
+        """One command. `DeviceFault` where the device refuses it."""
+        return self._ask([(op, 0, value)])[0]
+
+    def ping(self, value: int) -> None:
+        """Say that this program is alive, in a run."""
+        self.send_in_run(Op.PING, value)
+
+    def send_in_run(self, op: Op, value: int = 0) -> None:
+        """One command while the stream runs: the answer is waited for only where it does not come in the stream."""
+        if self._ack_in is not None:
+            self.send(op, value)
+        else:
+            self._link.write(self._command_out, self._command(op, 0, value).packed(), _ANSWER_S)
+
+    def forget_run(self) -> None:
+        """Abort a run, if there is one, and drop what it sent; the answer among it."""
+        self._link.write(self._command_out, self._command(Op.ABORT, 0, 0).packed(), _ANSWER_S)
+        self.drain()
+
+    def drain(self) -> None:
+        """Drop what lies ready on the stream. `ProtocolError` where it does not end."""
+        ends_at = time.monotonic() + _DRAIN_S
+        while time.monotonic() < ends_at:
+            try:
+                self._link.read(self._stream_in, _DRAIN_BYTES, _QUIET_S)
+            except DeviceTimeout:
+                return
+        raise ProtocolError(f"{self._link.label}: sends without being asked; wrong firmware, or unplug it once")
+
+    def _command(self, op: int, address: int, value: int) -> Command:
+        self._request_id = (self._request_id + 1) & 0xFFFF
+        return Command(op, self._request_id, address, value)
+
+    def _ask(self, requests: Sequence[tuple[int, int, int]]) -> list[Ack]:
+        """Send commands, some at a time, and return their acknowledgements in order."""
+        acks = []
+        for at in range(0, len(requests), _AT_ONCE):
+            commands = [self._command(*request) for request in requests[at : at + _AT_ONCE]]
+            self._received.clear()  # late answers to what was given up
+            self._link.write(self._command_out, b"".join(command.packed() for command in commands), _ANSWER_S)
+            ends_at = time.monotonic() + _ANSWER_S
+            for command in commands:
+                ack = self._answer(command, ends_at)
+                require_ok(self._link.label, command, ack)
+                acks.append(ack)
+        return acks
+
+    def _answer(self, command: Command, ends_at: float) -> Ack:
+        """The acknowledgement of a command; those of others, given up before, are passed over."""
+        while True:
+            while self._received:
+                ack = self._received.pop(0)
+                if (ack.request_id, ack.op) == (command.request_id, command.op):
+                    return ack
+            left_s = ends_at - time.monotonic()
+            if left_s <= 0:
+                raise DeviceTimeout(
+                    f"{self._link.label} did not acknowledge {Op(command.op).name} within {_ANSWER_S:g} s; "
+                    "power-cycle it"
+                )
+            self._received += self._read_acks(left_s)
+
+    def _read_acks(self, left_s: float) -> list[Ack]:
+        if self._ack_in is not None:
+            return read_acks(self._link.read(self._ack_in, _ACK_READ_BYTES, left_s))
+        data = np.frombuffer(self._link.read(self._stream_in, ACK_BLOCK_BYTES, left_s), np.uint8)
+        try:
+            fields = read_header(data)
+            if not fields.is_control or fields.block.payload_type != REGISTER_ACK:
+                return []
+            payload = read_control(data, fields)
+        except CorruptBlock:
+            return []  # what a run left behind; the answer is still to come, or the time runs out
+        return read_acks(payload[: len(payload) - len(payload) % ACK.size])

@@ -1,0 +1,325 @@
+"""The receiving end of a live SPB1 stream (hardware.md section 8.4): queued reads that point into ring slots.
+
+Reads of one stride each are kept in flight, into slots claimed in the order in which they will be published. A block is
+taken where it lies, or refused and counted; after damage the next sound header on a multiple of 1024 bytes tells where
+blocks begin, the reads already queued across that border are given up and one short read restores the step.
+
+Where the ring has no free slot, reads go on into spare memory so that the device's FIFO does not starve: what comes
+there is copied where a slot came free meanwhile, else dropped and counted.
+"""
+
+import logging
+from collections import deque
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import CorruptBlock
+from drivers.frames import BlockFlag, FrameBlock, packed_row_bytes
+from drivers.ring import BlockRing
+from drivers.spb1.layout import ALIGN, HEADER_BYTES, MAGIC
+from drivers.spb1.reader import HeaderFields, read_frames, read_header
+
+_log = logging.getLogger(__name__)
+
+Buffer = NDArray[np.uint8]
+
+QUEUE_BYTES = 8 << 20
+"""Reads in flight hold about so much, 20 ms of the fastest link: what a busy host may be late by. Half of what Linux
+grants by default."""
+MOST_READS, FEWEST_READS = 64, 4
+_WORD_PX = 64
+_LAST, _LOST_BEFORE, _FORCED_LOW = (
+    int(flag) for flag in (BlockFlag.LAST, BlockFlag.LOST_BEFORE, BlockFlag.GATE_FORCED_LOW)
+)
+"""Plain numbers: arithmetic with flags takes microseconds, ten times a block."""
+_ROOMY_RING = 8
+"""From so many slots on, two reads are kept in flight even where the ring is full."""
+
+
+class Reads(Protocol):
+    """Queued reads of one endpoint, done in order; a `BulkLink` has them."""
+
+    @property
+    def in_flight(self) -> int:
+        """Reads that are queued."""
+        ...
+
+    def submit(self, endpoint: int, buffer: Buffer) -> bool:
+        """Queue a read of the whole buffer. False where the system takes no more of them."""
+        ...
+
+    def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
+        """The oldest one once it is over, and its bytes."""
+        ...
+
+    def cancel(self) -> None:
+        """End all."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Armed:
+    """What the blocks of a run must look like."""
+
+    run_id: int
+    stride: int
+    width: int
+    height: int
+    sensor_width: int
+    sensor_height: int
+    n_frames: int | None
+    check_payload: bool
+
+
+class Took(Enum):
+    """What a read turned out to be."""
+
+    NOTHING = "nothing came in time"
+    CONTROL = "a control block, or what is left over from another run"
+    REFUSED = "damaged, counted"
+    FRAMES = "a block of frames, published or dropped"
+
+
+@dataclass(slots=True)
+class _Item:
+    """A read in flight. slot: into the ring's oldest claimed slot but those of the items before; use: of the data."""
+
+    buffer: Buffer
+    slot: bool
+    use: bool = True
+
+
+class BlockReceiver:
+    """The stream of one run. For one thread."""
+
+    def __init__(self, reads: Reads, endpoint: int, armed: Armed, label: str) -> None:
+        self.delivered = 0
+        self.next_frame = 0
+        """Behind the last frame that is known to have been exposed."""
+        self.crc_errors = 0
+        """Blocks refused: damaged, out of order or of another geometry."""
+        self.resyncs = 0
+        self.ended = False
+        """The run's last block came."""
+        self.gate_forced_low = False
+        """The device's watchdog ended the run."""
+        self._reads = reads
+        self._endpoint = endpoint
+        self._armed = armed
+        self._label = label
+        self._depth = max(FEWEST_READS, min(MOST_READS, QUEUE_BYTES // armed.stride))
+        self._items: deque[_Item] = deque()
+        self._held: Buffer | None = None
+        """A claimed slot that the system took no read for."""
+        self._spares: list[Buffer] = [np.zeros(armed.stride, np.uint8) for _ in range(2)]
+        self._ring: BlockRing | None = None
+        self._last_seq = -1
+        self._published = 0
+        self._lost_at_last = 0
+        """Frames that were lost before the block published last."""
+        self._realign = 0
+        """Bytes to read before blocks begin at the beginning of reads again."""
+        self._row_px = 8 * packed_row_bytes(armed.sensor_width)
+
+    def take(self, ring: BlockRing, timeout_s: float) -> Took:
+        """Wait for the next read and deal with it. May raise what `ring.mark_overflow` raises, frames counted."""
+        self._ring = ring
+        self._top_up(ring)
+        reaped = self._reads.reap(timeout_s)
+        if reaped is None:
+            return Took.NOTHING
+        item = self._items.popleft()
+        if not item.use:
+            self._give_back(item)
+            return Took.CONTROL
+        return self._judge(item, item.buffer[: reaped[1]])
+
+    def drain(self, timeout_s: float) -> bool:
+        """Read on without publishing, for at most one wait of `timeout_s`; True once the last block came."""
+        if not self._items:
+            self._submit(self._spare(), slot=False)
+        reaped = self._reads.reap(timeout_s)
+        if reaped is not None:
+            item = self._items.popleft()
+            try:
+                fields = read_header(item.buffer[: reaped[1]])
+                if not fields.is_control and fields.block.run_id == self._armed.run_id:
+                    self._note(fields, fields.n_frames)
+            except CorruptBlock:
+                pass  # nothing of it is used
+            self._give_back(item)
+        return self.ended
+
+    def close(self) -> None:
+        """Give up the reads in flight and give their slots back."""
+        self._reads.cancel()
+        if self._held is not None:
+            self._items.append(_Item(self._held, slot=True))
+            self._held = None
+        while self._items:
+            self._give_back(self._items.popleft())
+
+    def _top_up(self, ring: BlockRing) -> None:
+        """Keep as many reads in flight as the ring has slots for, a few in any case."""
+        fewest = 2 if ring.slots >= _ROOMY_RING else 1
+        if self._realign:
+            if not self._submit(self._spare()[: self._realign], slot=False, use=False):
+                return
+            self._realign = 0
+        while len(self._items) < self._depth:
+            if self._held is None:
+                self._held = ring.claim(0.0)
+            if self._held is None:
+                if len(self._items) >= fewest:
+                    return
+                self._submit(self._spare(), slot=False)
+            elif self._submit(self._held[: self._armed.stride], slot=True):
+                self._held = None
+            else:
+                self._depth = len(self._items)  # the system takes no more; asking again would only cost time
+
+    def _submit(self, buffer: Buffer, *, slot: bool, use: bool = True) -> bool:
+        if not self._reads.submit(self._endpoint, buffer):
+            if not slot:
+                self._spares.append(buffer)
+            return False
+        self._items.append(_Item(buffer, slot, use))
+        return True
+
+    def _spare(self) -> Buffer:
+        while self._spares:
+            if len(spare := self._spares.pop()) == self._armed.stride:
+                return spare
+        return np.zeros(self._armed.stride, np.uint8)
+
+    def _give_back(self, item: _Item) -> None:
+        if not item.slot:
+            self._spares.append(item.buffer)
+        elif self._ring is not None:
+            self._ring.discard()
+
+    def _judge(self, item: _Item, data: Buffer) -> Took:
+        try:
+            fields = read_header(data)
+            if fields.is_control or fields.block.run_id != self._armed.run_id:
+                self._give_back(item)
+                return Took.CONTROL
+            self._require_armed(fields)
+            block = read_frames(data, fields, check_payload=self._armed.check_payload)
+            self._require_windows(block)
+        except CorruptBlock as error:
+            self.crc_errors += 1
+            _log.warning("%s: block refused: %s", self._label, error)
+            self._find_step(data)
+            self._give_back(item)
+            return Took.REFUSED
+        except BaseException:
+            self._give_back(item)
+            raise
+        self._note(fields, block.n_frames)
+        if block.n_frames == 0:
+            self._give_back(item)
+            return Took.CONTROL
+        self._hand_over(item, block)
+        return Took.FRAMES
+
+    def _require_armed(self, fields: HeaderFields) -> None:
+        """CorruptBlock for a sound block that cannot be the next of this run."""
+        block, armed = fields.block, self._armed
+        found = (block.width, block.height, block.sensor_width, block.sensor_height)
+        if found != (armed.width, armed.height, armed.sensor_width, armed.sensor_height):
+            raise CorruptBlock(f"block {block.block_seq}: geometry {found} is not the one that was armed")
+        if block.block_seq <= self._last_seq or block.first_frame < self.next_frame:
+            raise CorruptBlock(
+                f"block {block.block_seq} from frame {block.first_frame} on comes after block {self._last_seq} and "
+                f"frame {self.next_frame - 1}"
+            )
+        if armed.n_frames is not None and block.first_frame + fields.n_frames > armed.n_frames:
+            raise CorruptBlock(f"block {block.block_seq} reaches beyond the {armed.n_frames} frames of the run")
+
+    def _require_windows(self, block: FrameBlock) -> None:
+        """CorruptBlock where a window lies off the words or beyond the row: what counts bits must not trip over it."""
+        if block.n_frames == 0:
+            return
+        x0 = block.records["x0"]
+        if self._armed.width == self._armed.sensor_width:
+            bad = bool(x0.any())
+        else:
+            bad = int(x0.max()) + self._armed.width > self._row_px or int(np.bitwise_or.reduce(x0)) % _WORD_PX != 0
+        if bad:
+            raise CorruptBlock(f"block {block.header.block_seq}: a window lies beyond the row or off its words")
+
+    def _note(self, fields: HeaderFields, n_frames: int) -> None:
+        """Count what the header says was exposed."""
+        block = fields.block
+        self._last_seq = max(self._last_seq, block.block_seq)
+        self.next_frame = max(self.next_frame, block.first_frame + n_frames)
+        flags = int(block.flags)
+        self.ended = self.ended or bool(flags & _LAST)
+        self.gate_forced_low = self.gate_forced_low or bool(flags & _FORCED_LOW)
+
+    def _hand_over(self, item: _Item, block: FrameBlock) -> None:
+        """Publish; what came into spare memory is copied or dropped."""
+        assert self._ring is not None, "set by take"
+        block = self._as_received(block)
+        if not item.slot:
+            copied = self._copied(block, item.buffer)
+            self._spares.append(item.buffer)
+            if copied is None:
+                self._ring.mark_overflow(block.n_frames)
+                return
+            block = copied
+        self._ring.publish(block)
+        self._lost_at_last = block.header.lost_before
+        self.delivered += block.n_frames
+        self._published += 1
+
+    def _copied(self, block: FrameBlock, buffer: Buffer) -> FrameBlock | None:
+        """The block in a slot that came free; not where later blocks already have their slots: order is all."""
+        assert self._ring is not None, "set by take"
+        if self._held is not None or any(item.slot for item in self._items):
+            return None
+        memory = self._ring.claim(0.0)
+        if memory is None:
+            return None
+        np.copyto(memory[: len(buffer)], buffer)
+        start = buffer.ctypes.data
+        records = _moved(block.records, start, memory)
+        bits = _moved(block.bits, start, memory) if np.shares_memory(block.bits, buffer) else block.bits
+        return FrameBlock(block.header, records, bits, block.status)
+
+    def _as_received(self, block: FrameBlock) -> FrameBlock:
+        """Number and losses as they are behind this receiver, which may have refused or dropped blocks."""
+        header = block.header
+        lost = header.first_frame - self.delivered
+        flags = int(header.flags) & ~_LOST_BEFORE | (_LOST_BEFORE if lost > self._lost_at_last else 0)
+        if (header.block_seq, header.lost_before, int(header.flags)) == (self._published, lost, flags):
+            return block
+        header = replace(header, block_seq=self._published, lost_before=lost, flags=BlockFlag(flags))
+        return replace(block, header=header)
+
+    def _find_step(self, data: Buffer) -> None:
+        """Look for a sound header inside a damaged read: from there on blocks begin elsewhere in each read."""
+        for offset in range(ALIGN, len(data) - HEADER_BYTES + 1, ALIGN):
+            if data[offset : offset + len(MAGIC)].tobytes() != MAGIC:
+                continue
+            try:
+                read_header(data[offset:])
+            except CorruptBlock:
+                continue
+            self.resyncs += 1
+            _log.warning("%s: blocks begin %d bytes later from here on", self._label, offset)
+            for item in self._items:
+                item.use = False
+            self._realign = offset
+            return
+
+
+def _moved(array: NDArray[Any], start: int, memory: Buffer) -> NDArray[Any]:
+    """The same place in `memory` as `array` has in the memory that starts at address `start`."""
+    offset = array.ctypes.data - start
+    return memory[offset : offset + array.nbytes].view(array.dtype).reshape(array.shape)

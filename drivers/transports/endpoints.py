@@ -1,0 +1,36 @@
+"""Where a device is found: a real address, or one that an emulating world created in this process."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from drivers.errors import DeviceNotFound
+
+EMULATED_PREFIX = "emulated:"
+"""`port: emulated:laser` in a config means the endpoint that the rig's emulating world calls "laser"."""
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """An address that a transport opens. Everything with `emulated` False is a real device and needs `--arm`."""
+
+    address: str
+    emulated: bool
+    usb_backend: object | None = None
+    """The `usb.backend.IBackend` that serves an emulated USB device; None: libusb."""
+
+
+def resolve(port: str, ports: Mapping[str, Endpoint]) -> Endpoint:
+    """The endpoint that a config's `port` means. ports: what the emulating world created, by name.
+
+    `DeviceNotFound` for an emulated port that is not among them; a real address is not looked at before it is opened.
+    """
+    if not port.startswith(EMULATED_PREFIX):
+        return Endpoint(port, emulated=False)
+    name = port.removeprefix(EMULATED_PREFIX)
+    if name in ports:
+        return ports[name]
+    if not ports:
+        raise DeviceNotFound(
+            f"port {port}: this rig emulates no devices; give a real port, or use a config with an emulating world"
+        )
+    raise DeviceNotFound(f"port {port}: no such emulated device; choose one of: {', '.join(sorted(ports))}")

@@ -1,0 +1,206 @@
+"""A serial port with a deadline on every call, and one typed error for each way in which it can fail.
+
+Wraps pyserial. What a lost port raises there depends on the call (SerialException, a bare OSError or termios.error), so
+all of them are caught around every call. Deadlines are in the host's time: pyserial waits in no other.
+"""
+
+import errno
+import select
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+import serial
+from serial.tools import list_ports
+
+from drivers.errors import (
+    DeviceBusy,
+    DeviceDisconnected,
+    DeviceError,
+    DeviceNotFound,
+    DevicePermission,
+    DeviceTimeout,
+    ProtocolError,
+)
+
+try:
+    from termios import error as _termios_error
+except ImportError:  # no such module, and no such error, on Windows
+    _termios_error = OSError  # type: ignore[assignment,misc]
+
+UDEV_RULES = "config/udev/70-spadrig.rules"
+"""The rules that give a lab user access to the ports; messages about permissions name them."""
+
+_FOREIGN = (serial.SerialException, OSError, _termios_error)
+_SLICE_S = 0.02
+"""One wait inside pyserial: the granularity of deadlines, in seconds."""
+_WRITE_S = 1.0
+"""Time for a write: a device that takes nothing for so long hangs. 1 s is 11 520 characters at 115 200 baud."""
+_MAX_LINE_BYTES = 65_536
+"""Longer than any reply to a command: beyond it the line is noise without an end."""
+
+_ABSENT = (errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EIO)
+_FORBIDDEN = (errno.EACCES, errno.EPERM)
+_HELD = (errno.EBUSY, errno.EAGAIN)
+
+
+class SerialPort:
+    """An open serial port, held exclusively, 8N1 without flow control. `close` is idempotent.
+
+    Not thread-safe: a driver that is polled from several threads locks around a whole command and reply.
+    """
+
+    def __init__(self, name: str, address: str, baud: int = 115_200) -> None:
+        """Open it. name: what messages call the device.
+
+        address: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
+        vendor and product, the only one attached). Raises `DeviceNotFound`, `DevicePermission` or `DeviceBusy`.
+        """
+        self._name = name
+        self._path = _find(name, address)
+        self._received = bytearray()
+        self._port = self._open(baud)
+
+    @property
+    def path(self) -> str:
+        """The port's path, found where the address was a serial number."""
+        return self._path
+
+    @property
+    def lost(self) -> bool:
+        """Whether the port has hung up, told by the kernel without a word on the wire. Any thread."""
+        if not hasattr(select, "poll"):
+            return False  # Windows tells with the next read
+        try:
+            hung_up = select.poll()
+            hung_up.register(self._port.fileno(), 0)  # hang-ups and errors are told unasked
+            return bool(hung_up.poll(0))
+        except (*_FOREIGN, TypeError, ValueError):
+            return True
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`. `DeviceTimeout` where the device takes none for a second, `DeviceDisconnected`."""
+        with self._translated():
+            try:
+                self._port.write(data)
+            except serial.SerialTimeoutException:
+                raise DeviceTimeout(
+                    f"{self._name} took no data for {_WRITE_S:g} s on {self._path}; it hangs: power-cycle it"
+                ) from None
+
+    def read_line(self, terminator: bytes, deadline_s: float) -> bytes:
+        """The next line without its terminator. `DeviceTimeout` after `deadline_s`: what came is kept for the next."""
+        ends_at = time.monotonic() + deadline_s
+        searched = 0
+        while (end := self._received.find(terminator, searched)) < 0:
+            if len(self._received) > _MAX_LINE_BYTES:
+                raise ProtocolError(f"{self._name} sent {len(self._received)} bytes without an end of line: noise")
+            searched = max(0, len(self._received) - len(terminator) + 1)
+            self._receive(ends_at, deadline_s, "a whole line")
+        return self._take(end, len(terminator))
+
+    def read_exact(self, n: int, deadline_s: float) -> bytes:
+        """Exactly n bytes. `DeviceTimeout` after `deadline_s`: what came is kept for the next read."""
+        ends_at = time.monotonic() + deadline_s
+        while len(self._received) < n:
+            self._receive(ends_at, deadline_s, f"{n} bytes")
+        return self._take(n, 0)
+
+    def reset_input(self) -> None:
+        """Drop everything received so far and not read."""
+        self._received.clear()
+        with self._translated():
+            self._port.reset_input_buffer()
+
+    def drain(self, quiet_s: float, deadline_s: float) -> bytes:
+        """Drop all that comes until the line is quiet for `quiet_s`, at most for `deadline_s`; returns what it was."""
+        ends_at = time.monotonic() + deadline_s
+        quiet_at = time.monotonic() + quiet_s
+        while time.monotonic() < min(quiet_at, ends_at):
+            if self._receive_some():
+                quiet_at = time.monotonic() + quiet_s
+        return self._take(len(self._received), 0)
+
+    def close(self) -> None:
+        """Give the port back; again: nothing happens. Never raises: a lost port is closed all the same."""
+        with suppress(*_FOREIGN):  # the port is gone, and with it all that could be given back
+            self._port.close()
+
+    def _open(self, baud: int) -> serial.Serial:
+        try:
+            return serial.Serial(self._path, baud, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
+        except _FOREIGN as error:
+            raise self._refused(error) from None
+
+    def _refused(self, error: Exception) -> DeviceError:
+        number = getattr(error, "errno", None)
+        where = f"{self._name}: port {self._path}"
+        if number in _ABSENT:
+            return DeviceNotFound(f"{where} is not there; plug the device in, switch it on, or correct 'port'")
+        if number in _FORBIDDEN:
+            return DevicePermission(
+                f"{where} may not be opened by this user; install the udev rules {UDEV_RULES} and plug in again"
+            )
+        if number in _HELD:
+            return DeviceBusy(f"{where} is held by another program; close that program and try again")
+        return DeviceNotFound(f"{where} cannot be opened as a serial port ({_one_line(error)}); correct 'port'")
+
+    def _receive(self, ends_at: float, deadline_s: float, what: str) -> None:
+        """Wait for bytes; DeviceTimeout past the deadline."""
+        if self._receive_some():
+            return
+        if time.monotonic() >= ends_at:
+            raise DeviceTimeout(
+                f"{self._name} did not send {what} within {deadline_s:g} s on {self._path} "
+                f"({len(self._received)} bytes came); check its power and cable"
+            )
+
+    def _receive_some(self) -> bool:
+        with self._translated():
+            data = self._port.read(max(1, self._port.in_waiting))
+        self._received += data
+        return bool(data)
+
+    def _take(self, n: int, terminator: int) -> bytes:
+        taken = bytes(self._received[:n])
+        del self._received[: n + terminator]
+        return taken
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        """Whatever pyserial raises about an open port means that it is gone."""
+        try:
+            yield
+        except (*_FOREIGN, TypeError) as error:
+            # TypeError: what pyserial's calls raise on the handle of a port that was closed under them.
+            raise DeviceDisconnected(
+                f"{self._name}: port {self._path} is lost ({_one_line(error)}); plug it in again"
+            ) from None
+
+
+def _find(name: str, address: str) -> str:
+    """The path that an address means."""
+    key, given, value = address.partition("=")
+    if not given or key not in ("serial", "usb"):
+        return address
+    attached = list_ports.comports()
+    if key == "serial":
+        matches = [port.device for port in attached if port.serial_number == value]
+        other = "give the port's path"
+    else:
+        matches = [
+            port.device
+            for port in attached
+            if port.vid is not None and f"{port.vid:04x}:{port.pid:04x}" == value.lower()
+        ]
+        other = "give serial=... or the port's path"
+    if not matches:
+        choices = ", ".join(f"{p.device} (serial={p.serial_number})" for p in attached if p.serial_number)
+        raise DeviceNotFound(f"{name}: no serial port with {address}; attached: {choices or 'none'}")
+    if len(matches) > 1:
+        raise DeviceNotFound(f"{name}: {len(matches)} serial ports with {address} ({', '.join(matches)}); {other}")
+    return str(matches[0])
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

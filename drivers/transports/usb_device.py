@@ -1,0 +1,315 @@
+"""One USB device, opened and claimed through pyusb: every call has a deadline, every failure is one of ours.
+
+Addresses: "usb" (the only one attached), "usb:serial=ABC", "usb:path=1-2.4" (bus and hub ports, as in
+/sys/bus/usb/devices; for devices without a serial string). Two equal devices and a plain "usb" are refused with the
+addresses to choose from. `backend` is pyusb's: None for the real libusb, an emulator's object otherwise.
+
+pyusb is synchronous: between two reads nothing is queued, so the device's FIFO must hold that long. A stream that
+cannot wait needs several transfers in flight, which pyusb does not offer (package `libusb1` does).
+
+Errors as libusb 1.0 numbers them and as Linux means them: unplugging shows as ENODEV, EIO or ESHUTDOWN; a read shorter
+than a packet overflows and loses the packet; the sum of all queued transfers is limited by `usbfs_memory_mb` (16).
+"""
+
+import array
+import errno
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from threading import RLock
+from typing import Any, Self
+
+import usb.backend.libusb1
+import usb.core
+import usb.util
+
+from drivers.errors import (
+    DeviceBusy,
+    DeviceDisconnected,
+    DeviceError,
+    DeviceFault,
+    DeviceNotFound,
+    DevicePermission,
+    DeviceTimeout,
+    ProtocolError,
+)
+
+UDEV_RULES = "config/udev/70-spadrig.rules"
+"""Gives the devices to group plugdev; its first lines say how to install it."""
+
+_LOST = (errno.ENODEV, errno.EIO, errno.ESHUTDOWN, errno.ENOTCONN)
+
+
+@dataclass(frozen=True, slots=True)
+class UsbId:
+    """What to look for. Vendors share numbers: one of `product_names`, if any, must be part of the product string."""
+
+    label: str
+    vendor: int
+    product: int
+    product_names: str | tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class UsbListing:
+    """A device on the bus as far as it can be known without claiming it. Strings are None where it may not be asked."""
+
+    vendor: int
+    product: int
+    path: str
+    serial: str | None
+    manufacturer: str | None
+    product_name: str | None
+    handle: Any = field(repr=False, compare=False, default=None)
+
+    @property
+    def address(self) -> str:
+        """The shortest address that means this device only."""
+        return f"usb:serial={self.serial}" if self.serial else f"usb:path={self.path}"
+
+
+def attached(wanted: UsbId, backend: object | None = None) -> list[UsbListing]:
+    """The attached devices of one sort, ordered by path. Claims nothing and changes nothing."""
+    found = usb.core.find(find_all=True, backend=backend or _libusb(), idVendor=wanted.vendor, idProduct=wanted.product)
+    with translated(wanted.label):
+        listings = [_listing(device) for device in found]
+    return sorted((one for one in listings if _named(one, wanted)), key=lambda one: one.path)
+
+
+def _named(one: UsbListing, wanted: UsbId) -> bool:
+    names = (wanted.product_names,) if isinstance(wanted.product_names, str) else wanted.product_names
+    name = one.product_name
+    return name is None or not names or any(part in name for part in names)
+
+
+class UsbDevice:
+    """An open device with its interfaces claimed and in the wanted alternate settings. Calls are safe from any thread.
+
+    Transfers on one endpoint are the caller's to serialise; `close` waits for none of them (end your threads first).
+    """
+
+    def __init__(self, listing: UsbListing, label: str, alternates: Mapping[int, int]) -> None:
+        """Claim and set `alternates`, {interface: alternate setting}. Use `open_device` to find the listing."""
+        self.listing = listing
+        self.label = f"{label} at {listing.address}"
+        self._device = listing.handle
+        self._lock = RLock()
+        self._open = True
+        try:
+            with translated(self.label):
+                self._configure(alternates)
+        except BaseException:
+            self.close()
+            raise
+
+    def _configure(self, alternates: Mapping[int, int]) -> None:
+        try:
+            self._device.get_active_configuration()
+        except usb.core.USBError as error:
+            if error.errno is not None:  # pyusb raises one without a number for 'not configured'
+                raise
+            self._device.set_configuration()
+        for interface, alternate in alternates.items():
+            usb.util.claim_interface(self._device, interface)
+            # Always sent, also where the setting is the present one: it is the firmware's 'start afresh'.
+            self._device.set_interface_altsetting(interface, alternate)
+
+    def set_alternate(self, interface: int, alternate: int) -> None:
+        """Change the alternate setting of a claimed interface."""
+        with self._lock, translated(self.label):
+            self._device.set_interface_altsetting(interface, alternate)
+
+    def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
+        """One OUT transfer, interrupt or bulk as the descriptor says. `DeviceTimeout` where not all of it went out."""
+        with translated(self.label, endpoint, timeout_s):
+            sent = self._device.write(endpoint, data, _milliseconds(timeout_s))
+        if sent != len(data):
+            raise DeviceTimeout(
+                f"{self.label}: {sent} of {len(data)} B went out on endpoint 0x{endpoint:02x} within {timeout_s:g} s"
+            )
+
+    def read(self, endpoint: int, size: int, timeout_s: float) -> bytes:
+        """One IN transfer of at most `size` bytes, a whole number of packets. `DeviceTimeout` where nothing came."""
+        with translated(self.label, endpoint, timeout_s):
+            return bytes(self._device.read(endpoint, size, _milliseconds(timeout_s)))
+
+    def read_into(self, endpoint: int, buffer: "array.array[int]", timeout_s: float) -> int:
+        """As `read`, into an existing array (its own size in whole packets); returns the bytes read."""
+        with translated(self.label, endpoint, timeout_s):
+            return int(self._device.read(endpoint, buffer, _milliseconds(timeout_s)))
+
+    def drain(self, endpoint: int, size: int, timeout_s: float, most: int = 1000) -> int:
+        """Read and drop until nothing comes for `timeout_s`; returns the transfers dropped.
+
+        `ProtocolError` after `most` of them: a device that never falls silent follows another protocol.
+        """
+        for dropped in range(most):
+            try:
+                self.read(endpoint, size, timeout_s)
+            except DeviceTimeout:
+                return dropped
+        raise ProtocolError(f"{self.label}: endpoint 0x{endpoint:02x} talks without being asked; check the firmware")
+
+    def control_in(
+        self, request_type: int, request: int, value: int, index: int, length: int, timeout_s: float
+    ) -> bytes:
+        """A control transfer that reads. `DeviceFault` where the device refuses it (stall)."""
+        with translated(self.label, 0, timeout_s):
+            reply = self._device.ctrl_transfer(request_type, request, value, index, length, _milliseconds(timeout_s))
+        return bytes(reply)
+
+    def control_out(
+        self, request_type: int, request: int, value: int, index: int, data: bytes, timeout_s: float
+    ) -> None:
+        """A control transfer that writes. `DeviceFault` where the device refuses it (stall)."""
+        with translated(self.label, 0, timeout_s):
+            self._device.ctrl_transfer(request_type, request, value, index, data, _milliseconds(timeout_s))
+
+    def endpoints(self) -> tuple[int, ...]:
+        """Addresses of all endpoints in the active configuration; bit 7 set = IN."""
+        with translated(self.label):
+            interfaces = list(self._device.get_active_configuration())
+        return tuple(endpoint.bEndpointAddress for interface in interfaces for endpoint in interface)
+
+    def clear_halt(self, endpoint: int) -> None:
+        """Make a stalled endpoint work again."""
+        with translated(self.label, endpoint):
+            self._device.clear_halt(endpoint)
+
+    def close(self) -> None:
+        """Give the interfaces and the device back; again: nothing happens. Raises nothing: the device may be gone."""
+        with self._lock:
+            if not self._open:
+                return
+            self._open = False
+            try:
+                usb.util.dispose_resources(self._device)
+            except (usb.core.USBError, NotImplementedError):
+                return
+
+    def __enter__(self) -> Self:
+        """The device itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+
+def open_device(wanted: UsbId, address: str, alternates: Mapping[int, int], backend: object | None = None) -> UsbDevice:
+    """Find, open, configure and claim.
+
+    `DeviceNotFound`: none, or none at that address. `DeviceError`: several equal ones and the address does not choose.
+    `DevicePermission` names the udev rule. `DeviceBusy`: claimed by another program.
+    """
+    return UsbDevice(find_device(wanted, address, backend), wanted.label, alternates)
+
+
+def find_device(wanted: UsbId, address: str, backend: object | None = None) -> UsbListing:
+    """The one device that an address means. Errors as of `open_device`, but for those of claiming it."""
+    return _choose(attached(wanted, backend), wanted, address)
+
+
+def _choose(listings: list[UsbListing], wanted: UsbId, address: str) -> UsbListing:
+    ids = f"{wanted.vendor:04x}:{wanted.product:04x}"
+    if not listings:
+        raise DeviceNotFound(f"{wanted.label}: no USB device {ids} is attached; plug it in and switch it on")
+    fits = _matcher(address)
+    chosen = [one for one in listings if fits(one)]
+    choices = ", ".join(one.address for one in listings)
+    if not chosen:
+        hidden = any(one.serial is None and one.product_name is None for one in listings)
+        if hidden and address.startswith("usb:serial="):
+            raise DevicePermission(_no_permission(wanted.label))
+        raise DeviceNotFound(f"{wanted.label}: none is attached at {address}; attached: {choices}")
+    if len(chosen) > 1:
+        raise DeviceError(f"{wanted.label}: {len(chosen)} are attached; set port to one of {choices}")
+    return chosen[0]
+
+
+def _matcher(address: str) -> Callable[[UsbListing], bool]:
+    sort, _, which = address.partition(":")
+    key, _, value = which.partition("=")
+    if address == "usb":
+        return lambda one: True
+    if sort == "usb" and key == "serial" and value:
+        return lambda one: one.serial == value
+    if sort == "usb" and key == "path" and value:
+        return lambda one: one.path == value
+    raise DeviceError(f"port {address!r} is no USB address; write usb, usb:serial=ABC or usb:path=1-2")
+
+
+def _listing(device: Any) -> UsbListing:
+    ports = device.port_numbers or (device.address or 0,)
+    serial, maker, product = (
+        _string(device, index) for index in (device.iSerialNumber, device.iManufacturer, device.iProduct)
+    )
+    usb.util.dispose_resources(device)  # asking for strings opened it
+    return UsbListing(
+        vendor=device.idVendor,
+        product=device.idProduct,
+        path=f"{device.bus}-{'.'.join(str(port) for port in ports)}",
+        serial=serial,
+        manufacturer=maker,
+        product_name=product,
+        handle=device,
+    )
+
+
+def _string(device: Any, index: int) -> str | None:
+    """A string of the device; None where there is none or it may not be asked."""
+    try:
+        text = usb.util.get_string(device, index)
+    except (usb.core.USBError, ValueError, NotImplementedError):  # ValueError: pyusb's 'no languages', mostly EACCES
+        return None
+    return str(text) if text is not None else None
+
+
+def _libusb() -> Any:
+    backend = usb.backend.libusb1.get_backend()
+    if backend is None:
+        raise DeviceError("libusb is not installed, USB devices cannot be reached; run: sudo apt install libusb-1.0-0")
+    return backend
+
+
+def _milliseconds(timeout_s: float) -> int:
+    """libusb takes 0 as 'for ever', which no call here may ask for."""
+    return max(1, round(timeout_s * 1000))
+
+
+def _no_permission(label: str) -> str:
+    return f"{label}: no permission to open it; install {UDEV_RULES} (its first lines say how) and plug it in again"
+
+
+@contextmanager
+def translated(label: str, endpoint: int | None = None, timeout_s: float | None = None) -> Iterator[None]:
+    """Turn what pyusb raises inside into one line and one class of `drivers.errors`."""
+    try:
+        yield
+    except usb.core.USBError as error:
+        raise _ours(error, label, endpoint, timeout_s) from None
+    except (ValueError, NotImplementedError) as error:  # no such endpoint or setting; a call libusb cannot do here
+        raise ProtocolError(f"{label}: {error}; check the device's firmware") from None
+
+
+def _ours(error: Any, label: str, endpoint: int | None, timeout_s: float | None) -> DeviceError:
+    where = "" if endpoint is None else f" on endpoint 0x{endpoint:02x}"
+    number = error.errno
+    if number == errno.ETIMEDOUT:
+        return DeviceTimeout(f"{label}: nothing{where} within {timeout_s or 0:g} s")
+    if number in _LOST:
+        return DeviceDisconnected(f"{label}: the device is gone ({error.strerror}); check cable and power, open again")
+    if number == errno.EACCES:
+        return DevicePermission(_no_permission(label))
+    if number == errno.EBUSY:
+        return DeviceBusy(f"{label}: another program holds it; end that program")
+    if number == errno.EPIPE:
+        return DeviceFault(f"{label}: the device refused the transfer{where} (stall)")
+    if number == errno.EOVERFLOW:
+        return ProtocolError(f"{label}: more bytes than asked for{where}; check the firmware")
+    if number == errno.ENOMEM:
+        return DeviceError(
+            f"{label}: the kernel's USB memory is used up; run: "
+            "echo 256 | sudo tee /sys/module/usbcore/parameters/usbfs_memory_mb"
+        )
+    return DeviceError(f"{label}: USB error{where}: {error.strerror or error}")

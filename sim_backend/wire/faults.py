@@ -1,0 +1,138 @@
+"""What can go wrong on a wire: late, split, merged, cut, corrupt, repeated or lost replies, stalls, unplugging, hangs.
+
+One seeded schedule decides, reply by reply, which fault strikes; the transports (serial, TCP, USB) act it out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+
+class Fault(Enum):
+    """One thing that goes wrong with one reply."""
+
+    LATE = "late"
+    """Comes whole, after `late_s`."""
+    SPLIT = "split"
+    """Comes in two parts with a pause between them."""
+    MERGED = "merged"
+    """Comes together with the next reply."""
+    TRUNCATED = "truncated"
+    """Its end never comes."""
+    CORRUPTED = "corrupted"
+    """One of its bits is flipped."""
+    REPEATED = "repeated"
+    """Comes twice."""
+    LOST = "lost"
+    """Never comes."""
+    STALL = "stall"
+    """It and all that follows come after `stall_s`."""
+    UNPLUG = "unplug"
+    """The cable is pulled before it comes."""
+    HANG = "hang"
+    """The firmware hangs: it takes and says nothing from now on; its outputs stay as they are."""
+
+
+SHAPING = (Fault.LATE, Fault.SPLIT, Fault.MERGED, Fault.TRUNCATED, Fault.CORRUPTED, Fault.REPEATED, Fault.LOST)
+"""Faults of one reply, acted out by `FaultSchedule.shape`."""
+FINAL = (Fault.STALL, Fault.UNPLUG, Fault.HANG)
+"""Faults of the whole device, acted out by the transport."""
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """Bytes that reach the host a while after the device sent them."""
+
+    delay_s: float
+    data: bytes
+
+
+class FaultSchedule:
+    """Decides on each reply. Seeded, so that a sequence that failed can be run again.
+
+    probability: that a reply meets a fault at all. kinds: which ones, equally often. skip: so many replies come
+    unharmed first (the opening of a device, say). most: faults in all; None: no end.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        probability: float = 0.2,
+        kinds: Sequence[Fault] = tuple(Fault),
+        *,
+        skip: int = 0,
+        most: int | None = None,
+        late_s: float = 0.3,
+        stall_s: float = 1.5,
+    ) -> None:
+        self._random = np.random.default_rng(seed)
+        self._probability = probability
+        self._kinds = tuple(kinds)
+        self._skip = skip
+        self._left = most
+        self._late_s = late_s
+        self.stall_s = stall_s
+        self._held = b""
+        self.struck: list[Fault] = []
+        """What struck so far, in order."""
+
+    def next(self) -> Fault | None:
+        """The fault that strikes the next reply."""
+        if self._skip > 0:
+            self._skip -= 1
+            return None
+        if self._left == 0 or not self._kinds or self._random.random() >= self._probability:
+            return None
+        if self._left is not None:
+            self._left -= 1
+        fault = self._kinds[int(self._random.integers(len(self._kinds)))]
+        self.struck.append(fault)
+        return fault
+
+    def shape(self, fault: Fault | None, reply: bytes) -> tuple[Delivery, ...]:
+        """What arrives instead of `reply`; a reply held back to be merged comes with the next one."""
+        if fault is Fault.MERGED:
+            self._held += reply
+            return ()
+        held, self._held = self._held, b""
+        whole = held + reply
+        if not whole:
+            return ()
+        match fault:
+            case Fault.LATE:
+                return (Delivery(self._random.uniform(0.1, 1.0) * self._late_s, whole),)
+            case Fault.SPLIT:
+                cut = int(self._random.integers(len(whole) + 1))
+                return Delivery(0.0, whole[:cut]), Delivery(self._random.uniform(0.0, 0.2) * self._late_s, whole[cut:])
+            case Fault.TRUNCATED:
+                return (Delivery(0.0, whole[: int(self._random.integers(len(whole)))]),)
+            case Fault.CORRUPTED:
+                return (Delivery(0.0, self._corrupted(whole)),)
+            case Fault.REPEATED:
+                return (Delivery(0.0, whole + whole),)
+            case Fault.LOST:
+                return ()
+            case _:
+                return (Delivery(0.0, whole),)
+
+    def _corrupted(self, data: bytes) -> bytes:
+        damaged = bytearray(data)
+        damaged[int(self._random.integers(len(data)))] ^= 1 << int(self._random.integers(8))
+        return bytes(damaged)
+
+
+class FaultScript(FaultSchedule):
+    """Faults in a given order, one a reply (None: the reply comes unharmed); none after the last."""
+
+    def __init__(self, *script: Fault | None, late_s: float = 0.3, stall_s: float = 1.5) -> None:
+        super().__init__(0, late_s=late_s, stall_s=stall_s)
+        self._script = list(script)
+
+    def next(self) -> Fault | None:
+        """The next of the script."""
+        fault = self._script.pop(0) if self._script else None
+        if fault is not None:
+            self.struck.append(fault)
+        return fault

@@ -1,0 +1,255 @@
+"""Model of a Coherent OBIS laser's firmware: handshake on or off, warm-up, CDRH delay, interlock, key, fault words.
+
+hardware.md section 4.2 (operator's manual, appendix C; `obis.h`; mmCoreAndDevices PR 645). Commands end with CR or LF,
+replies with CRLF. Traps kept: sets are silent with the handshake off, ON during warm-up is deferred, emission follows
+ON by the CDRH delay, modes are refused while it is on (ERR-200), behind a Remote only numbered commands reach it.
+"""
+
+import re
+from collections.abc import Callable
+
+OFF_BITS = 0xC800_0000
+"""Bits of every sample status in hardware.md section 4.2."""
+_COMMAND = re.compile(r"[^\r\n]+[\r\n]+")
+_ADDRESS = re.compile(r"^(SYST|SOUR)(\d*)(?=:)")
+FORBIDDEN = ("SYST:CDRH OFF",)
+"""Bypasses: a driver that sends one of them has failed its test."""
+
+
+class ObisModel:
+    """The laser. Its attributes are the truth that tests look at; the driver sees only what it says.
+
+    on_emission(emits, now_s) is called whenever power or emission change. channel: it hangs on a Remote, in this slot.
+    """
+
+    def __init__(
+        self,
+        *,
+        handshake: bool = True,
+        channel: int | None = None,
+        serial: str = "123456789012",
+        least_power_w: float = 0.002,
+        max_power_w: float = 0.11,
+        warm_up_s: float = 0.0,
+        cdrh_delay_s: float = 5.0,
+        on_emission: Callable[[bool, float], None] | None = None,
+    ) -> None:
+        self.handshake = handshake
+        self.channel = channel
+        self.serial = serial
+        self.least_power_w = least_power_w
+        self.max_power_w = max_power_w
+        self.cdrh_delay_s = cdrh_delay_s
+        self.on_emission = on_emission
+        self.key_on = True
+        self.interlock_open = False
+        self.fault = 0
+        self.state_on = False
+        self.mode = "CWP"
+        self.set_power_w = least_power_w
+        self.cdrh = True
+        self.autostart = False
+        self.tec = True
+        self.base_c = 24.6
+        self.forbidden: list[str] = []
+        self.commands: list[str] = []
+        self._warm_up_s = warm_up_s
+        self._warm_at_s: float | None = None
+        self._lit_at_s: float | None = None
+        self._now_s = 0.0
+        self._pending = ""
+        self._shown = (False, 0.0)
+
+    @property
+    def warm(self) -> bool:
+        """The warm-up is over."""
+        return self._warm_at_s is not None and self._now_s >= self._warm_at_s
+
+    @property
+    def able(self) -> bool:
+        """Nothing forbids emission."""
+        return self.key_on and not self.interlock_open and not self.fault
+
+    @property
+    def emitting(self) -> bool:
+        """It would shine through an open gate."""
+        return self.able and self.state_on and self._lit_at_s is not None and self._now_s >= self._lit_at_s
+
+    @property
+    def gated(self) -> bool:
+        """The TTL input governs the light."""
+        return self.mode == "DIGITAL"
+
+    @property
+    def power_w(self) -> float:
+        """Light that comes out now, through an open gate where it is gated, in W."""
+        return self.set_power_w if self.emitting else 0.0
+
+    def shine(self, power_w: float, *, gated: bool = True) -> None:
+        """Put it on, as somebody before us may have left it."""
+        self.state_on = True
+        self._warm_at_s = self._lit_at_s = float("-inf")
+        self.mode = "DIGITAL" if gated else "CWP"
+        self.set_power_w = power_w
+
+    def open_interlock(self, now_s: float) -> None:
+        """A door opens: off until somebody says ON again."""
+        self.tick(now_s)
+        self.interlock_open = True
+        self._switch(False)
+        self._tell()
+
+    def receive(self, data: bytes, now_s: float) -> bytes:
+        """Commands in, replies out."""
+        self.tick(now_s)
+        self._pending += data.decode("ascii", "replace")
+        out = ""
+        while (found := _COMMAND.match(self._pending.lstrip("\r\n"))) is not None:
+            self._pending = self._pending.lstrip("\r\n")[found.end() :]
+            out += self._reply(found[0].strip().upper())
+        self._tell()
+        return out.encode("ascii")
+
+    def tick(self, now_s: float) -> bytes:
+        """Warm-up and delay end; the laser never speaks unasked."""
+        self._now_s = now_s
+        if self._warm_at_s is None:
+            self._warm_at_s = now_s + self._warm_up_s
+        if self.state_on and self._lit_at_s is None and self.warm and self.able:
+            self._lit_at_s = now_s + (self.cdrh_delay_s if self.cdrh else 0.0)
+        self._tell()
+        return b""
+
+    def _reply(self, command: str) -> str:
+        self.commands.append(command)
+        address = _ADDRESS.match(command)
+        bare = _ADDRESS.sub(r"\1", command)
+        if bare in FORBIDDEN:
+            self.forbidden.append(bare)
+        for_laser = self.channel is None or (address is not None and address[2] == str(self.channel))
+        said = self._query(bare, for_laser) if command.endswith("?") else None
+        if said is not None:
+            return f"{said}\r\n" + ("OK\r\n" if self.handshake else "")
+        if command.endswith("?"):
+            return "ERR-100\r\n"
+        error = self._set(bare) if for_laser else -100
+        if not self.handshake:
+            return ""
+        return f"ERR{error}\r\n" if error else "OK\r\n"
+
+    def _query(self, command: str, for_laser: bool) -> str | None:
+        if command == "SYST:COMM:HAND?":
+            return "ON" if self.handshake else "OFF"
+        if command == "*IDN?":
+            return "Coherent, Inc - OBIS " + ("488nm 100mW C" if self.channel is None else "Remote") + " - V1.8.2"
+        return self._query_laser(command) if for_laser else None
+
+    def _query_laser(self, command: str) -> str | None:
+        match command:
+            case "SYST:INF:MOD?":
+                return "OBIS 488nm 100mW"
+            case "SYST:INF:SNUM?":
+                return self.serial
+            case "SYST:INF:FVER?":
+                return "V1.8.2"
+            case "SYST:STAT?":
+                return f"{self._bits():08X}"
+            case "SYST:FAUL?":
+                return f"{self.fault:08X}"
+            case "SYST:LOCK?":
+                return "OFF" if self.interlock_open else "ON"
+            case "SYST:CDRH?":
+                return _switch(self.cdrh)
+            case "SYST:AUT?":
+                return _switch(self.autostart)
+            case "SOUR:AM:STAT?":
+                return _switch(self.state_on)
+            case "SOUR:AM:SOUR?":
+                return self.mode
+            case "SOUR:POW:LEV:IMM:AMPL?":
+                return f"{self.set_power_w:.5f}"
+            case "SOUR:POW:LEV?":
+                return f"{self.power_w:.5f}"
+            case "SOUR:POW:LIM:LOW?":
+                return f"{self.least_power_w:.5f}"
+            case "SOUR:POW:LIM:HIGH?":
+                return f"{self.max_power_w:.5f}"
+            case "SOUR:POW:NOM?":
+                return f"{self.max_power_w / 1.1:.5f}"
+            case "SOUR:TEMP:APR?":
+                return _switch(self.tec)
+            case "SOUR:TEMP:BAS?":
+                return f"{self.base_c:.1f}C"
+        return None
+
+    def _bits(self) -> int:
+        bits = OFF_BITS
+        bits |= 0x1 if self.fault else 0
+        bits |= 0x2 if self.emitting else 0
+        bits |= 0x4 if self.warm and self.able and not self.state_on else 0
+        bits |= 0x8 if not self.able else 0
+        bits |= 0x10 if self.state_on and self._lit_at_s is not None and not self.emitting and self.able else 0
+        bits |= 0x100 if not self.warm else 0
+        bits |= 0x400 if self.mode == "DIGITAL" else 0
+        bits |= 0x0200_0000 if not self.key_on else 0
+        bits |= 0x0400_0000 if self.interlock_open else 0
+        return bits
+
+    def _set(self, command: str) -> int:
+        """Error number, 0 for none."""
+        name, _, value = command.partition(" ")
+        if not value:
+            return -109
+        match name:
+            case "SOUR:AM:STAT" if value in ("ON", "OFF"):
+                if value == "ON" and not self.able:
+                    return -200
+                self._switch(value == "ON")
+            case "SOUR:AM:EXT" if value in ("DIG", "ANAL", "MIX"):
+                return self._change_mode({"DIG": "DIGITAL", "ANAL": "ANALOG", "MIX": "MIXED"}[value])
+            case "SOUR:AM:INT" if value in ("CWP", "CWC"):
+                return self._change_mode(value)
+            case "SOUR:POW:LEV:IMM:AMPL":
+                return self._change_power(value)
+            case "SYST:CDRH" if value in ("ON", "OFF"):
+                self.cdrh = value == "ON"
+            case "SYST:AUT" if value in ("ON", "OFF"):
+                self.autostart = value == "ON"
+            case "SOUR:TEMP:APR" if value in ("ON", "OFF"):
+                self.tec = value == "ON"
+            case _:
+                return -100
+        return 0
+
+    def _switch(self, on: bool) -> None:
+        if on != self.state_on:
+            self._lit_at_s = None
+        self.state_on = on
+        self.tick(self._now_s)
+
+    def _change_mode(self, mode: str) -> int:
+        if self.state_on:
+            return -200
+        self.mode = mode
+        return 0
+
+    def _change_power(self, value: str) -> int:
+        try:
+            power_w = float(value)
+        except ValueError:
+            return -220
+        if not self.least_power_w <= power_w <= self.max_power_w:
+            return -220
+        self.set_power_w = power_w
+        return 0
+
+    def _tell(self) -> None:
+        shown = (self.emitting, self.power_w)
+        if shown != self._shown:
+            self._shown = shown
+            if self.on_emission is not None:
+                self.on_emission(self.emitting, self._now_s)
+
+
+def _switch(on: bool) -> str:
+    return "ON" if on else "OFF"

@@ -1,0 +1,396 @@
+"""The PrawnDO firmware 1.3 as a model: its commands, its program player and the levels of its outputs over time.
+
+Facts: hardware.md section 5.1; from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd (BSD).
+Its traps are here on purpose: a level trigger, short words that become waits, `abt` that leaves the outputs alone,
+`adm` that swallows everything until its last byte has come, an external clock that is taken on trust.
+"""
+
+from bisect import bisect_right
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.interfaces import OUT_GATE
+
+STOPPED, STARTING, RUNNING, ABORT_REQUESTED, ABORTED = 0, 1, 2, 3, 5
+"""Values of `run-status` that an onlooker can meet."""
+
+INTERNAL_HZ = 100_000_000
+MAX_WORDS = {1: 30_000, 2: 60_000}
+"""Words that a Pico (1) and a Pico 2 (2) hold."""
+MIN_CYCLES = 5
+BYTES_PER_WORD = 6
+LINE_BYTES = 256
+"""Size of the firmware's line buffer."""
+CLOCK_LIMIT_HZ = {1: 133_000_000, 2: 150_000_000}
+BANNER = b"Prawn Digital Output online\r\n"
+
+Trigger = Callable[[float, float], float | None]
+"""The first time in [from, until) at which the trigger input is high; None: it stays low."""
+
+
+class TriggerLine:
+    """A trigger input that is switched by hand, in order of time."""
+
+    def __init__(self) -> None:
+        self._edges: list[tuple[float, bool]] = []
+
+    def set(self, high: bool, at_s: float) -> None:
+        """Switch it at a time not before the last one."""
+        self._edges.append((at_s, high))
+
+    def pulse(self, at_s: float, width_s: float) -> None:
+        """High for `width_s` from `at_s` on."""
+        self.set(True, at_s)
+        self.set(False, at_s + width_s)
+
+    def __call__(self, from_s: float, until_s: float) -> float | None:
+        """As `Trigger`."""
+        index = bisect_right(self._edges, from_s, key=lambda edge: edge[0]) - 1
+        if index >= 0 and self._edges[index][1]:
+            return from_s
+        return next((at for at, high in self._edges[index + 1 :] if high and at < until_s), None)
+
+
+@dataclass(slots=True)
+class _Run:
+    """A program being played. Its present word began at `since_s`; before the first one, `index` is -1."""
+
+    index: int
+    since_s: float
+
+
+class PrawnDoModel:
+    """The firmware and the pins. Times are seconds of whatever clock the wire runs on; they never decrease.
+
+    trigger: what drives GPIO16. board: 1 for a Pico, 2 for a Pico 2. external_clock_hz: what is connected to GPIO20.
+    on_gate: told each change of the gate output and its time, in order, as soon as the model has been advanced over it.
+    """
+
+    def __init__(
+        self,
+        trigger: Trigger | None = None,
+        *,
+        board: int = 1,
+        version: str = "1.3.1",
+        external_clock_hz: int | None = None,
+        on_gate: Callable[[bool, float], None] | None = None,
+    ) -> None:
+        self._trigger = trigger or TriggerLine()
+        self._board = board
+        self._version = version
+        self.external_clock_hz = external_clock_hz
+        self._on_gate = on_gate
+        self._times: list[float] = [float("-inf")]
+        self._levels: list[int] = [0]
+        self._restart()
+
+    def _restart(self) -> None:
+        """State at power-up."""
+        self.status = STOPPED
+        self.clock_external = False
+        self.clock_hz = INTERNAL_HZ
+        self.words: list[tuple[int, int]] = []
+        self._run: _Run | None = None
+        self._line = bytearray()
+        self._missing = 0  # bytes that `adm` still waits for
+        self._binary = bytearray()
+        self._short_words = 0
+        self._adding = False
+        self._unasked = b""
+
+    # The wire
+
+    def receive(self, data: bytes, now_s: float) -> bytes:
+        """Take bytes from the host; returns the answers of all lines that are complete."""
+        self._settle(now_s)
+        answer = b""
+        while data:
+            if self._missing:
+                taken, data = data[: self._missing], data[self._missing :]
+                answer += self._take_words(taken)
+                continue
+            end = data.find(b"\n")
+            room = LINE_BYTES - 1 - len(self._line)
+            cut = min(room, len(data) if end < 0 else end + 1)
+            self._line += data[:cut]
+            data = data[cut:]
+            if self._line.endswith(b"\n") or len(self._line) >= LINE_BYTES - 1:
+                line, self._line = self._line.decode("latin-1").rstrip("\r\n"), bytearray()
+                answer += self._answer(line, now_s)
+        return answer
+
+    def tick(self, now_s: float) -> bytes:
+        """Play on to `now_s`; returns what the firmware prints of its own accord."""
+        self._settle(now_s)
+        unasked, self._unasked = self._unasked, b""
+        return unasked
+
+    # The pins
+
+    def outputs_at(self, at_s: float) -> int:
+        """Levels of the sixteen outputs at a time that the model has been advanced to."""
+        return self._levels[bisect_right(self._times, at_s) - 1]
+
+    def gate_level(self, at_s: float) -> bool:
+        """Whether the gate output is high then."""
+        return bool(self.outputs_at(at_s) & OUT_GATE)
+
+    def changes(self, from_s: float, until_s: float) -> list[tuple[float, int]]:
+        """The level at `from_s`, then each change before `until_s`: (time, outputs)."""
+        first = bisect_right(self._times, from_s)
+        last = bisect_right(self._times, until_s)
+        return [(from_s, self._levels[first - 1]), *zip(self._times[first:last], self._levels[first:last], strict=True)]
+
+    def forget(self, before_s: float) -> None:
+        """Drop history that nobody asks for any more."""
+        keep = bisect_right(self._times, before_s) - 1
+        del self._times[:keep], self._levels[:keep]
+
+    # What happens to the device
+
+    def power_cycle(self, at_s: float) -> None:
+        """Power lost and back: pull-downs hold the outputs low until the firmware drives them low again."""
+        self.advance(at_s)
+        self._restart()
+        self._set_outputs(0, at_s)
+        self._unasked = BANNER
+
+    def lose_external_clock(self) -> None:
+        """The clock on GPIO20 dies: the firmware goes on with its own and says so, unasked."""
+        self.external_clock_hz = None
+        if self.clock_external:
+            self._resuscitate()
+
+    # The player
+
+    def advance(self, until_s: float) -> None:
+        """Play the program up to `until_s`."""
+        while self._run is not None and self.status in (STARTING, RUNNING):
+            run = self._run
+            if run.index >= len(self.words):
+                return  # no terminator: the state machine waits for more words for ever
+            if run.index < 0 or self._waits(run.index):
+                found = self._trigger(run.since_s, until_s)
+                if found is None:
+                    return
+                self._enter(run.index + 1, found)
+            else:
+                end_s = run.since_s + self.words[run.index][1] / self.clock_hz
+                if end_s > until_s:
+                    return
+                self._enter(run.index + 1, end_s)
+
+    def _waits(self, index: int) -> bool:
+        return self.words[index][1] == 0
+
+    def _enter(self, index: int, at_s: float) -> None:
+        """The player reaches a word. Two words of zero cycles in a row end it on the level of the first one."""
+        self._run = _Run(index, at_s)
+        if index >= len(self.words):
+            return
+        self._set_outputs(self.words[index][0], at_s)
+        if self._waits(index) and index + 1 < len(self.words) and self._waits(index + 1):
+            self._run = None
+            self.status = STOPPED
+
+    def _set_outputs(self, level: int, at_s: float) -> None:
+        before = self._levels[-1]
+        if level == before:
+            return
+        self._times.append(at_s)
+        self._levels.append(level)
+        if self._on_gate is not None and (level ^ before) & OUT_GATE:
+            self._on_gate(bool(level & OUT_GATE), at_s)
+
+    def _settle(self, now_s: float) -> None:
+        """The second core acts on what the first one asked of it before the next bytes came."""
+        if self.status == ABORT_REQUESTED:
+            self.status = ABORTED
+        self.advance(now_s)
+        if self.status == STARTING:
+            self.status = RUNNING
+
+    # The commands
+
+    def _answer(self, line: str, now_s: float) -> bytes:
+        line = line.partition("\0")[0]  # a C string
+        if self._adding:
+            return self._add(line)
+        name = line[:3]
+        if len(line) < 3:
+            return _said(f"Invalid command: {line}")
+        if name in _ANY_TIME:
+            return _ANY_TIME[name](self, now_s)
+        if self.status not in (STOPPED, ABORTED):
+            return _said(f"Cannot execute command {line} during buffered execution.")
+        if name in _WHEN_IDLE:
+            return _WHEN_IDLE[name](self, line, now_s)
+        return _said(f"Invalid command: {line}")
+
+    def _version_line(self, now_s: float) -> bytes:
+        return _said(f"Version: {self._version}")
+
+    def _board_line(self, now_s: float) -> bytes:
+        return _said(f"board: pico{self._board}")
+
+    def _status_line(self, now_s: float) -> bytes:
+        return _said(f"run-status:{self.status} clock-status:{int(self.clock_external)}")
+
+    def _debug(self, now_s: float) -> bytes:
+        return _said("ok")
+
+    def _abort(self, now_s: float) -> bytes:
+        if self.status not in (STARTING, RUNNING):
+            return _said("Can only abort when status is 1 or 2")
+        self._run = None  # the outputs stay as they are
+        self.status = ABORT_REQUESTED
+        return _said("ok")
+
+    def _clear(self, line: str, now_s: float) -> bytes:
+        self.words.clear()
+        return _said("ok")
+
+    def _hardware_start(self, line: str, now_s: float) -> bytes:
+        self.status = STARTING
+        self._run = _Run(-1, now_s)
+        return _said("ok")
+
+    def _software_start(self, line: str, now_s: float) -> bytes:
+        self.status = STARTING
+        self._run = _Run(-1, now_s)
+        self._enter(0, now_s)
+        return _said("ok")
+
+    def _manual(self, line: str, now_s: float) -> bytes:
+        (level,) = _numbers(line, 16, 1) or (None,)
+        if level is None:
+            return _said("invalid request")
+        self._set_outputs(level & 0xFFFF, now_s)
+        return _said("ok")
+
+    def _pins(self, line: str, now_s: float) -> bytes:
+        return _said(f"{self.outputs_at(now_s):x}")
+
+    def _length(self, line: str, now_s: float) -> bytes:
+        return _said(f"Number of command lines: {2 * len(self.words)}", f"Number of instructions: {len(self.words)}")
+
+    def _dump(self, line: str, now_s: float) -> bytes:
+        lines = ((f"do_cmd: {word:04x}", f"\treps: {cycles:x}" if cycles else "\tWait") for word, cycles in self.words)
+        return b"".join(_said(*pair) for pair in lines)
+
+    def _start_adding(self, line: str, now_s: float) -> bytes:
+        self._adding = True
+        return b""
+
+    def _add(self, line: str) -> bytes:
+        if line.startswith("end"):
+            self._adding = False
+            return _said("ok")
+        numbers = _numbers(f"add {line}", 16, 2)
+        if numbers is None:
+            return b""
+        word, cycles = numbers
+        if word > 0xFFFF or 0 < cycles < MIN_CYCLES:
+            self._adding = False
+            what = f"Invalid output specification {word:x}" if word > 0xFFFF else _short(cycles)
+            return _said(what)
+        self.words.append((word, cycles))
+        return b""
+
+    def _add_many(self, line: str, now_s: float) -> bytes:
+        numbers = _numbers(line, 16, 2)
+        if numbers is None:
+            return _said("Invalid request")
+        start, count = numbers
+        if start + count > MAX_WORDS[self._board]:
+            return _said(f"Invalid address and/or too many instructions ({start} + {count}).")
+        del self.words[start:]
+        self._missing = count * BYTES_PER_WORD
+        self._binary.clear()
+        self._short_words = 0
+        return _said("ready") if count else _said("ready", "ok")
+
+    def _take_words(self, data: bytes) -> bytes:
+        self._binary += data
+        self._missing -= len(data)
+        if self._missing:
+            return b""
+        read = np.frombuffer(bytes(self._binary), [("outputs", "<u2"), ("cycles", "<u4")])
+        short = (read["cycles"] > 0) & (read["cycles"] < MIN_CYCLES)
+        cycles = np.where(short, 0, read["cycles"])  # a word too short becomes a wait, and the program is kept
+        self.words += zip(read["outputs"].tolist(), cycles.tolist(), strict=True)
+        if not short.any():
+            return _said("ok")
+        last = int(np.flatnonzero(short)[-1])
+        return _said(
+            f"Invalid number of reps in {int(short.sum())} instructions, most recent error at instruction {last}. "
+            "Setting reps to zero for these instructions."
+        )
+
+    def _clock(self, line: str, now_s: float) -> bytes:
+        numbers = _numbers(line, 10, 2)
+        if numbers is None:
+            return _said("invalid clock request")
+        source, hz = numbers
+        if source > 2:
+            return _said("invalid clock source request")
+        if hz > CLOCK_LIMIT_HZ[self._board]:
+            return _said("invalid clock frequency request")
+        self.clock_external = source != 0
+        self.clock_hz = hz
+        if self.clock_external and self.external_clock_hz is None:  # says ok all the same, then finds out
+            self._resuscitate()
+        return _said("ok")
+
+    def _resuscitate(self) -> None:
+        self.clock_external = False
+        self.clock_hz = INTERNAL_HZ
+        self._unasked += _said("System Clock Resus'd")
+
+    def _frequencies(self, line: str, now_s: float) -> bytes:
+        sys_khz = (self.external_clock_hz or 0) // 1000 if self.clock_external else self.clock_hz // 1000
+        names = ("pll_sys", "pll_usb", "rosc", "clk_sys", "clk_peri", "clk_usb", "clk_adc", "clk_rtc")
+        khz = (100_000, 48_000, 5_000, sys_khz, 48_000, 48_000, 48_000, 46)
+        return _said(*(f"{name} = {value}kHz" for name, value in zip(names, khz, strict=True)))
+
+
+_ANY_TIME: dict[str, Callable[[PrawnDoModel, float], bytes]] = {
+    "ver": PrawnDoModel._version_line,
+    "brd": PrawnDoModel._board_line,
+    "sts": PrawnDoModel._status_line,
+    "deb": PrawnDoModel._debug,
+    "ndb": PrawnDoModel._debug,
+    "abt": PrawnDoModel._abort,
+}
+_WHEN_IDLE: dict[str, Callable[[PrawnDoModel, str, float], bytes]] = {
+    "cls": PrawnDoModel._clear,
+    "run": PrawnDoModel._hardware_start,
+    "swr": PrawnDoModel._software_start,
+    "man": PrawnDoModel._manual,
+    "gto": PrawnDoModel._pins,
+    "len": PrawnDoModel._length,
+    "dmp": PrawnDoModel._dump,
+    "add": PrawnDoModel._start_adding,
+    "adm": PrawnDoModel._add_many,
+    "clk": PrawnDoModel._clock,
+    "frq": PrawnDoModel._frequencies,
+}
+
+
+def _said(*lines: str) -> bytes:
+    return "".join(f"{line}\r\n" for line in lines).encode("latin-1")
+
+
+def _short(cycles: int) -> str:
+    return f"Reps must be 0 or greater than 4, got {cycles:x}"
+
+
+def _numbers(line: str, base: int, count: int) -> tuple[int, ...] | None:
+    """The arguments of a command; None where fewer than `count` can be read."""
+    try:
+        numbers = tuple(int(text, base) for text in line.split()[1 : count + 1])
+    except ValueError:
+        return None
+    return numbers if len(numbers) == count else None

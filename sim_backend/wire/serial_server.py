@@ -1,0 +1,216 @@
+"""Serves a model of a serial device on a pseudo terminal: the real driver opens it with the real pyserial.
+
+Replies leave at 10 bits a character, in the host's time, as through a UART (a virtual COM port is faster, and no driver
+may depend on that). The model's own time comes from a clock, so that a warm-up of minutes costs a test nothing.
+A pseudo terminal ignores the baud rate. The path is a link that survives unplugging and plugging in again.
+"""
+
+import os
+import select
+import tempfile
+import threading
+import time
+import tty
+from collections import deque
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+from drivers.clock import NS_PER_S, Clock, SystemClock
+from drivers.transports.endpoints import Endpoint
+from sim_backend.wire.faults import Fault, FaultSchedule
+
+BITS_PER_CHARACTER = 10
+"""8N1: a start bit, eight data bits, a stop bit."""
+_TURN_S = 0.001
+"""One turn of the serving thread while bytes are on their way."""
+_IDLE_S = 0.01
+"""One turn while nothing happens: how late a model's own events come at most."""
+
+
+class SerialModel(Protocol):
+    """The firmware of a serial device: a pure state machine fed with bytes and a time. No threads, no waiting."""
+
+    def receive(self, data: bytes, now_s: float) -> bytes:
+        """Take bytes from the host, in pieces of any size; returns what the device answers."""
+        ...
+
+    def tick(self, now_s: float) -> bytes:
+        """Let time pass; returns what the device sends unasked."""
+        ...
+
+
+class SerialServer:
+    """A serial device on a wire of its own, from entering the `with` block (or `start`) to leaving it (`close`)."""
+
+    def __init__(
+        self,
+        model: SerialModel,
+        *,
+        clock: Clock | None = None,
+        baud: int = 115_200,
+        faults: FaultSchedule | None = None,
+    ) -> None:
+        self.model = model
+        self.lock = threading.RLock()
+        """Held around every call of the model; hold it to look at more than one of its attributes."""
+        self.faults = faults
+        self._clock = clock or SystemClock()
+        self._characters_per_s = baud / BITS_PER_CHARACTER
+        self._folder = tempfile.TemporaryDirectory(prefix="spadrig-tty-")
+        self._master: int | None = None
+        self._slave: int | None = None
+        self._outbox: deque[tuple[float, bytes]] = deque()
+        self._line_free_at = 0.0
+        self._hung = False
+        self._waiting = threading.Lock()
+        self._wake_in, self._wake_out = os.pipe()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="serial server", daemon=True)
+
+    @property
+    def path(self) -> str:
+        """Where pyserial finds the device while it is plugged in."""
+        return str(Path(self._folder.name) / "tty")
+
+    @property
+    def endpoint(self) -> Endpoint:
+        """The same for `Surroundings.ports`."""
+        return Endpoint(self.path, emulated=True)
+
+    def start(self) -> Self:
+        """Plug it in and serve it on a thread of its own."""
+        self.plug()
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Unplug it for good; again: nothing happens."""
+        self._ending.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self.unplug()
+        if self._wake_in >= 0:
+            os.close(self._wake_in)
+            os.close(self._wake_out)
+            self._wake_in = self._wake_out = -1
+        self._folder.cleanup()
+
+    def __enter__(self) -> Self:
+        """The server, serving."""
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()
+
+    def plug(self) -> None:
+        """Put the cable in. The device kept its power: its state is what it was."""
+        with self.lock:
+            if self._master is not None:
+                return
+            self._master, self._slave = os.openpty()
+            tty.setraw(self._slave)  # without it the terminal would echo what the device says before anybody opened it
+            os.set_blocking(self._master, False)
+            os.symlink(os.ttyname(self._slave), self.path)
+
+    def unplug(self) -> None:
+        """Pull the cable: the open port is lost, bytes on their way with it."""
+        with self.lock:
+            if self._master is None or self._slave is None:
+                return
+            os.unlink(self.path)
+            self._outbox.clear()
+            os.write(self._wake_out, b"w")
+            with self._waiting:  # a terminal that somebody waits on stays open, and the cable would still be in
+                os.close(self._slave)
+                os.close(self._master)
+                self._master = self._slave = None
+
+    def hang(self) -> None:
+        """The firmware hangs: nothing is taken and nothing said, outputs stay as they are."""
+        with self.lock:
+            self._hung = True
+            self._outbox.clear()
+
+    def resume(self) -> None:
+        """End a hang."""
+        with self.lock:
+            self._hung = False
+
+    def _serve(self) -> None:
+        while not self._ending.is_set():
+            with self.lock:
+                master = None if self._hung else self._master
+                if master is not None:
+                    self._turn(master)
+                wait_s = _TURN_S if self._outbox else _IDLE_S
+            if master is None:
+                self._ending.wait(_IDLE_S)
+            else:
+                self._await_input(master, wait_s)
+
+    def _await_input(self, master: int, wait_s: float) -> None:
+        with self._waiting:
+            if self._master != master:
+                return  # unplugged
+            readable, _, _ = select.select([master, self._wake_in], [], [], wait_s)
+            if self._wake_in in readable:
+                os.read(self._wake_in, 64)
+
+    def _turn(self, master: int) -> None:
+        """Take what came, let the model answer, send what is due."""
+        now_s = self._clock.now_ns() / NS_PER_S
+        self._reply(self.model.tick(now_s))
+        try:
+            data = os.read(master, 4096)
+        except OSError:
+            data = b""  # nothing there, or nobody has the port open
+        if data:
+            self._reply(self.model.receive(data, now_s))
+        if self._master is not None:  # a fault may just have unplugged it
+            self._send_due(self._master)
+
+    def _reply(self, reply: bytes) -> None:
+        """Queue a reply, as the faults would have it."""
+        if not reply:
+            return
+        now = time.monotonic()
+        fault = self.faults.next() if self.faults is not None else None
+        if self.faults is None:
+            self._queue(now, reply)
+        elif fault is Fault.UNPLUG:
+            self.unplug()
+        elif fault is Fault.HANG:
+            self.hang()
+        else:
+            if fault is Fault.STALL:
+                self._line_free_at = max(self._line_free_at, now) + self.faults.stall_s
+            for delivery in self.faults.shape(fault, reply):
+                self._queue(now + delivery.delay_s, delivery.data)
+
+    def _queue(self, at: float, data: bytes) -> None:
+        """Bytes leave in order, no faster than the line carries them."""
+        self._line_free_at = max(self._line_free_at, at)
+        self._outbox.append((self._line_free_at, data))
+        self._line_free_at += len(data) / self._characters_per_s
+
+    def _send_due(self, master: int) -> None:
+        now = time.monotonic()
+        while self._outbox and self._outbox[0][0] <= now:
+            starts_at, data = self._outbox.popleft()
+            n_due = max(1, int((now - starts_at) * self._characters_per_s))
+            sent = self._send(master, data[:n_due])
+            if sent < len(data):
+                self._outbox.appendleft((starts_at + sent / self._characters_per_s, data[sent:]))
+                return
+
+    def _send(self, master: int, data: bytes) -> int:
+        try:
+            return os.write(master, data)
+        except BlockingIOError:
+            return 0  # nobody reads: the terminal's buffer is full
+        except OSError:
+            return len(data)  # nobody has the port open: the bytes go nowhere

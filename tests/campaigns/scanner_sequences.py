@@ -1,0 +1,182 @@
+"""Random faults on a scanner's USB cable: every sequence ends right, or with one of our errors, in time.
+
+Runs on a virtual clock, so that seconds of silence cost nothing. 'Right' is judged by what the DAC put out, not by what
+the driver says: where no error and no fault is told, the lit points are the waveform, all of it, without a seam.
+"""
+
+import argparse
+import random
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drivers.clock import VirtualClock
+from drivers.errors import DeviceError
+from drivers.interfaces import MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
+from sim_backend.wire.dac_history import DacHistory
+from sim_backend.wire.faults import Fault, FaultSchedule
+from sim_backend.wire.usb_faults import FaultyUsb
+from sim_backend.wire.usb_model import UsbModel
+from tests.wire.scanners import Plugged, open_scanner, plug
+
+POINTS, LINE_POINTS, RATE_HZ = 700, 50, 25_000.0
+DEADLINE_S = 30.0
+"""Of virtual time, for a whole sequence: some ten verbs, each of which may wait for two frames and two seconds."""
+HANG_S = 20.0
+"""Of real time."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A scanner kind under test.
+
+    model: a firmware and its output's record. scan, lit: lines of the record: the markers, and one that is high all
+    through the waveform. tolerance: of the mirror's drive.
+    """
+
+    kind: str
+    model: Callable[[], tuple[UsbModel, DacHistory]]
+    config: dict[str, object]
+    scan: int
+    line: int
+    lit: int
+    tolerance: float
+
+
+@dataclass
+class Outcomes:
+    """How the sequences ended, and those that ended wrong: (seed, why)."""
+
+    ends: Counter[str] = field(default_factory=Counter)
+    wrong: list[tuple[int, str]] = field(default_factory=list)
+
+
+def wave(device: BeamScanner) -> ScanWaveform:
+    """A seamless cosine."""
+    at = np.arange(POINTS)
+    markers = np.where(at % LINE_POINTS == 0, MARKER_LINE, 0).astype(np.uint8)
+    markers[0] |= MARKER_SCAN
+    return ScanWaveform(-0.5 * np.cos(2 * np.pi * at / POINTS), markers, device.point_clock(RATE_HZ))
+
+
+def sequence(subject: Subject, seed: int) -> tuple[str, str | None]:
+    """How one sequence ended, and what was wrong with that, if anything."""
+    rng = random.Random(seed)
+    probability = rng.choice((0.003, 0.01, 0.05, 0.3))
+    schedule = FaultSchedule(
+        seed, probability, tuple(Fault), skip=rng.randrange(60), most=rng.randrange(1, 5), late_s=0.05, stall_s=0.3
+    )
+    clock = VirtualClock()
+    model, history = subject.model()
+    plugged = plug(FaultyUsb(model, schedule, late_s=rng.choice((0.001, 0.02, 0.2))), clock)
+    foreign: list[str] = []
+    before = threading.excepthook
+    threading.excepthook = lambda what: foreign.append(f"in a thread: {what.exc_type.__name__}: {what.exc_value}")
+    try:
+        end, wrong = _judged(subject, rng, plugged, history)
+    except DeviceError as error:
+        end, wrong = type(error).__name__, None if "\n" not in str(error) else "an error of several lines"
+    except Exception as error:
+        end, wrong = "foreign", f"{type(error).__name__}: {error}"
+    finally:
+        threading.excepthook = before
+    if foreign:
+        wrong = foreign[0]
+    took_s = plugged.now_s()
+    return end, wrong or (f"took {took_s:.1f} s" if took_s > DEADLINE_S else None)
+
+
+def _judged(subject: Subject, rng: random.Random, plugged: Plugged, history: DacHistory) -> tuple[str, str | None]:
+    with open_scanner(subject.kind, plugged.bus, plugged.clock, **subject.config) as device:
+        for _ in range(rng.randrange(1, 3)):
+            repeats = rng.randrange(3, 8)
+            waveform = wave(device)
+            clock = device.load(waveform, repeats)
+            began_s = plugged.now_s()
+            device.start()
+            stopped = rng.random() < 0.3
+            if stopped:
+                time.sleep(rng.random() * 0.003)
+                device.stop()
+            elif not _wait(device):
+                return "hang", "the run does not end"
+            fault = device.status.fault
+            if fault is not None:
+                return "fault", None if "\n" not in fault else "a fault of several lines"
+            wrong = _compare(subject, history, waveform, repeats, float(clock), began_s, plugged.now_s(), stopped)
+            if wrong is not None:
+                return "complete", wrong
+            if rng.random() < 0.5:
+                device.park()
+    return "complete", None
+
+
+def _wait(device: BeamScanner) -> bool:
+    end = time.monotonic() + HANG_S
+    while device.status.moving:
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.0005)
+    return True
+
+
+def _compare(
+    subject: Subject,
+    history: DacHistory,
+    waveform: ScanWaveform,
+    repeats: int,
+    rate_hz: float,
+    began_s: float,
+    now_s: float,
+    stopped: bool,
+) -> str | None:
+    """What is wrong with the lit points that came out."""
+    starts = history.rising(subject.scan, began_s, now_s + 1)
+    if stopped and not len(starts):
+        return None
+    if not stopped and len(starts) != repeats:
+        return f"{len(starts)} of {repeats} scans came out"
+    lines = (history.rising(subject.line, began_s, now_s + 1) - starts[0]) * rate_hz
+    if np.abs(lines - np.arange(len(lines)) * LINE_POINTS).max(initial=0) > 0.01:
+        return "line markers came at other points"
+    # A brake may begin right behind the last marker.
+    at = np.arange(round(lines[-1]) + 1 if stopped else repeats * POINTS)
+    times = starts[0] + (at + 0.5) / rate_hz
+    lit = history.level(subject.lit, times) > 0
+    if not stopped and not lit.all():
+        return f"only {int(lit.sum())} of {len(lit)} points came out"
+    if (np.diff(lit.astype(np.int8)) > 0).any():
+        return "the light went out and came again"
+    out = history.command(times)[lit]
+    error = np.abs(out - np.tile(waveform.command, repeats)[at][lit]).max(initial=0)
+    return f"the mirror was off by {error:g}" if error > subject.tolerance else None
+
+
+def campaign(subject: Subject, sequences: int, seed: int) -> Outcomes:
+    """All sequences, one after the other."""
+    outcomes = Outcomes()
+    for number in range(seed * 1_000_000, seed * 1_000_000 + sequences):
+        end, wrong = sequence(subject, number)
+        outcomes.ends[end] += 1
+        if wrong is not None:
+            outcomes.wrong.append((number, wrong))
+    return outcomes
+
+
+def run(subject: Subject, description: str) -> int:
+    """The command line: how the sequences ended; 1 where one ended wrong."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sequences", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=1)
+    asked = parser.parse_args()
+    outcomes = campaign(subject, asked.sequences, asked.seed)
+    print(", ".join(f"{end}: {n}" for end, n in outcomes.ends.most_common()))
+    for number, why in outcomes.wrong:
+        print(f"sequence {number}: {why}", file=sys.stderr)
+    print(f"{len(outcomes.wrong)} of {asked.sequences} ended wrong")
+    return 1 if outcomes.wrong else 0

@@ -1,0 +1,64 @@
+"""The guard's decision, in no time: what is silence, and what only looks like it."""
+
+import pytest
+
+from drivers.guard.watch import MAX_STEP_S, TICK_S, FrameWatch, GuardLimits
+
+LIMITS = GuardLimits(frames_within_s=0.06, busy_within_s=0.4, first_frame_s=1.0)
+
+
+def silence_until_trouble(watch: FrameWatch, *, busy: bool, frame: int = 1) -> float:
+    """Seconds of the same frame number until the watch complains; inf: never within 10 s."""
+    for tick in range(1000):
+        if watch.look(TICK_S, frame, False, lambda: busy) is not None:
+            return (tick + 1) * TICK_S
+    return float("inf")
+
+
+@pytest.fixture
+def watch() -> FrameWatch:
+    made = FrameWatch(LIMITS)
+    made.start(0)
+    return made
+
+
+def test_frames_that_come_are_all_it_wants(watch: FrameWatch) -> None:
+    for frame in range(1, 1000):
+        assert watch.look(TICK_S, frame, False, lambda: False) is None
+
+
+def test_an_application_asleep_has_the_short_limit(watch: FrameWatch) -> None:
+    watch.look(TICK_S, 1, False, lambda: False)
+    assert silence_until_trouble(watch, busy=False) == pytest.approx(0.065, abs=TICK_S)
+
+
+def test_one_at_work_has_the_long_one(watch: FrameWatch) -> None:
+    watch.look(TICK_S, 1, False, lambda: True)
+    assert silence_until_trouble(watch, busy=True) == pytest.approx(0.41, abs=1.5 * TICK_S)
+
+
+def test_the_first_frame_may_take_longer_and_work_is_no_excuse(watch: FrameWatch) -> None:
+    assert silence_until_trouble(watch, busy=True, frame=0) == pytest.approx(1.01, abs=1.5 * TICK_S)
+
+
+def test_a_stopped_application_is_found_at_once_frames_or_not(watch: FrameWatch) -> None:
+    assert watch.look(TICK_S, 1, True, lambda: True) == "is stopped"
+
+
+def test_a_machine_that_stood_still_is_no_silence(watch: FrameWatch) -> None:
+    watch.look(TICK_S, 1, False, lambda: False)
+    assert watch.look(60.0, 1, False, lambda: False) is None
+    assert LIMITS.frames_within_s > MAX_STEP_S
+
+
+def test_without_a_start_nothing_is_watched(watch: FrameWatch) -> None:
+    watch.stop()
+    assert watch.look(100.0, 0, True, lambda: False) is None
+    assert silence_until_trouble(watch, busy=False) == float("inf")
+
+
+def test_a_complaint_names_the_time_and_the_frame(watch: FrameWatch) -> None:
+    watch.look(TICK_S, 41, False, lambda: False)
+    for _ in range(8):
+        complaint = watch.look(TICK_S, 41, False, lambda: False)
+    assert complaint == "took no frame for 80 ms after frame 41"

@@ -1,0 +1,82 @@
+"""A laser and a gate on emulated wires in this process, and what counts: when there was light (emission AND gate)."""
+
+import bisect
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from sim_backend.wire.obis import ObisModel
+from sim_backend.wire.prawndo import PrawnDoModel
+from sim_backend.wire.serial_server import SerialServer
+
+USB_BAUD = 8_000_000
+"""A virtual COM port over USB full speed carries about 0.8 MB/s."""
+SWEEP_S = 0.012
+MARKER_S = 20e-6
+POWER_W = 0.02
+
+
+def sweeping(from_s: float, until_s: float) -> float | None:
+    """The scan marker of a mirror that sweeps for ever, as the trigger of a PrawnDO."""
+    into_s = from_s % SWEEP_S
+    first = from_s if into_s < MARKER_S else from_s - into_s + SWEEP_S
+    return first if first < until_s else None
+
+
+@dataclass
+class Line:
+    """A level over time, from the callbacks of a model."""
+
+    times: list[float] = field(default_factory=lambda: [float("-inf")])
+    levels: list[bool] = field(default_factory=lambda: [False])
+
+    def __call__(self, level: bool, at_s: float) -> None:
+        self.times.append(at_s)
+        self.levels.append(level)
+
+    def at(self, at_s: float) -> bool:
+        return self.levels[bisect.bisect_right(self.times, at_s) - 1]
+
+
+@dataclass
+class GuardedRig:
+    laser: SerialServer
+    sync: SerialServer
+    emission: Line
+    gate: Line
+
+    def light_after(self, at_s: float) -> float:
+        """Seconds from `at_s` to the last moment of light after it; 0 where there was none."""
+        last = 0.0
+        now = time.monotonic()
+        ends = [*self.gate.times[1:], now]
+        for start, end, level in zip(self.gate.times, ends, self.gate.levels, strict=True):
+            if level and end > at_s:
+                last = max([last, *(t - at_s for t in self._dark_at(max(start, at_s), end))])
+        return last
+
+    def _dark_at(self, start: float, end: float) -> Iterator[float]:
+        """Ends of light within a time of open gate."""
+        if self.emission.at(end - 1e-9):
+            yield end
+        yield from (
+            t
+            for t, level in zip(self.emission.times, self.emission.levels, strict=True)
+            if not level and start < t < end and self.emission.at(t - 1e-9)
+        )
+
+    @property
+    def light(self) -> bool:
+        """Whether light came out in the last sweeps."""
+        now = time.monotonic()
+        return self.emission.levels[-1] and self.light_after(now - 3 * SWEEP_S) > 0
+
+
+@contextmanager
+def guarded_rig() -> Iterator[GuardedRig]:
+    emission, gate = Line(), Line()
+    laser = ObisModel(cdrh_delay_s=0.0, on_emission=emission)  # a Cobolt takes 4 s to be asked about and armed
+    sync = PrawnDoModel(sweeping, board=2, on_gate=gate)
+    with SerialServer(laser) as laser_server, SerialServer(sync, baud=USB_BAUD) as sync_server:
+        yield GuardedRig(laser_server, sync_server, emission, gate)

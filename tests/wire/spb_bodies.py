@@ -1,0 +1,132 @@
+"""What the SPB1 driver does on a bus with one device, through real libusb: run in a process of its own under umockdev.
+
+`python -m tests.wire.spb_bodies CHIP` prints a JSON object {behaviour: "" or what failed}.
+"""
+
+import json
+import sys
+import traceback
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceNotFound
+from drivers.interfaces import SpadRequest, WindowTable
+from drivers.ring import BlockRing
+from drivers.spb_usb import SpbUsb, SpbUsbConfig, open_link
+from drivers.transports.bulk_link import QueuedLink
+from drivers.transports.endpoints import Endpoint
+from tests.wire.spb_device import REQUEST, require_right, take
+
+CHIP = sys.argv[1] if len(sys.argv) > 1 else "fx3"
+
+
+PULL_HEARTBEAT = "12345 ms"
+"""A run with this heartbeat makes the other side pull the cable."""
+
+
+def opened(reads: str, port: str = "usb", heartbeat: str = "1 s") -> SpbUsb:
+    config = SpbUsbConfig.model_validate({"chip": CHIP, "reads": reads, "port": port, "heartbeat": heartbeat})
+    return SpbUsb(config, open_link(config, Endpoint(port, False)))
+
+
+def queued_reads_bring_every_frame() -> None:
+    with opened("queued") as device:
+        assert isinstance(device._link, QueuedLink)
+        for _ in range(3):
+            _, blocks = take(device, 1000)
+            assert require_right(blocks) == list(range(1000))
+
+
+def plain_reads_bring_every_frame() -> None:
+    with opened("plain") as device:
+        _, blocks = take(device, 1000)
+        assert require_right(blocks) == list(range(1000))
+
+
+def blocks_lie_where_libusb_wrote_them() -> None:
+    with opened("queued") as device:
+        timing = device.configure(REQUEST)
+        ring = BlockRing(16, timing.stride)
+        reader = ring.reader("test")
+        device.start(64)
+        while device.fill(ring, 2.0):
+            pass
+        ring.finish()
+        for block in reader:
+            assert np.shares_memory(block.bits, ring._memory)
+
+
+def stopping_with_reads_in_flight_leaves_the_device_ready() -> None:
+    with opened("queued") as device:
+        timing = device.configure(REQUEST)
+        for _ in range(3):
+            ring = BlockRing(40, timing.stride)
+            device.start(None)
+            for _ in range(5):
+                device.fill(ring, 2.0)
+            device.stop()
+            assert len(ring._free) == ring.slots
+        _, blocks = take(device, 100)
+        assert require_right(blocks) == list(range(100))
+
+
+def windows_follow_the_line_markers() -> None:
+    window = WindowTable(64, (np.array([0, 64], np.int32),))
+    request = SpadRequest(REQUEST.frame_rate_hz, REQUEST.exposure_s, "stream", 16, window)
+    with opened("queued") as device:
+        _, blocks = take(device, 40, request)
+        x0 = np.concatenate([block.records["x0"] for block in blocks])
+        assert (x0[:10] == 0).all()
+        assert (x0[10:] == 64).all()
+
+
+def a_second_program_finds_it_busy() -> None:
+    with opened("queued"), pytest.raises(DeviceBusy):
+        opened("queued")
+
+
+def another_serial_is_not_found() -> None:
+    with pytest.raises(DeviceNotFound, match="usb:serial=SPB-0001"):
+        opened("queued", "usb:serial=OTHER")
+
+
+def pulling_the_cable_is_a_disconnection() -> None:
+    with opened("queued", heartbeat=PULL_HEARTBEAT) as device:
+        timing = device.configure(REQUEST)
+        ring = BlockRing(40, timing.stride)
+        device.start(None)
+        with pytest.raises(DeviceDisconnected, match="the device is gone"):  # noqa: PT012
+            while device.fill(ring, 2.0):
+                pass
+        device.stop()
+        assert not ring._claimed
+
+
+BODIES: tuple[Callable[[], None], ...] = (
+    queued_reads_bring_every_frame,
+    plain_reads_bring_every_frame,
+    blocks_lie_where_libusb_wrote_them,
+    stopping_with_reads_in_flight_leaves_the_device_ready,
+    windows_follow_the_line_markers,
+    a_second_program_finds_it_busy,
+    another_serial_is_not_found,
+    pulling_the_cable_is_a_disconnection,
+)
+
+
+def main() -> None:
+    """Run all and print how they went."""
+    outcomes = {}
+    for body in BODIES:
+        try:
+            body()
+            outcomes[body.__name__] = ""
+        except BaseException:
+            outcomes[body.__name__] = traceback.format_exc()
+    print(json.dumps(outcomes))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,48 @@
+"""The real PrawnDO driver on an emulated wire."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from drivers.clock import NS_PER_S, VirtualClock
+from drivers.interfaces import OUT_GATE, Pulse
+from drivers.prawndo import PrawnDo, PrawnDoConfig, create
+from drivers.registry import Surroundings
+from sim_backend.wire.faults import FaultSchedule
+from sim_backend.wire.prawndo import PrawnDoModel, TriggerLine
+from sim_backend.wire.serial_server import SerialServer
+
+USB_BAUD = 8_000_000
+"""A virtual COM port over USB full speed carries about 0.8 MB/s."""
+SWEEP = (Pulse(0, None), Pulse(0, 1e-3), Pulse(OUT_GATE, 5e-3), Pulse(0, 1e-5))
+
+
+class Board:
+    """A PrawnDO on its wire, in virtual time, with a trigger input."""
+
+    def __init__(self, faults: FaultSchedule | None = None, **settings: Any) -> None:
+        self.clock = VirtualClock()
+        self.trigger = TriggerLine()
+        self.model = PrawnDoModel(self.trigger, **settings)
+        self.server = SerialServer(self.model, clock=self.clock, baud=USB_BAUD, faults=faults)
+
+    @property
+    def now_s(self) -> float:
+        return self.clock.now_ns() / NS_PER_S
+
+    @property
+    def pins(self) -> int:
+        with self.server.lock:
+            self.model.advance(self.now_s)
+            return self.model.outputs_at(self.now_s)
+
+    def open(self, **config: Any) -> PrawnDo:
+        made = PrawnDoConfig.model_validate({"port": "emulated:sync", **config})
+        return create(made, Surroundings(self.clock, None, 0, {"sync": self.server.endpoint}))
+
+
+@contextmanager
+def board(faults: FaultSchedule | None = None, **settings: Any) -> Iterator[Board]:
+    made = Board(faults, **settings)
+    with made.server:
+        yield made

@@ -1,0 +1,204 @@
+"""The guard on emulated wires, with real processes that are really killed: light is what is measured, not commands."""
+
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from drivers.cobolt import CoboltConfig
+from drivers.errors import DeviceBusy, DeviceError, DeviceNotFound, GuardLost, LimitExceeded
+from drivers.guard import Guard, GuardLimits
+from drivers.obis import ObisConfig
+from drivers.prawndo import PrawnDo, PrawnDoConfig
+from drivers.registry import Surroundings
+from tests.wire.guard_strikes import NEVER_S, STRIKES, Outcome, strike
+from tests.wire.guarded_application import SWEEP
+from tests.wire.guarded_rig import POWER_W, GuardedRig, guarded_rig
+
+KILLS = 18
+KILL = "application killed"
+SCAN_S = 2.0
+"""Start, opening, arming and the first sweeps of the application's scan."""
+
+
+@pytest.fixture(scope="module")
+def outcomes() -> Iterator[dict[str, list["Future[Outcome]"]]]:
+    """Every blow at random moments, four scans at a time."""
+    random = np.random.default_rng(4)
+    with ThreadPoolExecutor(4) as pool:
+        found = {KILL: [pool.submit(strike, KILL, float(random.uniform(0, SCAN_S))) for _ in range(KILLS)]}
+        for name in STRIKES:
+            if name != KILL:
+                found[name] = [pool.submit(strike, name, float(random.uniform(0.05, 0.15)))]
+        yield found
+
+
+def test_a_killed_application_leaves_no_light(outcomes: dict[str, list["Future[Outcome]"]]) -> None:
+    results = [future.result() for future in outcomes[KILL]]
+    assert all(result.light_s < NEVER_S for result in results)
+    assert sum(result.light_s < 0.1 for result in results) >= KILLS - 1  # on a loaded machine
+    assert not any(result.emitted for result in results)
+
+
+@pytest.mark.parametrize("name", [name for name in STRIKES if name != KILL])
+def test_no_light_after(name: str, outcomes: dict[str, list["Future[Outcome]"]]) -> None:
+    made = STRIKES[name]
+    for future in outcomes[name]:
+        result = future.result()
+        assert result.was_lit or made.mode != "beat"
+        assert result.light_s < max(NEVER_S, made.light_s)
+        assert not (result.emitted and made.laser_answers)
+        assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize("name", ["application stopped", "application hangs", "application computes for ever"])
+def test_an_application_that_cannot_help_itself_is_killed(
+    name: str, outcomes: dict[str, list["Future[Outcome]"]]
+) -> None:
+    assert outcomes[name][0].result().code == -9
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        ("guard killed", "GuardLost"),
+        ("guard stopped", "GuardLost"),
+        ("laser unplugged", "DeviceDisconnected"),
+        ("gate unplugged", "DeviceDisconnected"),
+        ("interlock opened", "InterlockOpen"),
+    ],
+)
+def test_an_application_that_lives_ends_with_a_typed_error(
+    name: str, error: str, outcomes: dict[str, list["Future[Outcome]"]]
+) -> None:
+    result = outcomes[name][0].result()
+    assert result.code == 3
+    assert any(line.startswith(f"{error}: ") for line in result.output.splitlines())
+
+
+@pytest.fixture
+def rig() -> Iterator[GuardedRig]:
+    with guarded_rig() as made:
+        yield made
+
+
+def guard_of(rig: GuardedRig, limits: GuardLimits | None = None) -> Guard:
+    return Guard(
+        laser=ObisConfig.model_validate({"port": "emulated:laser", "max_power": "50 mW"}),
+        sync=PrawnDoConfig(port="emulated:sync"),
+        ports={"laser": rig.laser.endpoint, "sync": rig.sync.endpoint},
+        limits=limits,
+    )
+
+
+def test_errors_come_through_with_their_type_and_text(rig: GuardedRig) -> None:
+    with guard_of(rig) as guard:
+        with pytest.raises(LimitExceeded, match="60 W is outside"):
+            guard.laser.arm(60)
+        with pytest.raises(LimitExceeded, match="outside 5e-08 to"):
+            guard.sync.program([SWEEP[0], type(SWEEP[0])(0, 2e-8)], 1)
+
+
+def test_what_cannot_be_opened_is_told_device_by_device(rig: GuardedRig) -> None:
+    laser = CoboltConfig.model_validate({"port": "/dev/spadrig-nothing", "max_power": "50 mW"})
+    with Guard(laser=laser, sync=PrawnDoConfig(port=rig.sync.path)) as guard:
+        with pytest.raises(DeviceNotFound, match="/dev/spadrig-nothing is not there"):
+            _ = guard.laser
+        assert guard.sync.status.outputs == 0
+
+
+def test_a_device_without_config_is_not_guarded(rig: GuardedRig) -> None:
+    with Guard(sync=PrawnDoConfig(port=rig.sync.path)) as guard, pytest.raises(DeviceError, match="not guarded"):
+        _ = guard.laser
+
+
+def test_the_guard_holds_the_ports_and_gives_them_back(rig: GuardedRig) -> None:
+    config = PrawnDoConfig(port=rig.sync.path)
+    surroundings = Surroundings(None, None, 0)  # type: ignore[arg-type]
+    with guard_of(rig) as guard:
+        assert guard.sync.status.state == "stopped"
+        with pytest.raises(DeviceBusy):
+            PrawnDo(config, surroundings)
+    PrawnDo(config, surroundings).close()
+
+
+def test_a_program_that_ends_by_itself_is_no_hang(rig: GuardedRig) -> None:
+    with guard_of(rig) as guard:
+        guard.sync.program(SWEEP, 2)
+        guard.laser.arm(POWER_W)
+        guard.sync.run()
+        guard.beat(1)
+        for _ in range(40):  # no more frames: the program's two sweeps are over
+            status = guard.sync.status
+            if status.state == "stopped":
+                break
+        assert status.state == "stopped"
+        time.sleep(0.3)
+        assert guard.failure is None
+        assert guard.laser.status.emission
+
+
+def test_longer_limits_allow_longer_silence(rig: GuardedRig) -> None:
+    with guard_of(rig) as guard:
+        guard.sync.program(SWEEP, 1000)
+        guard.expect(GuardLimits(frames_within_s=5.0, busy_within_s=5.0))
+        guard.sync.run()
+        guard.beat(1)
+        time.sleep(0.3)
+        assert guard.failure is None
+
+
+def test_without_a_running_program_no_frames_are_asked_for(rig: GuardedRig) -> None:
+    with guard_of(rig, GuardLimits(first_frame_s=0.05)) as guard:
+        guard.laser.arm(POWER_W)
+        guard.sync.program(SWEEP, 1000)
+        time.sleep(0.3)
+        guard.sync.run()
+        guard.sync.abort()
+        time.sleep(0.3)
+        assert guard.failure is None
+
+
+def test_no_first_frame_at_all_ends_the_light(rig: GuardedRig) -> None:
+    with guard_of(rig, GuardLimits(first_frame_s=0.1)) as guard:
+        guard.laser.arm(POWER_W)
+        guard.sync.program(SWEEP, 1000)
+        guard.sync.run()
+        time.sleep(0.3)
+        with pytest.raises(DeviceError, match="took no frame for"):
+            guard.beat(1)
+        with pytest.raises(DeviceError, match="took no frame for"):
+            guard.laser.arm(POWER_W)
+        assert not rig.emission.levels[-1]
+        guard.sync.abort()
+        guard.laser.pause()
+
+
+def test_closing_leaves_all_dark_and_may_be_done_twice(rig: GuardedRig) -> None:
+    guard = guard_of(rig)
+    laser, sync = guard.laser, guard.sync
+    sync.program(SWEEP, 1000)
+    laser.arm(POWER_W)
+    sync.run()
+    guard.close()
+    guard.close()
+    assert not rig.emission.levels[-1]
+    assert not rig.gate.levels[-1]
+    with pytest.raises(GuardLost):
+        guard.ask("laser", "arm", POWER_W)
+
+
+def test_a_laser_that_was_never_armed_keeps_its_key(rig: GuardedRig) -> None:
+    with guard_of(rig) as guard:
+        assert guard.laser.status.armed is False
+        guard.sync.program(SWEEP, 1000)
+        guard.sync.run()
+        rig.sync.unplug()
+        time.sleep(0.2)
+        assert guard.failure is not None
+        with pytest.raises(DeviceError):
+            guard.sync.close()
+    commands = rig.laser.model.commands  # type: ignore[attr-defined]
+    assert not any("AMPL " in command for command in commands)  # what only `disarm` sets

@@ -1,0 +1,396 @@
+"""The PrawnDO: golden bytes of hardware.md section 5.1, and a test named after each of its traps."""
+
+import threading
+import time
+
+import pytest
+
+from drivers.errors import (
+    DeviceBusy,
+    DeviceDisconnected,
+    DeviceError,
+    DeviceFault,
+    DeviceNotFound,
+    DeviceTimeout,
+    LimitExceeded,
+    ProtocolError,
+)
+from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
+from sim_backend.wire.prawndo import PrawnDoModel, TriggerLine
+from tests.wire.syncs import SWEEP, board
+
+# The emulator, against bytes written by hand from hardware.md section 5.1
+
+
+def answers(model: PrawnDoModel, *lines: bytes) -> list[bytes]:
+    return [model.receive(line, 0.0) for line in lines]
+
+
+def test_the_model_speaks_as_the_firmware_does() -> None:
+    model = PrawnDoModel(board=2)
+    assert answers(model, b"sts\n", b"ver\r\n", b"brd\n", b"gto\n", b"abt\n", b"xyz\n", b"ab\n") == [
+        b"run-status:0 clock-status:0\r\n",
+        b"Version: 1.3.1\r\n",
+        b"board: pico2\r\n",
+        b"0\r\n",
+        b"Can only abort when status is 1 or 2\r\n",
+        b"Invalid command: xyz\r\n",
+        b"Invalid command: ab\r\n",
+    ]
+    assert answers(model, b"man 7\n", b"gto\n", b"man 0\n", b"gto\n") == [b"ok\r\n", b"7\r\n", b"ok\r\n", b"0\r\n"]
+
+
+def test_the_model_takes_words_of_six_bytes_little_endian() -> None:
+    model = PrawnDoModel()
+    assert answers(model, b"cls\n", b"adm 0 3\n") == [b"ok\r\n", b"ready\r\n"]
+    assert model.receive(bytes.fromhex("0200 a0860100 0000 00000000 0000 0000 00"), 0.0) == b""
+    assert model.receive(b"\x00", 0.0) == b"ok\r\n"
+    assert model.words == [(2, 100_000), (0, 0), (0, 0)]
+    assert answers(model, b"len\n") == [b"Number of command lines: 6\r\nNumber of instructions: 3\r\n"]
+
+
+def test_the_model_refuses_most_commands_while_it_runs() -> None:
+    model = PrawnDoModel()
+    answers(model, b"adm 0 3\n", bytes.fromhex("0400 05000000 0000 00000000 0000 00000000"))
+    assert answers(model, b"run\n", b"man 0\n", b"sts\n") == [
+        b"ok\r\n",
+        b"Cannot execute command man 0 during buffered execution.\r\n",
+        b"run-status:2 clock-status:0\r\n",
+    ]
+
+
+def test_the_model_plays_cycles_of_ten_nanoseconds_from_the_trigger_on() -> None:
+    line = TriggerLine()
+    model = PrawnDoModel(line)
+    answers(model, b"adm 0 4\n", bytes.fromhex("0000 00000000 0200 a0860100 0000 00000000 0000 00000000"), b"swr\n")
+    line.pulse(0.5, 1e-5)
+    model.tick(1.0)
+    assert model.changes(0.0, 1.0) == [(0.0, 0), (0.5, 2), (pytest.approx(0.501), 0)]
+    assert model.status == 0
+
+
+# Bytes that the driver sends
+
+
+def test_a_program_goes_out_as_hardware_md_writes_it() -> None:
+    heard: list[bytes] = []
+    with board() as wire, wire.open() as device:
+        receive = wire.model.receive
+
+        def listen(data: bytes, now_s: float) -> bytes:
+            heard.append(data)
+            return receive(data, now_s)
+
+        wire.model.receive = listen  # type: ignore[method-assign]
+        device.program([Pulse(OUT_MARKER, None), Pulse(OUT_GATE | OUT_FRAME, 1e-3)], 1)
+        device.run()
+    sent = b"".join(heard)
+    words = bytes.fromhex("0400 00000000 0300 a0860100 0000 00000000 0000 00000000")
+    assert b"\nadm 0 4\n" + words + b"#" in sent
+    assert b"\nswr\n" in sent
+    assert sent.index(b"cls\n") < sent.index(b"adm 0") < sent.index(b"swr")
+    assert b"prg" not in sent
+
+
+def test_closing_aborts_then_sets_all_outputs_low_then_reads_them_back() -> None:
+    heard = b""
+    with board() as wire:
+        device = wire.open()
+        receive = wire.model.receive
+
+        def listen(data: bytes, now_s: float) -> bytes:
+            nonlocal heard
+            heard += data
+            return receive(data, now_s)
+
+        wire.model.receive = listen  # type: ignore[method-assign]
+        device.close()
+    assert heard.startswith(b"\nabt\nman 0\n")
+    assert heard.index(b"abt\n") < heard.index(b"man 0\n") < heard.index(b"gto\n")
+
+
+# The traps of hardware.md section 5.1
+
+
+def test_the_trigger_is_a_level_so_waits_closer_than_a_scan_marker_are_refused() -> None:
+    with board() as wire, wire.open(trigger_pulse="40 us") as device:
+        with pytest.raises(LimitExceeded, match=r"plays 4e-05 s between the wait at word 0 and the next.*4e-05 s"):
+            device.program([Pulse(0, None), Pulse(OUT_GATE, 40e-6)], 2)
+        device.program([Pulse(0, None), Pulse(OUT_GATE, 40e-6)], 1)  # nothing waits behind it
+        device.program([Pulse(0, None), Pulse(OUT_GATE, 41e-6)], 2)
+        with pytest.raises(LimitExceeded, match="plays 0 s between"):
+            device.program([Pulse(0, None), Pulse(0, None), Pulse(OUT_GATE, 1e-3)], 1)
+
+
+def test_a_marker_still_high_at_the_next_wait_would_pass_it_in_the_model_too() -> None:
+    line = TriggerLine()
+    model = PrawnDoModel(line)
+    two_sweeps = bytes.fromhex("0000 00000000 0200 e8030000" * 2 + "0000 00000000 0000 00000000")
+    answers(model, b"adm 0 6\n", two_sweeps, b"swr\n")
+    line.pulse(0.1, 40e-6)
+    model.tick(1.0)
+    assert model.status == 0  # one marker, two sweeps
+
+
+def test_words_of_one_to_four_cycles_become_waits_so_they_are_refused_before_they_are_sent() -> None:
+    with board() as wire, wire.open() as device:
+        with pytest.raises(LimitExceeded, match=r"word 1 lasts 4e-08 s, outside 5e-08 to 42\.9497 s"):
+            device.program([Pulse(0, 1e-3), Pulse(OUT_GATE, 4e-8)], 1)
+        with pytest.raises(LimitExceeded, match="word 0 lasts 43 s"):
+            device.program([Pulse(0, 43.0)], 1)
+        device.program([Pulse(OUT_GATE, 5e-8)], 1)
+        assert wire.model.words == [(OUT_GATE, 5), (0, 0), (0, 0)]
+    model = PrawnDoModel()
+    (_, reply) = answers(model, b"adm 0 2\n", bytes.fromhex("0200 04000000 0200 05000000"))
+    assert reply.startswith(b"Invalid number of reps in 1 instructions")
+    assert model.words == [(2, 0), (2, 5)]
+
+
+def test_any_reply_but_ok_to_a_program_clears_it() -> None:
+    with board() as wire, wire.open() as device:
+        take = wire.model._take_words
+        wire.model._take_words = lambda data: take(data).replace(b"ok", b"Invalid number of reps in 1 instructions")  # type: ignore[method-assign]
+        with pytest.raises(DeviceFault, match="Invalid number of reps in 1 instructions"):
+            device.program(SWEEP, 1)
+        assert wire.model.words == []
+
+
+def test_a_program_that_did_not_arrive_whole_is_never_run() -> None:
+    with board() as wire, wire.open() as device:
+        device.program(SWEEP, 1)
+        take = wire.model._take_words
+        wire.model._take_words = lambda data: take(data).replace(b"ok", b"nok")  # type: ignore[method-assign]
+        with pytest.raises(DeviceFault):
+            device.program(SWEEP, 2)
+        with pytest.raises(DeviceFault, match="did not arrive whole"):
+            device.run()
+        assert wire.model.status == 0
+
+
+def test_abt_leaves_the_outputs_as_they_are_so_man_0_follows_it() -> None:
+    model = PrawnDoModel()
+    answers(model, b"adm 0 3\n", bytes.fromhex("0200 00e1f505 0000 00000000 0000 00000000"), b"swr\n", b"abt\n")
+    model.tick(0.1)
+    assert model.status == 5
+    assert model.gate_level(0.1)
+    with board() as wire, wire.open() as device:
+        device.program([Pulse(OUT_GATE, 1.0)], 1)
+        device.run()
+        wire.clock.sleep(0.1)
+        assert wire.pins == OUT_GATE
+        device.abort()
+        assert wire.pins == 0
+        assert device.status.outputs == 0
+
+
+def test_a_board_left_running_by_a_dead_host_is_lowered_by_opening_it() -> None:
+    with board() as wire:
+        device = wire.open()
+        device.program([Pulse(OUT_GATE, 30.0)], 1)
+        device.run()
+        wire.clock.sleep(0.1)
+        assert wire.pins == OUT_GATE
+        device._line.close()
+        with wire.open() as again:
+            assert wire.pins == 0
+            assert again.status.state == "aborted"
+
+
+def test_every_program_ends_on_two_words_that_hold_all_outputs_low() -> None:
+    with board() as wire, wire.open() as device:
+        device.program([Pulse(OUT_GATE | OUT_FRAME, 1e-3)], 3)
+        assert wire.model.words[-2:] == [(0, 0), (0, 0)]
+        device.run()
+        wire.clock.sleep(0.01)
+        assert wire.pins == 0
+        assert device.status.state == "stopped"
+
+
+def test_a_last_word_that_waits_is_parted_from_the_end() -> None:
+    """Else its zero and the end's first one would be the end, with that word's outputs left on the pins."""
+    with board() as wire, wire.open() as device:
+        device.program([Pulse(0, 1e-3), Pulse(OUT_MARKER, None)], 1)
+        device.run()
+        wire.clock.sleep(0.01)
+        assert device.status.state == "running"
+        wire.trigger.pulse(wire.now_s, 1e-5)
+        wire.clock.sleep(0.01)
+        assert wire.pins == 0
+        assert device.status.state == "stopped"
+
+
+def test_adm_cannot_be_left_before_all_bytes_came_so_a_wedged_board_is_filled_up() -> None:
+    with board(board=2) as wire:
+        wire.model.receive(b"adm 0 ea60\n\x02\x00", 0.0)  # a host died here: 359 998 bytes are missing
+        with wire.open() as device:
+            device.program(SWEEP, 1)
+            device.run()
+            assert device.status.state == "running"
+
+
+def test_a_half_sent_line_of_a_dead_host_is_ended_first() -> None:
+    with board() as wire:
+        wire.model.receive(b"man 2\nma", 0.0)
+        assert wire.pins == OUT_GATE
+        with wire.open():
+            assert wire.pins == 0
+
+
+def test_a_board_left_in_add_is_freed() -> None:
+    with board() as wire:
+        wire.model.receive(b"add\n2 5\n", 0.0)
+        with wire.open() as device:
+            device.program(SWEEP, 1)
+
+
+def test_clk_1_says_ok_without_a_clock_so_clock_status_is_asked() -> None:
+    with board() as wire, pytest.raises(DeviceFault, match="clock on GPIO20 is lost"):
+        wire.open(external_clock="10 MHz")
+
+
+def test_a_wrong_external_clock_is_measured() -> None:
+    with (
+        board(external_clock_hz=20_000_000) as wire,
+        pytest.raises(DeviceFault, match=r"runs at 2e\+07 Hz, not 1e\+07"),
+    ):
+        wire.open(external_clock="10 MHz")
+
+
+def test_an_external_clock_that_dies_is_noticed_before_the_next_run() -> None:
+    with board(external_clock_hz=10_000_000) as wire, wire.open(external_clock="10 MHz") as device:
+        assert device.resolution_s == 1e-7
+        device.program(SWEEP, 1)
+        assert wire.model.words[1] == (0, 10_000)
+        with wire.server.lock:
+            wire.model.lose_external_clock()
+        with pytest.raises(DeviceFault, match="GPIO20"):
+            device.run()
+        device.abort()
+
+
+def test_there_is_no_watchdog_so_every_word_that_waits_holds_the_gate_low() -> None:
+    with board() as wire, wire.open() as device:
+        with pytest.raises(LimitExceeded, match="waits with the gate high"):
+            device.program([Pulse(OUT_GATE, None), Pulse(0, 1e-3)], 1)
+        device.program(SWEEP, 100)
+        assert not any(outputs & OUT_GATE for outputs, cycles in wire.model.words if cycles == 0)
+
+
+@pytest.mark.parametrize(("kind", "words"), [(1, 30_000), (2, 60_000)])
+def test_there_are_no_loops_so_repeats_use_up_words(kind: int, words: int) -> None:
+    with board(board=kind) as wire, wire.open() as device:
+        most = (words - 2) // len(SWEEP)
+        device.program(SWEEP, most)
+        assert len(wire.model.words) == 4 * most + 2
+        with pytest.raises(LimitExceeded, match=f"it holds {words}"):
+            device.program(SWEEP, most + 1)
+
+
+def test_pins_cannot_be_read_while_a_program_runs() -> None:
+    with board() as wire, wire.open() as device:
+        device.program(SWEEP, 1)
+        device.run()
+        assert device.status.outputs is None
+
+
+# The gate first
+
+
+def test_the_gate_goes_low_at_once_beside_a_question_that_is_not_answered() -> None:
+    with board() as wire, wire.open() as device:
+        device.program([Pulse(OUT_GATE, 30.0)], 1)
+        device.run()
+        wire.clock.sleep(0.1)
+        wire.server.hang()
+        failures: list[BaseException] = []
+
+        def ask() -> None:
+            try:
+                _ = device.status
+            except DeviceError as error:
+                failures.append(error)
+
+        asking = threading.Thread(target=ask)
+        asking.start()
+        time.sleep(0.05)
+        threading.Timer(0.05, wire.server.resume).start()
+        device.gate_low()
+        asking.join()
+        assert wire.pins == 0
+        assert isinstance(failures[0], DeviceFault)
+
+
+def test_a_board_that_does_not_answer_is_no_low_gate() -> None:
+    with board() as wire:
+        device = wire.open()
+        device.program([Pulse(OUT_GATE, 30.0)], 1)
+        device.run()
+        wire.server.hang()
+        begun = time.monotonic()
+        with pytest.raises(DeviceTimeout, match="did not answer"):
+            device.gate_low()
+        assert time.monotonic() - begun < 2
+        wire.server.resume()
+        device.close()
+
+
+def test_debug_noise_and_blank_lines_do_not_confuse_it() -> None:
+    with board() as wire, wire.open() as device:
+        with wire.server.lock:
+            wire.model._unasked += b"\r\nhwstart: 0\r\n"
+        time.sleep(0.05)
+        assert device.status.outputs == 0
+
+
+# Wrong and missing hardware: one line each
+
+
+def test_an_absent_board() -> None:
+    with board() as wire, pytest.raises(DeviceNotFound, match="is not there"):
+        wire.open(port="/dev/spadrig-nothing")
+
+
+def test_a_busy_board() -> None:
+    with board() as wire, wire.open(), pytest.raises(DeviceBusy, match="held by another program"):
+        wire.open()
+
+
+def test_a_board_that_is_unplugged() -> None:
+    with board() as wire:
+        device = wire.open()
+        wire.server.unplug()
+        time.sleep(0.05)
+        assert device.port_lost
+        for verb in (lambda: device.status, device.abort, lambda: device.program(SWEEP, 1)):
+            with pytest.raises(DeviceDisconnected, match="plug it in again"):
+                verb()
+        with pytest.raises(DeviceDisconnected):
+            device.close()
+        wire.server.plug()
+        wire.open().close()
+
+
+def test_firmware_that_is_too_old() -> None:
+    with board(version="1.2.0") as wire, pytest.raises(ProtocolError, match=r"firmware 1\.2\.0 is older than 1\.3"):
+        wire.open()
+
+
+def test_a_device_that_is_no_prawndo() -> None:
+    class Laser:
+        def receive(self, data: bytes, now_s: float) -> bytes:
+            return b"Syntax error: illegal command\r\n" * data.count(b"\n")
+
+        def tick(self, now_s: float) -> bytes:
+            return b""
+
+    with board() as wire:
+        wire.server.model = Laser()
+        with pytest.raises(ProtocolError, match="is no PrawnDO"):
+            wire.open()
+
+
+def test_a_port_that_says_nothing() -> None:
+    with board() as wire:
+        wire.server.hang()
+        with pytest.raises(DeviceTimeout):
+            wire.open()

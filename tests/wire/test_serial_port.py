@@ -1,0 +1,246 @@
+"""Serial ports: deadlines kept, every failure one typed line, through the real pyserial on a pseudo terminal."""
+
+import errno
+import time
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+
+import pytest
+import serial
+from serial.tools import list_ports
+
+from drivers.errors import (
+    DeviceBusy,
+    DeviceDisconnected,
+    DeviceNotFound,
+    DevicePermission,
+    DeviceTimeout,
+    ProtocolError,
+)
+from drivers.transports.endpoints import Endpoint, resolve
+from drivers.transports.serial_port import SerialPort
+from sim_backend.wire.faults import Fault, FaultSchedule, FaultScript
+from sim_backend.wire.serial_server import SerialServer
+
+
+class Echo:
+    """Answers each line with itself in brackets; `n:` with n bytes."""
+
+    def receive(self, data: bytes, now_s: float) -> bytes:
+        return b"".join(b"[" + line + b"]\r\n" for line in data.split(b"\n") if line)
+
+    def tick(self, now_s: float) -> bytes:
+        return b""
+
+
+@pytest.fixture
+def server() -> Iterator[SerialServer]:
+    with SerialServer(Echo(), baud=1_000_000) as served:
+        yield served
+
+
+@pytest.fixture
+def port(server: SerialServer) -> Iterator[SerialPort]:
+    opened = SerialPort("echo", server.path)
+    yield opened
+    opened.close()
+
+
+def one_line(error: BaseException) -> str:
+    text = str(error)
+    assert text
+    assert "\n" not in text
+    return text
+
+
+def test_lines_and_exact_lengths_come_as_sent(port: SerialPort) -> None:
+    port.write(b"ab\n")
+    assert port.read_line(b"\r\n", 1.0) == b"[ab]"
+    port.write(b"cd\n")
+    assert port.read_exact(4, 1.0) == b"[cd]"
+    assert port.read_exact(2, 1.0) == b"\r\n"
+
+
+def test_a_reply_that_does_not_come_is_a_timeout_at_the_deadline(port: SerialPort) -> None:
+    for read in (lambda: port.read_line(b"\n", 0.2), lambda: port.read_exact(3, 0.2)):
+        began = time.monotonic()
+        with pytest.raises(DeviceTimeout, match=r"0\.2 s"):
+            read()
+        assert 0.15 < time.monotonic() - began < 1.0
+
+
+def test_what_came_before_a_timeout_is_kept_until_the_input_is_reset(port: SerialPort) -> None:
+    port.write(b"ab\n")
+    with pytest.raises(DeviceTimeout, match="6 bytes came"):
+        port.read_exact(100, 0.2)
+    assert port.read_exact(6, 0.1) == b"[ab]\r\n"
+    port.write(b"cd\n")
+    with pytest.raises(DeviceTimeout):
+        port.read_exact(100, 0.2)
+    port.reset_input()
+    with pytest.raises(DeviceTimeout, match="0 bytes came"):
+        port.read_line(b"\n", 0.05)
+
+
+def test_noise_without_an_end_is_a_protocol_error(port: SerialPort) -> None:
+    port._received += bytes(70_000)
+    with pytest.raises(ProtocolError, match="noise"):
+        port.read_line(b"\n", 0.1)
+
+
+def test_an_absent_port_is_one_line() -> None:
+    with pytest.raises(DeviceNotFound) as refused:
+        SerialPort("laser", "/dev/ttyNOWHERE")
+    assert "/dev/ttyNOWHERE" in one_line(refused.value)
+
+
+def test_a_busy_port_is_one_line(server: SerialServer, port: SerialPort) -> None:
+    with pytest.raises(DeviceBusy) as refused:
+        SerialPort("laser", server.path)
+    assert "held by another program" in one_line(refused.value)
+
+
+def test_a_forbidden_port_names_the_udev_rules(monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*args: object, **kwargs: object) -> None:
+        raise serial.SerialException(errno.EACCES, "could not open port /dev/ttyUSB0: Permission denied")
+
+    monkeypatch.setattr(serial, "Serial", forbidden)
+    with pytest.raises(DevicePermission) as refused:
+        SerialPort("laser", "/dev/ttyUSB0")
+    assert "config/udev/70-spadrig.rules" in one_line(refused.value)
+
+
+def test_a_file_that_is_no_port_is_refused() -> None:
+    with pytest.raises(DeviceNotFound, match="cannot be opened as a serial port") as refused:
+        SerialPort("laser", "/dev/null")
+    one_line(refused.value)
+
+
+def calls(port: SerialPort) -> list[Callable[[], object]]:
+    return [
+        lambda: port.write(b"x\n"),
+        lambda: port.read_line(b"\n", 0.3),
+        lambda: port.read_exact(1, 0.3),
+        port.reset_input,
+        lambda: port.drain(0.1, 0.3),
+    ]
+
+
+@pytest.mark.parametrize("call", range(5))
+def test_an_unplugged_port_is_lost_whatever_is_called(server: SerialServer, port: SerialPort, call: int) -> None:
+    server.unplug()
+    with pytest.raises(DeviceDisconnected) as lost:
+        calls(port)[call]()
+    assert "is lost" in one_line(lost.value)
+
+
+@pytest.mark.parametrize("call", range(5))
+def test_a_port_that_was_closed_under_a_call_is_lost(port: SerialPort, call: int) -> None:
+    port.close()
+    port.close()
+    with pytest.raises(DeviceDisconnected):
+        calls(port)[call]()
+
+
+def test_a_device_that_was_plugged_in_again_is_opened_again(server: SerialServer, port: SerialPort) -> None:
+    server.unplug()
+    with pytest.raises(DeviceNotFound):
+        SerialPort("echo", server.path)
+    server.plug()
+    again = SerialPort("echo", server.path)
+    again.write(b"ab\n")
+    assert again.read_line(b"\r\n", 1.0) == b"[ab]"
+    again.close()
+
+
+def test_a_device_that_takes_nothing_is_a_timeout(server: SerialServer, port: SerialPort) -> None:
+    server.hang()
+    with pytest.raises(DeviceTimeout, match="took no data"):
+        port.write(bytes(100_000))
+
+
+def attached(*ports: tuple[str, str | None, int | None, int | None]) -> list[SimpleNamespace]:
+    return [SimpleNamespace(device=d, serial_number=s, vid=v, pid=p) for d, s, v, p in ports]
+
+
+def test_a_port_is_found_by_serial_number_and_by_product(server: SerialServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = attached(("/dev/ttyS0", None, None, None), (server.path, "A1", 0x2E8A, 0xA))
+    monkeypatch.setattr(list_ports, "comports", lambda: listed)
+    for address in ("serial=A1", "usb=2E8A:000a"):
+        found = SerialPort("box", address)
+        assert found.path == server.path
+        found.close()
+    with pytest.raises(DeviceNotFound, match=r"no serial port with serial=B2; attached: .*serial=A1"):
+        SerialPort("box", "serial=B2")
+
+
+def test_two_equal_devices_ask_for_the_serial_number_or_the_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = attached(("/dev/ttyACM0", "A1", 0x2E8A, 0xA), ("/dev/ttyACM1", "A1", 0x2E8A, 0xA))
+    monkeypatch.setattr(list_ports, "comports", lambda: listed)
+    with pytest.raises(DeviceNotFound, match=r"2 serial ports .*ttyACM0, /dev/ttyACM1.*give serial=") as refused:
+        SerialPort("box", "usb=2e8a:000a")
+    one_line(refused.value)
+    with pytest.raises(DeviceNotFound, match="give the port's path"):
+        SerialPort("box", "serial=A1")
+
+
+def test_emulated_ports_are_looked_up_and_real_ones_are_not() -> None:
+    laser = Endpoint("/tmp/tty", emulated=True)
+    assert resolve("emulated:laser", {"laser": laser}) is laser
+    assert resolve("/dev/ttyUSB0", {"laser": laser}) == Endpoint("/dev/ttyUSB0", emulated=False)
+    with pytest.raises(DeviceNotFound, match="choose one of: gate, laser"):
+        resolve("emulated:lasr", {"laser": laser, "gate": laser})
+    with pytest.raises(DeviceNotFound, match="emulating world"):
+        resolve("emulated:laser", {})
+
+
+def test_replies_leave_at_ten_bits_a_character() -> None:
+    with SerialServer(Echo(), baud=9600) as server:
+        port = SerialPort("echo", server.path)
+        began = time.monotonic()
+        port.write(b"x" * 95 + b"\n")
+        port.read_line(b"\n", 2.0)
+        assert 0.09 < time.monotonic() - began < 0.5  # 99 characters at 960 a second
+        port.close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "arrives"),
+    [
+        (Fault.LATE, b"[a]\r\n[b]\r\n"),
+        (Fault.SPLIT, b"[a]\r\n[b]\r\n"),
+        (Fault.MERGED, b"[a]\r\n[b]\r\n"),
+        (Fault.REPEATED, b"[a]\r\n[a]\r\n[b]\r\n"),
+        (Fault.LOST, b"[b]\r\n"),
+        (Fault.STALL, b"[a]\r\n[b]\r\n"),
+    ],
+)
+def test_each_fault_does_to_the_first_reply_what_it_says(fault: Fault, arrives: bytes) -> None:
+    with SerialServer(Echo(), baud=1_000_000, faults=FaultScript(fault, late_s=0.1, stall_s=0.2)) as server:
+        port = SerialPort("echo", server.path)
+        port.write(b"a\n")
+        time.sleep(0.05)
+        port.write(b"b\n")
+        assert port.read_exact(len(arrives), 1.0) == arrives
+        assert port.drain(0.05, 0.2) == b""
+        port.close()
+
+
+def test_corrupted_and_truncated_replies_differ_from_what_was_sent() -> None:
+    faults = FaultSchedule(3, 1.0, [Fault.CORRUPTED])
+    for _ in range(20):
+        (delivery,) = faults.shape(Fault.CORRUPTED, b"hello")
+        assert sum((a ^ b).bit_count() for a, b in zip(delivery.data, b"hello", strict=True)) == 1
+        (delivery,) = faults.shape(Fault.TRUNCATED, b"hello")
+        assert b"hello".startswith(delivery.data)
+        assert len(delivery.data) < 5
+
+
+def test_the_same_seed_gives_the_same_faults() -> None:
+    def drawn(seed: int) -> list[Fault | None]:
+        schedule = FaultSchedule(seed, 0.5, skip=2, most=10)
+        return [schedule.next() for _ in range(50)]
+
+    assert drawn(1) == drawn(1) != drawn(2)
+    assert drawn(1)[:2] == [None, None]
+    assert sum(fault is not None for fault in drawn(1)) == 10

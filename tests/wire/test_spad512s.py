@@ -1,0 +1,349 @@
+"""The SPAD512S driver over a real socket, against an emulation of its vendor's program with its traps."""
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.errors import (
+    DeviceBusy,
+    DeviceDisconnected,
+    DeviceError,
+    DeviceFault,
+    DeviceNotFound,
+    DeviceTimeout,
+    LimitExceeded,
+    ProtocolError,
+    WrongState,
+)
+from drivers.frames import BlockFlag, FrameBlock
+from drivers.interfaces import SpadRequest
+from drivers.ring import BlockRing, OnFull
+from drivers.spad512s import Spad512s, Spad512sConfig
+from drivers.transports.endpoints import Endpoint
+from sim_backend.wire.spad512s import Spad512sModel
+from sim_backend.wire.tcp_server import TcpServer
+from tests.campaigns.spad512s_faults import campaign
+
+FRAME_BYTES = 32_768
+REQUEST = SpadRequest(Fraction(50_000), 20e-6, "burst", block_frames=16)
+
+
+def noise(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
+    """Frames that can be told from each other."""
+    frames = np.zeros((n, 512, 64), np.uint8)
+    for index in range(n):
+        frames[index] = np.random.default_rng(first + index).integers(0, 256, (512, 64), dtype=np.uint8)
+    return frames
+
+
+def reads_done(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
+    """Frames whose every four bytes read DONE or ERRO, also at the end of each read of 32 768 bytes."""
+    rows = np.tile(np.frombuffer(b"DONEERRO" if first % 2 else b"ERRODONE", np.uint8), 8)
+    return np.tile(rows, (n, 512, 1))
+
+
+@contextmanager
+def connected(model: Spad512sModel, **config: Any) -> Iterator[tuple[Spad512s, TcpServer]]:
+    with TcpServer(model) as server, Spad512s(Spad512sConfig(**config), server.endpoint, open_s=2.0) as device:
+        yield device, server
+
+
+def take(device: Spad512s, n_frames: int, ring_slots: int = 64, timeout_s: float = 5.0) -> list[FrameBlock]:
+    timing = device.configure(REQUEST)
+    ring = BlockRing(ring_slots, timing.stride)
+    reader = ring.reader("test")
+    device.start(n_frames)
+    try:
+        while device.fill(ring, timeout_s):
+            pass
+    finally:
+        device.stop()
+        ring.finish()
+    return list(reader)
+
+
+@contextmanager
+def scripted(*turns: tuple[bytes, bytes]) -> Iterator[tuple[str, list[bytes]]]:
+    """A peer that greets, then waits for the first of each pair and answers with the second; and what it heard."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    heard: list[bytes] = []
+
+    def serve() -> None:
+        client, _ = listener.accept()
+        with client:
+            client.settimeout(2.0)
+            client.sendall(b"SPAD512S ready\n")
+            for expected, answer in turns:
+                heard.append(client.recv(4096))
+                if heard[-1] != expected:
+                    return
+                client.sendall(answer)
+            client.recv(4096)
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    try:
+        yield f"127.0.0.1:{listener.getsockname()[1]}", heard
+    finally:
+        listener.close()
+        thread.join(3.0)
+
+
+INFO = b"M1\nS1\n2.0\n1.0\n1.0\n512\n1\n1\n1\n"
+
+
+def test_golden_bytes_of_a_run_and_of_its_first_pixel() -> None:
+    # One bit at the right end of the sensor's row 0: the corner that a quarter turn to the left takes to the top left.
+    pixels = bytearray(2 * FRAME_BYTES)
+    pixels[63] = 0x01
+    pixels[FRAME_BYTES + 511 * 64] = 0x80  # frame 1: left end of the last row, which comes to the bottom right
+    script = (
+        (b"D", INFO),
+        (b"PU,0", b"ok"),
+        (b"I,1,20,2,0,1,0,1\n", bytes(pixels) + b"DONE"),
+    )
+    with scripted(*script) as (address, heard), Spad512s(Spad512sConfig(), Endpoint(address, True)) as device:
+        (block,) = take(device, 2)
+        assert heard == [turn[0] for turn in script]
+    image = np.unpackbits(block.bits, axis=2)
+    assert np.argwhere(image[0]).tolist() == [[0, 0]]
+    assert np.argwhere(image[1]).tolist() == [[511, 511]]
+    assert block.header.flags == BlockFlag.FIRST | BlockFlag.LAST | BlockFlag.BURST
+    assert not block.records["marks"].any()
+
+
+def test_frames_come_as_they_were_taken() -> None:
+    with connected(Spad512sModel(noise)) as (device, _):
+        blocks = take(device, 100)
+        assert [block.n_frames for block in blocks] == [16] * 6 + [4]
+        assert np.array_equal(np.concatenate([block.bits for block in blocks]), noise(0, 0, 0, 100))
+        assert (device.counters.exposed, device.counters.delivered, device.counters.lost) == (100, 100, 0)
+
+
+def test_trap_done_inside_pixel_data() -> None:
+    with connected(Spad512sModel(reads_done, rotation=0), rotation=0) as (device, _):
+        blocks = take(device, 48)
+        assert sum(block.n_frames for block in blocks) == 48
+        assert bytes(blocks[0].bits[0, 0, :8]) == b"ERRODONE"
+
+
+def test_trap_time_in_microseconds_for_one_bit() -> None:
+    model = Spad512sModel(noise)
+    with connected(model) as (device, _):
+        device.configure(SpadRequest(Fraction(10_000), 100e-6, "burst", 16))
+        device.start(10_000)
+        device.stop()
+        assert model.commands[2:] == ["I,1,100,10000,0,1,0,1", "STOP"]
+        with pytest.raises(LimitExceeded, match=r"10\.5 us; it takes whole microseconds"):
+            device.configure(SpadRequest(Fraction(10_000), 10.5e-6, "burst", 16))
+
+
+def test_trap_calibration_on_connecting_is_waited_for_in_silence() -> None:
+    model = Spad512sModel(noise, calibration_s=0.3)
+    begun = time.monotonic()
+    with connected(model) as (device, _):
+        assert time.monotonic() - begun >= 0.3
+        assert model.commands == ["D", "D"]
+        assert device.info.serial == "MASTER-0042"
+
+
+def test_a_calibration_that_does_not_end_is_a_timeout() -> None:
+    words = r"calibration did not end within 0\.2 s"
+    with TcpServer(Spad512sModel(noise, calibration_s=60)) as server, pytest.raises(DeviceTimeout, match=words):
+        Spad512s(Spad512sConfig(), server.endpoint, calibration_s=0.2)
+
+
+def test_trap_error_text_instead_of_pixels_is_surfaced() -> None:
+    model = Spad512sModel(noise)
+    with connected(model) as (device, _):
+        model.fail_at_byte = 0
+        with pytest.raises(DeviceFault, match="Auto-protect: too much light"):
+            take(device, 100)
+        assert (device.counters.delivered, device.counters.lost) == (0, 100)
+        assert len(take(device, 20)) == 2  # connected anew
+
+
+@pytest.mark.parametrize("at_byte", [16 * FRAME_BYTES - 10, 16 * FRAME_BYTES, 20 * FRAME_BYTES + 7])
+def test_trap_error_text_is_never_taken_for_pixels(at_byte: int) -> None:
+    model = Spad512sModel(noise)
+    with connected(model) as (device, _):
+        model.fail_at_byte = at_byte
+        timing = device.configure(REQUEST)
+        ring = BlockRing(8, timing.stride)
+        reader = ring.reader("test")
+        device.start(64)
+        with pytest.raises(DeviceFault, match="ERROR"):  # noqa: PT012
+            while device.fill(ring, 5.0):
+                pass
+        ring.finish()
+        for block in reader:
+            assert np.array_equal(block.bits, noise(block.header.first_frame, 0, 0, block.n_frames))
+
+
+def test_trap_error_at_the_very_end_of_a_run_of_the_right_length() -> None:
+    pixels = np.zeros(FRAME_BYTES, np.uint8)
+    pixels[-6:] = np.frombuffer(b" ERROR"[:6], np.uint8)
+    with (
+        scripted((b"D", INFO), (b"PU,0", b"ok"), (b"I,1,20,1,0,1,0,1\n", pixels.tobytes()[4:] + b" too hot ERROR")) as (
+            address,
+            _,
+        ),
+        Spad512s(Spad512sConfig(), Endpoint(address, True)) as device,
+        pytest.raises(DeviceFault, match="too hot ERROR"),
+    ):
+        take(device, 1)
+
+
+def test_something_else_than_done_behind_the_pixels_is_refused() -> None:
+    answer = bytes(FRAME_BYTES) + b"DON"
+    with (
+        scripted((b"D", INFO), (b"PU,0", b"ok"), (b"I,1,20,1,0,1,0,1\n", answer + b"X")) as (address, _),
+        Spad512s(Spad512sConfig(), Endpoint(address, True)) as device,
+        pytest.raises(ProtocolError, match="not DONE"),
+    ):
+        take(device, 1)
+
+
+def test_trap_done_glued_to_text_answers() -> None:
+    with connected(Spad512sModel(noise, glued_done=True, extra_fields=True)) as (device, _):
+        assert device.health().frame_clock_hz == 97_656.25
+        assert device.identity.firmware == "1.4"
+        assert len(take(device, 16)) == 1
+
+
+def test_trap_pile_up_goes_before_every_run() -> None:
+    model = Spad512sModel(noise)
+    with connected(model) as (device, _):
+        take(device, 1)
+        take(device, 1)
+        assert [command[:2] for command in model.commands] == ["D", "PU", "I,", "PU", "I,"]
+
+
+def test_trap_one_client_the_second_is_refused() -> None:
+    with (
+        connected(Spad512sModel(noise)) as (_, server),
+        pytest.raises(DeviceNotFound, match="refuses the connection"),
+    ):
+        Spad512s(Spad512sConfig(), server.endpoint)
+
+
+def test_a_server_that_hangs_up_at_once_is_busy() -> None:
+    listener = socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=lambda: listener.accept()[0].close(), daemon=True)
+    thread.start()
+    with listener, pytest.raises(DeviceBusy, match="it serves one client"):
+        Spad512s(Spad512sConfig(), Endpoint(f"127.0.0.1:{listener.getsockname()[1]}", True))
+    thread.join(2.0)
+
+
+def test_wrong_addresses_and_wrong_programs_are_one_line_each() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        unused = f"127.0.0.1:{free.getsockname()[1]}"
+    cases: list[tuple[str, type[DeviceError], str]] = [
+        (unused, DeviceNotFound, "start the program"),
+        ("127.0.0.1", DeviceNotFound, "host:port"),
+        ("127.0.0.1:99999", DeviceNotFound, "host:port"),
+    ]
+    for address, sort, words in cases:
+        with pytest.raises(sort, match=words) as refused:
+            Spad512s(Spad512sConfig(), Endpoint(address, False))
+        assert "\n" not in str(refused.value)
+
+
+def test_a_silent_program_is_a_timeout() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener, pytest.raises(DeviceTimeout, match="nothing greets"):
+        Spad512s(Spad512sConfig(), Endpoint(f"127.0.0.1:{listener.getsockname()[1]}", True), open_s=0.1)
+
+
+def test_a_unit_without_intensity_imaging_is_refused() -> None:
+    with TcpServer(Spad512sModel(noise, intensity=False)) as server, pytest.raises(DeviceFault, match="not enabled"):
+        Spad512s(Spad512sConfig(), server.endpoint)
+
+
+def test_the_1m_flavour_has_1024_rows_and_lies_on_its_side() -> None:
+    def frames(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
+        return np.random.default_rng(first).integers(0, 256, (n, 512, 128), dtype=np.uint8)
+
+    with connected(Spad512sModel(frames, flavour="1M")) as (device, _):
+        assert (device.info.width, device.info.height) == (1024, 512)
+        (block,) = take(device, 8)
+        assert np.array_equal(block.bits, frames(0, 0, 0, 8))
+
+
+def test_a_rate_that_does_not_follow_from_the_exposure_is_refused_or_triggered() -> None:
+    request = SpadRequest(Fraction(20_000), 10e-6, "burst", 16)
+    with (
+        connected(Spad512sModel(noise)) as (device, _),
+        pytest.raises(LimitExceeded, match=r"running free that is 976"),
+    ):
+        device.configure(request)
+    model = Spad512sModel(noise)
+    with connected(model, trigger="external") as (device, _):
+        device.configure(request)
+        device.start(1)
+        device.stop()
+        assert "I,1,10,1,1,1,0,1" in model.commands
+
+
+@pytest.mark.parametrize("heeds_stop", [True, False])
+def test_a_stop_within_a_run_leaves_the_device_ready_for_the_next(heeds_stop: bool) -> None:
+    with connected(Spad512sModel(noise, heeds_stop=heeds_stop, paced=not heeds_stop)) as (device, server):
+        timing = device.configure(REQUEST)
+        ring = BlockRing(4, timing.stride)
+        device.start(10_000)
+        device.fill(ring, 5.0)
+        with pytest.raises(WrongState, match="its line carries a run"):
+            device.health()
+        begun = time.monotonic()
+        device.stop()
+        assert time.monotonic() - begun < 3.0
+        counters = device.counters
+        assert (counters.delivered, counters.lost) == (16, 10_000 - 16)
+        time.sleep(0.05)  # the program sees the hang-up and listens again
+        assert len(take(device, 32)) == 2
+        assert server.model is not None
+
+
+def test_a_program_that_ends_or_hangs_within_a_run_is_said_so() -> None:
+    with connected(Spad512sModel(noise, paced=True)) as (device, server):
+        timing = device.configure(REQUEST)
+        ring = BlockRing(4, timing.stride)
+        device.start(10_000)
+        device.fill(ring, 5.0)
+        server.hang()
+        with pytest.raises(DeviceTimeout, match="sent nothing"):  # noqa: PT012
+            while device.fill(ring, 0.1):
+                pass
+        server.resume()
+        server.unplug()
+        with pytest.raises(DeviceDisconnected):  # noqa: PT012
+            while device.fill(ring, 0.5):
+                pass
+        server.plug()
+        device.stop()
+        assert len(take(device, 16)) == 1
+
+
+def test_a_ring_that_does_not_wait_loses_counted_blocks() -> None:
+    with connected(Spad512sModel(noise)) as (device, _):
+        timing = device.configure(REQUEST)
+        ring = BlockRing(2, timing.stride, on_full=OnFull.DROP)
+        reader = ring.reader("test")
+        device.start(160)
+        while device.fill(ring, 5.0):
+            pass
+        ring.finish()
+        assert len(list(reader)) == 2
+        assert (device.counters.delivered, device.counters.lost, ring.dropped_frames) == (32, 128, 128)
+
+
+def test_fault_campaign_in_short() -> None:
+    assert campaign(sequences=40, seed=1).wrong == []

@@ -1,0 +1,527 @@
+"""The SPB1 driver over USB against an emulated device: control plane, receiver rules, watchdog, damage, both chips."""
+
+import json
+import struct
+import subprocess
+import sys
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from drivers.clock import SystemClock
+from drivers.errors import (
+    DeviceDisconnected,
+    DeviceError,
+    DeviceFault,
+    DeviceNotFound,
+    DevicePermission,
+    DeviceTimeout,
+    LimitExceeded,
+    ProtocolError,
+    RingOverflow,
+)
+from drivers.frames import BlockFlag, BlockStatus, Mark
+from drivers.interfaces import WindowTable
+from drivers.ring import BlockRing, OnFull
+from drivers.spb1.control import Ack, Command, Feature, Op, Register, State, pattern_row, read_acks
+from sim_backend.wire.spb_usb import SpbUsbModel
+from sim_backend.wire.umockdev_server import UmockdevBus, missing
+from sim_backend.wire.usb_backend import EmulatedUsb
+from sim_backend.wire.usb_model import AttachedDevice
+from tests.campaigns.spb_usb_faults import campaign
+from tests.wire import spb_bodies
+from tests.wire.spb_device import (
+    HEIGHT,
+    LINE_FRAMES,
+    REQUEST,
+    SWEEP_FRAMES,
+    WIDTH,
+    NumberedSource,
+    model,
+    nth,
+    on_bus,
+    opened,
+    require_right,
+    take,
+)
+
+STRIDE = 7168
+"""Of 16 frames of 128x24: 96 + 256 + pad to 384, 16 x 384 pixels, 32, rounded up to 1024."""
+
+
+# The control plane
+
+
+def test_golden_bytes_of_commands_and_acknowledgements() -> None:
+    # {`SPC1`, u16 op, u16 req_id, u32 addr, u32 value}, little-endian
+    assert (
+        Command(Op.WRITE, 0x0102, 0x0110, 1000).packed().hex(" ") == "53 50 43 31 02 00 02 01 10 01 00 00 e8 03 00 00"
+    )
+    assert Command(Op.PING, 7, 0, 0xFFFF_FFFF).packed().hex(" ") == "53 50 43 31 06 00 07 00 00 00 00 00 ff ff ff ff"
+    acks = bytes.fromhex("53 50 41 31 01 00 07 00 00 00 00 00 53 50 42 31")
+    assert read_acks(acks) == [Ack(Op.READ, 7, 0, 0x31425053)]
+    with pytest.raises(ProtocolError, match="instead of an acknowledgement"):
+        read_acks(b"SPC1" + acks[4:])
+
+
+def test_golden_bytes_of_the_ft601_session() -> None:
+    # u32 index, u8 pipe, u8 command, u16 0, u32 length, u32 0, u32 0: clear, then stream; abort, then clear at the end
+    seen: list[bytes] = []
+
+    class Spy(SpbUsbModel):
+        def _session(self, data: bytes) -> int:
+            seen.append(data)
+            return super()._session(data)
+
+    opened(Spy(NumberedSource(), WIDTH, HEIGHT, chip="ft601", acks="stream")).close()
+    head = [data[:6].hex(" ") for data in seen]
+    assert head == ["00 00 00 00 82 03", "00 00 00 00 82 02", "00 00 00 00 82 00", "00 00 00 00 82 03"]
+    assert all(len(data) == 20 for data in seen)
+
+
+def test_what_is_written_before_a_run() -> None:
+    device = model()
+    with opened(device, test_pattern=False, heartbeat="500 ms") as spad:
+        device.commands.clear()
+        take(spad, 32)
+    written = {address: value for op, address, value in device.commands if op == Op.WRITE}
+    assert written[Register.HEARTBEAT_MS] == 500
+    assert (written[Register.PERIOD_TICKS], written[Register.EXPOSURE_TICKS]) == (1000, 1000)
+    assert (written[Register.STRIDE], written[Register.BLOCK_FRAMES]) == (STRIDE, 16)
+    assert (written[Register.MODE], written[Register.N_FRAMES], written[Register.N_FRAMES + 4]) == (0, 32, 0)
+    assert device.commands[-3][0] == Op.START
+
+
+@pytest.mark.parametrize(
+    ("settings", "sort", "words"),
+    [
+        ({"product_name": "FX3 camera"}, DeviceNotFound, "no USB device|none is attached"),
+        ({"protocol": 0x0200}, DeviceFault, r"speaks SPB1 2\.0, this driver 1\.x"),
+    ],
+)
+def test_the_wrong_firmware_is_one_line(settings: dict[str, object], sort: type[DeviceError], words: str) -> None:
+    with pytest.raises(sort, match=words) as refused:
+        opened(model(**settings))
+    assert "\n" not in str(refused.value)
+
+
+def test_an_fx3_that_does_not_speak_spb1_is_not_found() -> None:
+    device = model()
+    device.deaf = True
+    with pytest.raises(DeviceNotFound, match="does not speak SPB1"):
+        opened(device)
+
+
+def test_absent_forbidden_and_two_equal_devices_are_one_line_each() -> None:
+    bus = EmulatedUsb(SystemClock())
+    with pytest.raises(DeviceNotFound, match="04b4:00f1"):
+        on_bus(bus)
+    attached = bus.plug(model(serial="A"))
+    attached.denied = True
+    with pytest.raises(DevicePermission, match=r"70-spadrig\.rules"):
+        on_bus(bus)
+    attached.denied = False
+    bus.plug(model(serial="B"))
+    with pytest.raises(DeviceError, match="2 are attached"):
+        on_bus(bus)
+    with on_bus(bus, "usb:serial=B") as spad:
+        assert spad.info.serial == "B"
+
+
+def test_the_test_pattern_is_the_one_of_section_8_4() -> None:
+    # row index in the first 2 bytes, one walking pixel
+    assert pattern_row(0x0102, 0, 64) == bytes.fromhex("02 01 80 00 00 00 00 00")
+    assert pattern_row(3, 9, 64) == bytes.fromhex("03 00 00 40 00 00 00 00")
+
+
+@pytest.mark.parametrize("order", ["bits", "rows"])
+def test_a_wrong_order_of_bits_or_rows_is_found_when_opening(order: str) -> None:
+    def turned(block: bytearray) -> tuple[bytes]:
+        pixels = np.frombuffer(block, np.uint8)[192 : 192 + 3 * HEIGHT * 16].reshape(3, HEIGHT, 16)
+        reverse = np.packbits(np.unpackbits(pixels, axis=2, bitorder="little"), axis=2)
+        pixels[:] = reverse if order == "bits" else pixels[:, ::-1]
+        payload = 192 - 96 + pixels.size
+        struct.pack_into("<I", block, 96 + payload + 20, zlib.crc32(block[96 : 96 + payload]))
+        struct.pack_into("<I", block, 96 + payload + 28, zlib.crc32(block[96 + payload : 96 + payload + 28]))
+        return (bytes(block),)
+
+    device = model()
+    device.mangle = nth(0, turned)
+    with pytest.raises(ProtocolError, match="bits or rows come in another order"):
+        opened(device)
+
+
+def test_a_device_found_running_is_aborted_first() -> None:
+    bus = EmulatedUsb(SystemClock())
+    device = model()
+    bus.plug(device)
+    first = on_bus(bus)
+    first.configure(REQUEST)
+    first.start(None)
+    first._link.close()  # the program dies
+    with on_bus(bus) as again:
+        _, blocks = take(again, 50)
+        assert require_right(blocks) == list(range(50))
+
+
+def test_a_rate_off_the_ticks_is_refused_with_the_nearest() -> None:
+    with opened(model()) as spad, pytest.raises(LimitExceeded, match="100000000/3001 Hz is"):
+        spad.configure(replace(REQUEST, frame_rate_hz=Fraction(100_000_000, 3001) + Fraction(1, 100)))
+
+
+def test_blocks_are_as_long_as_the_stride_allows() -> None:
+    with opened(model(max_stride=4096)) as spad:
+        _, blocks = take(spad, 40)
+        assert max(block.n_frames for block in blocks) == 9
+        assert require_right(blocks) == list(range(40))
+
+
+# Streams
+
+
+@pytest.mark.parametrize("acks", ["endpoint", "stream"])
+@pytest.mark.parametrize("chip", ["fx3", "ft601"])
+def test_both_chips_bring_every_frame_with_its_record(chip: str, acks: str) -> None:
+    with opened(model(chip=chip, acks=acks)) as spad:
+        for n_frames in (1000, 7):
+            _, blocks = take(spad, n_frames)
+            assert require_right(blocks) == list(range(n_frames))
+        assert spad.counters.exposed == spad.counters.delivered == 7
+        marks = np.concatenate([block.records["marks"] for block in blocks])
+        assert marks[0] == Mark.GATE_HIGH | Mark.SCAN
+
+
+def test_a_burst_is_read_out_behind_the_exposure() -> None:
+    with opened(model(paced=True)) as spad:
+        _, blocks = take(spad, 500, replace(REQUEST, mode="burst"))
+        assert require_right(blocks) == list(range(500))
+        assert all(block.header.flags & BlockFlag.BURST for block in blocks)
+
+
+def test_windows_move_with_the_line_markers_of_the_stream() -> None:
+    window = WindowTable(
+        64, tuple(np.array([64 * ((i + s) % 2) for i in range(SWEEP_FRAMES // LINE_FRAMES)], np.int32) for s in (0, 1))
+    )
+    with opened(model()) as spad:
+        _, blocks = take(spad, 3 * SWEEP_FRAMES, replace(REQUEST, window=window))
+        records = np.concatenate([block.records for block in blocks])
+        expected = window.x0_of(records["marks"], records["line"], records["sweep"].astype(np.int64) - 1)
+        assert np.array_equal(records["x0"], expected)
+        assert len(set(records["x0"].tolist())) == 2
+        with pytest.raises(LimitExceeded, match="3 sweeps"):
+            spad.configure(replace(REQUEST, window=WindowTable(64, (window.x0[0],) * 3)))
+    with opened(model(features=Feature.STREAM)) as spad, pytest.raises(LimitExceeded, match="moves no windows"):
+        spad.configure(replace(REQUEST, window=window))
+
+
+def test_heartbeats_between_slow_frames_are_no_frames_and_pings_go_on() -> None:
+    device = model(paced=True)
+    with opened(device, heartbeat="200 ms") as spad:
+        slow = replace(REQUEST, frame_rate_hz=Fraction(50), exposure_s=0.01, block_frames=10)
+        begun = time.monotonic()
+        _, blocks = take(spad, 30, slow)
+        assert time.monotonic() - begun >= 0.5
+        assert require_right(blocks) == list(range(30))
+        assert len(device.pings) >= 5
+        assert device.pings == sorted(device.pings)
+
+
+def test_a_host_that_falls_silent_ends_the_run_with_the_gate_low() -> None:
+    device = model(paced=True)
+    with opened(device, heartbeat="50 ms") as spad:
+        timing = spad.configure(REQUEST)
+        ring = BlockRing(8, timing.stride)
+        spad.start(None)
+        assert device.gate_allowed
+        time.sleep(0.15)  # a hung program sends no pings
+        with pytest.raises(DeviceFault, match=r"heard nothing of this program for 0\.05 s, dropped its gate"):  # noqa: PT012
+            while spad.fill(ring, 1.0):
+                pass
+        assert not device.gate_allowed
+        assert device.state is State.ARMED
+        spad.stop()
+        _, blocks = take(spad, 20)
+        assert require_right(blocks) == list(range(20))
+
+
+def test_stop_aborts_with_the_gate_low_and_counts_what_was_exposed() -> None:
+    device = model()
+    with opened(device) as spad:
+        timing = spad.configure(REQUEST)
+        ring = BlockRing(50, timing.stride)
+        spad.start(None)
+        for _ in range(5):
+            assert spad.fill(ring, 1.0)
+        spad.stop()
+        assert not device.gate_allowed
+        counters = spad.counters
+        assert counters.delivered == 80
+        assert counters.exposed == 80 + (counters.lost or 0)
+        assert spad.fill(ring, 1.0) is False
+        assert len(ring._claimed) == 0
+
+
+def test_a_firmware_that_hangs_is_a_timeout_and_unplugging_a_disconnection() -> None:
+    bus = EmulatedUsb(SystemClock())
+    device = model()
+    attached = bus.plug(device)
+    with on_bus(bus) as spad:
+        timing = spad.configure(REQUEST)
+        ring = BlockRing(50, timing.stride)
+        spad.start(None)
+        spad.fill(ring, 1.0)
+        device.deaf = True
+        with pytest.raises(DeviceTimeout):  # noqa: PT012
+            while spad.fill(ring, 0.1):
+                pass
+        device.deaf = False
+        bus.unplug(attached)
+        with pytest.raises(DeviceDisconnected):  # noqa: PT012
+            while spad.fill(ring, 0.5):
+                pass
+        assert spad.counters.delivered > 0
+        spad.stop()
+    bus.plug(model())
+    with on_bus(bus) as spad:
+        take(spad, 10)
+
+
+# Receiver rules (section 8.4) and damage
+
+
+def flipped(at: int) -> Callable[[bytearray], tuple[bytes]]:
+    def change(block: bytearray) -> tuple[bytes]:
+        block[at] ^= 0x10
+        return (bytes(block),)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "at", [0, 24, 69, 92, 96, 300, 400, 6000, 384 + 16 * 384 + 4, 384 + 16 * 384 + 28], ids=lambda at: f"byte {at}"
+)
+def test_a_flipped_bit_anywhere_in_a_block_refuses_that_block_only(at: int) -> None:
+    device = model()
+    with opened(device) as spad:
+        device.mangle = nth(3, flipped(at))
+        _, blocks = take(spad, 160)
+        assert require_right(blocks) == [*range(48), *range(64, 160)]
+        counters = spad.counters
+        assert (counters.exposed, counters.delivered, counters.lost, counters.crc_errors) == (160, 144, 16, 1)
+        assert blocks[3].header.flags & BlockFlag.LOST_BEFORE
+        assert blocks[3].header.lost_before == 16
+
+
+@pytest.mark.parametrize("keep", [1024, 3072, 6144])
+def test_a_block_cut_short_shifts_the_stream_and_is_resynchronised(keep: int) -> None:
+    device = model()
+    with opened(device) as spad:
+        device.mangle = nth(4, lambda block: (bytes(block[:keep]),))
+        _, blocks = take(spad, 3000)
+        numbers = require_right(blocks)
+        counters = spad.counters
+        assert numbers[:64] == list(range(64))
+        assert numbers[-1] == 2999
+        assert counters.resyncs == 1
+        assert counters.exposed == 3000
+        assert counters.lost == 3000 - len(numbers)
+        assert len(numbers) > 1000
+
+
+def test_extra_bytes_between_blocks_are_resynchronised() -> None:
+    device = model()
+    with opened(device) as spad:
+        device.mangle = nth(4, lambda block: (bytes(2048), bytes(block)))
+        _, blocks = take(spad, 3000)
+        require_right(blocks)
+        assert spad.counters.resyncs == 1
+
+
+def test_repeated_and_swapped_blocks_are_refused() -> None:
+    device = model()
+    with opened(device) as spad:
+        device.mangle = nth(4, lambda block: (bytes(block), bytes(block)))
+        _, blocks = take(spad, 160)
+        assert require_right(blocks) == list(range(160))
+        assert spad.counters.crc_errors == 1
+
+
+def resealed(**fields: tuple[int, str, int]) -> Callable[[bytearray], tuple[bytes]]:
+    """Change header fields (offset, format, value) and sign the header anew."""
+
+    def change(block: bytearray) -> tuple[bytes]:
+        for offset, form, value in fields.values():
+            struct.pack_into(form, block, offset, value)
+        struct.pack_into("<I", block, 92, zlib.crc32(block[:92]))
+        return (bytes(block),)
+
+    return change
+
+
+def test_a_sound_block_of_another_geometry_is_refused() -> None:
+    device = model()
+    with opened(device) as spad:
+        device.mangle = nth(2, resealed(sensor=(76, "<H", 256)))
+        _, blocks = take(spad, 160)
+        assert require_right(blocks) == [*range(32), *range(48, 160)]
+
+
+def test_a_block_of_another_run_is_passed_over() -> None:
+    device = model()
+    with opened(device) as spad:
+        device.mangle = nth(0, resealed(run=(14, "<H", 9999)))
+        _, blocks = take(spad, 160)
+        assert require_right(blocks) == list(range(16, 160))
+        assert spad.counters.lost == 16
+
+
+def test_a_run_whose_last_block_is_lost_ends_with_the_devices_own_count() -> None:
+    device = model()
+    with opened(device) as spad:
+        device.mangle = nth(9, lambda block: ())
+        begun = time.monotonic()
+        _, blocks = take(spad, 160)
+        assert time.monotonic() - begun < 1.5
+        assert require_right(blocks) == list(range(144))
+        assert (spad.counters.exposed, spad.counters.lost) == (160, 16)
+
+
+def test_frames_lost_inside_the_device_are_a_gap() -> None:
+    device = model()
+    with opened(device) as spad:
+        timing = spad.configure(REQUEST)
+        ring = BlockRing(50, timing.stride)
+        reader = ring.reader("test")
+        spad.start(160)
+        device.lose_next(5)
+        while spad.fill(ring, 1.0):
+            pass
+        ring.finish()
+        blocks = list(reader)
+        assert require_right(blocks) == list(range(5, 160))
+        assert blocks[0].header.flags & BlockFlag.MEMORY_OVERFLOW
+        assert (spad.counters.exposed, spad.counters.lost) == (160, 5)
+
+
+def test_a_truncated_block_counts_for_its_whole_frames() -> None:
+    def cut(block: bytearray) -> tuple[bytes]:
+        end = 384 + 16 * 384
+        struct.pack_into("<I", block, end + 4, BlockStatus.TRUNCATED)
+        struct.pack_into("<I", block, end + 16, 384 - 96 + 5 * 384 + 100)
+        struct.pack_into("<I", block, end + 28, zlib.crc32(block[end : end + 28]))
+        return (bytes(block),)
+
+    device = model()
+    with opened(device) as spad:
+        device.mangle = nth(1, cut)
+        _, blocks = take(spad, 64)
+        assert require_right(blocks) == [*range(21), *range(32, 64)]
+        assert spad.counters.lost == 11
+
+
+# The ring
+
+
+@pytest.mark.parametrize("slots", [1, 2, 3, 8, 40])
+def test_a_reader_that_keeps_up_loses_nothing_however_short_the_ring(slots: int) -> None:
+    with opened(model(paced=True, fifo_frames=1_000_000)) as spad:
+        timing = spad.configure(REQUEST)
+        ring = BlockRing(slots, timing.stride, on_full=OnFull.DROP)
+        reader = ring.reader("test")
+        numbers: list[int] = []
+
+        def read() -> None:
+            for block in reader:
+                numbers.extend(block.frame_numbers.tolist())
+                if slots < 3:
+                    return  # it holds what the source needs
+
+        thread = threading.Thread(target=read)
+        thread.start()
+        spad.start(320 if slots >= 3 else 16)
+        while spad.fill(ring, 1.0):
+            time.sleep(0.002)
+        ring.finish()
+        thread.join()
+        assert numbers == list(range(len(numbers)))
+        assert len(numbers) == (320 if slots >= 3 else 16)
+
+
+def test_a_full_ring_drops_counted_blocks_and_the_device_does_not_starve() -> None:
+    with opened(model()) as spad:
+        timing = spad.configure(REQUEST)
+        ring = BlockRing(3, timing.stride, on_full=OnFull.DROP)
+        reader = ring.reader("test")
+        spad.start(160)
+        while spad.fill(ring, 1.0):
+            pass
+        ring.finish()
+        assert require_right(list(reader)) == list(range(48))
+        assert (spad.counters.delivered, spad.counters.lost, ring.dropped_frames) == (48, 112, 112)
+
+
+def test_a_full_ring_ends_the_run_where_the_policy_says_so() -> None:
+    with opened(model()) as spad:
+        timing = spad.configure(REQUEST)
+        ring = BlockRing(3, timing.stride, on_full=OnFull.FAIL)
+        ring.reader("test")
+        spad.start(None)
+        with pytest.raises(RingOverflow):  # noqa: PT012
+            while spad.fill(ring, 1.0):
+                pass
+        spad.stop()
+        assert len(ring._claimed) == 0
+
+
+# Real libusb
+
+
+@contextmanager
+def pulling(attached: AttachedDevice, device: SpbUsbModel) -> Iterator[None]:
+    """Pull the cable a moment after a run with the agreed heartbeat begins."""
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.02):
+            if device.state is State.RUNNING and device.heartbeat_ms == 12_345:
+                over.wait(0.1)
+                attached.unplug()
+                return
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@pytest.fixture(scope="module", params=["fx3", "ft601"])
+def over_libusb(request: pytest.FixtureRequest) -> dict[str, str]:
+    """What became of each body in a process of its own, with real libusb."""
+    if missing():
+        pytest.skip(missing())
+    device = model(chip=request.param)
+    with UmockdevBus(SystemClock()) as bus, pulling(bus.plug(device), device):
+        command = [sys.executable, "-m", "tests.wire.spb_bodies", request.param]
+        done = subprocess.run(command, env=bus.environment(), capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    outcome: dict[str, str] = json.loads(done.stdout)
+    return outcome
+
+
+@pytest.mark.parametrize("body", spb_bodies.BODIES, ids=lambda body: body.__name__)
+def test_over_libusb(body: Callable[[], None], over_libusb: dict[str, str]) -> None:
+    assert over_libusb[body.__name__] == ""
+
+
+def test_fault_campaign_in_short() -> None:
+    assert campaign(sequences=50, seed=1).wrong == []

@@ -1,0 +1,32 @@
+"""The udev rules name every USB device that a driver opens."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from drivers.transports.usb_device import UDEV_RULES
+
+ROOT = Path(__file__).parents[2]
+IDS = sorted(
+    {
+        (f"{int(vendor, 16):04x}", f"{int(product, 16):04x}")
+        for file in (ROOT / "drivers").glob("*.py")
+        for vendor, product in re.findall(r"UsbId\([^,()]+, 0x(\w{4}), 0x(\w{4})", file.read_text(encoding="utf-8"))
+    }
+)
+
+
+def test_there_are_devices() -> None:
+    assert ("1209", "e500") in IDS
+
+
+@pytest.mark.parametrize(("vendor", "product"), IDS)
+def test_a_rule_names_the_device(vendor: str, product: str) -> None:
+    rules = (ROOT / UDEV_RULES).read_text(encoding="utf-8")
+    assert f'ATTR{{idVendor}}=="{vendor}", ATTR{{idProduct}}=="{product}"' in rules
+
+
+def test_it_says_how_to_install_it_in_one_line() -> None:
+    first = (ROOT / UDEV_RULES).read_text(encoding="utf-8").splitlines()[:3]
+    assert any(line.startswith("#") and "/etc/udev/rules.d/" in line for line in first)
