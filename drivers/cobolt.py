@@ -194,7 +194,10 @@ def _dialect(line: CoboltLine, model: str) -> Dialect:
 
 def _device_limit_w(line: CoboltLine) -> float:
     """`gmlp?` in milliwatts."""
-    return float(line.ask_surely("gmlp?", NUMBER)) * 1e-3
+    limit_w = float(line.ask_surely("gmlp?", NUMBER)) * 1e-3
+    if limit_w <= 0:
+        raise ProtocolError(f"{line.name} says that its most power is {limit_w:g} W; check its cable and firmware")
+    return limit_w
 
 
 KIND = Kind(config=CoboltConfig, create=create)

@@ -134,7 +134,8 @@ class CoboltLine:
     def _once(self, command: str) -> str:
         """One command and the line that follows it, without junk."""
         self._await_gap()
-        self._port.reset_input()
+        if self._port.reset_input().strip():  # a reply that nobody asked for, and perhaps its other half comes yet
+            self._port.drain(self._timing.quiet_s, self._timing.drain_s)
         self._port.write(command.encode("ascii") + b"\r")
         try:
             return self._line(command)

@@ -99,8 +99,14 @@ class LaserCubeRun:
         self._waiting += encode(points, self._axis, markers=self._markers)
         whole = len(self._waiting) // (8 * SAMPLES_PER_TRANSFER) * 8 * SAMPLES_PER_TRANSFER
         self._link.send(self._waiting[:whole])
+        empty_s = min(self._start_s) + self._sent / self._rate_hz
+        if whole and np.isfinite(empty_s) and self._now_s() > empty_s:
+            self._raise_dry()
         self._waiting = self._waiting[whole:]
         self._sent += whole // 8
+
+    def _raise_dry(self) -> None:
+        raise DeviceFault(f"{self._link.name}: the points ran dry; lengthen buffer or unload the host")
 
     def _queued(self) -> int:
         """Samples not yet played; `DeviceFault` where their number cannot be."""
@@ -108,7 +114,7 @@ class LaserCubeRun:
         queued = self._link.queued()
         after_s = self._now_s()
         if queued == 0:
-            raise DeviceFault(f"{self._link.name}: the points ran dry; lengthen buffer or unload the host")
+            self._raise_dry()
         played_s = (self._sent - queued) / self._rate_hz
         slack_s = _DRIFT * (after_s - self._asked_s)
         self._asked_s = after_s

@@ -167,7 +167,8 @@ class ObisLine:
             raise ObisRefused(f"{self.name} refuses {command!r}: {reply} ({meaning}); check its state and model")
 
     def _send(self, command: str) -> None:
-        self._port.reset_input()
+        if self._port.reset_input().strip():  # a reply that nobody asked for, and perhaps its other half comes yet
+            self._port.drain(self._timing.quiet_s, self._timing.drain_s)
         addressed = re.sub(r"^(SYST|SOUR)(?=:)", rf"\g<1>{self._suffix}", command)
         self._port.write(addressed.encode("ascii") + b"\r\n")
 

@@ -1,7 +1,8 @@
 """The ring of block slots between one source thread and its readers: allocated once, nothing copied, nothing lost.
 
 The source claims free slots (several at once where USB transfers are queued), fills them and publishes them in the
-order of claiming; every reader gets every block in that order and holds its slot until it asks for the next.
+order of claiming; every reader gets every block in that order and holds its slot until it asks for the next, or for
+some more.
 
 What a source does that finds no free slot is said by the ring, `on_full`, so that drivers need to know no policy: they
 claim, and where they got nothing and `ring.waits` is False, they drop the block, count it as lost and say so.
@@ -106,6 +107,10 @@ class BlockRing:
             if optional >= self.slots:
                 raise ValueError(
                     f"ring: optional reader {name!r} could hold the last of {self.slots} slots; make the ring longer"
+                )
+            if holds > self.slots - optional:
+                raise ValueError(
+                    f"ring: reader {name!r} would hold {holds} of {self.slots} slots; make the ring longer"
                 )
             reader = RingReader(self, name, required, holds)
             self._readers.append(reader)

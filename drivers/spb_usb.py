@@ -101,6 +101,10 @@ _WIRINGS: dict[Chip, _Wiring] = {
 }
 
 
+USB_IDS = tuple(wiring.usb for wiring in _WIRINGS.values())
+"""What such boards say they are on the bus."""
+
+
 class SpbUsbConfig(KindConfig):
     """Config of an SPB1 SPAD on USB."""
 

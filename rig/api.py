@@ -22,8 +22,10 @@ from rig.saving import SavePolicy
 
 if TYPE_CHECKING:
     from rig.acquisition import ScanProgress
+    from rig.attached import Attached
     from rig.bench.soak import SoakReport
     from rig.bench.speed import SpeedReport
+    from rig.doctor import Finding
     from rig.effects import Effect
     from rig.monitor import Watch
     from rig.overload import Overload
@@ -190,6 +192,30 @@ def effects(config: Config = SIMULATED, *, scene: str | None = None) -> "tuple[E
     from rig.effects import scene_effects
 
     return scene_effects(configure(config, scene=scene))
+
+
+def doctor(config: Config = SIMULATED, *, out: PathLike = "runs") -> "list[Finding]":
+    """Whether a scan could run (`rig doctor`): devices, plan, frames, markers, dark counts, disk; no light leaves.
+
+    The mirror moves. out: where a scan would write.
+    """
+    from rig.doctor import examine
+
+    return examine(configure(config), Path(out))
+
+
+def devices() -> "list[Attached]":
+    """USB devices that a driver knows and serial ports, as far as can be seen without opening them (`rig devices`)."""
+    from rig.attached import attached
+
+    return attached()
+
+
+def laser_off(config: Config = SIMULATED) -> list[str]:
+    """Take the gate low and disarm the laser (`rig laser off`); says what was done. Raises DevicesError."""
+    from rig.attached import laser_off as switch_off
+
+    return switch_off(configure(config))
 
 
 def bench(*, threads: int | None = None, progress: Progress | None = None) -> "SpeedReport":

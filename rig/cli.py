@@ -1,4 +1,4 @@
-"""The command line: `rig scan`, `rig reconstruct`, `rig effects`, `rig bench`, `rig warmup`, `rig config`.
+"""The command line: `rig scan`, `reconstruct`, `effects`, `doctor`, `devices`, `laser`, `bench`, `warmup`, `config`.
 
 Each command is one call of `rig.api` and some printing. Results go to stdout, everything else to stderr. Exit codes:
 0 done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted, 70 an error in the program itself.
@@ -42,6 +42,8 @@ app = typer.Typer(
 )
 config_app = typer.Typer(name="config", help="Check, show or describe a config.", rich_markup_mode=None)
 app.add_typer(config_app)
+laser_app = typer.Typer(name="laser", help="The laser's safe state.", rich_markup_mode=None)
+app.add_typer(laser_app)
 
 ConfigArgument = Annotated[
     str, typer.Argument(metavar="[CONFIG]", help="a bundled rig's name or a YAML file", show_default=True)
@@ -264,6 +266,53 @@ def effects_command(
         from rig.report_text import effects_table
 
         effects_table(effects)
+    return 0
+
+
+@app.command("doctor")
+@_command
+def doctor_command(
+    config: ConfigArgument = "simulated",
+    out: Annotated[Path, typer.Option("--out", help="folder that a scan would write to")] = Path("runs"),
+    as_json: JsonOption = False,
+) -> int:
+    """Open everything, look at the stream with the gate low, and say whether a scan could run."""
+    from rig import api
+
+    findings = api.doctor(config, out=out)
+    if as_json:
+        _print_json({"could_scan": all(one.ok for one in findings), "findings": [one.as_json() for one in findings]})
+    else:
+        for one in findings:
+            print(f"{'ok  ' if one.ok else 'FAIL'}  {one.name:<12}{one.text}")
+    return 0 if all(one.ok for one in findings) else EXIT_DEVICE
+
+
+@app.command("devices")
+@_command
+def devices_command(as_json: JsonOption = False) -> int:
+    """What is attached: USB devices that a driver knows, and serial ports."""
+    from rig import api
+
+    found = api.devices()
+    if as_json:
+        _print_json({"devices": [one.as_json() for one in found]})
+    else:
+        for one in found:
+            print(f"{one.address:<32}{one.what}")
+        if not found:
+            print("no known USB device and no serial port is attached")
+    return 0
+
+
+@laser_app.command("off")
+@_command
+def laser_off_command(config: ConfigArgument = "simulated") -> int:
+    """Take the gate low and switch the laser's emission off for good."""
+    from rig import api
+
+    for line in api.laser_off(config):
+        print(line)
     return 0
 
 

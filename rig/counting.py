@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from rig.row_threads import RowWorkers
 
+MOST_WIDTH_PX = 64 * 256
+"""A row's words must fit one chunk of the counters."""
 BIN_DARK = -1
 """Bin of a frame with the gate low during the whole exposure."""
 BIN_UNUSABLE = -2
@@ -40,7 +42,9 @@ class SweepLayout:
     dark: bool = True
 
     def __post_init__(self) -> None:
-        """Raises ValueError for windows that are not on whole words."""
+        """Raises ValueError for windows that are not on whole words, and for rows too wide."""
+        if self.padded_width > MOST_WIDTH_PX:
+            raise ValueError(f"rows of {self.width} pixels; counters take {MOST_WIDTH_PX} at most")
         if self.window % 64 or np.any(self.x0 % 64):
             raise ValueError(f"window {self.window} and its starts must be multiples of 64 pixels")
 

@@ -88,6 +88,7 @@ def count_map(cube: Cube, index: int, counter: Counter) -> FrameTally:
         bits[:, :, row_bytes - 1] &= last_byte
         column = (np.arange(start, stop) // exposures).astype(np.int32)
         counter.add(bits, column, column.astype(np.float64), np.zeros(len(bits), np.int32))
+        counter.settle(1)  # frames wait in memory until they are counted
     return counter.finish()
 
 

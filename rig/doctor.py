@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import DeviceError
 from drivers.frames import SUBFRAME_SHIFT, FrameBlock, Mark
+from drivers.interfaces import MARKER_LINE
 from drivers.ring import BlockRing
 from rig.config import RigConfig
 from rig.errors import DevicesError, RigError
@@ -54,9 +55,8 @@ def examine(config: RigConfig, folder: Path) -> list[Finding]:
         with open_rig(config) as rig:
             findings += _devices(rig)
             plan, timing = prepare(rig)
-            findings.append(
-                Finding("plan", True, f"{plan.columns} columns x {plan.exposures} exposures in {plan.sweep_s * 1e3:.3g} ms")
-            )
+            sweep = f"{plan.columns} columns x {plan.exposures} exposures in {plan.sweep_s * 1e3:.3g} ms"
+            findings.append(Finding("plan", True, sweep))
             findings += _frames(rig, plan, timing.stride)
     except (RigError, DeviceError) as error:
         lines = str(error).splitlines() if isinstance(error, DevicesError) else [str(error)]
@@ -66,12 +66,12 @@ def examine(config: RigConfig, folder: Path) -> list[Finding]:
 
 
 def _devices(rig: OpenRig) -> list[Finding]:
-    info, status = rig.spad.info, rig.laser.status
+    info, status, scanner_fault = rig.spad.info, rig.laser.status, rig.scanner.status.fault
     link = "" if info.stream is None or not info.stream.bytes_per_s else f", {info.stream.bytes_per_s / 1e6:.0f} MB/s"
     found = [
         Finding("spad", True, f"{rig.spad.name}: {info.model} {info.serial}, {info.width} x {info.height} px{link}"),
-        Finding("scanner", rig.scanner.status.fault is None, f"{rig.scanner.name}: {rig.scanner.status.fault or 'ready'}"),
-        Finding("sync", True, f"{rig.sync.name}: resolution {rig.sync.resolution}"),
+        Finding("scanner", scanner_fault is None, f"{rig.scanner.name}: {scanner_fault or 'ready'}"),
+        Finding("sync", True, f"{rig.sync.name}: resolution {rig.sync.resolution_s * 1e9:g} ns"),
     ]
     trouble = [
         text
@@ -98,7 +98,8 @@ def _frames(rig: OpenRig, plan: ScanPlan, stride: int) -> list[Finding]:
     ring = BlockRing(RING_SLOTS, stride)
     blocks: list[tuple[NDArray[np.void], float, int]] = []
     wanted = 2 * float(plan.frames_per_sweep)
-    frames = None if plan.burst_frames is None else int(min(plan.burst_frames, 0.3 * float(plan.frame_rate_hz) + wanted))
+    lead = 0.3 * float(plan.frame_rate_hz)
+    frames = None if plan.burst_frames is None else int(min(plan.burst_frames, lead + wanted))
     begun = time.monotonic()
     with ring.reader("doctor") as reader:
         rig.spad.start(frames)
@@ -144,17 +145,23 @@ def _markers(records: NDArray[np.void], plan: ScanPlan) -> Finding:
     at = np.flatnonzero(marks & int(Mark.LINE))
     scans = int(np.count_nonzero(marks & int(Mark.SCAN)))
     if len(at) < 3 or scans == 0:
-        return Finding("markers", False, f"{scans} scan and {len(at)} line markers seen; check the scanner's marker lines")
+        seen = f"{scans} scan and {len(at)} line markers seen"
+        return Finding("markers", False, f"{seen}; check the scanner's marker lines")
     frames = at + ((marks[at] >> SUBFRAME_SHIFT) & 0xFF) / 256
-    steps = np.diff(frames)
-    usual = float(np.median(steps))
-    regular = steps[np.abs(steps - usual) < 0.5 * usual]
-    jitter = float(np.std(regular)) / (usual / plan.columns_per_marker)
-    rate_hz = float(plan.frame_rate_hz) / usual
+    begins = int(np.flatnonzero(marks & int(Mark.SCAN))[0])
+    planned = np.flatnonzero(plan.waveform.markers & MARKER_LINE) / float(plan.point_rate_hz)
+    seen = frames[at >= begins][: len(planned)]
+    planned = planned[: len(seen)]
+    if len(seen) < 3:
+        return Finding("markers", False, f"only {len(seen)} line markers behind a scan marker; check the marker lines")
+    frames_per_s, offset = np.polyfit(planned, seen, 1)
+    jitter = float(np.std(seen - (frames_per_s * planned + offset))) / plan.exposures
+    error_ppm = (float(plan.frame_rate_hz) / frames_per_s - 1) * 1e6
     return Finding(
         "markers",
         jitter <= MOST_JITTER,
-        f"{scans} scan and {len(at)} line markers, {rate_hz:.6g} lines a second, jitter {jitter:.3g} columns",
+        f"{scans} scan and {len(at)} line markers, {1 / np.median(np.diff(planned)):.6g} a second, jitter {jitter:.3g} "
+        f"columns, scanner's clock {error_ppm:+.0f} ppm against the SPAD's",
     )
 
 

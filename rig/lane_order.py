@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rig.lanes import (
     LANES,
+    as_bytes,
     first_row_pairs,
     load_bytes,
     load_two_rows,
@@ -20,6 +21,7 @@ from rig.lanes import (
     store_bytes,
     write_byte,
     zero_bytes,
+    zero_int16,
 )
 
 STEPS: Final = 8
@@ -120,12 +122,17 @@ def read_planes(
             store_bytes(n, q * pair + 2 * (PAD + window // STEPS), zero_bytes())
 
 
+@numba.njit(inline="always")
+def _share(x, times):  # type: ignore[no-untyped-def]
+    """What is added to the count of pixel x before 2^times divide it: 0 to 2^times - 1 by turns."""
+    return ((x & 7) << times) >> 3
+
+
 @numba.njit(cache=True, nogil=True)
 def read_counts(counts: NDArray[np.unsignedinteger], halved: int, n: int, lanes: int) -> None:
     """Counts of a row in pixel order (window,) to address n, divided by 2^halved as `halve_counts` does."""
-    half = (1 << halved) >> 1
     for x in range(counts.shape[0]):
-        write_byte(n, place_of(x, lanes), np.uint8((np.int64(counts[x]) + half) >> halved))
+        write_byte(n, place_of(x, lanes), np.uint8((np.int64(counts[x]) + _share(x, halved)) >> halved))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -141,10 +148,15 @@ def write_counts(n: NDArray[np.uint8], counts: NDArray[np.unsignedinteger]) -> N
 
 @numba.njit(cache=True, nogil=True)
 def halve_counts(n: int, lanes: int, times: int) -> None:
-    """Divide all counts of the row at address n by 2^times, at least 2, rounded."""
-    for at in range(0, PAIRS * pair_bytes(lanes), 2 * LANES):
-        counts = load_bytes(n, at)
-        store_bytes(n, at, (counts >> times) + ((counts >> (times - 1)) & 1))
+    """Divide all counts of the row at address n by 2^times, rounded up or down by turns: few counts keep their mean."""
+    rest = (1 << times) - 1
+    for q in range(PAIRS):
+        # The sum of a byte and its share may not fit: what is left over is looked at by itself.
+        shares = as_bytes(zero_int16() + np.int16(_share(2 * q, times) | _share(2 * q + 1, times) << 8))
+        for v in range(0, 2 * lanes, 2 * LANES):
+            at = q * pair_bytes(lanes) + 2 * PAD + v
+            counts = load_bytes(n, at)
+            store_bytes(n, at, (counts >> times) + (((counts & rest) + shares) >> times))
 
 
 @numba.njit(forceinline=True)

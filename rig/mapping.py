@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Protocol
 
 from drivers.errors import DeviceFault
@@ -73,7 +74,12 @@ class Mapping:
     def _run(self) -> None:
         try:
             with self._reader:
-                self._count()
+                try:
+                    self._count()
+                finally:
+                    # Threads may still be at work on blocks whose slots go back now.
+                    with suppress(Exception):
+                        self._assembler.settle(0)
         except BaseException as error:  # raised again on the caller's thread
             self.error = error
         self._queue.end_stream()

@@ -1,6 +1,7 @@
 """Compiled work on image rows, shared out between threads; kernels release the interpreter's lock while they run."""
 
 import threading
+import weakref
 from collections.abc import Callable
 from itertools import pairwise
 from queue import SimpleQueue
@@ -11,26 +12,23 @@ import numpy as np
 
 Work = Callable[[int, int], None]
 """Called with the first row and the one behind the last."""
+_Job = tuple[Work, int, int]
 
 
 class RowWorkers:
     """Threads that share the rows of a picture, each one always the same: what it touched is still in its cache.
 
     Work can be left with them (`post`): each goes through it in order, none waits for the others, and handing over
-    costs the caller little. Work that fails is raised again at the next call. With one thread all is done at once.
+    costs the caller little. Work that fails is raised again at the next call, and what was left behind it is not begun.
+    With one thread all is done at once. The threads end with `close`, or when nobody has the workers any more.
     """
 
     def __init__(self, threads: int) -> None:
         self.threads = max(1, threads)
-        self._queues: list[SimpleQueue[tuple[Work, int, int] | None]] = []
-        self._done = [0] * self.threads
-        self._posted = 0
-        self._changed = threading.Condition()
-        self._error: BaseException | None = None
-        if self.threads > 1:
-            self._queues = [SimpleQueue() for _ in range(self.threads)]
-            for i in range(self.threads):
-                threading.Thread(target=self._run, args=(i,), name=f"rows {i}", daemon=True).start()
+        self._state = _State(self.threads if self.threads > 1 else 0)
+        self._ended = weakref.finalize(self, _end, self._state)
+        for i, queue in enumerate(self._state.queues):
+            threading.Thread(target=_run, args=(self._state, queue, i), name=f"rows {i}", daemon=True).start()
 
     def over(self, rows: int, work: Work) -> None:
         """Call work(first, last) for ranges that cover rows 0..rows-1 once, behind all that was posted before."""
@@ -39,30 +37,34 @@ class RowWorkers:
 
     def post(self, rows: int, work: Work) -> None:
         """The same without waiting for it."""
-        if not self._queues:
+        state = self._state
+        if not state.queues:
             if rows:
                 work(0, rows)
             return
-        self._raise_error()
+        if state.error is not None:
+            self.settle()
         edges = np.linspace(0, rows, self.threads + 1).astype(int).tolist()
-        self._posted += 1
-        for queue, (first, last) in zip(self._queues, pairwise(edges), strict=True):
+        state.posted += 1
+        for queue, (first, last) in zip(state.queues, pairwise(edges), strict=True):
             queue.put((work, first, last))
 
     def settle(self, under_way: int = 0) -> None:
-        """Wait until no more than the last `under_way` posts are not done."""
-        if not self._queues:
+        """Wait until no more than the last `under_way` posts are not done; all of them where one failed."""
+        state = self._state
+        if not state.queues:
             return
-        wanted = self._posted - under_way
-        if min(self._done) < wanted:
-            with self._changed:
-                self._changed.wait_for(lambda: min(self._done) >= wanted)
-        self._raise_error()
+        wanted = state.posted - under_way
+        if min(state.done) < wanted or state.error is not None:
+            with state.changed:
+                state.changed.wait_for(lambda: min(state.done) >= (wanted if state.error is None else state.posted))
+        if state.error is not None:
+            error, state.error = state.error, None
+            raise error
 
     def close(self) -> None:
         """End the threads once all is done."""
-        for queue in self._queues:
-            queue.put(None)
+        self._ended()
 
     def __enter__(self) -> Self:
         """The workers themselves."""
@@ -74,21 +76,35 @@ class RowWorkers:
         """Close."""
         self.close()
 
-    def _run(self, i: int) -> None:
-        while (job := self._queues[i].get()) is not None:
-            work, first, last = job
-            try:
-                if first < last and self._error is None:
-                    work(first, last)
-            except BaseException as error:  # raised again on the caller's thread
-                self._error = error
-            # Frames that the work holds must not outlive it.
-            del work, job
-            with self._changed:
-                self._done[i] += 1
-                self._changed.notify_all()
 
-    def _raise_error(self) -> None:
-        error, self._error = self._error, None
-        if error is not None:
-            raise error
+class _State:
+    """What the threads know; they must not keep the workers themselves alive."""
+
+    def __init__(self, threads: int) -> None:
+        self.queues: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(threads)]
+        self.done = [0] * threads
+        self.posted = 0
+        self.changed = threading.Condition()
+        self.error: BaseException | None = None
+        """The first failure, until the caller has been told and nothing is left over."""
+
+
+def _run(state: _State, queue: "SimpleQueue[_Job | None]", i: int) -> None:
+    while (job := queue.get()) is not None:
+        work, first, last = job
+        try:
+            if first < last and state.error is None:
+                work(first, last)
+        except BaseException as error:  # raised again on the caller's thread
+            with state.changed:
+                state.error = state.error or error
+        # Frames that the work holds must not outlive it.
+        del work, job
+        with state.changed:
+            state.done[i] += 1
+            state.changed.notify_all()
+
+
+def _end(state: _State) -> None:
+    for queue in state.queues:
+        queue.put(None)

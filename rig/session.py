@@ -83,6 +83,24 @@ def open_rig(config: RigConfig, clock: Clock | None = None, seed: int = 0) -> It
         yield _open(config, clock, seed, stack)
 
 
+@contextmanager
+def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
+    """The gate and the laser alone, directly; None where one cannot be opened, which `trouble` then says."""
+    with ExitStack() as stack:
+        virtual = config.world is not None and not config.world.real_time
+        clock: Clock = VirtualClock() if virtual else SystemClock()
+        world: Any = None if config.world is None else _create("world", config.world, Surroundings(clock, None, 0))
+        ports = stack.enter_context(world).ports if isinstance(world, EmulatesDevices) else {}
+        opened: dict[str, Any] = {"sync": None, "laser": None}
+        for slot in ("laser", "sync"):
+            try:
+                device = _create(slot, getattr(config, slot), Surroundings(clock, world, 0, ports))
+                opened[slot] = stack.enter_context(device)
+            except DeviceError as error:
+                trouble.append(f"{slot}: {error}")
+        yield opened["sync"], opened["laser"]
+
+
 def prepare(rig: OpenRig, scan: ScanConfig | None = None) -> tuple[ScanPlan, SpadTiming]:
     """Configure the SPAD and compile the plan; nothing moves and nothing lights. scan: the config's by default."""
     scan = rig.config.scan if scan is None else scan

@@ -93,6 +93,7 @@ class SweepAssembler:
         self._received = self._lit = self._dark = 0
         self._count_s = 0.0
         self._run_id: int | None = None
+        self._width: int | None = None
         self.frames_seen = 0
         self.sweeps_done = 0
         self.complete = False
@@ -128,7 +129,9 @@ class SweepAssembler:
 
     def settle(self, blocks: int) -> None:
         """Wait until none but the last `blocks` blocks, fewer than MOST_UNDER_WAY, will be read any more."""
+        begun = time.perf_counter()
         self._counter.settle(sum(list(self._adds)[-blocks:]) if blocks else 0)
+        self._count_s += time.perf_counter() - begun
 
     def _finish(self, clock: SweepClock) -> SweepData:
         expected = clock.end_frame - clock.first_frame
@@ -138,10 +141,13 @@ class SweepAssembler:
             if first < clock.end_frame and last >= clock.first_frame
         ]
         self._gaps = [gap for gap in self._gaps if gap[1] >= clock.end_frame]
+        begun = time.perf_counter()
+        volume = self._counter.finish()
+        self._count_s += time.perf_counter() - begun
         data = SweepData(
             index=self._first_index + clock.sweep,
             direction=self._plan.leg(clock.sweep).direction,
-            volume=self._counter.finish(),
+            volume=volume,
             residual_columns=clock.residual_columns,
             clock_error=clock.clock_error,
             synchronised=clock.synchronised,
@@ -186,6 +192,8 @@ class SweepAssembler:
         """Only blocks of this run, of whole frames or of the plan's windows, can be counted."""
         header, plan = block.header, self._plan
         widths = {plan.width} if plan.windows is None else {plan.width, plan.windows.width_px}
+        # Counters cannot go from one width to another in the middle of a column.
+        widths = widths if self._width is None else {self._width}
         if header.width not in widths or header.height != plan.rows:
             raise ProtocolError(
                 f"block {header.block_seq} holds frames of {header.width} x {header.height} pixels, the plan is for "
@@ -200,7 +208,7 @@ class SweepAssembler:
                 f"block {header.block_seq} begins at frame {header.first_frame}, before frame {self._next_frame} "
                 "that should come next; start anew"
             )
-        self._run_id = header.run_id
+        self._run_id, self._width = header.run_id, header.width
 
 
 def _warn(sweep: SweepData) -> None:

@@ -40,7 +40,7 @@ SILENCE_S = 1.0
 """A guard that gives no sign of life for so long, in time that this process was awake, hangs: it is ended..."""
 BUSY_SILENCE_S = 5.0
 """...or after this where it is at work or waits for a processor or a disk."""
-_TICK_S = 0.05
+_TICK_S = 0.02
 _MAX_STEP_S = 0.1
 _LOWERING = ("pause", "disarm", "gate_low", "abort")
 _ENABLING = ("arm", "program", "run")
@@ -235,10 +235,11 @@ class Guard:
             before = now
             if messages:
                 silent_s, begun, noted = 0.0, True, False
-            elif not noted:
+                continue
+            if not noted:
                 noted = True
                 self._seen.note_progress()
-            elif self._hangs(silent_s, begun):
+            if self._hangs(silent_s, begun):
                 _log.error("the laser guard hangs; ending it")
                 self._process.kill()
                 silent_s = 0.0

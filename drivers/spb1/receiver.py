@@ -174,9 +174,8 @@ class BlockReceiver:
             if self._held is None:
                 self._held = ring.claim(0.0)
             if self._held is None:
-                if len(self._items) >= fewest:
+                if len(self._items) >= fewest or not self._submit(self._spare(), slot=False):
                     return
-                self._submit(self._spare(), slot=False)
             elif self._submit(self._held[: self._armed.stride], slot=True):
                 self._held = None
             else:

@@ -106,11 +106,11 @@ class SerialPort:
             self._receive(ends_at, deadline_s, f"{n} bytes")
         return self._take(n, 0)
 
-    def reset_input(self) -> None:
-        """Drop everything received so far and not read."""
-        self._received.clear()
+    def reset_input(self) -> bytes:
+        """Drop everything received so far and not read; returns what it was. More may be on its way: see `drain`."""
         with self._translated():
-            self._port.reset_input_buffer()
+            self._received += self._port.read(self._port.in_waiting)
+        return self._take(len(self._received), 0)
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
         """Drop all that comes until the line is quiet for `quiet_s`, at most for `deadline_s`; returns what it was."""

@@ -91,7 +91,8 @@ class TcpStream:
         where = f"{self._name}: {self._address}"
         if isinstance(error, ConnectionRefusedError):
             return DeviceNotFound(
-                f"{where} refuses the connection; start the program that serves it, or correct 'port'"
+                f"{where} refuses the connection; start the program that serves it, end its other clients, or correct "
+                "'port'"
             )
         if error.errno in _FORBIDDEN:
             return DevicePermission(f"{where} may not be connected to by this user; ask for a firewall rule")

@@ -77,6 +77,7 @@ def measure_latency(
     for i, block in enumerate(reader):
         at = i % sweep_blocks * PLACE_FRAMES
         counter.add(block.bits, bins[at : at + PLACE_FRAMES], column[at : at + PLACE_FRAMES], x0)
+        counter.settle()
         judged[i] = time.perf_counter()
         if at:
             ended[i - 1] = judged[i]

@@ -40,6 +40,8 @@ CLOSE_SHIFT = 3
 """Weights of the close-up are of 16 units an octave: what 8 bits then cut says as much as 8 octaves."""
 CLOSE_LIMIT = 60000
 """Largest sum of a label's weights times counts if all pixels were full, which no line's are. Sums saturate at half."""
+LOOKED_AT = 32
+"""Columns whose weights say in which units to keep those of all."""
 ROUGH_UNITS = 4.0
 """Units per octave in which no weight reaches its limit: a logit lies within 11 octaves of 0 either way."""
 CUT = 1.25
@@ -251,9 +253,9 @@ def _empty_tables(columns: int, bands: int, lanes: int, reach: int) -> Tables:
 def _largest(sweep: Sweep, state: State, light: NDArray[np.float32], reach: int) -> tuple[float, float]:
     """Largest sum of a position's taps, or half of that of a lane's edge weights, which stand alone, and largest tap.
 
-    In octaves, from the tables of one band in the middle of every 16th column.
+    In octaves, from the tables of one band in the middle of some columns.
     """
-    columns = np.arange(0, sweep.plane.shape[0], 16)
+    columns = np.unique(np.linspace(0, sweep.plane.shape[0] - 1, LOOKED_AT).astype(np.int64))
     middle = slice(sweep.u.shape[0] // 2, sweep.u.shape[0] // 2 + 1)
     few = sweep._replace(
         x0=sweep.x0[columns], plane=np.ascontiguousarray(sweep.plane[columns]),

@@ -9,7 +9,7 @@ from typing import Final
 import numba
 import numpy as np
 
-from rig.lanes import add_saturated, from_bfloat16, from_bfloat16_unpacked, larger, smaller, zero_int16
+from rig.lanes import add_saturated, from_bfloat16, from_bfloat16_unpacked, larger, sub_saturated, zero_int16
 
 BIAS: Final = np.int16(127 << 7)
 """Exponent of 1.0 as a bfloat16."""
@@ -20,8 +20,7 @@ MEAN_EXCESS: Final = np.float32(1.040684)
 @numba.njit(inline="always")
 def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
     """What to add to scores so that nothing is at 0, 127 octaves below each lane's best score or at the lowest."""
-    # The negative of the lowest number does not exist.
-    return smaller((zero_int16() - best) + np.int16(np.int64(BIAS) >> shift), np.int16(32767))
+    return add_saturated(sub_saturated(zero_int16(), best), np.int16(np.int64(BIAS) >> shift))
 
 
 @numba.njit(inline="always")

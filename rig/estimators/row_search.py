@@ -302,10 +302,20 @@ def _neutral_counts(neutral: int, exposures: float, c: int, window: int, to: int
 
 @numba.njit(forceinline=True)
 def _mute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
-    """Give the hot pixels of the batch's rows counts that speak for no position."""
-    n = search.n - first * search.n_bytes
-    for h in range(_hot_of_row(desk, x0, first), _hot_of_row(desk, x0, first + rows)):
-        write_byte(n, read_int32(desk.hot_place, h), read_byte(search.neutral, read_int16(desk.hot_at, h)))
+    """Give the hot pixels of the batch's rows counts that speak for no position; their own are kept in `muted`."""
+    n, begin = search.n - first * search.n_bytes, _hot_of_row(desk, x0, first)
+    for h in range(begin, _hot_of_row(desk, x0, first + rows)):
+        place = read_int32(desk.hot_place, h)
+        write_byte(search.muted, h - begin, read_byte(n, place))
+        write_byte(n, place, read_byte(search.neutral, read_int16(desk.hot_at, h)))
+
+
+@numba.njit(forceinline=True)
+def _unmute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
+    """Give them back: what teaches the ambient light must be what was counted."""
+    n, begin = search.n - first * search.n_bytes, _hot_of_row(desk, x0, first)
+    for h in range(begin, _hot_of_row(desk, x0, first + rows)):
+        write_byte(n, read_int32(desk.hot_place, h), read_byte(search.muted, h - begin))
 
 
 @numba.njit(forceinline=True)
@@ -327,6 +337,7 @@ def judge_rows(desk: Desk, search: Search, table: Table, first: int, rows: int, 
     _measure_light(desk, search, table, first, rows, c, exposures, stripe)
     _look_closely(desk, search, rows, c, exposures, stripe)
     if c % desk.quiet_step == 0:
+        _unmute_hot(desk, search, first, rows, np.int64(read_int32(desk.x0, c)))
         for r in range(rows):
             if read_float32(stripe, desk.rows + r) > QUIET:
                 n, x = search.n + r * search.n_bytes, np.int64(read_int16(search.x, r))

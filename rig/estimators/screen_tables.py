@@ -39,7 +39,7 @@ class Tables(NamedTuple):
     from `first_pair` on, which hold those T px around it; at odd positions that of the pixel before as left as well.
     position: int16 (columns, bands, SCREENS, P), units of position x at the nominal number of exposures, its prior
     included; slope: int16, the same shape, by how many 1 / SLOPE of a unit it grows with each exposure more.
-    lane: float32 (columns, bands, lanes), units per exposure of all pixels of a lane lying left of the stripe.
+    lane: float32 (columns, bands, lanes), units per exposure of all pixels up to a lane's last lying left.
     none: float32 (columns, bands, 3), units of 'no stripe': all as right, all as left, a change somewhere (per lane).
     neutral: float32 (columns, bands, P), ones per exposure that say nothing, in pixel order.
     before, scale: float32 (columns, bands, P) as in `Row`, in pixel order.
@@ -169,6 +169,8 @@ def _positions(sweep, state, light, log_share, per_nat, nominal, b, c, span, row
         own = (levels[LOSS_LEFT, x] - levels[LOSS_RIGHT, x]) * per_nat
         within += own
         out.lane[c, b, x // STEPS] += own
+    for i in range(1, lanes):
+        out.lane[c, b, i] += out.lane[c, b, i - 1]
     mass = 0.0
     for t in range(begin, end + 1):
         mass += np.exp(row.log_prior[t])

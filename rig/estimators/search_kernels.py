@@ -26,15 +26,14 @@ from rig.lanes import (
     larger_float,
     last_lane,
     load_bytes,
-    load_float32,
     load_int16,
     lowest_bit,
+    read_float32,
     read_int16,
     running_sum,
     smaller,
     smaller_float,
     store_int16,
-    to_int16,
     up_1,
     write_int16,
     zero_float32,
@@ -48,6 +47,8 @@ PLACE_BEFORE: Final = 8
 """Pixels before the first one, and behind the last one, of which the place is known."""
 START: Final = -12000
 """Score of 'everything is as right of the stripe': most of the range lies above it."""
+NOTHING: Final = np.float32(1.2e-38)
+"""The smallest likelihood that counts."""
 MOST_OCTAVES: Final = 60
 """A hypothesis without a stripe counts no more than 2^60 times the best position."""
 
@@ -78,9 +79,9 @@ class Search(NamedTuple):
     n: counts, see `rig.lane_order`. int16: score (STEPS, lanes); start (lanes,), score of a change at the lane's first
     pixel; tops (LANES,), best scores of some lanes each; constant (SCREENS, STEPS, lanes), the tables' part per
     exposure times the exposures; lane (lanes,), the same; label (LANES,), scores of the close-up; place: index of pixel
-    -PLACE_BEFORE on in a row of counts. neutral: bytes, counts of hot pixels, see `row_search`. Of each row of the
-    batch, int16: all_left, score of all pixels lying left; best, x: best score and its pixel; left, right: the scores
-    beside it; levels: of the close-up; lift: what makes a score a power; ceiling: what no score exceeds. float32:
+    -PLACE_BEFORE on in a row of counts. neutral, muted: bytes, counts of hot pixels, see `row_search`. Of each row of
+    the batch, int16: all_left, score of all pixels lying left; best, x: best score and its pixel; left, right: the
+    scores beside it; levels: of the close-up; lift: what makes a score a power; ceiling: what no score exceeds. float32:
     light, before, scale, ambient: see `row_search`; answer: one field of the answers on its way out. Folded
     (`lane_reductions`): mass, sum of all likelihoods; moment, square: sums of the close-up.
     """
@@ -97,6 +98,7 @@ class Search(NamedTuple):
     label: int
     place: int
     neutral: int
+    muted: int
     all_left: int
     best: int
     x: int
@@ -132,12 +134,13 @@ def _search_at(n, lanes):  # type: ignore[no-untyped-def]
     place = folded + 3 * fold
     neutral = place + 2 * (STEPS * lanes + 2 * PLACE_BEFORE)
     search = Search(
-        lanes, n, n_bytes, score, score_bytes, start, tops, constant, lane, label, place, neutral, row, row + 2 * BATCH,
+        lanes, n, n_bytes, score, score_bytes, start, tops, constant, lane, label, place, neutral,
+        neutral + STEPS * lanes, row, row + 2 * BATCH,
         row + 4 * BATCH, row + 6 * BATCH, row + 8 * BATCH, row + 10 * BATCH, row + 12 * BATCH, row + 14 * BATCH, number,
         number + 4 * BATCH, number + 8 * BATCH, number + 12 * BATCH, number + 16 * BATCH, folded, folded + fold,
         folded + 2 * fold,
     )  # fmt: skip
-    return search, neutral + STEPS * lanes
+    return search, neutral + (1 + BATCH) * STEPS * lanes
 
 
 @numba.njit(cache=True, nogil=True)
@@ -177,11 +180,13 @@ def fit_positions(position: int, slope: int, places: int, more: float, to: int) 
 
 @numba.njit(forceinline=True)
 def fit_lanes(per_exposure: int, exposures: float, search: Search) -> None:
-    """Constants of the lanes; per_exposure: address of the table's."""
-    for v in range(0, search.lanes, LANES):
-        units = load_float32(per_exposure, v) * np.float32(exposures)
-        units = smaller_float(larger_float(units, np.float32(-32000)), np.float32(32000))
-        store_int16(search.lane, v, to_int16(units))
+    """Constants of the lanes; per_exposure: address of the table's, which are sums up to each lane."""
+    before = np.float32(0.0)
+    for i in range(search.lanes):
+        # Differences of rounded sums: rounding each lane would drift along the row.
+        through = np.floor(read_float32(per_exposure, i) * np.float32(exposures) + np.float32(0.5))
+        write_int16(search.lane, i, np.int16(min(max(through - before, np.float32(-32000)), np.float32(32000))))
+        before = through
 
 
 @numba.njit(forceinline=True)
@@ -373,4 +378,5 @@ def certainties(table: Table, search: Search, shift: int):  # type: ignore[no-un
     # The best position's own term is exact, the others are too large by the same share on average.
     others = totals_of_rows(search.mass) + ends - own
     own = own * MEAN_EXCESS
-    return smaller_float((own + near) / (own + others), np.float32(1.0))
+    # Where even the best score is the lowest there is, nothing is known.
+    return smaller_float((own + near) / larger_float(own + others, NOTHING), np.float32(1.0))

@@ -65,7 +65,7 @@ class ColumnJudge:
         self._judge = judge
         clear_found(self._found)
         self._tally.reset()
-        self._open, self._desks = {}, {}
+        self._open, self._desks, self._row_words = {}, {}, 0
 
     def add(
         self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
@@ -117,10 +117,9 @@ class ColumnJudge:
         # Frames of whole rows begin at the sensor's first word, whatever part of them is used.
         if row_words == layout.padded_width // 64:
             first_word = np.zeros_like(first_word)
-        if row_words != self._row_words:
-            # Frames of another size are shared out between the threads in another way.
-            self._workers.settle()
-            self._row_words, self._open = row_words, dict.fromkeys(range(layout.rows), self._opened())
+        if self._row_words not in (0, row_words):
+            raise ValueError(f"frames of {row_words} words a row behind those of {self._row_words}; begin a new sweep")
+        self._row_words = row_words
         chunk_rows = max(CHUNK // row_words, 1)
         chunks = -(-layout.rows // chunk_rows)
         if row_words not in self._planes:

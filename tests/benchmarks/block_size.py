@@ -40,6 +40,7 @@ def main() -> None:
                 for at in range(0, len(bins), block):
                     here = slice(at, at + block)
                     counter.add(frames.bits[first + at : first + at + block], bins[here], column[here], x0[here])
+                counter.settle()
                 seen[block, n].append(len(bins) / (time.perf_counter() - begun))
     print("frames per block, threads: thousand frames a second")
     for (block, n), rates in seen.items():

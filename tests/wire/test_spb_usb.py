@@ -480,6 +480,23 @@ def test_a_full_ring_ends_the_run_where_the_policy_says_so() -> None:
         assert len(ring._claimed) == 0
 
 
+@pytest.mark.parametrize("slots", [3, 40])
+def test_a_system_that_grants_few_reads_gets_few(slots: int) -> None:
+    with opened(model()) as spad:
+        link = spad._link
+        submit = link.submit
+        link.submit = lambda endpoint, buffer: link.in_flight < 2 and submit(endpoint, buffer)  # type: ignore[method-assign]
+        timing = spad.configure(REQUEST)
+        ring = BlockRing(slots, timing.stride, on_full=OnFull.DROP)
+        reader = ring.reader("test")
+        spad.start(160)
+        while spad.fill(ring, 1.0):
+            pass
+        ring.finish()
+        assert require_right(list(reader)) == list(range(min(160, 16 * slots)))
+        assert not ring._claimed
+
+
 # Real libusb
 
 

@@ -90,7 +90,7 @@ def test_thick_haze_takes_coarser_units_where_its_edge_would_not_fit():
         judge_of(m, geometry, 10, WORKERS, dark=False).shift
         for m in (base, replace(base, profile=profile, amplitude=base.amplitude * np.float32(0.1)))
     ]
-    assert shifts[1] >= shifts[0]
+    assert shifts[1] > shifts[0]
 
 
 @pytest.mark.parametrize(("exposures", "times"), [(1, 0), (63, 0), (64, 1), (127, 1), (128, 2), (255, 2), (70_000, 11)])

@@ -181,6 +181,9 @@ def scores(judge, c, band, counts, exposures):
 
     found = pixels(raw.reshape(len(counts), -1))
     constant, lane = pixels(constant.reshape(2, -1)), lane.astype(np.int64)
+    # However many lanes: their sum is the table's, rounded once.
+    drift = np.cumsum(lane) - exposures * tables.lane[c, band].astype(np.float64)
+    assert np.abs(drift).max() < 1.0 or np.abs(lane).max() >= 32000
     edge = tables.edge[c, band].transpose(1, 0, 2).reshape(-1).astype(np.int64)
     tap = tables.tap[c, band].astype(np.int64)
     reach = tap.shape[2] - 1

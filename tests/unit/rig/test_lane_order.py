@@ -110,11 +110,25 @@ def test_halving_rounds_the_same_from_planes_and_from_counts(times):
     counts[:2] = 0, most - 1
     one, other = new_counts(2, 16)
     read_counts(counts, times, address(one), 16)
-    np.testing.assert_array_equal(pixels_of(one, 16), (counts + ((1 << times) >> 1)) >> times)
+    # Rounded up or down by turns, so that few counts keep their mean.
+    shares = ((np.arange(128) & 7) << times) >> 3
+    np.testing.assert_array_equal(pixels_of(one, 16), (counts + shares) >> times)
     if counts.max() <= 255:
         read_counts(counts, 0, address(other), 16)
         halve_counts(address(other), 16, times)
         np.testing.assert_array_equal(other, one)
+
+
+@pytest.mark.parametrize("times", [1, 2, 3])
+@pytest.mark.parametrize("rate", [0.1, 0.5, 2.0])
+def test_halved_counts_keep_their_mean(rate, times):
+    counts = np.random.default_rng(times).poisson(rate, (200, 512)).astype(np.uint16)
+    n = new_counts(1, 64)[0]
+    total = 0
+    for row in counts:
+        read_counts(row, times, address(n), 64)
+        total += int(pixels_of(n, 64).sum())
+    assert total / counts.sum() == pytest.approx(2.0**-times, rel=0.03)
 
 
 def test_the_largest_counts_are_halved_without_running_over():
