@@ -145,8 +145,8 @@ def _markers(records: NDArray[np.void], plan: ScanPlan) -> Finding:
     at = np.flatnonzero(marks & int(Mark.LINE))
     scans = int(np.count_nonzero(marks & int(Mark.SCAN)))
     if len(at) < 3 or scans == 0:
-        seen = f"{scans} scan and {len(at)} line markers seen"
-        return Finding("markers", False, f"{seen}; check the scanner's marker lines")
+        text = f"{scans} scan and {len(at)} line markers seen; check the scanner's marker lines"
+        return Finding("markers", False, text)
     frames = at + ((marks[at] >> SUBFRAME_SHIFT) & 0xFF) / 256
     begins = int(np.flatnonzero(marks & int(Mark.SCAN))[0])
     planned = np.flatnonzero(plan.waveform.markers & MARKER_LINE) / float(plan.point_rate_hz)

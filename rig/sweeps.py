@@ -20,7 +20,7 @@ from rig.scan_plan import ScanPlan
 
 _log = logging.getLogger(__name__)
 
-MOST_UNDER_WAY = 4
+MOST_UNDER_WAY = 16
 """Blocks that the counting may hold at a time: threads are at work on some while the next one is bound."""
 
 Gap = tuple[int, int]

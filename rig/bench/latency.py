@@ -84,7 +84,7 @@ def measure_latency(
         if at + PLACE_FRAMES == len(bins):
             counter.finish()
             ended[i] = time.perf_counter()
-            counter = ColumnJudge(layout, frames.geometry, judge, workers)
+            counter.begin(judge)
     source.join()
     return _summary(published, judged, ended, exposures, workers.threads, float(late.max()))
 

@@ -24,6 +24,7 @@ from rig.counting_kernels import CHUNK, new_planes
 from rig.estimators.likelihood import Likelihood
 from rig.estimators.stream import ColumnJudge, SearchedSweep
 from rig.row_threads import RowWorkers
+from rig.sweeps import MOST_UNDER_WAY
 
 Bits = NDArray[np.uint8]
 
@@ -147,6 +148,7 @@ def search_stage(
                 begun = time.perf_counter()
                 place, bits = next(blocks)
                 counter.add(bits, bins[at : at + PLACE_FRAMES], column[at : at + PLACE_FRAMES], x0[: len(bits)])
+                counter.settle(MOST_UNDER_WAY - 1)
                 spent += time.perf_counter() - begun
                 done += len(bits)
                 places.append(place)

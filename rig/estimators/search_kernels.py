@@ -81,7 +81,8 @@ class Search(NamedTuple):
     exposure times the exposures; lane (lanes,), the same; label (LANES,), scores of the close-up; place: index of pixel
     -PLACE_BEFORE on in a row of counts. neutral, muted: bytes, counts of hot pixels, see `row_search`. Of each row of
     the batch, int16: all_left, score of all pixels lying left; best, x: best score and its pixel; left, right: the
-    scores beside it; levels: of the close-up; lift: what makes a score a power; ceiling: what no score exceeds. float32:
+    scores beside it; levels: of the close-up; lift: what makes a score a power; ceiling: what no score exceeds.
+    float32:
     light, before, scale, ambient: see `row_search`; answer: one field of the answers on its way out. Folded
     (`lane_reductions`): mass, sum of all likelihoods; moment, square: sums of the close-up.
     """
