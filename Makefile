@@ -2,7 +2,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: demo test lint types layers unit accuracy clean
+.PHONY: demo test lint types layers unit accuracy campaign clean
 .DELETE_ON_ERROR:
 
 demo: .venv/.installed
@@ -23,6 +23,14 @@ unit: .venv/.installed-tests
 # The accuracy tables of docs/results.md over the scenes of ../shared/scenes (minutes).
 accuracy: .venv/.installed-tests
 	$(BIN)/python -m tests.reference.accuracy
+
+# Random faults of every driver, and blows against the laser's guard (hours).
+SEQUENCES ?= 10000
+campaign: .venv/.installed-tests
+	for driver in cobolt obis prawndo helios lasercube spb_usb spad512s; do \
+		$(BIN)/python -m tests.campaigns.$${driver}_faults --sequences $(SEQUENCES) || exit; \
+	done
+	$(BIN)/python -m tests.campaigns.guard_kill
 
 .venv/.created:
 	@test -n "$(PYTHON)" || { echo "error: no python3 found; install Python 3.11 or newer, or call make PYTHON=/path/to/python" >&2; exit 2; }
