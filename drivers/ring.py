@@ -109,9 +109,7 @@ class BlockRing:
                     f"ring: optional reader {name!r} could hold the last of {self.slots} slots; make the ring longer"
                 )
             if holds > self.slots - optional:
-                raise ValueError(
-                    f"ring: reader {name!r} would hold {holds} of {self.slots} slots; make the ring longer"
-                )
+                raise ValueError(f"ring: reader {name!r} holds {holds} of {self.slots} slots; make the ring longer")
             reader = RingReader(self, name, required, holds)
             self._readers.append(reader)
             return reader

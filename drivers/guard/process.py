@@ -21,7 +21,7 @@ from drivers.guard.heartbeat import Heartbeat
 from drivers.guard.owned import Owned
 from drivers.guard.watch import TICK_S, FrameWatch, GuardLimits
 from drivers.guard.watched_process import WatchedProcess
-from drivers.interfaces import LineLaser
+from drivers.interfaces import DeviceState, LineLaser
 
 _log = logging.getLogger(__name__)
 
@@ -234,6 +234,8 @@ class GuardProcess:
             try:
                 status = device.status
             except DeviceError as error:
+                if device.state is DeviceState.CLOSED:  # by what stood before this on the lane
+                    return
                 if attempt:
                     self._trip(error)
                 continue

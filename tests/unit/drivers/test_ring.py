@@ -71,6 +71,42 @@ def test_a_full_ring_gives_no_slot_until_the_slowest_reader_moves_on() -> None:
     assert ring.high_water == 2
 
 
+def test_a_reader_may_hold_the_newest_blocks_for_work_that_is_under_way() -> None:
+    ring = BlockRing(4, STRIDE)
+    reader = ring.reader("count", holds=3)
+    for seq in range(4):
+        put(ring, seq)
+    blocks = [reader.next(0) for _ in range(3)]
+    assert ring.claim(0) is None
+    blocks.append(reader.next(0))  # the first one's slot is free now, the others' bytes are theirs
+    put(ring, 4)
+    assert [int(block.bits.ravel()[0]) for block in blocks[1:] if block is not None] == [1, 2, 3]
+    reader.release()
+    for seq in range(5, 8):
+        put(ring, seq)
+    assert ring.claim(0) is None
+
+
+def test_a_reader_cannot_hold_more_than_there_is() -> None:
+    ring = BlockRing(3, STRIDE)
+    with pytest.raises(ValueError, match="holds 4 of 3 slots"):
+        ring.reader("count", holds=4)
+    ring.reader("monitor", required=False)
+    with pytest.raises(ValueError, match="holds 3 of 3 slots"):
+        ring.reader("count", holds=3)
+
+
+def test_the_last_frame_is_that_of_the_last_block_even_if_it_was_dropped() -> None:
+    ring = BlockRing(2, STRIDE, on_full=OnFull.DROP)
+    ring.reader("slow")
+    assert ring.last_frame == -1
+    put(ring, 0)
+    put(ring, 1)
+    assert ring.last_frame == 1
+    ring.mark_overflow(5)
+    assert ring.last_frame == 6
+
+
 def test_several_slots_are_claimed_ahead_and_published_in_order() -> None:
     ring = BlockRing(3, STRIDE)
     reader = ring.reader("count")

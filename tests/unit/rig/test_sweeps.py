@@ -21,6 +21,9 @@ class Noting:
     def add(self, bits, bins, column, x0):
         self.bins += bins.tolist()
 
+    def settle(self, under_way=0):
+        self.settled = under_way
+
     def finish(self):
         return list(self.bins)
 
@@ -37,3 +40,30 @@ def test_frames_beyond_what_a_column_may_use_are_received_but_not_lit():
     assert sweep.frames.dark == np.count_nonzero(bins == BIN_DARK)
     assert sweep.frames.received == sweep.frames.expected == len(bins)
     assert sweep.frames.lost == 0
+
+
+def test_blocks_that_may_be_given_back_are_waited_for_by_what_they_added():
+    plan = plan_of(scan(columns=30))
+    stream = stream_of(plan, 2)
+    counter = Noting()
+    assembler = SweepAssembler(plan, counter, maps=2)
+    added = []
+    for block in stream.blocks(itertools.repeat(100)):
+        calls = 0
+        real = counter.add
+
+        def add(*arguments, real=real):
+            nonlocal calls
+            calls += 1
+            real(*arguments)
+
+        counter.add = add
+        list(assembler.add(block))
+        counter.add = real
+        added.append(calls)
+        for blocks in (0, 1, 3):
+            assembler.settle(blocks)
+            assert counter.settled == (sum(added[-blocks:]) if blocks else 0)
+        if assembler.complete:
+            break
+    assert max(added) == 2  # a block in which one sweep ends and the next one begins
