@@ -1,6 +1,6 @@
 """Compiled estimate of one image row: search, close look, and what the row teaches of the light.
 
-The same `judge_row` serves frames as they come and counts that are there already (`stream_kernels`): the answers are
+The same `judge_rows` serves frames as they come and counts that are there already (`stream_kernels`): the answers are
 the same bit for bit.
 """
 
