@@ -77,7 +77,7 @@ def agreement(volume, geometry, learned, near_px=NEAR_PX):
 
 @pytest.mark.parametrize("rig", RIGS)
 @pytest.mark.parametrize("light", LIGHTS)
-@pytest.mark.parametrize("exposures", [1, 3, 10, 40])
+@pytest.mark.parametrize("exposures", [1, 10, 40])
 def test_sure_answers_are_those_of_the_exact_likelihood(light, rig, exposures):
     sweep = simulated(light, exposures, rig)
     sure, also, difference = agreement(sweep.volume, sweep.geometry, model(light, rig))
@@ -237,7 +237,7 @@ def hard_rows(rng, window, exposures):
 
 @pytest.mark.parametrize("rig", RIGS)
 @pytest.mark.parametrize("light", LIGHTS)
-@pytest.mark.parametrize("exposures", [1, 2, 3, 10, 20, 40, 63])
+@pytest.mark.parametrize("exposures", [1, 3, 10, 63])
 def test_scores_of_any_counts_are_sums_of_whole_numbers_and_stop_at_the_limits(light, rig, exposures):
     judge, geometry = judged_rows(rig, exposures, light)
     rng = np.random.default_rng(exposures)
