@@ -76,9 +76,13 @@ def test_save_policies_that_are_none(text: str) -> None:
 
 
 def test_real_light_needs_arming() -> None:
-    def config(laser: str, sync: str) -> Any:
-        return SimpleNamespace(name="lab", laser=SimpleNamespace(kind=laser), sync=SimpleNamespace(kind=sync))
+    def device(kind: str, port: str) -> Any:
+        return SimpleNamespace(kind=kind, real_time=kind != "simulated", port=port)
 
+    def config(laser: str, sync: str, port: str = "/dev/ttyUSB0") -> Any:
+        return SimpleNamespace(name="lab", laser=device(laser, port), sync=device(sync, port))
+
+    assert require_simulated_or_armed(config("obis", "prawndo", port="emulated:laser"), arm=False) == []
     assert require_simulated_or_armed(config("simulated", "simulated"), arm=False) == []
     assert require_simulated_or_armed(config("obis", "prawndo"), arm=True) == []
     (problem,) = require_simulated_or_armed(config("obis", "simulated"), arm=False)
