@@ -4,7 +4,7 @@ import logging
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -87,15 +87,11 @@ def open_rig(config: RigConfig, clock: Clock | None = None, seed: int = 0) -> It
 def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
     """The gate and the laser alone, directly; None where one cannot be opened, which `trouble` then says."""
     with ExitStack() as stack:
-        virtual = config.world is not None and not config.world.real_time
-        clock: Clock = VirtualClock() if virtual else SystemClock()
-        world: Any = None if config.world is None else _create("world", config.world, Surroundings(clock, None, 0))
-        ports = stack.enter_context(world).ports if isinstance(world, EmulatesDevices) else {}
+        surroundings = _surroundings(config, None, 0, stack)
         opened: dict[str, Any] = {"sync": None, "laser": None}
-        for slot in ("laser", "sync"):
+        for slot in GUARDED:
             try:
-                device = _create(slot, getattr(config, slot), Surroundings(clock, world, 0, ports))
-                opened[slot] = stack.enter_context(device)
+                opened[slot] = stack.enter_context(_create(slot, getattr(config, slot), surroundings))
             except DeviceError as error:
                 trouble.append(f"{slot}: {error}")
         yield opened["sync"], opened["laser"]
@@ -128,22 +124,15 @@ def _open(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -
     usage: list[str] = []
     devices: list[str] = []
     model = _load_model(config, usage)
-    virtual = config.world is not None and not config.world.real_time
-    clock = clock or (VirtualClock() if virtual else SystemClock())
-    world: World | None = None
-    ports: Mapping[str, Endpoint] = {}
-    if config.world is not None:
-        try:
-            world = _create("world", config.world, Surroundings(clock, None, seed))
-            if isinstance(world, EmulatesDevices):
-                ports = stack.enter_context(world).ports
-        except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
-            usage.append(f"world: {error}")
+    surroundings: Surroundings | None = None
+    try:
+        surroundings = _surroundings(config, clock, seed, stack)
+    except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
+        usage.append(f"world: {error}")
     opened: dict[str, Any] = {}
     guard: Guard | None = None
-    if config.world is None or world is not None:
-        surroundings = Surroundings(clock, world, seed, ports)
-        guard = _guard_of(config, ports, stack)
+    if surroundings is not None:
+        guard = _guard_of(config, surroundings.ports, stack)
         # Closing runs backwards: the gate goes low before the laser pauses, the mirror parks and the SPAD stops.
         for slot in ("spad", "scanner", "laser", "sync"):
             try:
@@ -156,7 +145,21 @@ def _open(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -
         raise UsageError(*usage, *devices)
     if devices:
         raise DevicesError("\n".join(devices))
+    assert surroundings is not None, "else there is trouble"
+    clock, world = surroundings.clock, surroundings.world
     return OpenRig(config=config, clock=clock, world=world, model=model, guard=guard, **opened)
+
+
+def _surroundings(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -> Surroundings:
+    """Clock and world of the config, with the devices that the world plugs in. DeviceError where there is no world."""
+    virtual = config.world is not None and not config.world.real_time
+    clock = clock or (VirtualClock() if virtual else SystemClock())
+    bare = Surroundings(clock, None, seed)
+    if config.world is None:
+        return bare
+    world = _create("world", config.world, bare)
+    ports = stack.enter_context(world).ports if isinstance(world, EmulatesDevices) else {}
+    return replace(bare, world=world, ports=ports)
 
 
 def _guard_of(config: RigConfig, ports: Mapping[str, Endpoint], stack: ExitStack) -> Guard | None:
