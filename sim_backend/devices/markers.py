@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frames import SUBFRAME_SHIFT, Mark
+from drivers.interfaces import WindowTable
 from sim_backend.bench import Happening
 
 Array = NDArray[np.float64]
@@ -21,8 +22,12 @@ class MarkerInputs:
         self.line = 0
         self.sweep = 0
 
-    def record(self, happening: Happening, start_s: Array, period_s: float, records: NDArray[np.void]) -> None:
-        """Fill marks, line and sweep of consecutive frames that start at start_s (n,)."""
+    def record(self, happening: Happening, start_s: Array, period_s: float, records: NDArray[np.void]) -> int:
+        """Fill marks, line and sweep of consecutive frames that start at start_s (n,).
+
+        Returns the scan markers since START at the first of them, which the records' own counters cut to 16 bits.
+        """
+        first = self.sweep + int(np.count_nonzero(happening.scan_s < start_s[0] + period_s))
         marks = np.zeros(len(start_s), np.int64)
         marks[happening.edge] |= Mark.GATE_EDGE
         marks[~happening.edge & (happening.share > 0)] |= Mark.GATE_HIGH
@@ -46,3 +51,12 @@ class MarkerInputs:
         records["marks"] = marks
         records["line"] = lines & 0xFFFF
         records["sweep"] = sweeps & 0xFFFF
+        return first
+
+
+def windows_at(window: WindowTable | None, first_sweep: int, records: NDArray[np.void]) -> NDArray[np.int32]:
+    """First pixel of each frame's window (n,), 0 without a table; first_sweep: what `MarkerInputs.record` returned."""
+    if window is None:
+        return np.zeros(len(records), np.int32)
+    since = first_sweep + ((records["sweep"].astype(np.int64) - first_sweep) & 0xFFFF)
+    return window.x0_of(records["marks"], records["line"], since - 1)

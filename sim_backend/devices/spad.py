@@ -19,7 +19,7 @@ from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from drivers.units import BytesPerSecond, ExactHertz
-from sim_backend.devices.markers import MarkerInputs
+from sim_backend.devices.markers import MarkerInputs, windows_at
 from sim_backend.devices.place import world_of
 from sim_backend.photon_kernels import dropped_frames
 from sim_backend.photons import PhotonSource
@@ -188,9 +188,8 @@ class SimulatedSpad(SpadArray):
         records, bits = block_views(buffer, layout)
         start_s, period_s, exposure_s = self._times(n)
         happening = self._world.bench.during(start_s, exposure_s, period_s)
-        sweep = self._markers.sweep + int(np.count_nonzero(happening.scan_s < start_s[0] + period_s))
-        self._markers.record(happening, start_s, period_s, records)
-        x0 = self._window_x0(sweep, records)
+        sweep = self._markers.record(happening, start_s, period_s, records)
+        x0 = windows_at(self._window, sweep, records)
         records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
         records["x0"], records["y0"] = x0, 0
         held = self._world.grid.hold(happening.mirror)
@@ -201,13 +200,6 @@ class SimulatedSpad(SpadArray):
         ring.publish(block)
         self._block_seq += 1
         self._just_lost = False
-
-    def _window_x0(self, sweep: int, records: NDArray[np.void]) -> NDArray[np.int32]:
-        """First pixel of each frame's window. sweep: scan markers since START at the first frame."""
-        if self._window is None:
-            return np.zeros(len(records), np.int32)
-        since = sweep + ((records["sweep"].astype(np.int64) - sweep) & 0xFFFF)
-        return self._window.x0_of(records["marks"], records["line"], since - 1)
 
     def _advance(self, n: int, *, lost: int) -> None:
         """Let the time of n frames pass."""

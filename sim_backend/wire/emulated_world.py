@@ -22,7 +22,7 @@ from pydantic import Field
 from drivers.registry import Kind, Surroundings
 from drivers.transports.endpoints import Endpoint
 from sim_backend.bench import Happening
-from sim_backend.devices.markers import MarkerInputs
+from sim_backend.devices.markers import MarkerInputs, windows_at
 from sim_backend.gate_program import gate_shares
 from sim_backend.photons import PhotonSource
 from sim_backend.wire.cobolt import CoboltModel
@@ -169,12 +169,8 @@ class WorldFrames:
         """See `FrameSource`."""
         start_s: Array = span.start_s + np.arange(span.n, dtype=np.float64) * span.period_s
         happening, power_w = self._world.during(start_s, span.exposure_s, span.period_s)
-        sweep = self._markers.sweep + int(np.count_nonzero(happening.scan_s < start_s[0] + span.period_s))
-        self._markers.record(happening, start_s, span.period_s, records)
-        x0 = np.zeros(span.n, np.int32)
-        if span.window is not None:
-            since = sweep + ((records["sweep"].astype(np.int64) - sweep) & 0xFFFF)
-            x0 = span.window.x0_of(records["marks"], records["line"], since - 1)
+        sweep = self._markers.record(happening, start_s, span.period_s, records)
+        x0 = windows_at(span.window, sweep, records)
         records["x0"] = x0
         if bits is not None:
             held = self._world.grid.hold(happening.mirror)
