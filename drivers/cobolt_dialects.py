@@ -7,31 +7,36 @@ after `l0` its key must be turned (pycobolt issue 6), and a power of 0 can be re
 import re
 from typing import Protocol
 
-from drivers.cobolt_line import COUNT, FLAG, NUMBER, WORD, CoboltLine
+from drivers.cobolt_framing import COUNT, WORD
+from drivers.dialogue import FLAG, NUMBER, Dialogue
 
 _POWER_STEP_W = 1e-4
 """The finest power that every model keeps: 0.1 mW."""
 
 
 class Dialect(Protocol):
-    """What the driver needs said. All methods raise the errors of `CoboltLine`."""
+    """What the driver needs said. All methods raise the errors of `Dialogue`."""
 
     family: str
 
-    def input_mode(self) -> str:
-        """What governs the light: "digital" under the gate; everything else shines without asking the gate."""
+    def mode(self) -> str:
+        """The mode as the laser calls it."""
+        ...
+
+    def input_mode(self, mode: str) -> str:
+        """What governs the light in it: "digital" under the gate; everything else shines without asking the gate."""
         ...
 
     def gate(self) -> None:
-        """Let the TTL input, and nothing else, govern the light; the power is 0 meanwhile. Read back."""
+        """Let the TTL input, and nothing else, govern the light. Read back; to be called in the dark."""
         ...
 
     def set_power(self, power_w: float) -> None:
         """Power while the gate is high. Read back."""
         ...
 
-    def power_w(self) -> float | None:
-        """The power that the laser is set to in its present mode. None: set by current, it cannot say."""
+    def power_w(self, mode: str) -> float | None:
+        """The power that the laser is set to in this mode. None: set by current, it cannot say."""
         ...
 
     def darken(self) -> None:
@@ -62,24 +67,23 @@ class MldDialect:
     """06-MLD: `slmp`, `sdmes`, `em`."""
 
     family = "06-MLD"
-    _MODES = ("constant current", "constant power", "modulation")
+    _MODES = ("constant current", "constant power")
 
-    def __init__(self, line: CoboltLine) -> None:
+    def __init__(self, line: Dialogue) -> None:
         self._line = line
 
-    def input_mode(self) -> str:
-        """From `gam?`, `gdmes?` and `games?`."""
-        mode = self._line.ask("gam?", re.compile("[012]"))
+    def mode(self) -> str:
+        """`gam?`: 0 constant current, 1 constant power, 2 modulation."""
+        return self._line.ask("gam?", re.compile("[012]"))
+
+    def input_mode(self, mode: str) -> str:
+        """From `gdmes?` and `games?`."""
         if mode != "2":
             return self._MODES[int(mode)]
-        digital, analog = self._line.ask_flag("gdmes?"), self._line.ask_flag("games?")
-        if digital and not analog:
-            return "digital"
-        return "mixed" if digital else "analog" if analog else "modulation without input"
+        return _inputs(self._line.ask_flag("gdmes?"), self._line.ask_flag("games?"))
 
     def gate(self) -> None:
         """Digital modulation on, analog off, modulation mode."""
-        self._power_mw(0.0)
         self._line.tell_and_check("sdmes 1", "gdmes?", FLAG, "1".__eq__)
         self._line.tell_and_check("sames 0", "games?", FLAG, "0".__eq__)
         self._line.tell_and_check("em", "gam?", COUNT, "2".__eq__)
@@ -88,9 +92,8 @@ class MldDialect:
         """`slmp` takes milliwatts."""
         self._power_mw(power_w * 1e3)
 
-    def power_w(self) -> float | None:
+    def power_w(self, mode: str) -> float | None:
         """`glmp?` in milliwatts, `p?` in watts."""
-        mode = self._line.ask("gam?", re.compile("[012]"))
         if mode == "0":
             return None
         return self._line.ask_number("glmp?") * 1e-3 if mode == "2" else self._line.ask_number("p?")
@@ -117,22 +120,21 @@ class ScpiDialect:
     family = "06-01"
     _POWER = "laser:powermodulation:power:setpoint"
 
-    def __init__(self, line: CoboltLine) -> None:
+    def __init__(self, line: Dialogue) -> None:
         self._line = line
 
-    def input_mode(self) -> str:
-        """From the run mode and the inputs that are on."""
-        mode = self._line.ask("laser:runmode?", WORD)
-        if mode.lower() != "powermodulation":
+    def mode(self) -> str:
+        """The run mode."""
+        return self._line.ask("laser:runmode?", WORD).lower()
+
+    def input_mode(self, mode: str) -> str:
+        """From the inputs that are on."""
+        if mode != "powermodulation":
             return mode
-        digital, analog = self._line.ask_flag("las:pm:dig:ena?"), self._line.ask_flag("las:pm:ana:ena?")
-        if digital and not analog:
-            return "digital"
-        return "mixed" if digital else "analog" if analog else "modulation without input"
+        return _inputs(self._line.ask_flag("las:pm:dig:ena?"), self._line.ask_flag("las:pm:ana:ena?"))
 
     def gate(self) -> None:
         """The modulator must be the external one: as "command" it follows `!e` and `!d` without ever replying."""
-        self._power_mw(0.0)
         self._line.tell_and_check("las:pm:dig:ena 1", "las:pm:dig:ena?", FLAG, "1".__eq__)
         self._line.tell_and_check("las:pm:ana:ena 0", "las:pm:ana:ena?", FLAG, "0".__eq__)
         self._line.tell("laser:pm:dig:modulator external")
@@ -142,9 +144,8 @@ class ScpiDialect:
         """Milliwatts."""
         self._power_mw(power_w * 1e3)
 
-    def power_w(self) -> float | None:
+    def power_w(self, mode: str) -> float | None:
         """Milliwatts in both modes that know a power."""
-        mode = self._line.ask("laser:runmode?", WORD).lower()
         if mode == "powermodulation":
             return self._line.ask_number(f"{self._POWER}?") * 1e-3
         return self._line.ask_number("laser:cp:power:setpoint?") * 1e-3 if mode == "constantpower" else None
@@ -165,6 +166,12 @@ class ScpiDialect:
 
     def _power_mw(self, power_mw: float) -> None:
         self._line.tell_and_check(f"{self._POWER} {power_mw:.4f}", f"{self._POWER}?", NUMBER, _near(power_mw))
+
+
+def _inputs(digital: bool, analog: bool) -> str:
+    if digital and not analog:
+        return "digital"
+    return "mixed" if digital else "analog" if analog else "modulation without input"
 
 
 class _near:  # noqa: N801 - reads as what it says

@@ -20,6 +20,8 @@ Drive = Annotated[float, Field(ge=-1, le=1)]
 class GalvoConfig(KindConfig):
     """Limits of the galvo; they are in its data sheet. The DAC itself would follow anything."""
 
+    port: str = "usb"
+    """usb; where several are attached usb:serial=ABC, or usb:path=1-2 for a Helios, which has none; emulated:NAME."""
     axis: Literal["x", "y"] = "x"
     max_velocity: Annotated[PerSecond, Field(gt=0, le=1e6)]
     """Of the normalised drive: the full range is 2."""

@@ -36,14 +36,19 @@ def rate_of(pps: int) -> Fraction:
     return Fraction(SYSTICK_HZ, SYSTICK_HZ // pps + 1)
 
 
-def nearest_pps(requested_hz: float, low_hz: float, high_hz: float) -> int:
-    """What to ask for so that the true rate is nearest to `requested_hz`, within low to high."""
+def pps_of(rate_hz: Fraction) -> int:
+    """What to ask for so that the device runs at a rate that `rate_of` gave: 25 001 for 25 000 Hz."""
+    return math.floor(rate_hz) + 1
+
+
+def nearest_rate(requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
+    """The true rate nearest to `requested_hz`, within low to high."""
     near = math.floor(requested_hz)
     cycles = round(SYSTICK_HZ / requested_hz)
     # n cycles are what floor(112e6 / (n - 1)) asks for, where any whole number does.
     candidates = {near, near + 1} | {SYSTICK_HZ // (n - 1) for n in (cycles - 1, cycles, cycles + 1, cycles + 2)}
-    allowed = [pps for pps in candidates if LEAST_PPS <= pps <= MOST_PPS and low_hz <= rate_of(pps) <= high_hz]
-    return min(allowed, key=lambda pps: (abs(float(rate_of(pps)) - requested_hz), pps))
+    rates = [rate_of(pps) for pps in candidates if LEAST_PPS <= pps <= MOST_PPS]
+    return min((rate for rate in rates if low_hz <= rate <= high_hz), key=lambda rate: abs(float(rate) - requested_hz))
 
 
 def sendable(points: int) -> bool:

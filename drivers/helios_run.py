@@ -7,10 +7,11 @@ that the device dropped a frame in silence. What was really played only the mark
 """
 
 import threading
+from fractions import Fraction
 
 from drivers.clock import NS_PER_S, Clock
 from drivers.errors import DeviceFault, DeviceTimeout
-from drivers.helios_frames import FLAG_SINGLE, FLAG_START, MOST_POINTS, encode, rate_of, sendable, slice_points
+from drivers.helios_frames import FLAG_SINGLE, FLAG_START, MOST_POINTS, encode, pps_of, sendable, slice_points
 from drivers.helios_link import HeliosLink
 from drivers.point_source import PointSource
 
@@ -27,13 +28,13 @@ class HeliosRun:
     """Begin, then feed. Every wait has an end: at most two frames and two seconds."""
 
     def __init__(
-        self, link: HeliosLink, clock: Clock, source: PointSource, pps: int, *, frame_s: float, axis: str
+        self, link: HeliosLink, clock: Clock, source: PointSource, clock_hz: Fraction, *, frame_s: float, axis: str
     ) -> None:
         self.source = source
         self._link = link
         self._clock = clock
-        self._pps = pps
-        self._rate_hz = float(rate_of(pps))
+        self._pps = pps_of(clock_hz)
+        self._rate_hz = float(clock_hz)
         self._axis = axis
         most = min(MOST_POINTS, max(2, round(frame_s * self._rate_hz)))
         self._most = most if sendable(most) else most - 1

@@ -1,7 +1,9 @@
 """The Coherent OBIS LX/LS line laser, gated by its digital modulation input (`SOUR:AM:EXT DIG`).
 
 hardware.md section 4.2; from python-microscope `lights/obis.py` (69625e0), the bit tables of `obis.h`, the operator's
-manual (appendix C) and mmCoreAndDevices PRs 645 and 531. 115 200 baud, 8N1 (over USB the rate is ignored).
+manual (appendix C) and mmCoreAndDevices PRs 645 and 531. 115 200 baud, 8N1 (over USB the rate is ignored). Limits of
+the base plate's temperature are read by `SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not in hardware.md but in
+`obis.cpp` beside `obis.h` and in Micro-Manager's `CoherentOBIS.cpp`.
 
 Traps: `AM:STAT ON` during warm-up is deferred, light may come minutes later. So `arm` waits until the laser is ready
 and only then says ON; whatever ends the wait says OFF. With CDRH the emission follows ON by 5 s. Modes cannot be
@@ -13,11 +15,13 @@ Pause = `AM:STAT OFF`, confirmed by the emission bit; no key is needed to resume
 
 import re
 from contextlib import suppress
-from typing import Annotated, Literal
+from functools import partial
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
 from drivers.clock import NS_PER_S, Clock
+from drivers.dialogue import NUMBER, CommandRefused, Dialogue, LineTiming
 from drivers.errors import (
     DeviceError,
     DeviceFault,
@@ -25,17 +29,13 @@ from drivers.errors import (
     DeviceTimeout,
     InterlockOpen,
     LimitExceeded,
-    ProtocolError,
     WrongState,
 )
-from drivers.interfaces import LaserLimits, LaserStatus, LineLaser
-from drivers.obis_line import BITS, CELSIUS, NUMBER, SWITCH, TEXT, USUAL_TIMING, LineTiming, ObisLine
-from drivers.registry import Kind, KindConfig, Surroundings
-from drivers.transports.endpoints import resolve
-from drivers.transports.serial_port import SerialPort
-from drivers.units import Seconds, Watts
-
-BAUD = 115_200
+from drivers.interfaces import LaserLimits, LaserStatus
+from drivers.obis_framing import BITS, CELSIUS, SWITCH, TEXT, USUAL_TIMING, ObisFraming
+from drivers.registry import Kind, Surroundings
+from drivers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
+from drivers.units import Seconds
 
 EMISSION = 0x2
 READY = 0x4
@@ -77,51 +77,48 @@ _MODES = {"CWP": "constant power", "CWC": "constant current"}
 _READY_POLL_S = 0.5
 
 
-class ObisConfig(KindConfig):
+class ObisConfig(SerialLaserConfig):
     """Config of a Coherent OBIS laser."""
 
     kind: Literal["obis"] = "obis"
-    port: str
-    """Serial port: a path or COM port, "serial=..." or "usb=VVVV:PPPP" of its USB device, or "emulated:NAME"."""
-    max_power: Annotated[Watts, Field(gt=0)]
-    """The most this rig may ever send out; the laser's own maximum holds where it is smaller."""
-    serial_number: str | None = None
-    """Of the laser itself; another one is refused. None: any."""
     channel: Annotated[int | None, Field(ge=1, le=6)] = None
     """Slot of the laser in an OBIS Remote or Box. None: the laser itself is on the port."""
     warm_up: Annotated[Seconds, Field(gt=0)] = 600.0
     """Longest wait of `arm` for a laser that is not ready yet."""
 
 
-class ObisLaser(LineLaser):
+class TemperatureRange(NamedTuple):
+    """What the base plate may have, in degrees Celsius."""
+
+    low_c: float
+    high_c: float
+
+
+class ObisLaser(SerialLaser):
     """An OBIS. `arm` waits while the laser warms up; `pause` and `disarm` from another thread end that wait."""
 
-    def __init__(self, line: ObisLine, clock: Clock, name: str, limits: LaserLimits, warm_up_s: float) -> None:
-        super().__init__(name)
-        line.name = name
-        self._line = line
+    def __init__(
+        self,
+        line: Dialogue,
+        clock: Clock,
+        name: str,
+        limits: LaserLimits,
+        base_range: TemperatureRange | None,
+        warm_up_s: float,
+    ) -> None:
+        super().__init__(name, line, limits)
         self._clock = clock
-        self._limits = limits
+        self._base_range = base_range
         self._warm_up_s = warm_up_s
-        self._armed = False
         self._told_on = False
         self._n_stops = 0
-
-    @property
-    def limits(self) -> LaserLimits:
-        """The laser's least power to the smaller of its own and the config's maximum."""
-        return self._limits
-
-    @property
-    def port_lost(self) -> bool:
-        """Whether the port is gone, told without a word on the wire. Any thread."""
-        return self._line.port_lost
 
     def _do_status(self) -> LaserStatus:
         line = self._line
         bits = self._bits()
-        fault = self._fault(bits)
         closed = self._interlock_closed(bits)
+        base_c = _celsius(line.ask("SOUR:TEMP:BAS?", CELSIUS))
+        fault = self._fault(bits, base_c)
         on = line.ask("SOUR:AM:STAT?", SWITCH) == "ON"
         mode = line.ask("SOUR:AM:SOUR?", _MODE)
         emits = bool(bits & EMISSION)
@@ -135,7 +132,7 @@ class ObisLaser(LineLaser):
             key_on=not bits & KEY_OFF,
             warming_up=fault is None and closed and (bool(bits & (WARM_UP | CDRH_DELAY)) or pending),
             input_mode="digital" if mode in _DIGITAL else _MODES.get(mode, mode),
-            temperature_c=float(_celsius(line.ask("SOUR:TEMP:BAS?", CELSIUS))),
+            temperature_c=base_c,
             power_w=line.ask_number("SOUR:POW:LEV?"),
         )
 
@@ -147,7 +144,7 @@ class ObisLaser(LineLaser):
                 self._set_power(power_w)
                 self._await_ready(n_stops)
                 self._told_on = True
-                self._line.tell("SOUR:AM:STAT ON", "SOUR:AM:STAT?", SWITCH, "ON".__eq__)
+                self._line.tell_and_check("SOUR:AM:STAT ON", "SOUR:AM:STAT?", SWITCH, "ON".__eq__)
             else:
                 self._set_power(power_w)
         except DeviceError:
@@ -163,17 +160,17 @@ class ObisLaser(LineLaser):
         """Off, and set up so that nothing but the gate governs the light, at no later power-up either."""
         line = self._line
         self._switch_off()
-        line.tell("SYST:CDRH ON", "SYST:CDRH?", SWITCH, "ON".__eq__)
-        line.tell("SYST:AUT OFF", "SYST:AUT?", SWITCH, "OFF".__eq__)
-        line.tell("SOUR:AM:EXT DIG", "SOUR:AM:SOUR?", _MODE, _DIGITAL.__contains__)
-        line.tell("SOUR:TEMP:APR ON", "SOUR:TEMP:APR?", SWITCH, "ON".__eq__)
+        line.tell_and_check("SYST:CDRH ON", "SYST:CDRH?", SWITCH, "ON".__eq__)
+        line.tell_and_check("SYST:AUT OFF", "SYST:AUT?", SWITCH, "OFF".__eq__)
+        line.tell_and_check("SOUR:AM:EXT DIG", "SOUR:AM:SOUR?", _MODE, _DIGITAL.__contains__)
+        line.tell_and_check("SOUR:TEMP:APR ON", "SOUR:TEMP:APR?", SWITCH, "ON".__eq__)
 
     def _set_power(self, power_w: float) -> None:
         def is_power(reply: str) -> bool:
             return abs(float(reply) - power_w) <= max(0.01 * power_w, 5e-5)  # they keep 0.1 mW
 
         query = "SOUR:POW:LEV:IMM:AMPL?"
-        self._line.tell(f"SOUR:POW:LEV:IMM:AMPL {power_w:.5f}", query, NUMBER, is_power)
+        self._line.tell_and_check(f"SOUR:POW:LEV:IMM:AMPL {power_w:.5f}", query, NUMBER, is_power)
 
     def _await_ready(self, n_stops: int) -> None:
         """Until an ON acts at once: said earlier it would be deferred, and light come when nobody expects it."""
@@ -207,7 +204,7 @@ class ObisLaser(LineLaser):
 
     def _switch_off(self) -> None:
         """Off, a deferred ON too. `DeviceFault` where it still emits."""
-        self._line.tell("SOUR:AM:STAT OFF", "SOUR:AM:STAT?", SWITCH, "OFF".__eq__)
+        self._line.tell_and_check("SOUR:AM:STAT OFF", "SOUR:AM:STAT?", SWITCH, "OFF".__eq__)
         self._told_on = False
         if self._bits() & EMISSION:
             raise DeviceFault(f"{self._name} still emits after OFF; turn its key off")
@@ -215,12 +212,25 @@ class ObisLaser(LineLaser):
     def _bits(self) -> int:
         return int(self._line.ask_surely("SYST:STAT?", BITS), 16)
 
-    def _fault(self, bits: int) -> str | None:
+    def _fault(self, bits: int, base_c: float | None = None) -> str | None:
+        """What the laser calls a fault, and a base plate outside its range."""
+        said = []
         word = int(self._line.ask_surely("SYST:FAUL?", BITS), 16)
-        if not word:
-            return f"status 0x{bits:08X}" if bits & (FAULT | HARDWARE_FAULT) else None
-        names = [name for bit, name in FAULTS.items() if word & bit]
-        return f"0x{word:08X} ({', '.join(dict.fromkeys(names)) or 'unknown'})"
+        if word:
+            names = [name for bit, name in FAULTS.items() if word & bit]
+            said.append(f"0x{word:08X} ({', '.join(dict.fromkeys(names)) or 'unknown'})")
+        elif bits & (FAULT | HARDWARE_FAULT):
+            said.append(f"status 0x{bits:08X}")
+        if base_c is not None and self._out_of_range(base_c):
+            base_c = _celsius(self._line.ask_surely("SOUR:TEMP:BAS?", CELSIUS))  # a flipped bit ends no scan
+            if (allowed := self._out_of_range(base_c)) is not None:
+                said.append(f"base plate at {base_c:g} C, outside {allowed.low_c:g} to {allowed.high_c:g} C")
+        return "; ".join(said) or None
+
+    def _out_of_range(self, base_c: float) -> TemperatureRange | None:
+        """The range that it is outside of."""
+        allowed = self._base_range
+        return None if allowed is None or allowed.low_c <= base_c <= allowed.high_c else allowed
 
     def _interlock_closed(self, bits: int) -> bool:
         return self._line.ask_surely("SYST:LOCK?", _LOCK) != "OFF" and not bits & INTERLOCK
@@ -228,38 +238,23 @@ class ObisLaser(LineLaser):
     def _is_digital(self) -> bool:
         return self._line.ask("SOUR:AM:SOUR?", _MODE) in _DIGITAL
 
-    def _do_close(self) -> None:
-        self._line.close()
-
 
 def create(config: ObisConfig, surroundings: Surroundings, timing: LineTiming = USUAL_TIMING) -> ObisLaser:
     """Open the laser and identify it; changes nothing about it."""
-    endpoint = resolve(config.port, surroundings.ports)
-    port = SerialPort("obis laser", endpoint.address, BAUD)
-    try:
-        return _identify(config, ObisLine("obis laser", port, config.channel, timing), surroundings.clock)
-    except BaseException:
-        port.close()
-        raise
+    framing = ObisFraming(config.channel)
+    identify = partial(_identify, config, surroundings.clock, framing)
+    return open_laser("obis", config, surroundings, framing, timing, identify)
 
 
-def _identify(config: ObisConfig, line: ObisLine, clock: Clock) -> ObisLaser:
+def _identify(config: ObisConfig, clock: Clock, framing: ObisFraming, line: Dialogue) -> ObisLaser:
     where = f"obis laser on {config.port}"
-    try:
-        line.connect()
-    except (DeviceTimeout, ProtocolError):
-        raise DeviceNotFound(
-            f"obis laser: nothing on port {config.port} answers as one; check 'port', power and cable"
-        ) from None
-    if "OBIS" not in line.identity.upper():
-        raise DeviceNotFound(f"{where}: {line.identity[:60]!r} is no OBIS; correct 'port'")
-    if "REMOTE" in line.identity.upper() and config.channel is None:
+    framing.identity = line.ask_surely("*IDN?", TEXT)
+    if "OBIS" not in framing.identity.upper():
+        raise DeviceNotFound(f"{where}: {framing.identity[:60]!r} is no OBIS; correct 'port'")
+    if "REMOTE" in framing.identity.upper() and config.channel is None:
         raise DeviceNotFound(f"{where} is an OBIS Remote; say which laser by 'channel: 1'")
     model, serial = line.ask_surely("SYST:INF:MOD?", TEXT), line.ask_surely("SYST:INF:SNUM?", TEXT)
-    if config.serial_number not in (None, serial):
-        raise DeviceNotFound(
-            f"{where} has serial number {serial}, not {config.serial_number}; correct 'serial_number' or 'port'"
-        )
+    require_serial_number("obis", config, serial)
     least_w = float(line.ask_surely("SOUR:POW:LIM:LOW?", NUMBER))
     most_w = min(float(line.ask_surely("SOUR:POW:LIM:HIGH?", NUMBER)), config.max_power)
     if most_w < least_w:
@@ -267,13 +262,23 @@ def _identify(config: ObisConfig, line: ObisLine, clock: Clock) -> ObisLaser:
             f"{where}: max_power {config.max_power * 1e3:g} mW is below the least it can give, {least_w * 1e3:g} mW; "
             "use a weaker laser or an attenuator"
         )
-    return ObisLaser(line, clock, f"{model} {serial}", LaserLimits(least_w, most_w), config.warm_up)
+    limits = LaserLimits(least_w, most_w)
+    return ObisLaser(line, clock, f"{model} {serial}", limits, _base_range(line), config.warm_up)
 
 
-def _celsius(reply: str) -> str:
+def _base_range(line: Dialogue) -> TemperatureRange | None:
+    """None: this unit does not say; its own fault word judges then."""
+    try:
+        low, high = (line.ask_surely(f"SOUR:TEMP:PROT:BAS:{end}?", CELSIUS) for end in ("LOW", "HIGH"))
+    except CommandRefused:
+        return None
+    return TemperatureRange(_celsius(low), _celsius(high))
+
+
+def _celsius(reply: str) -> float:
     match = CELSIUS.fullmatch(reply)
     assert match is not None  # `ask` let no other reply through
-    return match[1]
+    return float(match[1])
 
 
-KIND = Kind(config=ObisConfig, create=create)
+KIND = Kind(config=ObisConfig, create=create, off=b"SOUR:AM:STAT OFF\r\n")

@@ -29,7 +29,7 @@ from drivers.prawndo_line import (
     LineTiming,
     PrawnDoLine,
 )
-from drivers.prawndo_program import Board, compile_program
+from drivers.prawndo_program import Board, compile_program, most_repeats
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.transports.endpoints import resolve
 from drivers.transports.serial_port import SerialPort
@@ -68,7 +68,7 @@ class PrawnDoConfig(KindConfig):
         Seconds,
         Field(
             gt=0,
-            description="longest scan marker: the trigger is a level, so the program must play longer between waits",
+            description="longest scan marker without a held pulse: the trigger is a level, so waits are farther apart",
             examples=["40 us"],
         ),
     ] = 40e-6
@@ -108,6 +108,10 @@ class PrawnDo(SyncSource):
     def port_lost(self) -> bool:
         """Whether the port is gone, told without a word on the wire. Any thread."""
         return self._line.port_lost
+
+    def most_repeats(self, pulses: Sequence[Pulse]) -> int:
+        """As often as they fit into the board's memory: there are no loops."""
+        return most_repeats(pulses, self._board)
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
         words = compile_program(pulses, repeats, self._board)

@@ -25,8 +25,9 @@ IDLE = (STOPPED, ABORTED)
 BYTES_PER_WORD = 6
 
 _CRLF = b"\r\n"
-_LOWER = b"\nabt\nman 0\n"
-"""The first line end completes whatever a former host began to say."""
+_LOWER = b"\nabt\nsts\nman 0\nsts\nman 0\n"
+"""The first line end completes whatever a former host began to say. While the board says its state, its second core
+does what `abt` asked for, without which it refuses `man`: low outputs need no round trip of a host that may be late."""
 _RESUSCITATED = "System Clock Resus'd"
 _CHUNK_BYTES = 4032
 """Bytes per write while a program is loaded: sixteen of the firmware's own pieces of 42 words."""

@@ -1,7 +1,8 @@
 """Turns pulses into the words of a PrawnDO program, and refuses what the board would play otherwise than written.
 
 A word is 16 outputs and a number of cycles (hardware.md section 5.1): 0 cycles wait for the trigger, two such words in
-a row are the end, with the first one's outputs left on the pins.
+a row are the end, with the first one's outputs left on the pins. The trigger is a level, so that a wait passes at once
+while it is high: that is how a held pulse looks at the scan marker.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import LimitExceeded
-from drivers.interfaces import Pulse
+from drivers.interfaces import Pulse, sliced
 
 MIN_CYCLES = 5
 MAX_CYCLES = 2**32 - 1
@@ -22,7 +23,7 @@ WORD = np.dtype([("outputs", "<u2"), ("cycles", "<u4")])
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """What bounds a program. trigger_pulse_s: the longest scan marker."""
+    """What bounds a program. trigger_pulse_s: the longest scan marker of a program without held pulses."""
 
     name: str
     clock_hz: float
@@ -32,13 +33,10 @@ class Board:
 
 def compile_program(pulses: Sequence[Pulse], repeats: int, board: Board) -> NDArray[np.void]:
     """The words of the whole program, repeats written out and the end with all outputs low. `LimitExceeded`."""
-    period = np.zeros(len(pulses), WORD)
-    for index, pulse in enumerate(pulses):
-        period[index] = pulse.outputs, _cycles(index, pulse, board)
-    _check_waits(period, repeats, board)
+    _check_waits(_words(pulses, board), repeats, board)
+    period = _words(sliced(pulses), board)
     # A wait beside the end's own zeros would be the end, on that wait's outputs: a shortest word parts them.
-    tail = [(0, MIN_CYCLES)] if period["cycles"][-1] == 0 else []
-    end = np.array([*tail, (0, 0), (0, 0)], WORD)
+    end = np.array([(0, MIN_CYCLES), (0, 0), (0, 0)], WORD)[int(period["cycles"][-1] != 0) :]
     n_words = repeats * len(period) + len(end)
     if n_words > board.max_words:
         raise LimitExceeded(
@@ -46,6 +44,18 @@ def compile_program(pulses: Sequence[Pulse], repeats: int, board: Board) -> NDAr
             f"{board.max_words}: scan fewer sweeps at a time"
         )
     return np.concatenate([np.tile(period, repeats), end])
+
+
+def most_repeats(pulses: Sequence[Pulse], board: Board) -> int:
+    """How often a period fits into the board beside the end."""
+    return (board.max_words - 3) // len(sliced(pulses))
+
+
+def _words(pulses: Sequence[Pulse], board: Board) -> NDArray[np.void]:
+    words = np.zeros(len(pulses), WORD)
+    for index, pulse in enumerate(pulses):
+        words[index] = pulse.outputs, _cycles(index, pulse, board)
+    return words
 
 
 def _cycles(index: int, pulse: Pulse, board: Board) -> int:

@@ -48,6 +48,9 @@ class Kind:
 
     config: type[BaseModel]
     create: Callable[[Any, Surroundings], Any]
+    off: bytes = b""
+    """What a laser on a serial port is sent where there is no time to open it first: emission off, whatever it answers.
+    """
 
 
 def kinds(slot: str) -> tuple[str, ...]:

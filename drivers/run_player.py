@@ -32,7 +32,7 @@ class RunPlayer:
     def __init__(self, name: str, halt: Callable[[], float], position: float) -> None:
         self._name = name
         self._halt = halt
-        self._position: float | None = position
+        self.position: float | None = position
         """Where the mirror rests; None: moving, or unknown after a fault."""
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -47,14 +47,14 @@ class RunPlayer:
         if not moving and self.error is None:
             ask()
         fault = None if self.error is None else str(self.error)
-        return ScannerStatus(moving=moving, fault=fault, position=None if moving else self._position)
+        return ScannerStatus(moving=moving, fault=fault, position=None if moving else self.position)
 
     def rest(self) -> float:
         """Wait for a run that is ending; where the mirror rests. After a fault nobody knows, so that it is halted."""
         self.join()
-        if self._position is None:
-            self._position = self._halt()
-        return self._position
+        if self.position is None:
+            self.position = self._halt()
+        return self.position
 
     def start(self, run: Run) -> None:
         """Begin, and leave the rest to a thread."""
@@ -68,7 +68,7 @@ class RunPlayer:
         if run.source.left:
             self._begin(run)
             run.feed(self._stopping)
-            self._position = run.source.last
+            self.position = run.source.last
 
     def stop(self) -> None:
         """Let the run brake; returns when the mirror rests."""
@@ -81,21 +81,23 @@ class RunPlayer:
         self.join()
 
     def join(self) -> None:
-        """Wait for the thread."""
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+        """Wait for the thread. Several may."""
+        thread = self._thread
+        if thread is not None:
+            thread.join()
+            if self._thread is thread:
+                self._thread = None
 
     def _begin(self, run: Run) -> None:
         self._stopping.clear()
-        self._position = None
+        self.position = None
         run.begin()
 
     def _feed(self, run: Run) -> None:
         """The thread. What fails here is told by `status` and ends the run."""
         try:
             run.feed(self._stopping)
-            self._position = run.source.last
+            self.position = run.source.last
         except DeviceError as error:
             self.error = error
             _log.error("%s", error)

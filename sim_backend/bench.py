@@ -146,5 +146,5 @@ class Bench:
         # Up to and including now: an edge at this very moment has happened.
         self._program.advance(np.nextafter(self.now_s(), np.inf), self._trigger)
 
-    def _trigger(self, from_s: float, until_s: float) -> Array:
-        return self._motion.edges(MARKER_SCAN, from_s, until_s)
+    def _trigger(self, from_s: float, until_s: float) -> float | None:
+        return self._motion.first_high(MARKER_SCAN, from_s, until_s)

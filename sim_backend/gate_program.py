@@ -5,21 +5,21 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.interfaces import OUT_GATE, Pulse
+from drivers.interfaces import OUT_GATE, Pulse, sliced
 
 Array = NDArray[np.float64]
-TriggerEdges = Callable[[float, float], Array]
-"""Times of the scan marker's rising edges in [from, until)."""
+Trigger = Callable[[float, float], float | None]
+"""The first time in [from, until) at which the scan marker is high; None: it stays low."""
 
 
 class GateProgram:
     """One run of a program from `start_s`. Output levels are known up to the time it was advanced to.
 
-    A word without duration waits for a rising edge after its own start. After the last repeat all outputs are low.
+    A word without duration waits while the scan marker is low. After the last repeat all outputs are low.
     """
 
     def __init__(self, pulses: Sequence[Pulse], repeats: int, start_s: float) -> None:
-        self._pulses = tuple(pulses)
+        self._pulses = tuple(sliced(pulses))
         self._words_left = repeats * len(self._pulses)
         self._index = 0
         self._word_start_s = start_s
@@ -38,16 +38,16 @@ class GateProgram:
         """Whether the present word waits for a trigger."""
         return not self.ended and self._pulses[self._index].duration_s is None
 
-    def advance(self, until_s: float, edges: TriggerEdges) -> None:
+    def advance(self, until_s: float, trigger: Trigger) -> None:
         """Play on up to `until_s`."""
         while not self.ended:
             duration_s = self._pulses[self._index].duration_s
             if duration_s is None:
-                found = edges(self._searched_s, until_s)
+                found = trigger(self._searched_s, until_s)
                 self._searched_s = max(self._searched_s, until_s)
-                if not len(found):
+                if found is None:
                     return
-                end_s = float(found[0])
+                end_s = found
             else:
                 end_s = self._word_start_s + duration_s
                 if end_s >= until_s:
@@ -55,8 +55,15 @@ class GateProgram:
             self._words_left -= 1
             self._index = (self._index + 1) % len(self._pulses)
             self._word_start_s = self._searched_s = end_s
-            self._times.append(end_s)
-            self._levels.append(0 if self.ended else self._pulses[self._index].outputs & self._mask)
+            self._set(end_s, 0 if self.ended else self._pulses[self._index].outputs & self._mask)
+
+    def _set(self, at_s: float, level: int) -> None:
+        """The outputs from then on. A level that lasts no time, as of a wait that passes at once, is none."""
+        if self._times[-1] == at_s and len(self._times) > 1:
+            del self._times[-1], self._levels[-1]
+        if level != self._levels[-1]:
+            self._times.append(at_s)
+            self._levels.append(level)
 
     def lower_gate(self, at_s: float) -> None:
         """Gate low from `at_s` for the rest of this run; the program plays on."""

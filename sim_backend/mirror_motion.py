@@ -31,6 +31,10 @@ class Motion(Protocol):
         """Times of the rising edges of a marker output in [from_s, until_s), ascending."""
         ...
 
+    def first_high(self, bit: int, from_s: float, until_s: float) -> float | None:
+        """First time in [from_s, until_s) at which a marker output is high; None: it stays low."""
+        ...
+
     def moving(self, time_s: float) -> bool:
         """Whether a waveform is being played."""
         ...
@@ -53,6 +57,10 @@ class Resting:
     def edges(self, bit: int, from_s: float, until_s: float) -> Array:
         """None."""
         return np.empty(0)
+
+    def first_high(self, bit: int, from_s: float, until_s: float) -> float | None:
+        """None."""
+        return None
 
     def moving(self, time_s: float) -> bool:
         """No."""
@@ -87,10 +95,20 @@ class Playing:
 
     def backward(self, time_s: Array) -> NDArray[np.bool_]:
         """Level of the direction output; low before the start and after the end."""
+        return self._high(LEVEL_BACKWARD, time_s)
+
+    def first_high(self, bit: int, from_s: float, until_s: float) -> float | None:
+        """At once where the output is high then, else at its next rising edge."""
+        if from_s < until_s and self._high(bit, np.array([from_s]))[0]:
+            return from_s
+        edges = self.edges(bit, from_s, until_s)
+        return float(edges[0]) if len(edges) else None
+
+    def _high(self, bit: int, time_s: Array) -> NDArray[np.bool_]:
         points = len(self.waveform.command)
         at = np.floor((time_s - self.start_s) * self.rate_hz).astype(np.int64)
         inside = (at >= 0) & (at < self.repeats * points)
-        level: NDArray[np.bool_] = inside & ((self.waveform.markers[at % points] & LEVEL_BACKWARD) != 0)
+        level: NDArray[np.bool_] = inside & ((self.waveform.markers[at % points] & bit) != 0)
         return level
 
     def edges(self, bit: int, from_s: float, until_s: float) -> Array:

@@ -27,6 +27,9 @@ class Owned:
         self.slot = slot
         self.device: Any = None
         self.armed = False
+        """A laser that is to be disarmed where the application cannot go on."""
+        self.emits = False
+        """A laser that shines through an open gate, as far as it was told to."""
         self.lane = Lane(slot)
         self.urgent = Lane(f"{slot}, urgent")
         self.enabling = False
@@ -67,6 +70,7 @@ class Owned:
         device = self.device
         if isinstance(device, LineLaser):
             self.armed = (self.armed or verb == "arm") and verb != "disarm"
+            self.emits = (self.emits or verb == "arm") and verb not in ("pause", "disarm")
         match verb:
             case "status":
                 return asdict(device.status)
@@ -74,7 +78,9 @@ class Owned:
                 device.arm(*arguments)
             case "program":
                 pulses, repeats = arguments
-                device.program([Pulse(outputs, duration_s) for outputs, duration_s in pulses], repeats)
+                device.program([Pulse(*pulse) for pulse in pulses], repeats)
+            case "most_repeats":
+                return device.most_repeats([Pulse(*pulse) for pulse in arguments[0]])
             case "pause" | "disarm" | "run" | "gate_low" | "abort" | "close":
                 getattr(device, verb)()
             case _:

@@ -182,7 +182,8 @@ class GuardProcess:
         elif watch.watching and not self._silence_noted:  # a look at every thread, and seldom needed
             self._silence_noted = True
             application.note_progress()
-        stopped = watch.watching and application.stopped
+        emits = any(owned.emits for owned in self._owned.values())
+        stopped = (watch.watching or emits) and application.stopped
         trouble = watch.look(elapsed_s, frame, stopped, application.busy)
         now = time.monotonic()
         if trouble is not None:

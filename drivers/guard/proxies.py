@@ -35,6 +35,9 @@ class GuardedLaser(LineLaser):
     def _do_status(self) -> LaserStatus:
         return LaserStatus(**self._guard.ask("laser", "status"))
 
+    def _check_health(self) -> None:
+        """The guard's own `arm` does it: a slow laser is not asked twice."""
+
     def _do_arm(self, power_w: float) -> None:
         self._guard.ask("laser", "arm", power_w)
 
@@ -62,8 +65,13 @@ class GuardedSync(SyncSource):
         """As the guard found it when it opened the device."""
         return self._resolution_s
 
+    def most_repeats(self, pulses: Sequence[Pulse]) -> int | None:
+        """As the device behind it."""
+        most: int | None = self._guard.ask("sync", "most_repeats", _plain(pulses))
+        return most
+
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
-        self._guard.ask("sync", "program", [[pulse.outputs, pulse.duration_s] for pulse in pulses], repeats)
+        self._guard.ask("sync", "program", _plain(pulses), repeats)
 
     def _do_run(self) -> None:
         self._guard.ask("sync", "run")
@@ -80,3 +88,7 @@ class GuardedSync(SyncSource):
     def _do_close(self) -> None:
         if not self._guard.lost:
             self._guard.ask("sync", "close")
+
+
+def _plain(pulses: Sequence[Pulse]) -> list[list[Any]]:
+    return [[pulse.outputs, pulse.duration_s, pulse.held] for pulse in pulses]

@@ -67,12 +67,12 @@ class FrameWatch:
     def look(self, elapsed_s: float, frame: int, stopped: bool, busy: Callable[[], bool]) -> str | None:
         """What is wrong with the application, `elapsed_s` after the last look; None: nothing that is known.
 
-        busy: asked only in doubt, since it costs a look at every thread.
+        stopped: it is, while the laser may shine. busy: asked only in doubt, since it costs a look at every thread.
         """
-        if not self._watching:
-            return None
         if stopped:
             return "is stopped"
+        if not self._watching:
+            return None
         if frame != self._last:
             self._last, self._begun, self._silent_s = frame, True, 0.0
             return None

@@ -21,11 +21,22 @@ from drivers.interfaces.spad import (
     SpadTiming,
     StreamMode,
 )
-from drivers.interfaces.sync import OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse, SyncSource, SyncStatus
+from drivers.interfaces.sync import (
+    HOLD_S,
+    OUT_FRAME,
+    OUT_GATE,
+    OUT_MARKER,
+    Pulse,
+    SyncSource,
+    SyncStatus,
+    sliced,
+    slices,
+)
 from drivers.interfaces.window_table import WindowTable
 from drivers.interfaces.world import SweepTruth, World
 
 __all__ = [
+    "HOLD_S",
     "LEVEL_BACKWARD",
     "MARKER_LINE",
     "MARKER_SCAN",
@@ -55,4 +66,6 @@ __all__ = [
     "SyncStatus",
     "WindowTable",
     "World",
+    "sliced",
+    "slices",
 ]

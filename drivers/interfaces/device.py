@@ -57,7 +57,7 @@ class Device(ABC):
         return self._state
 
     def close(self) -> None:
-        """Leave the device safe (laser paused, gate low, mirror parked) and give it back; again: nothing happens."""
+        """Leave the device safe (laser paused, gate low, a mirror that moved parked) and give it back, once."""
         if self._state is DeviceState.CLOSED:
             return
         _log.info("%s: close", self._name)

@@ -69,11 +69,7 @@ class LineLaser(Device):
                 f"{self._name}: power {power_w:g} W is outside {limits.min_power_w:g} to {limits.max_power_w:g} W; "
                 "choose a power within the limits"
             )
-        status = self._do_status()
-        if not status.interlock_closed:
-            raise InterlockOpen(f"{self._name}: the interlock is open; close it and arm again")
-        if status.fault is not None:
-            raise DeviceFault(f"{self._name}: fault {status.fault}; clear it at the laser and arm again")
+        self._check_health()
         _log.info("%s: arm at %g W", self._name, power_w)
         self._do_arm(power_w)
         self._state = DeviceState.RUNNING
@@ -98,6 +94,14 @@ class LineLaser(Device):
 
     def _make_safe(self) -> None:
         self.pause()
+
+    def _check_health(self) -> None:
+        """Before anything is enabled. `InterlockOpen`, `DeviceFault`."""
+        status = self._do_status()
+        if not status.interlock_closed:
+            raise InterlockOpen(f"{self._name}: the interlock is open; close it and arm again")
+        if status.fault is not None:
+            raise DeviceFault(f"{self._name}: fault {status.fault}; clear it at the laser and arm again")
 
     @abstractmethod
     def _do_status(self) -> LaserStatus: ...

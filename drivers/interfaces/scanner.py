@@ -16,7 +16,11 @@ _log = logging.getLogger(__name__)
 MARKER_LINE = 1
 MARKER_SCAN = 2
 LEVEL_BACKWARD = 4
-"""Bits of a waveform's marker words. A bit at point i is high from the start of point i for one point."""
+"""Bits of a waveform's marker words. A bit at point i is high from the start of point i for one point.
+
+A sweep begins where MARKER_SCAN rises. It stays high until just before the sweep's light ends: the sync source lets
+light out only while it is, and a scanner that stops or is unplugged lets it fall.
+"""
 
 _ROUNDING = 1e-6
 """Share by which a computed speed may exceed its limit: differences of float64 commands are that uncertain."""
@@ -62,7 +66,12 @@ class ScannerStatus:
 
 
 class BeamScanner(Device):
-    """A galvanometer with its DAC. load -> start -> the waveform ends after its repeats, or stop -> park."""
+    """A galvanometer with its DAC. load -> start -> the waveform ends after its repeats, or stop -> park.
+
+    Opening one moves nothing, and neither does closing it before the first `start` or `park`.
+    """
+
+    _has_moved = False
 
     @property
     @abstractmethod
@@ -110,6 +119,7 @@ class BeamScanner(Device):
         self._note_end()
         self._require("start", DeviceState.CONFIGURED, first="load" if self._state is DeviceState.READY else "stop")
         _log.info("%s: start", self._name)
+        self._has_moved = True
         self._do_start()
         self._state = DeviceState.RUNNING
 
@@ -125,6 +135,7 @@ class BeamScanner(Device):
         """Stop, and turn the mirror to where the beam is dumped. In any state. Any thread."""
         self.stop()
         _log.info("%s: park", self._name)
+        self._has_moved = True
         self._do_park()
 
     def _note_end(self) -> None:
@@ -133,7 +144,8 @@ class BeamScanner(Device):
             self._state = DeviceState.CONFIGURED
 
     def _make_safe(self) -> None:
-        self.park()
+        if self._has_moved:
+            self.park()
 
     @abstractmethod
     def _do_status(self) -> ScannerStatus: ...

@@ -18,14 +18,40 @@ OUT_GATE = 2
 """Output that lets laser light out."""
 OUT_MARKER = 4
 """Output that marks the SPAD's records."""
+HOLD_S = 0.5e-3
+"""Longest that a held pulse outlasts the scan marker. A galvo needs about as long to come to rest."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """One word of a program: hold the outputs (OR of `OUT_*`) for a duration, or (None) until the scan marker."""
+    """One word of a program: hold the outputs (OR of `OUT_*`) for a duration, or (None) while the scan marker is low.
+
+    held: the gate stays high only as long as the scan marker does, which the source looks at every `HOLD_S`: the light
+    of a scanner that stopped, was unplugged or lost its program is gone then, whoever else has noticed.
+    """
 
     outputs: int
     duration_s: float | None
+    held: bool = False
+
+
+def slices(duration_s: float) -> int:
+    """Equal parts of a held pulse, each of which begins only while the scan marker is high."""
+    return max(1, math.ceil(duration_s / HOLD_S - 1e-9))
+
+
+def sliced(pulses: Sequence[Pulse]) -> list[Pulse]:
+    """The pulses with every held one as its parts, each behind one wait: how a source plays it."""
+    played: list[Pulse] = []
+    for pulse in pulses:
+        if not pulse.held or pulse.duration_s is None:
+            played.append(pulse)
+            continue
+        n = slices(pulse.duration_s)
+        wait, part = Pulse(pulse.outputs & ~OUT_GATE, None), Pulse(pulse.outputs, pulse.duration_s / n)
+        waits_already = bool(played) and played[-1].duration_s is None
+        played += ([wait, part] * n)[waits_already:]
+    return played
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +71,10 @@ class SyncSource(Device):
     @abstractmethod
     def resolution_s(self) -> float:
         """Durations are rounded to multiples of this."""
+
+    def most_repeats(self, pulses: Sequence[Pulse]) -> int | None:
+        """How often `pulses` can be repeated in one program; None: as often as anybody likes."""
+        return None
 
     @property
     def status(self) -> SyncStatus:

@@ -169,9 +169,10 @@ def require_ok(label: str, command: Command, ack: Ack) -> None:
         AckStatus.BAD_ADDRESS: "has no such register",
         AckStatus.BAD_VALUE: "refuses the value",
         AckStatus.WRONG_STATE: "is in the wrong state",
-    }.get(AckStatus(ack.status) if ack.status in set(AckStatus) else AckStatus.OK, f"answers status {ack.status}")
-    name = Op(command.op).name if command.op in set(Op) else f"op {command.op}"
-    raise DeviceFault(f"{label}: {name} 0x{command.address:04x} = {command.value}: the device {words}")
+    }
+    why = words[AckStatus(ack.status)] if ack.status in words else f"answers status {ack.status}"
+    name = Op(command.op).name
+    raise DeviceFault(f"{label}: {name} 0x{command.address:04x} = {command.value}: the device {why}")
 
 
 def pattern_row(row: int, frame: int, width: int) -> bytes:

@@ -32,6 +32,14 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
     counts. A block whose number does not rise within its run was sent or written twice: damage too. Control blocks
     are passed over. `UnsupportedBlock` where the stream is of another sort than this reader takes.
     """
+    for _, item in walk_places(buffer, stride, check_payload=check_payload):
+        yield item
+
+
+def walk_places(
+    buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool
+) -> Iterator[tuple[int, FrameBlock | Damage]]:
+    """As `walk_blocks`, with the offset in `buffer` at which each block or damage begins."""
     if stride is not None:
         check_stride(stride)
     offset = 0
@@ -39,7 +47,7 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
     last: FrameBlock | None = None
     while offset < len(buffer):
         if stride is None and not buffer[offset : offset + ALIGN].any():
-            offset += ALIGN
+            offset = _behind_zeros(buffer, offset + ALIGN)
             continue
         try:
             fields = read_header(buffer[offset:])
@@ -48,7 +56,7 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
         except CorruptBlock as error:
             found = _next_header(buffer, rest, passed_over=offset)
             start = min(offset, found)
-            yield Damage(start, found - start, str(error))
+            yield start, Damage(start, found - start, str(error))
             offset = rest = found
             continue
         rest = offset + round_up(fields.block_bytes, ALIGN)
@@ -57,11 +65,26 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
             if last is not None and _repeats(block, last):
                 seq, run = block.header.block_seq, block.header.run_id
                 reason = f"block {seq} of run {run} comes after block {last.header.block_seq}"
-                yield Damage(offset, min(end, len(buffer)) - offset, reason)
+                yield offset, Damage(offset, min(end, len(buffer)) - offset, reason)
             else:
-                yield block
+                yield offset, block
                 last = block
         offset = end
+
+
+def _behind_zeros(buffer: NDArray[np.uint8], offset: int) -> int:
+    """The next multiple of `ALIGN` from `offset` on with a byte that is not zero in its piece, or the buffer's end.
+
+    Looks at more at a time the further it gets: the rest of a segment that was laid out in advance may be a gigabyte.
+    """
+    step = ALIGN
+    while offset < len(buffer):
+        piece = buffer[offset : offset + step]
+        if piece.any():
+            return offset + int(np.flatnonzero(piece)[0]) // ALIGN * ALIGN
+        offset += len(piece)
+        step = min(2 * step, _SEARCH_BYTES)
+    return offset
 
 
 def _repeats(block: FrameBlock, last: FrameBlock) -> bool:

@@ -2,6 +2,9 @@
 
 Wraps pyserial. What a lost port raises there depends on the call (SerialException, a bare OSError or termios.error), so
 all of them are caught around every call. Deadlines are in the host's time: pyserial waits in no other.
+
+Its network ports are refused: a write to `rfc2217://` has no deadline, nobody but a reader learns that it is lost, and
+`socket://` leaks its connection where that was reset (pyserial 3.5). A bridge to a local port has neither fault.
 """
 
 import errno
@@ -127,6 +130,11 @@ class SerialPort:
             self._port.close()
 
     def _open(self, baud: int) -> serial.Serial:
+        if "://" in self._path:
+            raise DeviceNotFound(
+                f"{self._name}: port {self._path} is on the network; make a local one of it (socat PTY,raw,link=PATH "
+                "TCP:HOST:PORT) and write its path"
+            )
         try:
             return serial.Serial(self._path, baud, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
         except _FOREIGN as error:

@@ -6,15 +6,10 @@ addresses to choose from. `backend` is pyusb's: None for the real libusb, an emu
 
 pyusb is synchronous: between two reads nothing is queued, so the device's FIFO must hold that long. A stream that
 cannot wait needs several transfers in flight, which pyusb does not offer (package `libusb1` does).
-
-Errors as libusb 1.0 numbers them and as Linux means them: unplugging shows as ENODEV, EIO or ESHUTDOWN; a read shorter
-than a packet overflows and loses the packet; the sum of all queued transfers is limited by `usbfs_memory_mb` (16).
 """
 
 import array
-import errno
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from threading import RLock
 from typing import Any, Self
@@ -23,21 +18,8 @@ import usb.backend.libusb1
 import usb.core
 import usb.util
 
-from drivers.errors import (
-    DeviceBusy,
-    DeviceDisconnected,
-    DeviceError,
-    DeviceFault,
-    DeviceNotFound,
-    DevicePermission,
-    DeviceTimeout,
-    ProtocolError,
-)
-
-UDEV_RULES = "config/udev/70-spadrig.rules"
-"""Gives the devices to group plugdev; its first lines say how to install it."""
-
-_LOST = (errno.ENODEV, errno.EIO, errno.ESHUTDOWN, errno.ENOTCONN)
+from drivers.errors import DeviceError, DeviceNotFound, DevicePermission, DeviceTimeout, ProtocolError
+from drivers.transports.usb_errors import no_permission, translated
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +104,7 @@ class UsbDevice:
     def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
         """One OUT transfer, interrupt or bulk as the descriptor says. `DeviceTimeout` where not all of it went out."""
         with translated(self.label, endpoint, timeout_s):
-            sent = self._device.write(endpoint, data, _milliseconds(timeout_s))
+            sent = self._device.write(endpoint, data, milliseconds(timeout_s))
         if sent != len(data):
             raise DeviceTimeout(
                 f"{self.label}: {sent} of {len(data)} B went out on endpoint 0x{endpoint:02x} within {timeout_s:g} s"
@@ -131,12 +113,12 @@ class UsbDevice:
     def read(self, endpoint: int, size: int, timeout_s: float) -> bytes:
         """One IN transfer of at most `size` bytes, a whole number of packets. `DeviceTimeout` where nothing came."""
         with translated(self.label, endpoint, timeout_s):
-            return bytes(self._device.read(endpoint, size, _milliseconds(timeout_s)))
+            return bytes(self._device.read(endpoint, size, milliseconds(timeout_s)))
 
     def read_into(self, endpoint: int, buffer: "array.array[int]", timeout_s: float) -> int:
         """As `read`, into an existing array (its own size in whole packets); returns the bytes read."""
         with translated(self.label, endpoint, timeout_s):
-            return int(self._device.read(endpoint, buffer, _milliseconds(timeout_s)))
+            return int(self._device.read(endpoint, buffer, milliseconds(timeout_s)))
 
     def drain(self, endpoint: int, size: int, timeout_s: float, most: int = 1000) -> int:
         """Read and drop until nothing comes for `timeout_s`; returns the transfers dropped.
@@ -155,7 +137,7 @@ class UsbDevice:
     ) -> bytes:
         """A control transfer that reads. `DeviceFault` where the device refuses it (stall)."""
         with translated(self.label, 0, timeout_s):
-            reply = self._device.ctrl_transfer(request_type, request, value, index, length, _milliseconds(timeout_s))
+            reply = self._device.ctrl_transfer(request_type, request, value, index, length, milliseconds(timeout_s))
         return bytes(reply)
 
     def control_out(
@@ -163,7 +145,7 @@ class UsbDevice:
     ) -> None:
         """A control transfer that writes. `DeviceFault` where the device refuses it (stall)."""
         with translated(self.label, 0, timeout_s):
-            self._device.ctrl_transfer(request_type, request, value, index, data, _milliseconds(timeout_s))
+            self._device.ctrl_transfer(request_type, request, value, index, data, milliseconds(timeout_s))
 
     def endpoints(self) -> tuple[int, ...]:
         """Addresses of all endpoints in the active configuration; bit 7 set = IN."""
@@ -220,7 +202,7 @@ def _choose(listings: list[UsbListing], wanted: UsbId, address: str) -> UsbListi
     if not chosen:
         hidden = any(one.serial is None and one.product_name is None for one in listings)
         if hidden and address.startswith("usb:serial="):
-            raise DevicePermission(_no_permission(wanted.label))
+            raise DevicePermission(no_permission(wanted.label))
         raise DeviceNotFound(f"{wanted.label}: none is attached at {address}; attached: {choices}")
     if len(chosen) > 1:
         raise DeviceError(f"{wanted.label}: {len(chosen)} are attached; set port to one of {choices}")
@@ -272,44 +254,6 @@ def _libusb() -> Any:
     return backend
 
 
-def _milliseconds(timeout_s: float) -> int:
+def milliseconds(timeout_s: float) -> int:
     """libusb takes 0 as 'for ever', which no call here may ask for."""
     return max(1, round(timeout_s * 1000))
-
-
-def _no_permission(label: str) -> str:
-    return f"{label}: no permission to open it; install {UDEV_RULES} (its first lines say how) and plug it in again"
-
-
-@contextmanager
-def translated(label: str, endpoint: int | None = None, timeout_s: float | None = None) -> Iterator[None]:
-    """Turn what pyusb raises inside into one line and one class of `drivers.errors`."""
-    try:
-        yield
-    except usb.core.USBError as error:
-        raise _ours(error, label, endpoint, timeout_s) from None
-    except (ValueError, NotImplementedError) as error:  # no such endpoint or setting; a call libusb cannot do here
-        raise ProtocolError(f"{label}: {error}; check the device's firmware") from None
-
-
-def _ours(error: Any, label: str, endpoint: int | None, timeout_s: float | None) -> DeviceError:
-    where = "" if endpoint is None else f" on endpoint 0x{endpoint:02x}"
-    number = error.errno
-    if number == errno.ETIMEDOUT:
-        return DeviceTimeout(f"{label}: nothing{where} within {timeout_s or 0:g} s")
-    if number in _LOST:
-        return DeviceDisconnected(f"{label}: the device is gone ({error.strerror}); check cable and power, open again")
-    if number == errno.EACCES:
-        return DevicePermission(_no_permission(label))
-    if number == errno.EBUSY:
-        return DeviceBusy(f"{label}: another program holds it; end that program")
-    if number == errno.EPIPE:
-        return DeviceFault(f"{label}: the device refused the transfer{where} (stall)")
-    if number == errno.EOVERFLOW:
-        return ProtocolError(f"{label}: more bytes than asked for{where}; check the firmware")
-    if number == errno.ENOMEM:
-        return DeviceError(
-            f"{label}: the kernel's USB memory is used up; run: "
-            "echo 256 | sudo tee /sys/module/usbcore/parameters/usbfs_memory_mb"
-        )
-    return DeviceError(f"{label}: USB error{where}: {error.strerror or error}")

@@ -200,7 +200,7 @@ class CoboltModel:
                 return self.serial
             case "gfv?" | "ver?":
                 return self.firmware
-            case "glm?":
+            case "glm?" if "." in self.firmware:  # -04- types have no dot there, and do not know it
                 return self.model
             case "hrs?":
                 return "123.45"

@@ -11,14 +11,15 @@ exposed; the SPAD's memory has room for a simulation that takes longer than that
 import os
 import threading
 from bisect import bisect_right
-from collections.abc import Mapping
 from types import TracebackType
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from drivers.frames import FRAME_RECORD, packed_row_bytes
+from drivers.interfaces import OUT_GATE
 from drivers.registry import Kind, Surroundings
 from drivers.transports.endpoints import Endpoint
 from sim_backend.bench import Happening
@@ -30,8 +31,12 @@ from sim_backend.wire.helios import BLUE, GREEN, INTENSITY, HeliosModel
 from sim_backend.wire.obis import ObisModel
 from sim_backend.wire.prawndo import PrawnDoModel
 from sim_backend.wire.serial_server import SerialServer
-from sim_backend.wire.spb_usb import Span, SpbUsbModel
+from sim_backend.wire.spad512s import Spad512sModel
+from sim_backend.wire.spb_usb import SpbUsbModel
+from sim_backend.wire.spb_usb_run import Span
+from sim_backend.wire.tcp_server import TcpServer
 from sim_backend.wire.usb_backend import EmulatedUsb
+from sim_backend.wire.usb_model import AttachedDevice, UsbModel
 from sim_backend.world import SimulatedWorld, WorldConfig
 
 Array = NDArray[np.float64]
@@ -40,8 +45,18 @@ MAX_THREADS = 8
 USB_BAUD = 10_000_000
 """A virtual COM port is as fast as USB lets it be."""
 PICO_2 = 2
+KEPT_S = 20.0
+"""What gate and mirror did before is forgotten."""
 KEPT_FRAMES = 1_000_000_000
 """Frames that wait for the host: as many as there may be."""
+
+
+class TakesDevices(Protocol):
+    """A USB bus, in this process or for other ones."""
+
+    def plug(self, model: UsbModel) -> AttachedDevice:
+        """Attach a model."""
+        ...
 
 
 class EmulatedWorldConfig(WorldConfig):
@@ -52,6 +67,8 @@ class EmulatedWorldConfig(WorldConfig):
     kind: str = "emulated"
     laser: Literal["cobolt", "obis"] = "cobolt"
     """Which laser answers at emulated:laser."""
+    spad: Literal["spb-usb", "spad512s"] = "spb-usb"
+    """Which SPAD answers at emulated:spad."""
     scanner_clock_error: float = Field(default=20e-6, ge=-1e-3, le=1e-3)
     """By how much the scanner's crystal runs fast."""
 
@@ -59,8 +76,13 @@ class EmulatedWorldConfig(WorldConfig):
 class EmulatedWorld(SimulatedWorld):
     """One scene and the devices that look at it, plugged in from its creation to `close`."""
 
-    def __init__(self, config: EmulatedWorldConfig, surroundings: Surroundings) -> None:
-        """DeviceError where the geometry or the scene cannot be used."""
+    def __init__(
+        self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: TakesDevices | None = None
+    ) -> None:
+        """DeviceError where the geometry or the scene cannot be used.
+
+        bus: where the USB devices are plugged in, and who closes it is its maker; by default one within this process.
+        """
         super().__init__(config, surroundings)
         rows, width = self.size
         clock, self._seed = surroundings.clock, surroundings.seed
@@ -69,25 +91,33 @@ class EmulatedWorld(SimulatedWorld):
         self.laser = (CoboltModel if config.laser == "cobolt" else ObisModel)(on_emission=self._note_emission)
         self.sync = PrawnDoModel(self._scan_marker, board=PICO_2)
         self.scanner = HeliosModel(clock_error=config.scanner_clock_error)
-        self.spad = SpbUsbModel(WorldFrames(self), width, rows, paced=True, fifo_frames=KEPT_FRAMES)
-        self._bus = EmulatedUsb(clock)
-        self._scanner_plug = self._bus.plug(self.scanner)
-        self._bus.plug(self.spad)
-        self._laser_wire = SerialServer(self.laser, clock=clock).start()
-        self._gate_wire = SerialServer(self.sync, clock=clock, baud=USB_BAUD).start()
-        on_bus = Endpoint("usb", emulated=True, usb_backend=self._bus)
-        self.ports: Mapping[str, Endpoint] = {
-            "laser": self._laser_wire.endpoint,
-            "gate": self._gate_wire.endpoint,
+        self._frames = WorldFrames(self)
+        self.spad = SpbUsbModel(self._frames, width, rows, paced=True, fifo_frames=KEPT_FRAMES)
+        bus = bus or EmulatedUsb(clock)
+        self.scanner_plug = bus.plug(self.scanner)
+        self.spad_plug = bus.plug(self.spad)
+        self.laser_wire = SerialServer(self.laser, clock=clock).start()
+        self.gate_wire = SerialServer(self.sync, clock=clock, baud=USB_BAUD).start()
+        on_bus = Endpoint("usb", emulated=True, usb_backend=bus if isinstance(bus, EmulatedUsb) else None)
+        self.ports: dict[str, Endpoint] = {
+            "laser": self.laser_wire.endpoint,
+            "gate": self.gate_wire.endpoint,
             "scanner": on_bus,
             "spad": on_bus,
         }
+        self.spad512s_wire: TcpServer | None = None
+        if config.spad == "spad512s":
+            self.spad512s_wire = TcpServer(Spad512sModel(self._frames.whole, paced=True), clock=clock).start()
+            self.ports["spad"] = self.spad512s_wire.endpoint
         """Where the emulated devices are."""
 
     def close(self) -> None:
-        """Unplug everything; again: nothing happens."""
-        self._laser_wire.close()
-        self._gate_wire.close()
+        """Unplug everything and end the threads; again: nothing happens."""
+        self.laser_wire.close()
+        self.gate_wire.close()
+        if self.spad512s_wire is not None:
+            self.spad512s_wire.close()
+        self._frames.close()
 
     def __enter__(self) -> Self:
         """The world itself."""
@@ -116,19 +146,51 @@ class EmulatedWorld(SimulatedWorld):
         """
         middle, until_s = start_s + 0.5 * exposure_s, float(start_s[-1]) + period_s
         history, lag = self.scanner.history, self.model.lag_s
-        with self._scanner_plug.lock:
+        with self.scanner_plug.lock:
             backward = history.level(INTENSITY, start_s) > 0
             lag_s = np.where(history.level(INTENSITY, middle) > 0, lag.backward, lag.forward)
             mirror = history.command(middle - lag_s)
             line_s = history.rising(GREEN, float(start_s[0]), until_s)
             scan_s = history.rising(BLUE, float(start_s[0]), until_s)
-        with self._gate_wire.lock:
+        with self.gate_wire.lock:
             self.sync.advance(until_s)
+            self.sync.forget(float(start_s[0]) - KEPT_S)
             changes = self.sync.changes(float(start_s[0]), until_s)
         times, words = np.array([t for t, _ in changes]), np.array([word for _, word in changes], np.int64)
         share, edge = gate_shares(times, words, start_s, exposure_s)
         power_w = self._power(middle)
         return Happening(mirror, share, edge, backward, line_s, scan_s, float(power_w[0])), power_w
+
+    def light(self, from_s: float, until_s: float) -> list[tuple[float, float]]:
+        """(start, end) of every time with light in [from_s, until_s], ascending: emission AND gate.
+
+        Of the host's time, at most until now; the last `KEPT_S` are known.
+        """
+        with self.gate_wire.lock:
+            self.sync.advance(until_s)
+            gate = [(at, bool(word & OUT_GATE)) for at, word in self.sync.changes(from_s, until_s)]
+        emission = [(max(at, from_s), power_w > 0) for at, power_w in self.emission() if at < until_s]
+        both = sorted([(at, 0, high) for at, high in gate] + [(at, 1, emits) for at, emits in emission])
+        levels, begun_s, found = [False, False], 0.0, []
+        for at_s, which, level in [*both, (until_s, 0, False)]:
+            was_lit = all(levels)
+            levels[which] = level
+            if all(levels) and not was_lit:
+                begun_s = at_s
+            elif was_lit and not all(levels) and at_s > begun_s:
+                found.append((begun_s, at_s))
+        return found
+
+    def emission(self) -> list[tuple[float, float]]:
+        """(time, power) of every change of what would come out through an open gate, in W; the first one is 'never'."""
+        with self._emission_lock:
+            return list(self._emission)
+
+    def mirror(self, time_s: Array) -> Array:
+        """Where the scanner's output drives the mirror, normalised, at times (n,)."""
+        with self.scanner_plug.lock:
+            self.scanner.advance(float(time_s[-1]))
+            return self.scanner.history.command(time_s)
 
     def _power(self, time_s: Array) -> Array:
         with self._emission_lock:
@@ -145,7 +207,7 @@ class EmulatedWorld(SimulatedWorld):
 
     def _scan_marker(self, from_s: float, until_s: float) -> float | None:
         """The sync source's trigger input hangs on the scanner's scan marker."""
-        with self._scanner_plug.lock:
+        with self.scanner_plug.lock:
             if self.scanner.history.level(BLUE, np.array([from_s]))[0]:
                 return from_s
             edges = self.scanner.history.rising(BLUE, from_s, until_s)
@@ -177,10 +239,22 @@ class WorldFrames:
             self._source(span.exposure_s).expose(span.first_frame, held, power_w * happening.share, x0, bits)
         return sweep
 
+    def whole(self, first_frame: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
+        """Whole frames of a SPAD without records, exposed all of their period; upright, (n, height, row bytes)."""
+        rows, width = self._world.size
+        bits = np.zeros((n, rows, packed_row_bytes(width)), np.uint8)
+        self.expose(Span(first_frame, n, start_s, period_s, period_s, None), np.zeros(n, FRAME_RECORD), bits)
+        return bits
+
+    def close(self) -> None:
+        """End the threads that draw; again: nothing happens."""
+        if self._photons is not None:
+            self._photons.close()
+            self._photons = None
+
     def _source(self, exposure_s: float) -> PhotonSource:
         if self._photons is None or exposure_s != self._exposure_s:
-            if self._photons is not None:
-                self._photons.close()
+            self.close()
             self._photons, self._exposure_s = self._world.photon_source(exposure_s), exposure_s
         return self._photons
 

@@ -5,22 +5,14 @@ is refused is refused in silence; frames within 100 ms of STOP are dropped; a fr
 """
 
 import struct
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.wire.dac_history import Array, DacHistory, Played
-from sim_backend.wire.usb_model import (
-    STALL,
-    AlternateSpec,
-    Answer,
-    DeviceSpec,
-    EndpointSpec,
-    Stall,
-    UsbModel,
-)
+from sim_backend.wire.dac_history import Array, Played
+from sim_backend.wire.dac_model import CENTRE, DAC_STEPS, DacModel, normal
+from sim_backend.wire.usb_descriptors import AlternateSpec, DeviceSpec, EndpointSpec
 
 SYSTICK_HZ = 112_000_000
 BUFFER_POINTS = 4096
@@ -31,7 +23,6 @@ BUS_BYTES_PER_S = 1.0e6
 COMMANDS, REPLIES, FRAMES = 0x06, 0x83, 0x02
 RED, GREEN, BLUE, INTENSITY = 0, 1, 2, 3
 """Colour outputs, as lines of the history."""
-_CENTRE = 0x800
 
 _SPEC = DeviceSpec(
     vendor=0x1209,
@@ -66,16 +57,12 @@ class _Frame:
     duration_s: float
 
 
-class HeliosModel(UsbModel):
-    """The firmware. Times are the transport's.
-
-    `history` is what its outputs did and, as far as its buffers go, will do: it may be asked about times to come.
-    """
+class HeliosModel(DacModel):
+    """The firmware. As far as its buffers go, `history` may be asked about times to come."""
 
     def __init__(self, *, name: str = "Helios 1", version: int = 6, clock_error: float = 0.0, axis: str = "x") -> None:
         """clock_error: of its crystal. axis: the one whose mirror the history follows."""
-        self.spec = _SPEC
-        self.history = DacHistory(_normal(_CENTRE), lines=4)
+        super().__init__(_SPEC, commands=COMMANDS, replies=REPLIES, points=FRAMES)
         self.shutter = False
         self.bootloader = False
         self.refused = 0
@@ -84,11 +71,8 @@ class HeliosModel(UsbModel):
         """Frames whose playing began."""
         self.drop_next = 0
         """Test knob: so many sound frames are dropped in silence."""
-        self.deaf = False
-        """Test knob: the firmware hangs, its outputs play on."""
         self._name, self._version, self._axis = name, version, axis
         self._clock_error = clock_error
-        self._replies: deque[bytes] = deque()
         self._playing: _Frame | None = None
         self._ends_s = 0.0
         self._pending: _Frame | None = None
@@ -97,41 +81,13 @@ class HeliosModel(UsbModel):
         self._arriving: tuple[int, float] | None = None
         self._dead_until_s = -1.0
 
-    def leave_reply(self, reply: bytes) -> None:
-        """A reply that an earlier program never read."""
-        self._replies.append(reply)
-
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Alternate 1 enables the DAC, anything else stops it."""
+        """Alternate 1 enables the DAC: blank, the mirror stays. Anything else stops it: blank and centre."""
         self.advance(now_s)
         self._halt(now_s)
-        self.history.cut(now_s, _normal(_CENTRE))
+        if alternate != 1:
+            self.history.cut(now_s, normal(CENTRE))
         self._armed = alternate == 1
-
-    def unplugged(self, now_s: float) -> None:
-        """No power: the outputs fall to 0 V, which is the centre."""
-        self.advance(now_s)
-        self._halt(now_s)
-        self.history.cut(now_s, _normal(_CENTRE))
-
-    def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
-        """Commands and frames."""
-        self.advance(now_s)
-        if self.deaf:
-            return None
-        if endpoint == COMMANDS:
-            self._command(data, now_s)
-            return len(data)
-        if endpoint == FRAMES:
-            return self._bulk(data, now_s)
-        return STALL
-
-    def inp(self, endpoint: int, length: int, now_s: float) -> Answer:
-        """Replies, one a transfer."""
-        self.advance(now_s)
-        if endpoint == REPLIES and self._replies and not self.deaf:
-            return self._replies.popleft()
-        return None
 
     def advance(self, now_s: float) -> None:
         """Play on until now: pending frames follow without a seam, single ones end with the colours low."""
@@ -154,7 +110,7 @@ class HeliosModel(UsbModel):
             case 0x01:
                 self._halt(now_s)
                 self._dead_until_s = now_s + STOP_DEAD_S
-                self.history.cut(self._dead_until_s, _normal(_CENTRE))
+                self.history.cut(self._dead_until_s, normal(CENTRE))
             case 0x02:
                 self.shutter = bool(data[1])
             case 0x03:
@@ -170,7 +126,7 @@ class HeliosModel(UsbModel):
             case 0xDE:
                 self.bootloader = self.gone = True
 
-    def _bulk(self, data: bytes, now_s: float) -> int | None:
+    def _take_points(self, data: bytes, now_s: float) -> int | None:
         if not self._armed:
             return None
         if self._arriving is None or self._arriving[0] != len(data):
@@ -207,7 +163,7 @@ class HeliosModel(UsbModel):
         x = raw[:, 0] << 4 | raw[:, 1] >> 4
         y = (raw[:, 1] & 0xF) << 8 | raw[:, 2]
         period_s = (SYSTICK_HZ // pps + 1) / SYSTICK_HZ / (1 + self._clock_error)
-        command = (x if self._axis == "x" else y) / 4095 * 2 - 1
+        command = (x if self._axis == "x" else y) / DAC_STEPS * 2 - 1
         return _Frame(command, raw[:, 3:].astype(np.uint8), period_s, bool(flags & 2), len(raw) * period_s)
 
     def _play(self, frame: _Frame, start_s: float) -> None:
@@ -221,7 +177,3 @@ class HeliosModel(UsbModel):
         if self._playing is not None:
             self.history.cut(now_s)
         self._playing = self._pending = None
-
-
-def _normal(value: int) -> float:
-    return value / 4095 * 2 - 1

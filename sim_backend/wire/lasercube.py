@@ -10,16 +10,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.wire.dac_history import DacHistory, Played
-from sim_backend.wire.usb_model import (
-    STALL,
-    AlternateSpec,
-    Answer,
-    DeviceSpec,
-    EndpointSpec,
-    Stall,
-    UsbModel,
-)
+from sim_backend.wire.dac_history import Played
+from sim_backend.wire.dac_model import DAC_STEPS, DacModel
+from sim_backend.wire.usb_descriptors import AlternateSpec, DeviceSpec, EndpointSpec
 
 COMMANDS, REPLIES, SAMPLES = 0x01, 0x81, 0x03
 RED, GREEN, BLUE, PLAYING = 0, 1, 2, 3
@@ -27,8 +20,8 @@ RED, GREEN, BLUE, PLAYING = 0, 1, 2, 3
 _REPEATED_SAMPLES = 64
 
 
-class LaserCubeModel(UsbModel):
-    """The firmware. `history` is what its outputs did; times are the transport's."""
+class LaserCubeModel(DacModel):
+    """The firmware."""
 
     def __init__(
         self,
@@ -42,7 +35,7 @@ class LaserCubeModel(UsbModel):
         axis: str = "x",
     ) -> None:
         """clock_error: of its crystal. axis: the one whose mirror the history follows."""
-        self.spec = DeviceSpec(
+        spec = DeviceSpec(
             vendor=0x1FC9,
             product=0x04D8,
             manufacturer="Wicked Lasers",
@@ -55,49 +48,17 @@ class LaserCubeModel(UsbModel):
                 AlternateSpec(1, 1, (EndpointSpec(SAMPLES, "bulk", 512),)),
             ),
         )
-        self.history = DacHistory(0x800 / 4095 * 2 - 1, lines=4)
+        super().__init__(spec, commands=COMMANDS, replies=REPLIES, points=SAMPLES)
         self.enabled = False
         self.rate_hz = 30_000
         self.rate_offset_hz = 0
         """Test knob: the rate that is set is another one by this much."""
-        self.deaf = False
-        """Test knob: the firmware hangs, its outputs play on."""
         self._ring_points, self._highest_rate_hz = ring, highest_rate_hz
         self._when_empty, self._axis, self._clock_error = when_empty, axis, clock_error
         self._ring: deque[NDArray[np.uint16]] = deque()
         self._queued = 0
         self._played_to_s = 0.0
         self._last: NDArray[np.uint16] | None = None
-        self._replies: deque[bytes] = deque()
-
-    def leave_reply(self, reply: bytes) -> None:
-        """A reply that an earlier program never read."""
-        self._replies.append(reply)
-
-    def unplugged(self, now_s: float) -> None:
-        """No power."""
-        self.advance(now_s)
-        self._clear()
-        self.enabled = False
-        self.history.cut(now_s, 0.0)
-
-    def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
-        """Commands and samples."""
-        self.advance(now_s)
-        if self.deaf:
-            return None
-        if endpoint == COMMANDS:
-            code, value = self._command(data, now_s)
-            self._replies.append((bytes((data[0], code)) + value).ljust(64, b"\0"))
-            return len(data)
-        if endpoint == SAMPLES:
-            return self._append(data, now_s)
-        return STALL
-
-    def inp(self, endpoint: int, length: int, now_s: float) -> Answer:
-        """Replies, one a transfer."""
-        self.advance(now_s)
-        return self._replies.popleft() if self._replies and not self.deaf else None
 
     def moving(self, now_s: float) -> bool:
         """Whether samples are being played."""
@@ -126,10 +87,10 @@ class LaserCubeModel(UsbModel):
         levels = np.stack([block[:, 0] & 0xFF, block[:, 0] >> 8, block[:, 1], np.full(len(block), 255)], axis=1)
         if not self.enabled:
             levels[:, :3] = 0
-        command = block[:, 2 if self._axis == "x" else 3] / 4095 * 2 - 1
+        command = block[:, 2 if self._axis == "x" else 3] / DAC_STEPS * 2 - 1
         self.history.play(Played(start_s, self._played_to_s, 1 / rate_hz, command, levels.astype(np.uint8)))
 
-    def _append(self, data: bytes, now_s: float) -> int | None:
+    def _take_points(self, data: bytes, now_s: float) -> int | None:
         samples = np.frombuffer(data, "<u2").reshape(-1, 4).astype(np.uint16)
         if self._queued + len(samples) > self._ring_points:
             return None
@@ -139,11 +100,15 @@ class LaserCubeModel(UsbModel):
         self._queued += len(samples)
         return len(data)
 
-    def _clear(self) -> None:
+    def _halt(self, now_s: float) -> None:
         self._ring.clear()
         self._queued = 0
 
-    def _command(self, data: bytes, now_s: float) -> tuple[int, bytes]:
+    def _command(self, data: bytes, now_s: float) -> None:
+        code, value = self._answer(data, now_s)
+        self._replies.append((bytes((data[0], code)) + value).ljust(64, b"\0"))
+
+    def _answer(self, data: bytes, now_s: float) -> tuple[int, bytes]:
         """Reply code and data."""
         answers = {
             0x81: bytes((self.enabled,)),
@@ -162,7 +127,7 @@ class LaserCubeModel(UsbModel):
             case 0x82:
                 self.rate_hz = int.from_bytes(data[1:5], "little") + self.rate_offset_hz
             case 0x8D:
-                self._clear()
+                self._halt(now_s)
             case opcode if opcode in answers:
                 return 0, answers[opcode]
             case _:

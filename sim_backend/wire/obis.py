@@ -51,6 +51,8 @@ class ObisModel:
         self.autostart = False
         self.tec = True
         self.base_c = 24.6
+        self.base_range_c: tuple[float, float] | None = (10.0, 50.0)
+        """What it states; None: this unit does not."""
         self.forbidden: list[str] = []
         self.commands: list[str] = []
         self._warm_up_s = warm_up_s
@@ -180,6 +182,10 @@ class ObisModel:
                 return _switch(self.tec)
             case "SOUR:TEMP:BAS?":
                 return f"{self.base_c:.1f}C"
+            case "SOUR:TEMP:PROT:BAS:LOW?" if self.base_range_c is not None:
+                return f"{self.base_range_c[0]:.1f}C"
+            case "SOUR:TEMP:PROT:BAS:HIGH?" if self.base_range_c is not None:
+                return f"{self.base_range_c[1]:.1f}C"
         return None
 
     def _bits(self) -> int:

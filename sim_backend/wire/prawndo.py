@@ -118,7 +118,10 @@ class PrawnDoModel:
             data = data[cut:]
             if self._line.endswith(b"\n") or len(self._line) >= LINE_BYTES - 1:
                 line, self._line = self._line.decode("latin-1").rstrip("\r\n"), bytearray()
+                asked = self.status == ABORT_REQUESTED
                 answer += self._answer(line, now_s)
+                if asked:  # to say this took longer than the second core needs
+                    self.status = ABORTED
         return answer
 
     def tick(self, now_s: float) -> bytes:
@@ -198,6 +201,9 @@ class PrawnDoModel:
     def _set_outputs(self, level: int, at_s: float) -> None:
         before = self._levels[-1]
         if level == before:
+            return
+        if self._times[-1] == at_s and self._levels[-2] == level:  # a level that lasted no time was none
+            del self._times[-1], self._levels[-1]
             return
         self._times.append(at_s)
         self._levels.append(level)

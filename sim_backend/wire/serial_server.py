@@ -1,8 +1,8 @@
 """Serves a model of a serial device on a pseudo terminal: the real driver opens it with the real pyserial.
 
 Replies leave at 10 bits a character, in the host's time, as through a UART (a virtual COM port is faster, and no driver
-may depend on that). The model's own time comes from a clock, so that a warm-up of minutes costs a test nothing.
-A pseudo terminal ignores the baud rate. The path is a link that survives unplugging and plugging in again.
+may depend on that). A pseudo terminal ignores the baud rate. The path is a link that survives unplugging and plugging
+in again.
 """
 
 import os
@@ -11,14 +11,13 @@ import tempfile
 import threading
 import time
 import tty
-from collections import deque
 from pathlib import Path
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
-from drivers.clock import NS_PER_S, Clock, SystemClock
+from drivers.clock import Clock
 from drivers.transports.endpoints import Endpoint
-from sim_backend.wire.faults import Fault, FaultSchedule
+from sim_backend.wire.faults import FaultSchedule
+from sim_backend.wire.wire_server import WireServer
 
 BITS_PER_CHARACTER = 10
 """8N1: a start bit, eight data bits, a stop bit."""
@@ -40,8 +39,8 @@ class SerialModel(Protocol):
         ...
 
 
-class SerialServer:
-    """A serial device on a wire of its own, from entering the `with` block (or `start`) to leaving it (`close`)."""
+class SerialServer(WireServer[SerialModel]):
+    """A serial device."""
 
     def __init__(
         self,
@@ -51,22 +50,13 @@ class SerialServer:
         baud: int = 115_200,
         faults: FaultSchedule | None = None,
     ) -> None:
-        self.model = model
-        self.lock = threading.RLock()
-        """Held around every call of the model; hold it to look at more than one of its attributes."""
-        self.faults = faults
-        self._clock = clock or SystemClock()
+        super().__init__(model, clock, faults)
         self._characters_per_s = baud / BITS_PER_CHARACTER
         self._folder = tempfile.TemporaryDirectory(prefix="spadrig-tty-")
         self._master: int | None = None
         self._slave: int | None = None
-        self._outbox: deque[tuple[float, bytes]] = deque()
-        self._line_free_at = 0.0
-        self._hung = False
         self._waiting = threading.Lock()
         self._wake_in, self._wake_out = os.pipe()
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="serial server", daemon=True)
 
     @property
     def path(self) -> str:
@@ -78,36 +68,17 @@ class SerialServer:
         """The same for `Surroundings.ports`."""
         return Endpoint(self.path, emulated=True)
 
-    def start(self) -> Self:
-        """Plug it in and serve it on a thread of its own."""
-        self.plug()
-        self._thread.start()
-        return self
-
     def close(self) -> None:
         """Unplug it for good; again: nothing happens."""
-        self._ending.set()
-        if self._thread.ident is not None:
-            self._thread.join()
-        self.unplug()
+        super().close()
         if self._wake_in >= 0:
             os.close(self._wake_in)
             os.close(self._wake_out)
             self._wake_in = self._wake_out = -1
         self._folder.cleanup()
 
-    def __enter__(self) -> Self:
-        """The server, serving."""
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close."""
-        self.close()
-
     def plug(self) -> None:
-        """Put the cable in. The device kept its power: its state is what it was."""
+        """Put the cable in."""
         with self.lock:
             if self._master is not None:
                 return
@@ -128,17 +99,6 @@ class SerialServer:
                 os.close(self._slave)
                 os.close(self._master)
                 self._master = self._slave = None
-
-    def hang(self) -> None:
-        """The firmware hangs: nothing is taken and nothing said, outputs stay as they are."""
-        with self.lock:
-            self._hung = True
-            self._outbox.clear()
-
-    def resume(self) -> None:
-        """End a hang."""
-        with self.lock:
-            self._hung = False
 
     def _serve(self) -> None:
         while not self._ending.is_set():
@@ -162,7 +122,7 @@ class SerialServer:
 
     def _turn(self, master: int) -> None:
         """Take what came, let the model answer, send what is due."""
-        now_s = self._clock.now_ns() / NS_PER_S
+        now_s = self._now_s()
         self._reply(self.model.tick(now_s))
         try:
             data = os.read(master, 4096)
@@ -173,29 +133,10 @@ class SerialServer:
         if self._master is not None:  # a fault may just have unplugged it
             self._send_due(self._master)
 
-    def _reply(self, reply: bytes) -> None:
-        """Queue a reply, as the faults would have it."""
-        if not reply:
-            return
-        now = time.monotonic()
-        fault = self.faults.next() if self.faults is not None else None
-        if self.faults is None:
-            self._queue(now, reply)
-        elif fault is Fault.UNPLUG:
-            self.unplug()
-        elif fault is Fault.HANG:
-            self.hang()
-        else:
-            if fault is Fault.STALL:
-                self._line_free_at = max(self._line_free_at, now) + self.faults.stall_s
-            for delivery in self.faults.shape(fault, reply):
-                self._queue(now + delivery.delay_s, delivery.data)
-
     def _queue(self, at: float, data: bytes) -> None:
-        """Bytes leave in order, no faster than the line carries them."""
-        self._line_free_at = max(self._line_free_at, at)
-        self._outbox.append((self._line_free_at, data))
-        self._line_free_at += len(data) / self._characters_per_s
+        """No faster than the line carries them."""
+        super()._queue(at, data)
+        self._free_at += len(data) / self._characters_per_s
 
     def _send_due(self, master: int) -> None:
         now = time.monotonic()

@@ -60,7 +60,7 @@ class Spad512sModel:
         self._rows = 1024 if "1M" in flavour else 512
         self._rotation: QuarterTurn = rotation
         self._paced = paced
-        self._calibrated = calibration_s == 0
+        self.restarted()
         self._calibrating_until: float | None = None
         self._pile_up_sent = False
         self._out = bytearray()
@@ -80,6 +80,10 @@ class Spad512sModel:
         """The run, if any, goes to nobody."""
         self._run = None
         self._out.clear()
+
+    def restarted(self) -> None:
+        """The program ended and was started anew."""
+        self._calibrated = self._calibration_s == 0
 
     def receive(self, data: bytes, now_s: float) -> None:
         """One command: there is no framing, so two that come together are none, as with the real program."""

@@ -6,16 +6,14 @@ One client at a time, as vendors' programs have it: while one is served nobody l
 import select
 import socket
 import struct
-import threading
 import time
-from collections import deque
 from contextlib import suppress
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
-from drivers.clock import NS_PER_S, Clock, SystemClock
+from drivers.clock import Clock
 from drivers.transports.endpoints import Endpoint
-from sim_backend.wire.faults import Fault, FaultSchedule
+from sim_backend.wire.faults import FaultSchedule
+from sim_backend.wire.wire_server import WireServer
 
 HOST = "127.0.0.1"
 CHUNK_BYTES = 65_536
@@ -44,23 +42,14 @@ class TcpModel(Protocol):
         ...
 
 
-class TcpServer:
-    """A program that serves one client, from entering the `with` block (or `start`) to leaving it (`close`)."""
+class TcpServer(WireServer[TcpModel]):
+    """A program that serves one client."""
 
     def __init__(self, model: TcpModel, *, clock: Clock | None = None, faults: FaultSchedule | None = None) -> None:
-        self.model = model
-        self.lock = threading.RLock()
-        """Held around every call of the model; hold it to look at more than one of its attributes."""
-        self.faults = faults
-        self._clock = clock or SystemClock()
+        super().__init__(model, clock, faults)
         self._port = 0
         self._listener: socket.socket | None = None
         self._client: socket.socket | None = None
-        self._outbox: deque[tuple[float, bytes]] = deque()
-        self._silent_until = 0.0
-        self._hung = False
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="tcp server", daemon=True)
 
     @property
     def address(self) -> str:
@@ -71,29 +60,6 @@ class TcpServer:
     def endpoint(self) -> Endpoint:
         """The same for `Surroundings.ports`."""
         return Endpoint(self.address, emulated=True)
-
-    def start(self) -> Self:
-        """Listen, and serve on a thread of its own."""
-        self.plug()
-        self._thread.start()
-        return self
-
-    def close(self) -> None:
-        """End it; again: nothing happens."""
-        self._ending.set()
-        if self._thread.ident is not None:
-            self._thread.join()
-        self.unplug()
-
-    def __enter__(self) -> Self:
-        """The server, serving."""
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close."""
-        self.close()
 
     def plug(self) -> None:
         """The program runs: it listens, on the same port as before."""
@@ -108,17 +74,6 @@ class TcpServer:
                 self._listener.close()
                 self._listener = None
             self._drop_client()
-
-    def hang(self) -> None:
-        """The program hangs: nothing is taken and nothing said; the connection stays."""
-        with self.lock:
-            self._hung = True
-            self._outbox.clear()
-
-    def resume(self) -> None:
-        """End a hang."""
-        with self.lock:
-            self._hung = False
 
     def _listen(self) -> None:
         self._listener = socket.create_server((HOST, self._port), backlog=1)
@@ -138,7 +93,7 @@ class TcpServer:
 
     def _turn(self) -> bool:
         """Accept, take, answer; whether anything moved."""
-        now_s = self._clock.now_ns() / NS_PER_S
+        now_s = self._now_s()
         if self._client is None:
             return self._accept(now_s)
         took = self._take(now_s)
@@ -155,7 +110,7 @@ class TcpServer:
         self._listener = None
         self._client.setblocking(False)
         self._outbox.clear()
-        self._silent_until = 0.0
+        self._free_at = 0.0
         self.model.connected(now_s)
         return True
 
@@ -178,10 +133,9 @@ class TcpServer:
         """Send what is due; ask the model for more only when all is sent, as a program blocks in its own send."""
         if self._client is None:
             return False
-        now = time.monotonic()
-        if not self._outbox and now >= self._silent_until:
-            self._queue(self.model.send(CHUNK_BYTES, now_s), now)
-        moved = False
+        if not self._outbox and time.monotonic() >= self._free_at:
+            self._reply(self.model.send(CHUNK_BYTES, now_s))
+        now, moved = time.monotonic(), False
         while self._client is not None and self._outbox and self._outbox[0][0] <= now:
             due_at, data = self._outbox.popleft()
             sent = self._send(data)
@@ -190,24 +144,6 @@ class TcpServer:
                 self._outbox.appendleft((due_at, data[sent:]))
                 break
         return moved
-
-    def _queue(self, data: bytes, now: float) -> None:
-        """What the faults make of a piece."""
-        if not data:
-            return
-        if self.faults is None:
-            self._outbox.append((now, data))
-            return
-        fault = self.faults.next()
-        if fault is Fault.UNPLUG:
-            self.unplug()
-        elif fault is Fault.HANG:
-            self.hang()
-        else:
-            if fault is Fault.STALL:
-                self._silent_until = now + self.faults.stall_s
-            for delivery in self.faults.shape(fault, data):
-                self._outbox.append((max(now, self._silent_until) + delivery.delay_s, delivery.data))
 
     def _send(self, data: bytes) -> int:
         assert self._client is not None, "asked for by the caller"
@@ -229,4 +165,4 @@ class TcpServer:
         self._client.close()
         self._client = None
         self._outbox.clear()
-        self.model.disconnected(self._clock.now_ns() / NS_PER_S)
+        self.model.disconnected(self._now_s())

@@ -20,35 +20,11 @@ import usb.backend
 import usb.core
 
 from drivers.clock import NS_PER_S, Clock
-from sim_backend.wire.usb_model import (
-    STALL,
-    AlternateSpec,
-    Answer,
-    AttachedDevice,
-    DeviceSpec,
-    EndpointSpec,
-    Setup,
-    Stall,
-    UsbFailure,
-    UsbModel,
-)
+from sim_backend.wire.usb_descriptors import AlternateSpec
+from sim_backend.wire.usb_model import AttachedDevice, Setup, UsbFailure, UsbModel
 
-__all__ = [
-    "STALL",
-    "AlternateSpec",
-    "Answer",
-    "AttachedDevice",
-    "DeviceSpec",
-    "EmulatedUsb",
-    "EndpointSpec",
-    "Setup",
-    "Stall",
-    "UsbFailure",
-    "UsbModel",
-]
-
-POLL_S = 250e-6
-"""How often a transfer that the device is not ready for asks again."""
+FIRST_POLL_S, LONGEST_POLL_S = 250e-6, 1e-3
+"""When a transfer that the device is not ready for asks again; each time twice as late, up to the second."""
 
 _LIBUSB = {
     errno.EIO: (-1, "Input/Output Error"),
@@ -300,10 +276,11 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         """Yield now and then until the time is over, at least once."""
         if timeout_ms <= 0:
             raise ValueError("a timeout of 0 waits for ever in libusb; give the transfer a deadline")
-        end_s = self._now_s() + timeout_ms / 1000
+        end_s, poll_s = self._now_s() + timeout_ms / 1000, FIRST_POLL_S
         yield
         while self._now_s() < end_s:
-            self._clock.sleep(POLL_S)
+            self._clock.sleep(poll_s)
+            poll_s = min(2 * poll_s, LONGEST_POLL_S)
             yield
 
 

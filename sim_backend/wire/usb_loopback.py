@@ -7,16 +7,8 @@ another process can.
 
 from collections import deque
 
-from sim_backend.wire.usb_model import (
-    STALL,
-    AlternateSpec,
-    Answer,
-    DeviceSpec,
-    EndpointSpec,
-    Setup,
-    Stall,
-    UsbModel,
-)
+from sim_backend.wire.usb_descriptors import AlternateSpec, DeviceSpec, EndpointSpec
+from sim_backend.wire.usb_model import STALL, Answer, Setup, Stall, UsbModel
 
 ECHO_IN, STALL_BULK_IN, OVERLONG, GONE, DEAF = 0x10, 0x11, 0x12, 0x13, 0x14
 """Vendor requests: answer `value` as two bytes; stall the next read of 0x81; answer the next read of 0x83 with a whole

@@ -20,19 +20,6 @@ from sim_backend.wire.usb_descriptors import (
     EndpointSpec,
 )
 
-__all__ = [
-    "STALL",
-    "AlternateSpec",
-    "Answer",
-    "AttachedDevice",
-    "DeviceSpec",
-    "EndpointSpec",
-    "Setup",
-    "Stall",
-    "UsbFailure",
-    "UsbModel",
-]
-
 _GET_STATUS, _GET_DESCRIPTOR, _GET_CONFIGURATION, _GET_INTERFACE = 0, 6, 8, 10
 
 

@@ -7,7 +7,7 @@ import random
 from typing import cast
 
 from drivers.cobolt import CoboltConfig, create
-from drivers.cobolt_line import LineTiming
+from drivers.dialogue import LineTiming
 from drivers.interfaces import LineLaser
 from drivers.registry import Surroundings
 from sim_backend.wire.cobolt import CoboltModel, Family
@@ -36,6 +36,8 @@ def make(rng: random.Random) -> LaserModel:
     )
     if rng.random() < 0.3:
         model.shine(0.05, gated=rng.random() < 0.5)
+    if rng.random() < 0.2:
+        model.mode = "modulation"  # with an input or without one
     return model
 
 

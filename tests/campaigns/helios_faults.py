@@ -3,22 +3,15 @@
 python -m tests.campaigns.helios_faults --sequences 10000 --seed 1
 """
 
-import logging
 import sys
+from functools import partial
 
-from sim_backend.wire.dac_history import DacHistory
 from sim_backend.wire.helios import BLUE, GREEN, RED, HeliosModel
-from sim_backend.wire.usb_model import UsbModel
-from tests.campaigns.scanner_sequences import Subject, run
+from tests.campaigns.outcomes import run
+from tests.campaigns.scanner_sequences import Subject, scanner_sequence
 
-
-def _model() -> tuple[UsbModel, DacHistory]:
-    model = HeliosModel()
-    return model, model.history
-
-
-SUBJECT = Subject("helios", _model, {"frame": "20 ms"}, BLUE, GREEN, RED, 1.01 / 4095)
+SUBJECT = Subject("helios", HeliosModel, {"frame": "20 ms"}, BLUE, GREEN, RED, 1.01 / 4095)
+sequence = partial(scanner_sequence, SUBJECT)
 
 if __name__ == "__main__":
-    logging.disable(logging.CRITICAL)
-    sys.exit(run(SUBJECT, __doc__ or ""))
+    sys.exit(run(sequence, __doc__))

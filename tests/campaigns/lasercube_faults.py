@@ -3,22 +3,17 @@
 python -m tests.campaigns.lasercube_faults --sequences 10000 --seed 1
 """
 
-import logging
 import sys
+from functools import partial
 
-from sim_backend.wire.dac_history import DacHistory
 from sim_backend.wire.lasercube import BLUE, GREEN, PLAYING, LaserCubeModel
-from sim_backend.wire.usb_model import UsbModel
-from tests.campaigns.scanner_sequences import Subject, run
+from tests.campaigns.outcomes import run
+from tests.campaigns.scanner_sequences import Subject, scanner_sequence
 
-
-def _model() -> tuple[UsbModel, DacHistory]:
-    model = LaserCubeModel()
-    return model, model.history
-
-
-SUBJECT = Subject("lasercube", _model, {"buffer": "20 ms", "colours": "markers"}, BLUE, GREEN, PLAYING, 1.01 / 4095)
+SUBJECT = Subject(
+    "lasercube", LaserCubeModel, {"buffer": "20 ms", "colours": "markers"}, BLUE, GREEN, PLAYING, 1.01 / 4095
+)
+sequence = partial(scanner_sequence, SUBJECT)
 
 if __name__ == "__main__":
-    logging.disable(logging.CRITICAL)
-    sys.exit(run(SUBJECT, __doc__ or ""))
+    sys.exit(run(sequence, __doc__))

@@ -6,9 +6,9 @@ python -m tests.campaigns.obis_faults --sequences 10000 --seed 1
 import random
 from typing import cast
 
+from drivers.dialogue import LineTiming
 from drivers.interfaces import LineLaser
 from drivers.obis import ObisConfig, create
-from drivers.obis_line import LineTiming
 from drivers.registry import Surroundings
 from sim_backend.wire.obis import ObisModel
 from tests.campaigns.laser_sequences import LIMIT_W, LaserModel, Subject, run

@@ -4,24 +4,21 @@ Runs on a virtual clock, so that seconds of silence cost nothing. 'Right' is jud
 the driver says: where no error and no fault is told, the lit points are the waveform, all of it, without a seam.
 """
 
-import argparse
 import random
-import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from drivers.clock import VirtualClock
-from drivers.errors import DeviceError
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
 from sim_backend.wire.dac_history import DacHistory
+from sim_backend.wire.dac_model import DacModel
 from sim_backend.wire.faults import Fault, FaultSchedule
 from sim_backend.wire.usb_faults import FaultyUsb
-from sim_backend.wire.usb_model import UsbModel
+from tests.campaigns.outcomes import Ending, ending
 from tests.wire.scanners import Plugged, open_scanner, plug
 
 POINTS, LINE_POINTS, RATE_HZ = 700, 50, 25_000.0
@@ -35,25 +32,17 @@ HANG_S = 20.0
 class Subject:
     """A scanner kind under test.
 
-    model: a firmware and its output's record. scan, lit: lines of the record: the markers, and one that is high all
+    model: a firmware. scan, lit: lines of the record: the markers, and one that is high all
     through the waveform. tolerance: of the mirror's drive.
     """
 
     kind: str
-    model: Callable[[], tuple[UsbModel, DacHistory]]
+    model: Callable[[], DacModel]
     config: dict[str, object]
     scan: int
     line: int
     lit: int
     tolerance: float
-
-
-@dataclass
-class Outcomes:
-    """How the sequences ended, and those that ended wrong: (seed, why)."""
-
-    ends: Counter[str] = field(default_factory=Counter)
-    wrong: list[tuple[int, str]] = field(default_factory=list)
 
 
 def wave(device: BeamScanner) -> ScanWaveform:
@@ -64,7 +53,7 @@ def wave(device: BeamScanner) -> ScanWaveform:
     return ScanWaveform(-0.5 * np.cos(2 * np.pi * at / POINTS), markers, device.point_clock(RATE_HZ))
 
 
-def sequence(subject: Subject, seed: int) -> tuple[str, str | None]:
+def scanner_sequence(subject: Subject, seed: int) -> Ending:
     """How one sequence ended, and what was wrong with that, if anything."""
     rng = random.Random(seed)
     probability = rng.choice((0.003, 0.01, 0.05, 0.3))
@@ -72,26 +61,19 @@ def sequence(subject: Subject, seed: int) -> tuple[str, str | None]:
         seed, probability, tuple(Fault), skip=rng.randrange(60), most=rng.randrange(1, 5), late_s=0.05, stall_s=0.3
     )
     clock = VirtualClock()
-    model, history = subject.model()
+    model = subject.model()
     plugged = plug(FaultyUsb(model, schedule, late_s=rng.choice((0.001, 0.02, 0.2))), clock)
     foreign: list[str] = []
     before = threading.excepthook
     threading.excepthook = lambda what: foreign.append(f"in a thread: {what.exc_type.__name__}: {what.exc_value}")
     try:
-        end, wrong = _judged(subject, rng, plugged, history)
-    except DeviceError as error:
-        end, wrong = type(error).__name__, None if "\n" not in str(error) else "an error of several lines"
-    except Exception as error:
-        end, wrong = "foreign", f"{type(error).__name__}: {error}"
+        end, wrong = ending(lambda: _judged(subject, rng, plugged, model.history), plugged.now_s, DEADLINE_S)
     finally:
         threading.excepthook = before
-    if foreign:
-        wrong = foreign[0]
-    took_s = plugged.now_s()
-    return end, wrong or (f"took {took_s:.1f} s" if took_s > DEADLINE_S else None)
+    return end, foreign[0] if foreign else wrong
 
 
-def _judged(subject: Subject, rng: random.Random, plugged: Plugged, history: DacHistory) -> tuple[str, str | None]:
+def _judged(subject: Subject, rng: random.Random, plugged: Plugged, history: DacHistory) -> Ending:
     with open_scanner(subject.kind, plugged.bus, plugged.clock, **subject.config) as device:
         for _ in range(rng.randrange(1, 3)):
             repeats = rng.randrange(3, 8)
@@ -155,28 +137,3 @@ def _compare(
     out = history.command(times)[lit]
     error = np.abs(out - np.tile(waveform.command, repeats)[at][lit]).max(initial=0)
     return f"the mirror was off by {error:g}" if error > subject.tolerance else None
-
-
-def campaign(subject: Subject, sequences: int, seed: int) -> Outcomes:
-    """All sequences, one after the other."""
-    outcomes = Outcomes()
-    for number in range(seed * 1_000_000, seed * 1_000_000 + sequences):
-        end, wrong = sequence(subject, number)
-        outcomes.ends[end] += 1
-        if wrong is not None:
-            outcomes.wrong.append((number, wrong))
-    return outcomes
-
-
-def run(subject: Subject, description: str) -> int:
-    """The command line: how the sequences ended; 1 where one ended wrong."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sequences", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=1)
-    asked = parser.parse_args()
-    outcomes = campaign(subject, asked.sequences, asked.seed)
-    print(", ".join(f"{end}: {n}" for end, n in outcomes.ends.most_common()))
-    for number, why in outcomes.wrong:
-        print(f"sequence {number}: {why}", file=sys.stderr)
-    print(f"{len(outcomes.wrong)} of {asked.sequences} ended wrong")
-    return 1 if outcomes.wrong else 0

@@ -7,19 +7,14 @@ the firmware hangs, stalls an endpoint or is unplugged, at a random moment. A ru
 but right frames, and counters that add up to what the device exposed.
 """
 
-import argparse
-import logging
 import random
 import sys
 import time
-from collections import Counter
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
 from fractions import Fraction
 
 from drivers.clock import SystemClock
-from drivers.errors import DeviceError, DeviceTimeout
+from drivers.errors import DeviceTimeout
 from drivers.frames import FrameBlock
 from drivers.interfaces import SpadRequest
 from drivers.ring import BlockRing
@@ -27,10 +22,11 @@ from drivers.spb_usb import SpbUsb
 from sim_backend.wire.spb_usb import SpbUsbModel
 from sim_backend.wire.usb_backend import EmulatedUsb
 from sim_backend.wire.usb_model import STALL, Answer
+from tests.campaigns.outcomes import Ending, ending, run
 from tests.wire.spb_device import HEIGHT, WIDTH, NumberedSource, on_bus, require_right
 
 REQUEST = SpadRequest(Fraction(100_000), 1e-5, "stream", block_frames=4)
-FILL_S = 0.1
+FILL_S = 0.3
 DEADLINE_S = 12.0
 
 
@@ -106,35 +102,17 @@ class FaultyModel(SpbUsbModel):
         return answer
 
 
-@dataclass
-class Outcomes:
-    """How the sequences ended, and those that ended wrong: (seed, why)."""
-
-    ends: Counter[str] = field(default_factory=Counter)
-    wrong: list[tuple[int, str]] = field(default_factory=list)
-
-
-def sequence(seed: int) -> tuple[str, str | None]:
+def sequence(seed: int) -> Ending:
     """How one sequence ended, and what was wrong with that, if anything."""
     rng = random.Random(seed)
     chip = rng.choice(("fx3", "ft601"))
     device = FaultyModel(
         rng, rng.choice((0.02, 0.1, 0.5)), rng.randrange(1, 8), chip=chip, acks=rng.choice(("endpoint", "stream"))
     )
-    begun = time.monotonic()
-    try:
-        end, wrong = _open_and_run(device, rng)
-    except DeviceError as error:
-        end, wrong = type(error).__name__, "an error of several lines" if "\n" in str(error) else None
-    except AssertionError as error:
-        end, wrong = "wrong frames", str(error)
-    except Exception as error:
-        end, wrong = "foreign", f"{type(error).__name__}: {error}"
-    took_s = time.monotonic() - begun
-    return end, wrong or (f"took {took_s:.1f} s" if took_s > DEADLINE_S else None)
+    return ending(lambda: _open_and_run(device, rng), time.monotonic, DEADLINE_S)
 
 
-def _open_and_run(device: FaultyModel, rng: random.Random) -> tuple[str, str | None]:
+def _open_and_run(device: FaultyModel, rng: random.Random) -> Ending:
     bus = EmulatedUsb(SystemClock())
     attached = bus.plug(device)
     with on_bus(bus, chip=device.chip, test_pattern=rng.random() < 0.3) as spad:
@@ -159,18 +137,18 @@ def _open_and_run(device: FaultyModel, rng: random.Random) -> tuple[str, str | N
     return "complete", None
 
 
-def _fill_to_the_end(spad: SpbUsb, ring: BlockRing, between: object) -> None:
+def _fill_to_the_end(spad: SpbUsb, ring: BlockRing, between: Callable[[], object]) -> None:
     """As the application does: two silences in a row are the end."""
     silences = 0
     while True:
-        between()  # type: ignore[operator]
+        between()
         try:
             if not spad.fill(ring, FILL_S):
                 return
             silences = 0
         except DeviceTimeout:
             silences += 1
-            if silences > 8:
+            if silences > 1:
                 raise
 
 
@@ -184,33 +162,5 @@ def _require_counted(spad: SpbUsb, blocks: list[FrameBlock], numbers: list[int])
         delivered += block.n_frames
 
 
-def campaign(sequences: int, seed: int, workers: int = 8) -> Outcomes:
-    """All sequences, several at a time: most of their time is waiting."""
-    outcomes = Outcomes()
-    with ThreadPoolExecutor(workers) as pool:
-        seeds = range(seed * 1_000_000, seed * 1_000_000 + sequences)
-        for number, (end, wrong) in zip(seeds, pool.map(sequence, seeds), strict=True):
-            outcomes.ends[end] += 1
-            if wrong is not None:
-                outcomes.wrong.append((number, wrong))
-    return outcomes
-
-
-def main() -> int:
-    """Run it and say how the sequences ended."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sequences", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=8)
-    asked = parser.parse_args()
-    logging.disable(logging.ERROR)  # every refused block says so
-    outcomes = campaign(asked.sequences, asked.seed, asked.workers)
-    print(", ".join(f"{end}: {n}" for end, n in outcomes.ends.most_common()))
-    for number, why in outcomes.wrong:
-        print(f"sequence {number}: {why}")
-    print(f"{len(outcomes.wrong)} of {asked.sequences} ended wrong")
-    return 1 if outcomes.wrong else 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(sequence, __doc__, workers=8))

@@ -5,68 +5,43 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-from drivers.clock import NS_PER_S, VirtualClock
 from drivers.guard import Guard
+from drivers.interfaces import SyncSource
 from drivers.obis import ObisConfig
-from drivers.prawndo import PrawnDoConfig, create
-from drivers.registry import Surroundings
+from drivers.prawndo import PrawnDoConfig
 from sim_backend.wire.obis import ObisModel
-from sim_backend.wire.prawndo import PrawnDoModel, TriggerLine
-from sim_backend.wire.serial_server import SerialServer
 from tests.conformance.cases import LaserCase, SyncCase
-
-USB_BAUD = 8_000_000
-"""A virtual COM port over USB full speed carries about 0.8 MB/s."""
-CONFIG = PrawnDoConfig(port="emulated:sync")
+from tests.wire.lasers import wire
+from tests.wire.syncs import Board, board
 
 
-@contextmanager
-def wired_prawndo() -> Iterator[tuple[SerialServer, Callable[[Any], SyncCase]]]:
-    """The board on its wire, and what makes a case of a device that speaks with it."""
-    clock = VirtualClock()
-    line = TriggerLine()
-    model = PrawnDoModel(line)
-    with SerialServer(model, clock=clock, baud=USB_BAUD) as server:
+def case(board: Board, device: SyncSource) -> SyncCase:
+    def trigger() -> None:
+        board.trigger.pulse(board.now_s + 1e-6, 10e-6)
+        board.clock.sleep(2e-6)
 
-        def now_s() -> float:
-            return clock.now_ns() / NS_PER_S
-
-        def trigger() -> None:
-            line.pulse(now_s() + 1e-6, 10e-6)
-            clock.sleep(2e-6)
-
-        def pins() -> int:
-            with server.lock:
-                model.advance(now_s())
-                return model.outputs_at(now_s())
-
-        yield server, lambda device: SyncCase(device, clock, trigger, pins, tells_waiting=False)
+    return SyncCase(device, board.clock, trigger, lambda: board.pins, tells_waiting=False)
 
 
 @contextmanager
 def emulated_prawndo(folder: Path) -> Iterator[SyncCase]:
-    with wired_prawndo() as (server, case):
-        surroundings = Surroundings(VirtualClock(), None, 0, {"sync": server.endpoint})
-        with create(CONFIG, surroundings) as device:
-            yield case(device)
+    with board() as wired, wired.open() as device:
+        yield case(wired, device)
 
 
 @contextmanager
 def guarded_prawndo(folder: Path) -> Iterator[SyncCase]:
-    with wired_prawndo() as (server, case), Guard(sync=CONFIG, ports={"sync": server.endpoint}) as guard:
-        yield case(guard.sync)
+    config = PrawnDoConfig(port="emulated:sync")
+    with board() as wired, Guard(sync=config, ports={"sync": wired.server.endpoint}) as guard:
+        yield case(wired, guard.sync)
 
 
 @contextmanager
 def guarded_obis(folder: Path) -> Iterator[LaserCase]:
-    clock = VirtualClock()
     model = ObisModel(cdrh_delay_s=0.2)
     config = ObisConfig.model_validate({"port": "emulated:laser", "max_power": "80 mW"})
-    with (
-        SerialServer(model, clock=clock, baud=1_000_000) as server,
-        Guard(laser=config, ports={"laser": server.endpoint}) as guard,
-    ):
-        yield LaserCase(guard.laser, clock, lambda: model.emitting)
+    with wire(model) as (_, surroundings), Guard(laser=config, ports=surroundings.ports) as guard:
+        yield LaserCase(guard.laser, surroundings.clock, lambda: model.emitting)
 
 
 EMULATED_SYNCS: dict[str, Callable[[Path], AbstractContextManager[Any]]] = {

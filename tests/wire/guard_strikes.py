@@ -36,7 +36,6 @@ class Strike:
     blow: Callable[[GuardedRig, "subprocess.Popen[str]", int], None]
     mode: str = "beat"
     at_once: bool = False
-    laser_answers: bool = True
     light_s: float = GONE_S
     emission_s: float = EMISSION_S
 
@@ -45,30 +44,14 @@ def _nothing(rig: GuardedRig, application: Any, guard: int) -> None:
     """The application does it to itself."""
 
 
-def _open_interlock(rig: GuardedRig, application: Any, guard: int) -> None:
-    with rig.laser.lock:
-        rig.laser.model.open_interlock(time.monotonic())  # type: ignore[attr-defined]
-
-
 STRIKES = {
     "application killed": Strike(lambda rig, application, guard: application.kill(), at_once=True),
-    "application stopped": Strike(lambda rig, application, guard: application.send_signal(signal.SIGSTOP)),
     "application hangs": Strike(_nothing, mode="hang"),
     "application computes for ever": Strike(_nothing, mode="spin", light_s=BUSY_S, emission_s=BUSY_S + 0.5),
     "application exits": Strike(_nothing, mode="vanish"),
     "guard killed": Strike(lambda rig, application, guard: os.kill(guard, signal.SIGKILL)),
-    "guard stopped": Strike(lambda rig, application, guard: os.kill(guard, signal.SIGSTOP)),
-    "laser unplugged": Strike(lambda rig, application, guard: rig.laser.unplug(), laser_answers=False),
-    "gate unplugged": Strike(lambda rig, application, guard: rig.sync.unplug()),
-    "gate's firmware hangs": Strike(lambda rig, application, guard: _hang(rig, application), light_s=NEVER_S),
-    "interlock opened": Strike(_open_interlock),
+    "gate unplugged, powered on": Strike(lambda rig, application, guard: rig.sync.unplug()),
 }
-
-
-def _hang(rig: GuardedRig, application: "subprocess.Popen[str]") -> None:
-    """The gate hears nothing any more, and then the application dies: only the laser is left to be lowered."""
-    rig.sync.hang()
-    application.kill()
 
 
 @dataclass(frozen=True)

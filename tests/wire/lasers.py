@@ -4,21 +4,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from drivers.clock import Clock, VirtualClock
+import pytest
+
+from drivers.clock import NS_PER_S, Clock, VirtualClock
 from drivers.cobolt import CoboltConfig
 from drivers.cobolt import create as create_cobolt
-from drivers.cobolt_line import LineTiming as CoboltTiming
+from drivers.dialogue import LineTiming
 from drivers.interfaces import LineLaser
 from drivers.obis import ObisConfig
 from drivers.obis import create as create_obis
-from drivers.obis_line import LineTiming as ObisTiming
 from drivers.registry import Surroundings
 from sim_backend.wire.faults import FaultSchedule
 from sim_backend.wire.serial_server import SerialModel, SerialServer
 
-QUICK_COBOLT = CoboltTiming(gap_s=0.1, reply_s=0.15, quiet_s=0.02, drain_s=0.1)
+QUICK_COBOLT = LineTiming(gap_s=0.1, reply_s=0.15, quiet_s=0.02, drain_s=0.1)
 """For virtual time, in which the gap costs nothing: replies come within milliseconds."""
-QUICK_OBIS = ObisTiming(reply_s=0.15, quiet_s=0.02, drain_s=0.1)
+QUICK_OBIS = LineTiming(reply_s=0.15, quiet_s=0.02, drain_s=0.1)
 
 
 def around(clock: Clock, server: SerialServer) -> Surroundings:
@@ -42,3 +43,33 @@ def open_cobolt(surroundings: Surroundings, **config: Any) -> LineLaser:
 def open_obis(surroundings: Surroundings, **config: Any) -> LineLaser:
     made = ObisConfig.model_validate({"port": "emulated:laser", "max_power": "80 mW", **config})
     return create_obis(made, surroundings, QUICK_OBIS)
+
+
+def now_s(clock: Clock) -> float:
+    return clock.now_ns() / NS_PER_S
+
+
+def bring_up(laser: LineLaser, clock: Clock, power_w: float = 0.05) -> None:
+    laser.arm(power_w)
+    for _ in range(100):
+        if laser.status.emission:
+            return
+        clock.sleep(0.5)
+    pytest.fail("no emission")
+
+
+class Silent:
+    """A device that says nothing."""
+
+    def receive(self, data: bytes, now_s: float) -> bytes:
+        return b""
+
+    def tick(self, now_s: float) -> bytes:
+        return b""
+
+
+class Babble(Silent):
+    """One that speaks another language."""
+
+    def receive(self, data: bytes, now_s: float) -> bytes:
+        return b"hello there\r\n"

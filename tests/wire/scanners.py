@@ -1,17 +1,80 @@
-"""Emulated scanners for tests: a bus, a model on it, and the driver opened the way the application opens it."""
+"""Emulated scanners for tests: a bus, a model on it, the driver opened the way the application opens it; a waveform."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.clock import NS_PER_S, Clock
-from drivers.interfaces import BeamScanner
+import numpy as np
+
+from drivers.clock import NS_PER_S, Clock, VirtualClock
+from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
 from drivers.registry import Surroundings, lookup
 from drivers.transports.endpoints import Endpoint
-from sim_backend.wire.usb_backend import AttachedDevice, EmulatedUsb, UsbModel
+from sim_backend.wire.dac_model import DacModel
+from sim_backend.wire.helios import HeliosModel
+from sim_backend.wire.lasercube import LaserCubeModel
+from sim_backend.wire.usb_backend import EmulatedUsb
+from sim_backend.wire.usb_model import AttachedDevice, Stall, UsbModel
 
 GALVO = {"max_velocity": "2000 /s", "max_acceleration": "2e6 /s2"}
+PATIENCE_S = 20.0
+LATE_S = 0.2
+
+
+class Recording(DacModel):
+    """Mixed into a board: notes what it took, (time, endpoint, data), and alternate settings as endpoint -1."""
+
+    def __init__(self, clock: VirtualClock | None = None, late: int = -1, **options: Any) -> None:
+        """late: before so many transfers of points the host is busy with something else for `LATE_S`."""
+        super().__init__(**options)
+        self.log: list[tuple[float, int, bytes]] = []
+        self._clock, self._late = clock, late
+
+    def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
+        super().set_interface(interface, alternate, now_s)
+        self.log.append((now_s, -1, bytes((alternate,))))
+
+    def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
+        if self._clock is not None and endpoint == self.points_endpoint and len(self.sent(endpoint)) == self._late:
+            self._late = -1
+            self._clock.sleep(LATE_S)
+            now_s += LATE_S
+        taken = super().out(endpoint, data, now_s)
+        if taken:
+            self.log.append((now_s, endpoint, data))
+        return taken
+
+    def sent(self, endpoint: int) -> list[bytes]:
+        """What came on an endpoint."""
+        return [data for _, at, data in self.log if at == endpoint]
+
+
+class HeliosRecorder(Recording, HeliosModel):
+    """A Helios that notes what it was sent."""
+
+
+class LaserCubeRecorder(Recording, LaserCubeModel):
+    """A LaserCube that notes what it was sent."""
+
+
+def cosine(device: BeamScanner, points: int = 6000, rate_hz: float = 25_000.0) -> ScanWaveform:
+    """A seamless wave with markers on 4 points of each line and of the scan."""
+    at = np.arange(points)
+    markers = np.zeros(points, np.uint8)
+    markers[at % 100 < 4] |= MARKER_LINE
+    markers[:4] |= MARKER_SCAN
+    markers[at >= points // 2] |= LEVEL_BACKWARD
+    return ScanWaveform(-0.5 * np.cos(2 * np.pi * at / points), markers, device.point_clock(rate_hz))
+
+
+def finish(device: BeamScanner) -> None:
+    """Wait for the end of a run whose own thread moves the virtual clock."""
+    end = time.monotonic() + PATIENCE_S
+    while device.status.moving:
+        assert time.monotonic() < end, "the run does not end"
+        time.sleep(0.001)
 
 
 @dataclass(frozen=True)

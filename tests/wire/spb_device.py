@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from drivers.clock import SystemClock
 from drivers.frames import FrameBlock, Mark
 from drivers.interfaces import SpadRequest, SpadTiming
-from drivers.ring import BlockRing
 from drivers.spb_usb import SpbUsb, SpbUsbConfig, open_link
 from drivers.transports.endpoints import Endpoint
-from sim_backend.wire.spb_usb import Span, SpbUsbModel
+from sim_backend.wire.spb_usb import SpbUsbModel
+from sim_backend.wire.spb_usb_run import Span
 from sim_backend.wire.usb_backend import EmulatedUsb
+from tests.wire.spads import take_run
 
 WIDTH, HEIGHT = 128, 24
 REQUEST = SpadRequest(Fraction(100_000), 1e-5, "stream", block_frames=16)
@@ -89,20 +90,10 @@ def on_bus(bus: EmulatedUsb, port: str = "usb", **config: Any) -> SpbUsb:
 
 
 def take(
-    device: SpbUsb, n_frames: int, request: SpadRequest = REQUEST, ring_slots: int = 400, timeout_s: float = 2.0
+    device: SpbUsb, n_frames: int, request: SpadRequest = REQUEST, ring_slots: int = 400
 ) -> tuple[SpadTiming, list[FrameBlock]]:
     """One run to its end; all blocks are still in the ring."""
-    timing = device.configure(request)
-    ring = BlockRing(ring_slots, timing.stride)
-    reader = ring.reader("test")
-    device.start(n_frames)
-    try:
-        while device.fill(ring, timeout_s):
-            pass
-    finally:
-        device.stop()
-        ring.finish()
-    return timing, list(reader)
+    return take_run(device, n_frames, request, ring_slots, timeout_s=2.0)
 
 
 def require_right(blocks: Iterable[FrameBlock]) -> list[int]:

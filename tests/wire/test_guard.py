@@ -17,7 +17,7 @@ from tests.wire.guard_strikes import NEVER_S, STRIKES, Outcome, strike
 from tests.wire.guarded_application import SWEEP
 from tests.wire.guarded_rig import POWER_W, GuardedRig, guarded_rig
 
-KILLS = 18
+KILLS = 6
 KILL = "application killed"
 SCAN_S = 2.0
 """Start, opening, arming and the first sweeps of the application's scan."""
@@ -49,11 +49,11 @@ def test_no_light_after(name: str, outcomes: dict[str, list["Future[Outcome]"]])
         result = future.result()
         assert result.was_lit or made.mode != "beat"
         assert result.light_s < max(NEVER_S, made.light_s)
-        assert not (result.emitted and made.laser_answers)
+        assert not result.emitted
         assert "Traceback" not in result.output
 
 
-@pytest.mark.parametrize("name", ["application stopped", "application hangs", "application computes for ever"])
+@pytest.mark.parametrize("name", ["application hangs", "application computes for ever"])
 def test_an_application_that_cannot_help_itself_is_killed(
     name: str, outcomes: dict[str, list["Future[Outcome]"]]
 ) -> None:
@@ -61,14 +61,7 @@ def test_an_application_that_cannot_help_itself_is_killed(
 
 
 @pytest.mark.parametrize(
-    ("name", "error"),
-    [
-        ("guard killed", "GuardLost"),
-        ("guard stopped", "GuardLost"),
-        ("laser unplugged", "DeviceDisconnected"),
-        ("gate unplugged", "DeviceDisconnected"),
-        ("interlock opened", "InterlockOpen"),
-    ],
+    ("name", "error"), [("guard killed", "GuardLost"), ("gate unplugged, powered on", "DeviceDisconnected")]
 )
 def test_an_application_that_lives_ends_with_a_typed_error(
     name: str, error: str, outcomes: dict[str, list["Future[Outcome]"]]

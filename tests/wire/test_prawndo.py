@@ -14,8 +14,10 @@ from drivers.errors import (
     DeviceTimeout,
     LimitExceeded,
     ProtocolError,
+    WrongState,
 )
-from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
+from drivers.interfaces import HOLD_S, OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
+from drivers.prawndo_program import Board, compile_program, most_repeats
 from sim_backend.wire.prawndo import PrawnDoModel, TriggerLine
 from tests.wire.syncs import SWEEP, board
 
@@ -105,14 +107,37 @@ def test_closing_aborts_then_sets_all_outputs_low_then_reads_them_back() -> None
 
         wire.model.receive = listen  # type: ignore[method-assign]
         device.close()
-    assert heard.startswith(b"\nabt\nman 0\n")
+    assert heard.startswith(b"\nabt\nsts\nman 0\n")
     assert heard.index(b"abt\n") < heard.index(b"man 0\n") < heard.index(b"gto\n")
 
 
-# The traps of hardware.md section 5.1
+def test_a_held_pulse_goes_out_in_slices_that_wait_for_the_marker_with_the_gate_low() -> None:
+    pico = Board("Pico", 1e8, 30_000, 40e-6)
+    pulses = [Pulse(0, None), Pulse(OUT_GATE | OUT_MARKER, 1.2e-3, held=True), Pulse(0, 1e-5)]
+    words = compile_program(pulses, 2, pico).tolist()
+    wait, part = (OUT_MARKER, 0), (OUT_GATE | OUT_MARKER, 40_000)
+    assert words == 2 * [(0, 0), part, wait, part, wait, part, (0, 1000)] + 2 * [(0, 0)]
+    assert most_repeats(pulses, pico) == (30_000 - 3) // 7
 
 
-def test_the_trigger_is_a_level_so_waits_closer_than_a_scan_marker_are_refused() -> None:
+def test_the_gate_is_low_within_half_a_millisecond_of_the_marker() -> None:
+    with board() as wire, wire.open() as device:
+        device.program([Pulse(0, None), Pulse(OUT_GATE, 1.0, held=True)], 1)
+        device.run()
+        rises_s = wire.now_s + 0.01
+        wire.trigger.pulse(rises_s, 0.0101)
+        wire.clock.sleep(0.05)
+        assert wire.pins == 0
+        changes = wire.model.changes(rises_s - 0.005, wire.now_s)
+    assert [level for _, level in changes] == [0, OUT_GATE, 0]
+    assert changes[1][0] == rises_s
+    assert 0.0101 <= changes[2][0] - rises_s <= 0.0101 + HOLD_S
+
+
+# The traps of hardware.md section 5.1, one test each
+
+
+def test_trap_the_trigger_is_a_level_so_waits_closer_than_a_scan_marker_are_refused() -> None:
     with board() as wire, wire.open(trigger_pulse="40 us") as device:
         with pytest.raises(LimitExceeded, match=r"plays 4e-05 s between the wait at word 0 and the next.*4e-05 s"):
             device.program([Pulse(0, None), Pulse(OUT_GATE, 40e-6)], 2)
@@ -122,7 +147,7 @@ def test_the_trigger_is_a_level_so_waits_closer_than_a_scan_marker_are_refused()
             device.program([Pulse(0, None), Pulse(0, None), Pulse(OUT_GATE, 1e-3)], 1)
 
 
-def test_a_marker_still_high_at_the_next_wait_would_pass_it_in_the_model_too() -> None:
+def test_trap_a_marker_still_high_at_the_next_wait_would_pass_it_in_the_model_too() -> None:
     line = TriggerLine()
     model = PrawnDoModel(line)
     two_sweeps = bytes.fromhex("0000 00000000 0200 e8030000" * 2 + "0000 00000000 0000 00000000")
@@ -132,7 +157,7 @@ def test_a_marker_still_high_at_the_next_wait_would_pass_it_in_the_model_too() -
     assert model.status == 0  # one marker, two sweeps
 
 
-def test_words_of_one_to_four_cycles_become_waits_so_they_are_refused_before_they_are_sent() -> None:
+def test_trap_words_of_one_to_four_cycles_become_waits_so_they_are_refused_before_they_are_sent() -> None:
     with board() as wire, wire.open() as device:
         with pytest.raises(LimitExceeded, match=r"word 1 lasts 4e-08 s, outside 5e-08 to 42\.9497 s"):
             device.program([Pulse(0, 1e-3), Pulse(OUT_GATE, 4e-8)], 1)
@@ -146,7 +171,7 @@ def test_words_of_one_to_four_cycles_become_waits_so_they_are_refused_before_the
     assert model.words == [(2, 0), (2, 5)]
 
 
-def test_any_reply_but_ok_to_a_program_clears_it() -> None:
+def test_trap_any_reply_but_ok_to_a_program_clears_it() -> None:
     with board() as wire, wire.open() as device:
         take = wire.model._take_words
         wire.model._take_words = lambda data: take(data).replace(b"ok", b"Invalid number of reps in 1 instructions")  # type: ignore[method-assign]
@@ -167,7 +192,7 @@ def test_a_program_that_did_not_arrive_whole_is_never_run() -> None:
         assert wire.model.status == 0
 
 
-def test_abt_leaves_the_outputs_as_they_are_so_man_0_follows_it() -> None:
+def test_trap_abt_leaves_the_outputs_as_they_are_so_man_0_follows_it() -> None:
     model = PrawnDoModel()
     answers(model, b"adm 0 3\n", bytes.fromhex("0200 00e1f505 0000 00000000 0000 00000000"), b"swr\n", b"abt\n")
     model.tick(0.1)
@@ -196,7 +221,7 @@ def test_a_board_left_running_by_a_dead_host_is_lowered_by_opening_it() -> None:
             assert again.status.state == "aborted"
 
 
-def test_every_program_ends_on_two_words_that_hold_all_outputs_low() -> None:
+def test_trap_a_program_without_an_end_never_stops_so_every_one_ends_on_two_words_that_hold_all_outputs_low() -> None:
     with board() as wire, wire.open() as device:
         device.program([Pulse(OUT_GATE | OUT_FRAME, 1e-3)], 3)
         assert wire.model.words[-2:] == [(0, 0), (0, 0)]
@@ -219,7 +244,7 @@ def test_a_last_word_that_waits_is_parted_from_the_end() -> None:
         assert device.status.state == "stopped"
 
 
-def test_adm_cannot_be_left_before_all_bytes_came_so_a_wedged_board_is_filled_up() -> None:
+def test_trap_adm_cannot_be_left_before_all_bytes_came_so_a_wedged_board_is_filled_up() -> None:
     with board(board=2) as wire:
         wire.model.receive(b"adm 0 ea60\n\x02\x00", 0.0)  # a host died here: 359 998 bytes are missing
         with wire.open() as device:
@@ -243,12 +268,12 @@ def test_a_board_left_in_add_is_freed() -> None:
             device.program(SWEEP, 1)
 
 
-def test_clk_1_says_ok_without_a_clock_so_clock_status_is_asked() -> None:
+def test_trap_clk_1_says_ok_without_a_clock_so_clock_status_is_asked() -> None:
     with board() as wire, pytest.raises(DeviceFault, match="clock on GPIO20 is lost"):
         wire.open(external_clock="10 MHz")
 
 
-def test_a_wrong_external_clock_is_measured() -> None:
+def test_trap_a_wrong_external_clock_is_measured() -> None:
     with (
         board(external_clock_hz=20_000_000) as wire,
         pytest.raises(DeviceFault, match=r"runs at 2e\+07 Hz, not 1e\+07"),
@@ -256,7 +281,7 @@ def test_a_wrong_external_clock_is_measured() -> None:
         wire.open(external_clock="10 MHz")
 
 
-def test_an_external_clock_that_dies_is_noticed_before_the_next_run() -> None:
+def test_trap_an_external_clock_that_dies_is_noticed_before_the_next_run() -> None:
     with board(external_clock_hz=10_000_000) as wire, wire.open(external_clock="10 MHz") as device:
         assert device.resolution_s == 1e-7
         device.program(SWEEP, 1)
@@ -268,7 +293,7 @@ def test_an_external_clock_that_dies_is_noticed_before_the_next_run() -> None:
         device.abort()
 
 
-def test_there_is_no_watchdog_so_every_word_that_waits_holds_the_gate_low() -> None:
+def test_trap_there_is_no_watchdog_so_every_word_that_waits_holds_the_gate_low() -> None:
     with board() as wire, wire.open() as device:
         with pytest.raises(LimitExceeded, match="waits with the gate high"):
             device.program([Pulse(OUT_GATE, None), Pulse(0, 1e-3)], 1)
@@ -277,7 +302,7 @@ def test_there_is_no_watchdog_so_every_word_that_waits_holds_the_gate_low() -> N
 
 
 @pytest.mark.parametrize(("kind", "words"), [(1, 30_000), (2, 60_000)])
-def test_there_are_no_loops_so_repeats_use_up_words(kind: int, words: int) -> None:
+def test_trap_there_are_no_loops_so_repeats_use_up_words(kind: int, words: int) -> None:
     with board(board=kind) as wire, wire.open() as device:
         most = (words - 2) // len(SWEEP)
         device.program(SWEEP, most)
@@ -286,11 +311,29 @@ def test_there_are_no_loops_so_repeats_use_up_words(kind: int, words: int) -> No
             device.program(SWEEP, most + 1)
 
 
-def test_pins_cannot_be_read_while_a_program_runs() -> None:
+def test_trap_pins_cannot_be_read_while_a_program_runs() -> None:
     with board() as wire, wire.open() as device:
         device.program(SWEEP, 1)
         device.run()
         assert device.status.outputs is None
+
+
+def test_trap_a_board_that_lost_power_greets_and_has_forgotten_its_program() -> None:
+    with board() as wire:
+        device = wire.open()
+        device.program([Pulse(OUT_GATE, 30.0)], 1)
+        device.run()
+        wire.server.unplug()
+        with wire.server.lock:
+            wire.model.power_cycle(wire.now_s)
+        wire.server.plug()
+        assert wire.pins == 0
+        with wire.open() as again:
+            assert wire.model.words == []
+            with pytest.raises(WrongState, match="program"):
+                again.run()
+        with pytest.raises(DeviceDisconnected):
+            device.close()
 
 
 # The gate first

@@ -184,6 +184,13 @@ def test_two_equal_devices_ask_for_the_serial_number_or_the_port(monkeypatch: py
         SerialPort("box", "serial=A1")
 
 
+@pytest.mark.parametrize("address", ["rfc2217://127.0.0.1:2217", "socket://127.0.0.1:2217"])
+def test_a_port_on_the_network_is_refused_with_a_way_to_make_it_a_local_one(address: str) -> None:
+    with pytest.raises(DeviceNotFound, match="socat") as refused:
+        SerialPort("laser", address)
+    one_line(refused.value)
+
+
 def test_emulated_ports_are_looked_up_and_real_ones_are_not() -> None:
     laser = Endpoint("/tmp/tty", emulated=True)
     assert resolve("emulated:laser", {"laser": laser}) is laser

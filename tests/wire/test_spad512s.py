@@ -27,10 +27,11 @@ from drivers.frames import BlockFlag, FrameBlock
 from drivers.interfaces import SpadRequest
 from drivers.ring import BlockRing, OnFull
 from drivers.spad512s import Spad512s, Spad512sConfig
+from drivers.spad512s_line import Deadlines
 from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.spad512s import Spad512sModel
 from sim_backend.wire.tcp_server import TcpServer
-from tests.campaigns.spad512s_faults import campaign
+from tests.wire.spads import take_run
 
 FRAME_BYTES = 32_768
 REQUEST = SpadRequest(Fraction(50_000), 20e-6, "burst", block_frames=16)
@@ -52,22 +53,15 @@ def reads_done(first: int, start_s: float, period_s: float, n: int) -> NDArray[n
 
 @contextmanager
 def connected(model: Spad512sModel, **config: Any) -> Iterator[tuple[Spad512s, TcpServer]]:
-    with TcpServer(model) as server, Spad512s(Spad512sConfig(**config), server.endpoint, open_s=2.0) as device:
+    with (
+        TcpServer(model) as server,
+        Spad512s(Spad512sConfig(**config), server.endpoint, deadlines=Deadlines(open_s=2.0)) as device,
+    ):
         yield device, server
 
 
-def take(device: Spad512s, n_frames: int, ring_slots: int = 64, timeout_s: float = 5.0) -> list[FrameBlock]:
-    timing = device.configure(REQUEST)
-    ring = BlockRing(ring_slots, timing.stride)
-    reader = ring.reader("test")
-    device.start(n_frames)
-    try:
-        while device.fill(ring, timeout_s):
-            pass
-    finally:
-        device.stop()
-        ring.finish()
-    return list(reader)
+def take(device: Spad512s, n_frames: int) -> list[FrameBlock]:
+    return take_run(device, n_frames, REQUEST, ring_slots=64, timeout_s=5.0)[1]
 
 
 @contextmanager
@@ -100,7 +94,7 @@ def scripted(*turns: tuple[bytes, bytes]) -> Iterator[tuple[str, list[bytes]]]:
 INFO = b"M1\nS1\n2.0\n1.0\n1.0\n512\n1\n1\n1\n"
 
 
-def test_golden_bytes_of_a_run_and_of_its_first_pixel() -> None:
+def test_trap_bits_come_most_significant_first_and_frames_lie_on_their_side() -> None:
     # One bit at the right end of the sensor's row 0: the corner that a quarter turn to the left takes to the top left.
     pixels = bytearray(2 * FRAME_BYTES)
     pixels[63] = 0x01
@@ -155,10 +149,23 @@ def test_trap_calibration_on_connecting_is_waited_for_in_silence() -> None:
         assert device.info.serial == "MASTER-0042"
 
 
+def test_trap_a_program_that_was_restarted_calibrates_again() -> None:
+    model = Spad512sModel(noise, calibration_s=0.1)
+    with connected(model) as (device, server):
+        server.unplug()
+        model.restarted()
+        server.plug()
+        with pytest.raises(DeviceDisconnected):
+            device.health()
+        model.commands.clear()
+        assert len(take(device, 16)) == 1
+        assert model.commands[:3] == ["D", "D", "PU,0"]
+
+
 def test_a_calibration_that_does_not_end_is_a_timeout() -> None:
     words = r"calibration did not end within 0\.2 s"
     with TcpServer(Spad512sModel(noise, calibration_s=60)) as server, pytest.raises(DeviceTimeout, match=words):
-        Spad512s(Spad512sConfig(), server.endpoint, calibration_s=0.2)
+        Spad512s(Spad512sConfig(), server.endpoint, Deadlines(calibration_s=0.2))
 
 
 def test_trap_error_text_instead_of_pixels_is_surfaced() -> None:
@@ -214,9 +221,27 @@ def test_something_else_than_done_behind_the_pixels_is_refused() -> None:
 
 def test_trap_done_glued_to_text_answers() -> None:
     with connected(Spad512sModel(noise, glued_done=True, extra_fields=True)) as (device, _):
-        assert device.health().frame_clock_hz == 97_656.25
+        health = device.health()
+        assert (health.frame_clock_hz, health.excess_v) == (97_656.25, 4.0)
         assert device.identity.firmware == "1.4"
         assert len(take(device, 16)) == 1
+
+
+def test_trap_commands_are_never_pipelined() -> None:
+    class Strict(Spad512sModel):
+        early = False
+
+        def receive(self, data: bytes, now_s: float) -> None:
+            self.early = self.early or bool(self._out) or self.running
+            super().receive(data, now_s)
+
+    model = Strict(noise, glued_done=True)
+    with connected(model) as (device, _):
+        device.health()
+        take(device, 16)
+        device.health()
+    assert not model.early
+    assert model.commands == ["D", "R", "V", "PU,0", "I,1,20,16,0,1,0,1", "R", "V"]
 
 
 def test_trap_pile_up_goes_before_every_run() -> None:
@@ -260,10 +285,10 @@ def test_wrong_addresses_and_wrong_programs_are_one_line_each() -> None:
 
 def test_a_silent_program_is_a_timeout() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener, pytest.raises(DeviceTimeout, match="nothing greets"):
-        Spad512s(Spad512sConfig(), Endpoint(f"127.0.0.1:{listener.getsockname()[1]}", True), open_s=0.1)
+        Spad512s(Spad512sConfig(), Endpoint(f"127.0.0.1:{listener.getsockname()[1]}", True), Deadlines(open_s=0.1))
 
 
-def test_a_unit_without_intensity_imaging_is_refused() -> None:
+def test_trap_a_unit_without_intensity_imaging_is_refused() -> None:
     with TcpServer(Spad512sModel(noise, intensity=False)) as server, pytest.raises(DeviceFault, match="not enabled"):
         Spad512s(Spad512sConfig(), server.endpoint)
 
@@ -294,7 +319,7 @@ def test_a_rate_that_does_not_follow_from_the_exposure_is_refused_or_triggered()
 
 
 @pytest.mark.parametrize("heeds_stop", [True, False])
-def test_a_stop_within_a_run_leaves_the_device_ready_for_the_next(heeds_stop: bool) -> None:
+def test_trap_a_stop_may_not_be_heeded_and_the_device_is_ready_for_the_next_run(heeds_stop: bool) -> None:
     with connected(Spad512sModel(noise, heeds_stop=heeds_stop, paced=not heeds_stop)) as (device, server):
         timing = device.configure(REQUEST)
         ring = BlockRing(4, timing.stride)
@@ -343,7 +368,3 @@ def test_a_ring_that_does_not_wait_loses_counted_blocks() -> None:
         ring.finish()
         assert len(list(reader)) == 2
         assert (device.counters.delivered, device.counters.lost, ring.dropped_frames) == (32, 128, 128)
-
-
-def test_fault_campaign_in_short() -> None:
-    assert campaign(sequences=20, seed=1).wrong == []

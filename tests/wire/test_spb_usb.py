@@ -1,14 +1,8 @@
-"""The SPB1 driver over USB against an emulated device: control plane, receiver rules, watchdog, damage, both chips."""
+"""The SPB1 driver over USB against an emulated device: control plane, watchdog, both chips."""
 
-import json
 import struct
-import subprocess
-import sys
-import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from fractions import Fraction
 
@@ -25,18 +19,13 @@ from drivers.errors import (
     DeviceTimeout,
     LimitExceeded,
     ProtocolError,
-    RingOverflow,
 )
-from drivers.frames import BlockFlag, BlockStatus, Mark
+from drivers.frames import BlockFlag, Mark
 from drivers.interfaces import WindowTable
-from drivers.ring import BlockRing, OnFull
+from drivers.ring import BlockRing
 from drivers.spb1.control import Ack, Command, Feature, Op, Register, State, pattern_row, read_acks
 from sim_backend.wire.spb_usb import SpbUsbModel
-from sim_backend.wire.umockdev_server import UmockdevBus, missing
 from sim_backend.wire.usb_backend import EmulatedUsb
-from sim_backend.wire.usb_model import AttachedDevice
-from tests.campaigns.spb_usb_faults import campaign
-from tests.wire import spb_bodies
 from tests.wire.spb_device import (
     HEIGHT,
     LINE_FRAMES,
@@ -71,7 +60,7 @@ def test_golden_bytes_of_commands_and_acknowledgements() -> None:
         read_acks(b"SPC1" + acks[4:])
 
 
-def test_golden_bytes_of_the_ft601_session() -> None:
+def test_golden_bytes_of_the_ft601_session_which_leaves_pipes_not_in_use_alone() -> None:
     # u32 index, u8 pipe, u8 command, u16 0, u32 length, u32 0, u32 0: clear, then stream; abort, then clear at the end
     seen: list[bytes] = []
 
@@ -110,6 +99,13 @@ def test_the_wrong_firmware_is_one_line(settings: dict[str, object], sort: type[
     with pytest.raises(sort, match=words) as refused:
         opened(model(**settings))
     assert "\n" not in str(refused.value)
+
+
+def test_another_board_with_the_same_ids_and_name_is_told_by_its_identity_register() -> None:
+    device = model()
+    device._registers[Register.MAGIC] = 0x12345678
+    with pytest.raises(DeviceNotFound, match="identity 0x12345678 is not SPB1"):
+        opened(device)
 
 
 def test_an_fx3_that_does_not_speak_spb1_is_not_found() -> None:
@@ -291,254 +287,3 @@ def test_a_firmware_that_hangs_is_a_timeout_and_unplugging_a_disconnection() -> 
     bus.plug(model())
     with on_bus(bus) as spad:
         take(spad, 10)
-
-
-# Receiver rules (section 8.4) and damage
-
-
-def flipped(at: int) -> Callable[[bytearray], tuple[bytes]]:
-    def change(block: bytearray) -> tuple[bytes]:
-        block[at] ^= 0x10
-        return (bytes(block),)
-
-    return change
-
-
-@pytest.mark.parametrize(
-    "at", [0, 24, 69, 92, 96, 300, 400, 6000, 384 + 16 * 384 + 4, 384 + 16 * 384 + 28], ids=lambda at: f"byte {at}"
-)
-def test_a_flipped_bit_anywhere_in_a_block_refuses_that_block_only(at: int) -> None:
-    device = model()
-    with opened(device) as spad:
-        device.mangle = nth(3, flipped(at))
-        _, blocks = take(spad, 160)
-        assert require_right(blocks) == [*range(48), *range(64, 160)]
-        counters = spad.counters
-        assert (counters.exposed, counters.delivered, counters.lost, counters.crc_errors) == (160, 144, 16, 1)
-        assert blocks[3].header.flags & BlockFlag.LOST_BEFORE
-        assert blocks[3].header.lost_before == 16
-
-
-@pytest.mark.parametrize("keep", [1024, 3072, 6144])
-def test_a_block_cut_short_shifts_the_stream_and_is_resynchronised(keep: int) -> None:
-    device = model()
-    with opened(device) as spad:
-        device.mangle = nth(4, lambda block: (bytes(block[:keep]),))
-        _, blocks = take(spad, 3000)
-        numbers = require_right(blocks)
-        counters = spad.counters
-        assert numbers[:64] == list(range(64))
-        assert numbers[-1] == 2999
-        assert counters.resyncs == 1
-        assert counters.exposed == 3000
-        assert counters.lost == 3000 - len(numbers)
-        assert len(numbers) > 1000
-
-
-def test_extra_bytes_between_blocks_are_resynchronised() -> None:
-    device = model()
-    with opened(device) as spad:
-        device.mangle = nth(4, lambda block: (bytes(2048), bytes(block)))
-        _, blocks = take(spad, 3000)
-        require_right(blocks)
-        assert spad.counters.resyncs == 1
-
-
-def test_repeated_and_swapped_blocks_are_refused() -> None:
-    device = model()
-    with opened(device) as spad:
-        device.mangle = nth(4, lambda block: (bytes(block), bytes(block)))
-        _, blocks = take(spad, 160)
-        assert require_right(blocks) == list(range(160))
-        assert spad.counters.crc_errors == 1
-
-
-def resealed(**fields: tuple[int, str, int]) -> Callable[[bytearray], tuple[bytes]]:
-    """Change header fields (offset, format, value) and sign the header anew."""
-
-    def change(block: bytearray) -> tuple[bytes]:
-        for offset, form, value in fields.values():
-            struct.pack_into(form, block, offset, value)
-        struct.pack_into("<I", block, 92, zlib.crc32(block[:92]))
-        return (bytes(block),)
-
-    return change
-
-
-def test_a_sound_block_of_another_geometry_is_refused() -> None:
-    device = model()
-    with opened(device) as spad:
-        device.mangle = nth(2, resealed(sensor=(76, "<H", 256)))
-        _, blocks = take(spad, 160)
-        assert require_right(blocks) == [*range(32), *range(48, 160)]
-
-
-def test_a_block_of_another_run_is_passed_over() -> None:
-    device = model()
-    with opened(device) as spad:
-        device.mangle = nth(0, resealed(run=(14, "<H", 9999)))
-        _, blocks = take(spad, 160)
-        assert require_right(blocks) == list(range(16, 160))
-        assert spad.counters.lost == 16
-
-
-def test_a_run_whose_last_block_is_lost_ends_with_the_devices_own_count() -> None:
-    device = model()
-    with opened(device) as spad:
-        device.mangle = nth(9, lambda block: ())
-        begun = time.monotonic()
-        _, blocks = take(spad, 160)
-        assert time.monotonic() - begun < 1.5
-        assert require_right(blocks) == list(range(144))
-        assert (spad.counters.exposed, spad.counters.lost) == (160, 16)
-
-
-def test_frames_lost_inside_the_device_are_a_gap() -> None:
-    device = model()
-    with opened(device) as spad:
-        timing = spad.configure(REQUEST)
-        ring = BlockRing(50, timing.stride)
-        reader = ring.reader("test")
-        spad.start(160)
-        device.lose_next(5)
-        while spad.fill(ring, 1.0):
-            pass
-        ring.finish()
-        blocks = list(reader)
-        assert require_right(blocks) == list(range(5, 160))
-        assert blocks[0].header.flags & BlockFlag.MEMORY_OVERFLOW
-        assert (spad.counters.exposed, spad.counters.lost) == (160, 5)
-
-
-def test_a_truncated_block_counts_for_its_whole_frames() -> None:
-    def cut(block: bytearray) -> tuple[bytes]:
-        end = 384 + 16 * 384
-        struct.pack_into("<I", block, end + 4, BlockStatus.TRUNCATED)
-        struct.pack_into("<I", block, end + 16, 384 - 96 + 5 * 384 + 100)
-        struct.pack_into("<I", block, end + 28, zlib.crc32(block[end : end + 28]))
-        return (bytes(block),)
-
-    device = model()
-    with opened(device) as spad:
-        device.mangle = nth(1, cut)
-        _, blocks = take(spad, 64)
-        assert require_right(blocks) == [*range(21), *range(32, 64)]
-        assert spad.counters.lost == 11
-
-
-# The ring
-
-
-@pytest.mark.parametrize("slots", [1, 2, 3, 8, 40])
-def test_a_reader_that_keeps_up_loses_nothing_however_short_the_ring(slots: int) -> None:
-    with opened(model(paced=True, fifo_frames=1_000_000)) as spad:
-        timing = spad.configure(REQUEST)
-        ring = BlockRing(slots, timing.stride, on_full=OnFull.DROP)
-        reader = ring.reader("test")
-        numbers: list[int] = []
-
-        def read() -> None:
-            for block in reader:
-                numbers.extend(block.frame_numbers.tolist())
-                if slots < 3:
-                    return  # it holds what the source needs
-
-        thread = threading.Thread(target=read)
-        thread.start()
-        spad.start(320 if slots >= 3 else 16)
-        while spad.fill(ring, 1.0):
-            time.sleep(0.002)
-        ring.finish()
-        thread.join()
-        assert numbers == list(range(len(numbers)))
-        assert len(numbers) == (320 if slots >= 3 else 16)
-
-
-def test_a_full_ring_drops_counted_blocks_and_the_device_does_not_starve() -> None:
-    with opened(model()) as spad:
-        timing = spad.configure(REQUEST)
-        ring = BlockRing(3, timing.stride, on_full=OnFull.DROP)
-        reader = ring.reader("test")
-        spad.start(160)
-        while spad.fill(ring, 1.0):
-            pass
-        ring.finish()
-        assert require_right(list(reader)) == list(range(48))
-        assert (spad.counters.delivered, spad.counters.lost, ring.dropped_frames) == (48, 112, 112)
-
-
-def test_a_full_ring_ends_the_run_where_the_policy_says_so() -> None:
-    with opened(model()) as spad:
-        timing = spad.configure(REQUEST)
-        ring = BlockRing(3, timing.stride, on_full=OnFull.FAIL)
-        ring.reader("test")
-        spad.start(None)
-        with pytest.raises(RingOverflow):  # noqa: PT012
-            while spad.fill(ring, 1.0):
-                pass
-        spad.stop()
-        assert len(ring._claimed) == 0
-
-
-@pytest.mark.parametrize("slots", [3, 40])
-def test_a_system_that_grants_few_reads_gets_few(slots: int) -> None:
-    with opened(model()) as spad:
-        link = spad._link
-        submit = link.submit
-        link.submit = lambda endpoint, buffer: link.in_flight < 2 and submit(endpoint, buffer)  # type: ignore[method-assign]
-        timing = spad.configure(REQUEST)
-        ring = BlockRing(slots, timing.stride, on_full=OnFull.DROP)
-        reader = ring.reader("test")
-        spad.start(160)
-        while spad.fill(ring, 1.0):
-            pass
-        ring.finish()
-        assert require_right(list(reader)) == list(range(min(160, 16 * slots)))
-        assert not ring._claimed
-
-
-# Real libusb
-
-
-@contextmanager
-def pulling(attached: AttachedDevice, device: SpbUsbModel) -> Iterator[None]:
-    """Pull the cable a moment after a run with the agreed heartbeat begins."""
-    over = threading.Event()
-
-    def watch() -> None:
-        while not over.wait(0.02):
-            if device.state is State.RUNNING and device.heartbeat_ms == 12_345:
-                over.wait(0.1)
-                attached.unplug()
-                return
-
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
-
-
-@pytest.fixture(scope="module", params=["fx3", "ft601"])
-def over_libusb(request: pytest.FixtureRequest) -> dict[str, str]:
-    """What became of each body in a process of its own, with real libusb."""
-    if missing():
-        pytest.skip(missing())
-    device = model(chip=request.param)
-    with UmockdevBus(SystemClock()) as bus, pulling(bus.plug(device), device):
-        command = [sys.executable, "-m", "tests.wire.spb_bodies", request.param]
-        done = subprocess.run(command, env=bus.environment(), capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    outcome: dict[str, str] = json.loads(done.stdout)
-    return outcome
-
-
-@pytest.mark.parametrize("body", spb_bodies.BODIES, ids=lambda body: body.__name__)
-def test_over_libusb(body: Callable[[], None], over_libusb: dict[str, str]) -> None:
-    assert over_libusb[body.__name__] == ""
-
-
-def test_fault_campaign_in_short() -> None:
-    assert campaign(sequences=50, seed=1).wrong == []

@@ -1,9 +1,6 @@
 """The USB transport over the emulated backend and, where umockdev is installed, over real libusb."""
 
 import errno
-import json
-import subprocess
-import sys
 from collections.abc import Callable
 
 import pytest
@@ -20,10 +17,12 @@ from drivers.errors import (
     DeviceTimeout,
     ProtocolError,
 )
-from drivers.transports.usb_device import attached, open_device, translated
+from drivers.transports.usb_device import attached, open_device
+from drivers.transports.usb_errors import translated
 from sim_backend.wire.umockdev_server import UmockdevBus, missing
 from sim_backend.wire.usb_backend import EmulatedUsb
 from sim_backend.wire.usb_loopback import LoopbackModel
+from tests.wire.bodies import outcomes
 from tests.wire.usb_bodies import BODIES, LOOPBACK
 
 
@@ -41,11 +40,7 @@ def over_libusb() -> dict[str, str]:
         pytest.skip(missing())
     with UmockdevBus(SystemClock()) as bus:
         bus.plug(LoopbackModel())
-        command = [sys.executable, "-m", "tests.wire.usb_bodies"]
-        done = subprocess.run(command, env=bus.environment(), capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
-    outcome: dict[str, str] = json.loads(done.stdout)
-    return outcome
+        return outcomes(bus, "tests.wire.usb_bodies")
 
 
 @pytest.mark.parametrize("body", BODIES, ids=lambda body: body.__name__)

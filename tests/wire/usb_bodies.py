@@ -6,10 +6,9 @@ failed}; the last one pulls the cable.
 
 import array
 import contextlib
-import json
 import time
-import traceback
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 
@@ -23,6 +22,7 @@ from drivers.errors import (
 )
 from drivers.transports.usb_device import UsbDevice, UsbId, attached, open_device
 from sim_backend.wire.usb_loopback import DEAF, ECHO_IN, GONE, OVERLONG, STALL_BULK_IN
+from tests.wire.bodies import report
 
 LOOPBACK = UsbId("loopback", 0x1209, 0x0001)
 VENDOR_IN, VENDOR_OUT = 0xC0, 0x40
@@ -176,16 +176,5 @@ BODIES: tuple[Callable[[object | None], None], ...] = (
 )
 
 
-def main() -> None:
-    outcome = {}
-    for body in BODIES:
-        try:
-            body(None)
-            outcome[body.__name__] = ""
-        except BaseException:
-            outcome[body.__name__] = traceback.format_exc()
-    print(json.dumps(outcome))
-
-
 if __name__ == "__main__":
-    main()
+    report({body.__name__: partial(body, None) for body in BODIES})

@@ -1,0 +1,88 @@
+"""What every laser on a serial line has: a config with limits, a port that may get lost, a serial number to check."""
+
+from collections.abc import Callable
+from typing import Annotated, TypeVar
+
+from pydantic import Field
+
+from drivers.dialogue import Dialogue, Framing, LineTiming
+from drivers.errors import DeviceNotFound, DeviceTimeout, ProtocolError
+from drivers.interfaces import LaserLimits, LineLaser
+from drivers.registry import KindConfig, Surroundings
+from drivers.transports.endpoints import resolve
+from drivers.transports.serial_port import SerialPort
+from drivers.units import Watts
+
+
+class SerialLaserConfig(KindConfig):
+    """What the config of each kind of them says."""
+
+    port: str
+    """Serial port: a path or COM port, "serial=..." or "usb=VVVV:PPPP" of its USB device, or "emulated:NAME"."""
+    max_power: Annotated[Watts, Field(gt=0)]
+    """The most this rig may ever send out; the laser's own maximum holds where it is smaller."""
+    serial_number: str | None = None
+    """Of the laser itself; another one is refused. None: any."""
+
+
+class SerialLaser(LineLaser):
+    """A laser that is spoken with over `self._line`."""
+
+    def __init__(self, name: str, line: Dialogue, limits: LaserLimits) -> None:
+        super().__init__(name)
+        line.name = name
+        self._line = line
+        self._limits = limits
+        self._armed = False
+
+    @property
+    def limits(self) -> LaserLimits:
+        """The laser's least power to the smaller of its own and the config's maximum."""
+        return self._limits
+
+    @property
+    def port_lost(self) -> bool:
+        """Whether the port is gone, told without a word on the wire. Any thread."""
+        return self._line.port_lost
+
+    def _do_close(self) -> None:
+        self._line.close()
+
+
+_Laser = TypeVar("_Laser", bound=SerialLaser)
+
+
+def open_laser(
+    make: str,
+    config: SerialLaserConfig,
+    surroundings: Surroundings,
+    framing: Framing,
+    timing: LineTiming,
+    identify: Callable[[Dialogue], _Laser],
+) -> _Laser:
+    """Open the port, get into step and identify the laser; gives the port back where any of it fails.
+
+    make: what messages call it. `DeviceNotFound` where nothing of that make answers; what `identify` raises.
+    """
+    port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports).address)
+    try:
+        line = Dialogue(f"{make} laser", port, framing, surroundings.clock, timing)
+        try:
+            line.connect()
+        except (DeviceTimeout, ProtocolError):
+            raise DeviceNotFound(
+                f"{make} laser: nothing on port {config.port} answers as one; check 'port', power and cable"
+            ) from None
+        return identify(line)
+    except BaseException:
+        port.close()
+        raise
+
+
+def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> None:
+    """`DeviceNotFound` where the config names another laser than was found."""
+    if config.serial_number not in (None, found):
+        raise DeviceNotFound(
+            f"{make} laser on {config.port} has serial number {found}, not {config.serial_number}; correct "
+            "'serial_number' or 'port'"
+        )

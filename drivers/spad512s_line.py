@@ -1,0 +1,239 @@
+"""The connection to a SPAD512S's vendor program: text commands and their answers, and who answers (hardware.md 2.1).
+
+Sources there: `nirrafa/SPAD512S-remote-gui` theoretical_info/piimaging_examples and docs/, `cwseitz/SPAD512`
+SPAD512/instruments/SPAD512S.py. There is no framing, no request number and one client; one command at a time, answers
+of no stated length. A connection greets with a banner whose first word is the sort of detector. The first `D` may say
+that a calibration of the breakdown voltage starts: then nothing may be sent before "The breakdown is around", and `D`
+is asked again.
+"""
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceFault, DeviceTimeout, ProtocolError
+from drivers.transports.tcp_stream import TcpStream
+
+_log = logging.getLogger(__name__)
+
+DONE, ERROR = b"DONE", b"ERROR"
+"""What ends a run; `DONE` may be glued to an answer in text as well."""
+QUIET_S = 0.05
+"""A text answer has no stated end: it is whole when the line was quiet for so long, or when it ends with DONE."""
+_MOST_TEXT_BYTES = 65_536
+_CALIBRATION_STARTS = ("will start soon", "has started")
+_CALIBRATION_ENDS = "The breakdown is around"
+
+
+@dataclass(frozen=True, slots=True)
+class Deadlines:
+    """Longest waits in seconds."""
+
+    open_s: float = 30.0
+    """For the banner."""
+    calibration_s: float = 90.0
+    answer_s: float = 5.0
+    stop_s: float = 1.0
+    """A run that still sends so long after STOP is left by closing the connection."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spad512sIdentity:
+    """What the device says about itself (`D`)."""
+
+    detector: str
+    master_serial: str
+    slave_serial: str
+    software: str
+    firmware: str
+    hardware: str
+    flavour: str
+    intensity: bool
+
+    @property
+    def rows(self) -> int:
+        """1024 for the 1M flavour, else 512."""
+        return 1024 if "1M" in self.flavour else 512
+
+
+@dataclass(frozen=True, slots=True)
+class Spad512sHealth:
+    """What the device measures: temperatures of FPGAs, board and chip and the clocks it sees (`R`), its bias (`V`)."""
+
+    master_c: float
+    slave_c: float
+    board_c: float
+    chip_c: float
+    laser_clock_hz: float
+    frame_clock_hz: float
+    quench_v: float
+    excess_v: float
+    """Excess bias: bright light at a high one ages the chip."""
+
+
+class Spad512sLine:
+    """The line, open once `connect` returned. For one thread at a time."""
+
+    def __init__(self, name: str, address: str, deadlines: Deadlines) -> None:
+        self.address = address
+        self._name = name
+        self._deadlines = deadlines
+        self._stream: TcpStream | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a run or an answer can come."""
+        return self._stream is not None
+
+    def connect(self) -> Spad512sIdentity:
+        """Banner, D, the calibration where one runs, D again."""
+        self._stream = TcpStream(self._name, self.address)
+        try:
+            return self._greet(self._stream)
+        except BaseException:
+            self.hang_up()
+            raise
+
+    def hang_up(self) -> None:
+        """Give the connection back; again: nothing happens."""
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
+
+    def tell(self, command: str) -> None:
+        """Send a command whose answer is pixels, or none."""
+        with self._given_up_on_silence():
+            self._open().send(command.encode("ascii"), self._deadlines.answer_s)
+
+    def ask(self, command: str) -> str:
+        """Send a command and return its answer; DeviceFault where that is an ERROR."""
+        answer_s = self._deadlines.answer_s
+        with self._given_up_on_silence():
+            stream = self._open()
+            stream.drain(0.0, answer_s)  # what came unasked is no answer to this
+            stream.send(command.encode("ascii"), answer_s)
+            answer = self._read_text(stream, answer_s)
+            if not answer:
+                raise DeviceTimeout(f"{self._name} did not answer {command} within {answer_s:g} s")
+        answer = answer.removesuffix(DONE.decode()).rstrip()
+        if answer.endswith(ERROR.decode()):
+            raise DeviceFault(f"{self._name} answers {command} with {' '.join(answer.split())!r}")
+        return answer
+
+    @contextmanager
+    def _given_up_on_silence(self) -> Iterator[None]:
+        """A connection that is gone or silent is closed: a late answer could not be told from the next one's."""
+        try:
+            yield
+        except (DeviceTimeout, DeviceDisconnected):
+            self.hang_up()
+            raise
+
+    def ask_numbers(self, command: str, n: int) -> list[float]:
+        """The first n numbers of an answer; newer programs and emulations send more behind them."""
+        fields = self.ask(command).replace("\n", ",").split(",")
+        try:
+            return [float(fields[i]) for i in range(n)]
+        except (IndexError, ValueError):
+            raise ProtocolError(f"{self._name} answers {command} with {fields!r}, not with {n} numbers") from None
+
+    def receive_into(self, view: memoryview, wait_s: float) -> int:
+        """Bytes of a run; 0 where none came. `DeviceDisconnected`."""
+        return self._open().receive_into(view, wait_s)
+
+    def rest(self) -> bytes:
+        """The end of what still comes of a run."""
+        return self._open().drain(4 * QUIET_S, self._deadlines.stop_s)
+
+    def leave_run(self) -> None:
+        """Ask the device to stop and take what still comes; where that is no end, close the connection."""
+        if self._stream is None:
+            return
+        try:
+            # A pause first: a STOP that reached the program together with the `I` before it would be neither.
+            came = self._stream.drain(QUIET_S, 2 * QUIET_S)
+            if not _ended(came):
+                self.tell("STOP")
+                came += self.rest()
+        except DeviceDisconnected:
+            came = b""
+        if not _ended(came):
+            limit_s = self._deadlines.stop_s
+            _log.warning("%s: the run did not end within %g s of STOP; closing the connection", self._name, limit_s)
+            self.hang_up()
+
+    def _open(self) -> TcpStream:
+        if self._stream is None:
+            raise DeviceDisconnected(f"{self._name}: the connection to {self.address} is gone; start again")
+        return self._stream
+
+    def _greet(self, stream: TcpStream) -> Spad512sIdentity:
+        try:
+            banner = self._read_text(stream, self._deadlines.open_s)
+        except DeviceDisconnected:
+            raise DeviceBusy(
+                f"{self._name}: {self.address} took the connection and closed it at once; it serves one client: end "
+                "the other one"
+            ) from None
+        if not banner.split():
+            raise DeviceTimeout(
+                f"{self._name}: nothing greets at {self.address} within {self._deadlines.open_s:g} s; is it the "
+                "vendor's program?"
+            )
+        detector = banner.split()[0]
+        if "SPAD" not in detector.upper():
+            raise ProtocolError(
+                f"{self._name}: {self.address} greets with {banner[:60]!r}; that is no SPAD, correct 'port'"
+            )
+        answer = self.ask("D")
+        if any(words in banner + answer for words in _CALIBRATION_STARTS):
+            if _CALIBRATION_ENDS not in banner + answer:
+                self._await_calibration(stream)
+            answer = self.ask("D")
+        return self._identity_of(detector, answer)
+
+    def _await_calibration(self, stream: TcpStream) -> None:
+        """Nothing may be sent before the end of it."""
+        _log.info("%s: calibrates its breakdown voltage; waiting", self._name)
+        ends_at = time.monotonic() + self._deadlines.calibration_s
+        text = ""
+        while _CALIBRATION_ENDS not in text:
+            left_s = ends_at - time.monotonic()
+            data = stream.receive(left_s) if left_s > 0 else b""
+            if not data:
+                raise DeviceTimeout(
+                    f"{self._name}: the breakdown calibration did not end within {self._deadlines.calibration_s:g} s; "
+                    "see the vendor's program"
+                )
+            text = (text + data.decode("utf-8", "replace"))[-_MOST_TEXT_BYTES:]
+        stream.drain(QUIET_S, self._deadlines.answer_s)
+
+    def _identity_of(self, detector: str, answer: str) -> Spad512sIdentity:
+        lines = [line.rpartition(":")[2].strip() for line in answer.splitlines() if line.strip()]
+        lines = [line for line in lines if line != DONE.decode()]
+        if len(lines) < 7:
+            raise ProtocolError(f"{self._name} answers D with {len(lines)} lines, not with its serials and versions")
+        master, slave, software, firmware, hardware, flavour, intensity = lines[:7]
+        enabled = intensity.lower() not in ("0", "no", "false", "disabled")
+        identity = Spad512sIdentity(detector, master, slave, software, firmware, hardware, flavour, enabled)
+        if not identity.intensity:
+            raise DeviceFault(f"{self._name} {identity.master_serial}: intensity imaging is not enabled on this unit")
+        return identity
+
+    def _read_text(self, stream: TcpStream, deadline_s: float) -> str:
+        """What comes until the line is quiet or says DONE, at most for `deadline_s`; empty where nothing came."""
+        ends_at = time.monotonic() + deadline_s
+        data = stream.receive(deadline_s)
+        while data and not data.endswith(DONE) and time.monotonic() < ends_at:
+            more = stream.receive(QUIET_S)
+            if not more:
+                break
+            data = (data + more)[-_MOST_TEXT_BYTES:]
+        return data.decode("utf-8", "replace").strip()
+
+
+def _ended(came: bytes) -> bool:
+    """Whether a run has ended, by its last bytes before a silence."""
+    return came.rstrip().endswith((DONE, ERROR))

@@ -1,0 +1,230 @@
+"""A whole rig with a small sensor, emulated outside of the application that scans with it, so that it outlives it.
+
+    with applications() as applications, scan_bench(applications, "cobolt") as bench:
+        bench.start(maps=10)
+        ...
+        bench.light(since_s), bench.light_at_rest(since_s)
+
+Laser and gate hang on pseudo terminals, scanner and SPAD on real libusb under umockdev: what happens to a port when a
+process is killed happens here too (a Helios stops and jumps to its centre).
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from drivers.clock import SystemClock
+from drivers.registry import Surroundings
+from sim_backend.wire.emulated_world import EmulatedWorld, EmulatedWorldConfig
+from sim_backend.wire.umockdev_server import PRELOAD, UmockdevBus
+from tests.system.small_rig import calibration
+
+WIDTH, HEIGHT = 64, 16
+COLUMNS, EXPOSURES = 20, 12
+STILL_S = 1e-3
+"""A mirror whose drive did not change for so long rests; a galvo needs about as long to come to rest."""
+STEP_S = 5e-5
+START_S = 60.0
+FIRST_LIGHT_S = 60.0
+"""A Cobolt takes ten commands a second, and may warm up."""
+
+
+class ScanFailedError(Exception):
+    """Raised where a scan never came to light; with all that it said."""
+
+
+class Applications:
+    """The process that forks those that scan."""
+
+    def __init__(self) -> None:
+        environment = {**os.environ, "LD_PRELOAD": PRELOAD, "OPENBLAS_NUM_THREADS": "1"}
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.wire.scanning_application"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        if self._answer() != "ready":
+            raise ScanFailedError("the application's process did not start")
+
+    def start(self, arguments: list[str], environment: dict[str, str], log: Path, labours: bool) -> int:
+        """`rig` with these arguments; its process number."""
+        number = self._ask(arguments=arguments, environment=environment, log=str(log), labours=labours)
+        assert isinstance(number, int)
+        return number
+
+    def exit_code(self, number: int, within_s: float) -> int | None:
+        """Its exit code, negative for a signal; None: it still runs."""
+        code: int | None = self._ask(wait=number, within_s=within_s)
+        return code
+
+    def close(self) -> None:
+        self._process.communicate()
+
+    def _ask(self, **request: Any) -> Any:
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(request) + "\n")
+        self._process.stdin.flush()
+        return self._answer()
+
+    def _answer(self) -> Any:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        return json.loads(line) if line else None
+
+
+@contextmanager
+def applications() -> Iterator[Applications]:
+    made = Applications()
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+@dataclass
+class ScanBench:
+    """The emulated devices, and at most one scan with them."""
+
+    world: EmulatedWorld
+    folder: Path
+    bus_environment: dict[str, str]
+    applications: Applications
+    number: int = 0
+    started_s: float = 0.0
+
+    def start(self, *, maps: int, record: bool = False, labours: bool = False) -> None:
+        """Begin a scan of so many maps. labours: with a disk that stalls and little of the interpreter."""
+        out = ["--out", str(self.folder / "run"), "--save", "last", *(["--record"] if record else [])]
+        arguments = ["scan", str(self.folder / "rig.yaml"), "--arm", "--maps", str(maps), *out]
+        self.started_s = time.monotonic()
+        self.number = self.applications.start(arguments, self.bus_environment, self.folder / "log", labours)
+
+    @property
+    def said(self) -> str:
+        """All that the application wrote to the terminal."""
+        return (self.folder / "log").read_text(errors="replace")
+
+    def await_light(self) -> None:
+        """Return at the first light."""
+        ends_at = time.monotonic() + FIRST_LIGHT_S
+        while not self.light(self.started_s):
+            if time.monotonic() > ends_at or self.applications.exit_code(self.number, 0.001) is not None:
+                raise ScanFailedError(f"no light:\n{self.said}")
+            time.sleep(0.005)
+
+    def guard(self) -> int:
+        """Process number of the application's guard."""
+        for task in Path(f"/proc/{self.number}/task").iterdir():
+            for child in (task / "children").read_text().split():
+                if b"drivers.guard" in Path(f"/proc/{child}/cmdline").read_bytes():
+                    return int(child)
+        raise ScanFailedError(f"there is no guard:\n{self.said}")
+
+    def light(self, since_s: float) -> list[tuple[float, float]]:
+        """Times of light from then to now."""
+        return self.world.light(since_s, time.monotonic())
+
+    def light_at_rest(self, since_s: float) -> list[float]:
+        """Times of light on a mirror at rest from then to now, `STEP_S` each."""
+        found: list[float] = []
+        for begun_s, ended_s in self.light(since_s):
+            at = np.arange(begun_s, ended_s, STEP_S)
+            if len(at):
+                drive = self.world.mirror((at[:, None] - np.linspace(0, STILL_S, 5)).ravel()).reshape(len(at), -1)
+                found += at[np.ptp(drive, axis=1) == 0].tolist()
+        return found
+
+    def dark_s(self, since_s: float) -> float:
+        """Seconds from then to the end of emission, through an open gate or not; inf: it goes on."""
+        changed_s, power_w = self.world.emission()[-1]
+        return float("inf") if power_w else max(changed_s - since_s, 0.0)
+
+
+@contextmanager
+def scan_bench(applications: Applications, laser: str, **scanner: str) -> Iterator[ScanBench]:
+    """scanner: what its config says otherwise."""
+    with tempfile.TemporaryDirectory() as name, UmockdevBus(SystemClock()) as bus:
+        folder = Path(name)
+        geometry = folder / "calibration.yaml"
+        geometry.write_text(yaml.safe_dump(calibration(WIDTH, HEIGHT)))
+        settings = EmulatedWorldConfig.model_validate(
+            {
+                "kind": "emulated",
+                "geometry": str(geometry),
+                "scene": "street-clear",
+                "laser": laser,
+                "command_grid": {"first": -0.8, "last": 0.8, "columns": COLUMNS},
+            }
+        )
+        with EmulatedWorld(settings, Surroundings(SystemClock(), None, 1), bus) as world:
+            if laser == "cobolt":
+                world.laser.warm_up_s = 0.2
+            else:
+                world.laser.cdrh_delay_s = 0.2
+            ports = {name: endpoint.address for name, endpoint in world.ports.items()}
+            (folder / "rig.yaml").write_text(yaml.safe_dump(_config(laser, ports, scanner)))
+            bench = ScanBench(world, folder, {"UMOCKDEV_DIR": bus.environment()["UMOCKDEV_DIR"]}, applications)
+            try:
+                yield bench
+            finally:
+                _end(bench)
+
+
+def _end(bench: ScanBench) -> None:
+    """No client may outlive the bus."""
+    if not bench.number:
+        return
+    try:
+        guard = bench.guard()
+    except (ScanFailedError, OSError):
+        guard = 0
+    for number in (guard, bench.number):
+        if number:
+            try:
+                os.kill(number, 9)
+            except ProcessLookupError:
+                continue
+    bench.applications.exit_code(bench.number, 5.0)
+
+
+def _config(laser: str, ports: dict[str, str], scanner: dict[str, str]) -> dict[str, Any]:
+    return {
+        "name": "struck",
+        "calibration": "calibration.yaml",
+        # The emulated bus draws frames while a transfer is queued: 64 of them would take half a second.
+        "spad": {"kind": "spb-usb", "port": ports["spad"], "reads": "plain"},
+        "scanner": {
+            "kind": "helios",
+            "port": ports["scanner"],
+            "max_velocity": "4000 /s",
+            "max_acceleration": "4e6 /s2",
+            "rms_duty": 1.0,
+            "max_point_rate": "30 kHz",
+            "frame": "100 ms",
+            **scanner,
+        },
+        "laser": {"kind": laser, "port": ports["laser"], "max_power": "50 mW"},
+        "sync": {"kind": "prawndo", "port": ports["gate"]},
+        "scan": {
+            "columns": COLUMNS,
+            "exposures": EXPOSURES,
+            "frame_rate": "12.5 kHz",
+            "depth_range": ["1 m", "15 m"],
+            "command_range": [-0.8, 0.8],
+            "power": "20 mW",
+        },
+        "estimate": {"estimator": "argmax", "threads": 1},
+    }

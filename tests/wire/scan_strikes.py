@@ -1,0 +1,146 @@
+"""One scan over emulated wires, one blow to it at some moment, and how long there was light after it, and on what."""
+
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tests.wire.guard_strikes import EMISSION_S, GONE_S, NEVER_S
+from tests.wire.scan_rig import STEP_S, Applications, ScanBench, scan_bench
+
+MAPS = 40
+"""Of a scan that is struck: about a second."""
+LONG_S = 1.1
+"""From the first light to beyond the end of the scan."""
+OPENING_S = {"obis": 1.2, "cobolt": 7.0}
+"""From the start to the first light, about."""
+FULL_BYTES = 16_384
+_END_S = 12.0
+
+
+@dataclass(frozen=True)
+class ScanStrike:
+    """A blow. at_once: it may come before any light. record: frames are written. own_end: the application goes on
+    living, says what happened and ends with code 3."""
+
+    blow: Callable[[ScanBench], None]
+    at_once: bool = False
+    record: bool = False
+    own_end: bool = False
+    laser_answers: bool = True
+    light_s: float = GONE_S
+
+
+def _signal(number: int) -> Callable[[ScanBench], None]:
+    return lambda bench: os.kill(bench.number, number)
+
+
+def _open_interlock(bench: ScanBench) -> None:
+    with bench.world.laser_wire.lock:
+        bench.world.laser.open_interlock(time.monotonic())
+
+
+def _fill_disk(bench: ScanBench) -> None:
+    """No file takes more than what the terminal's needs, as on a disk that is full (EFBIG instead of ENOSPC)."""
+    resource.prlimit(bench.number, resource.RLIMIT_FSIZE, (FULL_BYTES, resource.RLIM_INFINITY))
+
+
+def _hang_gate(bench: ScanBench) -> None:
+    """The gate hears nothing any more, and then the application dies: only the laser is left to be lowered."""
+    bench.world.gate_wire.hang()
+    os.kill(bench.number, signal.SIGKILL)
+
+
+def _unplug_gate(bench: ScanBench) -> None:
+    """Its cable is its power: pull-downs hold the outputs low (hardware.md section 6)."""
+    bench.world.gate_wire.unplug()
+    with bench.world.gate_wire.lock:
+        bench.world.sync.power_cycle(time.monotonic())
+
+
+SCAN_STRIKES = {
+    "application killed": ScanStrike(_signal(signal.SIGKILL), at_once=True),
+    "application stopped": ScanStrike(_signal(signal.SIGSTOP)),
+    "guard killed": ScanStrike(lambda bench: os.kill(bench.guard(), signal.SIGKILL), own_end=True),
+    "guard stopped": ScanStrike(lambda bench: os.kill(bench.guard(), signal.SIGSTOP), own_end=True),
+    "gate's firmware hangs": ScanStrike(_hang_gate, light_s=NEVER_S),
+    "spad unplugged": ScanStrike(lambda bench: bench.world.spad_plug.unplug(), own_end=True),
+    "scanner unplugged": ScanStrike(lambda bench: bench.world.scanner_plug.unplug(), own_end=True),
+    "gate unplugged": ScanStrike(_unplug_gate, own_end=True),
+    "laser unplugged": ScanStrike(lambda bench: bench.world.laser_wire.unplug(), own_end=True, laser_answers=False),
+    "interlock opened": ScanStrike(_open_interlock, own_end=True),
+    "disk full": ScanStrike(_fill_disk, record=True, own_end=True),
+}
+
+
+@dataclass(frozen=True)
+class ScanOutcome:
+    """What came of it.
+
+    light_s: to the last light. emission_s: to the end of emission; inf: none within the time. rest_s: light on a mirror
+    at rest, of the whole scan. over: the scan had ended before. code: the application's; None: it ran on for ever.
+    """
+
+    was_lit: bool
+    over: bool
+    light_s: float
+    emission_s: float
+    rest_s: float
+    code: int | None
+    said: str
+
+
+def strike_scan(
+    applications: Applications, name: str, laser: str, share: float, wait_s: float = EMISSION_S + 0.05
+) -> ScanOutcome:
+    """Start a scan and strike: share (0 to 1) of the way from its first light, or its start, to beyond its end.
+
+    wait_s: how long light and emission are looked at after it.
+    """
+    made = SCAN_STRIKES[name]
+    with scan_bench(applications, laser) as bench:
+        bench.start(maps=MAPS, record=made.record)
+        opening_s = OPENING_S[laser] if made.at_once else 0.0
+        into_s = share * (opening_s + LONG_S)
+        if into_s < opening_s:
+            time.sleep(into_s)
+        else:
+            bench.await_light()
+            time.sleep(into_s - opening_s)
+        over = applications.exit_code(bench.number, 0.0) is not None
+        at_s = time.monotonic()
+        was_lit = bool(bench.light(at_s - 0.05))
+        if not over:
+            made.blow(bench)
+        time.sleep(wait_s)
+        light, resting = bench.light(at_s), bench.light_at_rest(bench.started_s)
+        code = applications.exit_code(bench.number, _END_S)
+        return ScanOutcome(
+            was_lit,
+            over,
+            light[-1][1] - at_s if light else 0.0,
+            bench.dark_s(at_s),
+            len(resting) * STEP_S,
+            code,
+            bench.said + (f"light at rest {resting[0] - at_s:.3f} to {resting[-1] - at_s:.3f} s\n" if resting else ""),
+        )
+
+
+def trouble_of(name: str, outcome: ScanOutcome) -> list[str]:
+    """What one blow left undone, for each but the 100 ms, which are a percentile's."""
+    made = SCAN_STRIKES[name]
+    found = []
+    if outcome.light_s > max(NEVER_S, made.light_s):
+        found.append(f"light after {1e3 * outcome.light_s:.0f} ms")
+    if made.laser_answers and outcome.emission_s > EMISSION_S:
+        found.append(f"emission after {outcome.emission_s:.2f} s")
+    if outcome.rest_s:
+        found.append(f"{1e3 * outcome.rest_s:.2f} ms of light at rest")
+    if "Traceback" in outcome.said:
+        found.append("a traceback")
+    ended_well = "verdict  complete" in outcome.said  # it had its frames already
+    if made.own_end and not ended_well and not (outcome.code == 3 and "error: " in outcome.said):
+        found.append(f"code {outcome.code}")
+    return [f"{one} ({outcome.said.strip()[-300:]})" for one in found]

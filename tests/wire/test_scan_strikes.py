@@ -1,0 +1,49 @@
+"""A blow of each sort to a real scan over emulated wires, in a process of its own: light is what is measured.
+
+Hundreds of each: `python -m tests.campaigns.guard_kill`.
+"""
+
+from collections.abc import Iterator
+
+import pytest
+
+from sim_backend.wire.umockdev_server import missing
+from tests.wire.guard_strikes import NEVER_S
+from tests.wire.scan_rig import Applications, applications, scan_bench
+from tests.wire.scan_strikes import SCAN_STRIKES, strike_scan, trouble_of
+
+WAIT_S = 0.6
+SHARES = {name: 0.15 + 0.5 * i / len(SCAN_STRIKES) for i, name in enumerate(SCAN_STRIKES)}
+SHARES["application killed"] = 0.8  # most of the way is the opening
+
+pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
+
+
+@pytest.fixture(scope="module")
+def scans() -> Iterator[Applications]:
+    with applications() as made:
+        yield made
+
+
+def test_a_scan_that_nobody_strikes_ends_complete_with_its_light_on_a_moving_mirror(scans: Applications) -> None:
+    with scan_bench(scans, "obis") as bench:
+        bench.start(maps=4)
+        bench.await_light()
+        assert scans.exit_code(bench.number, 20.0) == 0, bench.said
+        assert "verdict  complete" in bench.said
+        assert len(bench.light(bench.started_s)) == 4
+        assert bench.light_at_rest(bench.started_s) == []
+
+
+@pytest.mark.parametrize("name", SCAN_STRIKES)
+def test_a_struck_scan_leaves_no_light(name: str, scans: Applications) -> None:
+    outcome = strike_scan(scans, name, "obis", SHARES[name], WAIT_S)
+    assert not outcome.over
+    assert outcome.light_s < NEVER_S
+    assert trouble_of(name, outcome) == []
+
+
+def test_the_guard_of_a_slow_laser_is_killed_and_it_is_off_within_a_second(scans: Applications) -> None:
+    outcome = strike_scan(scans, "guard killed", "cobolt", 0.2, WAIT_S)
+    assert outcome.was_lit
+    assert trouble_of("guard killed", outcome) == []

@@ -1,0 +1,212 @@
+"""What every laser on a serial line does, whatever its make: limits, identity, lost ports, faults on the wire."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from drivers import cobolt_framing, obis_framing
+from drivers.clock import SystemClock
+from drivers.cobolt import CoboltConfig
+from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceNotFound, DeviceTimeout, LimitExceeded
+from drivers.interfaces import LineLaser
+from drivers.obis import ObisConfig
+from drivers.serial_laser import SerialLaserConfig
+from drivers.transports.endpoints import Endpoint
+from rig.config_files import load_config
+from rig.errors import DevicesError
+from rig.session import open_rig
+from sim_backend.wire.cobolt import CoboltModel
+from sim_backend.wire.faults import Fault, FaultScript
+from sim_backend.wire.obis import ObisModel
+from tests.wire.lasers import Babble, Silent, around, bring_up, now_s, open_cobolt, open_obis, wire
+
+
+@dataclass(frozen=True)
+class Make:
+    """One make of laser: its firmware's model and its driver. most_w: what the laser itself can give."""
+
+    model: Callable[..., Any]
+    open: Callable[..., LineLaser]
+    config: type[SerialLaserConfig]
+    most_w: float
+
+    def set_power_w(self, model: Any) -> float:
+        """What it would shine with under its gate."""
+        return float(model.modulation_power_w if isinstance(model, CoboltModel) else model.set_power_w)
+
+
+MLD = Make(CoboltModel, open_cobolt, CoboltConfig, 0.1)
+SCPI = Make(partial(CoboltModel, "06-01"), open_cobolt, CoboltConfig, 0.1)
+OBIS = Make(ObisModel, open_obis, ObisConfig, 0.11)
+SILENT_SETS = Make(partial(ObisModel, handshake=False), open_obis, ObisConfig, 0.11)
+MAKES = {"cobolt": MLD, "obis": OBIS}
+DIALECTS = {"06-MLD": MLD, "06-01": SCPI, "obis": OBIS, "obis without handshake": SILENT_SETS}
+each_make = pytest.mark.parametrize("make", MAKES.values(), ids=MAKES)
+each_dialect = pytest.mark.parametrize("make", DIALECTS.values(), ids=DIALECTS)
+
+
+@each_make
+def test_the_power_limit_is_the_smaller_of_laser_and_config(make: Make) -> None:
+    for asked, limit_w in (("80 mW", 0.08), ("2 W", make.most_w)):
+        with wire(make.model()) as (_, surroundings), make.open(surroundings, max_power=asked) as laser:
+            assert laser.limits.max_power_w == pytest.approx(limit_w)
+            with pytest.raises(LimitExceeded):
+                laser.arm(limit_w * 1.01)
+
+
+@each_make
+def test_a_config_without_a_power_limit_or_a_port_is_refused(make: Make) -> None:
+    for given in ({"port": "/dev/ttyUSB0"}, {"max_power": "10 mW"}, {"port": "x", "max_power": 0.01}):
+        with pytest.raises(ValidationError):
+            make.config.model_validate(given)
+
+
+@each_make
+def test_another_laser_than_the_config_names_is_refused_and_a_busy_one_too(make: Make) -> None:
+    with wire(make.model(serial="777")) as (_, surroundings):
+        with pytest.raises(DeviceNotFound, match="serial number 777, not 16328"):
+            make.open(surroundings, serial_number="16328")
+        with make.open(surroundings, serial_number="777"), pytest.raises(DeviceBusy):
+            make.open(surroundings)
+
+
+@pytest.mark.parametrize("stranger", [Silent(), Babble()])
+@each_make
+def test_a_port_where_none_of_the_make_answers_is_one_line_and_given_back(make: Make, stranger: Any) -> None:
+    with wire(stranger) as (_, surroundings):
+        for _ in range(2):
+            with pytest.raises(DeviceNotFound, match="nothing on port emulated:laser") as refused:
+                make.open(surroundings)
+            assert "\n" not in str(refused.value)
+
+
+def test_no_emulated_port_of_that_name() -> None:
+    with wire(CoboltModel()) as (server, surroundings):
+        with pytest.raises(DeviceNotFound, match="choose one of: laser"):
+            open_cobolt(surroundings, port="emulated:lesar")
+        assert around(surroundings.clock, server).ports == {"laser": Endpoint(server.path, emulated=True)}
+
+
+def test_the_application_pauses_a_laser_found_emitting_and_refuses_the_scan() -> None:
+    model = ObisModel()
+    model.shine(0.06)
+    with wire(model, clock=SystemClock()) as (server, _):  # the guard's process has no other time
+        laser = {"kind": "obis", "port": server.path, "max_power": "50 mW"}
+        config = load_config("simulated", {"laser": laser})
+        with pytest.raises(DevicesError, match="found emitting and has been paused"), open_rig(config):
+            pass
+    assert not model.emitting
+
+
+@each_dialect
+def test_trap_no_watchdog_so_a_lost_port_leaves_it_on_and_is_said_at_once(make: Make) -> None:
+    model = make.model()
+    with wire(model) as (server, surroundings):
+        laser = make.open(surroundings)
+        bring_up(laser, surroundings.clock)
+        server.unplug()
+        assert model.emitting
+        assert laser.port_lost  # type: ignore[attr-defined]
+        for verb in (laser.pause, laser.disarm, lambda: laser.status, laser.close):
+            with pytest.raises(DeviceDisconnected, match="is lost"):
+                verb()
+        server.plug()
+        with make.open(surroundings) as again:
+            assert again.status.emission
+            again.pause()
+            assert not model.emitting
+
+
+@each_dialect
+def test_an_interlock_that_opens_while_it_emits_is_seen_by_the_next_poll(make: Make) -> None:
+    model = make.model()
+    with wire(model) as (server, surroundings), make.open(surroundings) as laser:
+        bring_up(laser, surroundings.clock)
+        with server.lock:
+            model.open_interlock(now_s(surroundings.clock))
+        status = laser.status
+        assert (status.interlock_closed, status.emission) == (False, False)
+        laser.pause()
+
+
+@each_make
+def test_a_firmware_that_hangs_is_a_timeout_within_its_deadline(make: Make) -> None:
+    model = make.model()
+    with wire(model) as (server, surroundings):
+        laser = make.open(surroundings)
+        bring_up(laser, surroundings.clock)
+        server.hang()
+        began = time.monotonic()
+        with pytest.raises(DeviceTimeout):
+            laser.pause()
+        assert time.monotonic() - began < 5.0
+        server.resume()
+        laser.pause()
+        assert not model.emitting
+        laser.close()
+
+
+def test_a_pause_is_not_held_up_by_a_thread_that_polls() -> None:
+    dark_at: list[float] = []
+    model = ObisModel(on_emission=lambda emits, _: None if emits else dark_at.append(time.monotonic()))
+    with wire(model, clock=SystemClock()) as (_, surroundings), open_obis(surroundings) as laser:
+        model.shine(0.05)
+        ending = threading.Event()
+
+        def poll() -> None:
+            while not ending.is_set():
+                _ = laser.status
+
+        thread = threading.Thread(target=poll)
+        thread.start()
+        time.sleep(0.2)
+        began = time.monotonic()
+        laser.pause()
+        ending.set()
+        thread.join()
+        assert not model.emitting
+        assert dark_at[0] - began < 1.0
+
+
+@each_make
+def test_emission_is_told_to_the_world_with_its_time(make: Make) -> None:
+    told: list[tuple[bool, float]] = []
+    model = make.model(on_emission=lambda emits, at_s: told.append((emits, at_s)))
+    with wire(model) as (_, surroundings), make.open(surroundings) as laser:
+        bring_up(laser, surroundings.clock)
+        surroundings.clock.sleep(1.0)
+        laser.pause()
+    assert [emits for emits, _ in told] == [True, False]
+    assert 0 < told[0][1] < told[1][1]
+
+
+@each_make
+@pytest.mark.parametrize("fault", list(Fault))
+def test_one_fault_in_an_arm_ends_in_a_typed_error_or_as_told(fault: Fault, make: Make) -> None:
+    model = make.model()
+    with wire(model) as (server, surroundings):
+        laser = make.open(surroundings)
+        server.faults = FaultScript(*[None] * 9, fault, late_s=0.1, stall_s=0.2)
+        try:
+            laser.arm(0.05)
+        except DeviceError:
+            assert fault in (Fault.UNPLUG, Fault.HANG)
+        else:
+            assert model.gated
+            assert make.set_power_w(model) == pytest.approx(0.05)
+        assert server.faults.struck == [fault]
+        server.close()
+        with pytest.raises(DeviceDisconnected):
+            laser.close()
+
+
+def test_trap_a_tenth_of_a_second_was_too_little_for_a_reply() -> None:
+    assert cobolt_framing.USUAL_TIMING.reply_s >= 1.0
+    assert obis_framing.USUAL_TIMING.reply_s >= 1.0
+    assert cobolt_framing.USUAL_TIMING.gap_s >= 0.1
