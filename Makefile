@@ -31,6 +31,7 @@ campaign: .venv/.installed-tests
 		$(BIN)/python -m tests.campaigns.$${driver}_faults --sequences $(SEQUENCES) || exit; \
 	done
 	$(BIN)/python -m tests.campaigns.guard_kill
+	$(BIN)/python -m tests.campaigns.blanking
 
 .venv/.created:
 	@test -n "$(PYTHON)" || { echo "error: no python3 found; install Python 3.11 or newer, or call make PYTHON=/path/to/python" >&2; exit 2; }

@@ -15,13 +15,13 @@ from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
 from rig.counting import SweepLayout
-from rig.errors import DevicesError
+from rig.errors import DevicesError, PlanError
 from rig.map_queue import AcquiredMap
 from rig.mapping import MakesMaps
 from rig.monitor import Watch
 from rig.overload import Overload, require_policy, ring_for
 from rig.pipeline import JOIN_S, Pipeline
-from rig.recording import Recording
+from rig.recording.recorder import Recording
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig
 from rig.stages import PipelineStats
@@ -85,6 +85,7 @@ class Acquisition:
         require_policy(policy, rig.spad.info)
         self._rig = rig
         self._plan = plan
+        self._require_memory()
         self._timing = timing
         self._maps = maps
         self._maker = maker
@@ -98,6 +99,18 @@ class Acquisition:
         self._stats_before = PipelineStats()
         self._counters_before = SpadCounters(0, 0, 0, 0, 0)
         self._frames_before = 0
+
+    def _require_memory(self) -> None:
+        """PlanError where the SPAD's memory would be full before one map is whole."""
+        if self._plan.burst_frames is None:
+            return
+        need = math.ceil(self._plan.frames_for(1) + self._lead_s * float(self._plan.frame_rate_hz))
+        if need > self._plan.burst_frames:
+            raise PlanError(
+                f"a burst of one map takes {need} frames, with the {self._lead_s:g} s until the scanner has started; "
+                f"the memory of {self._rig.spad.name} holds {self._plan.burst_frames}; lower scan.exposures, "
+                "scan.columns or scan.frame_rate"
+            )
 
     @property
     def frames_planned(self) -> int:
@@ -139,20 +152,27 @@ class Acquisition:
         return BURST_LEAD_S if isinstance(self._rig.clock, VirtualClock) else HOST_LEAD_S
 
     def _group(self, done: int) -> int:
-        """Sweeps of the next start of the SPAD: all in a stream, as many as its memory holds in a burst."""
-        left = self._maps - done
+        """Sweeps of the next start: as many as the SPAD's memory holds in a burst and the sync source's program."""
+        left = min(self._maps - done, self._most_sweeps)
         if self._first_alone and done == 0:
             return 1
         if self._plan.burst_frames is None:
             return left
-        spare = self._plan.burst_frames - self._lead_s * float(self._plan.frame_rate_hz)
+        spare = self._plan.burst_frames - self._lead_s * float(self._plan.frame_rate_hz) - self._plan.frames_for(0)
         return max(1, min(left, int(spare / float(self._plan.frames_per_sweep))))
+
+    @property
+    def _most_sweeps(self) -> int:
+        """Sweeps that one program of the sync source can hold; at least 1, which it may still refuse."""
+        legs = self._plan.sweeps_per_period
+        most = self._rig.sync.most_repeats(self._plan.sync_program(legs)[0])
+        return self._maps if most is None else max(1, most * legs)
 
     def _burst_frames(self, sweeps: int) -> int | None:
         if self._plan.burst_frames is None:
             return None
         lead = Fraction(self._lead_s) * self._plan.frame_rate_hz
-        return min(self._plan.burst_frames, math.ceil(sweeps * self._plan.frames_per_sweep + lead))
+        return min(self._plan.burst_frames, math.ceil(self._plan.frames_for(sweeps) + lead))
 
     def _run_group(self, assembler: SweepAssembler, sweeps: int, done: int) -> Generator[AcquiredMap, None, None]:
         rig, plan = self._rig, self._plan
@@ -188,6 +208,7 @@ class Acquisition:
                 while pipeline.streaming:
                     if (found := pipeline.take_streaming(TELL_S)) is not None:
                         yield found
+                    self._check_scanner()
                     self._tell(assembler, done)
             finally:
                 trouble = self._make_safe(pipeline)
@@ -227,6 +248,12 @@ class Acquisition:
             self._counters_before, self._stats_before = self.counters, self.stages
             self._pipeline = None
         self._frames_before += assembler.frames_seen
+
+    def _check_scanner(self) -> None:
+        """A mirror that has stopped early: frames would go on, markers would not. DeviceFault."""
+        fault = self._rig.scanner.status.fault
+        if fault is not None:
+            raise DeviceFault(fault)
 
     def _tell(self, assembler: SweepAssembler, done: int) -> None:
         if self._on_progress is None:

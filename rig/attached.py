@@ -8,7 +8,7 @@ from serial.tools import list_ports
 from drivers.errors import DeviceError
 from drivers.helios_link import HELIOS
 from drivers.lasercube_link import LASERCUBE
-from drivers.spb_usb import USB_IDS
+from drivers.spb_usb_chips import USB_IDS
 from drivers.transports.usb_device import attached as attached_usb
 from rig.config import RigConfig
 from rig.errors import DevicesError

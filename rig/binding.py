@@ -1,5 +1,7 @@
 """Binds frames to columns by the markers in their own stream, never by host time or by counting.
 
+Where the SPAD puts no markers into its frames, `rig.blanking_sync` finds the sweeps in their light and marks them.
+
 Each frame is placed from the latest marker at or before it: that marker's point of the scanner clock is known from the
 plan, the way on from there is the SPAD's own clock times the ratio of the two clocks, which is fitted to the markers of
 every sweep and used in the next one. So a frame's column depends on earlier frames only and not on the size of blocks.
@@ -21,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frames import FRAME_RECORD, SUBFRAME_MASK, SUBFRAME_SHIFT, BlockHeader, FrameBlock, Mark
+from rig.blanking import MAX_CLOCK_ERROR
+from rig.blanking_sync import BlankingSync
 from rig.scan_plan import ScanPlan
 
 MAX_RESIDUAL_COLUMNS = 0.05
 """A sweep whose markers stray further from one straight line of time than this is not synchronised."""
-MAX_CLOCK_ERROR = 1e-3
-"""Clock ratios further from nominal than this are a fault, not a crystal."""
 UNITS_PER_TICK = 2 * (SUBFRAME_MASK + 1)
 """Times are kept as whole numbers of this part of a tick, in which markers and exposure middles are exact: a frame's
 column is then the same to the last bit in whatever block it comes. Good for 200 days at 1 GHz."""
@@ -64,12 +66,15 @@ class BoundFrames:
 
 @dataclass(frozen=True, slots=True)
 class SweepClock:
-    """What the markers of one finished sweep say.
+    """What the markers, or the blanking patterns, of one finished sweep say.
 
     clock_error: relative excess of the scanner's clock over nominal, in the SPAD's time. residual_columns: largest
-    distance of a marker from the fitted line, in columns; NaN where there were fewer than two markers. first_frame,
+    distance of a marker from the fitted line, in columns; NaN where there were fewer than two markers. Of blanking
+    patterns: of the one behind the sweep from the line of those before it, or its standard deviation where that is
+    more; NaN where it was not found. markers: how many of either it rests on. first_frame,
     end_frame: frame numbers from this sweep's scan marker to the next one's. wrong_way: lit frames whose direction
-    level was not the plan's.
+    level was not the plan's. detection: chance that a blanking pattern as bright as this sweep's is found, 0 where it
+    was not; None: bound by markers.
     """
 
     sweep: int
@@ -79,6 +84,7 @@ class SweepClock:
     first_frame: int
     end_frame: int
     wrong_way: int
+    detection: float | None = None
 
     @property
     def synchronised(self) -> bool:
@@ -133,6 +139,7 @@ class FrameBinder:
         self._carried["sweep"] = self._carried["anchor_point"] = self._carried["column"] = -1
         self._edges = np.empty((2, 2 * len(plan.marker_points) + 2), np.int64)
         self._records = np.empty(0, FRAME_RECORD)
+        self._light = None if plan.blanking is None else BlankingSync(plan)
 
     def bind(self, block: FrameBlock) -> tuple[BoundFrames, list[SweepClock]]:
         """Places of the block's frames, and the clocks of the sweeps whose closing scan marker lies in the block."""
@@ -143,6 +150,8 @@ class FrameBinder:
         records = self._records[:n]
         # Always of one type, which memory of a ring, a file or a wire is not: each would be compiled by itself.
         records.view(_WHOLE)[:] = block.records.view(_WHOLE)
+        if self._light is not None:
+            self._light.mark(block, records)
         places = np.empty(n, np.int32), np.empty(n, np.int8), np.empty(n, np.float64), np.empty(n, np.int32)
         closed: list[SweepClock] = []
         starts = [0]
@@ -154,7 +163,8 @@ class FrameBinder:
                 break
             if at:
                 starts.append(at)
-            closed += self._begin(at, records[at], terms, header)
+            begin = self._begin if self._light is None else self._begin_in_light
+            closed += begin(at, records[at], terms, header)
         self._next_frame = header.first_frame + n * header.frame_step
         return BoundFrames(*places, tuple(starts)), closed
 
@@ -168,7 +178,7 @@ class FrameBinder:
 
     def _block_terms(self, header: BlockHeader) -> BlockTerms:
         return BlockTerms(
-            header.sweep,
+            header.sweep if self._light is None else self._markers_before,
             header.t0_ticks - (self._t0 or 0),
             _period(header),
             header.exposure_ticks * (UNITS_PER_TICK // 2),
@@ -178,7 +188,7 @@ class FrameBinder:
     def _begin(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
         """Close the sweep that ran, begin the next one at frame index `at`, where its scan marker is if received."""
         now = self._carried[0]
-        running, number = int(now["sweep"]), _markers_seen(record, header) - 1
+        running, number = int(now["sweep"]), _markers_seen(record, terms) - 1
         start = (int(record["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
         received = bool(record["marks"] & Mark.SCAN)
         closed = []
@@ -195,6 +205,34 @@ class FrameBinder:
             closed.append(self._close(missed, end, header.tick_hz))
         now["sweep"], now["edges"], now["column"] = number, 0, -1
         return closed
+
+    def _begin_in_light(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
+        """As `_begin`, where the light has told at which frame sweeps begin and when their scan markers came."""
+        assert self._light is not None, "asked for by the caller"
+        now = self._carried[0]
+        running, number = int(now["sweep"]), _markers_seen(record, terms) - 1
+        place = self._light.place(number)
+        closed = []
+        for missed in range(running, number) if running >= 0 else ():
+            detection, end = self._light.place(missed).detection, self._light.end(missed)
+            frame, residual = self._light.place(missed + 1).frame, end.residual_frames / self._plan.exposures
+            clock = end.clock_error, residual, end.patterns
+            closed.append(SweepClock(missed, *clock, self._first_frame, frame, int(now["wrong_way"]), detection))
+            self._first_frame, now["wrong_way"] = frame, 0
+        if running < 0:
+            self._first_frame = place.frame
+        start = (int(record["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
+        back = place.scan_frame - (header.first_frame + at)
+        self._ratio = place.ratio
+        now["anchor_time"] = start + round(back * _period(header) * UNITS_PER_TICK)
+        now["anchor_point"] = number * self._plan.sweep_points
+        now["sweep"], now["edges"], now["column"] = number, 0, -1
+        return closed
+
+    @property
+    def _markers_before(self) -> int:
+        """Scan markers up to the frames that come next, of which records have the low 16 bits."""
+        return int(self._carried["sweep"][0]) + 1
 
     def _boundary_frame(self, number: int, at: int, header: BlockHeader, start: int) -> int:
         """Number of the frame in which sweep `number` began, from the scanner's clock where the marker was lost."""
@@ -244,9 +282,9 @@ def _plan_terms(plan: ScanPlan) -> PlanTerms:
     )
 
 
-def _markers_seen(record: np.void, header: BlockHeader) -> int:
+def _markers_seen(record: np.void, terms: BlockTerms) -> int:
     """Scan markers since START at a frame: the record's low 16 bits, continued from the header's 32."""
-    return header.sweep + ((int(record["sweep"]) - header.sweep) & 0xFFFF)
+    return terms.sweep + ((int(record["sweep"]) - terms.sweep) & 0xFFFF)
 
 
 def _period(header: BlockHeader) -> int:

@@ -5,33 +5,39 @@ Each command is one call of `rig.api` and some printing. Results go to stdout, e
 Nothing heavy is imported before a command runs.
 """
 
-import functools
 import logging
 import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig import cli_recordings
+from rig.cli_command import (
+    EXIT_ABORTED,
+    EXIT_DEVICE,
+    EXIT_SOFTWARE,
+    EXIT_USAGE,
+    ConfidenceOption,
+    EstimatorOption,
+    FilterOption,
+    JsonOption,
+    command,
+    print_json,
+    progress,
+    report,
+    say,
+)
 from rig.kernel_cache import ensure_kernel_cache
 
 if TYPE_CHECKING:
-    from rig.run import RunResult
     from rig.scan_plan import ScanPlan
-
-EXIT_USAGE = 2
-EXIT_DEVICE = 3
-EXIT_ABORTED = 4
-EXIT_SOFTWARE = 70
-"""An error in the program itself: EX_SOFTWARE of sysexits.h."""
-
-P = ParamSpec("P")
 
 app = typer.Typer(
     name="rig",
@@ -44,6 +50,7 @@ config_app = typer.Typer(name="config", help="Check, show or describe a config."
 app.add_typer(config_app)
 laser_app = typer.Typer(name="laser", help="The laser's safe state.", rich_markup_mode=None)
 app.add_typer(laser_app)
+cli_recordings.register(app)
 
 ConfigArgument = Annotated[
     str, typer.Argument(metavar="[CONFIG]", help="a bundled rig's name or a YAML file", show_default=True)
@@ -52,15 +59,6 @@ SceneOption = Annotated[
     str | None,
     typer.Option("--scene", help="a bundled scene, a scene file or a folder (simulated rigs)", show_default=False),
 ]
-EstimatorOption = Annotated[
-    str | None, typer.Option("--estimator", help="argmax, edge or likelihood", show_default=False)
-]
-FilterOption = Annotated[str | None, typer.Option("--filter", help="none or median (5 x 5)", show_default=False)]
-ConfidenceOption = Annotated[
-    float | None,
-    typer.Option("--min-confidence", help="answers below this do not enter the depth map", show_default=False),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout")]
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -119,43 +117,8 @@ def _say_why(error: Exception) -> int:
         ("valid number", "write a number or "),
     )
     wanted = next((step for words, step in steps if words in message), "")
-    _say(f"error: {message}; {wanted}see '{command} --help'")
+    say(f"error: {message}; {wanted}see '{command} --help'")
     return EXIT_USAGE
-
-
-def _command(function: Callable[P, int | None]) -> Callable[P, None]:
-    """Turns what a command raises for its user's mistakes and its devices' faults into lines and exit codes."""
-
-    @functools.wraps(function)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
-        try:
-            code = function(*args, **kwargs)
-        except KeyboardInterrupt:
-            _say("aborted")
-            code = EXIT_ABORTED
-        except Exception as error:
-            code = _code_of(error)
-            if code is None:
-                raise
-            for line in str(error).splitlines():
-                _say(f"error: {line}")
-            for note in getattr(error, "__notes__", []):
-                _say(note)
-        raise typer.Exit(code or 0)
-
-    return wrapped
-
-
-def _code_of(error: Exception) -> int | None:
-    from calibration.errors import CalibrationError
-    from drivers.errors import DeviceError
-    from rig.errors import RigError
-
-    if isinstance(error, RigError):
-        return error.exit_code
-    if isinstance(error, CalibrationError):
-        return EXIT_USAGE
-    return EXIT_DEVICE if isinstance(error, DeviceError) else None
 
 
 @app.callback(invoke_without_command=True)
@@ -169,12 +132,12 @@ def _root(
         print(f"spadrig {installed('spadrig')}")
         raise typer.Exit(0)
     if context.invoked_subcommand is None:
-        _say(context.get_help())
+        say(context.get_help())
         raise typer.Exit(EXIT_USAGE)
 
 
 @app.command("scan")
-@_command
+@command
 def scan_command(
     config: ConfigArgument = "simulated",
     scene: SceneOption = None,
@@ -211,7 +174,7 @@ def scan_command(
     if dry_run:
         plan = api.plan_scan(config, maps=maps, seed=seed, save=save, on_overload=on_overload, **options)
         return _show_plan(plan, as_json)
-    with _progress("frames") as bar:
+    with progress("frames") as bar:
         result = api.scan(
             config,
             maps=maps,
@@ -224,11 +187,11 @@ def scan_command(
             live=None if bar is None else lambda done: bar(done.frames, done.frames_planned, done.lost),
             **options,
         )
-    return _report(result, as_json)
+    return report(result, as_json)
 
 
 @app.command("reconstruct")
-@_command
+@command
 def reconstruct_command(
     cube: Annotated[Path, typer.Argument(metavar="CUBE.npy", help="packed frames", show_default=False)],
     plan: Annotated[Path, typer.Option("--plan", help="plan.yaml of the cube", show_default=False)],
@@ -246,13 +209,13 @@ def reconstruct_command(
 
     # Names that are none are refused by the call, which knows which there are.
     options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
-    with _progress("maps") as progress:
-        result = api.reconstruct(cube, plan, calibration, out=out, progress=progress, **options)
-    return _report(result, as_json)
+    with progress("maps") as bar:
+        result = api.reconstruct(cube, plan, calibration, out=out, progress=bar, **options)
+    return report(result, as_json)
 
 
 @app.command("effects")
-@_command
+@command
 def effects_command(
     config: ConfigArgument = "simulated", scene: SceneOption = None, as_json: JsonOption = False
 ) -> int:
@@ -261,7 +224,7 @@ def effects_command(
 
     effects = api.effects(config, scene=scene)
     if as_json:
-        _print_json({"effects": [effect.as_json() for effect in effects]})
+        print_json({"effects": [effect.as_json() for effect in effects]})
     else:
         from rig.report_text import effects_table
 
@@ -270,7 +233,7 @@ def effects_command(
 
 
 @app.command("doctor")
-@_command
+@command
 def doctor_command(
     config: ConfigArgument = "simulated",
     out: Annotated[Path, typer.Option("--out", help="folder that a scan would write to")] = Path("runs"),
@@ -281,7 +244,7 @@ def doctor_command(
 
     findings = api.doctor(config, out=out)
     if as_json:
-        _print_json({"could_scan": all(one.ok for one in findings), "findings": [one.as_json() for one in findings]})
+        print_json({"could_scan": all(one.ok for one in findings), "findings": [one.as_json() for one in findings]})
     else:
         for one in findings:
             print(f"{'ok  ' if one.ok else 'FAIL'}  {one.name:<12}{one.text}")
@@ -289,14 +252,14 @@ def doctor_command(
 
 
 @app.command("devices")
-@_command
+@command
 def devices_command(as_json: JsonOption = False) -> int:
     """What is attached: USB devices that a driver knows, and serial ports."""
     from rig import api
 
     found = api.devices()
     if as_json:
-        _print_json({"devices": [one.as_json() for one in found]})
+        print_json({"devices": [one.as_json() for one in found]})
     else:
         for one in found:
             print(f"{one.address:<32}{one.what}")
@@ -306,7 +269,7 @@ def devices_command(as_json: JsonOption = False) -> int:
 
 
 @laser_app.command("off")
-@_command
+@command
 def laser_off_command(config: ConfigArgument = "simulated") -> int:
     """Take the gate low and switch the laser's emission off for good."""
     from rig import api
@@ -317,7 +280,7 @@ def laser_off_command(config: ConfigArgument = "simulated") -> int:
 
 
 @app.command("bench")
-@_command
+@command
 def bench_command(
     threads: Annotated[
         int | None, typer.Option("--threads", help="most threads to measure", show_default="one a core", min=1)
@@ -338,7 +301,7 @@ def bench_command(
     """How fast this machine counts and estimates, beside how fast it reads its memory."""
     from rig import api
 
-    with _progress("rows") as bar:
+    with progress("rows") as bar:
         report = api.bench(threads=threads, progress=bar)
     content = report.as_json()
     code = 0
@@ -347,7 +310,7 @@ def bench_command(
 
         speed_table(report)
     if soak is not None:
-        with _progress("frames") as bar:
+        with progress("frames") as bar:
             found = api.soak(
                 soak, threads=threads, window=window, slow_consumer_s=slow_consumer / 1e3, on_overload=on_overload,
                 progress=bar,
@@ -360,47 +323,47 @@ def bench_command(
             soak_table(found)
         code = found.exit_code
     if as_json:
-        _print_json(content)
+        print_json(content)
     return code
 
 
 @app.command("warmup")
-@_command
+@command
 def warmup_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
     """Compile everything that is compiled, so that no scan waits for it."""
     from rig import api
 
     seconds = api.warm_up(config)
     if as_json:
-        _print_json({"seconds": seconds})
+        print_json({"seconds": seconds})
     else:
         print(f"warm after {seconds:.1f} s; compiled code is kept on disk, once more takes seconds")
     return 0
 
 
 @config_app.command("check")
-@_command
+@command
 def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
     """Say whether a config is valid; all problems at once."""
     from rig.api import configure
 
     checked = configure(config)
     if as_json:
-        _print_json({"config": config, "name": checked.name, "valid": True})
+        print_json({"config": config, "name": checked.name, "valid": True})
     else:
         print(f"{config}: valid, rig '{checked.name}'")
     return 0
 
 
 @config_app.command("show")
-@_command
+@command
 def show_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
     """Print a config with every default filled in."""
     from rig.api import configure
 
     content = configure(config).model_dump(mode="json")
     if as_json:
-        _print_json(content)
+        print_json(content)
     else:
         import yaml
 
@@ -409,12 +372,12 @@ def show_command(config: ConfigArgument = "simulated", as_json: JsonOption = Fal
 
 
 @config_app.command("schema")
-@_command
+@command
 def schema_command() -> int:
     """Print the JSON schema of a config, for editors."""
     from rig.config_files import config_schema
 
-    _print_json(config_schema())
+    print_json(config_schema())
     return 0
 
 
@@ -422,51 +385,10 @@ def _show_plan(plan: "ScanPlan", as_json: bool) -> int:
     if as_json:
         from rig.scanning import plan_content
 
-        _print_json({"plan": plan_content(plan)})
+        print_json({"plan": plan_content(plan)})
     else:
         print(plan.describe())
     return 0
-
-
-def _report(result: "RunResult", as_json: bool) -> int:
-    """Print a run's summary, for programs or people; its exit code."""
-    from rig.summary import Verdict
-
-    if result.summary.valid_fraction == 0 and result.summary.verdict is not Verdict.UNCALIBRATED:
-        _say("warning: no pixel has a depth; raise --exposures, lower --min-confidence or check the depth range")
-    if as_json:
-        _print_json(result.summary.as_json())
-    else:
-        from rig.report_text import run_table
-
-        run_table(result)
-    return result.summary.verdict.exit_code
-
-
-def _print_json(content: Mapping[str, Any]) -> None:
-    from rig.outputs import json_text
-
-    print(json_text(content))
-
-
-@contextmanager
-def _progress(what: str) -> Iterator["Callable[..., None] | None"]:
-    """A progress bar on stderr while somebody is watching it, told what is done, all there is and how many got lost."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)
-
-        def update(done: int, total: int, lost: int = 0) -> None:
-            bar.update(task, completed=done, total=total, description=f"{what}, {lost} lost" if lost else what)
-
-        yield update
 
 
 def _default_out() -> Path:
@@ -479,7 +401,3 @@ def _join_save(arguments: list[str]) -> list[str]:
         if arguments[i : i + 2] == ["--save", "every"]:
             return [*arguments[: i + 1], f"every {arguments[i + 2]}", *arguments[i + 3 :]]
     return arguments
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

@@ -141,6 +141,8 @@ def _share_of_ones(block: FrameBlock) -> float:
 
 
 def _markers(records: NDArray[np.void], plan: ScanPlan) -> Finding:
+    if plan.blanking is not None:
+        return Finding("markers", True, "none: a scan finds its columns by a blanking pattern of the laser")
     marks = records["marks"].astype(np.int64)
     at = np.flatnonzero(marks & int(Mark.LINE))
     scans = int(np.count_nonzero(marks & int(Mark.SCAN)))

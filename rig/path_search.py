@@ -22,7 +22,8 @@ class PathDemand:
     """What the scan asks of the mirror.
 
     edges: commands of the lit part's two ends. column_s, frame_s: exact seconds of a column and of a frame. lag_s:
-    longest lag; guard_s: extra time the gate is open on either side; clock_tolerance: relative error of its clock.
+    longest lag; guard_s: extra time the gate is open on either side; clock_tolerance: relative error of its clock;
+    lead_s: further time at constant velocity, not dark.
     """
 
     edges: tuple[float, float]
@@ -34,6 +35,7 @@ class PathDemand:
     clock_tolerance: float
     dark_fraction: float
     bidirectional: bool
+    lead_s: float = 0.0
 
     @property
     def lit_s(self) -> Fraction:
@@ -54,7 +56,7 @@ class PathDemand:
     @property
     def cruise_margin_s(self) -> float:
         """Time at constant velocity beyond the lit part: there the lag is steady while the gate is open."""
-        return self.lag_s + self.gate_margin_s
+        return self.lag_s + self.gate_margin_s + self.lead_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +117,7 @@ def _within_limits(
 
 
 def _path(demand: PathDemand, motion: Motion) -> SweepPath:
-    gate_s = float(demand.lit_s) + 2 * (demand.gate_margin_s + float(demand.frame_s))
+    gate_s = float(demand.lit_s) + 2 * (demand.gate_margin_s + float(demand.frame_s)) + demand.lead_s
     least_s = gate_s / (1 - demand.dark_fraction)
     return sweep_path(
         demand.edges,

@@ -13,7 +13,7 @@ from rig.errors import RecordingError
 from rig.map_queue import AcquiredMap, MapQueue
 from rig.mapping import MakesMaps, Mapping
 from rig.monitor import Monitor, Watch
-from rig.recording import Recorder, Recording
+from rig.recording.recorder import Recorder, Recording
 from rig.source import Source
 from rig.stages import PipelineStats
 from rig.sweeps import MOST_UNDER_WAY, SweepAssembler

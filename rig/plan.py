@@ -26,8 +26,11 @@ from drivers.interfaces import (
     SpadInfo,
     SpadRequest,
     SpadTiming,
+    slices,
 )
 from drivers.interfaces.scanner import check_waveform
+from rig.blanking import MARGIN_FRAMES, MAX_CLOCK_ERROR, Blanking, blanking_for
+from rig.blanking_view import unseen_pattern
 from rig.config import ScanConfig
 from rig.errors import PlanError, UsageError
 from rig.mirror_path import SweepPath, mirrored
@@ -41,10 +44,11 @@ CLOCK_TOLERANCE = 2e-4
 """Relative difference allowed for between SPAD, scanner and sync clocks: three crystals of +-50 ppm, and margin."""
 GUARD_FRAMES = 1.0
 """Frames the gate opens before the first and closes after the last column, so that their own frames are wholly lit."""
-BLOCK_S = 1e-3
-"""Time that the frames of a block span: at any rate Python's cost per block is then a few percent of one core."""
-BLOCK_BYTES = 4 << 20
-"""Most bytes of a block's frames: blocks of big sensors stay in the cache of a laptop."""
+BLOCK_S = 5e-3
+"""Time that the frames of a block span. Each block costs Python some 0.3 ms, part of it on every thread; an estimate
+waits for its block to fill."""
+BLOCK_BYTES = 16 << 20
+"""Most bytes of a block's frames: 512 whole frames of 512 x 512 pixels."""
 
 PointClock = Callable[[float], Fraction]
 
@@ -83,17 +87,13 @@ def compile_plan(
     if plan is not None and plan.mode == "stream" and plan.bytes_per_s > (plan.link_bytes_per_s or 0.0):
         too_fast.append(_beyond_link(plan, info, lambda rate: draft(scan.model_copy(update={"frame_rate": rate}))[0]))
     spad_problems = [min(too_fast)[1]] if too_fast else []  # the stricter limit: the other remedy would not be enough
-    if not info.markers:
-        spad_problems.append(
-            f"the {info.model} SPAD puts no scanner markers into its frames, so they cannot be bound to columns; "
-            "use a SPAD with markers"
-        )
     problems = [*spad_problems, *problems]
     if problems or plan is None:
         raise PlanError(*problems)
-    if plan.burst_frames is not None and plan.burst_frames < plan.frames_per_sweep:
+    if plan.burst_frames is not None and plan.burst_frames < plan.frames_for(1):
+        pilots = ", pilots and the blanking pattern behind it" if plan.pilots else ""
         raise PlanError(
-            f"one sweep takes {float(plan.frames_per_sweep):.0f} frames, the SPAD's memory holds {plan.burst_frames}; "
+            f"one sweep{pilots} takes {plan.frames_for(1):.0f} frames, the SPAD's memory holds {plan.burst_frames}; "
             "lower scan.exposures or scan.columns"
         )
     return plan
@@ -151,6 +151,9 @@ def _draft(
 ) -> tuple[ScanPlan | None, list[str]]:
     """The plan, where there is a mirror path for it, and everything that stands against scanner and calibration."""
     frame_rate = scan.frame_rate if timing is None else timing.tick_hz / timing.frame_period_ticks
+    blanking = None
+    if not info.markers:
+        blanking = blanking_for(scan.columns, scan.exposures, frame_rate)
     demand = PathDemand(
         edges=scan.command_range,
         columns=scan.columns,
@@ -158,9 +161,11 @@ def _draft(
         frame_s=1 / frame_rate,
         lag_s=max(model.lag_s if model is not None else Lag()),
         guard_s=GUARD_FRAMES / float(frame_rate),
-        clock_tolerance=CLOCK_TOLERANCE,
+        # Without markers nothing says that the gate was low on a column: it is open on all of them for sure.
+        clock_tolerance=CLOCK_TOLERANCE if blanking is None else MAX_CLOCK_ERROR,
         dark_fraction=scan.dark_fraction,
         bidirectional=scan.bidirectional,
+        lead_s=0.0 if blanking is None else blanking.lead_s + MARGIN_FRAMES / float(frame_rate),
     )
     wrong_model = _model_problems(scan, model, info, demand.speed_per_s)
     found = find_path(demand, limits, point_clock)
@@ -171,13 +176,13 @@ def _draft(
     if found.path is None or problems:
         return None, problems
     try:
-        plan = _plan(scan, found.path, found.rate_hz, demand, model, info, timing)
+        plan = _plan(scan, found.path, found.rate_hz, demand, model, info, timing, blanking)
         check_waveform(plan.waveform, limits, plan.point_rate_hz, seamless=True)
     except LimitExceeded as error:
         return None, [f"scan: {error}"]
     except PlanError as error:
         return None, list(error.problems)
-    return plan, []
+    return plan, unseen_pattern(plan, model)
 
 
 def _plan(
@@ -188,6 +193,7 @@ def _plan(
     model: RigModel | None,
     info: SpadInfo,
     timing: SpadTiming | None,
+    blanking: Blanking | None,
 ) -> ScanPlan:
     """The plan along a mirror path; whether the SPAD's link carries it is for the caller to judge."""
     legs = _legs(path, scan, model.lag_s if model is not None else Lag(), demand.gate_margin_s, rate)
@@ -220,8 +226,10 @@ def _plan(
         link_bytes_per_s=info.stream.bytes_per_s if info.stream is not None else None,
         windows=None,
         windowed=False,
+        blanking=blanking,
     )
-    return _transported(_with_windows(plan, info.roi_step_px), info.burst)
+    # Line markers move the windows, also in whole frames; without them every pixel of a frame is used.
+    return _transported(plan if blanking else _with_windows(plan, info.roi_step_px), info.burst)
 
 
 def _with_windows(plan: ScanPlan, step_px: int) -> ScanPlan:
@@ -290,12 +298,21 @@ def _markers(path: SweepPath, scan: ScanConfig) -> tuple[int, NDArray[np.int64]]
     return step, np.array(points, np.int64)
 
 
+def _scan_marker_points(leg: Leg, rate: Fraction) -> int:
+    """How long the scan marker, which holds the gate, stays high: until the middle of the gate's last slice.
+
+    So neither the scanner's clock nor the sync source's decides when the gate closes, while they differ by less.
+    """
+    lit_s = leg.gate_close_s - leg.gate_open_s
+    return max(1, math.floor((leg.gate_close_s - lit_s / slices(lit_s) / 2) * rate))
+
+
 def _waveform(legs: tuple[Leg, ...], marker_points: NDArray[np.int64], rate: Fraction) -> ScanWaveform:
     commands, words = [], []
     for leg in legs:
         commands.append(leg.path.command(np.arange(leg.path.points, dtype=np.float64)))
         markers = np.full(leg.path.points, LEVEL_BACKWARD if leg.direction < 0 else 0, np.uint8)
-        markers[0] |= MARKER_SCAN
+        markers[: _scan_marker_points(leg, rate)] |= MARKER_SCAN
         markers[marker_points] |= MARKER_LINE
         words.append(markers)
     return ScanWaveform(np.concatenate(commands), np.concatenate(words), rate)

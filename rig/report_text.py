@@ -9,7 +9,7 @@ from rich.table import Table
 from rig.effects import Effect
 from rig.run import RunResult
 from rig.stages import PipelineStats
-from rig.summary import Summary, Verdict
+from rig.summary import Summary, Synchronisation, Verdict
 
 WIDE = 300
 """Characters; wider than any line here."""
@@ -19,7 +19,7 @@ LEAST_WAIT_S = 1e-3
 
 _NEXT_STEP = {
     Verdict.GAPS: "frames were lost; lower frame_rate or free the computer, then scan again",
-    Verdict.UNSYNCHRONISED: "markers do not fit the plan; check the marker cable and the clocks",
+    Verdict.UNSYNCHRONISED: "columns of frames are not sure; check marker cables, or light in the run-in, and clocks",
     Verdict.UNCALIBRATED: "there is no calibration, so no depth; name one in the config",
     Verdict.ABORTED: "the run ended before its last map; whole maps are kept",
 }
@@ -81,6 +81,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
             f"{summary.sensor_time_s:.3g} s of sensor, {summary.compute_time_s:.3g} s of computing "
             f"(real time x {_number(summary.realtime_factor)})",
         ),
+        *(() if summary.sync is None else (("sync", _sync(summary.sync)),)),
         *(() if summary.stages is None else (("stages", _stages(summary.stages)),)),
         ("filled", f"{_percent(summary.valid_fraction)} of the pixels have a depth"),
     ]
@@ -104,6 +105,11 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
             ("depth error", f"mean {_number(depth['mean_abs'])} m, median {_number(depth['median_abs'])} m"),
         ]
     return rows
+
+
+def _sync(sync: Synchronisation) -> str:
+    found = "" if sync.detection_probability is None else f", detected with p = {sync.detection_probability:.6g}"
+    return f"by {sync.by}{found}, residual {_number(sync.residual_columns, 2)} columns, clock {sync.clock_error:+.2g}"
 
 
 def _stages(stages: PipelineStats) -> str:

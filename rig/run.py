@@ -13,10 +13,10 @@ from drivers.interfaces import SweepTruth
 from rig.errors import UsageError
 from rig.outputs import Rays, RunFolder
 from rig.reconstruction import MapResult
-from rig.recording import FIRST_FILE, Recording
+from rig.recording.recorder import FIRST_FILE, Recording
 from rig.saving import SavePolicy
 from rig.stages import PipelineStats
-from rig.summary import MapTally, RunFrames, Summary, Verdict
+from rig.summary import MapTally, RunFrames, Summary, Synchronisation, Verdict
 
 Progress = Callable[[int, int], None]
 """Called now and then with what is done and what there is to do, in frames or maps."""
@@ -101,9 +101,10 @@ class Run:
         verdict: Verdict,
         manifest: Mapping[str, Any],
         stages: PipelineStats | None = None,
+        sync: Synchronisation | None = None,
     ) -> RunResult:
         """Write manifest and summary and make the folder appear; one without a map or a recorded block leaves none."""
-        summary = self.tally.summary(frames, sensor_time_s, verdict, stages)
+        summary = self.tally.summary(frames, sensor_time_s, verdict, stages, sync)
         index, result, truth = self._last or (None, None, None)
         folder = None
         if self._folder is not None and self.worth_keeping:

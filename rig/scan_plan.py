@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.frames import frame_bytes
 from drivers.interfaces import OUT_GATE, Pulse, ScanWaveform, SpadMode, WindowTable
+from rig.blanking import CODE, Blanking
 from rig.mirror_path import SweepPath
 
 Array = NDArray[np.float64]
@@ -46,7 +47,8 @@ class ScanPlan:
     commands: float64 (columns,), mirror command of each column's centre. x0: int32 (columns,), first stored pixel of
     each column's window; window: stored pixels per row; both multiples of 64. windows: the pixels of each frame that
     are used, by the markers before it; None: all. windowed: whether the SPAD sends only these. link_bytes_per_s: what
-    its link carries, None where it cannot stream.
+    its link carries, None where it cannot stream. blanking: the pattern that binds frames where the SPAD has no markers
+    for them; None: it has.
     """
 
     columns: int
@@ -72,6 +74,7 @@ class ScanPlan:
     link_bytes_per_s: float | None
     windows: WindowTable | None
     windowed: bool
+    blanking: Blanking | None = None
 
     @property
     def sweeps_per_period(self) -> int:
@@ -101,7 +104,8 @@ class ScanPlan:
     @property
     def dark_fraction(self) -> float:
         """Least share of a sweep's frames taken wholly with the gate low."""
-        gate_s = max(leg.gate_close_s - leg.gate_open_s for leg in self.legs)
+        lead_s = 0.0 if self.blanking is None else self.blanking.lead_s
+        gate_s = max(leg.gate_close_s - leg.gate_open_s for leg in self.legs) + lead_s
         return max(0.0, 1 - (gate_s + 2 / float(self.frame_rate_hz)) / float(self.sweep_s))
 
     @property
@@ -189,28 +193,60 @@ class ScanPlan:
         first, last = self.command_range
         return first + (np.asarray(column, np.float64) + 0.5) * ((last - first) / self.columns)
 
+    @property
+    def pilots(self) -> int:
+        """Sweeps with the blanking pattern alone, before the first map: they and its own give the clock ratio."""
+        return 0 if self.blanking is None else len(self.legs)
+
+    def pattern_s(self, leg: Leg) -> float:
+        """When the blanking pattern begins, from the scan marker of a sweep of this leg."""
+        return leg.gate_open_s - (0.0 if self.blanking is None else self.blanking.lead_s)
+
+    def frames_for(self, maps: int) -> float:
+        """Frames from the first scan marker until the end of `maps` maps is known, nominally."""
+        frames = (self.pilots + maps) * float(self.frames_per_sweep)
+        if self.blanking is None:
+            return frames
+        known_s = max(leg.gate_open_s for leg in self.legs) + self.blanking.tolerance_s
+        return frames + known_s * float(self.frame_rate_hz)
+
     def sync_program(self, maps: int) -> tuple[tuple[Pulse, ...], int]:
-        """Pulses and repeats that open the gate once in each of `maps` sweeps and then leave it low."""
+        """Pulses and repeats that open the gate once in each of `maps` sweeps and then leave it low.
+
+        With a blanking pattern there is one in each of them, in the pilots before them and in the sweep behind them.
+        """
+        if self.blanking is not None:
+            lit = range(self.pilots, self.pilots + maps)
+            sweeps = range(lit.stop + 1)
+            return tuple(p for sweep in sweeps for p in self._pulses(sweep, sweep in lit)), 1
         whole, rest = divmod(maps, len(self.legs))
-        if rest == 0:
-            return tuple(p for leg in self.legs for p in self._pulses(leg)), whole
-        return tuple(p for sweep in range(maps) for p in self._pulses(self.leg(sweep))), 1
+        sweeps, repeats = (range(len(self.legs)), whole) if rest == 0 else (range(maps), 1)
+        return tuple(p for sweep in sweeps for p in self._pulses(sweep, True)), repeats
 
     def scanner_repeats(self, maps: int) -> int:
-        """Repetitions of the waveform that hold `maps` sweeps and the scan marker that closes the last one."""
-        return -(-(maps + 1) // len(self.legs))
+        """Repetitions of the waveform that hold pilots, `maps` sweeps and what closes the last one."""
+        return -(-(self.pilots + maps + 1) // len(self.legs))
 
     def readout_s(self, frames: int) -> float:
         """Seconds to read `frames` out after a burst; 0 for a stream, which sends them as it goes."""
         return frames * self.frame_bytes / self.readout_bytes_per_s if self.readout_bytes_per_s else 0.0
 
-    def _pulses(self, leg: Leg) -> tuple[Pulse, ...]:
-        return (
-            Pulse(0, None),  # gate low while waiting: a scanner that stands still is never lit
-            Pulse(0, leg.gate_open_s),
-            Pulse(OUT_GATE, leg.gate_close_s - leg.gate_open_s),
-            Pulse(0, float(1 / self.frame_rate_hz)),
-        )
+    def _gate_s(self, sweep: int, lit: bool) -> list[tuple[float, float]]:
+        """(open, close) of the gate from the scan marker of a sweep, ascending."""
+        leg = self.leg(sweep)
+        flashes = () if self.blanking is None else self.blanking.flashes_s(sweep % len(self.legs))
+        begin_s = self.pattern_s(leg)
+        times = [(begin_s + opened, begin_s + closed) for opened, closed in flashes]
+        return [*times, (leg.gate_open_s, leg.gate_close_s)] if lit else times
+
+    def _pulses(self, sweep: int, lit: bool) -> list[Pulse]:
+        pulses = [Pulse(0, None)]  # gate low while waiting: a scanner that stands still is never lit
+        at_s = 0.0
+        for opened, closed in self._gate_s(sweep, lit):
+            pulses += [Pulse(0, opened - at_s), Pulse(OUT_GATE, closed - opened, held=True)]
+            at_s = closed
+        # Low until this sweep's scan marker has fallen, which it does just before the gate closes.
+        return [*pulses, Pulse(0, self.leg(sweep).gate_close_s - at_s + float(1 / self.frame_rate_hz))]
 
     def describe(self) -> str:
         """The plan for people, a few lines."""
@@ -230,10 +266,22 @@ class ScanPlan:
             f"maps        {self.map_rate_hz:.2f} a second from {float(self.frames_per_sweep):.1f} frames "
             f"({float(self.sweep_s) * 1e3:.1f} ms of sensor time), {self.dark_fraction:.1%} of them dark",
             f"gate        {gate.gate_open_s * 1e3:.3f} to {gate.gate_close_s * 1e3:.3f} ms after the scan marker",
+            f"sync        {self._describe_sync()}",
             f"window      {self.window} of {self.width} pixels for {near:g} to {far:g} m",
             f"link        {self._describe_link()}",
         )
         return "\n".join(lines)
+
+    def _describe_sync(self) -> str:
+        if self.blanking is None:
+            return "by the scanner's markers in the frames"
+        leg, frames = self.legs[0], self.blanking.chip_s * float(self.frame_rate_hz)
+        begin_s = self.pattern_s(leg)
+        return (
+            f"by a blanking pattern in the run-in, {len(CODE)} chips of {frames:.3f} frames, {begin_s * 1e3:.3f} to "
+            f"{(begin_s + self.blanking.length_s) * 1e3:.3f} ms; {self.pilots} pilot "
+            f"{'sweep' if self.pilots == 1 else 'sweeps'} before the first map of a burst"
+        )
 
     def _describe_link(self) -> str:
         sent = "full frames"

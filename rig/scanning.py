@@ -22,7 +22,7 @@ from rig.reconstruction import Reconstructor
 from rig.run import Run, RunResult
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, prepare
-from rig.summary import RunFrames, Verdict
+from rig.summary import RunFrames, Synchronisation, Verdict
 from rig.sweeps import SweepAccount
 from rig.warm_up import warm_up
 
@@ -96,6 +96,7 @@ def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, options: ScanOptions 
             "on_overload": options.policy.value,
         },
         acquisition.stages,
+        _synchronisation(sweeps),
     )
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:
@@ -201,6 +202,19 @@ def _frames(sweeps: list[SweepAccount], crc_errors: int | None) -> RunFrames:
     )
 
 
+def _synchronisation(sweeps: list[SweepAccount]) -> Synchronisation | None:
+    if not sweeps:
+        return None
+    residuals = [sweep.residual_columns for sweep in sweeps]
+    found = [sweep.detection for sweep in sweeps if sweep.detection is not None]
+    return Synchronisation(
+        by="blanking pattern" if found else "markers",
+        residual_columns=None if any(map(math.isnan, residuals)) else max(residuals),
+        clock_error=max((sweep.clock_error for sweep in sweeps), key=abs),
+        detection_probability=min(found) if found else None,
+    )
+
+
 def _verdict(sweeps: list[SweepAccount], model: RigModel | None, *, aborted: bool) -> Verdict:
     """The gravest that applies."""
     if aborted:
@@ -226,4 +240,5 @@ def _sweep_content(sweep: SweepAccount) -> dict[str, Any]:
         "dark": sweep.frames.dark,
         "clock_error": sweep.clock_error,
         "residual_columns": sweep.residual_columns,
+        "detection_probability": sweep.detection,
     }

@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -46,6 +46,20 @@ class RunFrames:
     lit: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class Synchronisation:
+    """By what the frames of a run were bound to columns, and how well.
+
+    residual_columns, clock_error: the largest of its sweeps; None where one could not be checked.
+    detection_probability: the least, of a blanking pattern as bright as theirs to be found; None: bound by markers.
+    """
+
+    by: Literal["markers", "blanking pattern"]
+    residual_columns: float | None
+    clock_error: float
+    detection_probability: float | None
+
+
 Errors = Mapping[str, float | None]
 
 
@@ -76,15 +90,18 @@ class Summary:
     truth: TruthErrors | None
     verdict: Verdict
     stages: PipelineStats | None = None
+    sync: Synchronisation | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """The summary as plain values; `truth` only where it is known, `stages` only of a scan."""
+        """The summary as plain values; `truth` only where it is known, `stages` and `sync` only of a scan."""
         content = asdict(self)
         content["verdict"] = self.verdict.value
         if self.truth is None:
             del content["truth"]
         if self.stages is None:
             del content["stages"]
+        if self.sync is None:
+            del content["sync"]
         return content
 
 
@@ -121,7 +138,12 @@ class MapTally:
         self._maps.append(_OfMap(compute_s, valid, result.fog, errors))
 
     def summary(
-        self, frames: RunFrames, sensor_time_s: float, verdict: Verdict, stages: PipelineStats | None = None
+        self,
+        frames: RunFrames,
+        sensor_time_s: float,
+        verdict: Verdict,
+        stages: PipelineStats | None = None,
+        sync: Synchronisation | None = None,
     ) -> Summary:
         """The run so far."""
         errors = [each.errors for each in self._maps if each.errors is not None]
@@ -143,6 +165,7 @@ class MapTally:
             truth=truth,
             verdict=verdict,
             stages=stages,
+            sync=sync,
         )
 
 

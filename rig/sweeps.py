@@ -47,7 +47,7 @@ class SweepAccount:
     direction: +1 where the mirror command rose, -1 where it fell; column indices mean the same commands both ways.
     residual_columns: largest distance of a marker from the sweep's clock line; synchronised: whether that and the clock
     are within their limits. gaps: (first, last) numbers of frames exposed but not received. first_frame, end_frame:
-    frame numbers from this scan marker to the next.
+    frame numbers from this scan marker to the next. detection: as in `SweepClock`.
     """
 
     index: int
@@ -59,6 +59,7 @@ class SweepAccount:
     gaps: tuple[Gap, ...]
     first_frame: int
     end_frame: int
+    detection: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,6 +156,7 @@ class SweepAssembler:
             gaps=tuple(gaps),
             first_frame=clock.first_frame,
             end_frame=clock.end_frame,
+            detection=clock.detection,
             count_s=self._count_s,
         )
         _warn(data)
@@ -218,7 +220,8 @@ def _warn(sweep: SweepData) -> None:
         _log.warning(
             "sweep %d: %d frames were lost in %d gaps, the first from %d to %d", sweep.index, lost, gaps, *first
         )
+    what = "markers" if sweep.detection is None else "blanking patterns"
     if math.isnan(sweep.residual_columns):
-        _log.warning("sweep %d: too few markers were received to check its clock", sweep.index)
+        _log.warning("sweep %d: too few %s were received to check its clock", sweep.index, what)
     elif not sweep.synchronised:
-        _log.warning("sweep %d: markers stray %.3g columns from its clock", sweep.index, sweep.residual_columns)
+        _log.warning("sweep %d: %s stray %.3g columns from its clock", sweep.index, what, sweep.residual_columns)

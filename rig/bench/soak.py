@@ -31,7 +31,7 @@ from rig.mapping import MakesMaps
 from rig.monitor import MonitorView
 from rig.overload import Overload, require_policy
 from rig.reconstruction import MapResult, Reconstructor
-from rig.recording import Recording
+from rig.recording.recorder import Recording
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, open_rig, prepare
 from rig.stages import PipelineStats

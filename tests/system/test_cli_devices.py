@@ -49,6 +49,12 @@ def test_an_unknown_config_is_a_usage_error(rig, command):
     assert len(ran.problems) == 1
 
 
+def test_a_dry_run_of_a_real_rig_needs_no_arming_and_names_every_device_that_is_absent(rig):
+    ran = rig("scan", "lab", "--dry-run")
+    assert ran.code == 3
+    assert [line.split(": ")[1] for line in ran.problems] == ["spad", "scanner", "laser", "sync"]
+
+
 def test_a_real_rig_is_not_scanned_without_arming(rig):
     ran = rig("scan", "lab")
     assert ran.code == 2

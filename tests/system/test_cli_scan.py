@@ -20,7 +20,7 @@ from drivers.ring import BlockRing
 from drivers.spb1 import walk_blocks
 from rig.outputs import RunFolder
 from rig.reconstruction import MapResult, Reconstructor
-from rig.recording import Recording
+from rig.recording.recorder import Recording
 from tests.system.conftest import Rig
 from tests.system.small_rig import HEIGHT, WIDTH, config, write_rig
 

@@ -1,34 +1,39 @@
 """The whole way with real drivers: config -> driver -> pyusb, pyserial -> emulated devices -> depth map through fog."""
 
 import json
+import threading
+import time
 
+import numpy as np
 import pytest
 
+from drivers.spb1.control import Op
 from rig import api
-from sim_backend.wire.emulated_world import EmulatedWorld
+from sim_backend.wire.emulated_world import KEPT_S, EmulatedWorld
 
 TRUE_EXTINCTION_PER_M = 0.087
 
 
 @pytest.fixture
-def dark_at_the_end(monkeypatch):
-    """What gate and laser were when the emulated devices were unplugged: light, not commands."""
+def worlds(monkeypatch):
+    """The emulated worlds, each with what was recorded of it when its devices were unplugged."""
     seen = []
     close = EmulatedWorld.close
 
     def look(world):
-        with world._gate_wire.lock:
+        if world not in [one for one, _ in seen]:
             now_s = world.bench.clock.now_ns() / 1e9
-            world.sync.advance(now_s)
-            gate = world.sync.gate_level(now_s)
-        seen.append(not (gate and world.laser.emitting))
+            seen.append((world, now_s))
+            with world.gate_wire.lock, world.laser_wire.lock:
+                world.sync.advance(now_s)
+                assert not (world.sync.gate_level(now_s) and world.laser.emitting)
         close(world)
 
     monkeypatch.setattr(EmulatedWorld, "close", look)
     return seen
 
 
-def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(tmp_path, dark_at_the_end):
+def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(tmp_path, worlds):
     result = api.scan("lab-emulated", out=tmp_path / "run")
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["verdict"] == "complete"
@@ -38,18 +43,33 @@ def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(tmp_path, da
     assert summary["truth"]["stripe_error_px"]["median_abs"] < 0.25
     assert summary["fog"]["extinction_per_m"] == pytest.approx(TRUE_EXTINCTION_PER_M, abs=0.02)
     assert result.folder == tmp_path / "run"
-    assert dark_at_the_end == [True]
+    ((world, ended_s),) = worlds
+    assert world.light(ended_s - KEPT_S, ended_s)
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("photons")]
 
 
-def test_the_doctor_says_that_it_could(tmp_path, dark_at_the_end):
+def test_a_dry_run_opens_every_device_and_neither_moves_nor_shines(worlds):
+    begun_s = time.monotonic()
+    plan = api.plan_scan("lab-emulated")
+    assert plan.columns == 250
+    ((world, ended_s),) = worlds
+    assert len(world.laser.commands) > 5
+    assert Op.READ in [op for op, _, _ in world.spad.commands]
+    assert not any(power_w for _, power_w in world.emission())
+    assert world.light(begun_s, ended_s) == []
+    assert np.ptp(world.mirror(np.linspace(begun_s, ended_s, 1000))) == 0
+
+
+def test_the_doctor_says_that_it_could(tmp_path, worlds):
     findings = {one.name: one for one in api.doctor("lab-emulated", out=tmp_path)}
     assert all(one.ok for one in findings.values()), findings
     assert "owns laser and gate" in findings["guard"].text
-    assert dark_at_the_end == [True]
+    ((world, ended_s),) = worlds
+    assert world.light(ended_s - KEPT_S, ended_s) == []
 
 
-def test_the_laser_is_switched_off_without_a_scan(dark_at_the_end):
+def test_the_laser_is_switched_off_without_a_scan(worlds):
     done = api.laser_off("lab-emulated")
     assert any("all outputs low" in line for line in done)
     assert any("emission off" in line for line in done)
-    assert dark_at_the_end == [True]
+    assert len(worlds) == 1

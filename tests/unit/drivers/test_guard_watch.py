@@ -51,9 +51,10 @@ def test_a_machine_that_stood_still_is_no_silence(watch: FrameWatch) -> None:
     assert LIMITS.frames_within_s > MAX_STEP_S
 
 
-def test_without_a_start_nothing_is_watched(watch: FrameWatch) -> None:
+def test_without_a_start_no_frames_are_asked_for(watch: FrameWatch) -> None:
     watch.stop()
-    assert watch.look(100.0, 0, True, lambda: False) is None
+    assert watch.look(100.0, 0, False, lambda: False) is None
+    assert watch.look(100.0, 0, True, lambda: False) == "is stopped"
     assert silence_until_trouble(watch, busy=False) == float("inf")
 
 

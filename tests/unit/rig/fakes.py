@@ -11,7 +11,7 @@ import numpy as np
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceTimeout
 from drivers.frames import BlockFlag
-from drivers.interfaces import LaserLimits, LaserStatus, SpadCounters, SpadTiming
+from drivers.interfaces import LaserLimits, LaserStatus, ScannerStatus, SpadCounters, SpadTiming
 from rig.acquisition import Acquisition
 from rig.counting import SweepCounter
 from rig.reconstruction import FogEstimate, MapResult
@@ -40,10 +40,16 @@ class Device:
 
 
 class FakeScanner(Device):
+    fault = None
+
     def load(self, waveform, repeats):
         self.told("load")
         self.repeats = repeats
         return waveform.point_rate_hz
+
+    @property
+    def status(self):
+        return ScannerStatus(True, self.fault, None)
 
     def start(self):
         self.told("start")
@@ -70,6 +76,11 @@ class FakeLaser(Device):
 
 
 class FakeSync(Device):
+    most = None
+
+    def most_repeats(self, pulses):
+        return self.most
+
     def program(self, pulses, repeats):
         self.told("program")
 

@@ -160,7 +160,7 @@ def stream_of(
     command = np.tile(plan.waveform.command, repeats)
     markers = np.tile(plan.waveform.markers, repeats)
     edge_s = latency_s + np.arange(len(command)) / rate
-    scan_s = edge_s[(markers & MARKER_SCAN) != 0]
+    scan_s = edge_s[np.flatnonzero(np.diff(markers & MARKER_SCAN, prepend=0) > 0)]
     line_s = edge_s[(markers & MARKER_LINE) != 0]
     frame_s = period / float(TICK_HZ)
     n = int((scan_s[maps] + plan.sweep_points / rate * 0.1) / frame_s) + 1

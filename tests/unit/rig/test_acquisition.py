@@ -172,6 +172,21 @@ def test_bursts_are_taken_in_groups_and_numbered_through():
     assert rig.spad.n_frames <= 900
 
 
+def test_sweeps_are_taken_in_groups_that_a_program_holds():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG), stream_of(PLAN, 1, lag=LAG)])
+    rig.sync.most = 2
+    assert [found.sweep.index for found in acquisition(rig, PLAN, 3).run()] == [0, 1, 2]
+    assert log == 2 * (START + STOP)
+
+
+def test_a_scanner_that_stops_early_ends_the_scan():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
+    rig.scanner.fault = "scanner: the points ran dry"
+    with pytest.raises(DeviceFault, match="ran dry"):
+        list(acquisition(rig, PLAN, 5).run())
+    assert log == START + STOP
+
+
 def sweeps_of(plan, blocks, maps):
     layout = SweepLayout(plan.columns, HEIGHT, WIDTH, plan.x0, plan.window, plan.exposures)
     counter = SweepCounter(layout, RowWorkers(1))

@@ -16,7 +16,7 @@ from drivers.spb1 import walk_blocks
 from rig import overload, pipeline
 from rig.errors import RecordingError, UsageError
 from rig.overload import Overload
-from rig.recording import FIRST_FILE, Recording
+from rig.recording.recorder import FIRST_FILE, Recording
 from tests.unit.rig.fakes import (
     PATIENCE_S,
     START,

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from calibration.model import Lag
 from drivers.clock import VirtualClock
-from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, OUT_GATE, OUT_MARKER, Pulse, ScanWaveform
+from drivers.interfaces import (
+    HOLD_S,
+    LEVEL_BACKWARD,
+    MARKER_LINE,
+    MARKER_SCAN,
+    OUT_GATE,
+    OUT_MARKER,
+    Pulse,
+    ScanWaveform,
+)
 from sim_backend.bench import Bench
 from sim_backend.gate_program import GateProgram
 from sim_backend.mirror_motion import Playing
@@ -72,9 +81,14 @@ def test_edges_are_found_once_however_time_is_cut(cuts: list[float]) -> None:
     np.testing.assert_array_equal(found, playing.edges(MARKER_LINE, 0.5, 2.0))
 
 
-def _edges(times: list[float]):  # type: ignore[no-untyped-def]
-    at = np.array(times)
-    return lambda from_s, until_s: at[(at >= from_s) & (at < until_s)]
+def _edges(times: list[float], width_s: float = 0.0):  # type: ignore[no-untyped-def]
+    """A trigger that is high for a while from each of these times on."""
+
+    def first_high(from_s: float, until_s: float) -> float | None:
+        found = [max(t, from_s) for t in times if t + width_s >= from_s and t < until_s]
+        return found[0] if found else None
+
+    return first_high
 
 
 @pytest.mark.parametrize("step", [0.01, 0.13, 10.0])
@@ -86,6 +100,19 @@ def test_the_gate_program_waits_for_each_trigger_and_ends_low(step: float) -> No
     np.testing.assert_allclose(times, [0.0, 1.0, 1.2, 1.7, 3.0, 3.2, 3.7])
     assert words.tolist() == [0, OUT_MARKER, OUT_GATE, 0, OUT_MARKER, OUT_GATE, 0]
     assert program.ended
+
+
+@pytest.mark.parametrize("step", [1e-4, 0.13])
+def test_a_held_pulse_lasts_as_long_as_the_marker_and_not_a_slice_longer(step: float) -> None:
+    lit_s = 20 * HOLD_S
+    program = GateProgram([Pulse(0, None), Pulse(0, HOLD_S), Pulse(OUT_GATE, lit_s, held=True), Pulse(0, 1.0)], 2, 0.0)
+    trigger = _edges([1.0], 21 * HOLD_S - HOLD_S / 2), _edges([3.0], 5.2 * HOLD_S)
+    for until in np.arange(step, 5, step):
+        program.advance(float(until), lambda a, b: trigger[0](a, b) or trigger[1](a, b))
+    times, words = program.levels(0.0, 5.0)
+    np.testing.assert_allclose(times, [0.0, 1 + HOLD_S, 1 + 21 * HOLD_S, 3 + HOLD_S, 3 + 6 * HOLD_S])
+    assert words.tolist() == [0, OUT_GATE, 0, OUT_GATE, 0]
+    assert program.waiting
 
 
 def test_lowering_the_gate_keeps_the_past_and_lasts() -> None:

@@ -1,0 +1,276 @@
+"""Writes marks and sweep numbers into the records of frames that carry none, from the blanking pattern in their light.
+
+    nothing known --a pattern, and the next one a sweep later--> sweep 0 --the pattern where it is expected--> sweep 1
+
+Scan markers lie on a straight line of time, which is fitted to all patterns found so far: one that is missing, because
+frames were lost or nothing was in the light's way, is taken from that line. A sweep begins, for those who count, with
+the frame at which its pattern has surely passed, just before the gate opens for the lit part. All of that depends on
+the frames before it only, not on the size of blocks, and never on the host's time or the device's word for its clock.
+"""
+
+import logging
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import DeviceFault
+from drivers.frames import BlockFlag, BlockHeader, FrameBlock, Mark
+from rig.blanking import MARGIN_FRAMES, MAX_CLOCK_ERROR, Blanking
+from rig.blanking_search import LEAST_SCORE, Found, PatternSearch, PatternShape, detection_probability
+from rig.geometry import WORD_PX
+from rig.marker_line import MarkerLine
+from rig.scan_plan import ScanPlan
+
+_log = logging.getLogger(__name__)
+
+SEARCH_S = 10.0
+"""A stream without two patterns a sweep apart for so long, sweeps apart, is given up."""
+CLEAR_SCORE = 2 * LEAST_SCORE
+"""A pattern that stands out so clearly is one: light is not what is missing."""
+ASIDE_PX = 64
+"""In the run-in the stripe is a little beside the window of the first column."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SweepPlace:
+    """Where a sweep lies. frame: from which it counts. scan_frame: place of its scan marker, in frames. ratio: of the
+    scanner's clock to nominal, in the SPAD's time. found: its pattern; None: taken from the line of the others."""
+
+    number: int
+    frame: int
+    scan_frame: float
+    ratio: float
+    found: Found | None
+
+    @property
+    def detection(self) -> float:
+        """Chance that a pattern as bright as this one is found; 0: it was not."""
+        return 0.0 if self.found is None else detection_probability(self.found.score)
+
+
+@dataclass(frozen=True, slots=True)
+class SweepEnd:
+    """What the pattern behind a sweep says of it: relative clock error, distance of that pattern from where the ones
+    before it put it (or how surely it is known, where that is more), and how many patterns that rests on."""
+
+    clock_error: float
+    residual_frames: float
+    patterns: int
+
+
+class BlankingSync:
+    """Finds the sweeps of one run, block by block. Indices count sweeps of the waveform, numbers those of the maps."""
+
+    def __init__(self, plan: ScanPlan) -> None:
+        assert plan.blanking is not None, "only such a plan is bound by its light"
+        self._plan = plan
+        self._blanking: Blanking = plan.blanking
+        self._rate = float(plan.frame_rate_hz)
+        self._period = float(plan.frames_per_sweep)
+        self._tolerance = self._blanking.tolerance_s * self._rate
+        exposure = min(plan.exposure_s * self._rate, 1.0)
+        self._shapes = [
+            PatternShape(np.array(self._blanking.flashes_s(leg)) * self._rate, exposure) for leg in range(plan.pilots)
+        ]
+        self._searches = [PatternSearch(shape) for shape in self._shapes]
+        self._delay = [plan.pattern_s(leg) * self._rate for leg in plan.legs]
+        """Frames from the scan marker to the pattern, by leg."""
+        self._words = [_words(plan, leg.columns_rise) for leg in plan.legs]
+        self._kept = math.ceil(3 * self._shapes[0].length + 2 * self._tolerance) + 8 * math.ceil(MARGIN_FRAMES)
+        self._ones: Array = np.empty((len(plan.legs), 0))
+        self._ones_first = 0
+        self._origin: int | None = None
+        self._best: tuple[float, int, int] | None = None
+        """Score, frame and leg of the best window since it first looked like a pattern."""
+        self._most: tuple[float, int] = (0.0, 0)
+        """Highest score of all, and its frame: to be told where nothing is found."""
+        self._pilots: list[tuple[int, Found]] = []
+        """Index and pattern of what may be the first ones."""
+        self._line = MarkerLine()
+        self._next: int | None = None
+        """Index of the sweep whose pattern is expected next; None: nothing is known yet."""
+        self._places: dict[int, SweepPlace] = {}
+        self._ends: dict[int, SweepEnd] = {}
+        self._now: SweepPlace | None = None
+
+    def mark(self, block: FrameBlock, records: NDArray[np.void]) -> None:
+        """Fill marks, line and sweep of the block's `records` (n,).
+
+        DeviceFault where the run, or `SEARCH_S`, ends without two patterns a sweep apart.
+        """
+        header, n = block.header, block.n_frames
+        self._count(block)
+        records["line"] = 0
+        at, last = header.first_frame, header.first_frame + n - 1
+        if self._next is None:
+            self._look(header.first_frame, last)
+        while (place := self._begin_next(last)) is not None:
+            begin = max(place.frame, at)  # later, where the frames in which it began were lost
+            self._write(records[at - header.first_frame : begin - header.first_frame], at)
+            self._now, at = place, begin
+        self._write(records[at - header.first_frame :], at)
+        if self._next is None:
+            self._give_up(header, last)
+
+    def place(self, number: int) -> SweepPlace:
+        """Where the sweep of map `number` lies; it is forgotten with the end of the sweep."""
+        return self._places[number]
+
+    def end(self, number: int) -> SweepEnd:
+        """What is known of that sweep, once the next one has begun."""
+        del self._places[number]
+        return self._ends.pop(number)
+
+    def _count(self, block: FrameBlock) -> None:
+        """The ones of each frame, where each leg's run-in is seen; lost frames are NaN."""
+        first = block.header.first_frame
+        if self._origin is None:
+            self._origin = self._ones_first = first
+        words = block.bits.view(np.uint64)
+        ones = np.stack([np.bitwise_count(words[:, :, a:b]).sum(axis=(1, 2), dtype=np.float64) for a, b in self._words])
+        gap = min(first - self._ones_first - self._ones.shape[1], self._kept)
+        lost = np.full((len(ones), gap), np.nan)
+        self._ones = np.concatenate([self._ones[:, max(0, self._ones.shape[1] - self._kept) :], lost, ones], axis=1)
+        self._ones_first = first + block.n_frames - self._ones.shape[1]
+
+    def _look(self, first: int, last: int) -> None:
+        """Take up patterns that lie anywhere in the frames so far."""
+        hits: list[tuple[int, float, int]] = []
+        for leg, search in enumerate(self._searches):
+            begin = max(first - search.window + 1, self._ones_first)
+            ones = self._ones[leg, begin - self._ones_first :]
+            if len(ones) < search.window:
+                continue
+            score, like = search.scores(ones)
+            frames = begin + np.arange(len(score)) + search.window - 1
+            highest = int(np.argmax(np.nan_to_num(score)))
+            if score[highest] > self._most[0]:
+                self._most = float(score[highest]), int(frames[highest]) - search.window + 1
+            hits += [(int(frames[i]), float(score[i]), leg) for i in np.flatnonzero(like)]
+        hold = math.ceil(self._shapes[0].length)
+        for frame, score_here, leg in [*sorted(hits), (last + 1, 0.0, 0)]:
+            if self._best is not None and frame > self._best[1] + hold:
+                self._take_up(*self._best[1:])
+                self._best = None
+            if score_here and (self._best is None or score_here > self._best[0]):
+                self._best = score_here, frame, leg
+
+    def _take_up(self, frame: int, leg: int) -> None:
+        search = self._searches[leg]
+        begin = frame - search.window + 1 + MARGIN_FRAMES
+        found = search.measure(self._ones[leg], self._ones_first, begin, math.ceil(self._shapes[leg].flashes[0, 1]) + 1)
+        if found is not None:
+            _log.info("blanking pattern at frame %.2f, %.1f sigma", found.place, found.score)
+            self._pilots.append((leg, found))
+
+    def _begin_next(self, last: int) -> SweepPlace | None:
+        """The next sweep that begins up to frame `last`; None: none does."""
+        if self._next is not None:
+            return self._expected(last)
+        for pilot in list(self._pilots):
+            index, found = pilot
+            scan = found.place - self._delay[index]
+            if self._known_at(index + 1, scan + self._period) > last:
+                continue
+            self._pilots.remove(pilot)
+            second = self._measure(index + 1, scan + self._period)
+            if second is None:
+                continue
+            self._line.add(index, scan, found.sd)
+            self._next = index + 1
+            return self._expected(last, first=True)
+        return None
+
+    def _expected(self, last: int, first: bool = False) -> SweepPlace | None:
+        index = self._next
+        assert index is not None, "asked for by the caller"
+        if first:
+            expected, sd, period = self._line.place[-1] + self._period, math.nan, self._period
+        else:
+            expected, sd, period = self._line.fit(index)
+        frame = self._known_at(index, expected)
+        if frame > last:
+            return None
+        found = self._measure(index, expected)
+        number = index - self._plan.pilots
+        residual = math.nan
+        if found is not None:
+            scan = found.place - self._delay[index % len(self._delay)]
+            residual = max(abs(scan - expected), math.hypot(sd, found.sd))
+            self._line.add(index, scan, found.sd)
+        scan, _, period = self._line.fit(index)
+        ratio = self._period / period
+        if number > 0:
+            self._ends[number - 1] = SweepEnd(ratio - 1, residual, len(self._line.index))
+        self._next = index + 1
+        place = SweepPlace(number, frame, scan, ratio, found)
+        if number >= 0:
+            self._places[number] = place
+        self._tell(place)
+        return place
+
+    def _known_at(self, index: int, scan: float) -> int:
+        """The frame by which the pattern of a sweep has surely passed."""
+        leg = index % len(self._delay)
+        return self._searches[leg].span(scan + self._delay[leg], self._tolerance)[1] - 1
+
+    def _measure(self, index: int, scan: float) -> Found | None:
+        leg = index % len(self._delay)
+        place = scan + self._delay[leg]
+        return self._searches[leg].measure(self._ones[leg], self._ones_first, place, self._tolerance)
+
+    def _write(self, records: NDArray[np.void], first: int) -> None:
+        """Marks of consecutive frames from `first` on, all of the present sweep."""
+        now = self._now
+        if now is None or now.number < 0:
+            records["sweep"], records["marks"] = 0, Mark.GATE_EDGE
+            return
+        leg = self._plan.leg(now.number)
+        since = first + np.arange(len(records)) - now.scan_frame
+        opened, closed = leg.gate_open_s * self._rate, leg.gate_close_s * self._rate
+        # The gate is on the sync source's clock, of which the light says nothing: half a frame, and what it may be off.
+        early, late = (0.5 + MAX_CLOCK_ERROR * at for at in (opened, closed))
+        upcoming = self._period / now.ratio + self._delay[(now.number + 1) % len(self._delay)] - self._tolerance
+        marks = np.full(len(records), int(Mark.GATE_EDGE), np.uint32)
+        marks[(since > closed + late) & (since + 1 < upcoming)] = 0
+        marks[(since >= opened + early) & (since + 1 <= closed - late)] = Mark.GATE_HIGH
+        records["marks"] = marks | np.uint32(Mark.BACKWARD if leg.direction < 0 else 0)
+        records["sweep"] = (now.number + 1) & 0xFFFF
+
+    def _tell(self, place: SweepPlace) -> None:
+        if place.found is None:
+            _log.warning("sweep %d: no blanking pattern where it was expected", place.number)
+            return
+        found = place.found
+        _log.info(
+            "sweep %d: blanking pattern at frame %.3f +- %.3f, %.1f sigma (%.4g over %.4g ones), detection probability "
+            "%.6f",
+            place.number, found.place, found.sd, found.score, found.brightness, found.level,
+            place.detection,
+        )  # fmt: skip
+
+    def _give_up(self, header: BlockHeader, last: int) -> None:
+        assert self._origin is not None, "frames were counted"
+        limit_s = SEARCH_S + 3 * self._period / self._rate
+        if not header.flags & BlockFlag.LAST and last - self._origin < limit_s * self._rate:
+            return
+        score, frame = self._most
+        step = "the laser's gate cable, and that the line is in the picture before the first column; raise scan.power"
+        if score >= CLEAR_SCORE:
+            step = "the scanner's scan marker at the sync source, and the clocks"
+        raise DeviceFault(
+            f"the blanking pattern of {self._shapes[0].length:.0f} frames was not found twice, {self._period:.0f} "
+            f"frames apart: among {last - self._origin + 1} frames it stood out by {score:.1f} sigma at most, at frame "
+            f"{frame} ({LEAST_SCORE:g} are needed, twice); frames cannot be bound to columns: check {step}"
+        )
+
+
+def _words(plan: ScanPlan, columns_rise: bool) -> tuple[int, int]:
+    """First word of a row, and the one behind the last, in which the run-in of a leg is seen."""
+    x0 = int(plan.x0[0 if columns_rise else -1])
+    row = -(-plan.width // WORD_PX)
+    return max(0, (x0 - ASIDE_PX) // WORD_PX), min(row, -(-(x0 + plan.window + ASIDE_PX) // WORD_PX))

@@ -1,0 +1,42 @@
+"""Whether the camera sees the blanking pattern, for which the line stands beside the first column."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model import RigModel
+from rig.scan_plan import ScanPlan
+
+DEPTHS_TRIED = 32
+COMMANDS_TRIED = 256
+"""Places at which it is tried whether the camera sees the line."""
+
+
+def unseen_pattern(plan: ScanPlan, model: RigModel | None) -> list[str]:
+    """What stands against a blanking pattern of which the camera sees no light within the depth range."""
+    if plan.blanking is None or model is None:
+        return []
+    u, _ = model.camera.tangents()
+    z = np.geomspace(*plan.depth_range_m, DEPTHS_TRIED)
+
+    def seen(command: NDArray[np.float64]) -> NDArray[np.bool_]:
+        nx, _, nz, d = model.planes(command).T
+        across = (d / z[:, None] - nz) / nx  # x / z in the middle row
+        inside: NDArray[np.bool_] = ((across >= np.nanmin(u)) & (across <= np.nanmax(u))).any(axis=0)
+        return inside
+
+    problems = []
+    for leg in plan.legs:
+        first, last = plan.command_range if leg.columns_rise else plan.command_range[::-1]
+        middle_s = plan.pattern_s(leg) + plan.blanking.length_s / 2
+        here = float(plan.command_at(plan.column(np.array([middle_s]), leg))[0])
+        tried = np.linspace(here, last, COMMANDS_TRIED)
+        visible = np.flatnonzero(seen(tried))
+        if len(visible) and visible[0] == 0:
+            continue
+        remedy = f"begin it at {tried[visible[0]] + first - here:.2f}" if len(visible) else "turn the camera or mirror"
+        near, far = plan.depth_range_m
+        problems.append(
+            f"scan.command_range begins at {first:g}: of the blanking pattern in the run-in, at {here:.3g}, the camera "
+            f"sees nothing from {near:g} to {far:g} m, and the SPAD has no markers; {remedy}"
+        )
+    return problems

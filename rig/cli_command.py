@@ -1,0 +1,112 @@
+"""What all commands have in common: their errors become lines and exit codes, their results text or one JSON object."""
+
+import functools
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
+
+import typer
+
+if TYPE_CHECKING:
+    from rig.run import RunResult
+
+EXIT_USAGE = 2
+EXIT_DEVICE = 3
+EXIT_ABORTED = 4
+EXIT_SOFTWARE = 70
+"""An error in the program itself: EX_SOFTWARE of sysexits.h."""
+
+P = ParamSpec("P")
+
+EstimatorOption = Annotated[
+    str | None, typer.Option("--estimator", help="argmax, edge or likelihood", show_default=False)
+]
+FilterOption = Annotated[str | None, typer.Option("--filter", help="none or median (5 x 5)", show_default=False)]
+ConfidenceOption = Annotated[
+    float | None,
+    typer.Option("--min-confidence", help="answers below this do not enter the depth map", show_default=False),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout")]
+
+
+def command(function: Callable[P, int | None]) -> Callable[P, None]:
+    """Turns what a command raises for its user's mistakes and its devices' faults into lines and exit codes."""
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            code = function(*args, **kwargs)
+        except KeyboardInterrupt:
+            say("aborted")
+            code = EXIT_ABORTED
+        except Exception as error:
+            code = _code_of(error)
+            if code is None:
+                raise
+            for line in str(error).splitlines():
+                say(f"error: {line}")
+            for note in getattr(error, "__notes__", []):
+                say(note)
+        raise typer.Exit(code or 0)
+
+    return wrapped
+
+
+def _code_of(error: Exception) -> int | None:
+    from calibration.errors import CalibrationError
+    from drivers.errors import DeviceError
+    from rig.errors import RigError
+
+    if isinstance(error, RigError):
+        return error.exit_code
+    if isinstance(error, CalibrationError):
+        return EXIT_USAGE
+    return EXIT_DEVICE if isinstance(error, DeviceError) else None
+
+
+def report(result: "RunResult", as_json: bool) -> int:
+    """Print a run's summary, for programs or people; its exit code."""
+    from rig.summary import Verdict
+
+    if result.summary.valid_fraction == 0 and result.summary.verdict is not Verdict.UNCALIBRATED:
+        say("warning: no pixel has a depth; raise --exposures, lower --min-confidence or check the depth range")
+    if as_json:
+        print_json(result.summary.as_json())
+    else:
+        from rig.report_text import run_table
+
+        run_table(result)
+    return result.summary.verdict.exit_code
+
+
+def print_json(content: Mapping[str, Any]) -> None:
+    """The one JSON object of a command, to stdout."""
+    from rig.outputs import json_text
+
+    print(json_text(content))
+
+
+@contextmanager
+def progress(what: str) -> Iterator["Callable[..., None] | None"]:
+    """A progress bar on stderr while somebody is watching it, told what is done, all there is and how many got lost."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+
+        def update(done: int, total: int, lost: int = 0) -> None:
+            bar.update(task, completed=done, total=total, description=f"{what}, {lost} lost" if lost else what)
+
+        yield update
+
+
+def say(line: str) -> None:
+    """A line for people, to stderr."""
+    print(line, file=sys.stderr, flush=True)
