@@ -41,10 +41,11 @@ CLOCK_TOLERANCE = 2e-4
 """Relative difference allowed for between SPAD, scanner and sync clocks: three crystals of +-50 ppm, and margin."""
 GUARD_FRAMES = 1.0
 """Frames the gate opens before the first and closes after the last column, so that their own frames are wholly lit."""
-BLOCK_S = 1e-3
-"""Time that the frames of a block span: at any rate Python's cost per block is then a few percent of one core."""
-BLOCK_BYTES = 4 << 20
-"""Most bytes of a block's frames: blocks of big sensors stay in the cache of a laptop."""
+BLOCK_S = 5e-3
+"""Time that the frames of a block span. Each block costs Python some 0.3 ms, part of it on every thread; an estimate
+waits for its block to fill."""
+BLOCK_BYTES = 16 << 20
+"""Most bytes of a block's frames: 512 whole frames of 512 x 512 pixels."""
 
 PointClock = Callable[[float], Fraction]
 

@@ -126,13 +126,6 @@ def first_px(odd, reach):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def level_of(flux):  # type: ignore[no-untyped-def]
-    """Level that a flux in photons per exposure lies in."""
-    octave = np.int64(np.float32(flux).view(np.uint32) >> LEVEL_SHIFT) - np.int64(LEVEL_BASE)
-    return min(max(octave, 0), LEVELS - 1)
-
-
-@numba.njit(inline="always")
 def level_flux(level):  # type: ignore[no-untyped-def]
     """Flux in the middle of a level: 1.25 or 1.75 times a power of two."""
     return (1.25 + 0.5 * (level & 1)) * 2.0 ** (LOWEST_OCTAVE + (level >> 1))

@@ -13,7 +13,6 @@ from rig.estimators.closeup_kernels import (
     label_scores,
     label_weights,
     level_flux,
-    level_of,
     levels_of,
     offsets,
 )
@@ -61,6 +60,13 @@ def look(memory, counts, x, exposures, weight, constant, pairs, index, square, s
 
 
 @cache
+def level_of(flux):
+    """Level that a flux in photons per exposure lies in: half octaves from 2^LOWEST_OCTAVE on, of equal width each."""
+    octave = np.floor(np.log2(flux)) if flux > 0 else -np.inf
+    level = 2 * (octave - LOWEST_OCTAVE) + (flux >= 1.5 * 2.0**octave)
+    return int(np.clip(level, 0, LEVELS - 1))
+
+
 def tables(near_is_left, sigma_px, shift=SHIFT):
     weight, constant = label_weights(AMBIENT, SHARE, near_is_left, fine_profiles(sigma_px), TABLE)
     return closeup_tables(weight, constant, 128 >> shift)

@@ -213,8 +213,10 @@ def test_a_spad_that_cannot_stream_fast_enough_takes_bursts():
         plan_of(scan(), spad=small)
 
 
-@pytest.mark.parametrize(("rate", "height", "frames"), [("100 kHz", 4, 100), ("100 kHz", 8192, 63), ("500 Hz", 4, 1)])
-def test_a_block_holds_a_millisecond_of_frames_and_at_most_four_mebibytes(rate, height, frames):
+@pytest.mark.parametrize(
+    ("rate", "height", "frames"), [("100 kHz", 4, 500), ("100 kHz", 8192, 255), ("300 Hz", 4, 2), ("100 Hz", 4, 1)]
+)
+def test_a_block_holds_five_milliseconds_of_frames_and_at_most_sixteen_mebibytes(rate, height, frames):
     tall = dataclasses.replace(SPAD, height=height)
     config = scan(frame_rate=rate)
     plan = compile_plan(config, scanner_limits(), timer_clock, None, tall)
