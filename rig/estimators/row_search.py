@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from rig.aligned import CACHE_LINE
 from rig.counting_kernels import WORD_PX
 from rig.estimators.closeup_kernels import label_scores, levels_of, offsets
-from rig.estimators.powers import lift_to_powers, powers
+from rig.estimators.powers import lift_to_powers, powers, powers_in_order
+from rig.estimators.row_kernels import LABEL_PX
 from rig.estimators.screen_tables import OUTSIDE, SCREENS
 from rig.estimators.search_desk import COUNT_LIMIT, FIELDS, Desk
 from rig.estimators.search_kernels import (
     BATCH,
+    NOTHING,
     START,
     Search,
     Table,
@@ -62,6 +64,8 @@ QUIET_STEP: Final = 8
 """Every 8th column does so where there are dark frames as well, else every one."""
 SIGNAL_REACH_PX: Final = 2
 """Pixels on either side whose light is the stripe's, where the line is narrower."""
+FEW_EXPOSURES: Final = 1
+"""Up to so many a close look says no more than the scores of the neighbours, which are there already."""
 USUAL_PAIRS: Final = 4
 """Pairs of pixels that the close-up looks at, where the line is no wider than usual."""
 
@@ -172,7 +176,10 @@ def judge_rows(desk: Desk, search: Search, table: Table, first: int, rows: int, 
     certainty = certainties(table, search, desk.shift)
     _answer(certainty, stripe + 4 * desk.rows, rows, search)
     _measure_light(desk, search, table, first, rows, c, exposures, stripe)
-    _look_closely(desk, search, rows, c, exposures, stripe)
+    if exposures <= FEW_EXPOSURES:
+        _place_by_neighbours(desk, search, rows, c, stripe)
+    else:
+        _look_closely(desk, search, rows, c, exposures, stripe)
     if c % desk.quiet_step == 0:
         _unmute_hot(desk, search, first, rows, np.int64(read_int32(desk.x0, c)))
         for r in range(rows):
@@ -228,6 +235,21 @@ def _read_light(desk, search, table, rows, exposures, reach):  # type: ignore[no
 
 
 @numba.njit(forceinline=True)
+def _place_by_neighbours(desk, search, rows, c, stripe):  # type: ignore[no-untyped-def]
+    """Place the lines of the batch's rows by the scores beside the best ones, and write the answers."""
+    lift = load_int16(search.lift, 0)
+    own = powers_in_order(load_int16(search.best, 0), lift, desk.shift)
+    left = powers_in_order(load_int16(search.left, 0), lift, desk.shift)
+    right = powers_in_order(load_int16(search.right, 0), lift, desk.shift)
+    beside = left + right
+    # Labels a pixel apart instead of a quarter.
+    offset, sd = offsets(larger_float(own + beside, NOTHING), right - left, beside, 1.0)
+    x = to_float32(load_int16(search.x, 0)) + np.float32(read_int32(desk.x0, c))
+    _answer(x + offset, stripe, rows, search)
+    _answer(sd, stripe + 8 * desk.rows, rows, search)
+
+
+@numba.njit(forceinline=True)
 def _look_closely(desk, search, rows, c, exposures, stripe):  # type: ignore[no-untyped-def]
     """Place the lines of the batch's rows, and write the answers."""
     # The usual width as a constant: its loop is unrolled.
@@ -243,7 +265,7 @@ def _look_closely(desk, search, rows, c, exposures, stripe):  # type: ignore[no-
         store_folded(search.moment, r, likelihood * load_float32(desk.label, 0))
         store_folded(search.square, r, likelihood * load_float32(desk.square, 0))
     mass, moment, square = (totals_of_rows(search.mass), totals_of_rows(search.moment), totals_of_rows(search.square))
-    offset, sd = offsets(mass, moment, square)
+    offset, sd = offsets(mass, moment, square, LABEL_PX)
     x = to_float32(load_int16(search.x, 0)) + np.float32(read_int32(desk.x0, c))
     _answer(x + offset, stripe, rows, search)
     _answer(sd, stripe + 8 * desk.rows, rows, search)

@@ -54,7 +54,7 @@ def look(memory, counts, x, exposures, weight, constant, pairs, index, square, s
     store_folded(search.moment, 0, likelihood * load_float32(index, 0))
     store_folded(search.square, 0, likelihood * load_float32(square, 0))
     mass, moment, spread = totals_of_rows(search.mass), totals_of_rows(search.moment), totals_of_rows(search.square)
-    offset, sd = offsets(mass, moment, spread)
+    offset, sd = offsets(mass, moment, spread, LABEL_PX)
     store_float32(address_of(out), 0, offset)
     store_float32(address_of(out), LANES, sd)
 
