@@ -31,6 +31,12 @@ FEW_FRAMES: Final = 15
 """Up to so many frames four planes do."""
 
 
+@numba.njit(cache=True, nogil=True)
+def rows_of_chunk(row_words: int) -> int:
+    """Rows of so many words that are counted together."""
+    return max(CHUNK // row_words, 1)
+
+
 def new_planes(chunks: int) -> NDArray[np.uint64]:
     """Counters, all zero, for so many chunks of a frame: (chunks, PLANES + 1, CHUNK); the last plane is scratch.
 
@@ -235,7 +241,7 @@ def add_runs(
     as_bytes = planes.view(np.uint8)
     n_lit = new_counts(2, padded_lanes(window))
     n_dark = new_counts(2, padded_lanes(used_words * WORD_PX))
-    chunk_rows = max(CHUNK // row_words, 1)
+    chunk_rows = rows_of_chunk(row_words)
     for y0 in range(first_row, last_row, chunk_rows):
         y1 = min(y0 + chunk_rows, last_row)
         n = (y1 - y0) * row_words

@@ -7,8 +7,8 @@ from drivers.ring import BlockRing, OnFull
 from rig.errors import UsageError
 from rig.scan_plan import ScanPlan
 
-RING_BYTES = 256 * 2**20
-"""Ring of a source that cannot wait: 0.08 s of full frames at 100 kHz, more than any pause of the interpreter."""
+RING_BYTES = 512 * 2**20
+"""Ring of a source that cannot wait: 0.16 s of full frames at 100 kHz, more than any pause of the interpreter."""
 FEWEST_SLOTS = 8
 """Also the slots for a source that can wait: it runs ahead by as many blocks."""
 MOST_SLOTS = 1024

@@ -1,5 +1,7 @@
 """Compiled work on image rows, shared out between threads; kernels release the interpreter's lock while they run."""
 
+import os
+import sys
 import threading
 import weakref
 from collections.abc import Callable
@@ -13,6 +15,7 @@ import numpy as np
 Work = Callable[[int, int], None]
 """Called with the first row and the one behind the last."""
 _Job = tuple[Work, int, int]
+_LEAST_URGENT = 19
 
 
 class RowWorkers:
@@ -87,6 +90,15 @@ class _State:
         self.changed = threading.Condition()
         self.error: BaseException | None = None
         """The first failure, until the caller has been told and nothing is left over."""
+
+
+def yield_to_others() -> None:
+    """Let the calling thread work only while others leave a core idle, where the system knows priorities of threads.
+
+    Row threads work in step: one that shares its core with work of no hurry slows all of them.
+    """
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LEAST_URGENT)
 
 
 def _run(state: _State, queue: "SimpleQueue[_Job | None]", i: int) -> None:

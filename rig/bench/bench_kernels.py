@@ -4,7 +4,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.counting_kernels import CHUNK, add_frames
+from rig.counting_kernels import add_frames, rows_of_chunk
 
 BITS_OF_CHANCE = 16
 """A pixel detects where a random number of so many bits is below its threshold."""
@@ -58,7 +58,7 @@ def count_columns(
     """
     frame = rows * row_words
     frames = words.shape[0] // frame
-    chunk_rows = max(CHUNK // row_words, 1)
+    chunk_rows = rows_of_chunk(row_words)
     for j in range(first_chunk, last_chunk):
         at = j * chunk_rows * row_words
         n = (min((j + 1) * chunk_rows, rows) - j * chunk_rows) * row_words

@@ -19,6 +19,9 @@ COLUMNS = 500
 """Columns of a sweep: what an estimate knows of each column is then as much memory as in a scan."""
 PLACE_FRAMES = 100
 """Frames for which a stripe stays; every number of exposures that estimates are measured at divides it."""
+BLOCK_PLACES = 5
+BLOCK_FRAMES = BLOCK_PLACES * PLACE_FRAMES
+"""Frames handed over at a time, as many as in a scan at 100 kHz (`rig.plan.BLOCK_S`)."""
 FRAMES_BYTES = 192 * 2**20
 """Frames of each window size: several times a big cache."""
 DISTINCT = 64
@@ -38,7 +41,7 @@ NEAR_W, FAR_W = 1.0, 0.125
 class BenchFrames:
     """Frames of one window size.
 
-    bits: uint8 (n, rows, row bytes), n a multiple of PLACE_FRAMES. truth_px: float32 (places, rows), where the stripe
+    bits: uint8 (n, rows, row bytes), n a multiple of BLOCK_FRAMES. truth_px: float32 (places, rows), where the stripe
     of frames PLACE_FRAMES i and on is. window: searched pixels, which begin at geometry.x0; rows of frames may be
     longer.
     """
@@ -61,7 +64,7 @@ class BenchFrames:
 
 def window_frames(window: int, workers: RowWorkers, n_bytes: int = FRAMES_BYTES) -> BenchFrames:
     """Frames that carry just the window."""
-    places = max(1, n_bytes // (PLACE_FRAMES * ROWS * window // 8))
+    places = BLOCK_PLACES * max(1, n_bytes // (BLOCK_FRAMES * ROWS * window // 8))
     bits = np.empty((places * PLACE_FRAMES, ROWS, window // 8), np.uint8)
     distinct = min(places, DISTINCT)
     rng = np.random.default_rng(window)
@@ -85,7 +88,7 @@ def window_frames(window: int, workers: RowWorkers, n_bytes: int = FRAMES_BYTES)
 def full_frames(narrow: BenchFrames, n_bytes: int = FRAMES_BYTES) -> BenchFrames:
     """Whole frames of the sensor; the window lies in them where its geometry says, the rest is like it."""
     copies = WIDTH // narrow.window
-    places = max(1, n_bytes // (PLACE_FRAMES * narrow.frame_bytes * copies))
+    places = BLOCK_PLACES * max(1, n_bytes // (BLOCK_FRAMES * narrow.frame_bytes * copies))
     bits = np.tile(narrow.bits[: places * PLACE_FRAMES], (1, 1, copies))
     return BenchFrames(narrow.window, bits, narrow.truth_px[:places], narrow.geometry)
 

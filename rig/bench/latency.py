@@ -1,6 +1,6 @@
 """How long after a column's last frame its estimate is there.
 
-A source thread copies blocks of a millisecond into the ring and publishes each when its last frame has been exposed, at
+A source thread copies blocks of 5 ms into the ring and publishes each when its last frame has been exposed, at
 100 kHz. The other thread takes them from the ring and judges them with the workers it was given; where a sweep ends it
 takes the result and makes a new counter, as a scan does. A frame's time is its block's minus the frames behind it: the
 wait for the block to fill is included, and so is that of a block's last column for the next block, whose first frame
@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
 from drivers.ring import BlockRing
-from rig.bench.frames import COLUMNS, PLACE_FRAMES, ROWS, WIDTH, BenchFrames
+from rig.bench.frames import BLOCK_FRAMES, COLUMNS, ROWS, WIDTH, BenchFrames
 from rig.estimators.likelihood import Likelihood
 from rig.estimators.stream import ColumnJudge
 from rig.row_threads import RowWorkers
 
 FRAME_S = 1e-5
 SECONDS = 3.0
-SLOTS = 64
-"""A ring of 64 ms, so that nothing is dropped where the host pauses; a pause is seen in the figures."""
+SLOTS = 16
+"""A ring of 80 ms, so that nothing is dropped where the host pauses; a pause is seen in the figures."""
 QUEUE_US = 1e4
 """A median of more than ten blocks is that of a queue which grows."""
 SPIN_S = 2e-4
@@ -47,7 +47,7 @@ class Latency:
     def kept_up(self) -> bool:
         """Whether the estimate kept up with the stream, so that the figures are of it and not of a queue."""
         return (
-            self.late_max_us < 1e6 * SLOTS * PLACE_FRAMES * FRAME_S and self.median < 1e6 * 10 * PLACE_FRAMES * FRAME_S
+            self.late_max_us < 1e6 * SLOTS * BLOCK_FRAMES * FRAME_S and self.median < 1e6 * 10 * BLOCK_FRAMES * FRAME_S
         )
 
 
@@ -55,8 +55,8 @@ def measure_latency(
     frames: BenchFrames, exposures: int, workers: RowWorkers, likelihood: Likelihood, seconds: float = SECONDS
 ) -> Latency:
     """Latency of a stream of `seconds` at 100 kHz."""
-    n_blocks = max(2, round(seconds / (PLACE_FRAMES * FRAME_S)))
-    ring = BlockRing(SLOTS, PLACE_FRAMES * frames.frame_bytes)
+    n_blocks = max(2, round(seconds / (BLOCK_FRAMES * FRAME_S)))
+    ring = BlockRing(SLOTS, BLOCK_FRAMES * frames.frame_bytes)
     reader = ring.reader("counting")
     published = np.zeros(n_blocks)
     late = np.zeros(n_blocks)
@@ -64,10 +64,10 @@ def measure_latency(
     source = threading.Thread(target=_play, args=(frames, ring, published, late), name="bench source", daemon=True)
     judge = likelihood.judge(frames.geometry, exposures, dark=True)
     layout = frames.layout(exposures)
-    sweep_blocks = COLUMNS * exposures // PLACE_FRAMES
+    sweep_blocks = COLUMNS * exposures // BLOCK_FRAMES
     bins = np.repeat(np.arange(COLUMNS, dtype=np.int32), exposures)
     column = bins.astype(np.float64)
-    x0 = np.full(PLACE_FRAMES, frames.geometry.x0[0], np.int32)
+    x0 = np.full(BLOCK_FRAMES, frames.geometry.x0[0], np.int32)
     judged = np.zeros(n_blocks)
     """When all columns but the last one of each block were judged."""
     ended = np.zeros(n_blocks)
@@ -75,13 +75,13 @@ def measure_latency(
     counter = ColumnJudge(layout, frames.geometry, judge, workers)
     source.start()
     for i, block in enumerate(reader):
-        at = i % sweep_blocks * PLACE_FRAMES
-        counter.add(block.bits, bins[at : at + PLACE_FRAMES], column[at : at + PLACE_FRAMES], x0)
+        at = i % sweep_blocks * BLOCK_FRAMES
+        counter.add(block.bits, bins[at : at + BLOCK_FRAMES], column[at : at + BLOCK_FRAMES], x0)
         counter.settle()
         judged[i] = time.perf_counter()
         if at:
             ended[i - 1] = judged[i]
-        if at + PLACE_FRAMES == len(bins):
+        if at + BLOCK_FRAMES == len(bins):
             counter.finish()
             ended[i] = time.perf_counter()
             counter.begin(judge)
@@ -91,9 +91,9 @@ def measure_latency(
 
 def _play(frames: BenchFrames, ring: BlockRing, published: NDArray[np.float64], late: NDArray[np.float64]) -> None:
     """Publish blocks as time passes, the bench's frames over and over."""
-    places = len(frames.bits) // PLACE_FRAMES
-    shape = (PLACE_FRAMES, *frames.bits.shape[1:])
-    records = np.zeros(PLACE_FRAMES, FRAME_RECORD)
+    places = len(frames.bits) // BLOCK_FRAMES
+    shape = (BLOCK_FRAMES, *frames.bits.shape[1:])
+    records = np.zeros(BLOCK_FRAMES, FRAME_RECORD)
     try:
         start = time.perf_counter()
         for i in range(len(published)):
@@ -101,9 +101,9 @@ def _play(frames: BenchFrames, ring: BlockRing, published: NDArray[np.float64], 
             if memory is None:
                 raise RuntimeError("the ring was full for a second; nothing reads it")
             bits = memory.reshape(shape)
-            place = i % places * PLACE_FRAMES
-            np.copyto(bits, frames.bits[place : place + PLACE_FRAMES])
-            due = start + (i + 1) * PLACE_FRAMES * FRAME_S
+            place = i % places * BLOCK_FRAMES
+            np.copyto(bits, frames.bits[place : place + BLOCK_FRAMES])
+            due = start + (i + 1) * BLOCK_FRAMES * FRAME_S
             _wait_until(due)
             published[i] = time.perf_counter()
             late[i] = published[i] - due
@@ -129,8 +129,8 @@ def _summary(
     threads: int,
     late_s: float,
 ) -> Latency:
-    last_frame = np.arange(exposures, PLACE_FRAMES + 1, exposures)
-    exposed = published[:, None] - (PLACE_FRAMES - last_frame) * FRAME_S
+    last_frame = np.arange(exposures, BLOCK_FRAMES + 1, exposures)
+    exposed = published[:, None] - (BLOCK_FRAMES - last_frame) * FRAME_S
     there = np.repeat(judged[:, None], len(last_frame), axis=1)
     there[:, -1] = ended
     waited_us = 1e6 * (there - exposed)[there > 0]
@@ -140,7 +140,7 @@ def _summary(
 
 def _header(seq: int, width: int) -> BlockHeader:
     return BlockHeader(
-        flags=BlockFlag(0), run_id=1, block_seq=seq, first_frame=seq * PLACE_FRAMES, t0_ticks=0, lost_before=0,
+        flags=BlockFlag(0), run_id=1, block_seq=seq, first_frame=seq * BLOCK_FRAMES, t0_ticks=0, lost_before=0,
         tick_hz=Fraction(100_000), frame_period_ticks=1, exposure_ticks=1, sweep=0, frame_step=1, width=width,
         height=ROWS, sensor_width=WIDTH, sensor_height=ROWS,
     )  # fmt: skip

@@ -150,16 +150,20 @@ def learn(frames: BenchFrames, threads: int) -> Likelihood:
     likelihood = Likelihood(threads)
     layout = frames.layout(LEARN_EXPOSURES)
     bins = np.repeat(np.arange(layout.columns, dtype=np.int32), LEARN_EXPOSURES)
-    x0 = np.full(PLACE_FRAMES, frames.geometry.x0[0], np.int32)
-    walk = Walk(len(frames.bits) // PLACE_FRAMES)
+    x0 = np.full(len(bins), frames.geometry.x0[0], np.int32)
     with RowWorkers(threads) as workers:
         counter = SweepCounter(layout, workers)
-        for at in range(0, len(bins), PLACE_FRAMES):
-            first = walk.next() * PLACE_FRAMES
-            here = bins[at : at + PLACE_FRAMES]
-            counter.add(frames.bits[first : first + PLACE_FRAMES], here, here.astype(np.float64), x0)
+        counter.add(_ever_new(frames, layout.columns), bins, bins.astype(np.float64), x0)
     likelihood.estimate(counter.finish(), frames.geometry)
     return likelihood
+
+
+def _ever_new(frames: BenchFrames, columns: int) -> NDArray[np.uint8]:
+    """Frames of columns that each have their own stripe, as in a scan: one that stayed would look like hot pixels."""
+    places = len(frames.bits) // PLACE_FRAMES
+    column = np.arange(columns)
+    first = column % places * PLACE_FRAMES + column // places * LEARN_EXPOSURES % PLACE_FRAMES
+    return frames.bits[(first[:, None] + np.arange(LEARN_EXPOSURES)).ravel()]
 
 
 def _cases(

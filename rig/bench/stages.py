@@ -2,7 +2,7 @@
 
 count: frames of just the window into bit planes, column after column; turning planes into counts is part of an
 estimate and left out. numpy: what one writes first: unpackbits, sum, argmax. likelihood: `ColumnJudge`, the counter of
-`rig scan --estimator likelihood`, fed blocks of about a millisecond; making it anew for each sweep is not timed, with
+`rig scan --estimator likelihood`, fed blocks as in a scan; making it anew for each sweep is not timed, with
 sweep it is, and so is taking its result. disk: the same from SPB1 blocks in a file mapped into memory, which the
 system most likely holds in its page cache. parse: blocks of that recording in memory, read without an estimate.
 full: whole frames of the sensor, of which only the window is searched. crc: payload checksums are verified.
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from drivers.frames import FrameBlock
 from drivers.spb1 import walk_blocks
 from rig.bench.bench_kernels import count_columns
-from rig.bench.frames import COLUMNS, PLACE_FRAMES, BenchFrames
-from rig.counting_kernels import CHUNK, new_planes
+from rig.bench.frames import BLOCK_FRAMES, BLOCK_PLACES, COLUMNS, PLACE_FRAMES, BenchFrames
+from rig.counting_kernels import new_planes, rows_of_chunk
 from rig.estimators.likelihood import Likelihood
 from rig.estimators.stream import ColumnJudge, SearchedSweep
 from rig.row_threads import RowWorkers
@@ -74,7 +74,7 @@ def count_stage(frames: BenchFrames, walk: Walk, exposures: int, workers: RowWor
     """Counting alone."""
     _, rows, row_bytes = frames.bits.shape
     row_words = row_bytes // 8
-    chunks = -(-rows // max(CHUNK // row_words, 1))
+    chunks = -(-rows // rows_of_chunk(row_words))
     planes = new_planes(chunks)
     n = min(COUNT_PIECE, len(frames.bits)) // exposures * exposures
 
@@ -126,7 +126,7 @@ def search_stage(
     *,
     whole_sweeps: bool = False,
 ) -> Stage:
-    """Counting and `likelihood`. source: gives places and their frames for ever; from memory where None.
+    """Counting and `likelihood`. source: gives blocks and their first places for ever; from memory where None.
 
     whole_sweeps: time also what is done once a sweep.
     """
@@ -144,14 +144,14 @@ def search_stage(
             counter = ColumnJudge(layout, frames.geometry, judge, workers)
             spent += time.perf_counter() - made if whole_sweeps else 0.0
             places: list[int] = []
-            for at in range(0, len(bins), PLACE_FRAMES):
+            for at in range(0, len(bins), BLOCK_FRAMES):
                 begun = time.perf_counter()
                 place, bits = next(blocks)
-                counter.add(bits, bins[at : at + PLACE_FRAMES], column[at : at + PLACE_FRAMES], x0[: len(bits)])
+                counter.add(bits, bins[at : at + BLOCK_FRAMES], column[at : at + BLOCK_FRAMES], x0[: len(bits)])
                 counter.settle(MOST_UNDER_WAY - 1)
                 spent += time.perf_counter() - begun
                 done += len(bits)
-                places.append(place)
+                places += range(place, place + BLOCK_PLACES)
                 if spent >= seconds and not whole_sweeps:
                     break
             settled = time.perf_counter()
@@ -189,26 +189,26 @@ def parse_stage(recording: NDArray[np.uint8], stride: int, *, check_payload: boo
 
 
 def from_memory(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
-    """Places and their frames, as they lie in memory."""
+    """Blocks and the first place of each, as they lie in memory."""
     while True:
-        place = walk.next()
-        yield place, frames.bits[place * PLACE_FRAMES : (place + 1) * PLACE_FRAMES]
+        place = walk.next(BLOCK_PLACES)
+        yield place, frames.bits[place * PLACE_FRAMES : place * PLACE_FRAMES + BLOCK_FRAMES]
 
 
 def from_file(
     path: Path, stride: int, *, check_payload: bool
 ) -> Callable[[BenchFrames, Walk], Iterator[tuple[int, Bits]]]:
-    """The same from the blocks of a recording, one for each place."""
+    """The same from a recording."""
 
     def blocks(frames: BenchFrames, walk: Walk) -> Iterator[tuple[int, Bits]]:
         # Copy-on-write: kernels are compiled for memory that may be written.
         mapped = np.memmap(path, np.uint8, "c")
-        place = walk.next()
+        seq = walk.next(BLOCK_PLACES) // BLOCK_PLACES
         while True:
-            for block in walk_blocks(mapped[place * stride :], stride, check_payload=check_payload):
-                yield place, _sound(block).bits
-                place += 1
-            place = 0
+            for block in walk_blocks(mapped[seq * stride :], stride, check_payload=check_payload):
+                yield seq * BLOCK_PLACES, _sound(block).bits
+                seq += 1
+            seq = 0
 
     return blocks
 
@@ -224,7 +224,7 @@ def _sweep_frames(
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
     """Bins and fractional columns of a sweep's frames, and where the windows of a block's begin."""
     bins = np.repeat(np.arange(COLUMNS, dtype=np.int32), exposures)
-    return bins, bins.astype(np.float64), np.full(PLACE_FRAMES, frames.geometry.x0[0], np.int32)
+    return bins, bins.astype(np.float64), np.full(BLOCK_FRAMES, frames.geometry.x0[0], np.int32)
 
 
 def _search_error(sweep: SearchedSweep, frames: BenchFrames, places: list[int], exposures: int) -> StripeError:

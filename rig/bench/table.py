@@ -41,7 +41,7 @@ def speed_table(report: SpeedReport) -> None:
         f"\nlatency of a column's estimate: median {latency.median:.0f} us, 99.9 % {latency.p999:.0f} us, "
         f"most {latency.max:.0f} us"
     )
-    console.print("(from its last frame on, waiting for its block of 1 ms to fill included)")
+    console.print("(from its last frame on, waiting for its block of 5 ms to fill included)")
     if not latency.kept_up:
         console.print("the estimate did not keep up with 100 kHz: this is the latency of a full ring")
     console.print(f"measured in {report.seconds:.0f} s")

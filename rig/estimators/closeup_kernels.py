@@ -126,13 +126,6 @@ def first_px(odd, reach):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def level_of(flux):  # type: ignore[no-untyped-def]
-    """Level that a flux in photons per exposure lies in."""
-    octave = np.int64(np.float32(flux).view(np.uint32) >> LEVEL_SHIFT) - np.int64(LEVEL_BASE)
-    return min(max(octave, 0), LEVELS - 1)
-
-
-@numba.njit(inline="always")
 def level_flux(level):  # type: ignore[no-untyped-def]
     """Flux in the middle of a level: 1.25 or 1.75 times a power of two."""
     return (1.25 + 0.5 * (level & 1)) * 2.0 ** (LOWEST_OCTAVE + (level >> 1))
@@ -168,12 +161,12 @@ def label_scores(search, r, x, exposures, weight, constant, pairs):  # type: ign
 
 
 @numba.njit(forceinline=True)
-def offsets(mass, moment, square):  # type: ignore[no-untyped-def]
+def offsets(mass, moment, square, label_px):  # type: ignore[no-untyped-def]
     """Offset of each line from the middle of its pixel in px, to the right, and its standard deviation; float32 lanes.
 
-    mass, moment, square: sums over the labels of their likelihoods, times their numbers, times those squared.
+    mass, moment, square: sums over the labels of their likelihoods, times their numbers, times those squared; label_px:
+    from one to the next.
     """
     mean = moment / mass
     variance = larger_float(square / mass - mean * mean, np.float32(0.0))
-    label_px = np.float32(LABEL_PX)
-    return mean * label_px, square_root(variance + np.float32(1.0 / 12.0)) * label_px
+    return mean * np.float32(label_px), square_root(variance + np.float32(1.0 / 12.0)) * np.float32(label_px)

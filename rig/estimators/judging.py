@@ -10,18 +10,9 @@ from rig.counting_kernels import WORD_PX
 from rig.estimators.closeup_kernels import closeup_tables, label_weights, largest_score
 from rig.estimators.row_input import TABLE, State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
-from rig.estimators.row_search import (
-    COUNT_LIMIT,
-    FIELDS,
-    QUIET_STEP,
-    SIGNAL_REACH_PX,
-    Found,
-    Judge,
-    count_fluxes,
-    halvings,
-    turned,
-)
+from rig.estimators.row_search import QUIET_STEP, SIGNAL_REACH_PX, halvings, turned
 from rig.estimators.screen_tables import SCREENS, WEIGHT_LIMIT, Tables, fill_tables
+from rig.estimators.search_desk import COUNT_LIMIT, FIELDS, Found, Judge, count_fluxes
 from rig.geometry import SweepGeometry
 from rig.lane_order import PAIRS, STEPS, padded_lanes, pair_bytes, pixel_order, places_of
 from rig.lanes import LANES

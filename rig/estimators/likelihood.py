@@ -19,12 +19,13 @@ from rig.estimators.judging import judge_of, nothing_found, quiet_of, stripes_of
 from rig.estimators.learning import Expectation, learn_first, learn_next, lines_of, next_lattice
 from rig.estimators.row_input import Lines
 from rig.estimators.row_model import RowModel
-from rig.estimators.row_search import Judge, new_bench
+from rig.estimators.search_desk import Judge
+from rig.estimators.search_kernels import search_memory
 from rig.estimators.stream import MOST_EXPOSURES, ColumnJudge, SearchedSweep
 from rig.estimators.stream_kernels import search_counts
 from rig.geometry import SweepGeometry
 from rig.lane_order import padded_lanes
-from rig.row_threads import RowWorkers
+from rig.row_threads import RowWorkers, yield_to_others
 from rig.stripes import StripeTable
 
 LEAST_SURE = 0.02
@@ -49,7 +50,7 @@ class Likelihood:
         self._judge: tuple[_JudgeKey, Judge] | None = None
         self._taught: Expectation | None = None
         self._lesson: Future[_Lesson] | None = None
-        self._tutor = ThreadPoolExecutor(1, thread_name_prefix="learning")
+        self._tutor = ThreadPoolExecutor(1, thread_name_prefix="learning", initializer=yield_to_others)
         self._frames_since = 0
         """Lit frames since the last map that taught."""
 
@@ -74,12 +75,13 @@ class Likelihood:
         if self._lesson is None:
             if sure and self._frames_since >= TEACH_FRAMES:
                 self._frames_since = 0
+                assert self._judge is not None, "a map has been judged"
                 self._lesson = self._tutor.submit(
-                    _teach, self.used, self._taught, sweep, sweep.intensity(), geometry, quiet, lines
+                    _teach, self.used, self._taught, sweep, sweep.intensity(), self._judge[0], quiet, lines
                 )
         elif self._frames_since >= LAG_FRAMES:
             # Waits where the lesson is not over: which map is judged with what never depends on speed.
-            self.model, self._taught = self._lesson.result()
+            self.model, self._taught, self._judge = self._lesson.result()
             self._lesson = None
         return stripes
 
@@ -112,14 +114,11 @@ class Likelihood:
         found = nothing_found(geometry, None)
 
         def work(first: int, last: int) -> None:
-            bench = new_bench(padded_lanes(geometry.window))
-            search_counts(volume.counts, volume.n_frames, judge, bench, found, first, last)
+            memory = search_memory(padded_lanes(geometry.window))
+            search_counts(volume.counts, volume.n_frames, judge, memory, found, first, last)
 
         self._workers.over(geometry.rows, work)
         return stripes_of(found, judge, self._workers), quiet_of(found, geometry.width)
-
-
-_Lesson = tuple[RowModel, Expectation]
 
 
 def _teach(
@@ -127,14 +126,16 @@ def _teach(
     before: Expectation | None,
     tally: FrameTally,
     intensity: NDArray[np.uint32],
-    geometry: SweepGeometry,
+    key: "_JudgeKey",
     quiet: NDArray[np.int32],
     lines: Lines,
-) -> _Lesson:
-    """The model carried on by one sweep, on one thread beside the stream."""
-    model = replace(model, ambient=ambient_map(tally, intensity, geometry, quiet))
+) -> "_Lesson":
+    """The model carried on by one sweep, and the judge that follows from it, on one thread beside the stream."""
+    model = replace(model, ambient=ambient_map(tally, intensity, key.geometry, quiet))
     with RowWorkers(1) as workers:
-        return learn_next(lines, geometry, model, before, workers)
+        model, taught = learn_next(lines, key.geometry, model, before, workers)
+        judge = judge_of(model, key.geometry, key.exposures, workers, dark=key.dark)
+    return model, taught, (replace(key, model=model), judge)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,6 +151,9 @@ class _JudgeKey:
         """Whether the other's judge would be the same one."""
         made = self.model is other.model and self.geometry is other.geometry
         return made and (self.exposures, self.dark) == (other.exposures, other.dark)
+
+
+_Lesson = tuple[RowModel, Expectation, tuple[_JudgeKey, Judge]]
 
 
 class _LikelihoodCounter:

@@ -4,7 +4,7 @@ The same `judge_rows` serves frames as they come and counts that are there alrea
 the same bit for bit.
 """
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numba
 import numpy as np
@@ -12,11 +12,14 @@ from numpy.typing import NDArray
 
 from rig.aligned import CACHE_LINE
 from rig.counting_kernels import WORD_PX
-from rig.estimators.closeup_kernels import Closeup, label_scores, levels_of, offsets
-from rig.estimators.powers import lift_to_powers, powers
-from rig.estimators.screen_tables import OUTSIDE, SCREENS, Tables
+from rig.estimators.closeup_kernels import label_scores, levels_of, offsets
+from rig.estimators.powers import lift_to_powers, powers, powers_in_order
+from rig.estimators.row_kernels import LABEL_PX
+from rig.estimators.screen_tables import OUTSIDE, SCREENS
+from rig.estimators.search_desk import COUNT_LIMIT, FIELDS, Desk
 from rig.estimators.search_kernels import (
     BATCH,
+    NOTHING,
     START,
     Search,
     Table,
@@ -27,13 +30,11 @@ from rig.estimators.search_kernels import (
     fit_lanes,
     fit_positions,
     score_rows,
-    search_memory,
 )
 from rig.lane_order import PAD, PAIRS, STEPS, pair_bytes, place_of
 from rig.lane_reductions import largest_of_rows, store_folded, totals_of_rows
 from rig.lanes import (
     LANES,
-    address_of,
     as_bytes,
     lanes_between,
     larger,
@@ -61,172 +62,12 @@ QUIET: Final = 0.9
 """Probability within 1 px from which the pixels behind the stripe teach the ambient light."""
 QUIET_STEP: Final = 8
 """Every 8th column does so where there are dark frames as well, else every one."""
-COUNT_LIMIT: Final = 63
-"""Largest count the search works with; counts of more exposures are halved until they fit."""
-FIELDS: Final = 5
-"""x_px, confidence, x_sd_px, signal, haze: see `StripeTable`."""
 SIGNAL_REACH_PX: Final = 2
 """Pixels on either side whose light is the stripe's, where the line is narrower."""
+FEW_EXPOSURES: Final = 1
+"""Up to so many a close look says no more than the scores of the neighbours, which are there already."""
 USUAL_PAIRS: Final = 4
 """Pairs of pixels that the close-up looks at, where the line is no wider than usual."""
-
-
-class Judge(NamedTuple):
-    """All that is needed to judge the rows of a sweep; fixed while the sweep lasts.
-
-    x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, 2, rows + LANES), first and
-    last stored pixel of each search window, the first behind the last where there is none. rows: of the picture.
-    ambient: float32 (bands, width padded to whole words). hot_start: int32 (words, rows + 1), for windows that begin at
-    each word the first entry of each row in hot_at, int16, stored pixels whose counts say nothing, and hot_place,
-    int32, their places in the counts of all rows of the picture. nominal: exposures the tables are for. faintest,
-    brightest: photons of a stripe at scale 1. reach: half the line's width in px. shift: units of the scores are
-    128 >> shift an octave, close_shift: of the close-up's. most: largest count. quiet_step: every so manieth column
-    teaches the ambient light. flux: see `count_fluxes`.
-    """
-
-    tables: Tables
-    closeup: Closeup
-    band_rows: int
-    x0: NDArray[np.int32]
-    window: int
-    rows: int
-    limits: NDArray[np.int16]
-    near_is_left: bool
-    ambient: NDArray[np.float32]
-    hot_start: NDArray[np.int32]
-    hot_at: NDArray[np.int16]
-    hot_place: NDArray[np.int32]
-    nominal: float
-    faintest: float
-    brightest: float
-    reach: int
-    shift: int
-    close_shift: int
-    most: int
-    quiet_step: int
-    flux: NDArray[np.float32]
-
-
-class Found(NamedTuple):
-    """What a sweep gives, to be filled.
-
-    stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 where there is nothing. quiet: int32 (rows, PAIRS,
-    lanes of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
-    (rows, lanes + 1), their exposures as steps up and down. light: int32, like quiet, ones of every pixel within the
-    windows. The last ones of both are still in quiet_here and light_here, uint8 (rows, PAIRS, lanes of the window, 2).
-    lines: int32 (lines, window), counts of the rows that the learning reads; line_start: int32 (columns + 1,) and
-    line_row: int32, the rows of each column in order.
-    """
-
-    stripe: NDArray[np.float32]
-    quiet: NDArray[np.int32]
-    quiet_exposures: NDArray[np.int32]
-    light: NDArray[np.int32]
-    quiet_here: NDArray[np.uint8]
-    light_here: NDArray[np.uint8]
-    lines: NDArray[np.int32]
-    line_start: NDArray[np.int32]
-    line_row: NDArray[np.int32]
-
-
-class Bench(NamedTuple):
-    """A thread's own memory."""
-
-    search: NDArray[np.uint8]
-
-
-class Desk(NamedTuple):
-    """Judge, Found and Bench as addresses and sizes, made once per call: see `rig.lanes` for why."""
-
-    memory: int
-    lanes: int
-    columns: int
-    rows: int
-    bands: int
-    taps: int
-    edge: int
-    tap: int
-    position: int
-    slope: int
-    lane: int
-    none: int
-    neutral: int
-    before: int
-    scale: int
-    first: int
-    last: int
-    weight: int
-    weight_constant: int
-    weight_pairs: int
-    label: int
-    square: int
-    x0: int
-    limits: int
-    limit_rows: int
-    ambient: int
-    ambient_px: int
-    hot_start: int
-    hot_at: int
-    hot_place: int
-    flux: int
-    stripe: int
-    quiet: int
-    quiet_exposures: int
-    light: int
-    quiet_sum: int
-    light_sum: int
-    sum_lanes: int
-    lines: int
-    line_start: int
-    line_row: int
-    band_rows: int
-    window: int
-    reach: int
-    shift: int
-    close_shift: int
-    most: int
-    quiet_step: int
-    near_is_left: bool
-    nominal: np.float32
-    faintest: np.float32
-    brightest: np.float32
-
-
-@numba.njit(cache=True, nogil=True)
-def desk_of(judge: Judge, found: Found, bench: Bench) -> Desk:
-    """Addresses of everything; the arrays must outlive it."""
-    tables, closeup = judge.tables, judge.closeup
-    return Desk(
-        address_of(bench.search), tables.lane.shape[2], judge.x0.shape[0], judge.rows, tables.lane.shape[1],
-        tables.tap.shape[4], address_of(tables.edge), address_of(tables.tap), address_of(tables.position),
-        address_of(tables.slope), address_of(tables.lane), address_of(tables.none), address_of(tables.neutral),
-        address_of(tables.before), address_of(tables.scale), address_of(tables.first), address_of(tables.last),
-        address_of(closeup.weight), address_of(closeup.constant), closeup.weight.shape[3],
-        address_of(closeup.label), address_of(closeup.square), address_of(judge.x0), address_of(judge.limits),
-        judge.limits.shape[2], address_of(judge.ambient), judge.ambient.shape[1], address_of(judge.hot_start),
-        address_of(judge.hot_at), address_of(judge.hot_place),
-        address_of(judge.flux), address_of(found.stripe), address_of(found.quiet_here),
-        address_of(found.quiet_exposures), address_of(found.light_here), address_of(found.quiet),
-        address_of(found.light), found.light.shape[2],
-        address_of(found.lines), address_of(found.line_start), address_of(found.line_row), judge.band_rows,
-        judge.window, judge.reach, judge.shift, judge.close_shift, judge.most, judge.quiet_step, judge.near_is_left,
-        np.float32(judge.nominal), np.float32(judge.faintest), np.float32(judge.brightest),
-    )  # fmt: skip
-
-
-@numba.njit(cache=True, nogil=True)
-def new_bench(lanes: int) -> Bench:
-    """Memory for rows of `lanes` lanes."""
-    return Bench(search_memory(lanes))
-
-
-def count_fluxes() -> NDArray[np.float32]:
-    """Photons per exposure that n ones in k exposures speak for, (k, n) float32: nearly unbiased, finite also at n = k.
-
-    Halved counts are rounded up, so that n may exceed the limit by one.
-    """
-    k, n = np.mgrid[: COUNT_LIMIT + 1, : COUNT_LIMIT + 2]
-    return np.log((k + 0.5) / (np.maximum(k - n, 0) + 0.5)).astype(np.float32)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -335,7 +176,10 @@ def judge_rows(desk: Desk, search: Search, table: Table, first: int, rows: int, 
     certainty = certainties(table, search, desk.shift)
     _answer(certainty, stripe + 4 * desk.rows, rows, search)
     _measure_light(desk, search, table, first, rows, c, exposures, stripe)
-    _look_closely(desk, search, rows, c, exposures, stripe)
+    if exposures <= FEW_EXPOSURES:
+        _place_by_neighbours(desk, search, rows, c, stripe)
+    else:
+        _look_closely(desk, search, rows, c, exposures, stripe)
     if c % desk.quiet_step == 0:
         _unmute_hot(desk, search, first, rows, np.int64(read_int32(desk.x0, c)))
         for r in range(rows):
@@ -391,6 +235,21 @@ def _read_light(desk, search, table, rows, exposures, reach):  # type: ignore[no
 
 
 @numba.njit(forceinline=True)
+def _place_by_neighbours(desk, search, rows, c, stripe):  # type: ignore[no-untyped-def]
+    """Place the lines of the batch's rows by the scores beside the best ones, and write the answers."""
+    lift = load_int16(search.lift, 0)
+    own = powers_in_order(load_int16(search.best, 0), lift, desk.shift)
+    left = powers_in_order(load_int16(search.left, 0), lift, desk.shift)
+    right = powers_in_order(load_int16(search.right, 0), lift, desk.shift)
+    beside = left + right
+    # Labels a pixel apart instead of a quarter.
+    offset, sd = offsets(larger_float(own + beside, NOTHING), right - left, beside, 1.0)
+    x = to_float32(load_int16(search.x, 0)) + np.float32(read_int32(desk.x0, c))
+    _answer(x + offset, stripe, rows, search)
+    _answer(sd, stripe + 8 * desk.rows, rows, search)
+
+
+@numba.njit(forceinline=True)
 def _look_closely(desk, search, rows, c, exposures, stripe):  # type: ignore[no-untyped-def]
     """Place the lines of the batch's rows, and write the answers."""
     # The usual width as a constant: its loop is unrolled.
@@ -406,7 +265,7 @@ def _look_closely(desk, search, rows, c, exposures, stripe):  # type: ignore[no-
         store_folded(search.moment, r, likelihood * load_float32(desk.label, 0))
         store_folded(search.square, r, likelihood * load_float32(desk.square, 0))
     mass, moment, square = (totals_of_rows(search.mass), totals_of_rows(search.moment), totals_of_rows(search.square))
-    offset, sd = offsets(mass, moment, square)
+    offset, sd = offsets(mass, moment, square, LABEL_PX)
     x = to_float32(load_int16(search.x, 0)) + np.float32(read_int32(desk.x0, c))
     _answer(x + offset, stripe, rows, search)
     _answer(sd, stripe + 8 * desk.rows, rows, search)

@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import FrameTally, SweepLayout, SweepTally
-from rig.counting_kernels import CHUNK, add_runs, new_planes
+from rig.counting_kernels import add_runs, new_planes, rows_of_chunk
 from rig.estimators.judging import clear_found, nothing_found, quiet_of, stripes_of
 from rig.estimators.learning import next_lattice
 from rig.estimators.row_input import Lines
-from rig.estimators.row_search import Bench, Desk, Found, Judge, desk_of, new_bench
+from rig.estimators.search_desk import Desk, Found, Judge, desk_of
+from rig.estimators.search_kernels import search_memory
 from rig.estimators.stream_kernels import OpenColumn, carry_sums, search_frames
 from rig.geometry import SweepGeometry
 from rig.lane_order import padded_lanes, pixel_order
@@ -56,7 +57,7 @@ class ColumnJudge:
         self._row_words = 0
         self._open: dict[int, OpenColumn] = {}
         self._planes: dict[int, NDArray[np.uint64]] = {}
-        self._desks: dict[int, tuple[Desk, Bench]] = {}
+        self._desks: dict[int, tuple[Desk, NDArray[np.uint8]]] = {}
         self._no_counts = np.zeros((0, layout.rows, layout.window), np.uint8)
 
     def begin(self, judge: Judge) -> None:
@@ -120,8 +121,7 @@ class ColumnJudge:
         if self._row_words not in (0, row_words):
             raise ValueError(f"frames of {row_words} words a row behind those of {self._row_words}; begin a new sweep")
         self._row_words = row_words
-        chunk_rows = max(CHUNK // row_words, 1)
-        chunks = -(-layout.rows // chunk_rows)
+        chunks = -(-layout.rows // rows_of_chunk(row_words))
         if row_words not in self._planes:
             self._planes[row_words] = new_planes(chunks)
         planes = self._planes[row_words]
@@ -137,8 +137,8 @@ class ColumnJudge:
     def _desk(self, first: int) -> Desk:
         """What the thread that begins at chunk `first` works with."""
         if first not in self._desks:
-            bench = new_bench(padded_lanes(self._layout.window))
-            self._desks[first] = desk_of(self._judge, self._found, bench), bench
+            memory = search_memory(padded_lanes(self._layout.window))
+            self._desks[first] = desk_of(self._judge, self._found, memory), memory
         return self._desks[first][0]
 
     def _opened(self) -> OpenColumn:

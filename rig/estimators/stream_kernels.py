@@ -11,18 +11,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.counting_kernels import CHUNK, PLANES, WORD_BYTES, WORD_PX, add_frames, planes_for
-from rig.estimators.row_search import (
-    Bench,
-    Desk,
-    Found,
-    Judge,
-    desk_of,
-    halvings,
-    judge_rows,
-    keep_line,
-    table_for,
-)
+from rig.counting_kernels import CHUNK, PLANES, WORD_BYTES, WORD_PX, add_frames, planes_for, rows_of_chunk
+from rig.estimators.row_search import halvings, judge_rows, keep_line, table_for
+from rig.estimators.search_desk import Desk, Found, Judge, desk_of
 from rig.estimators.search_kernels import BATCH, search_in
 from rig.lane_order import PAIRS, STEPS, halve_counts, read_counts, read_planes, sum_counts
 from rig.lanes import LANES, add_bytes, address_of, load_bytes, read_int32, store_bytes, zero_bytes
@@ -140,11 +131,11 @@ def search_frames(
 
     words: (all words,) of the block's frames; bins: (n,), column of each frame, negative ones are passed over;
     first_word: (n,) of each frame's window; row_words: words of a row; end: the sweep ends here, nothing stays open;
-    desk: with a thread's own bench; planes: see `new_planes`. Only chunks first_chunk..last_chunk-1 are touched.
+    desk: with a thread's own memory; planes: see `new_planes`. Only chunks first_chunk..last_chunk-1 are touched.
     """
     rows = desk.rows
     frame = rows * row_words
-    chunk_rows = max(CHUNK // row_words, 1)
+    chunk_rows = rows_of_chunk(row_words)
     counted = address_of(planes)
     chunk_bytes = (PLANES + 1) * CHUNK * WORD_BYTES
     state = open_column
@@ -191,13 +182,16 @@ def search_counts(
     counts: NDArray[np.unsignedinteger],
     n_frames: NDArray[np.int32],
     judge: Judge,
-    bench: Bench,
+    memory: NDArray[np.uint8],
     found: Found,
     first_row: int,
     last_row: int,
 ) -> None:
-    """Judge rows first_row..last_row-1 of counts (columns, rows, window); no light and no lines are kept."""
-    desk = desk_of(judge, found, bench)
+    """Judge rows first_row..last_row-1 of counts (columns, rows, window); no light and no lines are kept.
+
+    memory: see `search_memory`.
+    """
+    desk = desk_of(judge, found, memory)
     search = search_in(desk.memory, desk.lanes)
     sums_x0, pending = np.int64(0), 0
     for c in range(counts.shape[0]):

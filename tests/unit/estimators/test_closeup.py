@@ -13,7 +13,6 @@ from rig.estimators.closeup_kernels import (
     label_scores,
     label_weights,
     level_flux,
-    level_of,
     levels_of,
     offsets,
 )
@@ -55,12 +54,19 @@ def look(memory, counts, x, exposures, weight, constant, pairs, index, square, s
     store_folded(search.moment, 0, likelihood * load_float32(index, 0))
     store_folded(search.square, 0, likelihood * load_float32(square, 0))
     mass, moment, spread = totals_of_rows(search.mass), totals_of_rows(search.moment), totals_of_rows(search.square)
-    offset, sd = offsets(mass, moment, spread)
+    offset, sd = offsets(mass, moment, spread, LABEL_PX)
     store_float32(address_of(out), 0, offset)
     store_float32(address_of(out), LANES, sd)
 
 
 @cache
+def level_of(flux):
+    """Level that a flux in photons per exposure lies in: half octaves from 2^LOWEST_OCTAVE on, of equal width each."""
+    octave = np.floor(np.log2(flux)) if flux > 0 else -np.inf
+    level = 2 * (octave - LOWEST_OCTAVE) + (flux >= 1.5 * 2.0**octave)
+    return int(np.clip(level, 0, LEVELS - 1))
+
+
 def tables(near_is_left, sigma_px, shift=SHIFT):
     weight, constant = label_weights(AMBIENT, SHARE, near_is_left, fine_profiles(sigma_px), TABLE)
     return closeup_tables(weight, constant, 128 >> shift)

@@ -17,8 +17,9 @@ from rig.estimators.judging import (
 )
 from rig.estimators.learning import next_lattice
 from rig.estimators.likelihood import Likelihood
-from rig.estimators.row_search import COUNT_LIMIT, count_fluxes, halvings
+from rig.estimators.row_search import halvings
 from rig.estimators.screen_tables import WEIGHT_LIMIT
+from rig.estimators.search_desk import COUNT_LIMIT, count_fluxes
 from rig.row_threads import RowWorkers
 from tests.reference.geometry import Geometry
 from tests.unit.small_maps import RIGS, geometry_of, simulated

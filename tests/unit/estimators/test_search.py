@@ -13,8 +13,9 @@ from rig.estimators.likelihood import Likelihood
 from rig.estimators.row_input import judge_line, row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimators.row_kernels import mode_of
 from rig.estimators.row_model import RowModel, line_profile, stripe_scale
-from rig.estimators.row_search import desk_of, new_bench, table_for
-from rig.estimators.search_kernels import BATCH, START, score_rows, search_in
+from rig.estimators.row_search import table_for
+from rig.estimators.search_desk import desk_of
+from rig.estimators.search_kernels import BATCH, START, score_rows, search_in, search_memory
 from rig.estimators.stream_kernels import search_counts
 from rig.lane_order import STEPS, padded_lanes, read_counts
 from rig.lanes import read_int16
@@ -43,7 +44,7 @@ def searched(volume, geometry, learned, exposures=None):
     exposures = int(np.median(volume.n_frames)) if exposures is None else exposures
     judge = judge_of(learned, geometry, exposures, WORKERS, dark=False)
     found = nothing_found(geometry, None)
-    bench = new_bench(padded_lanes(geometry.window))
+    bench = search_memory(padded_lanes(geometry.window))
     search_counts(volume.counts, volume.n_frames, judge, bench, found, 0, geometry.rows)
     table = stripes_of(found, judge, WORKERS)
     return np.stack([table.x_px, table.confidence, table.x_sd_px, table.signal, table.haze])
@@ -170,7 +171,7 @@ def scores(judge, c, band, counts, exposures):
     """
     tables = judge.tables
     lanes = tables.lane.shape[2]
-    bench, found = new_bench(lanes), nothing_found(simulated().geometry, None)
+    bench, found = search_memory(lanes), nothing_found(simulated().geometry, None)
     desk = desk_of(judge, found, bench)
     raw, lane, constant = (np.zeros(n, np.int16) for n in (len(counts) * STEPS * lanes, lanes, 2 * STEPS * lanes))
     compiled_scores(desk, c, band, counts, np.float32(exposures), raw.reshape(len(counts), -1), lane, constant)

@@ -17,7 +17,7 @@ from drivers.spb1 import walk_blocks
 from rig import api, cli
 from rig.bench import looped_spad, speed
 from rig.bench.bench_kernels import count_columns, draw_frames, read_all
-from rig.bench.frames import EDGE_PX, PLACE_FRAMES, ROWS, WIDTH, full_frames, window_frames
+from rig.bench.frames import BLOCK_FRAMES, EDGE_PX, PLACE_FRAMES, ROWS, WIDTH, full_frames, window_frames
 from rig.bench.looped_spad import LEAD_FRAMES, Loop, LoopedSpad
 from rig.bench.recorded import recording_of
 from rig.bench.soak import SoakOptions, soak
@@ -121,7 +121,7 @@ def test_reading_reads_every_word():
 def test_the_recording_holds_the_frames(frames):
     recording, stride = recording_of(frames)
     blocks = list(walk_blocks(recording, stride, check_payload=True))
-    assert len(blocks) == len(frames.bits) // PLACE_FRAMES
+    assert len(blocks) == len(frames.bits) // BLOCK_FRAMES
     np.testing.assert_array_equal(np.concatenate([block.bits for block in blocks]), frames.bits)
     assert blocks[0].records["x0"][0] == frames.geometry.x0[0]
 
@@ -167,7 +167,7 @@ def test_estimating_rows_tell_their_error_and_others_none(report):
 
 def test_latency_counts_every_column(report):
     latency = report.latency_us
-    assert latency.columns == 20 * PLACE_FRAMES // 10 - 1  # nothing came behind the last one
+    assert latency.columns == 4 * BLOCK_FRAMES // 10 - 1  # nothing came behind the last one
     assert 0 < latency.median <= latency.p999 <= latency.max
 
 
