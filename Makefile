@@ -17,8 +17,10 @@ types: .venv/.installed-tests
 	$(BIN)/mypy
 layers: .venv/.installed-tests
 	$(BIN)/lint-imports
+# Files of tests go to the workers whole: what they prepare once is prepared once.
+WORKERS ?= 4
 unit: .venv/.installed-tests
-	$(BIN)/pytest
+	$(BIN)/pytest -n $(WORKERS) --dist loadfile
 
 # The accuracy tables of docs/results.md over the scenes of ../shared/scenes (minutes).
 accuracy: .venv/.installed-tests

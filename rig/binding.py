@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from drivers.frames import FRAME_RECORD, SUBFRAME_MASK, SUBFRAME_SHIFT, BlockHeader, FrameBlock, Mark
 from rig.blanking import MAX_CLOCK_ERROR
 from rig.blanking_sync import BlankingSync
+from rig.counting import BYTE_EXPOSURES, BYTE_FRAMES
 from rig.scan_plan import ScanPlan
 
 MAX_RESIDUAL_COLUMNS = 0.05
@@ -32,10 +33,6 @@ MAX_RESIDUAL_COLUMNS = 0.05
 UNITS_PER_TICK = 2 * (SUBFRAME_MASK + 1)
 """Times are kept as whole numbers of this part of a tick, in which markers and exposure middles are exact: a frame's
 column is then the same to the last bit in whatever block it comes. Good for 200 days at 1 GHz."""
-BYTE_EXPOSURES = 200
-"""Up to so many exposures the frames of a column are counted in bytes."""
-BYTE_FRAMES = 255
-"""Most frames that such a column uses, however long the mirror stands still."""
 CARRIED = np.dtype(
     [(name, np.int64) for name in ("sweep", "anchor_time", "anchor_point", "edges", "wrong_way", "column", "in_column")]
 )

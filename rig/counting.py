@@ -18,6 +18,10 @@ BIN_DARK = -1
 """Bin of a frame with the gate low during the whole exposure."""
 BIN_UNUSABLE = -2
 """Bin of a frame that belongs to no column and is not dark (gate edge inside, outside the sweep)."""
+BYTE_FRAMES = 255
+"""Most frames of a column that counters of 8 bits hold."""
+BYTE_EXPOSURES = 200
+"""Nominal exposures up to which such counters do: binding lets no column have more than BYTE_FRAMES then."""
 
 Counts = NDArray[np.unsignedinteger[Any]]
 """uint8, uint16 or uint32, as wide as the counts need."""

@@ -163,7 +163,8 @@ def _ever_new(frames: BenchFrames, columns: int) -> NDArray[np.uint8]:
     places = len(frames.bits) // PLACE_FRAMES
     column = np.arange(columns)
     first = column % places * PLACE_FRAMES + column // places * LEARN_EXPOSURES % PLACE_FRAMES
-    return frames.bits[(first[:, None] + np.arange(LEARN_EXPOSURES)).ravel()]
+    bits: NDArray[np.uint8] = frames.bits[(first[:, None] + np.arange(LEARN_EXPOSURES)).ravel()]
+    return bits
 
 
 def _cases(

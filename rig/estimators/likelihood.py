@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.counting import Counter, CountVolume, FrameTally, SweepCounter, SweepLayout
+from rig.counting import BYTE_EXPOSURES, Counter, CountVolume, FrameTally, SweepCounter, SweepLayout
 from rig.estimators.ambient import ambient_map
 from rig.estimators.judging import judge_of, nothing_found, quiet_of, stripes_of
 from rig.estimators.learning import Expectation, learn_first, learn_next, lines_of, next_lattice
@@ -21,7 +21,7 @@ from rig.estimators.row_input import Lines
 from rig.estimators.row_model import RowModel
 from rig.estimators.search_desk import Judge
 from rig.estimators.search_kernels import search_memory
-from rig.estimators.stream import MOST_EXPOSURES, ColumnJudge, SearchedSweep
+from rig.estimators.stream import ColumnJudge, SearchedSweep
 from rig.estimators.stream_kernels import search_counts
 from rig.geometry import SweepGeometry
 from rig.lane_order import padded_lanes
@@ -190,7 +190,7 @@ class _LikelihoodCounter:
         # Chosen with the first frames: only then has the sweep before this one been estimated and has taught.
         if self._counter is None:
             layout = self._layout
-            if self._of.model is None or layout.exposures > MOST_EXPOSURES:
+            if self._of.model is None or layout.exposures > BYTE_EXPOSURES:
                 self._counter = SweepCounter(layout, self._workers)
             else:
                 judge = self._of.judge(self._geometry, layout.exposures, dark=layout.dark)

@@ -18,8 +18,6 @@ from rig.lane_order import padded_lanes, pixel_order
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
-MOST_EXPOSURES = 200
-"""Nominal exposures of a column up to which its counters (of 8 bits) have room for what it really gets."""
 NO_COLUMN = OpenColumn(-1, 0, 0, 0, 0)
 
 

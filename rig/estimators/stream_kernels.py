@@ -11,6 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.counting import BYTE_FRAMES
 from rig.counting_kernels import CHUNK, PLANES, WORD_BYTES, WORD_PX, add_frames, planes_for, rows_of_chunk
 from rig.estimators.row_search import halvings, judge_rows, keep_line, table_for
 from rig.estimators.search_desk import Desk, Found, Judge, desk_of
@@ -18,7 +19,7 @@ from rig.estimators.search_kernels import BATCH, search_in
 from rig.lane_order import PAIRS, STEPS, halve_counts, read_counts, read_planes, sum_counts
 from rig.lanes import LANES, add_bytes, address_of, load_bytes, read_int32, store_bytes, zero_bytes
 
-SUM_LIMIT: Final = 255
+SUM_LIMIT: Final = BYTE_FRAMES
 """Exposures after which the 8-bit sums are carried over."""
 
 

@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rig.counting import BIN_DARK, BIN_UNUSABLE, CountVolume, SweepCounter, SweepLayout
+from rig.counting import BIN_DARK, BIN_UNUSABLE, BYTE_EXPOSURES, CountVolume, SweepCounter, SweepLayout
 from rig.estimators import likelihood
 from rig.estimators.likelihood import Likelihood
 from rig.estimators.row_model import RowModel
-from rig.estimators.stream import MOST_EXPOSURES, ColumnJudge, SearchedSweep
+from rig.estimators.stream import ColumnJudge, SearchedSweep
 from rig.geometry import uncalibrated_geometry
 from rig.row_threads import RowWorkers
 from tests.unit.small_maps import Sweep, simulated
@@ -144,7 +144,7 @@ def test_neither_threads_nor_blocks_change_a_bit(threads, sizes):
 
 
 def test_columns_of_more_exposures_than_the_counters_hold_are_counted_whole():
-    exposures = MOST_EXPOSURES + 100
+    exposures = BYTE_EXPOSURES + 100
     layout, sweeps = layout_of(exposures=exposures), [frames_of(exposures=exposures)]
     found = judged("left", layout, sweeps, 2, [500])
     assert isinstance(found[0][1], CountVolume)
