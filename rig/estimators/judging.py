@@ -11,7 +11,7 @@ from rig.estimators.closeup_kernels import closeup_tables, label_weights, larges
 from rig.estimators.row_input import TABLE, State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
 from rig.estimators.row_search import QUIET_STEP, SIGNAL_REACH_PX, halvings, turned
-from rig.estimators.screen_tables import SCREENS, WEIGHT_LIMIT, Tables, fill_tables
+from rig.estimators.screen_tables import NONE, SCREENS, WEIGHT_LIMIT, Tables, fill_tables
 from rig.estimators.search_desk import COUNT_LIMIT, FIELDS, Found, Judge, count_fluxes
 from rig.geometry import SweepGeometry
 from rig.lane_order import PAIRS, STEPS, padded_lanes, pair_bytes, pixel_order, places_of
@@ -232,7 +232,7 @@ def _empty_tables(columns: int, bands: int, lanes: int, reach: int) -> Tables:
         position=of(SCREENS, pixels, dtype=np.int16),
         slope=of(SCREENS, pixels, dtype=np.int16),
         lane=of(lanes),
-        none=of(3),
+        none=of(NONE),
         neutral=of(pixels),
         before=of(pixels),
         scale=of(pixels),

@@ -15,7 +15,7 @@ from rig.counting_kernels import WORD_PX
 from rig.estimators.closeup_kernels import label_scores, levels_of, offsets
 from rig.estimators.powers import lift_to_powers, powers, powers_in_order
 from rig.estimators.row_kernels import LABEL_PX
-from rig.estimators.screen_tables import OUTSIDE, SCREENS
+from rig.estimators.screen_tables import NONE, OUTSIDE, SCREENS
 from rig.estimators.search_desk import COUNT_LIMIT, FIELDS, Desk
 from rig.estimators.search_kernels import (
     BATCH,
@@ -108,19 +108,22 @@ def table_for(desk: Desk, search: Search, c: int, b: int, exposures: float) -> T
         fit_positions(constant, slope, SCREENS * pixels, exposures - desk.nominal, search.constant)
         constant = search.constant
     _fetch_ahead(desk, pixels, table + desk.bands)
-    fit_lanes(desk.lane + 4 * search.lanes * table, exposures, search)
+    none = desk.none + 4 * NONE * table
+    fit_lanes(
+        desk.lane + 4 * search.lanes * table, exposures, max(read_float32(none, 2), np.float32(OUTSIDE)),
+        np.int64(read_float32(none, 3)), np.int64(read_float32(none, 4)), search,
+    )  # fmt: skip
     x0, neutral = np.int64(read_int32(desk.x0, c)), desk.neutral + 4 * pixels * table
     band_end = min((b + 1) * desk.band_rows, desk.rows)
     if _hot_of_row(desk, x0, b * desk.band_rows) < _hot_of_row(desk, x0, band_end):
         _neutral_counts(neutral, exposures, c, desk.window, search.neutral)
     lowest = np.float32(OUTSIDE)
-    all_right = max(read_float32(desk.none, 3 * table) + np.float32(START), lowest)
+    all_right = max(read_float32(none, 0) + np.float32(START), lowest)
     return Table(
         desk.edge + pixels * table, desk.tap + 2 * SCREENS * desk.taps * pixels * table, constant,
         desk.before + 4 * pixels * table, desk.scale + 4 * pixels * table,
         desk.ambient + 4 * (b * desk.ambient_px + x0), np.int16(all_right),
-        np.int16(max(read_float32(desk.none, 3 * table + 1), lowest)),
-        np.int16(max(read_float32(desk.none, 3 * table + 2), lowest)),
+        np.int16(max(read_float32(none, 1), lowest)),
         read_int32(desk.first, table) <= read_int32(desk.last, table),
     )  # fmt: skip
 

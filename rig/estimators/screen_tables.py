@@ -23,6 +23,7 @@ SCREENS: Final = 2
 """Stripe amplitudes of the search; all of them take part in what follows it."""
 OUTSIDE: Final = -32000
 """Score of a position where the column's stripe cannot lie."""
+NONE: Final = 5
 SLOPE: Final = 8
 WEIGHT_LIMIT: Final = 127
 """Weights are cut there: a count that would say more says this much."""
@@ -40,7 +41,8 @@ class Tables(NamedTuple):
     position: int16 (columns, bands, SCREENS, P), units of position x at the nominal number of exposures, its prior
     included; slope: int16, the same shape, by how many 1 / SLOPE of a unit it grows with each exposure more.
     lane: float32 (columns, bands, lanes), units per exposure of all pixels up to a lane's last lying left.
-    none: float32 (columns, bands, 3), units of 'no stripe': all as right, all as left, a change somewhere (per lane).
+    none: float32 (columns, bands, NONE), units of 'no stripe': all as right, all as left, a change somewhere (per
+    lane); first and last lane with pixels of the column.
     neutral: float32 (columns, bands, P), ones per exposure that say nothing, in pixel order.
     before, scale: float32 (columns, bands, P) as in `Row`, in pixel order.
     first, last: int32 (columns, bands), first and last position in stored pixels.
@@ -180,6 +182,7 @@ def _positions(sweep, state, light, log_share, per_nat, nominal, b, c, span, row
     out.none[c, b, 0] = (np.log(all_right) - share) * per_nat
     out.none[c, b, 1] = (np.log(all_left) - share) * per_nat
     out.none[c, b, 2] = (np.log(change * STEPS / (length + 1)) - share) * per_nat
+    out.none[c, b, 3], out.none[c, b, 4] = low // STEPS, (low + length - 1) // STEPS
 
 
 @numba.njit(inline="always")

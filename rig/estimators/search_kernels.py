@@ -57,7 +57,7 @@ class Table(NamedTuple):
     """One table made ready for a number of exposures.
 
     Addresses, in lane order: edge, tap as in `Tables`, constant as in `Search`; in pixel order, float32 of the stored
-    pixels: before, scale, ambient. Numbers: all_right, all_left, change: scores of 'no stripe' as of
+    pixels: before, scale, ambient. Numbers: all_right, all_left: scores of 'no stripe' as of
     `Tables.none`, that of all pixels lying right complete. searched: whether there is any position to find.
     """
 
@@ -69,7 +69,6 @@ class Table(NamedTuple):
     ambient: int
     all_right: np.int16
     all_left: np.int16
-    change: np.int16
     searched: bool
 
 
@@ -78,7 +77,8 @@ class Search(NamedTuple):
 
     n: counts, see `rig.lane_order`. int16: score (STEPS, lanes); start (lanes,), score of a change at the lane's first
     pixel; tops (LANES,), best scores of some lanes each; constant (SCREENS, STEPS, lanes), the tables' part per
-    exposure times the exposures; lane (lanes,), the same; label (LANES,), scores of the close-up; place: index of pixel
+    exposure times the exposures; lane (lanes,), the same; change (lanes,), what a change without a stripe in
+    the lane adds; label (LANES,), scores of the close-up; place: index of pixel
     -PLACE_BEFORE on in a row of counts. neutral, muted: bytes, counts of hot pixels, see `row_search`. Of each row of
     the batch, int16: all_left, score of all pixels lying left; best, x: best score and its pixel; left, right: the
     scores beside it; levels: of the close-up; lift: what makes a score a power; ceiling: what no score exceeds.
@@ -96,6 +96,7 @@ class Search(NamedTuple):
     tops: int
     constant: int
     lane: int
+    change: int
     label: int
     place: int
     neutral: int
@@ -127,7 +128,8 @@ def _search_at(n, lanes):  # type: ignore[no-untyped-def]
     tops = start + BATCH * 2 * lanes
     constant = tops + BATCH * 2 * LANES
     lane = constant + 2 * SCREENS * STEPS * lanes
-    label = lane + 2 * lanes
+    change = lane + 2 * lanes
+    label = change + 2 * lanes
     row = label + BATCH * 2 * LANES
     number = row + 8 * 2 * BATCH
     folded = number + 5 * 4 * BATCH
@@ -135,7 +137,7 @@ def _search_at(n, lanes):  # type: ignore[no-untyped-def]
     place = folded + 3 * fold
     neutral = place + 2 * (STEPS * lanes + 2 * PLACE_BEFORE)
     search = Search(
-        lanes, n, n_bytes, score, score_bytes, start, tops, constant, lane, label, place, neutral,
+        lanes, n, n_bytes, score, score_bytes, start, tops, constant, lane, change, label, place, neutral,
         neutral + STEPS * lanes, row, row + 2 * BATCH,
         row + 4 * BATCH, row + 6 * BATCH, row + 8 * BATCH, row + 10 * BATCH, row + 12 * BATCH, row + 14 * BATCH, number,
         number + 4 * BATCH, number + 8 * BATCH, number + 12 * BATCH, number + 16 * BATCH, folded, folded + fold,
@@ -180,14 +182,18 @@ def fit_positions(position: int, slope: int, places: int, more: float, to: int) 
 
 
 @numba.njit(forceinline=True)
-def fit_lanes(per_exposure: int, exposures: float, search: Search) -> None:
-    """Constants of the lanes; per_exposure: address of the table's, which are sums up to each lane."""
+def fit_lanes(per_exposure: int, exposures: float, change: float, first: int, last: int, search: Search) -> None:
+    """Constants of the lanes; per_exposure: address of the table's, which are sums up to each lane.
+
+    change: score of a change without a stripe, in the lanes first..last that hold pixels of the column.
+    """
     before = np.float32(0.0)
     for i in range(search.lanes):
         # Differences of rounded sums: rounding each lane would drift along the row.
         through = np.floor(read_float32(per_exposure, i) * np.float32(exposures) + np.float32(0.5))
         write_int16(search.lane, i, np.int16(min(max(through - before, np.float32(-32000)), np.float32(32000))))
         before = through
+        write_int16(search.change, i, np.int16(change) if first <= i <= last else np.int16(OUTSIDE))
 
 
 @numba.njit(forceinline=True)
@@ -354,7 +360,9 @@ def add_likelihoods(table: Table, search: Search, rows: int, window: int, shift:
             c = c + powers(load_int16(score, 5 * lanes + v), lift, shift)
             d = powers(load_int16(score, 6 * lanes + v), lift, shift)
             d = d + powers(load_int16(score, 7 * lanes + v), lift, shift)
-            nowhere = smaller(add_saturated(load_int16(search.start, r * lanes + v), table.change), ceiling)
+            nowhere = smaller(
+                add_saturated(load_int16(search.start, r * lanes + v), load_int16(search.change, v)), ceiling
+            )
             lot = lot + (((a + b) + (c + d)) + powers(nowhere, lift, shift))
         store_folded(search.mass, r, lot)
         x = np.int64(read_int16(search.x, r))

@@ -7,6 +7,7 @@ import numba
 import numpy as np
 import pytest
 
+from rig.estimators import judging
 from rig.estimators.judging import SCORE_LIMIT, judge_of, nothing_found, stripes_of
 from rig.estimators.learning import lines_of
 from rig.estimators.likelihood import Likelihood
@@ -20,7 +21,8 @@ from rig.estimators.stream_kernels import search_counts
 from rig.lane_order import STEPS, padded_lanes, read_counts
 from rig.lanes import read_int16
 from rig.row_threads import RowWorkers
-from tests.unit.small_maps import simulated, volume_of
+from tests.reference.geometry import Geometry
+from tests.unit.small_maps import geometry_of, simulated, volume_of
 
 RIGS = ("left", "right", "turned")
 LIGHTS = ("report", "dense", "clear")
@@ -337,3 +339,37 @@ def test_a_column_of_more_frames_than_nominal_is_no_worse_for_it(nominal, frames
         stripe = searched(sweep.volume, sweep.geometry, model(), nominal)
         right.append(np.mean(sweep.errors(stripe[0]) <= 1))
     assert right[1] > right[0] - 0.03
+
+
+def stored(geometry, window, depth_range_m):
+    """The geometry with windows of so many pixels, of which those in a smaller depth range are searched."""
+    part = geometry_of(Geometry.build(width=512, height=geometry.rows, columns=geometry.columns), depth_range_m)
+    low = np.where(part.x_lo <= part.x_hi, part.x_lo, geometry.width).min(axis=0)
+    x0 = np.clip(low // 64 * 64, 0, geometry.width - window).astype(np.int32)
+    return replace(part, x0=x0, window=window)
+
+
+@pytest.mark.parametrize("window", [64, 128, 192, 320, 448])
+@pytest.mark.parametrize("exposures", [1, 10])
+def test_windows_of_any_size_are_searched_as_exactly(window, exposures):
+    sweep, learned = simulated(exposures=exposures), model()
+    geometry = stored(sweep.geometry, window, (3.0, 4.0))
+    sure, also, difference = agreement(volume_of(sweep.counts, geometry, exposures), geometry, learned)
+    assert min(sure, also) > 0.985
+    assert abs(difference.mean()) < 0.04
+    assert np.abs(difference).mean() < 0.04
+
+
+@pytest.mark.parametrize("band_rows", [64, 16, 8, 4])
+def test_columns_and_rows_without_a_search_window_have_no_answer_and_leave_the_others_alone(band_rows, monkeypatch):
+    monkeypatch.setattr(judging, "BAND_ROWS", (band_rows,))
+    sweep, learned = simulated(), model()
+    geometry, nothing = sweep.geometry, np.zeros((32, 96), bool)
+    nothing[:, ::7] = nothing[5] = nothing[16:20, 40:] = True
+    wanted = searched(sweep.volume, geometry, learned)
+    part = replace(geometry, x_lo=np.where(nothing, geometry.width, geometry.x_lo).astype(np.int32))
+    found = searched(volume_of(sweep.counts, part, 10), part, learned)
+    assert np.isnan(found[0][nothing]).all()
+    assert not found[1][nothing].any()
+    sure = ~nothing & (wanted[1] > SURE)
+    assert (np.abs(found[0] - wanted[0])[sure] <= NEAR_PX).mean() > 0.98
