@@ -110,7 +110,7 @@ def open_scanner(
 ) -> DacScanner:
     """The scanner at the config's port. identify: makes the `Dac` of an open device, or raises."""
     endpoint = resolve(config.port, surroundings.ports)
-    usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend)
+    usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, surroundings.tap)
     try:
         return DacScanner(identify(usb), config)
     except BaseException:

@@ -87,7 +87,7 @@ class PrawnDo(SyncSource):
         super().__init__("PrawnDO")
         self._config = config
         self._confirmed = False
-        port = SerialPort(self.name, resolve(config.port, surroundings.ports).address)
+        port = SerialPort(self.name, resolve(config.port, surroundings.ports).address, tap=surroundings.tap)
         self._line = PrawnDoLine(self.name, port, timing)
         try:
             self._line.connect(max(MAX_WORDS.values()))

@@ -11,6 +11,7 @@ from drivers.clock import Clock
 from drivers.errors import UnknownKind
 from drivers.interfaces import World
 from drivers.transports.endpoints import Endpoint
+from drivers.transports.tap import Tap
 
 SLOTS = ("spad", "scanner", "laser", "sync", "world")
 """The parts of a rig. The kinds of slot `spad` are the entry points of group `spadrig.spad`, and so on."""
@@ -36,6 +37,8 @@ class Surroundings:
     seed: int
     ports: Mapping[str, Endpoint] = field(default_factory=dict)
     """Ports that an emulating world created, by name; a device's `port: emulated:NAME` means one of them."""
+    tap: Tap | None = None
+    """Told of all that passes the device's port, where its traffic is recorded."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,10 +2,12 @@
 
 The answer to `I` is the pixels, then `DONE`; or text that ends with `ERROR`, anywhere. Pixels may well read `DONE` or
 `ERROR`: what counts is the exact length and what stands behind it. A block is given out once so much has come behind it
-that no error text can be part of it.
+that no error text can be part of it. Frames have neither number nor checksum: pixels handed over twice in place of
+others have the right length, so that no frame may be the very same as one before.
 """
 
 import time
+import zlib
 from collections.abc import Callable
 
 import numpy as np
@@ -20,6 +22,7 @@ SLICE_S = 0.05
 """One wait: how late a `stop` from another thread comes at most."""
 _ERROR_CHECK_S = 0.5
 """After a silence of so long within a run the last bytes are looked at: they may be an error text."""
+_UNIFORM = (0x00, 0xFF)
 
 
 class Spad512sRun:
@@ -41,6 +44,8 @@ class Spad512sRun:
         self._got = 0
         """Bytes of the present block and of what guards it that are here."""
         self._heard_at = time.monotonic()
+        self._seen: dict[tuple[int, int], int] = {}
+        """Frames by the checksums of their halves: 64 bits, since 10 000 frames may well share one of 32."""
 
     @property
     def next_n(self) -> int:
@@ -65,7 +70,9 @@ class Spad512sRun:
             self._receive_some(self._memory[self._got : wanted], ends_at, timeout_s)
         if self.ends:
             self._require_done(pixel_bytes)
-        return self._memory[:pixel_bytes]
+        pixels = self._memory[:pixel_bytes]
+        self._require_new(pixels.reshape(self.next_n, 2, -1))
+        return pixels
 
     def go_on(self) -> None:
         """The block is dealt with: what guarded it begins the next one."""
@@ -98,6 +105,16 @@ class Spad512sRun:
         raise ProtocolError(
             f"{self._name}: 0x{behind.hex()} stands behind the last pixel, not DONE; the run is not to be trusted"
         )
+
+    def _require_new(self, frames: NDArray[np.uint8]) -> None:
+        """ProtocolError for a frame that was there before, unless all dark or all bright. frames: (n, 2, half)."""
+        for number, (one, other) in enumerate(frames, self.next_frame):
+            before = self._seen.setdefault((zlib.crc32(one), zlib.crc32(other)), number)
+            if before != number and not (one[0] in _UNIFORM and (one == one[0]).all() and (other == one[0]).all()):
+                raise ProtocolError(
+                    f"{self._name}: frame {number} is the very same as frame {before}: pixels were handed over twice, "
+                    "or the sensor is saturated; start again, with less light"
+                )
 
     def _refuse_error_text(self, rest: bytes) -> None:
         """DeviceFault with the device's own words where what came last is text that ends with ERROR."""

@@ -6,7 +6,7 @@ rig is made safe, on the caller's thread; what is in the ring by then is still c
 
 import logging
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, fields
 from fractions import Fraction
 
@@ -21,11 +21,11 @@ from rig.mapping import MakesMaps
 from rig.monitor import Watch
 from rig.overload import Overload, require_policy, ring_for
 from rig.pipeline import JOIN_S, Pipeline
-from rig.recording.recorder import Recording
+from rig.recording.writer import Recording
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig
 from rig.stages import PipelineStats
-from rig.sweeps import SweepAssembler
+from rig.sweeps import SweepAssembler, SweepStart
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +60,8 @@ class Acquisition:
     """A scan of `maps` maps with an open rig, a plan and the SPAD's timing from `rig.session.prepare`.
 
     Iterate once over `run()`. maker: makes the maps, on the counting thread. first_alone: take the first map with a
-    start of its own, so that a SPAD that cannot wait stands still while it is learned from. recording, watch: what
+    start of its own, so that a SPAD that cannot wait stands still while it is learned from. groups: sweeps of each
+    start, where that is not for the scan to choose; starts: with which sweep each begins. recording, watch: what
     recorder and monitor work for, None for none. on_progress is called on the caller's thread.
     Raises UsageError where the SPAD cannot do what `policy` asks.
     """
@@ -75,6 +76,8 @@ class Acquisition:
         *,
         policy: Overload = Overload.ABORT,
         first_alone: bool = False,
+        groups: Iterator[int] | None = None,
+        starts: Iterator[SweepStart] | None = None,
         recording: Recording | None = None,
         watch: Watch | None = None,
         on_progress: Callable[[ScanProgress], None] | None = None,
@@ -85,7 +88,10 @@ class Acquisition:
         require_policy(policy, rig.spad.info)
         self._rig = rig
         self._plan = plan
-        self._require_memory()
+        self._groups = groups
+        self._starts = starts
+        if groups is None:
+            self._require_memory()
         self._timing = timing
         self._maps = maps
         self._maker = maker
@@ -142,7 +148,8 @@ class Acquisition:
         done = 0
         while done < self._maps:
             group = self._group(done)
-            assembler = SweepAssembler(plan, counter, group, done)
+            start = None if self._starts is None else next(self._starts)
+            assembler = SweepAssembler(plan, counter, group, done, start)
             counter.reset()
             yield from self._run_group(assembler, group, done)
             done += group
@@ -153,6 +160,8 @@ class Acquisition:
 
     def _group(self, done: int) -> int:
         """Sweeps of the next start: as many as the SPAD's memory holds in a burst and the sync source's program."""
+        if self._groups is not None:
+            return min(self._maps - done, next(self._groups))
         left = min(self._maps - done, self._most_sweeps)
         if self._first_alone and done == 0:
             return 1
@@ -196,6 +205,8 @@ class Acquisition:
         )
         if rig.guard is not None:
             rig.guard.expect(self._guard_limits(sweeps))
+        if self._recording is not None:
+            self._recording.begin(sweeps)
         trouble: list[str] = []
         try:
             try:

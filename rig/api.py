@@ -7,12 +7,14 @@ result.last.depth_m, result.summary.truth
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibration.errors import CalibrationError
 from calibration.files import load_rig_model
 from calibration.model import RigModel
+from drivers.units import parse_exact
 from rig.config import CubePlan, EstimateConfig, Estimator, Filter, RigConfig
 from rig.config_files import load_config, load_cube_plan, parse_config
 from rig.errors import UsageError
@@ -21,17 +23,40 @@ from rig.run import OutFolder, Progress, RunResult
 from rig.saving import SavePolicy
 
 if TYPE_CHECKING:
+    from drivers.replay_pace import Pace
     from rig.acquisition import ScanProgress
     from rig.attached import Attached
+    from rig.bench.disk import DiskReport
     from rig.bench.soak import SoakReport
     from rig.bench.speed import SpeedReport
     from rig.doctor import Finding
     from rig.effects import Effect
+    from rig.exchange.exporting import ExportResult
+    from rig.exchange.importing import ImportResult
     from rig.monitor import Watch
     from rig.overload import Overload
+    from rig.recording.compress import Compression
+    from rig.recording.info import RecordingInfo
+    from rig.recording.repair import Repair
+    from rig.recording.verify import Verification
     from rig.scan_plan import ScanPlan
 
-__all__ = ["RunResult", "bench", "configure", "effects", "plan_scan", "reconstruct", "scan", "soak", "warm_up"]
+__all__ = [
+    "RunResult",
+    "bench",
+    "compress",
+    "configure",
+    "cut",
+    "effects",
+    "plan_scan",
+    "reconstruct",
+    "recording_info",
+    "repair",
+    "scan",
+    "soak",
+    "verify",
+    "warm_up",
+]
 
 PathLike = str | os.PathLike[str]
 Config = RigConfig | PathLike
@@ -128,8 +153,10 @@ def scan(
     options = ScanOptions(overload, record, monitor, tell)
     estimate = settings.estimate
     tally = MapTally(settings.scan.columns, settings.scan.exposures, estimate.estimator, estimate.filter)
-    with Run(out, tally, policy) as run, open_rig(settings, seed=seed) as rig:
-        return run_scan(rig, run, maps, seed, options)
+    with Run(out, tally, policy, record=record) as run:
+        tap = run.start_tap() if record else None
+        with open_rig(settings, seed=seed, tap=tap) as rig:
+            return run_scan(rig, run, maps, seed, options)
 
 
 def plan_scan(
@@ -159,29 +186,166 @@ def plan_scan(
 
 
 def reconstruct(
-    cube: PathLike,
-    plan: CubePlan | PathLike,
-    calibration: RigModel | PathLike,
+    source: PathLike,
+    plan: CubePlan | PathLike | None = None,
+    calibration: RigModel | PathLike | None = None,
     *,
-    estimator: Estimator = "likelihood",
-    filter: Filter = "none",
-    min_confidence: float = 0.5,
+    estimator: Estimator | None = None,
+    filter: Filter | None = None,
+    min_confidence: float | None = None,
     out: OutFolder = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Depth from a packed `.npy` cube of frames that any program made (`rig reconstruct`).
+    """Depth from a recording, or from a packed `.npy` cube of frames that any program made (`rig reconstruct`).
 
-    cube: uint8 (maps x columns x exposures, height, ceil(width/8)). out: a folder to write, None to write nothing.
-    progress: called with maps done and all. Raises UsageError, a line per problem, for files that do not fit together.
-    An interrupt ends the run after its last whole map, with verdict 'aborted'.
+    source: folder of a run taken with `record`, or uint8 (maps x columns x exposures, height, ceil(width/8)). plan,
+    calibration: a cube needs both; a recording has its own, but may be given a calibration file that was made since.
+    Settings that are None are those of the recording; of a cube likelihood, none and 0.5.
+    out: a folder to write, None to write nothing. progress: called with frames or maps done and all. Raises UsageError,
+    a line per problem, for files that do not fit together. An interrupt ends the run after its last whole map, with
+    verdict 'aborted'.
     """
+    if Path(source).is_dir():
+        if plan is not None:
+            raise UsageError(f"{source} is a recording, which has the plan it was taken with; leave --plan out")
+        if isinstance(calibration, RigModel):
+            raise UsageError("the calibration for a recording is a file; calibration.files.save_rig_model writes one")
+        return replay(
+            source,
+            clock="max",
+            calibration=calibration,
+            estimator=estimator,
+            filter=filter,
+            min_confidence=min_confidence,
+            out=out,
+            progress=progress,
+        )
     from rig.cube import open_cube
     from rig.cube_depth import reconstruct_cube
 
-    estimate = _estimate(estimator, filter, min_confidence)
+    if plan is None or calibration is None:
+        missing = [name for name, given in (("--plan", plan), ("--calibration", calibration)) if given is None]
+        raise UsageError(f"{source} is no folder of a recording; a cube of frames needs {' and '.join(missing)} too")
+    estimate = _estimate(
+        "likelihood" if estimator is None else estimator,
+        "none" if filter is None else filter,
+        0.5 if min_confidence is None else min_confidence,
+    )
     cube_plan = plan if isinstance(plan, CubePlan) else load_cube_plan(Path(plan))
     model = calibration if isinstance(calibration, RigModel) else _load_calibration(calibration)
-    return reconstruct_cube(open_cube(cube, cube_plan, model), model, estimate, out, progress)
+    return reconstruct_cube(open_cube(source, cube_plan, model), model, estimate, out, progress)
+
+
+def replay(
+    run: PathLike,
+    *,
+    clock: str = "realtime",
+    loop: bool = False,
+    maps: int | None = None,
+    config: Config | None = None,
+    calibration: PathLike | None = None,
+    estimator: Estimator | None = None,
+    filter: Filter | None = None,
+    min_confidence: float | None = None,
+    threads: int | None = None,
+    block_frames: int | None = None,
+    save: str = "all",
+    arm: bool = False,
+    out: OutFolder = None,
+    record: bool = False,
+    on_overload: str = "abort",
+    progress: Progress | None = None,
+    live: "Callable[[ScanProgress], None] | None" = None,
+    monitor: "Watch | None" = None,
+    steps: "Callable[[Pace], None] | None" = None,
+) -> RunResult:
+    """Play a recording through the live stack (`rig replay`); the same depth, bit for bit, at any clock.
+
+    run: folder of a run taken with `record`. clock: 'realtime', 'max', 'x4' or 'x0.1', 'step'. loop: again and again,
+    until `maps` are made or for ever. config: a rig whose scanner, laser and sync source take part; None: they are
+    recorded too. calibration: a file made since; None: the recording's own. estimator, filter, min_confidence, threads:
+    as the recording says where None. block_frames: most frames of a block. steps: called before the start, with what
+    takes `step()` and `run_on()` from any thread where clock is 'step'. All else as `scan`. Raises UsageError where
+    there is no recording.
+    """
+    from rig.replaying import ReplayOptions, pace_of, replay_config
+    from rig.run import Run
+    from rig.scanning import ScanOptions, require_simulated_or_armed, run_scan
+    from rig.session import open_rig
+    from rig.summary import MapTally
+
+    played = ReplayOptions(clock, loop, block_frames)
+    others = None if config is None else configure(config)
+    estimate = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence, "threads": threads}
+    settings = replay_config(Path(run), played, others, estimate)
+    if calibration is not None:
+        settings = settings.model_copy(update={"calibration": Path(calibration)})
+    problems = require_simulated_or_armed(settings, arm)
+    if record and out is None:
+        problems.append("record writes the frames into the run's folder; name one with out")
+    policy, overload = _checked_policies(1 if maps is None else maps, 0, save, on_overload, problems)
+
+    def tell(done: "ScanProgress") -> None:
+        if progress is not None:
+            progress(done.frames, done.frames_planned)
+        if live is not None:
+            live(done)
+
+    options = ScanOptions(overload, record, monitor, tell)
+    tally = MapTally(
+        settings.scan.columns, settings.scan.exposures, settings.estimate.estimator, settings.estimate.filter
+    )
+    with Run(out, tally, policy, record=record) as writer, open_rig(settings) as rig:
+        if steps is not None:
+            steps(pace_of(rig.spad))
+        return run_scan(rig, writer, maps, 0, options)
+
+
+def verify(run: PathLike) -> "Verification":
+    """Whether a recording is what was recorded, every byte of it read (`rig verify`)."""
+    from rig.recording.verify import verify as read_all
+
+    return read_all(Path(run))
+
+
+def repair(run: PathLike) -> "Repair":
+    """Make a torn recording whole; no frame is changed and no byte thrown away (`rig repair`)."""
+    from rig.recording.repair import repair as mend
+
+    return mend(Path(run))
+
+
+def recording_info(run: PathLike) -> "RecordingInfo":
+    """What a recording holds, as its index and manifest tell (`rig info`)."""
+    from rig.recording.info import info
+
+    return info(Path(run))
+
+
+def cut(
+    run: PathLike,
+    out: PathLike,
+    *,
+    maps: str | None = None,
+    frames: str | None = None,
+    time: str | None = None,
+    start: int = 0,
+) -> dict[str, Any]:
+    """Write a part of a recording to the folder `out` (`rig cut`); its manifest.
+
+    Exactly one of: maps, frames, time (seconds from the first frame), each 'A:B', from A to before B. start: the start
+    of the SPAD that frames and time are of, counted from 0.
+    """
+    from rig.recording.cut import cut as cut_out
+
+    return cut_out(Path(run), Path(out), maps=maps, frames=frames, time=time, run=start)
+
+
+def compress(run: PathLike) -> "Compression":
+    """Compress a recording with zstd; it is read as before (`rig compress`). Needs `spadrig[compress]`."""
+    from rig.recording.compress import compress as pack
+
+    return pack(Path(run))
 
 
 def effects(config: Config = SIMULATED, *, scene: str | None = None) -> "tuple[Effect, ...]":
@@ -213,6 +377,16 @@ def laser_off(config: Config = SIMULATED) -> list[str]:
     from rig.attached import laser_off as switch_off
 
     return switch_off(configure(config))
+
+
+def bench_disk(folder: PathLike, *, progress: Progress | None = None) -> "DiskReport":
+    """How fast recordings are written to and read from the disk of `folder`, beside what it does at its best.
+
+    Some 2 GB are written there and removed again. progress: called with measurements done and all.
+    """
+    from rig.bench.disk import measure_disk
+
+    return measure_disk(Path(folder), progress)
 
 
 def bench(*, threads: int | None = None, progress: Progress | None = None) -> "SpeedReport":
@@ -256,6 +430,57 @@ def warm_up(config: Config = SIMULATED) -> float:
     from rig.warm_rig import warm_rig
 
     return warm_rig(configure(config))
+
+
+def import_frames(
+    kind: str,
+    files: Sequence[PathLike],
+    out: PathLike,
+    *,
+    form: str | None = None,
+    frame_rate: str | Fraction | None = None,
+    turn_deg: int | None = None,
+    rows: int | None = None,
+    progress: Progress | None = None,
+) -> "ImportResult":
+    """Make a recording of another program's frames (`rig import`): pi-imaging, swissspad2 or photoncube.
+
+    files: in order; a folder stands for those in it. form: packed or sparse, half or full. frame_rate: "97.7 kHz" or
+    hertz exactly; None where it is not known. turn_deg: counter-clockwise. rows: of a SPAD512S, 512 or 1024.
+    progress: called with frames done and all. Raises UsageError, a line per problem.
+    """
+    from rig.exchange.importing import ImportOptions
+    from rig.exchange.importing import import_frames as take
+
+    try:
+        rate = parse_exact(frame_rate, "frequency") if isinstance(frame_rate, str) else frame_rate
+    except ValueError as error:
+        raise UsageError(f"frame rate {error}") from None
+    return take(kind, files, out, ImportOptions(form, rate, turn_deg, rows), progress)
+
+
+def export_run(
+    run: PathLike,
+    kind: str,
+    *,
+    out: OutFolder = None,
+    view: str | None = None,
+    frames_per_picture: int | None = None,
+    pictures_per_s: float | None = None,
+    progress: Progress | None = None,
+) -> "ExportResult":
+    """Write a run for other programs (`rig export`): npy, hdf5, ply, png or mp4, to `out` or to RUN-KIND beside it.
+
+    view: what png and mp4 show, depth, intensity or frames; None: the first of them that there is. frames_per_picture:
+    summed where frames are shown. pictures_per_s: of a film. progress: called with frames done and all. Raises
+    UsageError where there is nothing of that kind.
+    """
+    from rig.exchange.exporting import ExportOptions
+    from rig.exchange.exporting import export_run as write
+
+    given = {"view": view, "frames_per_picture": frames_per_picture, "pictures_per_s": pictures_per_s}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    return write(run, kind, out, ExportOptions(**options), progress)
 
 
 def _checked_policies(

@@ -118,15 +118,18 @@ class BlockTerms(NamedTuple):
 
 
 class FrameBinder:
-    """Binds the blocks of one run, in order. Records count markers up to and including their own frame."""
+    """Binds the blocks of one run, in order. Records count markers up to and including their own frame.
 
-    def __init__(self, plan: ScanPlan) -> None:
+    clock_ratio: of the scanner's clock to nominal, as of the sweep before the first, where that is known.
+    """
+
+    def __init__(self, plan: ScanPlan, clock_ratio: float = 1.0) -> None:
         from rig.binding_kernels import walk
 
         self._walk = walk
         self._plan = plan
         self._terms = _plan_terms(plan)
-        self._ratio = 1.0
+        self._ratio = clock_ratio
         self._nominal = math.nan
         self._tick_hz: Fraction | None = None
         self._t0: int | None = None
@@ -190,7 +193,9 @@ class FrameBinder:
         received = bool(record["marks"] & Mark.SCAN)
         closed = []
         if running < 0:
-            self._first_frame = header.first_frame + at
+            # Where the first marker got lost, all frames that did with it may be of this sweep.
+            lost_with_it = not received and at == 0
+            self._first_frame = min(self._next_frame, header.first_frame) if lost_with_it else header.first_frame + at
         elif received and number == running + 1:
             position = (int(record["marks"]) >> SUBFRAME_SHIFT) & SUBFRAME_MASK
             edge = number * self._plan.sweep_points, start + (2 * position + 1) * terms.period_ticks

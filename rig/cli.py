@@ -12,13 +12,12 @@ import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig import cli_recordings
+from rig import cli_exchange, cli_recordings, cli_replay
 from rig.cli_command import (
     EXIT_ABORTED,
     EXIT_DEVICE,
@@ -29,6 +28,7 @@ from rig.cli_command import (
     FilterOption,
     JsonOption,
     command,
+    default_out,
     print_json,
     progress,
     report,
@@ -51,6 +51,8 @@ app.add_typer(config_app)
 laser_app = typer.Typer(name="laser", help="The laser's safe state.", rich_markup_mode=None)
 app.add_typer(laser_app)
 cli_recordings.register(app)
+cli_exchange.register(app)
+cli_replay.register(app)
 
 ConfigArgument = Annotated[
     str, typer.Argument(metavar="[CONFIG]", help="a bundled rig's name or a YAML file", show_default=True)
@@ -181,7 +183,7 @@ def scan_command(
             seed=seed,
             save=save,
             arm=arm,
-            out=_default_out() if out is None else out,
+            out=default_out() if out is None else out,
             record=record,
             on_overload=on_overload,
             live=None if bar is None else lambda done: bar(done.frames, done.frames_planned, done.lost),
@@ -193,24 +195,29 @@ def scan_command(
 @app.command("reconstruct")
 @command
 def reconstruct_command(
-    cube: Annotated[Path, typer.Argument(metavar="CUBE.npy", help="packed frames", show_default=False)],
-    plan: Annotated[Path, typer.Option("--plan", help="plan.yaml of the cube", show_default=False)],
-    calibration: Annotated[Path, typer.Option("--calibration", help="calibration.yaml", show_default=False)],
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="RUN_OR_NPY", help="a run taken with --record, or packed frames", show_default=False),
+    ],
     out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
-    estimator: Annotated[str, typer.Option("--estimator", help="argmax, edge or likelihood")] = "likelihood",
-    filter: Annotated[str, typer.Option("--filter", help="none or median (5 x 5)")] = "none",
-    min_confidence: Annotated[
-        float, typer.Option("--min-confidence", help="answers below this do not enter the depth map")
-    ] = 0.5,
+    plan: Annotated[
+        Path | None, typer.Option("--plan", help="plan.yaml of a cube", show_default="the recording's own")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="calibration.yaml", show_default="the recording's own")
+    ] = None,
+    estimator: EstimatorOption = None,
+    filter: FilterOption = None,
+    min_confidence: ConfidenceOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Depth from a packed .npy cube of frames."""
+    """Depth from a recording or from a packed .npy cube of frames."""
     from rig import api
 
     # Names that are none are refused by the call, which knows which there are.
     options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
-    with progress("maps") as bar:
-        result = api.reconstruct(cube, plan, calibration, out=out, progress=bar, **options)
+    with progress("done") as bar:
+        result = api.reconstruct(source, plan, calibration, out=out, progress=bar, **options)
     return report(result, as_json)
 
 
@@ -296,11 +303,17 @@ def bench_command(
     on_overload: Annotated[
         str, typer.Option("--on-overload", help="soak: frames come too fast: abort, drop or block")
     ] = "abort",
+    disk: Annotated[
+        Path | None,
+        typer.Option("--disk", metavar="FOLDER", help="measure recording to this folder's disk, nothing else"),
+    ] = None,
     as_json: JsonOption = False,
 ) -> int:
     """How fast this machine counts and estimates, beside how fast it reads its memory."""
     from rig import api
 
+    if disk is not None:
+        return _bench_disk(disk, as_json)
     with progress("rows") as bar:
         report = api.bench(threads=threads, progress=bar)
     content = report.as_json()
@@ -325,6 +338,20 @@ def bench_command(
     if as_json:
         print_json(content)
     return code
+
+
+def _bench_disk(folder: Path, as_json: bool) -> int:
+    from rig import api
+
+    with progress("measurements") as bar:
+        found = api.bench_disk(folder, progress=bar)
+    if as_json:
+        print_json(found.as_json())
+    else:
+        from rig.bench.table import disk_table
+
+        disk_table(found)
+    return 0
 
 
 @app.command("warmup")
@@ -389,10 +416,6 @@ def _show_plan(plan: "ScanPlan", as_json: bool) -> int:
     else:
         print(plan.describe())
     return 0
-
-
-def _default_out() -> Path:
-    return Path("runs") / datetime.now().strftime("%Y%m%d-%H%M%S")
 
 
 def _join_save(arguments: list[str]) -> list[str]:

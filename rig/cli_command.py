@@ -4,6 +4,8 @@ import functools
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 
 import typer
@@ -105,6 +107,11 @@ def progress(what: str) -> Iterator["Callable[..., None] | None"]:
             bar.update(task, completed=done, total=total, description=f"{what}, {lost} lost" if lost else what)
 
         yield update
+
+
+def default_out() -> Path:
+    """Where a run is written that names no folder."""
+    return Path("runs") / datetime.now().strftime("%Y%m%d-%H%M%S")
 
 
 def say(line: str) -> None:

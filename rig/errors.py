@@ -43,3 +43,7 @@ class RecordingError(RigError):
     """The recording that was asked for cannot be written; the run ends, and what was recorded is kept."""
 
     exit_code = 3
+
+
+class DamagedRecordingError(RigError):
+    """What was recorded is not what is on the disk any more: nothing is to be made of it before 'rig repair'."""

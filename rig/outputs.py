@@ -4,7 +4,8 @@
     learned/000000.npz (what the map was estimated with, where the estimator learns)
     truth/000000.npz (where a world knows it)  manifest.json  summary.json
 
-Everything is written beside the folder under a hidden name and moved in one step at the end.
+Everything is written beside the folder under a hidden name and moved in one step at the end; the folder of a recording
+is there from the start and grows in place.
 """
 
 import io
@@ -29,6 +30,8 @@ from rig.errors import UsageError
 from rig.pictures import depth_limits, depth_picture, intensity_picture, png_bytes
 from rig.pointcloud import cloud, ply_bytes
 from rig.reconstruction import MapResult
+from rig.recording.manifest import MANIFEST, sealed_text
+from rig.recording.sync import sync_file, sync_folder
 
 _log = logging.getLogger(__name__)
 
@@ -38,12 +41,14 @@ Rays = tuple[NDArray[np.floating], NDArray[np.floating]]
 class RunFolder:
     """Collects the outputs of a run; `publish` makes them appear as `path`, leaving without it removes every trace.
 
+    in_place: they are to be seen at `path` from the start.
     Raises UsageError, one line, where the folder exists with something in it or cannot be written.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Claim the folder; nothing is visible at `path` yet."""
+    def __init__(self, path: str | os.PathLike[str], *, in_place: bool = False) -> None:
+        """Claim the folder; nothing is visible at `path` yet, or an empty folder where it grows in place."""
         self.path = Path(path).absolute()
+        self._in_place = in_place
         self._limits: tuple[float, float] | None = None
         self._made_parents: list[Path] = []
         self._scratch: Path | None = None
@@ -101,8 +106,25 @@ class RunFolder:
             file.unlink(missing_ok=True)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write `name` (manifest.json, summary.json) as strict JSON."""
-        self._write({name: (json_text(content) + "\n").encode()})
+        """Write `name` (manifest.json, summary.json) as strict JSON; where there is one already, the old or the new."""
+        text = json_text(content)
+        text = sealed_text(text) if name == MANIFEST else text
+        self._write({f"{name}.part": (text + "\n").encode()})
+        file = self.place(name)
+        try:
+            if self._in_place:
+                sync_file(file.with_name(f"{name}.part"))
+            file.with_name(f"{name}.part").replace(file)
+            if self._in_place:
+                sync_folder(file.parent)
+        except OSError as error:
+            raise _unwritable(self.path, error) from error
+
+    def keep(self) -> None:
+        """Leave everything as it is: what a run recorded is kept also where it does not come to its end."""
+        assert self._in_place, "a run folder that is no recording appears whole or not at all"
+        self._scratch = None
+        self._made_parents.clear()
 
     def publish(self) -> Path:
         """Make the folder appear under its name, or beside it (NAME-2, ...) where somebody was faster; its path."""
@@ -119,6 +141,8 @@ class RunFolder:
         return published
 
     def _move(self, scratch: Path) -> Path:
+        if self._in_place:
+            return self.path
         if scratch.parent == self.path:  # an empty folder was given: fill it, summary.json last
             if list(self.path.iterdir()) == [scratch]:
                 for child in sorted(scratch.iterdir(), key=lambda file: file.name == "summary.json"):
@@ -133,7 +157,11 @@ class RunFolder:
     def discard(self) -> None:
         """Remove everything not published, and the folders made for it."""
         if self._scratch is not None:
-            shutil.rmtree(self._scratch, ignore_errors=True)
+            if self._in_place:
+                for child in self._scratch.iterdir():
+                    shutil.rmtree(child, ignore_errors=True) if child.is_dir() else child.unlink(missing_ok=True)
+            else:
+                shutil.rmtree(self._scratch, ignore_errors=True)
             self._scratch = None
         for parent in reversed(self._made_parents):
             try:
@@ -155,6 +183,11 @@ class RunFolder:
                 folder.mkdir()
                 self._made_parents.append(folder)
             parent = self.path.parent
+        if self._in_place:
+            if parent is not self.path:
+                self.path.mkdir()
+                self._made_parents.append(self.path)
+            return self.path
         scratch = parent / f".{self.path.name}.{secrets.token_hex(4)}.part"
         scratch.mkdir()
         return scratch

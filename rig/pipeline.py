@@ -13,7 +13,8 @@ from rig.errors import RecordingError
 from rig.map_queue import AcquiredMap, MapQueue
 from rig.mapping import MakesMaps, Mapping
 from rig.monitor import Monitor, Watch
-from rig.recording.recorder import Recorder, Recording
+from rig.recording.recorder import Recorder
+from rig.recording.writer import WRITERS, Recording
 from rig.source import Source
 from rig.stages import PipelineStats
 from rig.sweeps import MOST_UNDER_WAY, SweepAssembler
@@ -65,7 +66,8 @@ class Pipeline:
         )
         self._recorder: Recorder | None = None
         if recording is not None:
-            self._recorder = Recorder(ring.reader("recorder"), recording, self._queue.end_stream)
+            reader = ring.reader("recorder", holds=max(1, min(WRITERS, ring.slots // 4)))
+            self._recorder = Recorder(reader, recording, self._queue.end_stream)
         self._monitor: Monitor | None = None
         if watch is not None:
             self._monitor = Monitor(ring.reader("monitor", required=False), watch, self.stats)

@@ -13,7 +13,7 @@ from calibration.model import RigModel
 from rig.counting import Counter, FrameTally, SweepLayout
 from rig.depth import depth_map
 from rig.errors import UsageError
-from rig.estimators import ESTIMATORS, FILTERS, Learned, create_estimator
+from rig.estimators import ESTIMATORS, FILTERS, Learned, create_estimator, recalling
 from rig.geometry import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
@@ -66,6 +66,7 @@ class Reconstructor:
         filter: str = "none",
         min_confidence: float = 0.5,
         threads: int = 2,
+        learned: Sequence[Learned] = (),
     ) -> None:
         if estimator not in ESTIMATORS:
             raise UsageError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
@@ -76,7 +77,7 @@ class Reconstructor:
         self._min_confidence = min_confidence
         self._filter = filter
         self._workers = RowWorkers(threads)
-        self.estimator = create_estimator(estimator, threads)
+        self.estimator = recalling(learned, threads) if learned else create_estimator(estimator, threads)
         if model is not None:
             self.geometry = sweep_geometry(model, model.planes(self._commands), depth_range_m)
         elif sensor is not None:

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -10,13 +11,19 @@ from types import TracebackType
 from typing import Any, Self
 
 from drivers.interfaces import SweepTruth
+from drivers.replay_pace import PaceReport
+from drivers.transports.tap import CONTROL_FILE, TapFile
 from rig.errors import UsageError
 from rig.outputs import Rays, RunFolder
 from rig.reconstruction import MapResult
-from rig.recording.recorder import FIRST_FILE, Recording
+from rig.recording.manifest import file_crc32
+from rig.recording.writer import Recording
 from rig.saving import SavePolicy
 from rig.stages import PipelineStats
 from rig.summary import MapTally, RunFrames, Summary, Synchronisation, Verdict
+
+RECORDING = "recording"
+"""Verdict of a manifest whose run is not over, or was killed."""
 
 Progress = Callable[[int, int], None]
 """Called now and then with what is done and what there is to do, in frames or maps."""
@@ -40,29 +47,74 @@ class RunResult:
 class Run:
     """Takes the maps of a run one by one, writes those to be kept, and closes with manifest and summary.
 
-    Leaving the context without `finish` removes everything that was written. out: folder, None to write nothing.
-    rays: the camera's (u, v) of every pixel, to be set before the first map; None for an uncalibrated rig.
+    Leaving the context without `finish` removes everything that was written, but for a recording with a block in it.
+    out: folder, None to write nothing. record: the folder is that of a recording. rays: the camera's (u, v) of every
+    pixel, to be set before the first map; None for an uncalibrated rig.
     """
 
-    def __init__(self, out: OutFolder, tally: MapTally, save: SavePolicy | None = None) -> None:
+    def __init__(
+        self, out: OutFolder, tally: MapTally, save: SavePolicy | None = None, *, record: bool = False
+    ) -> None:
         """Claim the folder. Raises UsageError where it cannot be written."""
         self.tally = tally
-        self._folder = None if out is None else RunFolder(out)
+        self._folder = None if out is None else RunFolder(out, in_place=record)
         self.rays: Rays | None = None
         self._save = save or SavePolicy()
         self._last: tuple[int, MapResult, SweepTruth | None] | None = None
         self._recording: Recording | None = None
+        self._inputs: dict[str, int] = {}
+        self._tap: TapFile | None = None
+
+    def start_tap(self) -> TapFile:
+        """Where what passes the devices' ports is recorded from now on."""
+        assert self._folder is not None, "asked for with a recording, which needs a folder"
+        self._tap = TapFile.begin(self._folder.place(CONTROL_FILE))
+        return self._tap
 
     @property
     def worth_keeping(self) -> bool:
         """Whether there is a whole map or a recorded block."""
         return self.tally.maps > 0 or (self._recording is not None and self._recording.blocks > 0)
 
-    def start_recording(self) -> Recording:
-        """The run's recording, in its folder; closed with the run. Raises RecordingError where it cannot be written."""
-        if self._folder is None:
+    def start_recording(
+        self,
+        maps: int,
+        manifest: Mapping[str, Any],
+        write_inputs: Callable[[Path], None],
+        recording_bytes: int,
+        map_bytes: int,
+    ) -> Recording:
+        """The recording of a run of `maps` maps, in its folder; closed with the run.
+
+        manifest: what is known before the first frame; it is on the disk before this returns, and again with each start
+        of the SPAD. write_inputs: writes what has to stand beside the frames. recording_bytes, map_bytes: what all the
+        frames and one map will take. Raises UsageError where the disk has not so much, RecordingError where it cannot
+        be written.
+        """
+        folder = self._folder
+        if folder is None:
             raise UsageError("record writes the frames into the run's folder; name one with out")
-        self._recording = Recording(self._folder.place(FIRST_FILE))
+        _require_space(folder.path, recording_bytes, map_bytes * self._save.count(maps))
+
+        def begun() -> None:
+            assert self._recording is not None, "tells of its starts only"
+            content = {"versions": versions(), **manifest, "inputs": self._inputs, "verdict": RECORDING}
+            content["recording"] = self._recording.content()
+            folder.write_json("manifest.json", content)
+
+        try:
+            write_inputs(folder.path)
+            self._inputs = {
+                file.name: file_crc32(file)
+                for file in sorted(folder.path.iterdir())
+                if file.is_file() and file.name != CONTROL_FILE
+            }
+        except OSError as error:
+            raise UsageError(f"cannot write {folder.path}: {error.strerror or error}; name another --out") from error
+        self._recording = Recording(folder.path, expected_bytes=recording_bytes, on_begin=begun)
+        if self._tap is not None:
+            self._recording.also_sync(self._tap.sync)
+        begun()
         return self._recording
 
     def __enter__(self) -> Self:
@@ -72,11 +124,15 @@ class Run:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Remove what was not finished."""
-        if self._recording is not None:
-            self._recording.close()
-        if self._folder is not None:
-            self._folder.discard()
+        """Remove what was not finished, but what was recorded: 'rig repair' makes it whole."""
+        try:
+            if self._recording is not None:
+                self._recording.close()
+        finally:
+            if self._folder is not None and self._recording is not None and self._recording.blocks:
+                self._folder.keep()
+            elif self._folder is not None:
+                self._folder.discard()
 
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
         """Take the next map: whole, or, where anything ends it before it is counted, not at all."""
@@ -102,18 +158,19 @@ class Run:
         manifest: Mapping[str, Any],
         stages: PipelineStats | None = None,
         sync: Synchronisation | None = None,
+        replay: PaceReport | None = None,
     ) -> RunResult:
         """Write manifest and summary and make the folder appear; one without a map or a recorded block leaves none."""
-        summary = self.tally.summary(frames, sensor_time_s, verdict, stages, sync)
+        summary = self.tally.summary(frames, sensor_time_s, verdict, stages, sync, replay)
         index, result, truth = self._last or (None, None, None)
         folder = None
         if self._folder is not None and self.worth_keeping:
             if self._save.step is None and index is not None and result is not None:
                 self._write(index, result, truth)
-            content = {"versions": versions(), **manifest}
+            content = {"versions": versions(), **manifest, "verdict": verdict.value}
             if self._recording is not None:
                 self._recording.close()
-                content["recording"] = self._recording.content()
+                content |= {"inputs": self._inputs, "recording": self._recording.content()}
             self._folder.write_json("manifest.json", content)
             self._folder.write_json("summary.json", summary.as_json())
             folder = self._folder.publish()
@@ -125,6 +182,17 @@ class Run:
         self._folder.write_map(index, result, self.rays)
         if truth is not None:
             self._folder.write_truth(index, truth)
+
+
+def _require_space(folder: Path, recording_bytes: int, map_bytes: int) -> None:
+    """UsageError where the disk has not enough room for a run."""
+    free = shutil.disk_usage(folder).free
+    if recording_bytes + map_bytes > free:
+        raise UsageError(
+            f"the recording will take {recording_bytes / 1e9:.3g} GB and the maps {map_bytes / 1e9:.3g} GB, the disk "
+            f"of {folder} has {free / 1e9:.3g} GB free; free some, name a folder on another disk with --out, or lower "
+            "--maps"
+        )
 
 
 def versions() -> dict[str, str]:

@@ -27,6 +27,10 @@ class SavePolicy:
             raise UsageError(f"--save is {text!r}; write 'all', 'last' or 'every N' with N of 1 or more")
         return cls(int(match["step"]))
 
+    def count(self, maps: int) -> int:
+        """How many of `maps` maps are written."""
+        return min(maps, 1) if self.step is None else -(-maps // self.step)
+
     def keeps(self, index: int) -> bool:
         """Whether map `index` is written as soon as it is there."""
         return self.step is not None and index % self.step == 0

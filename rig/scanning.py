@@ -2,29 +2,35 @@
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from calibration.model import RigModel
 from drivers.errors import DeviceError
-from drivers.interfaces import SweepTruth
+from drivers.interfaces import SpadTiming, SweepTruth
 from drivers.registry import KindConfig
 from drivers.transports.endpoints import EMULATED_PREFIX
-from rig.acquisition import Acquisition, ScanProgress
+from rig.acquisition import SILENCE_S, Acquisition, ScanProgress
 from rig.config import RigConfig
 from rig.errors import RigError
-from rig.estimators import LEARNING
+from rig.estimators import LEARNING, Learned
 from rig.monitor import Watch
 from rig.overload import Overload, require_policy
+from rig.plan import spad_request
 from rig.reconstruction import Reconstructor
+from rig.recording.devices import devices_content
+from rig.recording.inputs import write_inputs
+from rig.recording.space import map_bytes, recording_bytes
+from rig.recording.writer import Recording
+from rig.replaying import Replayed
 from rig.run import Run, RunResult
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, prepare
 from rig.summary import RunFrames, Synchronisation, Verdict
 from rig.sweeps import SweepAccount
-from rig.warm_up import warm_up
+from rig.warm_up import warm_binding, warm_up
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +47,10 @@ class ScanOptions:
     live: Callable[[ScanProgress], None] | None = None
 
 
-def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, options: ScanOptions | None = None) -> RunResult:
+def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanOptions | None = None) -> RunResult:
     """Scan with an open rig; `run` takes the maps. seed: as the rig was opened with, for the manifest.
+
+    maps: None for all that a recording holds, which takes the SPAD's place.
 
     An interrupt ends the scan after its last whole map, with verdict 'aborted'. So does an error, which is raised again
     once the whole maps and the recording are safe; one before there is either leaves nothing.
@@ -50,13 +58,28 @@ def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, options: ScanOptions 
     options = options or ScanOptions()
     require_policy(options.policy, rig.spad.info)
     plan, timing = prepare(rig)
+    replayed = Replayed.of(rig.spad, plan, maps)
+    maps = maps or 1 if replayed is None else replayed.maps
     threads = rig.config.estimate.threads or os.cpu_count() or 1
-    reconstructor = _reconstructor(rig, plan, threads)
+    reconstructor = _reconstructor(
+        rig, plan, threads, () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
+    )
     geometry = reconstructor.geometry
     run.rays = (geometry.u, geometry.v) if rig.model is not None else None
 
     estimate = rig.config.estimate
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)
+    warm_binding(plan)
+    manifest: dict[str, Any] = {
+        "command": "scan" if replayed is None else "replay",
+        "config": rig.config.model_dump(mode="json"),
+        "plan": plan_content(plan),
+        "calibration": calibration_content(rig.model),
+        "devices": devices_content(rig, plan, timing),
+        "seed": seed,
+        "maps": maps,
+        "on_overload": options.policy.value,
+    }
     acquisition = Acquisition(
         rig,
         plan,
@@ -66,14 +89,17 @@ def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, options: ScanOptions 
         policy=options.policy,
         # Learning takes a second or more, and a live stream cannot stand still meanwhile.
         first_alone=estimate.estimator in LEARNING and not rig.spad.info.can_wait,
-        recording=run.start_recording() if options.record else None,
+        groups=None if replayed is None else replayed.groups(),
+        starts=None if replayed is None else replayed.starts(),
+        recording=_recording(rig, run, plan, timing, maps, manifest) if options.record else None,
         watch=options.watch,
         on_progress=options.live,
+        silence_s=SILENCE_S if replayed is None else replayed.silence_s,
     )
     sweeps: list[SweepAccount] = []
     ended_by: BaseException | None = None
     try:
-        _collect(acquisition, rig, plan, run, sweeps)
+        _collect(acquisition, rig, plan, run, sweeps, replayed)
     except (KeyboardInterrupt, DeviceError, RigError) as error:
         if not run.worth_keeping and not isinstance(error, KeyboardInterrupt):
             raise
@@ -85,24 +111,33 @@ def run_scan(rig: OpenRig, run: Run, maps: int, seed: int, options: ScanOptions 
         frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
         _verdict(sweeps, rig.model, aborted=ended_by is not None),
         {
-            "command": "scan",
-            "config": rig.config.model_dump(mode="json"),
-            "plan": plan_content(plan),
-            "calibration": calibration_content(rig.model),
-            "seed": seed,
-            "maps": maps,
+            **manifest,
             "sweeps": [_sweep_content(sweep) for sweep in sweeps],
             "gaps": [list(gap) for sweep in sweeps for gap in sweep.gaps],
-            "on_overload": options.policy.value,
+            "counters": asdict(acquisition.counters),
         },
         acquisition.stages,
         _synchronisation(sweeps),
+        None if replayed is None else replayed.report,
     )
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:
             ended_by.add_note(f"{len(sweeps)} of {maps} maps were whole and are in {result.folder}")
         raise ended_by
     return result
+
+
+def _recording(
+    rig: OpenRig, run: Run, plan: ScanPlan, timing: SpadTiming, maps: int, manifest: dict[str, Any]
+) -> Recording:
+    """The recording of a scan, begun in the run's folder with all that is known before the first frame."""
+    return run.start_recording(
+        maps,
+        manifest,
+        lambda folder: write_inputs(folder, plan, rig.model),
+        recording_bytes(plan, spad_request(rig.config.scan, plan), timing, maps),
+        map_bytes(plan),
+    )
 
 
 def require_simulated_or_armed(config: RigConfig, arm: bool) -> list[str]:
@@ -161,7 +196,7 @@ def calibration_content(model: RigModel | None) -> dict[str, Any] | None:
     return None if model is None else {"id": model.fingerprint(), "provenance": dict(model.provenance)}
 
 
-def _reconstructor(rig: OpenRig, plan: ScanPlan, threads: int) -> Reconstructor:
+def _reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned]) -> Reconstructor:
     estimate = rig.config.estimate
     return Reconstructor(
         rig.model,
@@ -172,6 +207,7 @@ def _reconstructor(rig: OpenRig, plan: ScanPlan, threads: int) -> Reconstructor:
         filter=estimate.filter,
         min_confidence=estimate.min_confidence,
         threads=threads,
+        learned=learned,
     )
 
 
@@ -181,12 +217,15 @@ def _collect(
     plan: ScanPlan,
     run: Run,
     sweeps: list[SweepAccount],
+    replayed: Replayed | None,
 ) -> None:
     running = acquisition.run()
     with closing(running):
         for found in running:
             truth: SweepTruth | None = None
-            if rig.world is not None:  # asked only now: no estimate ever sees it
+            if replayed is not None:
+                truth = replayed.truth(found.sweep.index)
+            elif rig.world is not None:  # asked only now: no estimate ever sees it
                 truth = rig.world.truth(plan.command_at(found.column))
             sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
             run.add(found.result, found.compute_s, truth)

@@ -18,11 +18,14 @@ from drivers.errors import DeviceError
 from drivers.guard import Guard
 from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SpadTiming, SyncSource, World
 from drivers.registry import KindConfig, Surroundings, lookup
+from drivers.replay import ReplaySpad
 from drivers.transports.endpoints import Endpoint
+from drivers.transports.tap import TapFile
 from rig.config import RigConfig, ScanConfig
 from rig.cube import cube_columns
 from rig.errors import DevicesError, PlanError, UsageError
 from rig.plan import compile_plan, spad_request
+from rig.replaying import replay_plan
 from rig.scan_plan import ScanPlan
 
 _log = logging.getLogger(__name__)
@@ -73,14 +76,17 @@ class EmulatesDevices(Protocol):
 
 
 @contextmanager
-def open_rig(config: RigConfig, clock: Clock | None = None, seed: int = 0) -> Iterator[OpenRig]:
+def open_rig(
+    config: RigConfig, clock: Clock | None = None, seed: int = 0, tap: TapFile | None = None
+) -> Iterator[OpenRig]:
     """Open every device of the config; on exit the sync source is closed first, then laser, scanner and SPAD.
 
     clock: by default virtual time for a simulated rig and the host's for a real one. seed: of everything simulated.
+    tap: records what passes the ports of scanner, laser and sync source.
     Raises UsageError where config or calibration are at fault, DevicesError where devices are; each lists all problems.
     """
     with ExitStack() as stack:
-        yield _open(config, clock, seed, stack)
+        yield _open(config, clock, seed, tap, stack)
 
 
 @contextmanager
@@ -100,6 +106,8 @@ def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSour
 def prepare(rig: OpenRig, scan: ScanConfig | None = None) -> tuple[ScanPlan, SpadTiming]:
     """Configure the SPAD and compile the plan; nothing moves and nothing lights. scan: the config's by default."""
     scan = rig.config.scan if scan is None else scan
+    if isinstance(rig.spad, ReplaySpad):  # what was scanned is bound by the plan that it was scanned with
+        return replay_plan(rig.spad, scan, rig.model)
     most_w = rig.laser.limits.max_power_w
     if scan.power is not None and scan.power > most_w:
         raise PlanError(
@@ -120,7 +128,7 @@ def prepare(rig: OpenRig, scan: ScanConfig | None = None) -> tuple[ScanPlan, Spa
     return plan, timing
 
 
-def _open(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -> OpenRig:
+def _open(config: RigConfig, clock: Clock | None, seed: int, tap: TapFile | None, stack: ExitStack) -> OpenRig:
     usage: list[str] = []
     devices: list[str] = []
     model = _load_model(config, usage)
@@ -132,11 +140,12 @@ def _open(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -
     opened: dict[str, Any] = {}
     guard: Guard | None = None
     if surroundings is not None:
-        guard = _guard_of(config, surroundings.ports, stack)
+        guard = _guard_of(config, surroundings.ports, tap, stack)
         # Closing runs backwards: the gate goes low before the laser pauses, the mirror parks and the SPAD stops.
         for slot in ("spad", "scanner", "laser", "sync"):
             try:
-                opened[slot] = stack.enter_context(_open_device(slot, getattr(config, slot), surroundings, guard))
+                tapped = surroundings if tap is None else replace(surroundings, tap=tap.tap(slot))
+                opened[slot] = stack.enter_context(_open_device(slot, getattr(config, slot), tapped, guard))
             except DeviceError as error:
                 devices.append(f"{slot}: {error}")
     if "laser" in opened:
@@ -162,10 +171,10 @@ def _surroundings(config: RigConfig, clock: Clock | None, seed: int, stack: Exit
     return replace(bare, world=world, ports=ports)
 
 
-def _guard_of(config: RigConfig, ports: Mapping[str, Endpoint], stack: ExitStack) -> Guard | None:
+def _guard_of(config: RigConfig, ports: Mapping[str, Endpoint], tap: TapFile | None, stack: ExitStack) -> Guard | None:
     """The guard of a laser and a gate that are not simulated, at work until the rig is closed; None: there are none."""
     guarded = {slot: kind for slot in GUARDED if (kind := getattr(config, slot)).real_time}
-    return stack.enter_context(Guard(**guarded, ports=ports)) if guarded else None
+    return stack.enter_context(Guard(**guarded, ports=ports, tap=tap)) if guarded else None
 
 
 def _open_device(slot: str, kind: KindConfig, surroundings: Surroundings, guard: Guard | None) -> Any:

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from drivers.interfaces import SweepTruth
+from drivers.replay_pace import PaceReport
 from rig.reconstruction import FogEstimate, MapResult
 from rig.scoring import depth_errors, stripe_errors
 from rig.stages import PipelineStats
@@ -91,9 +92,10 @@ class Summary:
     verdict: Verdict
     stages: PipelineStats | None = None
     sync: Synchronisation | None = None
+    replay: PaceReport | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """The summary as plain values; `truth` only where it is known, `stages` and `sync` only of a scan."""
+        """The summary as plain values; `truth` only where it is known, others only of a scan or of a replay."""
         content = asdict(self)
         content["verdict"] = self.verdict.value
         if self.truth is None:
@@ -102,6 +104,8 @@ class Summary:
             del content["stages"]
         if self.sync is None:
             del content["sync"]
+        if self.replay is None:
+            del content["replay"]
         return content
 
 
@@ -144,6 +148,7 @@ class MapTally:
         verdict: Verdict,
         stages: PipelineStats | None = None,
         sync: Synchronisation | None = None,
+        replay: PaceReport | None = None,
     ) -> Summary:
         """The run so far."""
         errors = [each.errors for each in self._maps if each.errors is not None]
@@ -166,6 +171,7 @@ class MapTally:
             verdict=verdict,
             stages=stages,
             sync=sync,
+            replay=replay,
         )
 
 

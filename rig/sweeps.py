@@ -74,10 +74,23 @@ class SweepData(SweepAccount):
         return SweepAccount(**{field.name: getattr(self, field.name) for field in fields(SweepAccount)})
 
 
+@dataclass(frozen=True, slots=True)
+class SweepStart:
+    """With which sweep of a run its maps begin: number 0, but where the run is a part that was cut from a recording.
+
+    clock_ratio: as of `FrameBinder`. Frames of sweeps before it are not counted.
+    """
+
+    sweep: int = 0
+    clock_ratio: float = 1.0
+
+
 class SweepAssembler:
     """Turns the blocks of one run into sweeps. The result does not depend on how frames are grouped into blocks."""
 
-    def __init__(self, plan: ScanPlan, counter: Counter, maps: int, first_index: int = 0) -> None:
+    def __init__(
+        self, plan: ScanPlan, counter: Counter, maps: int, first_index: int = 0, start: SweepStart | None = None
+    ) -> None:
         from rig.binding_kernels import cover
 
         self._plan = plan
@@ -87,7 +100,8 @@ class SweepAssembler:
         self._counter = counter
         self._maps = maps
         self._first_index = first_index
-        self._binder = FrameBinder(plan)
+        self._start = start or SweepStart()
+        self._binder = FrameBinder(plan, self._start.clock_ratio)
         self._adds: deque[int] = deque(maxlen=MOST_UNDER_WAY)
         self._next_frame: int | None = None
         self._gaps: list[Gap] = []
@@ -113,10 +127,13 @@ class SweepAssembler:
         for a, b in pairwise((*bound.starts, block.n_frames)):
             number = int(bound.sweep[a])
             while clocks and clocks[0].sweep < number:
-                yield self._finish(clocks.pop(0))
+                clock = clocks.pop(0)
+                if clock.sweep < self._start.sweep:
+                    continue
+                yield self._finish(clock)
                 if self.complete:
                     return
-            if number < 0:
+            if number < self._start.sweep:
                 continue
             begun = time.perf_counter()
             bins = bound.bins[a:b]
@@ -146,7 +163,7 @@ class SweepAssembler:
         volume = self._counter.finish()
         self._count_s += time.perf_counter() - begun
         data = SweepData(
-            index=self._first_index + clock.sweep,
+            index=self._first_index + clock.sweep - self._start.sweep,
             direction=self._plan.leg(clock.sweep).direction,
             volume=volume,
             residual_columns=clock.residual_columns,
@@ -164,7 +181,7 @@ class SweepAssembler:
         self._received = self._lit = self._dark = 0
         self._count_s = 0.0
         self.sweeps_done += 1
-        self.complete = clock.sweep + 1 >= self._maps
+        self.complete = clock.sweep + 1 - self._start.sweep >= self._maps
         return data
 
     def _note_gap(self, block: FrameBlock) -> None:

@@ -26,6 +26,7 @@ from drivers.guard.watched_process import WatchedProcess
 from drivers.interfaces import LineLaser, SyncSource
 from drivers.registry import KindConfig
 from drivers.transports.endpoints import Endpoint
+from drivers.transports.tap import TapFile
 
 _log = logging.getLogger(__name__)
 
@@ -62,8 +63,12 @@ class Guard:
         sync: KindConfig | None = None,
         ports: Mapping[str, Endpoint] | None = None,
         limits: GuardLimits | None = None,
+        tap: TapFile | None = None,
     ) -> None:
-        """Start the guard, which opens the devices meanwhile. `UnknownKind` for a kind that is not installed."""
+        """Start the guard, which opens the devices meanwhile. `UnknownKind` for a kind that is not installed.
+
+        tap: records what passes their ports.
+        """
         configs = {slot: config for slot, config in (("laser", laser), ("sync", sync)) if config is not None}
         ports = ports or {}
         self._rescue = Rescue(configs, ports)
@@ -90,6 +95,7 @@ class Guard:
             {
                 "open": {slot: config.model_dump(mode="json") for slot, config in configs.items()},
                 "ports": plain_ports(ports),
+                "tap": None if tap is None else asdict(tap),
                 "limits": asdict(limits or GuardLimits()),
                 "pid": os.getpid(),
             },

@@ -13,6 +13,7 @@ from drivers.guard.lane import Lane
 from drivers.interfaces import DeviceState, LineLaser, Pulse, SyncSource
 from drivers.registry import Surroundings, lookup
 from drivers.transports.endpoints import Endpoint
+from drivers.transports.tap import TapFile
 
 _log = logging.getLogger(__name__)
 
@@ -23,7 +24,10 @@ RETRY_S = 0.1
 class Owned:
     """One slot of the rig, with a lane for its ordinary jobs and one for those that must not wait for them."""
 
-    def __init__(self, slot: str, config: dict[str, Any], ports: dict[str, str]) -> None:
+    def __init__(
+        self, slot: str, config: dict[str, Any], ports: dict[str, str], tap: dict[str, Any] | None = None
+    ) -> None:
+        """tap: fields of the `TapFile` that records its port; None: nothing is recorded."""
         self.slot = slot
         self.device: Any = None
         self.armed = False
@@ -42,7 +46,8 @@ class Owned:
         self._trouble = ""
         kind = lookup(slot, config["kind"])
         endpoints = {name: Endpoint(address, emulated=True) for name, address in ports.items()}
-        surroundings = Surroundings(SystemClock(), None, 0, endpoints)
+        tapped = None if tap is None else TapFile(**tap).tap(slot)
+        surroundings = Surroundings(SystemClock(), None, 0, endpoints, tapped)
         model = kind.config.model_validate(config)
         self._create: Callable[[], Any] = lambda: kind.create(model, surroundings)
 

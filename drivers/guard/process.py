@@ -113,7 +113,7 @@ class GuardProcess:
         self._watch.limits = GuardLimits(**message["limits"])
         for slot, config in message["open"].items():
             try:
-                owned = Owned(slot, config, message["ports"])
+                owned = Owned(slot, config, message["ports"], message["tap"])
             except Exception as error:  # a config of a kind that this process cannot make: told, not died of
                 self._channel.send({"opened": slot, "error": error_message(error)})
                 continue

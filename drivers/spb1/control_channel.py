@@ -21,6 +21,7 @@ _DRAIN_BYTES = 1 << 16
 _QUIET_S = 0.003
 """A stream that gives nothing for so long is empty: what the device has ready comes within microseconds."""
 _DRAIN_S = 1.0
+_TRIES = 3
 
 
 class ControlChannel:
@@ -44,8 +45,15 @@ class ControlChannel:
         return self.read_all((register,))[0]
 
     def read_all(self, registers: Sequence[int]) -> list[int]:
-        """Several registers."""
-        return [ack.value for ack in self._ask([(Op.READ, register, 0) for register in registers])]
+        """Several registers, each asked for twice: acknowledgements carry no checksum, and a value may just change.
+
+        `ProtocolError` where the answers never agree.
+        """
+        for _ in range(_TRIES):
+            values = [ack.value for ack in self._ask([(Op.READ, register, 0) for register in (*registers, *registers)])]
+            if values[: len(registers)] == values[len(registers) :]:
+                return values[: len(registers)]
+        raise ProtocolError(f"{self._link.label}: two answers to the same question differ; check cable and firmware")
 
     def read64(self, register: int) -> int:
         """A value of 64 bits."""

@@ -4,7 +4,6 @@ Header and trailer are always checked in full; the payload's CRC on request, sin
 that would cost a live path a good part of a core.
 """
 
-import zlib
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import CorruptBlock, UnsupportedBlock
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
+from drivers.spb1.checksum import crc32
 from drivers.spb1.layout import (
     CRC,
     HEADER,
@@ -97,7 +97,7 @@ def read_header(buffer: NDArray[np.uint8]) -> HeaderFields:
     if magic != MAGIC:
         raise CorruptBlock(f"no block: starts with 0x{magic.hex()}, not 0x{MAGIC.hex()} ({MAGIC.decode()})")
     fields = HEADER.unpack(raw)
-    _check_crc("header", zlib.crc32(raw[: -CRC.size]), fields[-1])
+    _check_crc("header", crc32(raw[: -CRC.size]), fields[-1])
     (_, version, header_bytes, flags, bits_per_px, payload_type, run_id, block_seq, first_frame, t0_ticks) = fields[:10]
     (lost_before, tick_hz, tick_hz_den, period, exposure, sweep, n_frames, frame_step, width, height) = fields[10:20]
     (sensor_width, sensor_height, payload_bytes, pixels_offset) = fields[20:24]
@@ -130,7 +130,7 @@ def read_frames(buffer: NDArray[np.uint8], fields: HeaderFields, *, check_payloa
     layout = _checked_layout(fields, len(buffer))
     status, valid_bytes, payload_crc = _read_trailer(buffer, fields)
     if check_payload and payload_crc:
-        found = zlib.crc32(buffer.data[fields.header_bytes : fields.trailer_offset])
+        found = crc32(buffer.data[fields.header_bytes : fields.trailer_offset])
         _check_crc(f"payload of block {fields.block.block_seq}", found, payload_crc)
     records, bits = views_at(buffer, layout, fields.header_bytes, fields.pixels_offset)
     if valid_bytes < fields.payload_bytes:
@@ -147,7 +147,7 @@ def read_control(buffer: NDArray[np.uint8], fields: HeaderFields) -> bytes:
     _, valid_bytes, payload_crc = _read_trailer(buffer, fields)
     payload = bytes(buffer.data[fields.header_bytes : fields.header_bytes + valid_bytes])
     if payload_crc:
-        _check_crc("control block", zlib.crc32(payload), payload_crc)
+        _check_crc("control block", crc32(payload), payload_crc)
     return payload
 
 
@@ -211,7 +211,7 @@ def _read_trailer(buffer: NDArray[np.uint8], fields: HeaderFields) -> tuple[int,
     magic, status, block_seq, valid_bytes, payload_crc, _, crc = TRAILER.unpack(raw)
     if magic != TRAILER_MAGIC:
         raise CorruptBlock(f"{where}: no trailer behind the pixels, but 0x{magic.hex()}")
-    _check_crc(f"trailer of {where}", zlib.crc32(raw[: -CRC.size]), crc)
+    _check_crc(f"trailer of {where}", crc32(raw[: -CRC.size]), crc)
     if block_seq != fields.block.block_seq:
         raise CorruptBlock(f"{where}: ends with the trailer of block {block_seq}")
     if valid_bytes > fields.payload_bytes:

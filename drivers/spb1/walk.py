@@ -39,15 +39,39 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
 def walk_places(
     buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool
 ) -> Iterator[tuple[int, FrameBlock | Damage]]:
-    """As `walk_blocks`, with the offset in `buffer` at which each block or damage begins."""
+    """As `walk_blocks`, each item behind the offset at which it begins."""
+    last: FrameBlock | None = None
+    for item in walk_placed(buffer, stride, check_payload=check_payload):
+        if isinstance(item, Damage):
+            yield item.offset, item
+        elif last is None or not _repeats(item.block, last):
+            last = item.block
+            yield item.offset, item.block
+        else:
+            seq, run = item.block.header.block_seq, item.block.header.run_id
+            reason = f"block {seq} of run {run} comes after block {last.header.block_seq}"
+            yield item.offset, Damage(item.offset, min(item.end, len(buffer)) - item.offset, reason)
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A sound block and where it lies: from byte `offset` on, `length` bytes, the next one at `end` or behind it."""
+
+    offset: int
+    length: int
+    end: int
+    block: FrameBlock
+
+
+def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[Placed | Damage]:
+    """As `walk_blocks`, with the places of the blocks and in whatever order they come, twice too."""
     if stride is not None:
         check_stride(stride)
     offset = 0
     rest = 0  # where the block before really ended: a piece lost from its padding brings the next one forward
-    last: FrameBlock | None = None
     while offset < len(buffer):
-        if stride is None and not buffer[offset : offset + ALIGN].any():
-            offset = _behind_zeros(buffer, offset + ALIGN)
+        if stride is None and (zeros := _zeros(buffer, offset)):
+            offset += zeros
             continue
         try:
             fields = read_header(buffer[offset:])
@@ -56,35 +80,25 @@ def walk_places(
         except CorruptBlock as error:
             found = _next_header(buffer, rest, passed_over=offset)
             start = min(offset, found)
-            yield start, Damage(start, found - start, str(error))
+            yield Damage(start, found - start, str(error))
             offset = rest = found
             continue
         rest = offset + round_up(fields.block_bytes, ALIGN)
         end = rest if stride is None else offset + stride
         if block is not None:
-            if last is not None and _repeats(block, last):
-                seq, run = block.header.block_seq, block.header.run_id
-                reason = f"block {seq} of run {run} comes after block {last.header.block_seq}"
-                yield offset, Damage(offset, min(end, len(buffer)) - offset, reason)
-            else:
-                yield offset, block
-                last = block
+            yield Placed(offset, fields.block_bytes, end, block)
         offset = end
 
 
-def _behind_zeros(buffer: NDArray[np.uint8], offset: int) -> int:
-    """The next multiple of `ALIGN` from `offset` on with a byte that is not zero in its piece, or the buffer's end.
-
-    Looks at more at a time the further it gets: the rest of a segment that was laid out in advance may be a gigabyte.
-    """
-    step = ALIGN
-    while offset < len(buffer):
-        piece = buffer[offset : offset + step]
+def _zeros(buffer: NDArray[np.uint8], offset: int) -> int:
+    """Bytes, whole pieces of `ALIGN`, that are zero from `offset` on; what is only allocated is passed quickly."""
+    end, step = offset, ALIGN
+    while end < len(buffer):
+        piece = buffer[end : end + step]
         if piece.any():
-            return offset + int(np.flatnonzero(piece)[0]) // ALIGN * ALIGN
-        offset += len(piece)
-        step = min(2 * step, _SEARCH_BYTES)
-    return offset
+            return end - offset + int((piece != 0).argmax()) // ALIGN * ALIGN
+        end, step = end + step, _SEARCH_BYTES
+    return end - offset
 
 
 def _repeats(block: FrameBlock, last: FrameBlock) -> bool:

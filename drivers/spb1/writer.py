@@ -1,13 +1,13 @@
 """Writing SPB1 blocks: sealed round records and pixels that are in place already, or in parts for a file."""
 
 import struct
-import zlib
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, BlockStatus, FrameBlock
+from drivers.spb1.checksum import crc32
 from drivers.spb1.layout import (
     CRC,
     HEADER,
@@ -46,7 +46,7 @@ def seal_block(
     raw = buffer.data
     buffer[HEADER_BYTES + FRAME_RECORD.itemsize * layout.n_frames : layout.pixels_offset] = 0
     end = HEADER_BYTES + layout.payload_bytes
-    crc = zlib.crc32(raw[HEADER_BYTES:end]) if payload_crc else 0
+    crc = crc32(raw[HEADER_BYTES:end]) if payload_crc else 0
     _pack(raw[:HEADER_BYTES], raw[end : end + TRAILER_BYTES], header, layout, status, frames_lost, crc)
     buffer[end + TRAILER_BYTES :] = 0
     return FrameBlock(header, records, bits, status)
@@ -72,7 +72,7 @@ def seal_control(buffer: NDArray[np.uint8], payload_type: int, run_id: int, payl
     HEADER.pack_into(raw, 0, *numbers, 0, 0)
     raw[HEADER_BYTES:end] = payload
     trailer = raw[end : end + TRAILER_BYTES]
-    TRAILER.pack_into(trailer, 0, TRAILER_MAGIC, BlockStatus.OK, 0, len(payload), zlib.crc32(payload), 0, 0)
+    TRAILER.pack_into(trailer, 0, TRAILER_MAGIC, BlockStatus.OK, 0, len(payload), crc32(payload), 0, 0)
     _sign(raw[:HEADER_BYTES])
     _sign(trailer)
     buffer[end + TRAILER_BYTES :] = 0
@@ -90,7 +90,7 @@ def block_parts(block: FrameBlock) -> tuple[memoryview, ...]:
     records = _bytes_of(block.records)
     bits = _bytes_of(block.bits)
     gap = memoryview(bytes(layout.pixels_offset - HEADER_BYTES - records.nbytes))
-    crc = zlib.crc32(bits, zlib.crc32(gap, zlib.crc32(records)))
+    crc = crc32(bits, crc32(gap, crc32(records)))
     head, tail = memoryview(bytearray(HEADER_BYTES)), bytearray(layout.min_stride - layout.block_bytes + TRAILER_BYTES)
     trailer = memoryview(tail)[:TRAILER_BYTES]
     _pack(head, trailer, header, layout, block.status, header.lost_before, crc)
@@ -150,7 +150,7 @@ def _pack_header(raw: memoryview, header: BlockHeader, layout: BlockLayout) -> N
 
 
 def _sign(part: memoryview) -> None:
-    CRC.pack_into(part, len(part) - CRC.size, zlib.crc32(part[: -CRC.size]))
+    CRC.pack_into(part, len(part) - CRC.size, crc32(part[: -CRC.size]))
 
 
 def _check(header: BlockHeader, layout: BlockLayout) -> None:

@@ -25,6 +25,7 @@ from drivers.errors import (
     DeviceTimeout,
     ProtocolError,
 )
+from drivers.transports.tap import IN, OUT, Tap
 
 try:
     from termios import error as _termios_error
@@ -53,8 +54,8 @@ class SerialPort:
     Not thread-safe: a driver that is polled from several threads locks around a whole command and reply.
     """
 
-    def __init__(self, name: str, address: str, baud: int = 115_200) -> None:
-        """Open it. name: what messages call the device.
+    def __init__(self, name: str, address: str, baud: int = 115_200, tap: Tap | None = None) -> None:
+        """Open it. name: what messages call the device. tap: told of all that passes.
 
         address: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
         vendor and product, the only one attached). Raises `DeviceNotFound`, `DevicePermission` or `DeviceBusy`.
@@ -62,6 +63,7 @@ class SerialPort:
         self._name = name
         self._path = _find(name, address)
         self._received = bytearray()
+        self._tap = tap
         self._port = self._open(baud)
 
     @property
@@ -83,6 +85,7 @@ class SerialPort:
 
     def write(self, data: bytes) -> None:
         """Send all of `data`. `DeviceTimeout` where the device takes none for a second, `DeviceDisconnected`."""
+        self._note(OUT, data)
         with self._translated():
             try:
                 self._port.write(data)
@@ -112,7 +115,9 @@ class SerialPort:
     def reset_input(self) -> bytes:
         """Drop everything received so far and not read; returns what it was. More may be on its way: see `drain`."""
         with self._translated():
-            self._received += self._port.read(self._port.in_waiting)
+            data = self._port.read(self._port.in_waiting)
+        self._note(IN, data)
+        self._received += data
         return self._take(len(self._received), 0)
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
@@ -166,8 +171,13 @@ class SerialPort:
     def _receive_some(self) -> bool:
         with self._translated():
             data = self._port.read(max(1, self._port.in_waiting))
+        self._note(IN, data)
         self._received += data
         return bool(data)
+
+    def _note(self, direction: str, data: bytes) -> None:
+        if self._tap is not None:
+            self._tap.note("serial", direction, data)
 
     def _take(self, n: int, terminator: int) -> bytes:
         taken = bytes(self._received[:n])

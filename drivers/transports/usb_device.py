@@ -19,6 +19,7 @@ import usb.core
 import usb.util
 
 from drivers.errors import DeviceError, DeviceNotFound, DevicePermission, DeviceTimeout, ProtocolError
+from drivers.transports.tap import IN, OUT, Tap
 from drivers.transports.usb_errors import no_permission, translated
 
 
@@ -70,13 +71,17 @@ class UsbDevice:
     Transfers on one endpoint are the caller's to serialise; `close` waits for none of them (end your threads first).
     """
 
-    def __init__(self, listing: UsbListing, label: str, alternates: Mapping[int, int]) -> None:
-        """Claim and set `alternates`, {interface: alternate setting}. Use `open_device` to find the listing."""
+    def __init__(self, listing: UsbListing, label: str, alternates: Mapping[int, int], tap: Tap | None = None) -> None:
+        """Claim and set `alternates`, {interface: alternate setting}. Use `open_device` to find the listing.
+
+        tap: told of what `write` and `read` pass.
+        """
         self.listing = listing
         self.label = f"{label} at {listing.address}"
         self._device = listing.handle
         self._lock = RLock()
         self._open = True
+        self._tap = tap
         try:
             with translated(self.label):
                 self._configure(alternates)
@@ -103,6 +108,8 @@ class UsbDevice:
 
     def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
         """One OUT transfer, interrupt or bulk as the descriptor says. `DeviceTimeout` where not all of it went out."""
+        if self._tap is not None:
+            self._tap.note(f"{endpoint:02x}", OUT, data)
         with translated(self.label, endpoint, timeout_s):
             sent = self._device.write(endpoint, data, milliseconds(timeout_s))
         if sent != len(data):
@@ -113,7 +120,10 @@ class UsbDevice:
     def read(self, endpoint: int, size: int, timeout_s: float) -> bytes:
         """One IN transfer of at most `size` bytes, a whole number of packets. `DeviceTimeout` where nothing came."""
         with translated(self.label, endpoint, timeout_s):
-            return bytes(self._device.read(endpoint, size, milliseconds(timeout_s)))
+            data = bytes(self._device.read(endpoint, size, milliseconds(timeout_s)))
+        if self._tap is not None:
+            self._tap.note(f"{endpoint:02x}", IN, data)
+        return data
 
     def read_into(self, endpoint: int, buffer: "array.array[int]", timeout_s: float) -> int:
         """As `read`, into an existing array (its own size in whole packets); returns the bytes read."""
@@ -178,13 +188,19 @@ class UsbDevice:
         self.close()
 
 
-def open_device(wanted: UsbId, address: str, alternates: Mapping[int, int], backend: object | None = None) -> UsbDevice:
+def open_device(
+    wanted: UsbId,
+    address: str,
+    alternates: Mapping[int, int],
+    backend: object | None = None,
+    tap: Tap | None = None,
+) -> UsbDevice:
     """Find, open, configure and claim.
 
     `DeviceNotFound`: none, or none at that address. `DeviceError`: several equal ones and the address does not choose.
     `DevicePermission` names the udev rule. `DeviceBusy`: claimed by another program.
     """
-    return UsbDevice(find_device(wanted, address, backend), wanted.label, alternates)
+    return UsbDevice(find_device(wanted, address, backend), wanted.label, alternates, tap)
 
 
 def find_device(wanted: UsbId, address: str, backend: object | None = None) -> UsbListing:

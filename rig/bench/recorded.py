@@ -26,12 +26,13 @@ def recording_of(frames: BenchFrames) -> tuple[NDArray[np.uint8], int]:
         records["ticks"] = np.arange(BLOCK_FRAMES) * PERIOD_TICKS
         records["x0"] = frames.geometry.x0[0] if width < WIDTH else 0
         bits[:] = frames.bits[seq * BLOCK_FRAMES : (seq + 1) * BLOCK_FRAMES]
-        seal_block(memory[seq], _header(seq, width), layout, payload_crc=True)
+        seal_block(memory[seq], header_of(seq, BLOCK_FRAMES, width), layout, payload_crc=True)
     return memory.reshape(-1), layout.min_stride
 
 
-def _header(seq: int, width: int) -> BlockHeader:
-    first = seq * BLOCK_FRAMES
+def header_of(seq: int, frames: int, width: int) -> BlockHeader:
+    """Of block number `seq`, with `frames` frames of the bench's sensor in it as in all others."""
+    first = seq * frames
     return BlockHeader(
         flags=BlockFlag(0), run_id=1, block_seq=seq, first_frame=first, t0_ticks=first * PERIOD_TICKS, lost_before=0,
         tick_hz=TICK_HZ, frame_period_ticks=PERIOD_TICKS, exposure_ticks=PERIOD_TICKS, sweep=0, frame_step=1,

@@ -31,7 +31,7 @@ from rig.mapping import MakesMaps
 from rig.monitor import MonitorView
 from rig.overload import Overload, require_policy
 from rig.reconstruction import MapResult, Reconstructor
-from rig.recording.recorder import Recording
+from rig.recording.writer import Recording
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, open_rig, prepare
 from rig.stages import PipelineStats
@@ -188,12 +188,12 @@ def _recorded(rig: OpenRig, plan: ScanPlan) -> Loop:
     sweeps = math.ceil(math.ceil(LOOP_S / float(plan.sweep_s)) / whole) * whole
     with tempfile.TemporaryDirectory(prefix="spadrig-bench-") as folder:
         maker = _reconstructor(rig, plan, "argmax", 1)
-        with closing(Recording(Path(folder) / "frames.spb")) as recording:
+        with closing(Recording(Path(folder))) as recording:
             for _ in Acquisition(rig, plan, timing, sweeps, maker, recording=recording).run():
                 pass
-        file = np.memmap(recording.path, np.uint8, "r")
-        blocks = (block for block in walk_blocks(file, None, check_payload=False) if isinstance(block, FrameBlock))
-        return Loop.of(blocks, sweeps)
+        files = (np.memmap(Path(folder) / name, np.uint8, "r") for name in recording.files)
+        items = (item for file in files for item in walk_blocks(file, None, check_payload=False))
+        return Loop.of((item for item in items if isinstance(item, FrameBlock)), sweeps)
 
 
 def _reconstructor(rig: OpenRig, plan: ScanPlan, estimator: str, threads: int) -> Reconstructor:

@@ -6,6 +6,7 @@ from itertools import groupby
 from rich.console import Console
 from rich.table import Table
 
+from rig.bench.disk import DiskReport
 from rig.bench.soak import SoakReport
 from rig.bench.speed import Row, SpeedReport
 
@@ -45,6 +46,21 @@ def speed_table(report: SpeedReport) -> None:
     if not latency.kept_up:
         console.print("the estimate did not keep up with 100 kHz: this is the latency of a full ring")
     console.print(f"measured in {report.seconds:.0f} s")
+
+
+def disk_table(report: DiskReport) -> None:
+    """Print the disk's rows to stdout."""
+    console = Console(highlight=False, width=WIDTH)
+    _print_machine(console, report.machine)
+    past = "past the page cache" if report.direct else "through the page cache, which this disk cannot be had without"
+    console.print(f"{report.gigabytes:.1f} GB in {report.folder}; plain: two threads {past}")
+    table = Table(box=None, pad_edge=False)
+    for title in ("row", "MB/s", "CPU s/GB", "of plain"):
+        table.add_column(title, justify="left" if title == "row" else "right")
+    for row in report.rows:
+        of_plain = "" if row.of_plain is None else f"{row.of_plain:.2f}"
+        table.add_row(row.stage, f"{row.mb_per_s:.0f}", f"{row.cpu_s_per_gb:.2f}", of_plain)
+    console.print(table)
 
 
 def soak_table(report: SoakReport) -> None:

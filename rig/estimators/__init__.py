@@ -1,5 +1,6 @@
 """Stripe estimators by name: counts of a sweep in, a stripe table out."""
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -48,6 +49,13 @@ class Estimator(Protocol):
     def estimate(self, sweep: Any, geometry: SweepGeometry) -> StripeTable:
         """Stripe table of what `counter` gave of one sweep, or of a `CountVolume`."""
         ...
+
+
+def recalling(learned: Sequence[Learned], threads: int = 2) -> Estimator:
+    """The estimator that learned these states, to estimate the map of each again as with it; it learns nothing."""
+    from rig.estimators.recalled import Recalled
+
+    return Recalled(learned, threads)
 
 
 def create_estimator(name: str, threads: int = 2) -> Estimator:

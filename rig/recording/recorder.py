@@ -1,89 +1,47 @@
-"""The recording of a run: its blocks as they came, appended to one file as SPB1 with the payload's CRC.
+"""The pipeline's recorder: a thread that hands the blocks of one start of the SPAD to the recording.
 
-The recorder is a thread of its own with a required place in the ring: where the disk is slower than the stream, the
-ring fills and the overload policy decides. Checksums are computed here, without the interpreter's lock, and nowhere
-else live. `drivers.spb1.walk_blocks` reads the file (stride None).
+It has a required place in the ring: where the disk is slower than the stream, the ring fills and the overload policy
+decides. Blocks are written by the recording's own threads, several at a time, from the slots they lie in.
 """
 
 import threading
-import time
+from collections import deque
 from collections.abc import Callable
-from pathlib import Path
+from concurrent.futures import Future
 
 from drivers.frames import FrameBlock
 from drivers.ring import RingReader
-from drivers.spb1 import block_parts
-from rig.errors import RecordingError
-
-FIRST_FILE = "frames-000000.spb"
-RESERVE_BYTES = 1 << 20
-"""Kept free beside the recording, so that manifest and summary still find room on the disk that it filled."""
-
-
-class Recording:
-    """An SPB1 file that grows block by block; whatever fails, it ends behind a whole block."""
-
-    def __init__(self, path: Path) -> None:
-        """Begin the file. Raises RecordingError where it cannot be written."""
-        self.path = path
-        self.blocks = 0
-        self.bytes = 0
-        self._reserve = path.with_suffix(".reserve")
-        try:
-            self._file = path.open("xb", buffering=0)
-            self._reserve.write_bytes(bytes(RESERVE_BYTES))
-        except OSError as error:
-            raise self._failed(error) from error
-
-    def append(self, block: FrameBlock) -> None:
-        """Write a block behind the others. Raises RecordingError where it did not fit; the file is then as before."""
-        try:
-            written = sum(self._write(part) for part in block_parts(block))
-        except BaseException as error:
-            self._file.truncate(self.bytes)
-            self._file.seek(self.bytes)
-            if isinstance(error, OSError):
-                raise self._failed(error) from error
-            raise
-        self.blocks += 1
-        self.bytes += written
-
-    def close(self) -> None:
-        """End the file. A second call does nothing."""
-        self._file.close()
-        self._reserve.unlink(missing_ok=True)
-
-    def content(self) -> dict[str, object]:
-        """What there is, for the manifest."""
-        return {"files": [self.path.name], "blocks": self.blocks, "bytes": self.bytes}
-
-    def _write(self, part: memoryview) -> int:
-        left = part
-        while left:  # a disk that is nearly full takes a piece of what it is given
-            left = left[self._file.write(left) or 0 :]
-        return part.nbytes
-
-    def _failed(self, error: OSError) -> RecordingError:
-        self._reserve.unlink(missing_ok=True)
-        reason = error.strerror or str(error)
-        return RecordingError(
-            f"cannot write the recording {self.path.name} beyond {self.bytes / 1e6:.0f} MB: {reason}; "
-            "free the space it needs or name a folder on another disk with --out"
-        )
+from rig.recording.writer import Recording
 
 
 class Recorder:
-    """The thread that records the blocks of one start of the SPAD, up to the last one. on_failure: called on it."""
+    """Records the blocks of one start of the SPAD, up to the last one. on_failure: called on its thread.
+
+    reader: holds as many blocks as are to be written at a time.
+    """
 
     def __init__(self, reader: RingReader, recording: Recording, on_failure: Callable[[], None]) -> None:
         self._reader = reader
         self._recording = recording
         self._on_failure = on_failure
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
-        self.busy_s = 0.0
-        self.blocks = 0
-        self.bytes = 0
+        self._before = recording.busy_s, recording.blocks, recording.bytes
         self.error: BaseException | None = None
+
+    @property
+    def busy_s(self) -> float:
+        """Time of all writers together, for checksums and writing."""
+        return self._recording.busy_s - self._before[0]
+
+    @property
+    def blocks(self) -> int:
+        """Blocks written of this start."""
+        return self._recording.blocks - self._before[1]
+
+    @property
+    def bytes(self) -> int:
+        """What they take in the recording."""
+        return self._recording.bytes - self._before[2]
 
     def start(self) -> None:
         """Begin to record."""
@@ -97,11 +55,18 @@ class Recorder:
 
     def _run(self) -> None:
         with self._reader:
+            under_way: deque[Future[None]] = deque()
             try:
                 while (block := self._next()) is not None:
-                    self._record(block)
+                    under_way.append(self._recording.submit(block))
+                    while len(under_way) >= self._reader.holds:  # asking for the next block gives the oldest one back
+                        under_way.popleft().result()
+                while under_way:
+                    under_way.popleft().result()
             except BaseException as error:  # raised again on the caller's thread
                 self.error = error
+                for each in under_way:
+                    each.exception()  # slots go back only once nobody reads them
                 self._on_failure()
 
     def _next(self) -> FrameBlock | None:
@@ -110,13 +75,3 @@ class Recorder:
             return self._reader.next()
         except Exception:
             return None
-
-    def _record(self, block: FrameBlock) -> None:
-        begun = time.perf_counter()
-        before = self._recording.bytes
-        try:
-            self._recording.append(block)
-        finally:
-            self.busy_s += time.perf_counter() - begun
-        self.blocks += 1
-        self.bytes += self._recording.bytes - before

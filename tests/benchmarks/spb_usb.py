@@ -28,8 +28,8 @@ from drivers.interfaces import SpadRequest
 from drivers.ring import BlockRing
 from drivers.spb1.control import Op, Register
 from drivers.spb_usb import SpbUsb, SpbUsbConfig, open_link
-from drivers.transports.queued_link import QueuedLink
 from drivers.transports.endpoints import Endpoint
+from drivers.transports.queued_link import QueuedLink
 from sim_backend.wire.spb_usb import SpbUsbModel
 from sim_backend.wire.umockdev_server import UmockdevBus, missing
 from tests.wire.spb_device import TiledSource

@@ -32,8 +32,8 @@ DEADLINE_S = 5.0
 
 
 def _frames(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
-    """Frames that all differ: the number of the frame in every word."""
-    words = np.arange(first, first + n, dtype="<u8")[:, None] * np.uint64(0x9E3779B97F4A7C15)
+    """Frames that all differ, and none is dark: the number of the frame in every word."""
+    words = np.arange(first + 1, first + 1 + n, dtype="<u8")[:, None] * np.uint64(0x9E3779B97F4A7C15)
     return np.repeat(words, 512 * 8, axis=1).reshape(n, 512, 8).view(np.uint8)
 
 

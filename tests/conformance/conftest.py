@@ -21,6 +21,7 @@ from tests.conformance.emulated_lasers import EMULATED_LASERS
 from tests.conformance.emulated_scanners import EMULATED_SCANNERS
 from tests.conformance.emulated_spads import EMULATED_SPADS
 from tests.conformance.emulated_syncs import EMULATED_SYNCS, GUARDED_LASERS
+from tests.conformance.replayed_spads import replayed_spads
 
 ROWS, WIDTH = 24, 100
 """A small camera, its width no multiple of 64."""
@@ -125,6 +126,7 @@ SPADS: dict[str, Factory] = {
     "simulated, lossy": simulated_lossy_spad,
     "simulated, windows": simulated_window_spad,
     **EMULATED_SPADS,
+    **replayed_spads(simulated_spad, simulated_lossy_spad, simulated_window_spad, EMULATED_SPADS["spb-usb, burst"]),
 }
 SCANNERS: dict[str, Factory] = {"simulated": simulated_scanner, **EMULATED_SCANNERS}
 LASERS: dict[str, Factory] = {"simulated": simulated_laser, **EMULATED_LASERS, **GUARDED_LASERS}

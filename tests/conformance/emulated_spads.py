@@ -23,7 +23,10 @@ _NOISE = np.random.default_rng(1).integers(0, 256, (64, 512, 64), dtype=np.uint8
 
 
 def _frames(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
-    return _NOISE[:n]
+    """Noise that tells its number."""
+    frames = _NOISE[:n].copy()
+    frames[:, 0, :8] = np.arange(first, first + n, dtype="<u8")[:, None].view(np.uint8)
+    return frames
 
 
 @contextmanager

@@ -177,7 +177,7 @@ def test_a_calibration_of_mirror_commands_does_not_fit_a_bare_cube(rig: Rig, wal
 
 
 def test_missing_options_are_one_line(rig: Rig, wall: Path) -> None:
-    refused(rig("reconstruct", wall / "cube.npy"), "--plan")
+    refused(rig("reconstruct", wall / "cube.npy"), "--out")
 
 
 def refused(ran: Ran, said: str) -> None:

@@ -20,13 +20,13 @@ from drivers.ring import BlockRing
 from drivers.spb1 import walk_blocks
 from rig.outputs import RunFolder
 from rig.reconstruction import MapResult, Reconstructor
-from rig.recording.recorder import Recording
+from rig.recording.segment import Segment, Staging
 from tests.system.conftest import Rig
 from tests.system.small_rig import HEIGHT, WIDTH, config, write_rig
 
 KEYS = {
     "maps", "map_rate_hz", "columns", "exposures", "estimator", "filter", "frames", "sensor_time_s", "compute_time_s",
-    "realtime_factor", "valid_fraction", "fog", "truth", "verdict", "stages",
+    "realtime_factor", "valid_fraction", "fog", "truth", "verdict", "stages", "sync",
 }  # fmt: skip
 FILES = {
     "depth/000000.npy", "depth/000000.png", "intensity/000000.png", "stripe/000000.npz", "cloud/000000.ply",
@@ -97,11 +97,11 @@ def test_a_recording_holds_every_frame_of_the_scan(rig: Rig, small: Path) -> Non
     assert len(numbers) >= summary["frames"]["received"]  # type: ignore[index]
     stages, recording = summary["stages"], strict(Path("run/manifest.json").read_text())["recording"]
     assert isinstance(stages, dict)
-    assert recording == {
-        "files": ["frames-000000.spb"],
-        "blocks": stages["recorder_blocks"],
-        "bytes": Path("run/frames-000000.spb").stat().st_size,
-    }
+    assert isinstance(recording, dict)
+    assert (recording["files"], recording["blocks"]) == (["frames-000000.spb"], stages["recorder_blocks"])
+    assert recording["sync_interval_s"] == 0.2
+    assert recording["bytes"] == Path("run/frames-000000.spb").stat().st_size
+    assert recording["starts"] == [{"sweeps": 2, "segment": 0}]
 
 
 def test_recording_and_policies_change_no_result(rig: Rig, small: Path) -> None:
@@ -125,12 +125,12 @@ def test_frames_dropped_for_a_slow_estimate_are_gaps(rig: Rig, small: Path, monk
 
     monkeypatch.setattr(BlockRing, "mark_overflow", marked)
     monkeypatch.setattr(Reconstructor, "map", slow)
-    ran = rig("scan", small, "--maps", 3, "--on-overload", "drop", "--json", "--out", "run")
+    ran = rig("scan", small, "--maps", 8, "--on-overload", "drop", "--json", "--out", "run")
     summary, manifest = strict(ran.out), strict(Path("run/manifest.json").read_text())
     frames, gaps = summary["frames"], manifest["gaps"]
     assert isinstance(frames, dict)
     assert isinstance(gaps, list)
-    assert (ran.code, summary["verdict"], summary["maps"]) == (1, "gaps", 3)
+    assert (ran.code, summary["verdict"], summary["maps"]) == (1, "gaps", 8)
     assert frames["expected"] == frames["received"] + frames["lost"]
     assert frames["lost"] == sum(last - first + 1 for first, last in gaps) > 0
     assert summary["stages"]["dropped_frames"] >= frames["lost"]  # type: ignore[index]
@@ -140,14 +140,14 @@ def test_frames_dropped_for_a_slow_estimate_are_gaps(rig: Rig, small: Path, monk
 def test_a_disk_that_the_recording_fills_ends_the_scan_in_a_line_and_keeps_what_is_whole(
     rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    append = Recording.append
+    write = Segment.write
 
-    def full(self: Recording, block: FrameBlock) -> None:
-        if self.blocks == 3:
-            monkeypatch.setattr(self, "_write", lambda part: os.write(-1, b""), raising=False)
-        append(self, block)
+    def full(self: Segment, block: FrameBlock, offset: int, staging: Staging) -> None:
+        if block.header.block_seq == 3:
+            os.write(-1, b"")
+        write(self, block, offset, staging)
 
-    monkeypatch.setattr(Recording, "append", full)
+    monkeypatch.setattr(Segment, "write", full)
     ran = rig("scan", small, "--maps", 20, "--record", "--out", "run")
     assert (ran.code, len(ran.problems)) == (3, 1)
     assert "cannot write the recording frames-000000.spb" in ran.problems[0]

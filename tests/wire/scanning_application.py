@@ -7,14 +7,17 @@ NUMBER, "within_s": S} prints its exit code (negative: the signal), or null whil
 One that labours has a disk that stalls and threads that fight those of the scan for the interpreter.
 """
 
+import faulthandler
 import json
 import os
+import signal
 import sys
 import time
+from concurrent.futures import Future
 from typing import Any
 
 from drivers.frames import FrameBlock
-from rig.recording.recorder import Recording
+from rig.recording.writer import Recording
 from rig.warm_up import warm_up
 from tests.wire.guarded_application import labour
 from tests.wire.scan_rig import EXPOSURES
@@ -59,6 +62,7 @@ def become(arguments: list[str], environment: dict[str, str], log: str, labours:
     with open(log, "wb", buffering=0) as output, open(os.devnull, "rb") as nothing:
         for number, file in ((0, nothing), (1, output), (2, output)):
             os.dup2(file.fileno(), number)
+    faulthandler.register(signal.SIGUSR1, all_threads=True)
     if labours:
         stall_disk()
         labour()
@@ -67,16 +71,16 @@ def become(arguments: list[str], environment: dict[str, str], log: str, labours:
 
 def stall_disk() -> None:
     """Now and then a write of the recording takes a second."""
-    append, stalled_at = Recording.append, time.monotonic()
+    submit, stalled_at = Recording.submit, time.monotonic()
 
-    def stalling(recording: Recording, block: FrameBlock) -> None:
+    def stalling(recording: Recording, block: FrameBlock) -> Future[None]:
         nonlocal stalled_at
         if time.monotonic() - stalled_at > STALL_EVERY_S:
             stalled_at = time.monotonic()
             time.sleep(STALL_S)
-        append(recording, block)
+        return submit(recording, block)
 
-    Recording.append = stalling  # type: ignore[method-assign]
+    Recording.submit = stalling  # type: ignore[method-assign]
 
 
 def exit_code(ended: dict[int, int], wait: int, within_s: float) -> int | None:

@@ -48,7 +48,9 @@ def noise(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uin
 def reads_done(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
     """Frames whose every four bytes read DONE or ERRO, also at the end of each read of 32 768 bytes."""
     rows = np.tile(np.frombuffer(b"DONEERRO" if first % 2 else b"ERRODONE", np.uint8), 8)
-    return np.tile(rows, (n, 512, 1))
+    frames = np.tile(rows, (n, 512, 1))
+    frames[:, 1, 0] = np.arange(first, first + n)
+    return frames
 
 
 @contextmanager
@@ -217,6 +219,18 @@ def test_something_else_than_done_behind_the_pixels_is_refused() -> None:
         pytest.raises(ProtocolError, match="not DONE"),
     ):
         take(device, 1)
+
+
+def test_trap_frames_without_numbers_may_come_twice_in_place_of_others() -> None:
+    def stuck(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
+        return noise(first if first < 40 else first - 24, start_s, period_s, n)
+
+    with connected(Spad512sModel(stuck)) as (device, _), pytest.raises(ProtocolError, match=r"40 .* same as frame 16"):
+        take(device, 64)
+    dark = np.zeros((8, 512, 64), np.uint8)
+    for uniform in (dark, ~dark):
+        with connected(Spad512sModel(lambda first, start_s, period_s, n: uniform[:n])) as (device, _):  # noqa: B023
+            assert len(take(device, 48)) == 3
 
 
 def test_trap_done_glued_to_text_answers() -> None:

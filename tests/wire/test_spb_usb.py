@@ -23,7 +23,7 @@ from drivers.errors import (
 from drivers.frames import BlockFlag, Mark
 from drivers.interfaces import WindowTable
 from drivers.ring import BlockRing
-from drivers.spb1.control import Ack, Command, Feature, Op, Register, State, pattern_row, read_acks
+from drivers.spb1.control import Ack, AckStatus, Command, Feature, Op, Register, State, pattern_row, read_acks
 from sim_backend.wire.spb_usb import SpbUsbModel
 from sim_backend.wire.usb_backend import EmulatedUsb
 from tests.wire.spb_device import (
@@ -85,7 +85,7 @@ def test_what_is_written_before_a_run() -> None:
     assert (written[Register.PERIOD_TICKS], written[Register.EXPOSURE_TICKS]) == (1000, 1000)
     assert (written[Register.STRIDE], written[Register.BLOCK_FRAMES]) == (STRIDE, 16)
     assert (written[Register.MODE], written[Register.N_FRAMES], written[Register.N_FRAMES + 4]) == (0, 32, 0)
-    assert device.commands[-3][0] == Op.START
+    assert device.commands[-5][0] == Op.START  # EXPOSED is asked for behind it, two halves twice
 
 
 @pytest.mark.parametrize(
@@ -106,6 +106,27 @@ def test_another_board_with_the_same_ids_and_name_is_told_by_its_identity_regist
     device._registers[Register.MAGIC] = 0x12345678
     with pytest.raises(DeviceNotFound, match="identity 0x12345678 is not SPB1"):
         opened(device)
+
+
+def test_a_flipped_bit_in_an_answer_without_a_checksum_is_noticed() -> None:
+    class Flipping(SpbUsbModel):
+        left = 0
+
+        def _read(self, address: int) -> tuple[AckStatus, int]:
+            status, value = super()._read(address)
+            if address == Register.EXPOSED and self.left:
+                self.left -= 1
+                value ^= self.left + 1  # another one each time
+            return status, value
+
+    device = Flipping(NumberedSource(), WIDTH, HEIGHT)
+    with opened(device) as spad:
+        device.left = 1
+        take(spad, 20)
+        assert spad.counters.exposed == 20
+        device.left = 100
+        with pytest.raises(ProtocolError, match="two answers to the same question differ"):
+            take(spad, 20)
 
 
 def test_an_fx3_that_does_not_speak_spb1_is_not_found() -> None:

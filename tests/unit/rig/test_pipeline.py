@@ -3,6 +3,7 @@
 import errno
 import itertools
 import logging
+import mmap
 import threading
 
 import numpy as np
@@ -12,11 +13,13 @@ from hypothesis import strategies as st
 
 from calibration.model import Lag
 from drivers.errors import DeviceFault, RingOverflow
+from drivers.recorded.index import INDEX_FILE, segment_name
 from drivers.spb1 import walk_blocks
 from rig import overload, pipeline
 from rig.errors import RecordingError, UsageError
 from rig.overload import Overload
-from rig.recording.recorder import FIRST_FILE, Recording
+from rig.recording.segment import PAGE_BYTES, Segment
+from rig.recording.writer import Recording
 from tests.unit.rig.fakes import (
     PATIENCE_S,
     START,
@@ -80,8 +83,9 @@ def stalled_maker(rig, until_seq):
     return FakeMaker(lambda index: index or go_on.wait(PATIENCE_S))
 
 
-def blocks_in(file):
-    found = list(walk_blocks(np.fromfile(file, np.uint8), None, check_payload=True))
+def blocks_in(folder):
+    files = sorted(folder.glob("frames-*.spb"))
+    found = [block for f in files for block in walk_blocks(np.fromfile(f, np.uint8), None, check_payload=True)]
     assert all(hasattr(block, "bits") for block in found), found
     return found
 
@@ -200,11 +204,11 @@ def test_a_first_map_of_its_own_is_made_before_the_stream_goes_on():
 
 def test_the_recording_holds_every_block_with_its_checksum(tmp_path):
     rig, _ = rig_of()
-    recording = Recording(tmp_path / FIRST_FILE)
+    recording = Recording(tmp_path)
     acquired = acquisition(rig, PLAN, MAPS, recording=recording)
     maps = list(acquired.run())
     recording.close()
-    blocks = blocks_in(recording.path)
+    blocks = blocks_in(tmp_path)
     numbers = np.concatenate([block.frame_numbers for block in blocks])
     assert numbers.tolist() == rig.spad.delivered
     sent = STREAM.blocks(itertools.repeat(16))
@@ -212,17 +216,17 @@ def test_the_recording_holds_every_block_with_its_checksum(tmp_path):
         np.testing.assert_array_equal(block.bits, original.bits)
         np.testing.assert_array_equal(block.records, original.records)
         assert block.header.t0_ticks == original.header.t0_ticks
-    assert acquired.stages.recorder_bytes == recording.path.stat().st_size == recording.bytes
+    assert acquired.stages.recorder_bytes == (tmp_path / segment_name(0)).stat().st_size == recording.bytes
     assert acquired.stages.recorder_blocks == recording.blocks == len(blocks)
     assert numbers[-1] >= maps[-1].sweep.end_frame
-    assert [file.name for file in tmp_path.iterdir()] == [FIRST_FILE]
+    assert sorted(file.name for file in tmp_path.iterdir()) == [segment_name(0), INDEX_FILE]
 
 
 def test_a_slow_recorder_loses_by_the_policy_and_both_readers_have_the_same_frames(tmp_path, monkeypatch):
     rig, _ = rig_of(can_wait=False)
-    recording = Recording(tmp_path / FIRST_FILE)
-    append, go_on = recording.append, threading.Event()
-    monkeypatch.setattr(recording, "append", lambda block: (go_on.wait(PATIENCE_S), append(block)))
+    recording = Recording(tmp_path)
+    submit, go_on = recording.submit, threading.Event()
+    monkeypatch.setattr(recording, "submit", lambda block: (go_on.wait(PATIENCE_S), submit(block))[1])
     stalled_maker(rig, N_BLOCKS // 2)
     behaviour = rig.spad.behaviour
 
@@ -236,57 +240,59 @@ def test_a_slow_recorder_loses_by_the_policy_and_both_readers_have_the_same_fram
     _, lost = accounted(list(acquired.run()))
     recording.close()
     assert lost == acquired.stages.dropped_frames == len(rig.spad.dropped) > 0
-    recorded = np.concatenate([block.frame_numbers for block in blocks_in(recording.path)]).tolist()
+    recorded = np.concatenate([block.frame_numbers for block in blocks_in(tmp_path)]).tolist()
     assert recorded == rig.spad.delivered
 
 
 def test_a_slow_recorder_makes_a_source_that_can_wait_wait(tmp_path, monkeypatch):
     rig, _ = rig_of()
-    recording = Recording(tmp_path / FIRST_FILE)
-    append = recording.append
+    recording = Recording(tmp_path)
+    submit = recording.submit
     acquired = acquisition(rig, PLAN, MAPS, recording=recording, silence_s=0.02)
 
     def slow(block):
-        if recording.blocks == 1:
+        if block.header.block_seq == 1:
             wait_until(lambda: acquired.stages.source_wait_s > 0.1)
-        append(block)
+        return submit(block)
 
-    monkeypatch.setattr(recording, "append", slow)
+    monkeypatch.setattr(recording, "submit", slow)
     assert accounted(list(acquired.run()))[1] == 0
     recording.close()
-    assert len(blocks_in(recording.path)) == recording.blocks
+    assert len(blocks_in(tmp_path)) == recording.blocks
+
+
+def fill_up(monkeypatch, whole):
+    """Let the disk be full in the middle of the block behind `whole` ones: a page of it fits."""
+    write = Segment._write
+
+    def full(segment, pieces, offset):
+        size = sum(len(piece) for piece in pieces)
+        if offset < size * whole:
+            return write(segment, pieces, offset)
+        if offset == size * whole:
+            write(segment, [memoryview(mmap.mmap(-1, PAGE_BYTES))], offset)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Segment, "_write", full)
 
 
 @pytest.mark.parametrize("whole", [0, 5])
 def test_a_full_disk_ends_the_run_in_a_line_and_what_was_before_it_is_whole(tmp_path, monkeypatch, whole):
     rig, log = rig_of()
-    recording = Recording(tmp_path / FIRST_FILE)
-    file, written = recording._file, []
-
-    class Full:
-        def write(self, data):
-            written.append(1)
-            if len(written) == 5 * whole + 4:  # in the middle of the pixels: a piece of them fits
-                file.write(data[:100])
-                raise OSError(errno.ENOSPC, "No space left on device")
-            return file.write(data)
-
-        def __getattr__(self, name):
-            return getattr(file, name)
-
-    monkeypatch.setattr(recording, "_file", Full())
+    recording = Recording(tmp_path)
+    fill_up(monkeypatch, whole)
     with pytest.raises(RecordingError, match=r"frames-000000.spb beyond .*: No space left on device; free") as caught:
         list(acquisition(rig, PLAN, MAPS, recording=recording).run())
     assert caught.value.exit_code == 3
     recording.close()
     assert log == START + STOP
-    assert len(blocks_in(recording.path)) == recording.blocks == whole
-    assert [file.name for file in tmp_path.iterdir()] == [FIRST_FILE]
+    assert len(blocks_in(tmp_path)) == recording.blocks == whole
+    assert sorted(file.name for file in tmp_path.iterdir()) == [segment_name(0)] * (whole > 0) + [INDEX_FILE]
 
 
 def test_a_recording_that_cannot_be_begun_is_refused(tmp_path):
     with pytest.raises(RecordingError, match="No such file"):
-        Recording(tmp_path / "absent" / FIRST_FILE)
+        Recording(tmp_path / "absent")
 
 
 # The monitor
@@ -374,10 +380,10 @@ def run_with_failure(stage, n, error, policy=Overload.ABORT, folder=None, can_wa
     maker = FakeMaker(fail if stage == "estimation" else lambda index: None)
     recording = None
     if folder is not None:
-        recording = Recording(folder / FIRST_FILE)
+        recording = Recording(folder)
         if stage == "recorder":
-            append = recording.append
-            recording.append = lambda block: (fail(), append(block))
+            submit = recording.submit
+            recording.submit = lambda block: (fail(), submit(block))[1]
     acquired = acquisition(
         rig,
         PLAN,
@@ -406,13 +412,13 @@ def run_with_failure(stage, n, error, policy=Overload.ABORT, folder=None, can_wa
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), DeviceFault("broken"), ZeroDivisionError("ours")])
 @pytest.mark.parametrize(("stage", "n"), [("source", 40), ("estimation", 2), ("recorder", 3), ("caller", 1)])
 def test_an_error_or_interrupt_on_any_thread_reaches_the_caller_with_the_rig_safe(tmp_path, stage, n, error):
-    maps, caught, log, recording = run_with_failure(stage, n, error, folder=tmp_path)
+    maps, caught, log, _ = run_with_failure(stage, n, error, folder=tmp_path)
     assert caught is error
     assert log == START + STOP
     assert [found.sweep.index for found in maps] == list(range(len(maps)))
     if stage == "estimation":
         assert len(maps) == 2
-    blocks_in(recording.path)
+    blocks_in(tmp_path)
 
 
 def test_counts_behind_an_error_of_the_source_still_become_maps():
@@ -440,7 +446,7 @@ def test_no_failure_anywhere_deadlocks_or_leaves_the_rig_unsafe(tmp_path_factory
     if caught is None:
         assert len(maps) == MAPS or accounted(maps)[1] > 0
     accounted(maps)
-    assert len(blocks_in(recording.path)) == recording.blocks
+    assert len(blocks_in(folder)) == recording.blocks
 
 
 def test_figures_of_several_starts_are_added_or_the_largest_taken():

@@ -1,14 +1,20 @@
-import pytest
+"""What is compiled before a laser is armed: the frames of a scan must find nothing left to compile."""
 
-from rig.estimators.stream import ColumnJudge
-from rig.warm_up import warm_up
+from rig import binding_kernels
+from rig.config_files import load_config
+from rig.session import open_rig, prepare
+from rig.warm_up import warm_binding
 
 
-@pytest.mark.parametrize("exposures", [1, 10, 100])
-@pytest.mark.parametrize("dark", [True, False])
-def test_columns_are_judged_on_the_way_before_a_run_needs_it(monkeypatch, exposures, dark):
-    judged = []
-    finish = ColumnJudge.finish
-    monkeypatch.setattr(ColumnJudge, "finish", lambda self: judged.append(self) or finish(self))
-    warm_up("likelihood", "none", exposures, dark=dark)
-    assert judged
+def test_binding_compiles_nothing_more_behind_it():
+    from rig.acquisition import Acquisition
+    from rig.reconstruction import Reconstructor
+
+    with open_rig(load_config("simulated", {"scan.columns": 40, "scan.exposures": 20})) as rig:
+        plan, timing = prepare(rig)
+        warm_binding(plan)
+        made = [len(kernel.signatures) for kernel in (binding_kernels.walk, binding_kernels.cover)]
+        assert min(made) >= 1
+        maker = Reconstructor(rig.model, plan.commands, plan.depth_range_m, estimator="argmax", threads=1)
+        list(Acquisition(rig, plan, timing, 1, maker).run())
+        assert made == [len(kernel.signatures) for kernel in (binding_kernels.walk, binding_kernels.cover)]

@@ -59,14 +59,17 @@ def index_header() -> bytes:
     return bare + _CRC.pack(zlib.crc32(bare))
 
 
-def index_of(block: FrameBlock, segment: int, offset: int) -> bytes:
-    """The record, 64 bytes, of a block that begins at byte `offset` of `segment`."""
+def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = None) -> bytes:
+    """The record, 64 bytes, of a block that begins at byte `offset` of `segment`.
+
+    length: its bytes, where it was not written by `drivers.spb1.block_parts`.
+    """
     header = block.header
     bare = _RECORD.pack(
         segment,
         int(header.flags),
         offset,
-        BlockLayout(block.n_frames, header.width, header.height).block_bytes,
+        length or BlockLayout(block.n_frames, header.width, header.height).block_bytes,
         header.run_id,
         header.block_seq & 0xFFFFFFFF,
         header.first_frame,

@@ -1,0 +1,210 @@
+"""Reading a recording: its runs, and their blocks by frame number, each checked before anybody sees it.
+
+Blocks are read ahead by threads, which check the payloads' CRC without the interpreter's lock, so that reading keeps
+up with the disk. What is damaged is left out, as frames that were lost, and told in `problems`.
+"""
+
+import logging
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from drivers.errors import ProtocolError
+from drivers.frames import BlockFlag, BlockHeader, FrameBlock
+from drivers.recorded.contents import Entries, find_blocks, read_entry
+from drivers.recorded.segments import open_segments
+
+READERS: Final = 2
+"""One thread checks 4 GB/s."""
+BLOCKS_AHEAD: Final = 6
+READ_AHEAD_BYTES: Final = 32 * 2**20
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedRun:
+    """The blocks of one start of the SPAD. entries: (n,) of `INDEX_RECORD`. header: of its first sound block.
+
+    Frame numbers of the run are counted from the SPAD's start, so that the first need not be 0.
+    """
+
+    number: int
+    header: BlockHeader
+    entries: Entries
+
+    @property
+    def first_frame(self) -> int:
+        """Number of its first frame."""
+        return int(self.entries["first_frame"][0])
+
+    @property
+    def end_frame(self) -> int:
+        """One behind the number of its last frame."""
+        return int(self.entries["first_frame"][-1]) + int(self.entries["n_frames"][-1])
+
+    @property
+    def frames(self) -> int:
+        """Frames recorded."""
+        return int(self.entries["n_frames"].sum())
+
+    def gaps(self) -> list[tuple[int, int]]:
+        """(first, last) numbers of the frames that lie between its blocks and are in none."""
+        begins = self.entries["first_frame"].astype(np.int64)
+        ends = begins + self.entries["n_frames"]
+        where = np.flatnonzero(begins[1:] > ends[:-1])
+        return [(int(ends[i]), int(begins[i + 1]) - 1) for i in where]
+
+
+class RunRecording:
+    """A recording to be read: a run's folder, or one `.spb` file. Any number of threads may read it.
+
+    runs: in the order in which they were taken. problems: what is wrong with it, a line each; reading may add some.
+    Raises `DeviceNotFound` where there is none and `ProtocolError` where no frame of it is left.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._segments = {segment.number: segment for segment in open_segments(path)}
+        found = find_blocks(list(self._segments.values()), path)
+        self.problems = found.problems
+        self.indexed = found.indexed
+        self.runs = self._runs_of(found.entries)
+        for problem in self.problems:
+            _log.warning("%s: %s", path, problem)
+        if not self.runs:
+            raise ProtocolError(f"{path} holds no whole block of frames; 'rig verify' says what is left of it")
+
+    @property
+    def frames(self) -> int:
+        """Frames of all runs."""
+        return sum(run.frames for run in self.runs)
+
+    def blocks(
+        self, run: RecordedRun, first_frame: int | None = None, end_frame: int | None = None
+    ) -> Iterator[FrameBlock]:
+        """The frames of a run from `first_frame` to before `end_frame`, all where None, in the blocks they lie in.
+
+        The first and the last block are cut to size. Blocks stay valid as long as somebody holds them.
+        """
+        first = run.first_frame if first_frame is None else first_frame
+        end = run.end_frame if end_frame is None else end_frame
+        begins = run.entries["first_frame"].astype(np.int64)
+        wanted = run.entries[(begins < end) & (begins + run.entries["n_frames"] > first)]
+        for block in self._read(wanted, run.header):
+            yield block_part(block, first, end)
+
+    def read(self, run: RecordedRun, entry: Any) -> FrameBlock | None:
+        """The block of one entry of a run; None, and a problem more, where it is damaged."""
+        segment = self._segments[int(entry["segment"])]
+        try:
+            block = read_entry(segment, entry)
+            if not _is_of(block.header, run.header):
+                raise ProtocolError(f"block {block.header.block_seq} is of another size or clock than its run")
+        except ProtocolError as error:
+            self._add_problem(f"{segment.path.name}, byte {entry['offset']}: {error}")
+            return None
+        return block
+
+    def _read(self, entries: Entries, header: BlockHeader) -> Iterator[FrameBlock]:
+        run = RecordedRun(0, header, entries)
+        if int(entries["length"].sum()) < READ_AHEAD_BYTES:  # threads would take longer to start
+            yield from (block for entry in entries if (block := self.read(run, entry)) is not None)
+            return
+        ahead: deque[Future[FrameBlock | None]] = deque()
+        with ThreadPoolExecutor(READERS, "recording reader") as pool:
+            told = 0
+            for i, entry in enumerate(entries):
+                told = self._expect(entries, i, told)
+                ahead.append(pool.submit(self.read, run, entry))
+                if len(ahead) > BLOCKS_AHEAD and (block := ahead.popleft().result()) is not None:
+                    yield block
+            while ahead:
+                if (block := ahead.popleft().result()) is not None:
+                    yield block
+
+    def _expect(self, entries: Entries, i: int, told: int) -> int:
+        """Have the system read what comes, in pieces; index of the first entry it was not told of."""
+        if told > i:
+            return told
+        size, told = 0, i
+        while told < len(entries) and size < READ_AHEAD_BYTES:
+            size += int(entries["length"][told])
+            told += 1
+        for number in set(entries["segment"][i:told].tolist()):
+            mine = entries[i:told][entries["segment"][i:told] == number]
+            begin = int(mine["offset"].min())
+            self._segments[number].expect(begin, int((mine["offset"] + mine["length"]).max()) - begin)
+        return told
+
+    def _runs_of(self, entries: Entries) -> list[RecordedRun]:
+        begins = np.flatnonzero(np.diff(entries["run_id"].astype(np.int64), prepend=-1))
+        runs: list[RecordedRun] = []
+        for begin, stop in pairwise([*begins.tolist(), len(entries)]):
+            mine = entries[begin:stop]
+            header = self._first_header(mine)
+            if header is not None and mine["n_frames"].any():
+                runs.append(RecordedRun(len(runs), header, mine))
+        return runs
+
+    def _first_header(self, entries: Entries) -> BlockHeader | None:
+        """Of the first block that is sound; those before it are told of where they are read."""
+        for entry in entries:
+            try:
+                return read_entry(self._segments[int(entry["segment"])], entry).header
+            except ProtocolError:
+                continue
+        return None
+
+    def _add_problem(self, line: str) -> None:
+        if line not in self.problems:
+            self.problems.append(line)
+            _log.warning("%s: %s", self.path, line)
+
+
+def block_part(block: FrameBlock, first_frame: int, end_frame: int) -> FrameBlock:
+    """The frames of a block from `first_frame` to before `end_frame`, as a block; itself where that is all of it."""
+    header = block.header
+    begin = max(0, first_frame - header.first_frame)
+    end = min(block.n_frames, end_frame - header.first_frame)
+    if (begin, end) == (0, block.n_frames):
+        return block
+    records = block.records[begin:end].copy()
+    flags = header.flags
+    if begin:
+        flags &= ~(BlockFlag.FIRST | BlockFlag.LOST_BEFORE)
+    if end < block.n_frames:
+        flags &= ~BlockFlag.LAST
+    skipped = int(records["ticks"][0])
+    records["ticks"] -= np.uint32(skipped)
+    header = replace(
+        header,
+        flags=flags,
+        first_frame=header.first_frame + begin,
+        t0_ticks=header.t0_ticks + skipped,
+        sweep=header.sweep + ((int(records["sweep"][0]) - header.sweep) & 0xFFFF),
+    )
+    return FrameBlock(header, records, block.bits[begin:end], block.status)
+
+
+def _is_of(header: BlockHeader, first: BlockHeader) -> bool:
+    """Whether a block can be of the run that another one is of."""
+    return all(getattr(header, name) == getattr(first, name) for name in _OF_A_RUN)
+
+
+_OF_A_RUN: Final = (
+    "run_id",
+    "width",
+    "height",
+    "sensor_width",
+    "sensor_height",
+    "tick_hz",
+    "frame_period_ticks",
+    "exposure_ticks",
+)

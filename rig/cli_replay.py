@@ -1,0 +1,115 @@
+"""The command that plays a recording: `rig replay`."""
+
+import os
+import select
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli_command import (
+    ConfidenceOption,
+    EstimatorOption,
+    FilterOption,
+    JsonOption,
+    command,
+    default_out,
+    progress,
+    report,
+    say,
+)
+
+if TYPE_CHECKING:
+    from drivers.replay_pace import Pace
+
+_LOOK_S = 0.2
+"""One wait for a key."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command("replay")(replay_command)
+
+
+@command
+def replay_command(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="a run taken with --record", show_default=False)],
+    clock: Annotated[
+        str, typer.Option("--clock", help="realtime, max, x4 or x0.1, or step (Enter: one sweep more)")
+    ] = "realtime",
+    loop: Annotated[bool, typer.Option("--loop", help="again and again, until Ctrl-C or --maps")] = False,
+    maps: Annotated[int | None, typer.Option("--maps", help="depth maps to make", show_default="all")] = None,
+    config: Annotated[
+        str | None,
+        typer.Option(
+            "--config",
+            help="a rig whose scanner, laser and sync source take part, like hil",
+            show_default="they are recorded too",
+        ),
+    ] = None,
+    estimator: EstimatorOption = None,
+    filter: FilterOption = None,
+    min_confidence: ConfidenceOption = None,
+    threads: Annotated[
+        int | None, typer.Option("--threads", help="that count and estimate", show_default="as recorded")
+    ] = None,
+    block_frames: Annotated[
+        int | None, typer.Option("--block-frames", help="most frames of a block", show_default="5 ms", min=1)
+    ] = None,
+    save: Annotated[
+        str, typer.Option("--save", help="maps to write: all, last or every N", show_default="all, with --loop last")
+    ] = "",
+    out: Annotated[
+        Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="runs/DATE-TIME")
+    ] = None,
+    record: Annotated[bool, typer.Option("--record", help="write the frames into the folder too")] = False,
+    on_overload: Annotated[
+        str, typer.Option("--on-overload", help="frames come too fast: abort and block wait, drop counts them")
+    ] = "abort",
+    arm: Annotated[bool, typer.Option("--arm", help="let a real laser shine: the beam path is clear")] = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Play a recording through the live stack, at any clock."""
+    from rig import api
+
+    options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
+    with progress("frames") as bar:
+        result = api.replay(
+            run,
+            clock=clock,
+            loop=loop,
+            maps=maps,
+            config=config,
+            threads=threads,
+            block_frames=block_frames,
+            save=save or ("last" if loop else "all"),
+            arm=arm,
+            out=default_out() if out is None else out,
+            record=record,
+            on_overload=on_overload,
+            live=None if bar is None else lambda done: bar(done.frames, done.frames_planned, done.lost),
+            steps=_step_by_keys if clock == "step" else None,
+            **options,
+        )
+    return report(result, as_json)
+
+
+def _step_by_keys(pace: "Pace") -> None:
+    """A step for each line of the standard input, from a thread; behind its end the rest as fast as may be."""
+    if sys.stdin.isatty():
+        say("Enter: one sweep more; Ctrl-C ends")
+    threading.Thread(target=_follow, args=(pace, sys.stdin.fileno()), name="steps", daemon=True).start()
+
+
+def _follow(pace: "Pace", handle: int) -> None:
+    while not pace.closed:
+        # Not through sys.stdin: a thread that holds its lock would hang the interpreter at its end.
+        if select.select([handle], [], [], _LOOK_S)[0]:
+            data = os.read(handle, 4096)
+            for _ in range(data.count(b"\n")):
+                pace.step()
+            if not data:
+                pace.run_on()
+                return

@@ -1,0 +1,1 @@
+"""Recordings from and for other programs: `rig import`, `rig export` (docs/exchange.md)."""

@@ -1,0 +1,218 @@
+"""`rig export`: a run for other programs, as arrays, one HDF5 file, point clouds, pictures or a film."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
+
+from drivers.errors import ProtocolError
+from drivers.frames import FrameBlock
+from drivers.recorded import RunRecording
+from drivers.recorded.segments import NO_SEGMENT, segment_files
+from rig.errors import DamagedRecordingError, UsageError
+from rig.exchange import hdf5, pictures
+from rig.exchange.frame_log import FrameLog
+from rig.exchange.maps import MapFiles
+from rig.exchange.npy import write_npy
+from rig.exchange.pictures import VIEWS, Picture, View
+from rig.outputs import RunFolder
+from rig.recording.inputs import read_model
+from rig.recording.manifest import read_manifest
+from rig.run import Progress
+
+ExportKind = Literal["npy", "hdf5", "ply", "png", "mp4"]
+EXPORT_KINDS: Final[tuple[ExportKind, ...]] = get_args(ExportKind)
+FILMS_PER_S: Final = 25.0
+FRAMES_PER_PICTURE: Final = 100
+_NO_MAPS: Final = "make them first: rig reconstruct {run} --out DIR, and export that folder"
+
+
+@dataclass(frozen=True, slots=True)
+class ExportOptions:
+    """What is shown (png, mp4) and how.
+
+    view: depth, intensity or frames; None: the first of them that there is. frames_per_picture: frames summed for one
+    picture of view frames. pictures_per_s: of a film.
+    """
+
+    view: str | None = None
+    frames_per_picture: int = FRAMES_PER_PICTURE
+    pictures_per_s: float = FILMS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class ExportResult:
+    """What an export wrote. gaps: [run id, first, last] of missing frames; damage: what could not be read, and why."""
+
+    folder: Path
+    kind: str
+    files: tuple[str, ...]
+    frames: int
+    maps: int
+    gaps: tuple[tuple[int, int, int], ...] = ()
+    damage: tuple[str, ...] = ()
+
+    @property
+    def exit_code(self) -> int:
+        """1 where parts of the recording are missing in what was written, else 0."""
+        return 1 if self.damage else 0
+
+    def as_json(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+def export_run(
+    run: str | os.PathLike[str],
+    kind: str,
+    out: str | os.PathLike[str] | None = None,
+    options: ExportOptions | None = None,
+    progress: Progress | None = None,
+) -> ExportResult:
+    """Write `run` in another form to a new folder: `out`, or RUN-KIND beside the run; it appears whole or not at all.
+
+    Raises UsageError where the run has nothing of that kind, or h5py is not installed.
+    """
+    options = options or ExportOptions()
+    run = Path(run)
+    _check(run, kind, options)
+    target = Path(out) if out is not None else run.absolute().with_name(f"{run.absolute().name}-{kind}")
+    with RunFolder(target) as folder:
+        export = _Export(run, folder, options, progress)
+        try:
+            getattr(export, f"write_{kind}")()
+        except OSError as error:
+            raise UsageError(
+                f"cannot export {run} to {target}: {error.strerror or error}; free the space it needs or name another "
+                "folder with --out"
+            ) from error
+        files = tuple(sorted(file.name for file in folder.place("").iterdir()))
+        log = export.log
+        path = folder.publish()
+    frames, gaps = (export.n_frames, []) if log is None else (log.n_frames, log.gaps())
+    return ExportResult(path, kind, files, frames, export.n_maps, tuple(gaps), tuple(export.damage))
+
+
+class _Export:
+    """One export on its way: a method for each kind."""
+
+    def __init__(self, run: Path, folder: RunFolder, options: ExportOptions, progress: Progress | None) -> None:
+        self._run, self._folder, self._options, self._progress = run, folder, options, progress
+        self._maps = MapFiles(run)
+        self.log: FrameLog | None = None
+        self.n_maps = self.n_frames = 0
+        self.damage: list[str] = []
+
+    def write_npy(self) -> None:
+        """The frames as a cube."""
+        if not self._recorded:
+            raise UsageError(f"{self._run} {NO_SEGMENT}")
+        model = read_model(self._run)
+        source = {"run": self._run.absolute().name, "manifest": self._manifest()}
+        self.log = write_npy(self._blocks(), self._folder, source, None if model is None else model.camera)
+
+    def write_hdf5(self) -> None:
+        """Frames and maps, as far as there are any."""
+        if not self._maps.indices and not self._recorded:
+            raise UsageError(f"{self._run} holds neither maps nor recorded frames; name the folder of a run")
+        blocks = self._blocks() if self._recorded else iter(())
+        log = hdf5.write_hdf5(blocks, self._maps, self._manifest(), self._folder.place(hdf5.FILE))
+        self.log = log if self._recorded else None
+        self.n_maps = len(self._maps.indices)
+
+    def write_ply(self) -> None:
+        """The point clouds of all maps."""
+        clouds = self._maps.files("cloud", ".ply")
+        if not clouds:
+            raise UsageError(f"{self._run} holds no point clouds; {_NO_MAPS.format(run=self._run)}")
+        for file in clouds:
+            shutil.copyfile(file, self._folder.place(file.name))
+        self.n_maps = len(clouds)
+
+    def write_png(self) -> None:
+        """Single pictures."""
+        view = self._view()
+        self._count(view, pictures.write_pngs(self._pictures(view), self._folder, view))
+
+    def write_mp4(self) -> None:
+        """A film."""
+        view = self._view()
+        film = self._folder.place(f"{view}.mp4")
+        self._count(view, pictures.write_mp4(self._pictures(view), film, self._options.pictures_per_s))
+
+    @property
+    def _recorded(self) -> bool:
+        return bool(segment_files(self._run))
+
+    def _blocks(self) -> Iterator[FrameBlock]:
+        """All sound blocks of the recording; what is not sound is noted as damage."""
+        try:
+            recording = RunRecording(self._run)
+            done = 0
+            for run in recording.runs:
+                for block in recording.blocks(run):
+                    yield block
+                    done += block.n_frames
+                    if self._progress is not None:
+                        self._progress(done, recording.frames)
+        except ProtocolError as error:
+            raise DamagedRecordingError(str(error)) from error
+        self.damage += recording.problems
+
+    def _manifest(self) -> dict[str, Any]:
+        """The run's manifest; empty where there is none or it is damaged, which is noted."""
+        try:
+            return read_manifest(self._run) or {}
+        except DamagedRecordingError as error:
+            self.damage.append(str(error))
+            return {}
+
+    def _view(self) -> View:
+        """What is shown, once it is clear that there is some of it."""
+        there = {
+            "depth": bool(self._maps.files("depth", ".npy")),
+            "intensity": bool(self._maps.files("intensity", ".png")),
+            "frames": self._recorded,
+        }
+        view = next(
+            (one for one in VIEWS if one == self._options.view or (not self._options.view and there[one])), None
+        )
+        if view is None or not there[view]:
+            what = f"no {view}" if view else "nothing to show"
+            raise UsageError(f"{self._run} holds {what}; {_NO_MAPS.format(run=self._run)}")
+        return view
+
+    def _pictures(self, view: View) -> Iterator[Picture]:
+        if view == "frames":
+            return pictures.frame_pictures(self._blocks(), self._options.frames_per_picture)
+        return pictures.map_pictures(self._maps, view)
+
+    def _count(self, view: View, n: int) -> None:
+        if view != "frames":
+            self.n_maps = n
+            return
+        self.n_frames = n * self._options.frames_per_picture
+        if n == 0:
+            raise UsageError(
+                f"{self._run} holds fewer than {self._options.frames_per_picture} frames, one picture's; lower --frames"
+            )
+
+
+def _check(run: Path, kind: str, options: ExportOptions) -> None:
+    problems = []
+    if kind not in EXPORT_KINDS:
+        problems.append(f"export kind {kind!r} is unknown; choose one of {', '.join(EXPORT_KINDS)}")
+    if not run.exists():
+        problems.append(f"{run} does not exist; name the folder of a run")
+    if options.view is not None and options.view not in VIEWS:
+        problems.append(f"view {options.view!r} is unknown; choose one of {', '.join(VIEWS)}")
+    if options.frames_per_picture < 1:
+        problems.append(f"{options.frames_per_picture} frames make no picture; sum at least 1")
+    if not 0 < options.pictures_per_s <= 1000:
+        problems.append(f"a film of {options.pictures_per_s:g} pictures a second; choose 1000 or less, above 0")
+    if problems:
+        raise UsageError.of(problems)
+    if kind == "hdf5":
+        hdf5.require_h5py()

@@ -1,0 +1,77 @@
+"""Frames in the file of another program, as any importer hands them on."""
+
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.errors import UsageError
+
+CHUNK_BYTES: Final = 16 << 20
+"""Files are read in pieces of about this size."""
+
+LSB_FIRST: Final = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8), bitorder="little"))
+"""Bytes turned round, for cameras that send the leftmost pixel in the least significant bit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForeignFrames:
+    """Frames of one size in their order.
+
+    chunks: gives them anew at each call, uint8 (n, height, ceil(width / 8)), most significant bit = leftmost pixel; n
+    may differ and be 0. ranges: [first frame, frames] of consecutive numbers, where the file tells of lost ones.
+    origin: what the manifest is to know of where they come from. hints: lines for the user, about what may be amiss.
+    """
+
+    width: int
+    height: int
+    n_frames: int
+    chunks: Callable[[], Iterator[NDArray[np.uint8]]]
+    origin: Mapping[str, Any]
+    frame_rate: Fraction | None = None
+    ranges: Sequence[tuple[int, int]] = ()
+    hints: Sequence[str] = field(default=())
+
+
+def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
+    """The files given, in that order; a folder stands for all its files with `suffix`, those within folders too.
+
+    A folder's files come in natural order (2 before 10), as the cameras number them. UsageError where one is missing.
+    """
+    found: list[Path] = []
+    problems = []
+    for file in map(Path, files):
+        inside = [file] if file.is_file() else sorted(file.rglob(f"*{suffix}"), key=_natural) if file.is_dir() else []
+        if not inside:
+            problems.append(f"{file} holds no {suffix} file" if file.is_dir() else f"{file} does not exist")
+        found += inside
+    if problems:
+        raise UsageError.of(problems)
+    if not found:
+        raise UsageError(f"no file was named; name {suffix} files, or the folder that holds them")
+    return found
+
+
+def bytes_of(file: Path) -> NDArray[np.uint8]:
+    """The file's bytes, mapped into memory; UsageError where it cannot be read."""
+    try:
+        return np.memmap(file, np.uint8, mode="r") if file.stat().st_size else np.zeros(0, np.uint8)
+    except OSError as error:
+        raise UsageError(f"cannot read {file}: {error.strerror or error}") from error
+
+
+def chunks_of(frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
+    """`frames` (n, ...) in pieces of `CHUNK_BYTES`."""
+    step = max(1, CHUNK_BYTES // max(1, frames[:1].nbytes))
+    for first in range(0, len(frames), step):
+        yield frames[first : first + step]
+
+
+def _natural(file: Path) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", str(file))]

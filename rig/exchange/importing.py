@@ -1,0 +1,256 @@
+"""`rig import`: the frames of another program as a recording of ours.
+
+Foreign files carry pixels and little else. What they do not say stays open in the recording: no markers, and without
+a frame rate no clock (`frame_period_ticks` 0, one tick a frame). The pixels are the files' own, bit by bit.
+"""
+
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock, frame_bytes, packed_row_bytes
+from drivers.orientation import QuarterTurn, turn_packed, turned_size
+from drivers.spb1 import BlockLayout, frames_per_block
+from rig.errors import UsageError
+from rig.exchange import photoncube, pi_imaging, swissspad2
+from rig.exchange.foreign import ForeignFrames, gather
+from rig.outputs import RunFolder
+from rig.recording.manifest import MANIFEST
+from rig.recording.writer import Recording
+from rig.run import Progress, versions
+
+ImportKind = Literal["pi-imaging", "swissspad2", "photoncube"]
+IMPORT_KINDS: Final[tuple[ImportKind, ...]] = get_args(ImportKind)
+
+_SUFFIXES: Final = {"pi-imaging": ".bin", "swissspad2": ".bin", "photoncube": ".npy"}
+_FORMS: Final[dict[str, tuple[str, ...]]] = {"pi-imaging": pi_imaging.FORMS, "swissspad2": swissspad2.FORMS}
+_UPRIGHT_DEG: Final[dict[str, QuarterTurn]] = {"pi-imaging": 90}
+"""Turns that make frames upright: the vendor's samples turn by 90 degrees, and so does the driver (`rotation`)."""
+_RUN_ID: Final = 1
+_BLOCK_BYTES: Final = 1 << 20
+_MAX_TICK_HZ: Final = 0xFFFFFFFF
+"""Numerator and denominator of a clock that a block's header can say."""
+_MIN_RATE_HZ: Final = 0.001
+
+
+@dataclass(frozen=True, slots=True)
+class ImportResult:
+    """What an import wrote. gaps: [first, last] numbers of frames that the source says were lost."""
+
+    folder: Path
+    kind: str
+    frames: int
+    width: int
+    height: int
+    frame_rate_hz: float | None
+    gaps: tuple[tuple[int, int], ...]
+    blocks: int
+    bytes: int
+    hints: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+@dataclass(frozen=True, slots=True)
+class ImportOptions:
+    """How files are read.
+
+    form: packed or sparse (pi-imaging), half or full (swissspad2); None: as seen from the file, or half.
+    frame_rate: None where it is not known. turn_deg: counter-clockwise; None: 90 for pi-imaging, else 0. rows: of the
+    sensor, pi-imaging only; None: 512.
+    """
+
+    form: str | None = None
+    frame_rate: Fraction | None = None
+    turn_deg: int | None = None
+    rows: int | None = None
+
+
+def import_frames(
+    kind: str,
+    files: Iterable[str | os.PathLike[str]],
+    out: str | os.PathLike[str],
+    options: ImportOptions | None = None,
+    progress: Progress | None = None,
+) -> ImportResult:
+    """Write the frames of `files` to a new run folder `out`; it appears whole or not at all.
+
+    Raises UsageError, a line per problem, for files or options that cannot be.
+    """
+    options = options or ImportOptions()
+    turn = _checked_turn(kind, options)
+    sources = gather(files, _SUFFIXES[kind])
+    foreign = _opened(kind, sources, options)
+    if turn and (foreign.width % 8 or foreign.height % 8):
+        raise UsageError(
+            f"frames of {foreign.width} x {foreign.height} pixels cannot be turned, sizes that are no multiples of 8 "
+            "stay as they are; import with --rotate 0"
+        )
+    rate = foreign.frame_rate if options.frame_rate is None else options.frame_rate
+    if rate is not None and not _MIN_RATE_HZ <= rate <= _MAX_TICK_HZ:
+        raise UsageError(f"frame rate {float(rate):g} Hz is outside {_MIN_RATE_HZ} to {_MAX_TICK_HZ} Hz")
+    width, height = turned_size(foreign.width, foreign.height, turn)
+    clock = _clock(rate)
+    ranges = foreign.ranges or ((0, foreign.n_frames),)
+    gaps = _gaps(ranges)
+    with RunFolder(out) as folder:
+        expected = foreign.n_frames * frame_bytes(width, height)
+        scratch = folder.place("")
+        _require_space(scratch, expected)
+        recording = Recording(scratch, expected_bytes=expected)
+        try:
+            done = 0
+            for block in _blocks(_turned(foreign, turn), width, height, ranges, clock):
+                recording.append(block)
+                done += block.n_frames
+                if progress is not None:
+                    progress(done, foreign.n_frames)
+        finally:
+            recording.close()
+        manifest: dict[str, Any] = {
+            "versions": versions(),
+            "command": "import",
+            "import": {
+                "kind": kind,
+                "files": [file.absolute() for file in sources],
+                **foreign.origin,
+                "turned_deg": turn,
+                "width": width,
+                "height": height,
+                "frame_rate_hz": rate,
+                "frames": foreign.n_frames,
+            },
+            "gaps": gaps,
+            "recording": recording.content(),
+            "verdict": "gaps" if gaps else "complete",
+        }
+        if ranges[0][0]:  # not from the start of the SPAD on, as after 'rig cut'
+            manifest["cut"] = {"first_frame": ranges[0][0]}
+        folder.write_json(MANIFEST, manifest)
+        path = folder.publish()
+    return ImportResult(
+        path, kind, foreign.n_frames, width, height, None if rate is None else float(rate), gaps,
+        recording.blocks, recording.bytes, tuple(foreign.hints),
+    )  # fmt: skip
+
+
+def _checked_turn(kind: str, options: ImportOptions) -> QuarterTurn:
+    """The quarter turn, once all options fit the kind."""
+    if kind not in IMPORT_KINDS:
+        raise UsageError(f"import kind {kind!r} is unknown; choose one of {', '.join(IMPORT_KINDS)}")
+    problems = []
+    forms = _FORMS.get(kind, ())
+    if options.form is not None and options.form not in forms:
+        known = f"choose {' or '.join(forms)}" if forms else "leave --form out"
+        problems.append(f"{kind} has no form {options.form!r}; {known}")
+    turn = _UPRIGHT_DEG.get(kind, 0) if options.turn_deg is None else options.turn_deg
+    turns = get_args(QuarterTurn)
+    if turn not in turns:
+        problems.append(f"frames cannot be turned by {turn} degrees; choose one of {', '.join(map(str, turns))}")
+    if options.rows is not None and kind != "pi-imaging":
+        problems.append(f"rows is {options.rows}, but {kind} files say their size themselves; leave --rows out")
+    elif options.rows is not None and options.rows not in (512, 1024):
+        problems.append(f"rows is {options.rows}; a SPAD512S has 512, its 1M flavour 1024")
+    if problems:
+        raise UsageError.of(problems)
+    return next(one for one in turns if one == turn)
+
+
+def _opened(kind: str, sources: list[Path], options: ImportOptions) -> ForeignFrames:
+    if kind == "pi-imaging":
+        form = next((form for form in get_args(pi_imaging.Form) if form == options.form), None)
+        return pi_imaging.open_pi_imaging(sources, form, options.rows or pi_imaging.ROWS)
+    if kind == "swissspad2":
+        return swissspad2.open_swissspad2(sources, "full" if options.form == "full" else "half")
+    return photoncube.open_photoncube(sources)
+
+
+def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.uint8]]:
+    """Chunks uint8 (n, height, row bytes) with rows padded to whole words and clean pad bits, upright."""
+    width, height = turned_size(foreign.width, foreign.height, turn)
+    last_byte = np.uint8(0xFF << (-foreign.width % 8) & 0xFF)
+    for chunk in foreign.chunks():
+        bits = np.zeros((len(chunk), height, packed_row_bytes(width)), np.uint8)
+        pixels = bits[:, :, : -(-width // 8)]
+        if turn:
+            turn_packed(np.ascontiguousarray(chunk), turn, pixels)
+        else:
+            pixels[:] = chunk
+            pixels[:, :, -1] &= last_byte
+        yield bits
+
+
+@dataclass(frozen=True, slots=True)
+class _Clock:
+    tick_hz: Fraction
+    period_ticks: int
+    """0: not known."""
+    ticks_per_frame: int
+
+
+def _clock(rate: Fraction | None) -> _Clock:
+    """The clock with the finest tick that a block's header can say, at most 1000 a frame."""
+    if rate is None:
+        return _Clock(Fraction(1), 0, 1)
+    rate = rate.limit_denominator(_MAX_TICK_HZ // max(1, -(-rate.numerator // rate.denominator)))
+    ticks = next((n for n in (1000, 100, 10) if (rate * n).numerator <= _MAX_TICK_HZ), 1)
+    return _Clock(rate * ticks, ticks, ticks)
+
+
+def _blocks(
+    chunks: Iterable[NDArray[np.uint8]], width: int, height: int, ranges: Iterable[tuple[int, int]], clock: _Clock
+) -> Iterator[FrameBlock]:
+    """Blocks of consecutive frames; the first and the last one are marked as such."""
+    stride = max(_BLOCK_BYTES, BlockLayout(1, width, height).min_stride)
+    most = frames_per_block(stride, width, height)
+    left = [[first, n] for first, n in ranges]
+    expected = left[0][0]
+    seq = lost_before = 0
+    for bits in chunks:
+        at = 0
+        while at < len(bits):
+            first, n = left[0]
+            take = min(most, n, len(bits) - at)
+            flags = BlockFlag(0) if seq else BlockFlag.FIRST
+            if first > expected:
+                flags |= BlockFlag.LOST_BEFORE
+            lost_before += first - expected
+            left[0] = [first + take, n - take]
+            if take == n:
+                left.pop(0)
+            if not left:
+                flags |= BlockFlag.LAST
+            records = np.zeros(take, FRAME_RECORD)
+            records["ticks"] = np.arange(take) * clock.ticks_per_frame
+            header = BlockHeader(
+                flags, _RUN_ID, seq, first, first * clock.ticks_per_frame, lost_before, clock.tick_hz,
+                clock.period_ticks, clock.ticks_per_frame, 0, 1, width, height, width, height,
+            )  # fmt: skip
+            yield FrameBlock(header, records, bits[at : at + take])
+            at += take
+            expected = first + take
+            seq += 1
+
+
+def _gaps(ranges: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
+    """[first, last] of the numbers between `ranges`."""
+    return tuple((first + n, after - 1) for (first, n), (after, _) in pairwise(ranges))
+
+
+def _require_space(folder: Path, size: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if size > free:
+        raise UsageError(
+            f"the recording will take {size / 1e9:.3g} GB, the disk of {folder.parent} has {free / 1e9:.3g} GB free; "
+            "free some or name a folder on another disk with --out"
+        )

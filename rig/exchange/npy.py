@@ -1,0 +1,71 @@
+"""A recording as a photon cube: `frames.npy` for `photoncube`, `visionsim` and `rig reconstruct`, JSON beside it.
+
+The array is uint8 (frames, height, ceil(width / 8)), most significant bit first, the frames that were received one
+after the other. `frames.json` says what it cannot: clock, numbers and gaps, markers, windows. `transforms.json`, where
+there is a camera, makes it a data set of visionsim.
+"""
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+
+from calibration.camera import Camera
+from drivers.frames import FrameBlock
+from rig.exchange.frame_log import FrameLog
+from rig.exchange.photoncube import SIDECAR_FORMAT, TRANSFORMS
+from rig.outputs import RunFolder, json_text
+
+CUBE: Final = "frames.npy"
+_POSE: Final = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
+"""The camera does not move, and its own frame is the world's."""
+
+
+def write_npy(
+    blocks: Iterable[FrameBlock], folder: RunFolder, source: Mapping[str, Any], camera: Camera | None
+) -> FrameLog:
+    """Write the cube of `blocks` and what belongs beside it. UsageError where they do not make one array."""
+    log = FrameLog()
+    with folder.place(CUBE).open("wb") as file:
+        for block in blocks:
+            if log.n_frames == 0:
+                _write_header(file, block, 0)
+            log.add(block)
+            file.write(np.ascontiguousarray(block.bits[:, :, : -(-block.header.width // 8)]).data)
+        header = log.header
+        file.seek(0)
+        _write_header(file, block, log.n_frames)
+    content = {"format": SIDECAR_FORMAT, "version": 1, "array": CUBE, **log.content(), "source": source}
+    lines = (f"{json.dumps(key)}: {json.dumps(value)}" for key, value in json.loads(json_text(content)).items())
+    sidecar = folder.place(CUBE).with_suffix(".json")
+    sidecar.write_text("{" + ",\n".join(lines) + "}\n", encoding="utf-8")
+    whole = (header.width, header.height) == (header.sensor_width, header.sensor_height)
+    if camera is not None and whole and (camera.width, camera.height) == (header.width, header.height):
+        folder.place(TRANSFORMS).write_text(_transforms(camera, log.n_frames), encoding="utf-8")
+    return log
+
+
+def _write_header(file: BinaryIO, block: FrameBlock, n_frames: int) -> None:
+    """The header takes the same room for any number of frames (numpy leaves it for arrays that grow)."""
+    shape = (n_frames, block.header.height, -(-block.header.width // 8))
+    np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
+
+
+def _transforms(camera: Camera, n_frames: int) -> str:
+    """visionsim's description of a data set (visionsim 0.1, dataset/schema.py)."""
+    matrix = camera.matrix
+    content = {
+        "fl_x": float(matrix[0, 0]),
+        "fl_y": float(matrix[1, 1]),
+        "cx": float(matrix[0, 2]),
+        "cy": float(matrix[1, 2]),
+        "w": camera.width,
+        "h": camera.height,
+        "c": 1,
+        "bitpack": True,
+        "bitpack_dim": 2,
+        "file_path": CUBE,
+    }
+    frames = ",\n".join([f'{{"transform_matrix": {_POSE}}}'] * n_frames)
+    return f'{json.dumps(content)[:-1]}, "frames": [\n{frames}\n]}}\n'

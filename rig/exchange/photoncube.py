@@ -1,0 +1,157 @@
+"""Photon cubes: `.npy` uint8 (frames, height, width / 8) of `photoncube` and `visionsim` (hardware.md 2.7).
+
+Packed along the width, most significant bit first (`numpy.packbits(axis=2)`). What the array cannot say, a file beside
+it may: `NAME.json` of `rig export` (width, frame rate, frame numbers) or visionsim's `transforms.json` (width).
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.errors import UsageError
+from rig.exchange.foreign import ForeignFrames, chunks_of
+
+SIDECAR_FORMAT: Final = "spadrig-frames"
+TRANSFORMS: Final = "transforms.json"
+_MOST_PIXELS: Final = 0xFFFF
+"""Width and height that a block's header can say."""
+_MOST_FRAMES: Final = 2**48
+"""Frame numbers beyond are no frame numbers: three years of 100 kHz are a thirtieth of it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cube:
+    frames: NDArray[np.uint8]
+    width: int
+    frame_rate: Fraction | None
+    ranges: tuple[tuple[int, int], ...]
+
+
+def open_photoncube(files: Sequence[Path]) -> ForeignFrames:
+    """Frames of all cubes, one after the other. UsageError, a line per problem, for files that are no such cubes."""
+    problems: list[str] = []
+    cubes: list[_Cube] = []
+    for file in files:
+        try:
+            cubes.append(_open(file))
+        except UsageError as error:
+            problems += error.problems
+    if not problems and len({(cube.width, cube.frames.shape[1:]) for cube in cubes}) > 1:
+        sizes = ", ".join(
+            f"{file.name} {cube.width} x {cube.frames.shape[1]}" for file, cube in zip(files, cubes, strict=True)
+        )
+        problems.append(f"the cubes differ in size: {sizes}; import them one by one")
+    if problems:
+        raise UsageError.of(problems)
+    first = cubes[0]
+
+    def chunks() -> Iterator[NDArray[np.uint8]]:
+        for cube in cubes:
+            yield from map(np.ascontiguousarray, chunks_of(cube.frames))
+
+    n_frames = sum(len(cube.frames) for cube in cubes)
+    rates = {cube.frame_rate for cube in cubes}
+    return ForeignFrames(
+        first.width,
+        first.frames.shape[1],
+        n_frames,
+        chunks,
+        {},
+        frame_rate=rates.pop() if len(rates) == 1 else None,
+        ranges=first.ranges if len(cubes) == 1 else (),
+    )
+
+
+def _open(file: Path) -> _Cube:
+    try:
+        loaded = np.load(file, mmap_mode="r", allow_pickle=False)
+    except OSError as error:
+        raise UsageError(f"cannot read {file}: {error.strerror or error}") from error
+    except (ValueError, EOFError) as error:
+        raise UsageError(f"{file} is no whole .npy file of numbers; write it with photoncube or numpy.save") from error
+    if not isinstance(loaded, np.ndarray):
+        raise UsageError(f"{file} is an archive of arrays; a photon cube is one array, written with numpy.save")
+    if loaded.dtype != np.uint8 or loaded.ndim not in (3, 4) or 0 in loaded.shape:
+        raise UsageError(
+            f"{file} holds {loaded.dtype} of shape {loaded.shape}; a photon cube is uint8 (frames, height, width / 8), "
+            "packed with numpy.packbits(axis=2)"
+        )
+    if loaded.ndim == 4:
+        if loaded.shape[3] != 1:
+            raise UsageError(
+                f"{file} has {loaded.shape[3]} channels; a recording has one, save one alone: cube[..., 0]"
+            )
+        loaded = loaded[..., 0]
+    beside = _beside(file)
+    width = _width(file, loaded, beside)
+    if max(width, loaded.shape[1]) > _MOST_PIXELS:
+        raise UsageError(f"{file} has frames of {width} x {loaded.shape[1]} pixels; at most {_MOST_PIXELS} each way")
+    return _Cube(loaded, width, _frame_rate(beside), _ranges(beside, len(loaded)))
+
+
+def _beside(file: Path) -> Mapping[str, Any]:
+    """What `rig export` or visionsim wrote beside a cube; nothing where there is no such file."""
+    for sidecar in (file.with_suffix(".json"), file.with_name(TRANSFORMS)):
+        try:
+            content = json.loads(sidecar.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            continue
+        except (OSError, ValueError) as error:
+            raise UsageError(f"{sidecar} beside the cube cannot be read: {error}; mend it or move it away") from error
+        if not isinstance(content, dict):
+            continue
+        if content.get("format") == SIDECAR_FORMAT or content.get("file_path") == file.name:
+            return content
+    return {}
+
+
+def _width(file: Path, frames: NDArray[np.uint8], beside: Mapping[str, Any]) -> int:
+    packed: int = 8 * frames.shape[2]
+    if beside.get("format") == SIDECAR_FORMAT:
+        width = beside.get("width")
+    elif beside:
+        if not beside.get("bitpack"):
+            raise UsageError(f"{file} is not packed, says {TRANSFORMS}; pack its bits with numpy.packbits(axis=2)")
+        if beside.get("bitpack_dim") != 2:
+            raise UsageError(
+                f"{file} is packed along axis {beside.get('bitpack_dim')}, says {TRANSFORMS}; pack it along the width, "
+                "axis 2"
+            )
+        width = beside.get("w")
+    else:
+        return packed
+    if not isinstance(width, int) or not packed - 8 < width <= packed:
+        raise UsageError(f"{file} has rows of {frames.shape[2]} bytes, the file beside it says a width of {width}")
+    return width
+
+
+def _frame_rate(beside: Mapping[str, Any]) -> Fraction | None:
+    clock = beside.get("clock")
+    if not isinstance(clock, dict):
+        return None
+    try:
+        (numerator, denominator), period = clock["tick_hz"], clock["frame_period_ticks"]
+        rate = Fraction(numerator, denominator) / Fraction(period) if period else None
+    except (KeyError, TypeError, ValueError, ArithmeticError):
+        return None
+    return rate if rate is None or rate > 0 else None
+
+
+def _ranges(beside: Mapping[str, Any], n_frames: int) -> tuple[tuple[int, int], ...]:
+    """[first frame, frames] of a cube whose frames are of one start of the SPAD; none where that is not so."""
+    stated = beside.get("ranges", ())
+    try:
+        ranges = tuple((int(first), int(n)) for _, first, n in stated)
+        starts = {run for run, _, _ in stated}
+    except (TypeError, ValueError, OverflowError):
+        return ()
+    ends = [first + n for first, n in ranges]
+    rises = all(end < first for end, (first, _) in zip(ends, ranges[1:], strict=False))
+    whole = sum(n for _, n in ranges) == n_frames and all(first >= 0 and n > 0 for first, n in ranges)
+    return ranges if len(starts) == 1 and rises and whole and ends[-1] <= _MOST_FRAMES else ()

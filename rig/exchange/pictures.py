@@ -1,0 +1,113 @@
+"""A run as pictures: the depth maps, the intensity of each, or sums of recorded frames; single PNGs or an MP4 film."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.frames import FrameBlock
+from rig.errors import UsageError
+from rig.exchange.maps import MapFiles, load
+from rig.outputs import RunFolder
+from rig.pictures import depth_limits, depth_picture, png_bytes
+
+View = Literal["depth", "intensity", "frames"]
+VIEWS: Final[tuple[View, ...]] = get_args(View)
+_BRIGHT_SHARE: Final = 0.999
+"""Of the first picture's pixels so many are darker than what is shown as white."""
+
+Picture = NDArray[np.uint8]
+"""Grey (height, width) or BGR (height, width, 3)."""
+
+
+def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
+    """One picture a map, all of the same size; the colours of the first depth map hold for all."""
+    if view == "intensity":
+        import cv2
+
+        for file in maps.files("intensity", ".png"):
+            picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+            if picture is None:
+                raise UsageError(f"{file} is no picture; make the maps again with rig reconstruct")
+            yield np.asarray(picture, np.uint8)
+        return
+    limits = None
+    for file in maps.files("depth", ".npy"):
+        depth_m = load(file)
+        limits = limits or depth_limits(depth_m)
+        yield depth_picture(depth_m, limits)
+
+
+def frame_pictures(blocks: Iterable[FrameBlock], frames_per_picture: int) -> Iterator[Picture]:
+    """Sums of so many received frames on the whole sensor, square-root grey; what is over at the end is left out.
+
+    White is where the brightest pixels of the first picture are, so that a film does not flicker.
+    """
+    white = 0.0
+    for counts in _sums(blocks, frames_per_picture):
+        white = white or max(1.0, float(np.quantile(counts, _BRIGHT_SHARE)))
+        yield np.sqrt(np.minimum(counts / white, 1.0) * 255.0**2).round().astype(np.uint8)
+
+
+def write_pngs(pictures: Iterable[Picture], folder: RunFolder, name: str) -> int:
+    """Write NAME-000000.png, ...; how many there were."""
+    n = 0
+    for n, picture in enumerate(pictures, start=1):
+        folder.place(f"{name}-{n - 1:06d}.png").write_bytes(png_bytes(picture))
+    return n
+
+
+def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) -> int:
+    """Write a film (MPEG-4 part 2); how many pictures it has. UsageError where OpenCV cannot write it here."""
+    import cv2
+
+    film = None
+    n = 0
+    try:
+        for picture in pictures:
+            frame = _even(picture)
+            if film is None:
+                codec = cv2.VideoWriter.fourcc(*"mp4v")
+                film = cv2.VideoWriter(str(path), codec, pictures_per_s, frame.shape[1::-1])
+                if not film.isOpened():
+                    raise UsageError("this OpenCV writes no MP4; export png and make the film with another program")
+            film.write(frame)
+            n += 1
+    finally:
+        if film is not None:
+            film.release()
+    if n and cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT) != n:  # OpenCV says nothing of a full disk
+        raise UsageError(f"only a part of the film could be written; is the disk of {path.parent} full?")
+    return n
+
+
+def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
+    """Counts (sensor height, sensor width) of every n frames, each window where it lay."""
+    counts: NDArray[np.uint32] | None = None
+    missing = n
+    for block in blocks:
+        header = block.header
+        x0, y0 = block.records["x0"].astype(np.int64), block.records["y0"].astype(np.int64)
+        at = 0
+        while at < block.n_frames:
+            if counts is None:
+                counts = np.zeros((header.sensor_height, header.sensor_width), np.uint32)
+            same = (x0[at:] == x0[at]) & (y0[at:] == y0[at])
+            take = min(missing, len(same) if same.all() else int(np.argmin(same)))
+            part = np.unpackbits(block.bits[at : at + take], axis=2, count=header.width).sum(axis=0, dtype=np.uint32)
+            # The last window of a row may end in the padding of the sensor.
+            place = counts[y0[at] : y0[at] + header.height, x0[at] : x0[at] + header.width]
+            place += part[: place.shape[0], : place.shape[1]]
+            at, missing = at + take, missing - take
+            if missing == 0:
+                yield counts
+                counts, missing = None, n
+
+
+def _even(picture: Picture) -> Picture:
+    """BGR with even sides, which the film format asks for."""
+    bgr = np.repeat(picture[:, :, None], 3, axis=2) if picture.ndim == 2 else picture
+    height, width = bgr.shape[:2]
+    return np.pad(bgr, ((0, height % 2), (0, width % 2), (0, 0)))

@@ -1,0 +1,29 @@
+"""The plan of a recording for a calibration made since: what was scanned stays, where it is seen may change."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from calibration.errors import CalibrationError
+from calibration.model import RigModel
+from rig.errors import UsageError
+from rig.geometry import sweep_geometry
+from rig.scan_plan import ScanPlan
+
+
+def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
+    """The plan with the lag and the windows of `model`: the same plan where it was compiled for that.
+
+    Mirror, gate and markers are those that there were, and so are the pixels that the SPAD sent: where they do not hold
+    a column's window its frames do not count. UsageError where the calibration is not one of this rig and scan.
+    """
+    try:
+        model.check_sensor(plan.width, plan.rows)
+        model.check_speed(plan.speed_per_s)
+        model.planes(np.array(plan.command_range))
+        geometry = sweep_geometry(model, model.planes(plan.commands), plan.depth_range_m)
+    except CalibrationError as error:
+        raise UsageError(f"calibration: {error}") from error
+    lags = {1: model.lag_s.forward, -1: model.lag_s.backward}
+    legs = tuple(replace(leg, lag_s=lags[leg.direction]) for leg in plan.legs)
+    return replace(plan, legs=legs, x0=geometry.x0, window=geometry.window)

@@ -1,0 +1,95 @@
+"""Compressing a recording once it is over: each block a frame of its own, so that any of them is still read alone.
+
+`frames-000000.spb` becomes `frames-000000.spb.zst`; the index stays as it is. Each segment is replaced only once the
+compressed one is on the disk and unpacks to the same bytes.
+"""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from drivers.errors import ProtocolError
+from drivers.recorded.seekable import table_bytes, unpack_frame, zstandard_or_error
+from drivers.recorded.segments import PACKED_SUFFIX, PackedSegment, PlainSegment
+from rig.errors import DamagedRecordingError, RecordingError, UsageError
+from rig.recording.sync import sync_folder
+from rig.recording.verify import UNFINISHED, Integrity, examine
+
+LEVEL: Final = 3
+"""Of zstd, its default: binary frames are noise to it, and higher levels find little more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Compression:
+    """What it came to: bytes of all segments before and after."""
+
+    segments: int
+    bytes_before: int
+    bytes_after: int
+
+
+def compress(folder: Path) -> Compression:
+    """Compress the segments of a recording (`rig compress`); those that are already stay as they are.
+
+    UsageError where there is none, or the package zstandard is missing; DamagedRecordingError where it is not whole;
+    RecordingError where the disk is full, with every segment plain or compressed as a whole.
+    """
+    try:
+        zstandard_or_error()
+    except ProtocolError as error:
+        raise UsageError(str(error)) from None
+    found = examine(folder)
+    if found.problems or (found.manifest or {}).get("verdict") == UNFINISHED:
+        why = found.problems[0] if found.problems else f"its run is not over ({Integrity.UNFINISHED.value})"
+        raise DamagedRecordingError(f"{folder} is not compressed as it is: {why}; 'rig repair' it first")
+    before = after = 0
+    for segment in found.segments:
+        before += segment.size
+        if isinstance(segment, PlainSegment):
+            mine = found.entries[found.entries["segment"] == segment.number]
+            try:
+                _compress(segment, np.sort(mine["offset"]).tolist())
+            except OSError as error:
+                raise RecordingError(
+                    f"cannot compress {segment.path}: {error.strerror or error}; free the space it needs"
+                ) from error
+        packed = segment.path.with_name(segment.path.name.removesuffix(PACKED_SUFFIX) + PACKED_SUFFIX)
+        after += packed.stat().st_size
+    return Compression(len(found.segments), before, after)
+
+
+def _compress(segment: PlainSegment, offsets: list[int]) -> None:
+    """Write the compressed segment beside the plain one, check it, and remove the plain one."""
+    packer = zstandard_or_error().ZstdCompressor(level=LEVEL, write_checksum=True)
+    packed = segment.path.with_name(segment.path.name + PACKED_SUFFIX)
+    scratch = packed.with_name(f"{packed.name}.part")
+    sizes: list[tuple[int, int]] = []
+    try:
+        with scratch.open("wb") as file:
+            for begin, end in _pieces(offsets, segment.size):
+                plain = segment.at(begin, end - begin)
+                frame = packer.compress(plain.data)
+                if not np.array_equal(unpack_frame(np.frombuffer(frame, np.uint8), len(plain)), plain):
+                    raise RecordingError(f"{segment.path}: zstandard does not unpack what it packed; leave it plain")
+                file.write(frame)
+                sizes.append((len(frame), len(plain)))
+            file.write(table_bytes(sizes))
+            file.flush()
+            os.fsync(file.fileno())
+        if PackedSegment(scratch, segment.number).size != segment.size:
+            raise RecordingError(f"{scratch} is not as it was written; check the disk")
+        scratch.replace(packed)
+        sync_folder(packed.parent)
+    finally:
+        scratch.unlink(missing_ok=True)
+    segment.path.unlink()
+
+
+def _pieces(offsets: list[int], size: int) -> list[tuple[int, int]]:
+    """From each block to the next one; what lies before the first is a piece too."""
+    begins = [0, *offsets] if not offsets or offsets[0] else offsets
+    ends = [*begins[1:], size]
+    return [(begin, end) for begin, end in zip(begins, ends, strict=True) if end > begin]

@@ -1,0 +1,223 @@
+"""A part of a recording as a recording of its own: by maps, by frames of a run, or by time.
+
+Frames keep their run and number, so that maps of a part are bound and named as in the whole. What is needed to estimate
+its maps again comes along: plan, calibration, learned states and, where it was known, the truth.
+"""
+
+import json
+import re
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from drivers.recorded import RecordedRun, RunRecording
+from rig.binding import MAX_RESIDUAL_COLUMNS
+from rig.blanking import MAX_CLOCK_ERROR
+from rig.errors import DamagedRecordingError, UsageError
+from rig.outputs import RunFolder
+from rig.recording.manifest import MANIFEST
+from rig.recording.maps import MapSpan, map_spans
+from rig.recording.opening import manifest_or_none, open_recording
+from rig.recording.writer import Recording
+
+OF_MAPS: Final = ("learned", "truth")
+"""Folders with a file for each map, which a part takes along."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Frames of one run. first_map, end_map: the maps that lie in it whole, by their numbers in the whole recording."""
+
+    run: RecordedRun
+    first_frame: int
+    end_frame: int
+    first_map: int
+    end_map: int
+
+
+def cut(
+    folder: Path,
+    out: Path,
+    *,
+    maps: str | None = None,
+    frames: str | None = None,
+    time: str | None = None,
+    run: int = 0,
+) -> dict[str, Any]:
+    """Write a part of a recording to a new folder (`rig cut`); its manifest.
+
+    Exactly one of: maps 'A:B', frames 'A:B' of a run, time 'A:B' in seconds of its frame clock from its first frame;
+    each from A to before B, either left out for the first or the end, a single number for one of them.
+    run: of frames and time. UsageError for what there is not, RecordingError where `out` cannot be written.
+    """
+    recording = open_recording(folder)
+    manifest, trouble = manifest_or_none(folder)
+    if manifest is None:
+        raise DamagedRecordingError(f"{folder}: {trouble}")
+    spans = map_spans(recording, manifest)
+    parts = _parts(recording, spans, maps, frames, time, run)
+    with RunFolder(out) as target:
+        written = Recording(target.place("."), expected_bytes=0)
+        lost: list[list[int]] = []
+        try:
+            for part in parts:
+                written.begin(part.end_map - part.first_map)
+                for block in recording.blocks(part.run, part.first_frame, part.end_frame):
+                    written.append(block)
+                lost += [list(gap) for gap in part.run.gaps() if gap[0] < part.end_frame and gap[1] >= part.first_frame]
+        finally:
+            written.close()
+        if written.blocks == 0 or recording.problems:
+            raise DamagedRecordingError(
+                f"{folder} is damaged: {'; '.join(recording.problems[:3]) or 'no frame is left there'}; 'rig repair' it"
+            )
+        content = _manifest(manifest, parts, written.content(), lost)
+        _copy_inputs(folder, target.place("."), manifest, content["cut"]["maps"])
+        target.write_json(MANIFEST, content)
+        target.publish()
+    return content
+
+
+def _parts(
+    recording: RunRecording, spans: Sequence[MapSpan], maps: str | None, frames: str | None, time: str | None, run: int
+) -> list[Part]:
+    given = {"--maps": maps, "--frames": frames, "--time": time}
+    asked = [(name, text) for name, text in given.items() if text is not None]
+    if len(asked) != 1:
+        raise UsageError(f"say what to cut by exactly one of {', '.join(given)}; {len(asked)} were given")
+    if not 0 <= run < len(recording.runs):
+        raise UsageError(f"run {run} is not in {recording.path}; it has {len(recording.runs)}, counted from 0")
+    of = recording.runs[run]
+    name, text = asked[0]
+    if name == "--maps":
+        return _map_parts(recording, spans, *_range(name, text, 0, len(spans)))
+    if name == "--frames":
+        first, end = _range(name, text, of.first_frame, of.end_frame)
+    else:
+        first, end = _frames_at(of, text)
+    if max(first, of.first_frame) >= min(end, of.end_frame):
+        raise UsageError(f"{name} {text} holds no frame of run {run}, which has {of.first_frame} to {of.end_frame - 1}")
+    inside = [i for i, s in enumerate(spans) if s.run == run and s.first_frame >= first and s.end_frame < end]
+    maps_in = (inside[0], inside[-1] + 1) if inside else (0, 0)
+    return [Part(of, max(first, of.first_frame), min(end, of.end_frame), *maps_in)]
+
+
+def _map_parts(recording: RunRecording, spans: Sequence[MapSpan], first: int, end: int) -> list[Part]:
+    """A part of each run that the maps are of, with the frame of the marker that closes its last map."""
+    if not 0 <= first < end <= len(spans):
+        raise UsageError(f"maps {first}:{end} are not all in {recording.path}; it has {len(spans)}, counted from 0")
+    if not any(run.entries["sweep"].any() for run in recording.runs):
+        raise UsageError(
+            f"{recording.path} has no markers: its sweeps are found by the light of the whole run; cut it with --frames"
+        )
+    parts = []
+    for run in recording.runs:
+        mine = [i for i in range(first, end) if spans[i].run == run.number]
+        if mine:
+            last = spans[mine[-1]].end_frame + 1
+            parts.append(Part(run, spans[mine[0]].first_frame, min(last, run.end_frame), mine[0], mine[-1] + 1))
+    return parts
+
+
+def _frames_at(run: RecordedRun, text: str) -> tuple[int, int]:
+    """The frames of a run that begin in a span of time."""
+    hz, start = float(run.header.tick_hz), int(run.entries["t0_ticks"][0])
+    first_s, end_s = _range_s(text)
+    period = run.header.frame_period_ticks
+
+    def frame_at(seconds: float | None, default: int) -> int:
+        if seconds is None:
+            return default
+        tick = start + seconds * hz
+        at = max(0, int(np.searchsorted(run.entries["t0_ticks"].astype(np.float64), tick, "right")) - 1)
+        entry = run.entries[at]
+        behind = int(np.ceil((tick - int(entry["t0_ticks"])) / period)) if period else 0
+        return int(entry["first_frame"]) + min(max(0, behind), int(entry["n_frames"]))
+
+    return frame_at(first_s, run.first_frame), frame_at(end_s, run.end_frame)
+
+
+def _range(name: str, text: str, first: int, end: int) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d*)(:?)(\d*)", text.strip())
+    if match is None or not (match[1] or match[2]):
+        raise UsageError(f"{name} {text!r} is no range; write 3 or 2:5, which is 2, 3 and 4")
+    if not match[2]:
+        return int(match[1]), int(match[1]) + 1
+    return int(match[1] or first), int(match[3] or end)
+
+
+def _range_s(text: str) -> tuple[float | None, float | None]:
+    parts = text.split(":")
+    try:
+        first, end = (float(part) if part.strip() else None for part in parts)
+    except ValueError:
+        raise UsageError(f"--time {text!r} is no range; write seconds from the first frame, as 0.5:1.25") from None
+    return first, end
+
+
+def _manifest(
+    manifest: dict[str, Any], parts: Sequence[Part], recording: dict[str, object], lost: list[list[int]]
+) -> dict[str, Any]:
+    """The whole's manifest, with the part's frames, maps and verdict."""
+    first_map, end_map = parts[0].first_map, parts[-1].end_map
+    sweeps = manifest.get("sweeps")
+    content = {
+        key: value
+        for key, value in manifest.items()
+        if key not in ("counters", "missing", "repaired", "gaps", "sweeps")
+    }
+    before = (manifest.get("cut") or {}).get("maps", [0])[0]
+    content |= {
+        "command": "cut",
+        "verdict": "gaps" if lost else manifest.get("verdict"),
+        "recording": recording,
+        "gaps": lost,
+        "cut": {
+            "of_id": _seal_of(manifest),
+            "maps": [before + first_map, before + end_map],
+            "frames": [[part.run.header.run_id, part.first_frame, part.end_frame] for part in parts],
+            "clock_ratios": [_clock_ratio(manifest, part, i == 0) for i, part in enumerate(parts)],
+        },
+    }
+    if sweeps is not None:
+        content["sweeps"] = sweeps[first_map:end_map]
+        content["maps"] = end_map - first_map
+    return content
+
+
+def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
+    """Ratio of the clocks that the first map of a part was bound with: the last one fitted before it in its run."""
+    sweeps = manifest.get("sweeps") or []
+    known = (manifest.get("cut") or {}).get("clock_ratios") or []
+    ratio = float(known[part.run.number]) if part.run.number < len(known) else 1.0
+    for i in range(part.first_map) if is_first else ():
+        sweep: dict[str, Any] = sweeps[i] if i < len(sweeps) else {}
+        if i and sweep.get("first_frame", 0) < sweeps[i - 1]["end_frame"]:
+            ratio = 1.0  # another start of the SPAD
+        residual, error = sweep.get("residual_columns"), float(sweep.get("clock_error") or 0.0)
+        if residual is not None and residual <= MAX_RESIDUAL_COLUMNS and abs(error) <= MAX_CLOCK_ERROR:
+            ratio = 1 + error
+    return ratio
+
+
+def _seal_of(manifest: dict[str, Any]) -> int:
+    from rig.recording.manifest import SEAL, sealed_text
+
+    return int(json.loads(sealed_text(json.dumps(manifest)))[SEAL])
+
+
+def _copy_inputs(folder: Path, out: Path, manifest: dict[str, Any], maps: Sequence[int]) -> None:
+    """Copy what stands beside the frames; files of maps are numbered from 0 again, as the part's maps are."""
+    for name in manifest.get("inputs") or {}:
+        shutil.copyfile(folder / name, out / name)
+    before = (manifest.get("cut") or {}).get("maps", [0])[0]
+    for kind in OF_MAPS:
+        for i in range(maps[0] - before, maps[1] - before):
+            file = folder / kind / f"{i:06d}.npz"
+            if file.exists():
+                (out / kind).mkdir(exist_ok=True)
+                shutil.copyfile(file, out / kind / f"{i - (maps[0] - before):06d}.npz")

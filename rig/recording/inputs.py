@@ -1,0 +1,59 @@
+"""What stands beside the frames of a recording so that they mean something without the rig: plan and calibration."""
+
+from pathlib import Path
+from typing import Final
+
+import yaml
+
+from calibration.errors import CalibrationError
+from calibration.files import load_rig_model, save_rig_model
+from calibration.model import RigModel
+from rig.errors import UsageError
+from rig.recording.plain import from_plain, to_plain
+from rig.scan_plan import ScanPlan
+
+PLAN_FILE: Final = "plan.yaml"
+CALIBRATION_FILE: Final = "calibration.yaml"
+PLAN_FORMAT: Final = "spadrig-plan"
+PLAN_VERSION: Final = 1
+
+
+def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None) -> None:
+    """Write the compiled plan, every number of it, and the calibration, where there is one. Raises OSError."""
+    content = {"format": PLAN_FORMAT, "version": PLAN_VERSION, "plan": to_plain(plan)}
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    text = yaml.dump(content, Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
+    (folder / PLAN_FILE).write_text(text, encoding="utf-8")
+    if model is not None:
+        save_rig_model(model, folder / CALIBRATION_FILE)
+
+
+def read_plan(folder: Path) -> ScanPlan:
+    """The plan that a recording was taken with. UsageError where there is none that this program reads."""
+    file = folder / PLAN_FILE
+    try:
+        content = yaml.load(file.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except OSError as error:
+        raise UsageError(
+            f"cannot read {file}: {error.strerror or error}; name the folder of a run that was taken with --record"
+        ) from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UsageError(f"{file} is no YAML; take it from a copy of the recording") from error
+    head = (content.get("format"), content.get("version")) if isinstance(content, dict) else None
+    if head != (PLAN_FORMAT, PLAN_VERSION):
+        raise UsageError(f"{file} is not the plan of a recording ('format: {PLAN_FORMAT}', version {PLAN_VERSION})")
+    try:
+        return from_plain(ScanPlan, content.get("plan"))
+    except (ValueError, TypeError, KeyError) as error:
+        raise UsageError(f"{file}: {error}") from error
+
+
+def read_model(folder: Path) -> RigModel | None:
+    """The calibration that a recording was taken with; None where the rig had none. UsageError where it is damaged."""
+    file = folder / CALIBRATION_FILE
+    if not file.exists():
+        return None
+    try:
+        return load_rig_model(file)
+    except CalibrationError as error:
+        raise UsageError(str(error)) from error

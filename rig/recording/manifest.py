@@ -1,0 +1,70 @@
+"""The manifest of a run, `manifest.json`: sealed with a checksum, since depth depends on what it says.
+
+`crc32` is the CRC-32 (zlib) of the rest of it as JSON without spaces and with sorted keys: a digit that changed on the
+disk is found, other line breaks are not.
+"""
+
+import json
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from rig.errors import DamagedRecordingError
+
+MANIFEST: Final = "manifest.json"
+SEAL: Final = "crc32"
+_PIECE_BYTES: Final = 1 << 20
+
+
+def sealed_text(text: str) -> str:
+    """A manifest, strict JSON, with its seal."""
+    content = json.loads(text)
+    return json.dumps({**content, SEAL: _crc32(content)}, indent=1, ensure_ascii=False)
+
+
+def read_manifest(folder: Path) -> dict[str, Any] | None:
+    """The manifest of a run without its seal; None where there is none. DamagedRecordingError where it is damaged."""
+    try:
+        raw = (folder / MANIFEST).read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise DamagedRecordingError(f"{folder / MANIFEST} cannot be read: {error.strerror or error}") from error
+    try:
+        content = json.loads(raw)
+    except (ValueError, RecursionError) as error:
+        raise DamagedRecordingError(f"{MANIFEST} is no JSON any more: {str(error).splitlines()[0]}; {_NEXT}") from None
+    if not isinstance(content, dict) or content.get(SEAL) != _crc32(content):
+        raise DamagedRecordingError(f"{MANIFEST} is not as it was written, its checksum does not fit; {_NEXT}")
+    del content[SEAL]
+    return content
+
+
+def file_crc32(path: Path) -> int:
+    """CRC-32 of a file, for the manifest. Raises OSError."""
+    crc = 0
+    with path.open("rb") as file:
+        while piece := file.read(_PIECE_BYTES):
+            crc = zlib.crc32(piece, crc)
+    return crc
+
+
+def inputs_problems(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
+    """Files beside the frames that are not what the manifest says."""
+    problems = []
+    for name, stated in (manifest.get("inputs") or {}).items():
+        try:
+            if file_crc32(folder / name) != stated:
+                problems.append(f"{name} is not as it was written, its checksum does not fit")
+        except OSError as error:
+            problems.append(f"{name} cannot be read: {error.strerror or error}")
+    return problems
+
+
+def _crc32(content: Mapping[str, Any]) -> int:
+    bare = {key: value for key, value in content.items() if key != SEAL}
+    return zlib.crc32(json.dumps(bare, sort_keys=True, separators=(",", ":")).encode())
+
+
+_NEXT: Final = "'rig repair' writes a new one"

@@ -1,0 +1,62 @@
+"""What a part of a recording (`rig cut`) takes over from the whole, so that its maps come out the same bit for bit."""
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.model import RigModel
+from drivers.frames import Mark
+from drivers.recorded import RecordedRun, RunRecording
+from rig.config import EstimateConfig
+from rig.errors import DamagedRecordingError
+from rig.estimators import LEARNING
+from rig.estimators.row_model import RowModel
+from rig.recording.manifest import read_manifest
+from rig.sweeps import SweepStart
+
+
+def part_starts(recording: RunRecording) -> list[SweepStart]:
+    """With which sweep the maps of each run begin: the first, but in a part."""
+    cut = (read_manifest(recording.path) or {}).get("cut") if recording.path.is_dir() else None
+    if cut is None:
+        return [SweepStart() for _ in recording.runs]
+    ratios = cut.get("clock_ratios") or []
+    return [
+        SweepStart(_first_sweep(recording, run), float(ratios[run.number]) if run.number < len(ratios) else 1.0)
+        for run in recording.runs
+    ]
+
+
+def part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None) -> list[RowModel]:
+    """The states that the maps of a part were estimated with, where it is estimated as the whole was; else none.
+
+    Nothing of a whole recording, which learns the same again from its first map on.
+    """
+    manifest: dict[str, Any] = (read_manifest(folder) or {}) if folder.is_dir() else {}
+    before = (manifest.get("config") or {}).get("estimate") or {}
+    same = before.get("estimator") == estimate.estimator and estimate.estimator in LEARNING
+    calibration = (manifest.get("calibration") or {}).get("id")
+    if "cut" not in manifest or not same or model is None or calibration != model.fingerprint():
+        return []
+    states = []
+    for i in range(manifest["cut"]["maps"][1] - manifest["cut"]["maps"][0]):
+        file = folder / "learned" / f"{i:06d}.npz"
+        if not file.exists():  # the whole kept those of some maps only
+            return []
+        try:
+            with np.load(file, allow_pickle=False) as arrays:
+                states.append(RowModel.from_arrays(dict(arrays)))
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to learn anew") from error
+    return states
+
+
+def _first_sweep(recording: RunRecording, run: RecordedRun) -> int:
+    """Number of the first sweep that begins in a run: a part may begin in the middle of one."""
+    block = recording.read(run, run.entries[0])
+    if block is None:
+        raise DamagedRecordingError(f"{recording.path}: its first block is damaged; take it from the whole again")
+    begins = bool(int(block.records["marks"][0]) & Mark.SCAN)
+    return block.header.sweep - begins

@@ -1,0 +1,193 @@
+"""Making a torn recording whole: nothing but sound blocks, with an index and a manifest that say so.
+
+No frame is changed and no byte is thrown away: what is no sound block goes to `frames-000000.torn`, at the place where
+it was in the segment, a damaged manifest to `manifest.damaged.json`. What a repair left stays as it is in another one.
+"""
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from drivers.recorded.contents import round_up_to_page
+from drivers.recorded.index import INDEX_FILE, index_header
+from drivers.recorded.segments import PlainSegment, Segment
+from rig.errors import RecordingError, UsageError
+from rig.recording.checking import SoundBlock
+from rig.recording.holding import is_held
+from rig.recording.manifest import MANIFEST, sealed_text
+from rig.recording.sync import sync_folder
+from rig.recording.verify import UNFINISHED, Examined, Verification, examine, verify
+from rig.recording.writer import RESERVE_FILE
+
+ABORTED: Final = "aborted"
+GAPS: Final = "gaps"
+_PIECE_BYTES: Final = 1 << 24
+
+Range = tuple[int, int]
+"""Bytes of a segment: from, to before."""
+
+
+@dataclass(frozen=True, slots=True)
+class Repair:
+    """What was done, a line for each thing, and what `verify` says afterwards."""
+
+    done: list[str]
+    after: Verification
+
+
+def repair(folder: Path) -> Repair:
+    """Make a recording whole as far as it can be (`rig repair`).
+
+    UsageError where there is none, RecordingError where it cannot be written.
+    """
+    if is_held(folder / INDEX_FILE):
+        raise UsageError(f"{folder} is still being recorded; let the run end, or end it, and repair it then")
+    found = examine(folder)
+    done: list[str] = []
+    try:
+        for segment in found.segments:
+            if isinstance(segment, PlainSegment):
+                _clear(segment, _blocks_in(segment, found), done)
+        _write_index(folder, found, done)
+        _write_manifest(folder, found, done)
+        (folder / RESERVE_FILE).unlink(missing_ok=True)
+        sync_folder(folder)
+    except OSError as error:
+        raise RecordingError(
+            f"cannot repair {folder}: {error.strerror or error}; free the space it needs or work on a copy"
+        ) from error
+    return Repair(done, verify(folder))
+
+
+def _blocks_in(segment: Segment, found: Examined) -> list[Range]:
+    """Where the sound blocks of a segment lie, in order."""
+    mine = found.entries[found.entries["segment"] == segment.number]
+    begin = np.sort(mine, order="offset")
+    return list(zip(begin["offset"].tolist(), (begin["offset"] + begin["length"]).tolist(), strict=True))
+
+
+def _clear(segment: PlainSegment, blocks: list[Range], done: list[str]) -> None:
+    """Zero what is no sound block, and end the segment behind the last one; a copy of it is kept."""
+    end = round_up_to_page(blocks[-1][1]) if blocks else 0
+    others = [(a, used) for a, b in _between(blocks, segment.size) if (used := _used(segment, a, b)) > a]
+    if others:
+        torn = segment.path.with_suffix(".torn")
+        _keep(segment, others, torn)
+        done.append(f"{segment.path.name}: {len(others)} pieces that are no sound block are kept in {torn.name}")
+    if not blocks:
+        segment.path.unlink()
+        done.append(f"{segment.path.name} removed, it holds no sound block")
+        return
+    if not others and segment.size == end:
+        return
+    with segment.path.open("rb+") as file:
+        for begin, stop in others:
+            file.seek(begin)
+            file.write(bytes(min(stop, end) - begin if begin < end else 0))
+        file.truncate(end)
+        os.fsync(file.fileno())
+    if segment.size != end:
+        done.append(f"{segment.path.name} ends at byte {end}, not {segment.size}")
+
+
+def _between(blocks: list[Range], size: int) -> Iterator[Range]:
+    """What lies between the blocks, in pieces."""
+    begin = 0
+    for start, stop in [*blocks, (size, size)]:
+        for piece in range(begin, start, _PIECE_BYTES):
+            yield piece, min(start, piece + _PIECE_BYTES)
+        begin = stop
+
+
+def _used(segment: Segment, begin: int, stop: int) -> int:
+    """Where the last byte ends that is not zero; `begin` where all are."""
+    data = segment.at(begin, stop - begin)
+    return stop - int((data[::-1] != 0).argmax()) if data.any() else begin
+
+
+def _keep(segment: PlainSegment, pieces: list[Range], torn: Path) -> None:
+    """Copy pieces of a segment to the same places of another file, which has them by the time this returns."""
+    with torn.open("rb+" if torn.exists() else "wb") as copy:
+        for begin, stop in pieces:
+            copy.seek(begin)
+            copy.write(segment.at(begin, stop - begin).data)
+        copy.flush()
+        os.fsync(copy.fileno())
+
+
+def _write_index(folder: Path, found: Examined, done: list[str]) -> None:
+    data = index_header() + found.entries.tobytes()
+    file = folder / INDEX_FILE
+    if file.exists() and file.read_bytes() == data:
+        return
+    _replace(file, data)
+    done.append(f"{INDEX_FILE} written anew, of {len(found.entries)} blocks")
+
+
+def _write_manifest(folder: Path, found: Examined, done: list[str]) -> None:
+    manifest = found.manifest
+    if manifest is None:
+        damaged = folder / MANIFEST
+        if damaged.exists():
+            damaged.replace(folder / "manifest.damaged.json")
+            done.append(f"the damaged {MANIFEST} is kept as manifest.damaged.json")
+        done.append(f"{MANIFEST} written anew, from the blocks alone: plan and calibration are as they lie here")
+        manifest = {"verdict": UNFINISHED}
+    elif manifest.get("verdict") == UNFINISHED:
+        done.append(f"{MANIFEST}: the run was not over; its verdict is '{ABORTED}' now")
+    elif not (done or found.problems):
+        return
+    recording = {**(manifest.get("recording") or {}), **_recording(found)}
+    missing = [*(manifest.get("missing") or []), *map(list, found.joined.missing)]
+    content: dict[str, Any] = {
+        **{key: value for key, value in manifest.items() if key != "counters"},
+        "verdict": _verdict(manifest, recording, missing),
+        "recording": recording,
+        "missing": missing,
+        "repaired": [*(manifest.get("repaired") or []), *done],
+    }
+    if "counters" in manifest:  # they are of what was recorded, not of what is left of it
+        content["counters_when_recorded"] = manifest["counters"]
+    _replace(folder / MANIFEST, (sealed_text(json.dumps(content)) + "\n").encode())
+
+
+def _verdict(manifest: dict[str, Any], recording: dict[str, Any], missing: list[Any]) -> str:
+    before = (manifest.get("recording") or {}).get("blocks")
+    if missing or (manifest["verdict"] != UNFINISHED and before is not None and before > recording["blocks"]):
+        return GAPS
+    return ABORTED if manifest["verdict"] == UNFINISHED else str(manifest["verdict"])
+
+
+def _recording(found: Examined) -> dict[str, Any]:
+    """What there is, as `Recording.content` says it; the starts only where nobody knows better."""
+    with_blocks = set(found.entries["segment"].tolist())
+    content: dict[str, Any] = {
+        "files": [s.path.name.removesuffix(".zst") for s in found.segments if s.number in with_blocks],
+        "index": INDEX_FILE,
+        "blocks": len(found.entries),
+        "bytes": found.bytes,
+    }
+    if "starts" not in ((found.manifest or {}).get("recording") or {}):
+        content["starts"] = [_start(found, run) for run in found.runs]
+    return content
+
+
+def _start(found: Examined, run: list[SoundBlock]) -> dict[str, int]:
+    """As `rig.recording.writer.Start`: whole sweeps of a run, as its blocks tell, and its first segment."""
+    mine = found.entries[found.entries["run_id"] == run[0].run_id]
+    return {"sweeps": max(0, run[-1].last_sweep - max(1, run[0].sweep)), "segment": int(mine["segment"].min())}
+
+
+def _replace(file: Path, data: bytes) -> None:
+    """Write a file that is there whole or as it was before."""
+    scratch = file.with_name(f"{file.name}.part")
+    with scratch.open("wb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+    scratch.replace(file)

@@ -1,0 +1,174 @@
+"""One segment of a recording: SPB1 blocks one after the other, each padded with zeros to whole pages.
+
+Blocks are written past the page cache where the system can (O_DIRECT), several at a time, pixels straight from where
+they lie: 0.3 s of CPU a GB, nearly all of it for the checksum, where the page cache takes 2 s. What is written is then
+on the disk, and a sync has little to do.
+"""
+
+import errno
+import mmap
+import os
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from drivers.frames import FrameBlock
+from drivers.spb1 import block_parts
+
+PAGE_BYTES: Final = 4096
+"""Places and sizes of what is written past the page cache are multiples of this, in the file and in memory."""
+_SHARE_OF_FREE: Final = 2
+"""At most one half of the free space is set aside at a time: maps are written to the same disk."""
+
+_sync_data = getattr(os, "fdatasync", os.fsync)
+
+
+class Staging:
+    """Page-aligned memory of a thread, in which the parts of a block are put together that do not lie on pages."""
+
+    def __init__(self) -> None:
+        self._memory = mmap.mmap(-1, PAGE_BYTES)
+
+    def take(self, size: int) -> memoryview:
+        """`size` bytes, with old content."""
+        if len(self._memory) < size:
+            self._memory = mmap.mmap(-1, paged(size))
+        return memoryview(self._memory)[:size]
+
+
+class Segment:
+    """An open segment. Blocks are placed in order, by one thread, and written by any."""
+
+    def __init__(self, folder: Path, number: int, name: str, reserve_bytes: int) -> None:
+        """Make the file; set `reserve_bytes` aside for it as far as the disk has them. Raises OSError."""
+        self.number = number
+        self.path = folder / name
+        self.placed = 0
+        """Where the next block goes, bytes."""
+        self.end = 0
+        """Where the last block ends that is written, as are all before it."""
+        self.synced = 0
+        """As `end`, at the beginning of the last sync."""
+        self._lock = threading.Lock()
+        self._fd = _open_direct(self.path)
+        _reserve(self.path, reserve_bytes)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every block that was placed is written."""
+        return self.end == self.placed
+
+    def place(self, size: int) -> int:
+        """The offset of a block of `size` bytes, padding included, which comes next."""
+        offset = self.placed
+        self.placed += size
+        return offset
+
+    def write(self, block: FrameBlock, offset: int, staging: Staging) -> None:
+        """Write a block at its place; its memory has to stay as it is until then. Raises OSError."""
+        pieces = _pieces(block, staging)
+        while pieces:
+            written = self._write(pieces, offset)
+            offset += written
+            pieces = _behind(pieces, written)
+
+    def sync(self) -> None:
+        """Make sure that what is written survives a loss of power. Raises OSError."""
+        if self.synced != self.end:
+            end = self.end
+            _sync_data(self._fd)
+            self.synced = end
+
+    def close(self) -> None:
+        """End the file behind its last whole block; without a block it is removed. Raises OSError."""
+        if self._fd < 0:
+            return
+        fd, self._fd = self._fd, -1
+        try:
+            if self.end:
+                os.ftruncate(fd, self.end)
+                os.fsync(fd)
+            else:
+                self.path.unlink(missing_ok=True)
+        finally:
+            os.close(fd)
+
+    def _write(self, pieces: Sequence[memoryview], offset: int) -> int:
+        if hasattr(os, "pwritev"):
+            written = os.pwritev(self._fd, pieces, offset)
+        else:  # Windows: one thread at a time
+            with self._lock:
+                os.lseek(self._fd, offset, os.SEEK_SET)
+                written = os.write(self._fd, pieces[0])
+        if written == 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return written
+
+
+def paged(size: int) -> int:
+    """Bytes of the whole pages that `size` bytes take."""
+    return -(-size // PAGE_BYTES) * PAGE_BYTES
+
+
+def _pieces(block: FrameBlock, staging: Staging) -> list[memoryview]:
+    """The bytes of a block with its padding: pages of pixels where they are, all else in `staging`."""
+    *front, bits, tail = block_parts(block)
+    front_bytes = sum(len(part) for part in front)
+    before = min(paged(front_bytes) - front_bytes, len(bits))
+    inside = (len(bits) - before) // PAGE_BYTES * PAGE_BYTES
+    if (np.asarray(bits).ctypes.data + before) % PAGE_BYTES:
+        inside = 0
+    parts = [*front, bits[:before], bits[before + inside :], tail]
+    used = sum(len(part) for part in parts)
+    memory = staging.take(paged(used))
+    at = 0
+    for part in parts:
+        memory[at : at + len(part)] = part
+        at += len(part)
+    memory[at:] = bytes(len(memory) - at)
+    split = front_bytes + before
+    return [piece for piece in (memory[:split], bits[before : before + inside], memory[split:]) if len(piece)]
+
+
+def _behind(pieces: Sequence[memoryview], written: int) -> list[memoryview]:
+    """What is left of `pieces` behind the first `written` bytes."""
+    left = []
+    for piece in pieces:
+        if written < len(piece):
+            left.append(piece[written:])
+        written = max(0, written - len(piece))
+    return left
+
+
+def _open_direct(path: Path) -> int:
+    """A new file, open past the page cache where file system and system can."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+    direct = getattr(os, "O_DIRECT", 0)
+    fd = os.open(path, flags, 0o644)
+    if not direct:
+        return fd
+    try:
+        direct_fd = os.open(path, os.O_WRONLY | direct)
+    except OSError:  # EINVAL: a file system without
+        return fd
+    os.close(fd)
+    return direct_fd
+
+
+def _reserve(path: Path, size: int) -> None:
+    """Set space aside, which spares the file system the work while frames come; without it nothing is lost."""
+    if not hasattr(os, "posix_fallocate"):
+        return
+    fd = os.open(path, os.O_WRONLY)
+    try:
+        free = os.fstatvfs(fd)
+        size = min(size, free.f_bavail * free.f_frsize // _SHARE_OF_FREE) // PAGE_BYTES * PAGE_BYTES
+        if size:
+            os.posix_fallocate(fd, 0, size)
+    except OSError:
+        os.ftruncate(fd, 0)
+    finally:
+        os.close(fd)

@@ -1,0 +1,192 @@
+"""Whether a recording is what was recorded: every byte of it, its index, its manifest and the device's own counts."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from drivers.errors import DeviceNotFound, ProtocolError
+from drivers.recorded.contents import Contents, find_blocks, in_order, round_up_to_page
+from drivers.recorded.index import INDEX_FILE, INDEX_RECORD
+from drivers.recorded.segments import Segment, open_segments
+from rig.errors import DamagedRecordingError, UsageError
+from rig.recording.checking import Continuity, Gap, SoundBlock, check_segments, continuity
+from rig.recording.manifest import MANIFEST, inputs_problems, read_manifest
+
+UNFINISHED: Final = "recording"
+"""Verdict of the manifest of a run that is not over, or was killed."""
+
+
+class Integrity(StrEnum):
+    """What a recording is worth."""
+
+    INTACT = "intact"
+    GAPS = "gaps"
+    """Whole, but the device lost frames, and said so."""
+    UNFINISHED = "unfinished"
+    """The run is not over, or was killed; nothing else is wrong."""
+    DAMAGED = "damaged"
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """The verdict and what it rests on.
+
+    blocks, frames, bytes: sound ones. lost: frames that the device lost, gaps: [run, first, last] where. problems: a
+    line each; run: the verdict of the run that was recorded.
+    """
+
+    verdict: Integrity
+    segments: int
+    runs: int
+    blocks: int
+    frames: int
+    bytes: int
+    lost: int
+    gaps: list[Gap]
+    problems: list[str]
+    run: str | None
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of the command line."""
+        return 0 if self.verdict is Integrity.INTACT else 1
+
+    def as_json(self) -> dict[str, Any]:
+        """As plain values."""
+        return {**asdict(self), "verdict": self.verdict.value}
+
+
+@dataclass(frozen=True, slots=True)
+class Examined:
+    """All that can be known of a recording. runs: the sound blocks of each, in order of their frames."""
+
+    segments: list[Segment]
+    contents: Contents
+    runs: list[list[SoundBlock]]
+    joined: Continuity
+    manifest: dict[str, Any] | None
+    problems: list[str]
+
+    @property
+    def bytes(self) -> int:
+        """What the sound blocks take in their segments."""
+        return int(round_up_to_page(self.entries["length"]).sum())
+
+    @property
+    def entries(self) -> np.ndarray[Any, Any]:
+        """(n,) of INDEX_RECORD, of the sound blocks."""
+        return np.frombuffer(b"".join(block.entry for run in self.runs for block in run), INDEX_RECORD)
+
+
+def verify(folder: Path) -> Verification:
+    """Read all of a recording (`rig verify`). UsageError where there is none; damage is in the result."""
+    found = examine(folder)
+    blocks = [block for run in found.runs for block in run]
+    return Verification(
+        verdict=_verdict(found),
+        segments=len(found.segments),
+        runs=len(found.runs),
+        blocks=len(blocks),
+        frames=sum(block.n_frames for block in blocks),
+        bytes=found.bytes,
+        lost=found.joined.lost,
+        gaps=found.joined.gaps,
+        problems=found.problems,
+        run=None if found.manifest is None else found.manifest.get("verdict"),
+    )
+
+
+def examine(folder: Path) -> Examined:
+    """Everything that `verify` and `repair` need to know. UsageError where there is no recording."""
+    try:
+        segments = open_segments(folder)
+    except DeviceNotFound as error:
+        raise UsageError(str(error)) from None
+    except ProtocolError as error:  # a package is missing
+        raise UsageError(f"{folder}: {error}") from None
+    contents = find_blocks(segments, folder)
+    sound, damage = check_segments(segments)
+    problems = list(dict.fromkeys([*contents.problems, *damage]))
+    manifest = None
+    try:
+        manifest = read_manifest(folder)
+        if manifest is None:
+            problems.append(f"{MANIFEST} is missing")
+    except DamagedRecordingError as error:
+        problems.append(str(error))
+    runs = _runs(contents, sound, problems)
+    joined = continuity(runs, is_part=manifest is not None and "cut" in manifest, known=_known_missing(manifest))
+    problems += joined.problems
+    if manifest is not None and manifest.get("verdict") != UNFINISHED:
+        problems += _against_manifest(manifest, segments, contents, runs, joined)
+    if manifest is not None:
+        problems += inputs_problems(folder, manifest)
+    return Examined(segments, contents, runs, joined, manifest, problems)
+
+
+def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) -> list[list[SoundBlock]]:
+    """The sound blocks of each run, in order; a problem for each block that should be there and is not."""
+    by_entry = {block.entry: block for block in sound}
+    told = {entry.tobytes(): entry for entry in contents.entries}
+    for entry in (entry for raw, entry in told.items() if raw not in by_entry):
+        last = int(entry["first_frame"]) + int(entry["n_frames"]) - 1
+        problems.append(
+            f"block {entry['block_seq']} of run {entry['run_id']} (frames {entry['first_frame']} to {last}) is damaged "
+            f"or gone: segment {entry['segment']}, byte {entry['offset']}"
+        )
+    others = sum(raw not in told for raw in by_entry)
+    if others:
+        problems.append(f"{others} blocks are not where {INDEX_FILE} tells of them, or come twice")
+    entries = np.frombuffer(b"".join(by_entry), INDEX_RECORD)
+    runs: dict[int, list[SoundBlock]] = {}
+    for entry in in_order(entries, contents.run_order, [])[0]:
+        block = by_entry[entry.tobytes()]
+        runs.setdefault(block.run_id, []).append(block)
+    return list(runs.values())
+
+
+def _known_missing(manifest: dict[str, Any] | None) -> list[Gap] | None:
+    """What a repair found missing; None where there was none."""
+    if manifest is None or "repaired" not in manifest:
+        return None
+    return [(run, first, last) for run, first, last in manifest.get("missing") or []]
+
+
+def _against_manifest(
+    manifest: dict[str, Any],
+    segments: Sequence[Segment],
+    contents: Contents,
+    runs: Sequence[Sequence[SoundBlock]],
+    joined: Continuity,
+) -> list[str]:
+    """Where a finished run's manifest tells of other blocks and frames than there are."""
+    recording = manifest.get("recording") or {}
+    blocks = sum(len(run) for run in runs)
+    frames = sum(block.n_frames for run in runs for block in run)
+    files = [segment.path.name.removesuffix(".zst") for segment in segments]
+    problems = [
+        f"{MANIFEST} tells of {stated} {what}, there are {found}"
+        for what, stated, found in (
+            ("blocks", recording.get("blocks"), blocks),
+            ("segments", recording.get("files"), files),
+        )
+        if stated is not None and stated != found
+    ]
+    counters = manifest.get("counters") or {}
+    if counters.get("delivered") not in (None, frames):
+        problems.append(f"the device delivered {counters['delivered']} frames, {frames} are recorded")
+    if counters.get("lost") is not None and counters["lost"] < joined.lost:
+        problems.append(f"the device says that it lost {counters['lost']} frames, its blocks say {joined.lost}")
+    return problems
+
+
+def _verdict(found: Examined) -> Integrity:
+    if found.problems or not found.runs:
+        return Integrity.DAMAGED
+    if found.manifest is not None and found.manifest.get("verdict") == UNFINISHED:
+        return Integrity.UNFINISHED
+    return Integrity.GAPS if found.joined.gaps else Integrity.INTACT

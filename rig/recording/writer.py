@@ -1,0 +1,279 @@
+"""Writing a recording: segments of SPB1 blocks and their index, whole to the last block whatever ends the program.
+
+A block counts once all its bytes and those of every block before it are with the system; then its index record is
+written. So a killed program loses no block that counted, and a loss of power none older than `SYNC_INTERVAL_S`: a
+thread makes the disk keep what was written, blocks before index.
+"""
+
+import errno
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+from drivers.frames import FrameBlock
+from drivers.recorded.index import HEADER_BYTES, INDEX_FILE, RECORD_BYTES, index_header, index_of, segment_name
+from drivers.spb1 import BlockLayout
+from rig.errors import RecordingError
+from rig.recording.holding import hold
+from rig.recording.segment import Segment, Staging, paged
+from rig.recording.sync import sync_folder
+
+SEGMENT_BYTES: Final = 1 << 30
+"""A segment is no larger, except for a block that is."""
+SYNC_INTERVAL_S: Final = 0.2
+"""What was recorded longer ago than this survives a loss of power."""
+_SYNC_EVERY_S: Final = SYNC_INTERVAL_S / 2
+"""From the end of one sync to the next: the other half is for the sync itself."""
+WRITERS: Final = 4
+"""Blocks written at a time: one thread makes checksums for some 4 GB/s, and disks like a queue."""
+RESERVE_FILE: Final = ".recording.reserve"
+RESERVE_BYTES: Final = 1 << 20
+"""Kept free beside the recording, so that manifest and summary still find room on the disk that it filled."""
+
+
+@dataclass(slots=True, eq=False)
+class _Placed:
+    """A block on its way to its place. end: of the block in its segment."""
+
+    segment: Segment
+    end: int
+    index_record: bytes
+    done: bool = False
+
+
+@dataclass(slots=True)
+class Start:
+    """One start of the SPAD. sweeps: what it was to give; segment: number of its first segment."""
+
+    sweeps: int
+    segment: int
+
+
+class Recording:
+    """A recording that grows block by block in a folder; whatever fails, it ends behind a whole block.
+
+    `submit` and `append` belong to one thread. expected_bytes: how much will come, as far as it is known; so much is
+    set aside on the disk. on_begin: called where a start of the SPAD begins. Raises RecordingError where the folder
+    cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        expected_bytes: int | None = None,
+        segment_bytes: int = SEGMENT_BYTES,
+        on_begin: Callable[[], None] | None = None,
+    ) -> None:
+        self.folder = folder
+        self.blocks = 0
+        """Blocks that count."""
+        self.bytes = 0
+        """What they take in the segments."""
+        self.busy_s = 0.0
+        """Time of all writers together, for checksums and writing."""
+        self.files: list[str] = []
+        self.starts: list[Start] = []
+        self.longest_unsynced_s = 0.0
+        """Longest time from one sync's beginning to the next one's end."""
+        self._expected_bytes = expected_bytes
+        self._segment_bytes = segment_bytes
+        self._on_begin = on_begin
+        self._segment: Segment | None = None
+        self._segment_is_for: tuple[int, int] | None = None
+        self._open: list[Segment] = []
+        self._order: deque[_Placed] = deque()
+        self._lock = threading.Lock()
+        self._failure: BaseException | None = None
+        self._companions: list[Callable[[], None]] = []
+        self._staging = threading.local()
+        self._closed = threading.Event()
+        self._reserve = folder / RESERVE_FILE
+        try:
+            self._reserve.write_bytes(bytes(RESERVE_BYTES))
+            self._index = (folder / INDEX_FILE).open("xb", buffering=0)
+            hold(self._index.fileno())
+            self._index.write(index_header())
+            sync_folder(folder)
+        except OSError as error:
+            self._reserve.unlink(missing_ok=True)
+            raise self._failed(error) from error
+        self._pool = ThreadPoolExecutor(WRITERS, "recording writer")
+        self._last_sync = time.monotonic()
+        self._indexed_at_sync = 0
+        self._syncing = threading.Thread(target=self._sync_on, name="recording sync", daemon=True)
+        self._syncing.start()
+
+    def begin(self, sweeps: int) -> None:
+        """A start of the SPAD that is to give `sweeps` sweeps: its blocks come next, in segments of their own."""
+        self.starts.append(Start(sweeps, len(self.files)))
+        with self._lock:
+            self._segment = None
+        if self._on_begin is not None:
+            self._on_begin()
+
+    def append(self, block: FrameBlock) -> None:
+        """Write a block behind the others and wait until it counts. Raises RecordingError where it did not fit."""
+        self.submit(block).result()
+
+    def submit(self, block: FrameBlock) -> "Future[None]":
+        """Begin to write a block behind the others; its memory has to stay as it is until the result is there.
+
+        The result, or this call, raises RecordingError where a block could not be written: none counts from it on.
+        """
+        header = block.header
+        size = paged(BlockLayout(block.n_frames, header.width, header.height).block_bytes)
+        with self._lock:
+            if self._failure is not None:
+                raise self._failed(self._failure) from self._failure
+        segment = self._segment_for(size, (header.run_id, header.width))
+        offset = segment.place(size)
+        placed = _Placed(segment, offset + size, index_of(block, segment.number, offset))
+        with self._lock:
+            self._order.append(placed)
+        return self._pool.submit(self._write, block, placed, offset)
+
+    def also_sync(self, companion: Callable[[], None]) -> None:
+        """Call `companion` with every sync, on its thread, and when the recording is closed."""
+        self._companions.append(companion)
+
+    def close(self) -> None:
+        """Wait until everything is written, end the files and sync them. A second call does nothing.
+
+        Raises RecordingError where the disk did not take it.
+        """
+        if self._closed.is_set():
+            return
+        self._pool.shutdown()
+        self._closed.set()
+        self._syncing.join()
+        try:
+            for segment in self._open:
+                segment.close()
+            self._index.truncate(HEADER_BYTES + self.blocks * RECORD_BYTES)
+            os.fsync(self._index.fileno())
+            sync_folder(self.folder)
+            for companion in self._companions:
+                companion()
+        except OSError as error:
+            raise self._failed(error) from error
+        finally:
+            self._open.clear()
+            self._index.close()
+            self._reserve.unlink(missing_ok=True)
+            self.files = [name for name in self.files if (self.folder / name).exists()]
+
+    def content(self) -> dict[str, object]:
+        """What there is, for the manifest."""
+        return {
+            "files": list(self.files),
+            "index": INDEX_FILE,
+            "blocks": self.blocks,
+            "bytes": self.bytes,
+            "sync_interval_s": SYNC_INTERVAL_S,
+            "longest_unsynced_s": self.longest_unsynced_s,
+            "failed": None if self._failure is None else _reason(self._failure),
+            "starts": [asdict(start) for start in self.starts],
+        }
+
+    def _segment_for(self, size: int, is_for: tuple[int, int]) -> Segment:
+        """The segment that a block goes to: a new one where the old is full, or of another run or width."""
+        segment = self._segment
+        fits = segment is not None and (segment.placed == 0 or segment.placed + size <= self._segment_bytes)
+        if segment is not None and fits and self._segment_is_for == is_for:
+            return segment
+        reserve = self._segment_bytes
+        if self._expected_bytes is not None:
+            reserve = min(reserve, max(0, self._expected_bytes - self.bytes))
+        name = segment_name(len(self.files))
+        try:
+            segment = Segment(self.folder, len(self.files), name, reserve)
+            sync_folder(self.folder)
+        except OSError as error:
+            raise self._failed(error) from error
+        with self._lock:
+            self.files.append(name)
+            self._open.append(segment)
+            self._segment, self._segment_is_for = segment, is_for
+        return segment
+
+    def _write(self, block: FrameBlock, placed: _Placed, offset: int) -> None:
+        """One writer's work."""
+        begun = time.perf_counter()
+        try:
+            staging = getattr(self._staging, "of_thread", None)
+            if staging is None:
+                staging = self._staging.of_thread = Staging()
+            placed.segment.write(block, offset, staging)
+            self._count(placed)
+        except BaseException as error:
+            with self._lock:
+                self._failure = self._failure or error
+            if isinstance(error, OSError):
+                raise self._failed(error) from error
+            raise
+        finally:
+            with self._lock:
+                self.busy_s += time.perf_counter() - begun
+
+    def _count(self, placed: _Placed) -> None:
+        """Index every block before which nothing is missing any more."""
+        with self._lock:
+            placed.done = True
+            while self._order and self._order[0].done and self._failure is None:
+                first = self._order[0]
+                if self._index.write(first.index_record) != RECORD_BYTES:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                self._order.popleft()
+                self.bytes += first.end - first.segment.end
+                first.segment.end = first.end
+                self.blocks += 1
+
+    def _sync_on(self) -> None:
+        """The sync thread."""
+        while not self._closed.wait(_SYNC_EVERY_S):
+            try:
+                self._sync()
+            except OSError as error:
+                with self._lock:
+                    self._failure = self._failure or error
+                return
+
+    def _sync(self) -> None:
+        begun = time.monotonic()
+        with self._lock:
+            segments = list(self._open)
+            full = [segment for segment in segments if segment is not self._segment and segment.complete]
+            blocks = self.blocks
+        for segment in segments:
+            if segment in full:
+                segment.close()
+                with self._lock:
+                    self._open.remove(segment)
+            else:
+                segment.sync()
+        if blocks != self._indexed_at_sync:
+            os.fsync(self._index.fileno())
+            self._indexed_at_sync = blocks
+        for companion in self._companions:
+            companion()
+        self.longest_unsynced_s = max(self.longest_unsynced_s, time.monotonic() - self._last_sync)
+        self._last_sync = begun
+
+    def _failed(self, error: BaseException) -> RecordingError:
+        self._reserve.unlink(missing_ok=True)
+        name = self.files[-1] if self.files else segment_name(0)
+        return RecordingError(
+            f"cannot write the recording {name} beyond {self.bytes / 1e6:.0f} MB: {_reason(error)}; "
+            "free the space it needs or name a folder on another disk with --out"
+        )
+
+
+def _reason(error: BaseException) -> str:
+    return getattr(error, "strerror", None) or str(error)

@@ -1,0 +1,226 @@
+"""A recording through the live stack: its plan and its starts, with other devices recorded too, emulated or real.
+
+Frames are bound by the plan that they were taken with (`plan.yaml`), never by one compiled anew, and each start of the
+SPAD is played as one: so a map is made of the very same frames in the very same order, at any clock.
+"""
+
+import itertools
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.model import RigModel
+from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
+from drivers.recorded import RecordedRun, RunRecording
+from drivers.replay import ReplaySpad
+from drivers.replay_pace import Pace, PaceReport, ReplayClock
+from rig.config import EstimateConfig, RigConfig, ScanConfig
+from rig.config_files import parse_config
+from rig.errors import DamagedRecordingError, UsageError
+from rig.estimators import Learned
+from rig.plan import spad_request
+from rig.recording.inputs import CALIBRATION_FILE, read_plan
+from rig.recording.manifest import MANIFEST, inputs_problems, read_manifest
+from rig.recording.part import part_learned, part_starts
+from rig.scan_plan import ScanPlan
+from rig.sweeps import SweepStart
+
+SILENCE_S = 5.0
+"""As of a live SPAD, in the time of the recording."""
+ENDLESS_S = 1e6
+ENDLESS = 1_000_000_000
+"""Maps of a loop that nobody counts."""
+RECORDED = ("scanner", "laser", "sync")
+"""Slots that a recording can play all by itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayOptions:
+    """How a recording is played. block_frames: of a block at most, None for what the plan says."""
+
+    clock: str = "max"
+    loop: bool = False
+    block_frames: int | None = None
+
+    def __post_init__(self) -> None:
+        """UsageError for a clock that is none."""
+        try:
+            ReplayClock.parse(self.clock)
+        except ValueError as error:
+            raise UsageError(f"--{error}") from None
+        if self.block_frames is not None and self.block_frames < 1:
+            raise UsageError(f"block_frames is {self.block_frames}; it must be at least 1")
+
+
+def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, estimate: dict[str, Any]) -> RigConfig:
+    """The rig that plays a recording. others: whose world, scanner, laser and sync source take part; None: recorded.
+
+    estimate: settings laid over those of the recording. UsageError where there is no recording.
+    """
+    if not run.is_dir():
+        raise UsageError(f"{run} is no folder of a run; name one that was taken with --record")
+    plan = read_plan(run)
+    manifest = read_manifest(run)
+    if manifest is None:
+        raise DamagedRecordingError(f"{run / MANIFEST} is missing; 'rig repair' writes a new one")
+    if problems := inputs_problems(run, manifest):
+        raise DamagedRecordingError("\n".join(f"{line}; take it from a copy of the recording" for line in problems))
+    recorded = manifest.get("config") or {}
+    calibration = run / CALIBRATION_FILE
+    scan = recorded.get("scan") or _scan_of(plan)
+    content: dict[str, Any] = {
+        "name": f"replay of {recorded.get('name') or run.name}",
+        "calibration": str(calibration.absolute()) if calibration.exists() else None,
+        "world": None,
+        "spad": {
+            "kind": "replay",
+            "recording": str(run.absolute()),
+            "clock": options.clock,
+            "loop": options.loop,
+            "block_frames": options.block_frames,
+        },
+        **{slot: {"kind": "replay"} for slot in RECORDED},
+        "scan": scan,
+        "estimate": {**(recorded.get("estimate") or {}), **{k: v for k, v in estimate.items() if v is not None}},
+    }
+    if others is not None:
+        content |= {slot: part for slot, part in others.model_dump(mode="json").items() if slot in (*RECORDED, "world")}
+    return parse_config(content)
+
+
+def replay_plan(spad: ReplaySpad, scan: ScanConfig, model: RigModel | None) -> tuple[ScanPlan, SpadTiming]:
+    """The plan that the frames were taken with, for the calibration that there is, and the SPAD configured for it."""
+    plan = read_plan(spad.recording.path)
+    if model is not None:
+        from rig.recalibrated import recalibrated
+
+        plan = recalibrated(plan, model)
+    request = replace(spad_request(scan, plan), frame_rate_hz=plan.frame_rate_hz, exposure_s=plan.exposure_s)
+    return plan, spad.configure(request)
+
+
+class Replayed:
+    """What a run needs to know of the recording that its SPAD plays. maps: to take."""
+
+    def __init__(self, spad: ReplaySpad, plan: ScanPlan, maps: int | None) -> None:
+        self._spad = spad
+        self._sweeps = recorded_sweeps(spad.recording, plan)
+        there = sum(self._sweeps)
+        if there == 0:
+            raise UsageError(f"{spad.recording.path} holds no whole sweep, so there is no map to be made of it")
+        if maps is not None and maps > there and not spad.loops:
+            raise UsageError(f"--maps is {maps}, {spad.recording.path} holds {there}; ask for fewer, or add --loop")
+        self.maps: int = maps or (ENDLESS if spad.loops else there)
+
+    @classmethod
+    def of(cls, spad: SpadArray, plan: ScanPlan, maps: int | None) -> "Replayed | None":
+        """None for a SPAD that plays no recording. UsageError where that has not so many maps."""
+        return cls(spad, plan, maps) if isinstance(spad, ReplaySpad) else None
+
+    @property
+    def report(self) -> PaceReport:
+        """How its clock was held."""
+        return self._spad.pace.report
+
+    @property
+    def silence_s(self) -> float:
+        """How long it may give nothing: at a slow clock longer, and while it waits for steps as long as it takes."""
+        pace = self._spad.pace
+        return ENDLESS_S if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
+
+    def groups(self) -> Iterator[int]:
+        """Sweeps of one start after the other."""
+        return itertools.cycle(self._sweeps) if self._spad.loops else iter(self._sweeps)
+
+    def starts(self) -> Iterator[SweepStart]:
+        """With which sweep each of the starts begins."""
+        found = part_starts(self._spad.recording)
+        return itertools.cycle(found) if self._spad.loops else iter(found)
+
+    def learned(self, estimate: EstimateConfig, model: RigModel | None) -> Sequence[Learned]:
+        """Of a part of a recording, what its maps were estimated with; empty where they are to be learned anew."""
+        return part_learned(self._spad.recording.path, estimate, model)
+
+    def truth(self, index: int) -> SweepTruth | None:
+        """What was known of a map when it was recorded, where that was kept."""
+        return recorded_truth(self._spad.recording.path, index % sum(self._sweeps))
+
+
+def pace_of(spad: SpadArray) -> Pace:
+    """What steps are told to."""
+    assert isinstance(spad, ReplaySpad), "opened from a config of `replay_config`"
+    return spad.pace
+
+
+def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[int]:
+    """How many sweeps each start of the SPAD gave, as the run took them; of a run that was killed the whole ones.
+
+    DamagedRecordingError where a start is missing: its maps would be taken for those of others.
+    """
+    manifest = read_manifest(recording.path) or {}
+    noted = manifest.get("recording") or {}
+    starts = noted.get("starts")
+    if not starts:
+        return [_whole_sweeps(recording, run, plan) for run in recording.runs]
+    planned = [int(start["sweeps"]) for start in starts]
+    segments = np.array([int(start["segment"]) for start in starts])
+    found = [int(np.searchsorted(segments, run.entries["segment"][0], "right")) - 1 for run in recording.runs]
+    if found != list(range(len(found))):
+        raise DamagedRecordingError(
+            f"{recording.path}: of {len(starts)} starts of the SPAD only {len(set(found))} are there, not the first; "
+            "take the missing segments from a copy"
+        )
+    planned = planned[: len(found)]
+    if manifest.get("sweeps") is not None:
+        return _limited(planned, len(manifest["sweeps"]))
+    planned[-1] = min(planned[-1], _whole_sweeps(recording, recording.runs[-1], plan))
+    return _limited(planned, sum(planned))
+
+
+def recorded_truth(folder: Path, index: int) -> SweepTruth | None:
+    """What a world said of a map when it was recorded; None where there was none or it was not kept."""
+    file = folder / "truth" / f"{index:06d}.npz"
+    if not file.exists():
+        return None
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            return SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"])
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to go on without it") from error
+
+
+def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> int:
+    """Sweeps of a start that are there to their end: by its markers, or without such by the number of frames."""
+    if plan.blanking is not None:
+        frames = float(plan.frames_per_sweep)
+        return max(0, int((run.end_frame - plan.frames_for(0)) / frames))
+    last = next((b for e in run.entries[::-1] if (b := recording.read(run, e)) is not None and b.n_frames), None)
+    if last is None:
+        return 0
+    before = last.header.sweep
+    return max(0, before + ((int(last.records["sweep"][-1]) - before) & 0xFFFF) - 1)
+
+
+def _limited(planned: list[int], most: int) -> list[int]:
+    """The first `most` sweeps of those planned; starts of none are left out."""
+    taken = []
+    for sweeps in planned:
+        taken.append(min(sweeps, most))
+        most -= taken[-1]
+    return [sweeps for sweeps in taken if sweeps]
+
+
+def _scan_of(plan: ScanPlan) -> dict[str, Any]:
+    """The scan section that a plan came from, as far as a run asks for it."""
+    return {
+        "columns": plan.columns,
+        "exposures": plan.exposures,
+        "frame_rate": f"{plan.frame_rate_hz} Hz",
+        "depth_range": [f"{depth_m!r} m" for depth_m in plan.depth_range_m],
+        "command_range": list(plan.command_range),
+        "bidirectional": len(plan.legs) == 2,
+    }

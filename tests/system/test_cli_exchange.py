@@ -1,0 +1,78 @@
+"""`rig import` and `rig export` as a user calls them: a recorded scan goes out, comes back and gives the same depth."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.system.conftest import Rig
+from tests.unit.rig.foreign_files import pi_packed, some_frames, swissspad2_full
+
+
+@pytest.fixture
+def recorded(rig: Rig, small: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "recorded"
+    ran = rig("scan", small, "--record", "--maps", "2", "--out", folder)
+    assert ran.code == 0, ran.err
+    return folder
+
+
+def test_every_kind_of_export_of_a_scan(rig: Rig, recorded: Path) -> None:
+    wanted = {
+        "npy": ["frames.json", "frames.npy", "transforms.json"],
+        "hdf5": ["run.h5"],
+        "ply": ["000000.ply", "000001.ply"],
+        "png": ["depth-000000.png", "depth-000001.png"],
+        "mp4": ["depth.mp4"],
+    }
+    for kind, files in wanted.items():
+        ran = rig("export", recorded, kind, "--json")
+        assert (ran.code, ran.err) == (0, "")
+        assert json.loads(ran.out)["files"] == files
+        assert sorted(file.name for file in recorded.with_name(f"recorded-{kind}").iterdir()) == files
+    depth = cv2.imread(str(recorded.with_name("recorded-png") / "depth-000001.png"))
+    again = cv2.imread(str(recorded / "depth" / "000001.png"))
+    assert depth is not None
+    assert again is not None
+    assert np.array_equal(depth, again)
+
+
+def test_the_camera_goes_with_the_cube(rig: Rig, recorded: Path, tmp_path: Path) -> None:
+    assert rig("export", recorded, "npy", "--out", tmp_path / "cube").code == 0
+    frames = np.load(tmp_path / "cube" / "frames.npy")
+    described = json.loads((tmp_path / "cube" / "transforms.json").read_text())
+    assert (described["w"], described["h"], described["bitpack_dim"]) == (96, 40, 2)
+    assert (described["fl_x"], described["cx"]) == (110, 47.5)
+    assert len(described["frames"]) == len(frames)
+
+
+def test_foreign_frames_become_a_recording_that_verifies(rig: Rig, tmp_path: Path) -> None:
+    (tmp_path / "acq").mkdir()
+    (tmp_path / "acq" / "RAW00000.bin").write_bytes(pi_packed(some_frames(3, 512, 512)) + b"DONE")
+    (tmp_path / "full.bin").write_bytes(swissspad2_full(some_frames(2, 512, 512)))
+    ran = rig("import", "pi-imaging", tmp_path / "acq", "--out", "pi", "--frame-rate", "97.7 kHz", "--json")
+    assert (ran.code, ran.err) == (0, "")
+    assert json.loads(ran.out)["frame_rate_hz"] == 97_700
+    assert rig("import", "swissspad2", tmp_path / "full.bin", "--form", "full", "--out", "swiss").code == 0
+    for run in ("pi", "swiss"):
+        verified = rig("verify", run)
+        assert verified.code == 0, verified.out + verified.err
+    assert rig("export", "pi", "npy").code == 0
+    assert np.load("pi-npy/frames.npy").shape == (3, 512, 64)
+
+
+def test_what_cannot_be_ends_with_code_2_and_writes_nothing(rig: Rig, tmp_path: Path) -> None:
+    (tmp_path / "short.bin").write_bytes(bytes(100))
+    for arguments in (
+        ("import", "swissspad2", tmp_path / "short.bin", "--out", "new"),
+        ("import", "photoncube", tmp_path / "absent.npy", "--out", "new"),
+        ("import", "photoncube", tmp_path, "--out", "new"),
+        ("export", tmp_path / "absent", "npy", "--out", "new"),
+        ("export", tmp_path, "png", "--out", "new"),
+    ):
+        ran = rig(*arguments)
+        assert ran.code == 2
+        assert len(ran.problems) == 1
+        assert not Path("new").exists()

@@ -1,0 +1,132 @@
+"""Recordings as a user makes them: a folder in place from the start, and depth from it that is the same to the bit."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from rig import run as rig_run
+from rig.acquisition import Acquisition
+from tests.system.conftest import Rig
+
+OPTIONS = ("--exposures", 3, "--maps", 3, "--seed", 5)
+
+
+def arrays(folder: Path) -> dict[str, Any]:
+    """Everything that a run made of its frames, by file and name."""
+    found = {str(file.relative_to(folder)): np.load(file) for file in folder.glob("depth/*.npy")}
+    for file in (*folder.glob("stripe/*.npz"), *folder.glob("learned/*.npz"), *folder.glob("truth/*.npz")):
+        with np.load(file) as content:
+            found |= {f"{file.relative_to(folder)}/{name}": content[name] for name in content}
+    return found
+
+
+def assert_same(a: Path, b: Path) -> None:
+    first, second = arrays(a), arrays(b)
+    assert first.keys() == second.keys()
+    for name, array in first.items():
+        assert array.tobytes() == second[name].tobytes(), name
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return content
+
+
+@pytest.mark.parametrize("estimator", ["likelihood", "argmax"])
+def test_a_recording_gives_the_depth_of_its_scan_to_the_bit_alone(rig: Rig, small: Path, estimator: str) -> None:
+    taken = rig("scan", small, "--estimator", estimator, *OPTIONS, "--record", "--out", "lab/run")
+    assert taken.code == 0, taken.err
+    shutil.move("lab/run", "elsewhere")
+    shutil.rmtree(small.parent)  # neither the rig's files nor its name are there any more
+    again = rig("reconstruct", "elsewhere", "--out", "again")
+    assert again.code == 0, again.err
+    assert_same(Path("elsewhere"), Path("again"))
+    live, replayed = summary(Path("elsewhere")), summary(Path("again"))
+    for key in ("maps", "frames", "sensor_time_s", "valid_fraction", "fog", "truth", "verdict", "sync"):
+        assert live[key] == replayed[key], key
+
+
+def test_a_recording_can_be_reconstructed_otherwise(rig: Rig, small: Path) -> None:
+    assert rig("scan", small, "--maps", 1, "--record", "--out", "run").code == 0
+    plain = rig("scan", small, "--maps", 1, "--estimator", "edge", "--filter", "median", "--out", "edge")
+    assert plain.code == 0
+    assert rig("reconstruct", "run", "--estimator", "edge", "--filter", "median", "--out", "other").code == 0
+    assert_same(Path("edge"), Path("other"))
+    nearer = yaml.safe_load(Path("run/calibration.yaml").read_text())
+    nearer["scanner"]["pivot"]["axis_point_m"] = [-0.15, 0, 0]  # half the base line
+    Path("nearer.yaml").write_text(yaml.safe_dump(nearer))
+    assert rig("reconstruct", "run", "--calibration", "run/calibration.yaml", "--out", "same").code == 0
+    assert_same(Path("run"), Path("same"))
+    assert rig("reconstruct", "run", "--calibration", "nearer.yaml", "--out", "near").code == 0
+    depth, near = (np.load(f"{name}/depth/000000.npy") for name in ("run", "near"))
+    assert np.nanmedian(near) == pytest.approx(np.nanmedian(depth) / 2, rel=0.1)
+
+
+def test_what_does_not_fit_a_recording_is_refused(rig: Rig, small: Path) -> None:
+    assert rig("scan", small, "--record", "--out", "run").code == 0
+    (Path("run") / "plan.yaml").rename("plan.yaml")
+    for arguments, said in (
+        (("run",), "plan.yaml"),
+        (("run", "--plan", "plan.yaml"), "leave --plan out"),
+        (("cube.npy",), "--plan and --calibration"),
+    ):
+        ran = rig("reconstruct", *arguments, "--out", "out")
+        assert (ran.code, len(ran.problems)) == (2, 1)
+        assert said in ran.problems[0]
+    assert not Path("out").exists()
+
+
+def test_the_folder_of_a_recording_says_what_it_is_before_the_first_frame(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start, seen = Acquisition._arm, []
+
+    def look(self: Acquisition) -> None:
+        seen.append(json.loads(Path("run/manifest.json").read_text()))
+        assert {file.name for file in Path("run").iterdir()} >= {"plan.yaml", "calibration.yaml", "frames.idx"}
+        start(self)
+
+    monkeypatch.setattr(Acquisition, "_arm", look)
+    assert rig("scan", small, "--record", "--out", "run").code == 0
+    (begun,) = seen
+    ended = json.loads(Path("run/manifest.json").read_text())
+    assert (begun["verdict"], ended["verdict"]) == ("recording", "complete")
+    assert begun["recording"]["sync_interval_s"] == 0.2
+    for key in ("versions", "config", "plan", "calibration", "devices", "seed", "maps"):
+        assert begun[key] == ended[key], key
+    assert ended["devices"]["spad"]["info"]["serial"]
+    assert ended["counters"]["delivered"] >= ended["sweeps"][-1]["end_frame"]
+
+
+def test_a_disk_with_too_little_room_is_refused_before_the_start(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(".")
+    monkeypatch.setattr(rig_run.shutil, "disk_usage", lambda folder: usage._replace(free=1000))
+    ran = rig("scan", small, "--record", "--maps", 50, "--out", "deep/run")
+    assert (ran.code, len(ran.problems)) == (2, 1)
+    assert "the recording will take" in ran.problems[0]
+    assert "free some" in ran.problems[0]
+    assert not Path("deep").exists()
+
+
+def test_an_error_of_ours_leaves_what_was_recorded(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    add = rig_run.Run.add
+
+    def broken(self: rig_run.Run, *arguments: Any) -> None:
+        if self.tally.maps == 1:
+            raise ZeroDivisionError("ours")
+        add(self, *arguments)
+
+    monkeypatch.setattr(rig_run.Run, "add", broken)
+    assert rig("scan", small, "--record", "--maps", 4, "--out", "run").code == 70
+    monkeypatch.setattr(rig_run.Run, "add", add)
+    assert json.loads(Path("run/manifest.json").read_text())["verdict"] == "recording"
+    assert rig("reconstruct", "run", "--out", "again").code == 0
+    assert summary(Path("again"))["maps"] >= 1
+    assert np.load("run/depth/000000.npy").tobytes() == np.load("again/depth/000000.npy").tobytes()

@@ -1,0 +1,75 @@
+"""`rig verify`, `repair`, `info`, `cut` and `compress` on a recorded scan, as a user calls them."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.system.conftest import Rig
+from tests.system.small_rig import config, write_rig
+
+
+@pytest.fixture
+def run(rig: Rig, small: Path, tmp_path: Path) -> Path:
+    assert rig("scan", small, "--maps", 2, "--record", "--out", tmp_path / "run").code == 0
+    return tmp_path / "run"
+
+
+def test_a_recorded_scan_is_intact_until_it_is_damaged_and_whole_once_repaired(rig: Rig, run: Path) -> None:
+    found = json.loads(rig("verify", run, "--json").out)
+    assert (found["verdict"], found["problems"], found["run"]) == ("intact", [], "complete")
+    summary = json.loads((run / "summary.json").read_text())
+    assert found["frames"] >= summary["frames"]["received"]
+
+    segment = run / "frames-000000.spb"
+    data = bytearray(segment.read_bytes())
+    data[len(data) // 2] ^= 8
+    segment.write_bytes(data)
+    ran = rig("verify", run)
+    assert ran.code == 1
+    assert "frames-000000.spb, bytes " in ran.err
+    assert "damaged: " in ran.out
+
+    ran = rig("repair", run)
+    assert ran.code == 1  # there is a gap now
+    assert "gaps: " in ran.out
+    assert json.loads(rig("verify", run, "--json").out)["verdict"] == "gaps"
+    assert json.loads(rig("repair", run, "--json").out)["done"] == []
+
+
+def test_parts_and_compressed_recordings_are_recordings(rig: Rig, run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("zstandard", reason="pip install 'spadrig[compress]'")
+    assert rig("compress", run).code == 0
+    assert rig("cut", run, "--maps", "1", "--out", tmp_path / "part").code == 0
+    for folder, maps in ((run, 2), (tmp_path / "part", 1)):
+        told = json.loads(rig("info", folder, "--json").out)
+        assert (told["maps"], told["verdict"], told["problems"]) == (maps, "complete", [])
+        assert rig("verify", folder).code == 0
+    assert "start 0: frames " in rig("info", tmp_path / "part").out
+
+
+@pytest.mark.parametrize("estimator", ["argmax", "likelihood"])
+def test_the_maps_of_a_part_come_out_as_in_the_whole(rig: Rig, tmp_path: Path, estimator: str) -> None:
+    content = config()
+    content["scan"] |= {"bidirectional": True}
+    content["scanner"]["clock_error"] = "300 ppm"
+    small = write_rig(tmp_path / "rig", content)
+    whole, part, again = tmp_path / "whole", tmp_path / "part", tmp_path / "again"
+    assert rig("scan", small, "--maps", 4, "--estimator", estimator, "--record", "--out", whole).code == 0
+    assert rig("cut", whole, "--maps", "1:3", "--out", part).code == 0
+    assert rig("reconstruct", part, "--out", again).code == 0
+    for made, was in ((0, 1), (1, 2)):
+        for name in ("depth/{:06d}.npy", "stripe/{:06d}.npz"):
+            assert (again / name.format(made)).read_bytes() == (whole / name.format(was)).read_bytes()
+
+
+def test_mistakes_are_one_line(rig: Rig, run: Path, tmp_path: Path) -> None:
+    for arguments in (
+        ("verify", tmp_path),
+        ("repair", tmp_path / "nowhere"),
+        ("info", tmp_path),
+        ("cut", run, "--out", tmp_path / "part"),
+        ("cut", run, "--maps", "7", "--out", tmp_path / "part"),
+    ):
+        ran = rig(*arguments)
+        assert (ran.code, len(ran.problems), ran.err.count("\n")) == (2, 1, 1)

@@ -1,0 +1,151 @@
+"""`rig replay`: a recording gives the same depth, to the last bit, at every clock, thread count and block size."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rig.scanning
+from rig import api
+from rig.acquisition import Acquisition
+from rig.errors import DamagedRecordingError, UsageError
+from rig.recording.manifest import read_manifest, sealed_text
+from tests.system.conftest import Rig
+from tests.system.small_rig import config, write_rig
+
+
+def scan_of(folder: Path, estimator: str, maps: int, **spad: object) -> Path:
+    """A run of the small rig with its recording."""
+    content = config()
+    content["estimate"]["estimator"] = estimator
+    content["spad"].update(spad)
+    api.scan(write_rig(folder / "rig", content), maps=maps, seed=5, out=folder / "run", record=True)
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Maps that depend on those before them."""
+    return scan_of(tmp_path_factory.mktemp("learned"), "likelihood", 3)
+
+
+@pytest.fixture(scope="module")
+def lossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Maps with gaps, from two starts of the SPAD."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rig.scanning, "Acquisition", lambda *a, **k: Acquisition(*a, **{**k, "first_alone": True}))
+        return scan_of(tmp_path_factory.mktemp("lossy"), "argmax", 3, loss_probability=0.01)
+
+
+def arrays(run: Path) -> dict[str, bytes]:
+    """Every number of every map."""
+    found = {}
+    for kind in ("depth", "stripe", "learned", "truth"):
+        for file in sorted((run / kind).glob("*.np[yz]")):
+            loaded = np.load(file)
+            parts = {"": loaded} if file.suffix == ".npy" else dict(loaded)
+            found |= {f"{kind}/{file.stem}/{name}": part.tobytes() for name, part in parts.items()}
+    assert found
+    return found
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"clock": "realtime"},
+        {"clock": "x0.25", "threads": 1, "block_frames": 13},
+        {"clock": "max", "threads": 3, "block_frames": 1000},
+    ],
+    ids=str,
+)
+def test_the_maps_are_those_of_the_scan_to_the_last_bit(learned: Path, tmp_path: Path, options: dict) -> None:
+    api.replay(learned, out=tmp_path / "again", **options)
+    assert arrays(tmp_path / "again") == arrays(learned)
+
+
+@pytest.mark.parametrize("block_frames", [None, 5])
+def test_gaps_and_starts_are_those_of_the_scan(lossy: Path, tmp_path: Path, block_frames: int | None) -> None:
+    result = api.replay(lossy, clock="max", block_frames=block_frames, out=tmp_path / "again", record=True)
+    before, after = read_manifest(lossy), read_manifest(tmp_path / "again")
+    assert before is not None
+    assert after is not None
+    assert [start["sweeps"] for start in before["recording"]["starts"]] == [1, 2]
+    assert after["gaps"] == before["gaps"] != []
+    assert after["sweeps"] == before["sweeps"]
+    assert result.summary.verdict.value == "gaps"
+    assert arrays(tmp_path / "again") == arrays(lossy)
+    api.replay(tmp_path / "again", clock="max", out=tmp_path / "third")  # a replay that was recorded is a recording
+    assert arrays(tmp_path / "third") == arrays(lossy)
+
+
+def test_fewer_maps_are_the_first_ones_and_more_need_a_loop(lossy: Path, tmp_path: Path) -> None:
+    api.replay(lossy, clock="max", maps=2, out=tmp_path / "two")
+    two = arrays(tmp_path / "two")
+    assert two.items() < arrays(lossy).items()
+    with pytest.raises(UsageError, match=r"--maps is 4, .* holds 3; .*--loop"):
+        api.replay(lossy, clock="max", maps=4)
+    api.replay(lossy, clock="max", loop=True, maps=5, out=tmp_path / "five")
+    first = {name: data for name, data in arrays(tmp_path / "five").items() if "/00000" in name}
+    assert first["depth/000003/"] == first["depth/000000/"]
+    assert first["depth/000004/"] == first["depth/000001/"]
+
+
+def test_another_estimator_can_be_tried_on_the_same_frames(learned: Path) -> None:
+    result = api.replay(learned, clock="max", estimator="argmax", filter="median")
+    assert (result.summary.estimator, result.summary.filter) == ("argmax", "median")
+    assert result.summary.maps == 3
+    assert result.summary.truth is not None
+
+
+def test_a_recording_that_was_killed_gives_its_whole_maps(learned: Path, tmp_path: Path) -> None:
+    run = tmp_path / "torn"
+    shutil.copytree(learned, run)
+    manifest = read_manifest(run)
+    assert manifest is not None
+    bare = {key: value for key, value in manifest.items() if key not in ("sweeps", "gaps", "counters")}
+    (run / "manifest.json").write_text(sealed_text(json.dumps({**bare, "verdict": "recording"})))
+    (segment,) = run.glob("frames-*.spb")
+    os.truncate(segment, segment.stat().st_size * 3 // 4)
+    result = api.replay(run, clock="max", out=tmp_path / "again")
+    assert result.summary.maps == 2
+    assert arrays(tmp_path / "again").items() < arrays(learned).items()
+
+
+def test_a_missing_start_is_not_closed_up(lossy: Path, tmp_path: Path) -> None:
+    run = tmp_path / "holed"
+    shutil.copytree(lossy, run)
+    (run / "frames-000000.spb").unlink()
+    with pytest.raises(DamagedRecordingError, match="not the first"):
+        api.replay(run, clock="max")
+
+
+def test_the_command_plays_and_reports_how_the_clock_was_held(learned: Path, rig: Rig) -> None:
+    ran = rig("replay", learned, "--clock", "x2", "--maps", 2, "--json", "--out", "again")
+    assert ran.code == 0, ran.err
+    summary = json.loads(ran.out)
+    assert summary["maps"] == 2
+    assert summary["replay"]["blocks"] > 0
+    assert summary["replay"]["late_max_s"] >= summary["replay"]["late_mean_s"] >= 0
+    assert json.loads(Path("again/manifest.json").read_text())["command"] == "replay"
+
+
+def test_a_wrong_clock_and_a_wrong_folder_are_the_users(learned: Path, rig: Rig, tmp_path: Path) -> None:
+    ran = rig("replay", learned, "--clock", "fast")
+    assert ran.code == 2
+    assert "realtime, max, step" in ran.problems[0]
+    for folder in (tmp_path, tmp_path / "none", tmp_path / "work"):
+        assert rig("replay", folder).code == 2
+    assert not list(Path().iterdir())
+
+
+def test_enter_lets_one_sweep_pass(lossy: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", "from rig.cli import main; main()", "replay", str(lossy), "--clock", "step"]
+    out = ["--out", str(tmp_path / "again"), "--json"]
+    ran = subprocess.run([*command, *out], input=b"\n\n", capture_output=True, timeout=120, check=False)
+    assert ran.returncode == 1, ran.stderr  # gaps
+    assert json.loads(ran.stdout)["maps"] == 3

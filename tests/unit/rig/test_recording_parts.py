@@ -1,0 +1,208 @@
+"""`cut`, `info`, maps of a recording, and compression: parts and compressed recordings give the very frames."""
+
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.frames import FrameBlock
+from drivers.recorded import INDEX_FILE, RunRecording
+from rig.errors import DamagedRecordingError, UsageError
+from rig.recording.compress import compress
+from rig.recording.cut import cut
+from rig.recording.info import info
+from rig.recording.manifest import read_manifest
+from rig.recording.maps import MapSpan, map_spans
+from rig.recording.repair import repair
+from rig.recording.verify import Integrity, verify
+from tests.unit.rig.recorded import MAPS, read, record, run_blocks, same
+from tests.unit.rig.streams import plan_of, scan, stream_of
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[list[FrameBlock]]:
+    return [run_blocks(run_id=1), run_blocks(lost=range(140, 145), run_id=2, seed=1)]
+
+
+def true_spans() -> list[MapSpan]:
+    begins = stream_of(plan_of(scan()), MAPS).scan_frames.tolist()
+    return [MapSpan(run, begins[i], begins[i + 1]) for run in (0, 1) for i in range(MAPS)]
+
+
+def sweeps() -> list[dict[str, float]]:
+    return [
+        {
+            "first_frame": span.first_frame,
+            "end_frame": span.end_frame,
+            "clock_error": (i + 1) * 1e-5,
+            "residual_columns": 0.01,
+        }
+        for i, span in enumerate(true_spans())
+    ]
+
+
+def frames_in(recording: RunRecording, run: int, first: int, end: int) -> tuple[list[int], bytes]:
+    blocks = list(recording.blocks(recording.runs[run], first, end))
+    numbers = np.concatenate([block.frame_numbers for block in blocks]).tolist()
+    return numbers, b"".join(block.bits.tobytes() + block.start_ticks.tobytes() for block in blocks)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_maps_are_found_by_manifest_and_by_markers(tmp_path: Path, runs: list[list[FrameBlock]], stated: bool) -> None:
+    folder = record(tmp_path, runs, **({"sweeps": sweeps()} if stated else {}))
+    assert map_spans(RunRecording(folder), read_manifest(folder)) == true_spans()
+
+
+def test_info_tells_what_there_is(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    found = info(record(tmp_path, runs, config={"name": "small"}, devices={"spad": {"name": "SPAD 7"}}))
+    assert (found.maps, found.config, found.devices) == (2 * MAPS, "small", {"spad": "SPAD 7"})
+    assert [(run.run_id, run.first_map, run.end_map, run.gaps) for run in found.runs] == [(1, 0, 3, 0), (2, 3, 6, 1)]
+    assert found.runs[0].duration_s == pytest.approx(found.runs[0].frames * 1e-5)
+    assert found.as_json()["folder"] == str(tmp_path)
+
+
+def test_maps_are_cut_out_with_their_closing_marker(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    folder = record(tmp_path / "run", runs, sweeps=sweeps(), maps=6, inputs={"plan.yaml": 0})
+    (folder / "plan.yaml").write_bytes(b"")
+    (folder / "learned").mkdir()
+    for i in range(6):
+        (folder / "learned" / f"{i:06d}.npz").write_bytes(bytes([i]))
+    manifest = cut(folder, tmp_path / "part", maps="2:5")
+    spans = true_spans()
+    whole, part = RunRecording(folder), RunRecording(tmp_path / "part")
+    for run, first, end in (
+        (0, spans[2].first_frame, spans[2].end_frame + 1),
+        (1, spans[3].first_frame, spans[4].end_frame + 1),
+    ):
+        assert frames_in(part, run, 0, 10_000) == frames_in(whole, run, first, end)
+    assert manifest["cut"]["maps"] == [2, 5]
+    assert manifest["cut"]["clock_ratios"] == [1 + 2e-5, 1.0]
+    assert manifest["gaps"] == [[140, 144]]
+    assert map_spans(part, manifest) == map_spans(part, None) == spans[2:5]
+    assert [(tmp_path / "part/learned" / f"{i:06d}.npz").read_bytes() for i in range(3)] == [b"\2", b"\3", b"\4"]
+    assert verify(tmp_path / "part").verdict is Integrity.GAPS
+    again = cut(tmp_path / "part", tmp_path / "again", maps="1")
+    assert again["cut"]["maps"] == [3, 4]
+    assert (tmp_path / "again/learned/000000.npz").read_bytes() == b"\3"
+    assert verify(tmp_path / "again").verdict is Integrity.INTACT
+
+
+@pytest.mark.parametrize(
+    ("asked", "first", "end"),
+    [
+        ({"frames": "37:150"}, 37, 150),
+        ({"frames": ":20"}, 0, 20),
+        ({"frames": "50"}, 50, 51),
+        ({"time": "0.0002:0.00101"}, 20, 101),
+        ({"time": "0.0025:"}, 250, 10_000),
+    ],
+)
+def test_frames_and_times_are_cut_out(
+    tmp_path: Path, runs: list[list[FrameBlock]], asked: dict[str, str], first: int, end: int
+) -> None:
+    folder = record(tmp_path / "run", runs)
+    cut(folder, tmp_path / "part", run=1, **asked)
+    part = RunRecording(tmp_path / "part")
+    assert frames_in(part, 0, 0, 10_000) == frames_in(RunRecording(folder), 1, first, end)
+    assert not verify(tmp_path / "part").problems
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({}, "0 were given"),
+        ({"maps": "0", "time": "0:1"}, "2 were given"),
+        ({"maps": "4:9"}, "it has 6"),
+        ({"maps": "x"}, "no range"),
+        ({"frames": "900:"}, "holds no frame"),
+        ({"frames": "1", "run": 2}, "it has 2"),
+        ({"time": "1:2:3"}, "no range"),
+    ],
+)
+def test_what_is_not_there_is_not_cut(
+    tmp_path: Path, runs: list[list[FrameBlock]], asked: dict[str, object], words: str
+) -> None:
+    folder = record(tmp_path / "run", runs)
+    with pytest.raises(UsageError, match=words):
+        cut(folder, tmp_path / "part", **asked)  # type: ignore[arg-type]
+    assert not (tmp_path / "part").exists()
+
+
+def test_a_damaged_recording_is_not_cut(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    folder = record(tmp_path / "run", runs)
+    data = bytearray((folder / "frames-000000.spb").read_bytes())
+    data[500] ^= 1
+    (folder / "frames-000000.spb").write_bytes(data)
+    with pytest.raises(DamagedRecordingError, match="repair"):
+        cut(folder, tmp_path / "part", maps="0:2")
+    assert not (tmp_path / "part").exists()
+
+
+class TestCompressed:
+    @pytest.fixture(autouse=True)
+    def _zstandard(self) -> None:
+        pytest.importorskip("zstandard", reason="pip install 'spadrig[compress]'")
+
+    def test_every_frame_is_read_by_the_same_index(self, tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+        folder = record(tmp_path, runs)
+        index = (folder / INDEX_FILE).read_bytes()
+        plain = sum(file.stat().st_size for file in folder.glob("frames-*.spb"))
+        made = compress(folder)
+        assert (made.bytes_before, list(folder.glob("frames-*.spb"))) == (plain, [])
+        assert made.bytes_after < plain
+        recording = RunRecording(folder)
+        assert recording.problems == []
+        for found, written in zip(read(recording), runs, strict=True):
+            assert all(same(a, b) for a, b in zip(found, written, strict=True))
+        assert frames_in(recording, 1, 30, 50)[0] == list(range(30, 50))
+        assert (folder / INDEX_FILE).read_bytes() == index
+        assert verify(folder).verdict is Integrity.GAPS
+        assert repair(folder).done == []
+        assert compress(folder).bytes_before == plain
+
+    def test_any_zstd_gives_the_plain_segment_back(self, tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+        import zstandard
+
+        folder = record(tmp_path, runs)
+        plain = (folder / "frames-000000.spb").read_bytes()
+        compress(folder)
+        packed = folder / "frames-000000.spb.zst"
+        with packed.open("rb") as file:
+            assert zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True).read() == plain
+        with suppress(FileNotFoundError):  # not installed everywhere
+            assert subprocess.run(["zstd", "-dc", packed], capture_output=True, check=True).stdout == plain
+
+    @pytest.mark.parametrize("what", ["table", "frame"])
+    def test_damage_costs_what_it_hit(self, tmp_path: Path, runs: list[list[FrameBlock]], what: str) -> None:
+        folder = record(tmp_path, runs)
+        compress(folder)
+        file = folder / "frames-000000.spb.zst"
+        data = bytearray(file.read_bytes())
+        data[-2 if what == "table" else 40] ^= 1
+        file.write_bytes(data)
+        found = read(RunRecording(folder))
+        lost = 0 if what == "table" else 1
+        assert all(same(a, b) for a, b in zip(found[0], runs[0][lost:], strict=True))
+        assert verify(folder).verdict is (Integrity.GAPS if what == "table" else Integrity.DAMAGED)
+
+    def test_a_recording_that_is_not_whole_is_not_compressed(
+        self, tmp_path: Path, runs: list[list[FrameBlock]]
+    ) -> None:
+        folder = record(tmp_path, runs, verdict="recording")
+        with pytest.raises(DamagedRecordingError, match="not over"):
+            compress(folder)
+        (folder / INDEX_FILE).unlink()
+        with pytest.raises(DamagedRecordingError, match="repair"):
+            compress(folder)
+        assert list(folder.glob("*.zst")) == []
+
+
+def test_without_the_package_the_command_to_install_it_is_told(
+    tmp_path: Path, runs: list[list[FrameBlock]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    with pytest.raises(UsageError, match=r"pip install 'spadrig\[compress\]'"):
+        compress(record(tmp_path, runs))
