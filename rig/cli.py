@@ -314,30 +314,25 @@ def bench_command(
 
     if disk is not None:
         return _bench_disk(disk, as_json)
-    with progress("rows") as bar:
-        report = api.bench(threads=threads, progress=bar)
-    content = report.as_json()
-    code = 0
-    if not as_json:
-        from rig.bench.table import speed_table
-
-        speed_table(report)
-    if soak is not None:
+    stream = None
+    if soak is not None:  # before all that takes a minute: what it is asked for may be wrong
         with progress("frames") as bar:
-            found = api.soak(
+            stream = api.soak(
                 soak, threads=threads, window=window, slow_consumer_s=slow_consumer / 1e3, on_overload=on_overload,
                 progress=bar,
             )  # fmt: skip
-        content["soak"] = found.as_json()
-        if not as_json:
-            from rig.bench.table import soak_table
-
-            print()
-            soak_table(found)
-        code = found.exit_code
+    with progress("rows") as bar:
+        report = api.bench(threads=threads, progress=bar)
     if as_json:
-        print_json(content)
-    return code
+        print_json(report.as_json() | ({} if stream is None else {"soak": stream.as_json()}))
+    else:
+        from rig.bench.table import soak_table, speed_table
+
+        speed_table(report)
+        if stream is not None:
+            print()
+            soak_table(stream)
+    return 0 if stream is None else stream.exit_code
 
 
 def _bench_disk(folder: Path, as_json: bool) -> int:

@@ -79,7 +79,7 @@ def test_all_problems_are_listed_at_once_in_the_order_of_the_file(write):
     )
     assert problems(path) == [
         'rig.yaml:5: laser.max_power: 50 has no unit; write the power with a unit, like "50 mW"',
-        "rig.yaml:6: sync: unknown kind 'simulate'; choose one of: prawndo, simulated",
+        "rig.yaml:6: sync: unknown kind 'simulate'; choose one of: prawndo, replay, simulated",
         "rig.yaml:8: unknown key 'scan.colums'; did you mean 'columns'?",
         "rig.yaml:9: scan.exposures is -3, it must be at least 1; write for example 'exposures: 10'",
         'rig.yaml:10: scan.frame_rate: 97700 has no unit; write the frequency with a unit, like "100 kHz"',
@@ -100,7 +100,7 @@ def test_all_problems_are_listed_at_once_in_the_order_of_the_file(write):
         (("exposures: 4", "exposure: 20 m"), "scan.exposure: '20 m': 'm' is no unit of time"),
         (("  frame_rate: 97.7 kHz\n", ""), "'scan.frame_rate' is missing; write for example 'frame_rate: 100 kHz'"),
         (("name: test", "estimate: {estimator: likelyhood}\nname: t"), "did you mean 'likelihood'?"),
-        (("sync: {kind: simulated}", "sync: {}"), "sync has no 'kind'; add one of: prawndo, simulated"),
+        (("sync: {kind: simulated}", "sync: {}"), "sync has no 'kind'; add one of: prawndo, replay, simulated"),
         (("sync: {kind: simulated}", "sync: 3"), "sync is 3; it must be a mapping that names a kind"),
         (
             ("sync: {kind: simulated}", "sync: {kind: simulated, port: 1}"),
