@@ -194,7 +194,7 @@ class Acquisition:
         rig.sync.program(*plan.sync_program(sweeps))
         pipeline = Pipeline(
             rig.spad,
-            ring_for(self._policy, rig.spad.info, plan, self._timing),
+            ring_for(self._policy, rig.spad.info, plan, self._timing, keeps_time=self._groups is not None),
             assembler,
             sweeps,
             self._maker,

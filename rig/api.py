@@ -243,6 +243,7 @@ def replay(
     loop: bool = False,
     maps: int | None = None,
     config: Config | None = None,
+    against_recording: bool = False,
     calibration: PathLike | None = None,
     estimator: Estimator | None = None,
     filter: Filter | None = None,
@@ -263,21 +264,22 @@ def replay(
 
     run: folder of a run taken with `record`. clock: 'realtime', 'max', 'x4' or 'x0.1', 'step'. loop: again and again,
     until `maps` are made or for ever. config: a rig whose scanner, laser and sync source take part; None: they are
-    recorded too. calibration: a file made since; None: the recording's own. estimator, filter, min_confidence, threads:
-    as the recording says where None. block_frames: most frames of a block. steps: called before the start, with what
-    takes `step()` and `run_on()` from any thread where clock is 'step'. All else as `scan`. Raises UsageError where
-    there is no recording.
+    recorded too. against_recording: the recording's own drivers take part, against what their devices answered then.
+    calibration: a file made since; None: the recording's own. estimator, filter, min_confidence, threads: as the
+    recording says where None. block_frames: most frames of a block. steps: called before the start, with what takes
+    `step()` and `run_on()` from any thread where clock is 'step'. All else as `scan`. Raises UsageError where there is
+    no recording, DivergedError where drivers said other than recorded or more than 2 ms from their times.
     """
-    from rig.replaying import ReplayOptions, pace_of, replay_config
+    from rig.replay_run import play
+    from rig.replaying import ReplayOptions, replay_config
     from rig.run import Run
-    from rig.scanning import ScanOptions, require_simulated_or_armed, run_scan
-    from rig.session import open_rig
+    from rig.scanning import ScanOptions, require_simulated_or_armed
     from rig.summary import MapTally
 
     played = ReplayOptions(clock, loop, block_frames)
     others = None if config is None else configure(config)
     estimate = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence, "threads": threads}
-    settings = replay_config(Path(run), played, others, estimate)
+    settings = replay_config(Path(run), played, others, estimate, against_recording=against_recording)
     if calibration is not None:
         settings = settings.model_copy(update={"calibration": Path(calibration)})
     problems = require_simulated_or_armed(settings, arm)
@@ -295,10 +297,8 @@ def replay(
     tally = MapTally(
         settings.scan.columns, settings.scan.exposures, settings.estimate.estimator, settings.estimate.filter
     )
-    with Run(out, tally, policy, record=record) as writer, open_rig(settings) as rig:
-        if steps is not None:
-            steps(pace_of(rig.spad))
-        return run_scan(rig, writer, maps, 0, options)
+    with Run(out, tally, policy, record=record) as writer:
+        return play(settings, Path(run), writer, maps, options, steps)
 
 
 def verify(run: PathLike) -> "Verification":

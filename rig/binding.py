@@ -22,14 +22,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import ProtocolError
 from drivers.frames import FRAME_RECORD, SUBFRAME_MASK, SUBFRAME_SHIFT, BlockHeader, FrameBlock, Mark
 from rig.blanking import MAX_CLOCK_ERROR
 from rig.blanking_sync import BlankingSync
-from rig.counting import BYTE_EXPOSURES, BYTE_FRAMES
+from rig.counting import BIN_UNUSABLE, BYTE_EXPOSURES, BYTE_FRAMES
 from rig.scan_plan import ScanPlan
 
 MAX_RESIDUAL_COLUMNS = 0.05
 """A sweep whose markers stray further from one straight line of time than this is not synchronised."""
+MOST_OUT_OF_TURN = 1000
+"""Frames of a sweep that may name one which cannot have begun; more are no flipped bits but a wrong line or link."""
+Places = tuple[NDArray[np.int32], NDArray[np.int8], NDArray[np.float64], NDArray[np.int32]]
+"""Sweep, direction, column and bin of each frame."""
 UNITS_PER_TICK = 2 * (SUBFRAME_MASK + 1)
 """Times are kept as whole numbers of this part of a tick, in which markers and exposure middles are exact: a frame's
 column is then the same to the last bit in whatever block it comes. Good for 200 days at 1 GHz."""
@@ -135,6 +140,7 @@ class FrameBinder:
         self._t0: int | None = None
         self._first_frame = 0
         self._next_frame = 0
+        self._passed_over = 0
         self._carried = np.zeros(1, CARRIED)
         self._carried["sweep"] = self._carried["anchor_point"] = self._carried["column"] = -1
         self._edges = np.empty((2, 2 * len(plan.marker_points) + 2), np.int64)
@@ -161,12 +167,59 @@ class FrameBinder:
             at = self._walk(records, at, terms, self._terms, self._carried, self._edges, *places)
             if at == n:
                 break
+            if self._light is None and self._out_of_turn(at, records, terms):
+                self._pass_over(at, places, header)
+                at += 1
+                continue
             if at:
                 starts.append(at)
             begin = self._begin if self._light is None else self._begin_in_light
             closed += begin(at, records[at], terms, header)
         self._next_frame = header.first_frame + n * header.frame_step
         return BoundFrames(*places, tuple(starts)), closed
+
+    def compile(self) -> None:
+        """Compile the walk, by placing no frames."""
+        none = np.empty(0, np.int32), np.empty(0, np.int8), np.empty(0, np.float64), np.empty(0, np.int32)
+        terms = BlockTerms(0, 0, 1, 1, 1.0)
+        self._walk(self._records[:0], 0, terms, self._terms, self._carried, self._edges, *none)
+
+    def _out_of_turn(self, at: int, records: NDArray[np.void], terms: BlockTerms) -> bool:
+        """Whether frame `at` names a sweep that cannot have begun, as one flipped bit does.
+
+        Its own scan marker makes it the next sweep; else the frame behind must say the same, and where sweeps are left
+        out, or no frame is behind, so must the time since the latest marker.
+        """
+        now = self._carried[0]
+        running, number = int(now["sweep"]), _markers_seen(records[at], terms) - 1
+        received = bool(records[at]["marks"] & Mark.SCAN)
+        if running >= 0 and received and number == running + 1:
+            return False
+        if at + 1 < len(records):
+            behind = _markers_seen(records[at + 1], terms) - 1
+            if behind != number and not (behind == number + 1 and records[at + 1]["marks"] & Mark.SCAN):
+                return True
+            if running < 0 or number == running + 1:
+                return False
+        elif running < 0:
+            return at > 0 and not received
+        if now["anchor_point"] < 0:
+            return False
+        start = (int(records[at]["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
+        gone = (start - int(now["anchor_time"])) * terms.points_per_unit
+        spare = 2 * terms.period_ticks * UNITS_PER_TICK * terms.points_per_unit + MAX_CLOCK_ERROR * abs(gone)
+        return bool(gone + spare < number * self._plan.sweep_points - int(now["anchor_point"]))
+
+    def _pass_over(self, at: int, places: Places, header: BlockHeader) -> None:
+        """Leave out a frame that names a wrong sweep. Raises ProtocolError where that is no accident any more."""
+        self._passed_over += 1
+        if self._passed_over > MOST_OUT_OF_TURN:
+            raise ProtocolError(
+                f"frame {header.first_frame + at} and {MOST_OUT_OF_TURN} before it name sweeps that cannot have begun "
+                f"behind sweep {int(self._carried['sweep'][0])}; check the scan marker's line and the SPAD's link"
+            )
+        sweep, direction, column, bins = places
+        sweep[at], direction[at], column[at], bins[at] = int(self._carried["sweep"][0]), 0, np.nan, BIN_UNUSABLE
 
     def _make_room(self, n: int) -> None:
         """For n more frames, should there be a marker in each of them."""
@@ -196,7 +249,7 @@ class FrameBinder:
             # Where the first marker got lost, all frames that did with it may be of this sweep.
             lost_with_it = not received and at == 0
             self._first_frame = min(self._next_frame, header.first_frame) if lost_with_it else header.first_frame + at
-        elif received and number == running + 1:
+        elif received and number == running + 1 and not record["marks"] & Mark.GATE_EDGE:
             position = (int(record["marks"]) >> SUBFRAME_SHIFT) & SUBFRAME_MASK
             edge = number * self._plan.sweep_points, start + (2 * position + 1) * terms.period_ticks
             self._edges[:, now["edges"]] = edge
@@ -206,6 +259,7 @@ class FrameBinder:
             end = header.first_frame + at if exact else self._boundary_frame(missed + 1, at, header, start)
             closed.append(self._close(missed, end, header.tick_hz))
         now["sweep"], now["edges"], now["column"] = number, 0, -1
+        self._passed_over = 0
         return closed
 
     def _begin_in_light(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:

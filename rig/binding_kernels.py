@@ -90,7 +90,8 @@ def walk(
         if number > now.sweep:
             return i
         sweep[i], direction[i], column[i], bins[i] = number, 0, np.nan, BIN_UNUSABLE
-        if number < 0:
+        # Sweeps never go back: such a number is damaged, and so may be the marker beside it.
+        if number < 0 or number < now.sweep:
             continue
         start = (np.int64(record.ticks) + block.start_ticks) * UNITS_PER_TICK
         point = _marker_point(marks, np.int64(record.line), number, plan)

@@ -49,6 +49,10 @@ def replay_command(
             show_default="they are recorded too",
         ),
     ] = None,
+    against_recording: Annotated[
+        bool,
+        typer.Option("--against-recording", help="the recorded drivers take part, against what was answered then"),
+    ] = False,
     estimator: EstimatorOption = None,
     filter: FilterOption = None,
     min_confidence: ConfidenceOption = None,
@@ -82,6 +86,7 @@ def replay_command(
             loop=loop,
             maps=maps,
             config=config,
+            against_recording=against_recording,
             threads=threads,
             block_frames=block_frames,
             save=save or ("last" if loop else "all"),
@@ -93,6 +98,8 @@ def replay_command(
             steps=_step_by_keys if clock == "step" else None,
             **options,
         )
+    if result.control is not None:
+        say(f"control: {result.control}")
     return report(result, as_json)
 
 

@@ -10,9 +10,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.geometry import WORD_PX
 from rig.row_threads import RowWorkers
 
-MOST_WIDTH_PX = 64 * 256
+MOST_WIDTH_PX = WORD_PX * 256
 """A row's words must fit one chunk of the counters."""
 BIN_DARK = -1
 """Bin of a frame with the gate low during the whole exposure."""
@@ -49,18 +50,18 @@ class SweepLayout:
         """Raises ValueError for windows that are not on whole words, and for rows too wide."""
         if self.padded_width > MOST_WIDTH_PX:
             raise ValueError(f"rows of {self.width} pixels; counters take {MOST_WIDTH_PX} at most")
-        if self.window % 64 or np.any(self.x0 % 64):
-            raise ValueError(f"window {self.window} and its starts must be multiples of 64 pixels")
+        if self.window % WORD_PX or np.any(self.x0 % WORD_PX):
+            raise ValueError(f"window {self.window} and its starts must be multiples of {WORD_PX} pixels")
 
     @property
     def padded_width(self) -> int:
         """Pixels of a row as it lies in memory."""
-        return -(-self.width // 64) * 64
+        return -(-self.width // WORD_PX) * WORD_PX
 
     @property
     def used_words(self) -> int:
         """Words of each row that are used."""
-        return (self.padded_width if self.used_px is None else self.used_px) // 64
+        return (self.padded_width if self.used_px is None else self.used_px) // WORD_PX
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,11 +96,13 @@ class CountVolume(FrameTally):
     """Counts of one sweep.
 
     counts: (columns, rows, window) uint8, uint16 or uint32, 1s of each pixel over the frames of the column.
-    x0: (columns,) int32, first pixel of each column's window.
+    x0: (columns,) int32, first pixel of each column's window. exposures: frames nominally taken per column, None where
+    only the counts are known.
     """
 
     counts: Counts
     x0: NDArray[np.int32]
+    exposures: int | None = None
 
     def intensity(self) -> NDArray[np.uint32]:
         """Counts summed over the columns, (rows, width) uint32."""
@@ -170,7 +173,7 @@ class SweepTally:
         if len(dark):
             self._n_dark += len(dark)
             for word, frames in zip(*np.unique(dark, return_counts=True), strict=True):
-                self._dark_frames[64 * word : 64 * (word + self._layout.used_words)] += frames
+                self._dark_frames[WORD_PX * word : WORD_PX * (word + self._layout.used_words)] += frames
 
     def finish(self) -> FrameTally:
         """The tally so far."""
@@ -206,7 +209,7 @@ class SweepCounter:
         """Add frames, see `Counter`."""
         from rig.counting_kernels import add_runs
 
-        layout, first_word = self._layout, x0 // np.int32(64)
+        layout, first_word = self._layout, x0 // np.int32(WORD_PX)
         self._tally.note(bins, column, first_word)
         self._make_room()
         words, row_words = bits.reshape(-1).view(np.uint64), bits.shape[2] // 8
@@ -236,4 +239,5 @@ class SweepCounter:
         return CountVolume(
             counts=self._counts, x0=self._layout.x0, n_frames=tally.n_frames, column=tally.column,
             dark_counts=tally.dark_counts, n_dark=tally.n_dark, width=tally.width, dark_frames=tally.dark_frames,
+            exposures=self._layout.exposures,
         )  # fmt: skip

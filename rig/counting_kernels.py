@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.aligned import aligned_zeros
+from rig.geometry import WORD_PX
 from rig.lane_order import PAD, PAIRS, STEPS, new_counts, padded_lanes, read_planes, write_counts
 from rig.lanes import LANES, address_of
 
-WORD_PX: Final = 64
 WORD_BYTES: Final = 8
 CHUNK: Final = 256
 """Words of a frame that are counted together; their planes fill half of a 32 KiB cache."""

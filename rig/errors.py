@@ -45,5 +45,9 @@ class RecordingError(RigError):
     exit_code = 3
 
 
+class DivergedError(RigError):
+    """A driver said to its device other than in the recording that is played, or at another time."""
+
+
 class DamagedRecordingError(RigError):
     """What was recorded is not what is on the disk any more: nothing is to be made of it before 'rig repair'."""

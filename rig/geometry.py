@@ -6,6 +6,7 @@ the interval simply moves from row to row.
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from calibration.model import RigModel
 from rig.errors import UsageError
 
-WORD_PX = 64
+WORD_PX: Final = 64
 """Windows start and end at multiples of one 64-bit word, so that counting runs on whole words."""
 MARGIN_PX = 10
 """Pixels kept on both sides of the search interval: they still say where the haze ends."""

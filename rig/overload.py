@@ -42,9 +42,15 @@ def require_policy(policy: Overload, info: SpadInfo) -> None:
         )
 
 
-def ring_for(policy: Overload, info: SpadInfo, plan: ScanPlan, timing: SpadTiming) -> BlockRing:
-    """The ring between this SPAD and its readers, allocated and touched."""
-    slots = FEWEST_SLOTS if info.can_wait else min(max(RING_BYTES // timing.stride, FEWEST_SLOTS), MOST_SLOTS)
+def ring_for(
+    policy: Overload, info: SpadInfo, plan: ScanPlan, timing: SpadTiming, *, keeps_time: bool = False
+) -> BlockRing:
+    """The ring between this SPAD and its readers, allocated and touched.
+
+    keeps_time: the SPAD can wait, but should have no need to.
+    """
+    few = info.can_wait and not keeps_time
+    slots = FEWEST_SLOTS if few else min(max(RING_BYTES // timing.stride, FEWEST_SLOTS), MOST_SLOTS)
     waits = OnFull.WAIT if info.can_wait else OnFull.FAIL
     on_full = OnFull.DROP if policy is Overload.DROP else waits
     frames = slots * (timing.stride // plan.frame_bytes)

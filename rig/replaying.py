@@ -56,9 +56,17 @@ class ReplayOptions:
             raise UsageError(f"block_frames is {self.block_frames}; it must be at least 1")
 
 
-def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, estimate: dict[str, Any]) -> RigConfig:
+def replay_config(
+    run: Path,
+    options: ReplayOptions,
+    others: RigConfig | None,
+    estimate: dict[str, Any],
+    *,
+    against_recording: bool = False,
+) -> RigConfig:
     """The rig that plays a recording. others: whose world, scanner, laser and sync source take part; None: recorded.
 
+    against_recording: the recording's own drivers take part, against what their devices answered then.
     estimate: settings laid over those of the recording. UsageError where there is no recording.
     """
     if not run.is_dir():
@@ -89,6 +97,8 @@ def replay_config(run: Path, options: ReplayOptions, others: RigConfig | None, e
     }
     if others is not None:
         content |= {slot: part for slot, part in others.model_dump(mode="json").items() if slot in (*RECORDED, "world")}
+    elif against_recording:
+        content |= _own_drivers(run, recorded)
     return parse_config(content)
 
 
@@ -212,6 +222,18 @@ def _limited(planned: list[int], most: int) -> list[int]:
         taken.append(min(sweeps, most))
         most -= taken[-1]
     return [sweeps for sweeps in taken if sweeps]
+
+
+def _own_drivers(run: Path, recorded: dict[str, Any]) -> dict[str, Any]:
+    """The drivers of a recorded config, at ports where what was recorded answers. UsageError where there are none."""
+    parts = {slot: recorded.get(slot) or {} for slot in RECORDED}
+    parts = {slot: {**part, "port": f"emulated:{slot}"} for slot, part in parts.items() if "port" in part}
+    if not parts:
+        raise UsageError(f"{run} was taken with simulated devices only: there is no driver to play it against")
+    world = {"kind": "recorded", "recording": str(run.absolute())}
+    if "scanner" in parts:
+        world["scanner"] = parts["scanner"]["kind"]
+    return {"world": world, **parts}
 
 
 def _scan_of(plan: ScanPlan) -> dict[str, Any]:

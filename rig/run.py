@@ -13,6 +13,7 @@ from typing import Any, Self
 from drivers.interfaces import SweepTruth
 from drivers.replay_pace import PaceReport
 from drivers.transports.tap import CONTROL_FILE, TapFile
+from rig.control_check import ControlCheck
 from rig.errors import UsageError
 from rig.outputs import Rays, RunFolder
 from rig.reconstruction import MapResult
@@ -35,13 +36,15 @@ class RunResult:
     """What a run gives back.
 
     last: the last map, None where the run ended before its first. truth: that map's, where a world knows it.
-    folder: where everything was written, None where nothing was.
+    folder: where everything was written, None where nothing was. control: of a replay with drivers that took part, how
+    what they said compares with the recording.
     """
 
     summary: Summary
     last: MapResult | None
     truth: SweepTruth | None
     folder: Path | None
+    control: ControlCheck | None = None
 
 
 class Run:

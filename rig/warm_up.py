@@ -1,10 +1,7 @@
 """Compiles the kernels of an estimate before a run, so that its times are those of the work alone (`rig warmup`)."""
 
-from fractions import Fraction
-
 import numpy as np
 
-from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
 from rig.binding import FrameBinder
 from rig.counting import BIN_DARK, SweepLayout
 from rig.depth import depth_map
@@ -49,16 +46,9 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
 
 
 def warm_binding(plan: ScanPlan) -> None:
-    """Compile what binds frames to this plan's columns; of frames that carry markers."""
+    """Compile what binds frames to this plan's columns."""
     from rig.binding_kernels import cover
 
-    if plan.blanking is None:
-        header = BlockHeader(
-            flags=BlockFlag(0), run_id=0, block_seq=0, first_frame=0, t0_ticks=0, lost_before=0, tick_hz=Fraction(1),
-            frame_period_ticks=1, exposure_ticks=1, sweep=0, frame_step=1, width=plan.width, height=plan.rows,
-            sensor_width=plan.width, sensor_height=plan.rows,
-        )  # fmt: skip
-        bits = np.zeros((0, plan.rows, -(-plan.width // WORD_PX) * WORD_PX // 8), np.uint8)
-        FrameBinder(plan).bind(FrameBlock(header, np.zeros(0, FRAME_RECORD), bits))
+    FrameBinder(plan).compile()
     none = np.zeros(0, np.int32)
     cover(none, none, plan.width, np.array(plan.x0, np.int32), plan.window)

@@ -95,6 +95,10 @@ def _index_records(folder: Path, segments: dict[int, Segment], problems: list[st
     if not sound.all():
         problems.append(f"{INDEX_FILE}: {int((~sound).sum())} of {len(sound)} records are damaged")
     records = records[sound]
+    by_place = np.lexsort((records["offset"], records["segment"]))
+    if (np.diff(by_place) < 0).any():
+        problems.append(f"{INDEX_FILE}: its records are not in the order in which they were written")
+    records = records[by_place]
     order = list(dict.fromkeys(records["run_id"].tolist()))
     sizes = np.zeros(max(segments) + 2)
     sizes[list(segments)] = [segment.size for segment in segments.values()]
@@ -103,7 +107,7 @@ def _index_records(folder: Path, segments: dict[int, Segment], problems: list[st
     inside &= (records["offset"] % ALIGN == 0) & (records["length"] > 0) & (records["n_frames"] <= MOST_FRAMES)
     if not inside.all():
         problems.append(f"{INDEX_FILE}: {int((~inside).sum())} blocks lie beyond the end of their segments")
-    records = np.sort(records[inside], order=["segment", "offset"], kind="stable")
+    records = records[inside]
     end = records["offset"] + records["length"]
     apart = np.ones(len(records), bool)
     apart[1:] = (records["segment"][1:] != records["segment"][:-1]) | (records["offset"][1:] >= end[:-1])
@@ -113,16 +117,15 @@ def _index_records(folder: Path, segments: dict[int, Segment], problems: list[st
 
 
 def _fits(records: Entries, segment: Segment) -> bool:
-    """Whether the first and the last block are those the index tells of; damaged ones say nothing."""
-    return len(records) == 0 or all(_is_other(segment, entry) is not True for entry in (records[0], records[-1]))
+    """Whether the first and the last block that the index tells of in a segment are there."""
+    return len(records) == 0 or all(_is_there(segment, entry) for entry in (records[0], records[-1]))
 
 
-def _is_other(segment: Segment, entry: Any) -> bool | None:
-    """Whether a sound block at an entry's place is not the entry's; None where there is no sound one."""
+def _is_there(segment: Segment, entry: Any) -> bool:
     try:
-        return _block_at(segment, entry, check_payload=False) is None
+        return _block_at(segment, entry, check_payload=False) is not None
     except (CorruptBlock, UnsupportedBlock):
-        return None
+        return False
 
 
 def _block_at(segment: Segment, entry: Any, *, check_payload: bool) -> FrameBlock | None:

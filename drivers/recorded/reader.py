@@ -149,7 +149,9 @@ class RunRecording:
         for begin, stop in pairwise([*begins.tolist(), len(entries)]):
             mine = entries[begin:stop]
             header = self._first_header(mine)
-            if header is not None and mine["n_frames"].any():
+            if header is None:
+                self.problems.append(f"run {mine['run_id'][0]}: none of its {len(mine)} blocks is sound")
+            elif mine["n_frames"].any():
                 runs.append(RecordedRun(len(runs), header, mine))
         return runs
 

@@ -2,7 +2,7 @@
 
 from drivers.spb1.layout import ALIGN, HEADER_BYTES, TRAILER_BYTES, BlockLayout, block_views, frames_per_block
 from drivers.spb1.reader import parse_block
-from drivers.spb1.walk import Damage, Placed, walk_blocks, walk_placed, walk_places
+from drivers.spb1.walk import Damage, Placed, walk_blocks, walk_placed
 from drivers.spb1.writer import block_parts, seal_block
 
 __all__ = [
@@ -19,5 +19,4 @@ __all__ = [
     "seal_block",
     "walk_blocks",
     "walk_placed",
-    "walk_places",
 ]

@@ -32,25 +32,17 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
     counts. A block whose number does not rise within its run was sent or written twice: damage too. Control blocks
     are passed over. `UnsupportedBlock` where the stream is of another sort than this reader takes.
     """
-    for _, item in walk_places(buffer, stride, check_payload=check_payload):
-        yield item
-
-
-def walk_places(
-    buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool
-) -> Iterator[tuple[int, FrameBlock | Damage]]:
-    """As `walk_blocks`, each item behind the offset at which it begins."""
     last: FrameBlock | None = None
     for item in walk_placed(buffer, stride, check_payload=check_payload):
         if isinstance(item, Damage):
-            yield item.offset, item
+            yield item
         elif last is None or not _repeats(item.block, last):
             last = item.block
-            yield item.offset, item.block
+            yield item.block
         else:
             seq, run = item.block.header.block_seq, item.block.header.run_id
             reason = f"block {seq} of run {run} comes after block {last.header.block_seq}"
-            yield item.offset, Damage(item.offset, min(item.end, len(buffer)) - item.offset, reason)
+            yield Damage(item.offset, min(item.end, len(buffer)) - item.offset, reason)
 
 
 @dataclass(frozen=True, slots=True)

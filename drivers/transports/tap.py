@@ -8,6 +8,7 @@ each line is one write at its end. Ports of the SPAD are not tapped; its frames 
 import json
 import logging
 import os
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,8 +56,9 @@ class Tap:
     def __init__(self, file: TapFile, device: str) -> None:
         self._file = file
         self._device = device
+        self._lock = threading.Lock()
+        self._handle: int | None = None
         self._full = False
-        self._handle = os.open(file.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
 
     def note(self, port: str, direction: str, data: bytes) -> None:
         """A piece of bytes; of none nothing is noted."""
@@ -67,16 +69,23 @@ class Tap:
             f'{{"t_ns": {t_ns}, "device": "{self._device}", "port": "{port}", "dir": "{direction}", '
             f'"bytes": "{bytes(data).hex()}"}}\n'
         )
-        if not self._full:
+        with self._lock:
+            if self._full:
+                return
             try:
+                if self._handle is None:
+                    self._handle = os.open(
+                        self._file.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644
+                    )
                 os.write(self._handle, line.encode())
             except OSError as error:  # never a reason to let go of a device; the recording itself ends the run
                 self._full = True
                 _log.warning("%s ends here: %s", self._file.path, error.strerror or error)
 
     def __del__(self) -> None:
-        """The file is the last reader's to close: devices are closed in any order, and their threads after them."""
-        os.close(self._handle)
+        """Closed with the last who holds it: devices are closed in any order, and their threads after them."""
+        if self._handle is not None:
+            os.close(self._handle)
 
 
 @dataclass(frozen=True, slots=True)

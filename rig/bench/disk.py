@@ -5,6 +5,7 @@ that write and read a file past the page cache (O_DIRECT) and do nothing else, `
 replay do. CPU is that of the whole process, the system's part in it.
 """
 
+import errno
 import os
 import shutil
 import statistics
@@ -14,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -154,47 +155,67 @@ class _Plain:
 
     def write(self) -> None:
         """Write all, from the same memory as the recording, and sync."""
-        fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | self._flag)
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(fd, 0, self._size)
+        with _opened(self.path, os.O_WRONLY | os.O_CREAT | self._flag) as fd:
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(fd, 0, self._size)
 
-        def write(offset: int, size: int, thread: int) -> None:
-            at = offset % len(self._source)
-            os.pwritev(fd, [self._source[at : at + size]], offset)
+            def write(offset: int, size: int, thread: int) -> int:
+                at = offset % len(self._source)
+                return os.pwritev(fd, [self._source[at : at + size]], offset)
 
-        self._in_threads(write)
-        os.fsync(fd)
-        os.close(fd)
+            self._in_threads(write)
+            os.fsync(fd)
 
     def read(self) -> None:
         """Read all."""
-        fd = os.open(self.path, os.O_RDONLY | self._flag)
         memories = [Staging().take(PLAIN_BYTES) for _ in range(PLAIN_THREADS)]
-        self._in_threads(lambda offset, size, thread: os.preadv(fd, [memories[thread][:size]], offset))
-        os.close(fd)
+        with _opened(self.path, os.O_RDONLY | self._flag) as fd:
+            self._in_threads(lambda offset, size, thread: os.preadv(fd, [memories[thread][:size]], offset))
 
-    def _in_threads(self, work: Callable[[int, int, int], object]) -> None:
-        offsets = iter(range(0, self._size, PLAIN_BYTES))
+    def _in_threads(self, work: Callable[[int, int, int], int]) -> None:
+        """Call work(offset, size, thread), which returns the bytes done, for all of the file; OSError if too few."""
+        pieces = iter(self._pieces())
         lock = threading.Lock()
+        failures: list[BaseException] = []
 
         def run(thread: int) -> None:
-            while True:
-                with lock:
-                    offset = next(offsets, None)
-                if offset is None:
-                    return
-                # The source's memory ends on no multiple of what is written at a time.
-                room = len(self._source) - offset % len(self._source)
-                first = min(PLAIN_BYTES, self._size - offset, room)
-                work(offset, first, thread)
-                if first < min(PLAIN_BYTES, self._size - offset):
-                    work(offset + first, min(PLAIN_BYTES, self._size - offset) - first, thread)
+            try:
+                while not failures:
+                    with lock:
+                        piece = next(pieces, None)
+                    if piece is None:
+                        return
+                    if (done := work(*piece, thread)) != piece[1]:
+                        raise OSError(errno.EIO, f"{done} of {piece[1]} bytes done at {piece[0]}", str(self.path))
+            except BaseException as error:  # raised again on the caller's thread
+                failures.append(error)
 
         threads = [threading.Thread(target=run, args=(number,)) for number in range(PLAIN_THREADS)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
+        if failures:
+            raise failures[0]
+
+    def _pieces(self) -> Iterator[tuple[int, int]]:
+        """Offset and size of what is written or read at a time."""
+        for offset in range(0, self._size, PLAIN_BYTES):
+            size = min(PLAIN_BYTES, self._size - offset)
+            # The source's memory ends on no multiple of that.
+            first = min(size, len(self._source) - offset % len(self._source))
+            yield offset, first
+            if first < size:
+                yield offset + first, size - first
+
+
+@contextmanager
+def _opened(path: Path, flags: int) -> Iterator[int]:
+    fd = os.open(path, flags)
+    try:
+        yield fd
+    finally:
+        os.close(fd)
 
 
 def _read(folder: Path) -> None:
@@ -210,9 +231,8 @@ def _settle(folder: Path) -> None:
     if not hasattr(os, "posix_fadvise"):
         return
     for file in _files(folder):
-        fd = os.open(file, os.O_RDONLY)
-        os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
-        os.close(fd)
+        with _opened(file, os.O_RDONLY) as fd:
+            os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
 
 
 def _files(folder: Path) -> Iterator[Path]:

@@ -2,32 +2,30 @@
 
 A source thread copies blocks of 5 ms into the ring and publishes each when its last frame has been exposed, at
 100 kHz. The other thread takes them from the ring and judges them with the workers it was given; where a sweep ends it
-takes the result and makes a new counter, as a scan does. A frame's time is its block's minus the frames behind it: the
-wait for the block to fill is included, and so is that of a block's last column for the next block, whose first frame
-says that the column is complete. Binding frames to columns and making the map are not included.
+takes the result and clears the counter for the next, as a scan does. A frame's time is its block's minus the frames
+behind it: the wait for the block to fill is included, and so is that of a block's last column for the next block, whose
+first frame says that the column is complete. Binding frames to columns and making the map are not included.
 """
 
 import threading
 import time
 from dataclasses import dataclass
-from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
+from drivers.frames import FRAME_RECORD, FrameBlock
 from drivers.ring import BlockRing
-from rig.bench.frames import BLOCK_FRAMES, COLUMNS, ROWS, WIDTH, BenchFrames
+from rig.bench.frames import BLOCK_FRAMES, COLUMNS, BenchFrames
+from rig.bench.recorded import PERIOD_TICKS, TICK_HZ, header_of
 from rig.estimators.likelihood import Likelihood
 from rig.estimators.stream import ColumnJudge
 from rig.row_threads import RowWorkers
 
-FRAME_S = 1e-5
+FRAME_S = float(PERIOD_TICKS / TICK_HZ)
 SECONDS = 3.0
 SLOTS = 16
 """A ring of 80 ms, so that nothing is dropped where the host pauses; a pause is seen in the figures."""
-QUEUE_US = 1e4
-"""A median of more than ten blocks is that of a queue which grows."""
 SPIN_S = 2e-4
 """Before a block is due the source stops sleeping, which may take longer than asked for."""
 
@@ -45,7 +43,10 @@ class Latency:
 
     @property
     def kept_up(self) -> bool:
-        """Whether the estimate kept up with the stream, so that the figures are of it and not of a queue."""
+        """Whether the estimate kept up with the stream, so that the figures are of it and not of a queue.
+
+        A median of more than ten blocks is that of a queue which grows.
+        """
         return (
             self.late_max_us < 1e6 * SLOTS * BLOCK_FRAMES * FRAME_S and self.median < 1e6 * 10 * BLOCK_FRAMES * FRAME_S
         )
@@ -107,7 +108,7 @@ def _play(frames: BenchFrames, ring: BlockRing, published: NDArray[np.float64], 
             _wait_until(due)
             published[i] = time.perf_counter()
             late[i] = published[i] - due
-            ring.publish(FrameBlock(_header(i, shape[2] * 8), records, bits))
+            ring.publish(FrameBlock(header_of(i, BLOCK_FRAMES, shape[2] * 8), records, bits))
         ring.finish()
     except BaseException as error:  # raised again by the reader
         ring.finish(error)
@@ -136,11 +137,3 @@ def _summary(
     waited_us = 1e6 * (there - exposed)[there > 0]
     median, p999 = np.quantile(waited_us, [0.5, 0.999])
     return Latency(float(median), float(p999), float(waited_us.max()), waited_us.size, threads, 1e6 * late_s)
-
-
-def _header(seq: int, width: int) -> BlockHeader:
-    return BlockHeader(
-        flags=BlockFlag(0), run_id=1, block_seq=seq, first_frame=seq * BLOCK_FRAMES, t0_ticks=0, lost_before=0,
-        tick_hz=Fraction(100_000), frame_period_ticks=1, exposure_ticks=1, sweep=0, frame_step=1, width=width,
-        height=ROWS, sensor_width=WIDTH, sensor_height=ROWS,
-    )  # fmt: skip

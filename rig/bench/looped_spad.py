@@ -128,17 +128,20 @@ class LoopedSpad(SpadArray):
         loop = self._loop
         length = len(loop.records)
         records, bits = block_views(memory, self._layout(n))
-        done = 0
+        done = sweep = 0
         while done < n:
             cycle, at = divmod(first + done + length - self._lead, length)
             size = min(n - done, length - at)
             records[done : done + size] = loop.records[at : at + size]
             # Before the first marker, cycle 0, the sweeps that the loop counts from 1 on are over or have not begun.
-            records["sweep"][done : done + size] += np.uint16((cycle - 1) * loop.sweeps & 0xFFFF)
+            before = (cycle - 1) * loop.sweeps
+            if not done:  # the header's count goes on where the 16 bits of records begin again
+                sweep = int(loop.records["sweep"][at]) + before
+            records["sweep"][done : done + size] += np.uint16(before & 0xFFFF)
             np.copyto(bits[done : done + size], loop.bits[at : at + size])
             done += size
         records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
-        return FrameBlock(self._header(first, int(records["sweep"][0])), records, bits)
+        return FrameBlock(self._header(first, sweep), records, bits)
 
     def _header(self, first: int, sweep: int) -> BlockHeader:
         timing = self._timing

@@ -2,10 +2,10 @@
 
 count: frames of just the window into bit planes, column after column; turning planes into counts is part of an
 estimate and left out. numpy: what one writes first: unpackbits, sum, argmax. likelihood: `ColumnJudge`, the counter of
-`rig scan --estimator likelihood`, fed blocks as in a scan; making it anew for each sweep is not timed, with
-sweep it is, and so is taking its result. disk: the same from SPB1 blocks in a file mapped into memory, which the
-system most likely holds in its page cache. parse: blocks of that recording in memory, read without an estimate.
-full: whole frames of the sensor, of which only the window is searched. crc: payload checksums are verified.
+`rig scan --estimator likelihood`, fed blocks as in a scan; taking its result at the end of a sweep and clearing it for
+the next is not timed, with sweep it is. disk: the same from SPB1 blocks in a file mapped into memory, which the system
+most likely holds in its page cache. parse: blocks of that recording in memory, read without an estimate. full: whole
+frames of the sensor, of which only the window is searched. crc: payload checksums are verified.
 """
 
 import time
@@ -136,13 +136,12 @@ def search_stage(
 
     def measure(seconds: float) -> Measured:
         judge = likelihood.judge(frames.geometry, exposures, dark=True)
+        # One for all sweeps, as in a scan; kept beyond this moment, the tables of all stages' judges would be too much.
+        counter = ColumnJudge(layout, frames.geometry, judge, workers)
         blocks = source(frames, walk)
         done, spent = 0, 0.0
         error: StripeError | None = None
         while spent < seconds or not done:
-            made = time.perf_counter()
-            counter = ColumnJudge(layout, frames.geometry, judge, workers)
-            spent += time.perf_counter() - made if whole_sweeps else 0.0
             places: list[int] = []
             for at in range(0, len(bins), BLOCK_FRAMES):
                 begun = time.perf_counter()
@@ -157,11 +156,12 @@ def search_stage(
             settled = time.perf_counter()
             counter.settle()
             spent += time.perf_counter() - settled
-            if error is None or whole_sweeps:
-                ended = time.perf_counter()
-                sweep = counter.finish()
-                spent += time.perf_counter() - ended if whole_sweeps else 0.0
-                error = error or _search_error(sweep, frames, places, exposures)
+            ended = time.perf_counter()
+            sweep = counter.finish() if error is None or whole_sweeps else None
+            counter.begin(judge)
+            spent += time.perf_counter() - ended if whole_sweeps else 0.0
+            if error is None and sweep is not None:
+                error = _search_error(sweep, frames, places, exposures)
         return Measured(done, spent, error)
 
     return measure

@@ -6,14 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.aligned import aligned_zeros
-from rig.counting_kernels import WORD_PX
 from rig.estimators.closeup_kernels import closeup_tables, label_weights, largest_score
 from rig.estimators.row_input import TABLE, State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
 from rig.estimators.row_search import QUIET_STEP, SIGNAL_REACH_PX, halvings, turned
 from rig.estimators.screen_tables import NONE, SCREENS, WEIGHT_LIMIT, Tables, fill_tables
 from rig.estimators.search_desk import COUNT_LIMIT, FIELDS, Found, Judge, count_fluxes
-from rig.geometry import SweepGeometry
+from rig.geometry import WORD_PX, SweepGeometry
 from rig.lane_order import PAIRS, STEPS, padded_lanes, pair_bytes, pixel_order, places_of
 from rig.lanes import LANES
 from rig.row_threads import RowWorkers
@@ -124,7 +123,7 @@ def _hot_of_windows(
 def nothing_found(geometry: SweepGeometry, lines: tuple[NDArray[np.int32], NDArray[np.int32]] | None) -> Found:
     """Empty results of a sweep; lines: (rows, columns) whose counts are to be kept, sorted by column."""
     rows, columns = geometry.rows, geometry.columns
-    lanes = -(-geometry.width // 64) * 64 // STEPS + LANES
+    lanes = -(-geometry.width // WORD_PX) * WORD_PX // STEPS + LANES
     stripe = np.full((columns, FIELDS, rows), np.nan, np.float32)
     stripe[:, 1] = 0.0
     line_row, line_column = (np.zeros(0, np.int32),) * 2 if lines is None else lines

@@ -40,10 +40,12 @@ class Likelihood:
     """Row likelihood with the state it has learned so far; `model` is None before a map that taught.
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
+    learns: whether later maps change that state.
     """
 
-    def __init__(self, threads: int = 2, model: RowModel | None = None) -> None:
+    def __init__(self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True) -> None:
         self._workers = RowWorkers(threads)
+        self._learns = learns
         self.model = model
         self.used: RowModel | None = None
         """The state that the last map was estimated with."""
@@ -73,7 +75,7 @@ class Likelihood:
         if sure and self.model is None:
             self.model = self.used
         if self._lesson is None:
-            if sure and self._frames_since >= TEACH_FRAMES:
+            if self._learns and sure and self._frames_since >= TEACH_FRAMES:
                 self._frames_since = 0
                 assert self._judge is not None, "a map has been judged"
                 self._lesson = self._tutor.submit(
@@ -108,8 +110,10 @@ class Likelihood:
         self, volume: CountVolume, geometry: SweepGeometry, model: RowModel
     ) -> tuple[StripeTable, NDArray[np.int32]]:
         """Stripes under `model`, and the ones and exposures of pixels behind clear stripes (2, rows, width)."""
-        frames = volume.n_frames[volume.n_frames > 0]
-        exposures = int(np.median(frames)) if len(frames) else 1
+        exposures = volume.exposures
+        if exposures is None:
+            frames = volume.n_frames[volume.n_frames > 0]
+            exposures = int(np.median(frames)) if len(frames) else 1
         judge = self._judge_of(model, geometry, exposures, dark=volume.dark_counts is not None)
         found = nothing_found(geometry, None)
 

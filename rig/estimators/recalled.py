@@ -16,7 +16,7 @@ class Recalled:
 
     def __init__(self, states: Sequence[Learned], threads: int = 2) -> None:
         self._states = [state for state in states if isinstance(state, RowModel)]
-        self._of = Likelihood(threads, self._states.pop(0))
+        self._of = Likelihood(threads, self._states.pop(0), learns=False)
 
     @property
     def used(self) -> RowModel | None:
@@ -28,8 +28,8 @@ class Recalled:
         return self._of.counter(layout, geometry)
 
     def estimate(self, sweep: CountVolume | SearchedSweep, geometry: SweepGeometry) -> StripeTable:
-        """See `Likelihood`; what the map teaches is not heeded."""
-        before = self._of.model
+        """See `Likelihood`."""
         stripes = self._of.estimate(sweep, geometry)
-        self._of.model = self._states.pop(0) if self._states else before
+        if self._states:
+            self._of.model = self._states.pop(0)
         return stripes

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.aligned import CACHE_LINE
-from rig.counting_kernels import WORD_PX
 from rig.estimators.closeup_kernels import label_scores, levels_of, offsets
 from rig.estimators.powers import lift_to_powers, powers, powers_in_order
 from rig.estimators.row_kernels import LABEL_PX
@@ -31,6 +30,7 @@ from rig.estimators.search_kernels import (
     fit_positions,
     score_rows,
 )
+from rig.geometry import WORD_PX
 from rig.lane_order import PAD, PAIRS, STEPS, pair_bytes, place_of
 from rig.lane_reductions import largest_of_rows, store_folded, totals_of_rows
 from rig.lanes import (

@@ -55,7 +55,8 @@ class ColumnJudge:
         self._row_words = 0
         self._open: dict[int, OpenColumn] = {}
         self._planes: dict[int, NDArray[np.uint64]] = {}
-        self._desks: dict[int, tuple[Desk, NDArray[np.uint8]]] = {}
+        self._desks: dict[int, Desk] = {}
+        self._benches: dict[int, NDArray[np.uint8]] = {}
         self._no_counts = np.zeros((0, layout.rows, layout.window), np.uint8)
 
     def begin(self, judge: Judge) -> None:
@@ -134,10 +135,11 @@ class ColumnJudge:
 
     def _desk(self, first: int) -> Desk:
         """What the thread that begins at chunk `first` works with."""
+        if first not in self._benches:
+            self._benches[first] = search_memory(padded_lanes(self._layout.window))
         if first not in self._desks:
-            memory = search_memory(padded_lanes(self._layout.window))
-            self._desks[first] = desk_of(self._judge, self._found, memory), memory
-        return self._desks[first][0]
+            self._desks[first] = desk_of(self._judge, self._found, self._benches[first])
+        return self._desks[first]
 
     def _opened(self) -> OpenColumn:
         """The open column: the same for all threads once they have done their work."""

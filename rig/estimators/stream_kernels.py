@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import BYTE_FRAMES
-from rig.counting_kernels import CHUNK, PLANES, WORD_BYTES, WORD_PX, add_frames, planes_for, rows_of_chunk
+from rig.counting_kernels import CHUNK, PLANES, WORD_BYTES, add_frames, planes_for, rows_of_chunk
 from rig.estimators.row_search import halvings, judge_rows, keep_line, table_for
 from rig.estimators.search_desk import Desk, Found, Judge, desk_of
 from rig.estimators.search_kernels import BATCH, search_in
+from rig.geometry import WORD_PX
 from rig.lane_order import PAIRS, STEPS, halve_counts, read_counts, read_planes, sum_counts
 from rig.lanes import LANES, add_bytes, address_of, load_bytes, read_int32, store_bytes, zero_bytes
 

@@ -50,6 +50,8 @@ def repair(folder: Path) -> Repair:
     found = examine(folder)
     done: list[str] = []
     try:
+        if _put_in_order(found, done):
+            found = examine(folder)
         for segment in found.segments:
             if isinstance(segment, PlainSegment):
                 _clear(segment, _blocks_in(segment, found), done)
@@ -62,6 +64,22 @@ def repair(folder: Path) -> Repair:
             f"cannot repair {folder}: {error.strerror or error}; free the space it needs or work on a copy"
         ) from error
     return Repair(done, verify(folder))
+
+
+def _put_in_order(found: Examined, done: list[str]) -> bool:
+    """Rename segments so that their numbers rise with the frames in them; whether that was to be done."""
+    segments = {segment.number: segment.path for segment in found.segments}
+    numbers = list(dict.fromkeys(found.entries["segment"].tolist()))  # entries are in the order of their frames
+    if numbers == sorted(numbers):
+        return False
+    moves = [(segments[old], segments[new]) for old, new in zip(numbers, sorted(numbers), strict=True) if old != new]
+    for path, _ in moves:
+        path.rename(path.with_name(f"{path.name}.moving"))
+    for path, other in moves:
+        target = other.with_name(other.name.split(".")[0] + "".join(path.suffixes))
+        path.with_name(f"{path.name}.moving").rename(target)
+        done.append(f"{path.name} is {target.name} now, by the frames in it")
+    return True
 
 
 def _blocks_in(segment: Segment, found: Examined) -> list[Range]:
@@ -121,7 +139,7 @@ def _keep(segment: PlainSegment, pieces: list[Range], torn: Path) -> None:
 
 
 def _write_index(folder: Path, found: Examined, done: list[str]) -> None:
-    data = index_header() + found.entries.tobytes()
+    data = index_header() + np.sort(found.entries, order=["segment", "offset"]).tobytes()
     file = folder / INDEX_FILE
     if file.exists() and file.read_bytes() == data:
         return

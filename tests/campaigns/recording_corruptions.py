@@ -149,7 +149,7 @@ def judge(folder: Path, pristine: Pristine) -> str:
     told, frames, manifest = _read(folder)
     _require_true(frames, pristine.frames)
     whole = frames == pristine.frames
-    in_order = list(frames) == [key for key in pristine.frames if key in frames]
+    in_order = _in_order(frames, pristine)
     assert told or (in_order and _missing_is_seen(frames, pristine)), (
         "frames are missing, or astray, and nobody says so"
     )
@@ -182,6 +182,10 @@ def _read(folder: Path) -> tuple[bool, Frames, Any]:
     return bool(recording.problems), frames, manifest
 
 
+def _in_order(frames: Frames, pristine: Pristine) -> bool:
+    return list(frames) == [key for key in pristine.frames if key in frames]
+
+
 def _missing_is_seen(frames: Frames, pristine: Pristine) -> bool:
     """Whether what is missing lies between frames that are there, as a gap."""
     missing = [key for key in pristine.frames if key not in frames]
@@ -211,6 +215,7 @@ def mend(folder: Path, pristine: Pristine) -> None:
     frames = _read(folder)[1]
     _require_true(frames, pristine.frames)
     assert frames.keys() >= before.keys(), f"{len(before.keys() - frames.keys())} frames were there before repair"
+    assert _in_order(frames, pristine) or not _in_order(before, pristine), "repair changed the order of the starts"
     again = repair(folder)
     assert again.done == [] or packed or after.frames == 0, f"repaired twice: {again.done}"
 

@@ -213,3 +213,18 @@ def test_a_block_of_very_many_frames_is_summed_without_running_over():
         judge = ColumnJudge(layout, g, estimator.judge(g, exposures, dark=False), workers)
         judge.add(bits, bins, bins.astype(float), np.zeros(len(bins), np.int32))
         assert np.all(judge.finish().intensity() == len(bins))
+
+
+@pytest.mark.parametrize(("exposures", "lost"), [(10, 2), (10, 6), (40, 6)])
+def test_a_first_map_that_lost_frames_everywhere_is_the_same_again_with_what_it_taught(exposures, lost):
+    whole = frames_of(exposures=exposures)
+    in_column = np.arange(len(whole.bins)) - np.searchsorted(whole.bins, whole.bins)
+    frames, layout = whole[(whole.bins < 0) | (in_column >= lost)], layout_of(exposures=exposures)
+    first = Likelihood(1)
+    counter = first.counter(layout, scene().geometry)
+    table = first.estimate(fed(counter, frames, [10**9]), scene().geometry)
+    again = Likelihood(1, first.used)
+    counter = again.counter(layout, scene().geometry)
+    recalled = again.estimate(fed(counter, frames, [37]), scene().geometry)
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(recalled, name), getattr(table, name), err_msg=name)

@@ -15,16 +15,18 @@ from drivers.interfaces import SpadRequest, SpadTiming
 from drivers.ring import BlockRing, OnFull
 from drivers.spb1 import walk_blocks
 from rig import api, cli
-from rig.bench import looped_spad, speed
+from rig.bench import looped_spad, speed, stages
 from rig.bench.bench_kernels import count_columns, draw_frames, read_all
-from rig.bench.frames import BLOCK_FRAMES, EDGE_PX, PLACE_FRAMES, ROWS, WIDTH, full_frames, window_frames
+from rig.bench.frames import BLOCK_FRAMES, COLUMNS, EDGE_PX, PLACE_FRAMES, ROWS, WIDTH, full_frames, window_frames
 from rig.bench.looped_spad import LEAD_FRAMES, Loop, LoopedSpad
 from rig.bench.recorded import recording_of
 from rig.bench.soak import SoakOptions, soak
 from rig.bench.speed import Extent, measure_speed
+from rig.bench.stages import Walk, search_stage
 from rig.counting import SweepCounter, SweepLayout
 from rig.counting_kernels import CHUNK, new_planes, planes_for
 from rig.errors import UsageError
+from rig.estimators.stream import ColumnJudge
 from rig.row_threads import RowWorkers
 from rig.sweeps import SweepAssembler
 from tests.unit.rig.streams import SPAD, plan_of, scan, stream_of
@@ -43,6 +45,11 @@ KEYS = {
 def frames():
     with RowWorkers(2) as workers:
         return window_frames(64, workers, 2**22)
+
+
+@pytest.fixture(scope="module")
+def learned(frames):
+    return speed.learn(frames, 1)
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +131,43 @@ def test_the_recording_holds_the_frames(frames):
     assert len(blocks) == len(frames.bits) // BLOCK_FRAMES
     np.testing.assert_array_equal(np.concatenate([block.bits for block in blocks]), frames.bits)
     assert blocks[0].records["x0"][0] == frames.geometry.x0[0]
+
+
+@pytest.mark.parametrize("whole_sweeps", [False, True])
+def test_one_counter_serves_all_sweeps_of_a_moment_and_clearing_it_is_timed_with_whole_sweeps(
+    frames, learned, monkeypatch, whole_sweeps
+):
+    clock, begun = VirtualClock(), []
+
+    class SlowlyCleared(ColumnJudge):
+        made = 0
+
+        def __init__(self, *args):
+            super().__init__(*args)
+            SlowlyCleared.made += 1
+
+        def add(self, *args):
+            clock.sleep(0.0625)
+            super().add(*args)
+
+        def begin(self, judge):
+            begun.append(judge)
+            clock.sleep(16.0)
+            super().begin(judge)
+
+    monkeypatch.setattr(stages, "ColumnJudge", SlowlyCleared)
+    monkeypatch.setattr(stages.time, "perf_counter", lambda: clock.now_ns() / 1e9)
+    blocks = COLUMNS // BLOCK_FRAMES  # of a sweep with one exposure a column
+    with RowWorkers(1) as workers:
+        stage = search_stage(
+            frames, Walk(len(frames.bits) // PLACE_FRAMES), 1, workers, learned, whole_sweeps=whole_sweeps
+        )
+        measured = stage(3 * (16.0 + blocks * 0.0625) if whole_sweeps else 3 * blocks * 0.0625)
+    assert SlowlyCleared.made == 1
+    assert len(begun) == 3
+    assert measured.frames == 3 * COLUMNS
+    assert measured.seconds == pytest.approx(3 * (blocks * 0.0625 + 16.0 * whole_sweeps))
+    assert measured.error.missing == 0
 
 
 # The report
@@ -280,6 +324,22 @@ def test_the_stream_begins_at_the_end_of_a_sweep(in_no_time):
     assert np.flatnonzero(joined["marks"] & int(Mark.SCAN)).tolist() == [lead]
     assert set(joined["sweep"][:lead]) == {0}
     assert joined["sweep"][lead] == 1
+
+
+@pytest.mark.parametrize("sweep", [65535, 65536, 65537])
+def test_the_count_of_sweeps_goes_on_where_that_of_records_begins_again(in_no_time, sweep):
+    loop, spad = looped()
+    ring = BlockRing(1, 2**16)
+    reader = ring.reader("counting")
+    first = int(np.searchsorted(loop.records["sweep"], 1 + (sweep - 1) % SWEEPS))
+    spad.start(None)
+    # As after so many sweeps, an hour and more.
+    spad._next_frame = spad._lead + (sweep - 1) // SWEEPS * len(loop.records) + first
+    assert spad.fill(ring, 1.0)
+    block = reader.next(1.0)
+    assert block.header.sweep == sweep
+    assert set(block.records["sweep"]) == {sweep & 0xFFFF}
+    assert int(block.records["marks"][0]) & int(Mark.SCAN)
 
 
 def test_a_plan_of_another_rate_is_refused():

@@ -7,7 +7,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from calibration.model import Lag
-from drivers.frames import Mark
+from drivers.errors import ProtocolError
+from drivers.frames import SUBFRAME_SHIFT, Mark
 from rig.binding import FrameBinder, SweepClock
 from rig.counting import BIN_DARK, BIN_UNUSABLE
 from rig.errors import PlanError
@@ -312,3 +313,39 @@ def test_a_sweep_with_too_few_markers_is_not_called_synchronised():
     assert not SweepClock(0, 0.0, float("nan"), 1, 0, 10, 0).synchronised
     assert not SweepClock(0, 5e-3, 0.0, 9, 0, 10, 0).synchronised
     assert SweepClock(0, 5e-5, 0.01, 9, 0, 10, 0).synchronised
+
+
+@pytest.mark.parametrize("bit", range(16))
+@pytest.mark.parametrize("at", [1, 10, 12, 105, 150, 250, 251, 400])
+def test_one_flipped_bit_of_a_sweep_number_costs_no_more_than_its_frame(bit, at):
+    plan = plan_of(scan())
+    stream = stream_of(plan, 5)
+    wanted, clocks = bind(plan, whole(stream))
+    stream.records["sweep"][at] ^= np.uint16(1 << bit)
+    found, same_clocks = bind(plan, whole(stream))
+    others = np.arange(len(stream.records)) != at
+    for name in ("sweep", "bins"):
+        differ = np.flatnonzero((found[name] != wanted[name]) & others)
+        # Without the very first marker the frames up to the next one cannot be placed.
+        assert differ.size <= (at == 12), name
+    assert len(same_clocks) == len(clocks)
+    for clock, whole_clock in zip(same_clocks, clocks, strict=True):
+        assert abs(clock.end_frame - whole_clock.end_frame) <= 1
+        assert abs(clock.first_frame - whole_clock.first_frame) <= 1
+
+
+def test_a_stream_that_names_wrong_sweeps_on_and_on_is_an_error():
+    plan = plan_of(scan(columns=200))
+    stream = stream_of(plan, 4)
+    stream.records["sweep"][700:] += np.uint16(5)
+    with pytest.raises(ProtocolError, match=r"name sweeps that cannot have begun .*check the scan marker's line"):
+        bind(plan, whole(stream))
+
+
+def test_a_scan_marker_beside_a_gate_edge_does_not_say_where_in_its_frame_it_is():
+    plan = plan_of(scan())
+    stream = stream_of(plan, 3)
+    first = int(np.flatnonzero(stream.records["marks"] & Mark.SCAN)[1])
+    assert bind(plan, whole(stream))[1][0].synchronised
+    stream.records["marks"][first] ^= np.uint16(0x80 << SUBFRAME_SHIFT | Mark.GATE_EDGE)
+    assert bind(plan, whole(stream))[1][0].synchronised

@@ -9,6 +9,8 @@ from drivers.errors import DeviceNotFound, ProtocolError
 from drivers.frames import FrameBlock
 from drivers.recorded import INDEX_FILE, RunRecording, reader
 from drivers.recorded.index import HEADER_BYTES, RECORD_BYTES
+from rig.recording.repair import repair
+from rig.recording.verify import Integrity
 from tests.unit.rig.recorded import read, record, run_blocks, same
 
 
@@ -98,6 +100,19 @@ def test_swapped_segments_are_put_in_order(tmp_path: Path, runs: list[list[Frame
     recording = RunRecording(folder)
     assert_all_there(recording, runs)
     assert recording.problems
+    assert repair(folder).after.verdict is Integrity.GAPS  # as the device said
+    assert (first.read_bytes(), last.read_bytes()) == (one, other)
+    assert_all_there(RunRecording(folder), runs)
+
+
+def test_starts_stay_in_order_when_index_records_are_swapped(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    folder = record(tmp_path, runs)
+    data = (folder / INDEX_FILE).read_bytes()
+    middle = HEADER_BYTES + len(runs[0]) * RECORD_BYTES
+    (folder / INDEX_FILE).write_bytes(data[:HEADER_BYTES] + data[middle:] + data[HEADER_BYTES:middle])
+    recording = RunRecording(folder)
+    assert_all_there(recording, runs)
+    assert recording.problems == ["frames.idx: its records are not in the order in which they were written"]
 
 
 def test_a_folder_without_a_recording_is_said(tmp_path: Path) -> None:
@@ -106,3 +121,25 @@ def test_a_folder_without_a_recording_is_said(tmp_path: Path) -> None:
     (tmp_path / "frames-000000.spb").write_bytes(b"none" * 1000)
     with pytest.raises(ProtocolError, match="holds no whole block"):
         RunRecording(tmp_path)
+
+
+def test_a_start_of_which_no_block_is_sound_is_said(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    folder = record(tmp_path, runs)
+    first = {entry["segment"] for entry in RunRecording(folder).runs[0].entries}
+    for number in first:
+        file = folder / f"frames-{number:06d}.spb"
+        data = np.frombuffer(file.read_bytes(), np.uint8).copy()
+        data[500::4096] ^= 1  # the pixels of every block
+        file.write_bytes(data.tobytes())
+    recording = RunRecording(folder)
+    assert [run.header.run_id for run in recording.runs] == [2]
+    assert recording.problems == [f"run 1: none of its {len(runs[0])} blocks is sound"]
+
+
+def test_blocks_that_all_moved_are_found(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    folder = record(tmp_path, runs)
+    file = folder / "frames-000000.spb"
+    file.write_bytes(bytes(1024) + file.read_bytes())
+    recording = RunRecording(folder)
+    assert_all_there(recording, runs)
+    assert recording.problems

@@ -54,15 +54,19 @@ def test_one_thread_leaves_nothing_over():
 
 
 def test_work_behind_a_failure_is_not_begun_and_the_workers_go_on_afterwards():
-    done = []
+    go, behind, done = threading.Event(), [], []
 
     def fail(first, last):
+        assert go.wait(10.0)
         raise RuntimeError("broken")
 
     with RowWorkers(2) as workers:
         workers.post(2, fail)
+        workers.post(2, lambda first, last: behind.append(first))
+        go.set()
         with pytest.raises(RuntimeError, match="broken"):
             workers.settle()
+        assert not behind
         workers.over(2, lambda first, last: done.append(first))
     assert sorted(done) == [0, 1]
 

@@ -4,8 +4,9 @@ import itertools
 
 import numpy as np
 
+from drivers.recorded.reader import block_part
 from rig.counting import BIN_DARK
-from rig.sweeps import SweepAssembler
+from rig.sweeps import SweepAssembler, SweepStart
 from tests.unit.rig.streams import plan_of, scan, stand_still, stream_of
 
 
@@ -67,3 +68,28 @@ def test_blocks_that_may_be_given_back_are_waited_for_by_what_they_added():
         if assembler.complete:
             break
     assert max(added) == 2  # a block in which one sweep ends and the next one begins
+
+
+def test_a_sweep_whose_first_marker_got_lost_has_lost_frames():
+    plan = plan_of(scan(columns=30))
+    stream = stream_of(plan, 1)
+    lost = range(stream.scan_frames[0] - 5, stream.scan_frames[0] + 3)
+    assembler = SweepAssembler(plan, Noting(), maps=1)
+    (sweep,) = [found for block in stream.blocks(itertools.repeat(100), lost) for found in assembler.add(block)]
+    assert (sweep.first_frame, sweep.frames.lost) == (lost.start, len(lost))
+    assert sweep.gaps == ((lost.start, lost.stop - 1),)
+
+
+def test_maps_of_a_part_begin_with_the_sweep_that_is_whole():
+    plan = plan_of(scan(columns=30))
+    stream = stream_of(plan, 3)
+    blocks = stream.blocks(itertools.repeat(100))
+    whole = SweepAssembler(plan, Noting(), maps=3)
+    sweeps = [found for block in blocks for found in whole.add(block)]
+    first = stream.scan_frames[0] + 50  # in the middle of sweep 0
+    part = SweepAssembler(plan, Noting(), 2, 0, SweepStart(1, 1 + sweeps[0].clock_error))
+    kept = [block_part(block, first, 10**6) for block in blocks if block.header.first_frame + block.n_frames > first]
+    found = [sweep for block in kept for sweep in part.add(block)]
+    assert [sweep.index for sweep in found] == [0, 1]
+    assert [sweep.volume for sweep in found] == [sweep.volume for sweep in sweeps[1:]]
+    assert part.complete

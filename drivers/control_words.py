@@ -1,0 +1,113 @@
+"""What a recording of control traffic says: the commands that do something, apart from the questions between them.
+
+How often a driver asks depends on the host's moment, and so do the tokens that number its questions: neither is
+compared. Commands of the drivers may be sent again where a reply was lost, so that repeats count once. Questions are
+those of the drivers here: hardware.md sections 3.1 (Helios), 3.2 (LaserCube), 4.1 (Cobolt), 4.2 (OBIS), 5.1 (PrawnDO).
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import accumulate
+
+from drivers.transports.tap import OUT, Passed
+
+_SERIAL = "serial"
+_LINE_END = re.compile(rb"[\r\n]")
+_QUESTION = re.compile(rb"\s*|[ -~]*\?|sts|gto|ver|brd|frq|len|#[0-9a-f]{8}")
+_USB_QUESTIONS = {
+    "06": (0x03, 0x04, 0x05),  # Helios: status, version, name
+    "01": (0x83, 0x84, 0x87, 0x88, 0x89, 0x8A, 0x8B, 0x8C),  # LaserCube: rates, range, ring, version
+}
+FRAME_PORTS = ("02", "03")
+"""Bulk endpoints that points go to: each transfer is a buffer of the device, sent when it has room."""
+BEGIN, END = (b"run", b"swr"), b"abt"
+"""Of the sync source: between them a scan runs, behind the end the mirror is parked from wherever it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Word:
+    """A command, or a buffer of points, that went to a device."""
+
+    t_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Spoken:
+    """All that went to the devices of a rig. commands: by device. scans: the buffers of each scan that was run."""
+
+    commands: dict[str, list[Word]]
+    scans: list[list[Word]]
+
+    @classmethod
+    def of(cls, passed: Iterable[Passed]) -> "Spoken":
+        """Of what passed the taps, in order of time."""
+        sent: dict[tuple[str, str], list[Word]] = defaultdict(list)
+        for one in passed:
+            if one.direction == OUT:
+                sent[one.device, one.port].append(Word(one.t_ns, one.data))
+        commands: dict[str, list[Word]] = {}
+        buffers: list[Word] = []
+        for (device, port), words in sent.items():
+            if port in FRAME_PORTS:
+                buffers += words
+            else:
+                said = _once(_lines(words)) if port == _SERIAL else _without_questions(port, words)
+                commands.setdefault(device, []).extend(said)
+        return cls(commands, _scans(commands.get("sync"), buffers))
+
+
+def is_question(piece: bytes) -> bool:
+    """Whether a piece of bytes to a serial device does nothing but ask."""
+    return all(_QUESTION.fullmatch(line) for line in _LINE_END.split(piece))
+
+
+def _without_questions(port: str, words: list[Word]) -> list[Word]:
+    questions = _USB_QUESTIONS.get(port, ())
+    return [word for word in words if word.data[0] not in questions]
+
+
+def _lines(pieces: list[Word]) -> list[Word]:
+    """The lines that are no questions, each with the time of its last piece."""
+    stream = b"".join(piece.data for piece in pieces)
+    ends = list(accumulate(len(piece.data) for piece in pieces))
+    found, begin, piece = [], 0, 0
+    for match in _LINE_END.finditer(stream):
+        line, begin_next = stream[begin : match.start()], match.end()
+        while ends[piece] < begin_next:
+            piece += 1
+        if not _QUESTION.fullmatch(line):
+            found.append(Word(pieces[piece].t_ns, line))
+        begin = begin_next
+    return found
+
+
+def _once(words: list[Word]) -> list[Word]:
+    """Without repeats of what was just said, a command or two of them: both are how drivers make sure."""
+    kept: list[Word] = []
+    for word in words:
+        kept.append(word)
+        said = [one.data for one in kept[-4:]]
+        for length in (1, 2):
+            if len(said) >= 2 * length and said[-length:] == said[-2 * length : len(said) - length]:
+                del kept[-length:]
+                break
+    return kept
+
+
+def _scans(sync: list[Word] | None, buffers: list[Word]) -> list[list[Word]]:
+    """The buffers sent while a scan ran; without a sync source that says when, all of them."""
+    if not buffers:
+        return []
+    if sync is None:
+        return [buffers]
+    scans, begun = [], -1
+    for word in sync:
+        if word.data in BEGIN:
+            begun = word.t_ns
+        elif word.data == END and begun >= 0:
+            scans.append([one for one in buffers if begun <= one.t_ns < word.t_ns])
+            begun = -1
+    return scans

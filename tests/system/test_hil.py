@@ -1,0 +1,117 @@
+"""Hardware in the loop: a recording plays while real drivers run, and what they say is held against it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import rig.replay_run
+from drivers.transports.tap import read_taps
+from rig import api
+from rig.config_files import load_config
+from rig.errors import DivergedError, UsageError
+from tests.system.small_rig import config, write_rig
+
+LASER = {"kind": "obis", "port": "emulated:laser", "max_power": "50 mW"}
+"""Quicker to ask than a Cobolt."""
+SCANNER = {"frame": "200 ms", "max_point_rate": "10 kHz"}
+"""Long buffers: a machine that runs other tests at the same time is late by tens of milliseconds."""
+
+
+def lab() -> dict[str, Any]:
+    """The small rig with emulated devices."""
+    content = config()
+    hil = load_config("hil").model_dump(mode="json")
+    content |= {slot: hil[slot] for slot in ("sync",)}
+    content["world"] = {"kind": "emulated", "geometry": "./rig.yaml", "scene": "street-clear", "laser": "obis"}
+    content["spad"] = {"kind": "spb-usb", "port": "emulated:spad", "reads": "plain"}
+    content["scanner"] = hil["scanner"] | SCANNER
+    content["laser"] = LASER
+    content["scan"] |= {"frame_rate": "4 kHz", "columns": 100}
+    content["scan"]["command_range"] = [-0.5, 0.5]
+    return content
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scan of emulated devices, recorded."""
+    folder = tmp_path_factory.mktemp("taken")
+    api.scan(write_rig(folder / "rig", lab()), out=folder / "run", record=True)
+    return folder / "run"
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bytes are held against the recording, times only roughly: a busy machine is late."""
+    monkeypatch.setattr(rig.replay_run, "SWAP_TOLERANCE_S", 0.2)
+
+
+def hil(folder: Path, laser: dict[str, Any]) -> Path:
+    """The bundled config with the devices of `taken`."""
+    content = load_config("hil").model_dump(mode="json")
+    content["world"] = {"kind": "emulated", "geometry": str(folder / "rig" / "rig.yaml"), "laser": "obis"}
+    content["scanner"] |= SCANNER
+    content["laser"] = laser
+    file = folder / f"hil-{laser['max_power'].split()[0]}.yaml"
+    file.write_text(yaml.safe_dump(content))
+    return file
+
+
+def test_what_passed_the_ports_of_a_scan_is_recorded_with_it(taken: Path) -> None:
+    passed = read_taps(taken / "control.jsonl")
+    assert {one.device for one in passed} == {"scanner", "laser", "sync"}
+    assert any(one.data.startswith(b"SOUR:AM:STAT ON") for one in passed)
+    assert api.verify(taken).exit_code == 0
+
+
+@pytest.mark.usefixtures("patient")
+def test_drivers_in_the_loop_say_what_they_said_and_the_depth_is_the_same(taken: Path, tmp_path: Path) -> None:
+    result = api.replay(taken, config=hil(taken.parent, LASER), out=tmp_path / "again")
+    assert result.control is not None
+    assert result.control.problems == ()
+    assert result.control.commands > 20
+    assert result.control.swaps > 0
+    depth = "depth/000000.npy"
+    assert (tmp_path / "again" / depth).read_bytes() == (taken / depth).read_bytes()
+
+
+@pytest.mark.usefixtures("patient")
+def test_drivers_play_against_what_their_devices_answered(taken: Path) -> None:
+    result = api.replay(taken, against_recording=True)
+    assert result.control is not None
+    assert result.control.problems == ()
+
+
+@pytest.mark.usefixtures("patient")
+def test_the_first_byte_that_was_not_recorded_fails_the_replay_and_is_shown(taken: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    for file in taken.iterdir():
+        if file.is_file():
+            (other / file.name).write_bytes(file.read_bytes())
+    lines = [json.loads(line) for line in (taken / "control.jsonl").read_text().splitlines()]
+    power = next(one for one in lines if bytes.fromhex(one["bytes"]).startswith(b"SOUR:POW:LEV:IMM:AMPL 0.0"))
+    changed = bytes.fromhex(power["bytes"]).replace(b"AMPL 0.0", b"AMPL 0.1")
+    power["bytes"] = changed.hex()
+    (other / "control.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    with pytest.raises(DivergedError, match=r"laser: command \d+: byte 24 is 0x30, recorded was 0x31 .*AMPL 0\.0"):
+        api.replay(other, against_recording=True)
+
+
+def test_a_simulated_recording_has_no_drivers_to_play(tmp_path: Path) -> None:
+    content = config()
+    api.scan(write_rig(tmp_path / "rig", content), out=tmp_path / "run", record=True)
+    assert not (tmp_path / "run" / "control.jsonl").exists()
+    with pytest.raises(UsageError, match="simulated devices only"):
+        api.replay(tmp_path / "run", against_recording=True)
+
+
+def test_no_light_is_let_out_without_a_word(taken: Path) -> None:
+    content = load_config("hil").model_dump(mode="json")
+    content["sync"]["port"] = "/dev/ttyACM0"
+    file = taken.parent / "real.yaml"
+    file.write_text(yaml.safe_dump(content))
+    with pytest.raises(UsageError, match="--arm"):
+        api.replay(taken, config=file)
