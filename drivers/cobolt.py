@@ -74,6 +74,7 @@ class CoboltLaser(SerialLaser):
     def _do_arm(self, power_w: float) -> None:
         try:
             self._enable(power_w)
+            self._require_no_stop()
         except DeviceError:
             with suppress(DeviceError):  # the first error is the one to tell
                 self._dialect.darken()
@@ -89,9 +90,13 @@ class CoboltLaser(SerialLaser):
             dialect.darken()  # whenever it comes on, it is dark until the power is set
         if not gated:
             dialect.gate()
+        # Each exchange takes a tenth of a second: a pause from another thread is heeded before what lights.
+        self._require_no_stop()
         if not on:
             self._start()
+        self._require_no_stop()
         dialect.set_power(power_w)
+        self._require_no_stop()
         dialect.brighten()
 
     def _start(self) -> None:

@@ -29,7 +29,6 @@ from drivers.errors import (
     DeviceTimeout,
     InterlockOpen,
     LimitExceeded,
-    WrongState,
 )
 from drivers.interfaces import LaserLimits, LaserStatus
 from drivers.obis_framing import BITS, CELSIUS, SWITCH, TEXT, USUAL_TIMING, ObisFraming
@@ -111,7 +110,6 @@ class ObisLaser(SerialLaser):
         self._base_range = base_range
         self._warm_up_s = warm_up_s
         self._told_on = False
-        self._n_stops = 0
 
     def _do_status(self) -> LaserStatus:
         line = self._line
@@ -137,12 +135,11 @@ class ObisLaser(SerialLaser):
         )
 
     def _do_arm(self, power_w: float) -> None:
-        n_stops = self._n_stops
         try:
             if not (self._told_on and self._bits() & EMISSION and self._is_digital()):
                 self._prepare()
                 self._set_power(power_w)
-                self._await_ready(n_stops)
+                self._await_ready()
                 self._told_on = True
                 self._line.tell_and_check("SOUR:AM:STAT ON", "SOUR:AM:STAT?", SWITCH, "ON".__eq__)
             else:
@@ -151,9 +148,9 @@ class ObisLaser(SerialLaser):
             with suppress(DeviceError):  # the first error is the one to tell
                 self._switch_off()
             raise
-        if self._n_stops != n_stops:  # a pause from another thread overtook the ON
+        if self._stopped:  # a pause from another thread overtook the ON
             self._switch_off()
-            raise WrongState(f"{self._name}: arm was ended by a pause; arm again")
+        self._require_no_stop()
         self._armed = True
 
     def _prepare(self) -> None:
@@ -172,7 +169,7 @@ class ObisLaser(SerialLaser):
         query = "SOUR:POW:LEV:IMM:AMPL?"
         self._line.tell_and_check(f"SOUR:POW:LEV:IMM:AMPL {power_w:.5f}", query, NUMBER, is_power)
 
-    def _await_ready(self, n_stops: int) -> None:
+    def _await_ready(self) -> None:
         """Until an ON acts at once: said earlier it would be deferred, and light come when nobody expects it."""
         give_up_ns = self._clock.now_ns() + round(self._warm_up_s * NS_PER_S)
         while not (bits := self._bits()) & READY or bits & WARM_UP:
@@ -183,8 +180,7 @@ class ObisLaser(SerialLaser):
                 raise DeviceFault(f"{self._name}: its key is off; turn it on and arm again")
             if not self._interlock_closed(bits):
                 raise InterlockOpen(f"{self._name}: the interlock is open; close it and arm again")
-            if self._n_stops != n_stops:
-                raise WrongState(f"{self._name}: arm was ended by a pause; arm again")
+            self._require_no_stop()
             if self._clock.now_ns() >= give_up_ns:
                 raise DeviceTimeout(
                     f"{self._name} is not ready after {self._warm_up_s:g} s (status 0x{bits:08X}); wait, or raise "
@@ -193,11 +189,9 @@ class ObisLaser(SerialLaser):
             self._clock.sleep(_READY_POLL_S)
 
     def _do_pause(self) -> None:
-        self._n_stops += 1
         self._switch_off()
 
     def _do_disarm(self) -> None:
-        self._n_stops += 1
         self._armed = False
         self._switch_off()
         self._set_power(self._limits.min_power_w)

@@ -6,7 +6,7 @@ from typing import Annotated, TypeVar
 from pydantic import Field
 
 from drivers.dialogue import Dialogue, Framing, LineTiming
-from drivers.errors import DeviceNotFound, DeviceTimeout, ProtocolError
+from drivers.errors import DeviceNotFound, DeviceTimeout, ProtocolError, WrongState
 from drivers.interfaces import LaserLimits, LineLaser
 from drivers.registry import KindConfig, Surroundings
 from drivers.transports.endpoints import resolve
@@ -34,6 +34,28 @@ class SerialLaser(LineLaser):
         self._line = line
         self._limits = limits
         self._armed = False
+        self._stopped = False
+        """Whether pause or disarm was called since arm began: other threads may."""
+
+    def arm(self, power_w: float) -> None:
+        """See `LineLaser`. `WrongState`: ended by a pause from another thread."""
+        self._stopped = False
+        super().arm(power_w)
+
+    def pause(self) -> None:
+        """See `LineLaser`. An `arm` under way on another thread ends."""
+        self._stopped = True
+        super().pause()
+
+    def disarm(self) -> None:
+        """See `LineLaser`. An `arm` under way on another thread ends."""
+        self._stopped = True
+        super().disarm()
+
+    def _require_no_stop(self) -> None:
+        """`WrongState` where a pause has come while arming: what is to be lit must stay dark."""
+        if self._stopped:
+            raise WrongState(f"{self._name}: arm was ended by a pause; arm again")
 
     @property
     def limits(self) -> LaserLimits:

@@ -117,7 +117,10 @@ def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: 
     first = np.where(empty, 0, np.clip(first, 0, width - 1)) // WORD_PX * WORD_PX
     last = np.where(empty, 0, np.clip(last, 0, width - 1))
     window = int(-(-(last - first + 1).max() // WORD_PX) * WORD_PX)
-    x0 = np.minimum(first, padded - window).astype(np.int32)
+    # Columns that see nothing take their neighbour's window: moving windows need not jump for them.
+    some = np.flatnonzero(~empty)
+    nearest = some[np.searchsorted(some, np.arange(x_lo.shape[1])).clip(max=len(some) - 1)]
+    x0 = np.minimum(first, padded - window).astype(np.int32)[nearest]
     defects = np.zeros(u.shape, np.bool_) if model.defects is None else model.defects
     return SweepGeometry(u, v, plane, planes, x_lo, x_hi, x0, window, near_is_left, (near_m, far_m), defects)
 

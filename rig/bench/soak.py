@@ -42,6 +42,8 @@ EXIT_DEVICE = 3
 """Exit code of a scan that the overload policy ended."""
 LOOP_S = 0.2
 """Least time that the recorded sweeps last: many times what a cache holds."""
+DEPTH_RANGE = ["4 m", "15 m"]
+"""Range whose stripes lie within 128 pixels of a row, the window for which speeds are stated."""
 LINK_MARGIN = 1.02
 """A link that carries windows of the line, but no whole frames, carries so many times what they need."""
 SETTLED = 0.1
@@ -160,7 +162,7 @@ def _quiet_sweeps() -> Iterator[None]:
 def _looped_rig(options: SoakOptions) -> Iterator[tuple[OpenRig, ScanPlan, LoopedSpad]]:
     """The simulated rig, its plan, and in its SPAD's place one that plays what that recorded."""
     # Clocks that agree to the last bit: the loop then closes without a jump.
-    settings: dict[str, object] = {"scanner.clock_error": "0 ppm"}
+    settings: dict[str, object] = {"scanner.clock_error": "0 ppm", "scan.depth_range": DEPTH_RANGE}
     if options.window:
         settings["spad.link"] = f"{_window_bytes_per_s(settings) / 1e6:.6f} MB/s"
     with open_rig(load_config(CONFIG, settings)) as rig:

@@ -16,9 +16,11 @@ from drivers.errors import ProtocolError
 from drivers.frames import FrameBlock, Mark
 from drivers.interfaces import BurstMode, StreamMode
 from rig.binding import FrameBinder
+from rig.config_files import load_config
 from rig.counting import BIN_DARK, BIN_UNUSABLE
 from rig.errors import PlanError
 from rig.plan import compile_plan, spad_request
+from rig.session import open_rig, prepare
 from rig.sweeps import SweepAssembler
 from tests.unit.rig.streams import NO_LAG, SPAD, scan, scanner_limits, stream_of, timer_clock
 
@@ -308,3 +310,12 @@ def test_the_table_follows_the_exact_timing_of_the_spad():
     slow = plan_of(scan(frame_rate=f"{100_000 - 7} Hz"))
     assert slow.frame_rate_hz == Fraction(99_993)
     assert [len(x0) for x0 in slow.windows.x0] == [len(slow.marker_points) + 1]
+
+
+def test_columns_that_see_nothing_make_no_window_jump():
+    with open_rig(load_config("simulated", {"scan.depth_range": ["4 m", "15 m"]})) as rig:
+        plan, _ = prepare(rig)
+    assert plan.window == 128
+    assert np.abs(np.diff(plan.x0)).max() <= 64
+    assert plan.windows is not None
+    assert plan.windows.width_px <= plan.window + 128
