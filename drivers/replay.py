@@ -83,6 +83,11 @@ class ReplaySpad(SpadArray):
 
     def _do_configure(self, request: SpadRequest) -> SpadTiming:
         first = self._recording.runs[0].header
+        if not first.frame_period_ticks:
+            raise LimitExceeded(
+                f"{self.name}: the recording does not say at what rate its frames were taken; import them again with "
+                "--frame-rate"
+            )
         rate = first.tick_hz / first.frame_period_ticks
         width = self._info.width if request.window is None else request.window.width_px
         exposure_ticks = Fraction(request.exposure_s) * first.tick_hz
