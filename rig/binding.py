@@ -158,7 +158,7 @@ class FrameBinder:
         records.view(_WHOLE)[:] = block.records.view(_WHOLE)
         if self._light is not None:
             self._light.mark(block, records)
-        places = np.empty(n, np.int32), np.empty(n, np.int8), np.empty(n, np.float64), np.empty(n, np.int32)
+        places = _new_places(n)
         closed: list[SweepClock] = []
         starts = [0]
         at = 0
@@ -180,9 +180,8 @@ class FrameBinder:
 
     def compile(self) -> None:
         """Compile the walk, by placing no frames."""
-        none = np.empty(0, np.int32), np.empty(0, np.int8), np.empty(0, np.float64), np.empty(0, np.int32)
         terms = BlockTerms(0, 0, 1, 1, 1.0)
-        self._walk(self._records[:0], 0, terms, self._terms, self._carried, self._edges, *none)
+        self._walk(self._records[:0], 0, terms, self._terms, self._carried, self._edges, *_new_places(0))
 
     def _out_of_turn(self, at: int, records: NDArray[np.void], terms: BlockTerms) -> bool:
         """Whether frame `at` names a sweep that cannot have begun, as one flipped bit does.
@@ -191,12 +190,12 @@ class FrameBinder:
         out, or no frame is behind, so must the time since the latest marker.
         """
         now = self._carried[0]
-        running, number = int(now["sweep"]), _markers_seen(records[at], terms) - 1
+        running, number = int(now["sweep"]), _sweep_named(records[at], terms)
         received = bool(records[at]["marks"] & Mark.SCAN)
         if running >= 0 and received and number == running + 1:
             return False
         if at + 1 < len(records):
-            behind = _markers_seen(records[at + 1], terms) - 1
+            behind = _sweep_named(records[at + 1], terms)
             if behind != number and not (behind == number + 1 and records[at + 1]["marks"] & Mark.SCAN):
                 return True
             if running < 0 or number == running + 1:
@@ -241,7 +240,7 @@ class FrameBinder:
     def _begin(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
         """Close the sweep that ran, begin the next one at frame index `at`, where its scan marker is if received."""
         now = self._carried[0]
-        running, number = int(now["sweep"]), _markers_seen(record, terms) - 1
+        running, number = int(now["sweep"]), _sweep_named(record, terms)
         start = (int(record["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
         received = bool(record["marks"] & Mark.SCAN)
         closed = []
@@ -266,7 +265,7 @@ class FrameBinder:
         """As `_begin`, where the light has told at which frame sweeps begin and when their scan markers came."""
         assert self._light is not None, "asked for by the caller"
         now = self._carried[0]
-        running, number = int(now["sweep"]), _markers_seen(record, terms) - 1
+        running, number = int(now["sweep"]), _sweep_named(record, terms)
         place = self._light.place(number)
         closed = []
         for missed in range(running, number) if running >= 0 else ():
@@ -338,9 +337,16 @@ def _plan_terms(plan: ScanPlan) -> PlanTerms:
     )
 
 
-def _markers_seen(record: np.void, terms: BlockTerms) -> int:
-    """Scan markers since START at a frame: the record's low 16 bits, continued from the header's 32."""
-    return terms.sweep + ((int(record["sweep"]) - terms.sweep) & 0xFFFF)
+def _new_places(n: int) -> Places:
+    return np.empty(n, np.int32), np.empty(n, np.int8), np.empty(n, np.float64), np.empty(n, np.int32)
+
+
+def _sweep_named(record: np.void, terms: BlockTerms) -> int:
+    """Number of the sweep that a frame names, -1 before the first: one less than the scan markers it has seen.
+
+    Of those the record has the low 16 bits, continued from the header's 32.
+    """
+    return terms.sweep + ((int(record["sweep"]) - terms.sweep) & 0xFFFF) - 1
 
 
 def _period(header: BlockHeader) -> int:
