@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 import typer
 
 if TYPE_CHECKING:
+    from rig.acquisition import ScanProgress
     from rig.run import RunResult
 
 EXIT_USAGE = 2
@@ -21,6 +22,13 @@ EXIT_SOFTWARE = 70
 
 P = ParamSpec("P")
 
+ConfigArgument = Annotated[
+    str, typer.Argument(metavar="[CONFIG]", help="a bundled rig's name or a YAML file", show_default=True)
+]
+SceneOption = Annotated[
+    str | None,
+    typer.Option("--scene", help="a bundled scene, a scene file or a folder (simulated rigs)", show_default=False),
+]
 EstimatorOption = Annotated[
     str | None, typer.Option("--estimator", help="argmax, edge or likelihood", show_default=False)
 ]
@@ -29,6 +37,11 @@ ConfidenceOption = Annotated[
     float | None,
     typer.Option("--min-confidence", help="answers below this do not enter the depth map", show_default=False),
 ]
+OutOption = Annotated[
+    Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="runs/DATE-TIME")
+]
+RecordOption = Annotated[bool, typer.Option("--record", help="write the frames into the folder too")]
+ArmOption = Annotated[bool, typer.Option("--arm", help="let a real laser shine: the beam path is clear")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout")]
 
 
@@ -107,6 +120,13 @@ def progress(what: str) -> Iterator["Callable[..., None] | None"]:
             bar.update(task, completed=done, total=total, description=f"{what}, {lost} lost" if lost else what)
 
         yield update
+
+
+@contextmanager
+def live_progress() -> Iterator["Callable[[ScanProgress], None] | None"]:
+    """The progress bar of an acquisition's frames."""
+    with progress("frames") as bar:
+        yield None if bar is None else lambda done: bar(done.frames, done.frames_planned, done.lost)
 
 
 def default_out() -> Path:

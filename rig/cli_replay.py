@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli_command import (
+    ArmOption,
     ConfidenceOption,
     EstimatorOption,
     FilterOption,
     JsonOption,
+    OutOption,
+    RecordOption,
     command,
     default_out,
-    progress,
+    live_progress,
     report,
     say,
 )
@@ -65,21 +68,19 @@ def replay_command(
     save: Annotated[
         str, typer.Option("--save", help="maps to write: all, last or every N", show_default="all, with --loop last")
     ] = "",
-    out: Annotated[
-        Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="runs/DATE-TIME")
-    ] = None,
-    record: Annotated[bool, typer.Option("--record", help="write the frames into the folder too")] = False,
+    out: OutOption = None,
+    record: RecordOption = False,
     on_overload: Annotated[
         str, typer.Option("--on-overload", help="frames come too fast: abort and block wait, drop counts them")
     ] = "abort",
-    arm: Annotated[bool, typer.Option("--arm", help="let a real laser shine: the beam path is clear")] = False,
+    arm: ArmOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Play a recording through the live stack, at any clock."""
     from rig import api
 
     options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
-    with progress("frames") as bar:
+    with live_progress() as live:
         result = api.replay(
             run,
             clock=clock,
@@ -94,7 +95,7 @@ def replay_command(
             out=default_out() if out is None else out,
             record=record,
             on_overload=on_overload,
-            live=None if bar is None else lambda done: bar(done.frames, done.frames_planned, done.lost),
+            live=live,
             steps=_step_by_keys if clock == "step" else None,
             **options,
         )

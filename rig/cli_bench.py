@@ -1,0 +1,89 @@
+"""Commands for the speed of this machine: `rig bench`, `warmup`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli_command import ConfigArgument, JsonOption, command, print_json, progress
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    app.command("bench")(bench_command)
+    app.command("warmup")(warmup_command)
+
+
+@command
+def bench_command(
+    threads: Annotated[
+        int | None, typer.Option("--threads", help="most threads to measure", show_default="one a core", min=1)
+    ] = None,
+    soak: Annotated[
+        float | None,
+        typer.Option("--soak", help="also play so many seconds of stream in real time", show_default=False),
+    ] = None,
+    window: Annotated[bool, typer.Option("--window", help="soak: moving windows instead of whole frames")] = False,
+    slow_consumer: Annotated[
+        float, typer.Option("--slow-consumer", metavar="MS", help="soak: milliseconds added to every map")
+    ] = 0.0,
+    on_overload: Annotated[
+        str, typer.Option("--on-overload", help="soak: frames come too fast: abort, drop or block")
+    ] = "abort",
+    disk: Annotated[
+        Path | None,
+        typer.Option("--disk", metavar="FOLDER", help="measure recording to this folder's disk, nothing else"),
+    ] = None,
+    as_json: JsonOption = False,
+) -> int:
+    """How fast this machine counts and estimates, beside how fast it reads its memory."""
+    from rig import api
+
+    if disk is not None:
+        return _bench_disk(disk, as_json)
+    stream = None
+    if soak is not None:  # before all that takes a minute: what it is asked for may be wrong
+        with progress("frames") as bar:
+            stream = api.soak(
+                soak, threads=threads, window=window, slow_consumer_s=slow_consumer / 1e3, on_overload=on_overload,
+                progress=bar,
+            )  # fmt: skip
+    with progress("rows") as bar:
+        report = api.bench(threads=threads, progress=bar)
+    if as_json:
+        print_json(report.as_json() | ({} if stream is None else {"soak": stream.as_json()}))
+    else:
+        from rig.bench.table import soak_table, speed_table
+
+        speed_table(report)
+        if stream is not None:
+            print()
+            soak_table(stream)
+    return 0 if stream is None else stream.exit_code
+
+
+def _bench_disk(folder: Path, as_json: bool) -> int:
+    from rig import api
+
+    with progress("measurements") as bar:
+        found = api.bench_disk(folder, progress=bar)
+    if as_json:
+        print_json(found.as_json())
+    else:
+        from rig.bench.table import disk_table
+
+        disk_table(found)
+    return 0
+
+
+@command
+def warmup_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
+    """Compile everything that is compiled, so that no scan waits for it."""
+    from rig import api
+
+    seconds = api.warm_up(config)
+    if as_json:
+        print_json({"seconds": seconds})
+    else:
+        print(f"warm after {seconds:.1f} s; compiled code is kept on disk, once more takes seconds")
+    return 0

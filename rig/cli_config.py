@@ -1,0 +1,51 @@
+"""Commands for configs: `rig config check`, `show`, `schema`."""
+
+import typer
+
+from rig.cli_command import ConfigArgument, JsonOption, command, print_json
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    config = typer.Typer(name="config", help="Check, show or describe a config.", rich_markup_mode=None)
+    config.command("check")(check_command)
+    config.command("show")(show_command)
+    config.command("schema")(schema_command)
+    app.add_typer(config)
+
+
+@command
+def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
+    """Say whether a config is valid; all problems at once."""
+    from rig.api import configure
+
+    checked = configure(config)
+    if as_json:
+        print_json({"config": config, "name": checked.name, "valid": True})
+    else:
+        print(f"{config}: valid, rig '{checked.name}'")
+    return 0
+
+
+@command
+def show_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
+    """Print a config with every default filled in."""
+    from rig.api import configure
+
+    content = configure(config).model_dump(mode="json")
+    if as_json:
+        print_json(content)
+    else:
+        import yaml
+
+        print(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), end="")
+    return 0
+
+
+@command
+def schema_command() -> int:
+    """Print the JSON schema of a config, for editors."""
+    from rig.config_files import config_schema
+
+    print_json(config_schema())
+    return 0

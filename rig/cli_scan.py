@@ -1,0 +1,140 @@
+"""Commands that make depth maps, and what to expect of a scene: `rig scan`, `reconstruct`, `effects`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli_command import (
+    ArmOption,
+    ConfidenceOption,
+    ConfigArgument,
+    EstimatorOption,
+    FilterOption,
+    JsonOption,
+    OutOption,
+    RecordOption,
+    SceneOption,
+    command,
+    default_out,
+    live_progress,
+    print_json,
+    progress,
+    report,
+)
+
+if TYPE_CHECKING:
+    from rig.scan_plan import ScanPlan
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    app.command("scan")(scan_command)
+    app.command("reconstruct")(reconstruct_command)
+    app.command("effects")(effects_command)
+
+
+@command
+def scan_command(
+    config: ConfigArgument = "simulated",
+    scene: SceneOption = None,
+    maps: Annotated[int, typer.Option("--maps", help="depth maps to take")] = 1,
+    exposures: Annotated[
+        int | None, typer.Option("--exposures", help="frames per column (K)", show_default=False)
+    ] = None,
+    estimator: EstimatorOption = None,
+    filter: FilterOption = None,
+    min_confidence: ConfidenceOption = None,
+    seed: Annotated[int, typer.Option("--seed", help="of everything simulated")] = 0,
+    save: Annotated[str, typer.Option("--save", help="maps to write: all, last or every N")] = "all",
+    out: OutOption = None,
+    record: RecordOption = False,
+    on_overload: Annotated[
+        str, typer.Option("--on-overload", help="frames come too fast: abort, drop (and count) or block (wait)")
+    ] = "abort",
+    arm: ArmOption = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="compile and print the plan; nothing moves")] = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Acquire and reconstruct depth maps."""
+    from rig import api
+
+    options: dict[str, Any] = {
+        "scene": scene,
+        "exposures": exposures,
+        "estimator": estimator,
+        "filter": filter,
+        "min_confidence": min_confidence,
+    }
+    if dry_run:
+        plan = api.plan_scan(config, maps=maps, seed=seed, save=save, on_overload=on_overload, **options)
+        return _show_plan(plan, as_json)
+    with live_progress() as live:
+        result = api.scan(
+            config,
+            maps=maps,
+            seed=seed,
+            save=save,
+            arm=arm,
+            out=default_out() if out is None else out,
+            record=record,
+            on_overload=on_overload,
+            live=live,
+            **options,
+        )
+    return report(result, as_json)
+
+
+def _show_plan(plan: "ScanPlan", as_json: bool) -> int:
+    if as_json:
+        from rig.scanning import plan_content
+
+        print_json({"plan": plan_content(plan)})
+    else:
+        print(plan.describe())
+    return 0
+
+
+@command
+def reconstruct_command(
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="RUN_OR_NPY", help="a run taken with --record, or packed frames", show_default=False),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
+    plan: Annotated[
+        Path | None, typer.Option("--plan", help="plan.yaml of a cube", show_default="the recording's own")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="calibration.yaml", show_default="the recording's own")
+    ] = None,
+    estimator: EstimatorOption = None,
+    filter: FilterOption = None,
+    min_confidence: ConfidenceOption = None,
+    as_json: JsonOption = False,
+) -> int:
+    """Depth from a recording or from a packed .npy cube of frames."""
+    from rig import api
+
+    # Names that are none are refused by the call, which knows which there are.
+    options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
+    with progress("done") as bar:
+        result = api.reconstruct(source, plan, calibration, out=out, progress=bar, **options)
+    return report(result, as_json)
+
+
+@command
+def effects_command(
+    config: ConfigArgument = "simulated", scene: SceneOption = None, as_json: JsonOption = False
+) -> int:
+    """Which physical effects a scene calls for, why, and what leaving each out would change."""
+    from rig import api
+
+    effects = api.effects(config, scene=scene)
+    if as_json:
+        print_json({"effects": [effect.as_json() for effect in effects]})
+    else:
+        from rig.report_text import effects_table
+
+        effects_table(effects)
+    return 0
