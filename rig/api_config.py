@@ -1,0 +1,51 @@
+"""The config that a call is made with: loaded, changed by the call's options, validated."""
+
+import os
+from collections.abc import Mapping
+
+from rig.config import Estimator, Filter, RigConfig
+from rig.config_files import load_config, parse_config
+from rig.errors import UsageError
+
+PathLike = str | os.PathLike[str]
+Config = RigConfig | PathLike
+
+SIMULATED = "simulated"
+"""Name of the bundled rig, and kind of the devices, that need no hardware."""
+
+
+def configure(
+    config: Config = SIMULATED,
+    *,
+    scene: str | None = None,
+    exposures: int | None = None,
+    estimator: Estimator | None = None,
+    filter: Filter | None = None,
+    min_confidence: float | None = None,
+) -> RigConfig:
+    """The validated config that `scan` would use; options that are None stay as the config says.
+
+    config: a bundled rig's name, a file or a RigConfig. Raises UsageError with one line per problem.
+    """
+    options = {
+        "world.scene": scene,
+        "scan.exposures": exposures,
+        "estimate.estimator": estimator,
+        "estimate.filter": filter,
+        "estimate.min_confidence": min_confidence,
+    }
+    loaded = config if isinstance(config, RigConfig) else load_config(os.fspath(config))
+    if scene is not None and loaded.world is None:
+        raise UsageError(f"scene {scene!r} was asked for, but {loaded.name} is a real rig; leave --scene out")
+    given = {key: value for key, value in options.items() if value is not None}
+    if not given:
+        return loaded
+    return load_config(os.fspath(config), given) if not isinstance(config, RigConfig) else _changed(config, given)
+
+
+def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
+    content = config.model_dump(mode="json")
+    for key, value in options.items():
+        section, name = key.split(".")
+        content[section][name] = value
+    return parse_config(content)
