@@ -1,6 +1,5 @@
 """The counting thread: blocks in, maps out. It alone counts and estimates, one sweep after the other."""
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -12,6 +11,7 @@ from rig.counting import Counter, FrameTally, SweepLayout
 from rig.map_queue import AcquiredMap, MapQueue
 from rig.reconstruction import MapResult
 from rig.source import Source, blocks
+from rig.stage_thread import StageThread
 from rig.sweeps import SweepAssembler, SweepData
 
 
@@ -54,7 +54,7 @@ class Mapping:
         self._source = source
         self._silence_s = silence_s
         self._on_complete = on_complete
-        self._thread = threading.Thread(target=self._run, name="counting", daemon=True)
+        self._thread = StageThread(self._run, "counting")
         self.counting_s = 0.0
         self.estimation_s = 0.0
         self.wait_s = 0.0
@@ -67,9 +67,7 @@ class Mapping:
 
     def join(self, timeout_s: float) -> bool:
         """Wait for the thread; False where it does not end."""
-        if self._thread.ident is not None:
-            self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+        return self._thread.join(timeout_s)
 
     def _run(self) -> None:
         try:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.frames import FrameBlock
 from drivers.ring import RingReader
+from rig.stage_thread import StageThread
 from rig.stages import PipelineStats
 
 _log = logging.getLogger(__name__)
@@ -59,7 +60,7 @@ class Monitor:
         self._stats = stats
         self._interval_s = interval_s
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
+        self._thread = StageThread(self._run, "monitor")
         self.updates = 0
         self.failed = False
         """Whether the callback raised."""
@@ -76,11 +77,10 @@ class Monitor:
     def end(self, timeout_s: float) -> bool:
         """Show no more; False where the callback does not return, and is left behind with its thread."""
         self._over.set()
-        if self._thread.ident is not None:
-            self._thread.join(timeout_s)
-        if self._thread.is_alive():
+        ended = self._thread.join(timeout_s)
+        if not ended:
             _log.warning("the monitor hangs in its callback and is left behind; nothing of the run is lost")
-        return not self._thread.is_alive()
+        return ended
 
     def _run(self) -> None:
         with self._reader:

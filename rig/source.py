@@ -8,6 +8,7 @@ from drivers.errors import DeviceTimeout
 from drivers.frames import FrameBlock
 from drivers.interfaces import SpadArray
 from drivers.ring import BlockRing, RingReader
+from rig.stage_thread import StageThread
 
 HANG_S = 180.0
 """Longest wait for a SPAD whose `fill` neither returns nor says that it has nothing."""
@@ -34,7 +35,7 @@ class Source:
         self._on_end = on_end
         self._on_frame = on_frame
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="spad source", daemon=True)
+        self._thread = StageThread(self._run, "spad source")
         self._busy_s = 0.0
         self.silences: list[DeviceTimeout] = []
         """What the SPAD said each time it had nothing for half of `silence_s`."""
@@ -60,10 +61,9 @@ class Source:
 
     def join(self, timeout_s: float) -> bool:
         """Wait for the thread; False where it does not end. Readers get no more blocks in any case."""
-        if self._thread.ident is not None:
-            self._thread.join(timeout_s)
+        ended = self._thread.join(timeout_s)
         self._ring.finish()
-        return not self._thread.is_alive()
+        return ended
 
     def _run(self) -> None:
         error: BaseException | None = None

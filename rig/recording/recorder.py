@@ -4,7 +4,6 @@ It has a required place in the ring: where the disk is slower than the stream, t
 decides. Blocks are written by the recording's own threads, several at a time, from the slots they lie in.
 """
 
-import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -12,6 +11,7 @@ from concurrent.futures import Future
 from drivers.frames import FrameBlock
 from drivers.ring import RingReader
 from rig.recording.writer import Recording
+from rig.stage_thread import StageThread
 
 
 class Recorder:
@@ -24,7 +24,7 @@ class Recorder:
         self._reader = reader
         self._recording = recording
         self._on_failure = on_failure
-        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread = StageThread(self._run, "recorder")
         self._before = recording.busy_s, recording.blocks, recording.bytes
         self.error: BaseException | None = None
 
@@ -49,9 +49,7 @@ class Recorder:
 
     def join(self, timeout_s: float) -> bool:
         """Wait until everything is written; False where that takes longer."""
-        if self._thread.ident is not None:
-            self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+        return self._thread.join(timeout_s)
 
     def _run(self) -> None:
         with self._reader:
