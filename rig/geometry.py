@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.model import RigModel
+from calibration.triangulation import near_side
 from rig.errors import UsageError
 
 WORD_PX: Final = 64
@@ -98,8 +99,7 @@ def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: 
             "depth is not determined; check the baseline in the calibration"
         )
     plane = planes[:, :3] / offset[:, None]
-    middle = len(plane) // 2
-    near_is_left = bool(plane[middle, 0] < 0)
+    near_is_left = bool(near_side(0.0, 0.0, planes[len(planes) // 2], model.camera) < 0)
     near_m, far_m = depth_range_m
     x_lo, x_hi = row_windows(u, v, plane, 1.0 / far_m, 1.0 / near_m)
     seen = x_lo <= x_hi
