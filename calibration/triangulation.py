@@ -1,4 +1,4 @@
-"""Depth where a pixel's ray meets a light plane, and how uncertain it is.
+"""Depth where a pixel's ray meets a light plane, and how it changes along an image row.
 
 Ray r = (u, v, 1), plane n.X = d:  z = d / (n.r). Along an image row dz/dx = -(z^2 / d) (n . dr/dx), whose sign says on
 which side of the stripe the near points lie. Everything broadcasts; NaN is 'no depth', never inf, never a warning.
@@ -38,11 +38,6 @@ def depth_slope(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -
     with np.errstate(all="ignore"):
         slope = -(z * z) / p[..., 3] * (p[..., 0] * du + p[..., 1] * dv)
     return np.where(np.isfinite(slope), slope, np.nan)
-
-
-def depth_sd(u: ArrayLike, v: ArrayLike, planes: ArrayLike, x_sd_px: ArrayLike, camera: Camera) -> Array:
-    """Standard deviation of depth (m), first order in the stripe's x_sd_px (raw pixels); NaN = no depth."""
-    return np.abs(depth_slope(u, v, planes, camera)) * np.asarray(x_sd_px, np.float64)
 
 
 def near_side(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -> NDArray[np.int8]:

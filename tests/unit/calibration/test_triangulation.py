@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.triangulation import depth, depth_sd, depth_slope, inverse_depth, near_side
+from calibration.triangulation import depth, depth_slope, inverse_depth, near_side
 from tests.unit.calibration.cameras import LENSES, camera
 
 TILT = st.floats(-0.6, 0.6)
@@ -60,7 +60,7 @@ def test_no_meeting_point_is_nan_without_a_warning() -> None:
     assert inverse_depth(0.0, 0.0, behind) < 0
     assert np.isnan(depth(np.nan, 0.0, [1, 0, -1, -0.3]))
     assert np.isnan(depth(1e-320, 0.0, [-1, 0, 0, -0.3]))  # so far away that z overflows
-    assert np.isnan(depth_sd(0.0, 0.0, through_camera, 1.0, camera([])))
+    assert np.isnan(depth_slope(0.0, 0.0, through_camera, camera([])))
 
 
 def test_a_rectified_rig_gives_the_textbook_depth() -> None:
@@ -78,15 +78,6 @@ def test_depth_slope_is_the_derivative_along_the_raw_row(terms: list[float]) -> 
     around = [depth(*cam.tangents_at(x + h, y), plane) for h in (-0.01, 0.01)]
     slope = depth_slope(*cam.tangents_at(x, y), plane, cam)
     assert np.allclose(slope, (around[1] - around[0]) / 0.02, rtol=1e-5)
-    assert np.allclose(depth_sd(*cam.tangents_at(x, y), plane, 0.3, cam), 0.3 * np.abs(slope))
-
-
-def test_depth_sd_is_the_spread_of_noisy_stripes() -> None:
-    cam = camera(LENSES["5 terms"])
-    plane = np.array([0.9, 0.1, -0.45, -0.3])
-    noisy = 200 + np.random.default_rng(0).normal(0, 0.2, 20000)
-    spread = np.std(depth(*cam.tangents_at(noisy, 250.0), plane))
-    assert spread == pytest.approx(float(depth_sd(*cam.tangents_at(200.0, 250.0), plane, 0.2, cam)), rel=0.03)
 
 
 @pytest.mark.parametrize(("side", "near"), [(-0.3, -1), (0.3, 1)])
