@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from rig.aligned import aligned_zeros
 from rig.geometry import WORD_PX
+from rig.lane_memory import address_of
 from rig.lane_order import PAD, PAIRS, STEPS, new_counts, padded_lanes, read_planes, write_counts
-from rig.lanes import LANES, address_of
+from rig.lanes import LANES
 
 WORD_BYTES: Final = 8
 CHUNK: Final = 256

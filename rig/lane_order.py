@@ -11,18 +11,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.lanes import (
-    LANES,
-    as_bytes,
-    first_row_pairs,
-    load_bytes,
-    load_two_rows,
-    second_row_pairs,
-    store_bytes,
-    write_byte,
-    zero_bytes,
-    zero_int16,
-)
+from rig.lane_memory import load_bytes, load_two_rows, store_bytes, write_byte
+from rig.lane_shuffles import first_row_pairs, second_row_pairs
+from rig.lanes import LANES, as_bytes, zero_bytes, zero_int16
 
 STEPS: Final = 8
 """Pixels per lane."""

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from rig.aligned import aligned_zeros
 from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, LABEL_PX, LABELS, cell_of
 from rig.estimators.screen_tables import LN2, WEIGHT_LIMIT
-from rig.estimators.search_kernels import count_place
+from rig.estimators.search_buffers import count_place
+from rig.lane_memory import load_bytes, load_float32, read_int16
 from rig.lanes import (
     LANES,
     UNPACKED,
@@ -23,9 +24,6 @@ from rig.lanes import (
     dot_pairs,
     larger,
     larger_float,
-    load_bytes,
-    load_float32,
-    read_int16,
     smaller,
     square_root,
     to_bfloat16,

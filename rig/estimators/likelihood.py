@@ -19,8 +19,8 @@ from rig.estimators.judging import judge_of, nothing_found, quiet_of, stripes_of
 from rig.estimators.learning import Expectation, learn_first, learn_next, lines_of, next_lattice
 from rig.estimators.row_input import Lines
 from rig.estimators.row_model import RowModel
+from rig.estimators.search_buffers import search_memory
 from rig.estimators.search_desk import Judge
-from rig.estimators.search_kernels import search_memory
 from rig.estimators.stream import ColumnJudge, SearchedSweep
 from rig.estimators.stream_kernels import search_counts
 from rig.geometry import SweepGeometry

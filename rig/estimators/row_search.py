@@ -11,34 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.aligned import CACHE_LINE
+from rig.estimators.best_kernels import NOTHING, add_likelihoods, certainties, find_best
 from rig.estimators.closeup_kernels import label_scores, levels_of, offsets
 from rig.estimators.powers import lift_to_powers, powers, powers_in_order
 from rig.estimators.row_kernels import LABEL_PX
 from rig.estimators.screen_tables import NONE, OUTSIDE, SCREENS
+from rig.estimators.search_buffers import BATCH, Search, Table, count_place
 from rig.estimators.search_desk import COUNT_LIMIT, FIELDS, Desk
-from rig.estimators.search_kernels import (
-    BATCH,
-    NOTHING,
-    START,
-    Search,
-    Table,
-    add_likelihoods,
-    certainties,
-    count_place,
-    find_best,
-    fit_lanes,
-    fit_positions,
-    score_rows,
-)
+from rig.estimators.search_kernels import START, fit_lanes, fit_positions, score_rows
 from rig.geometry import WORD_PX
-from rig.lane_order import PAD, PAIRS, STEPS, pair_bytes, place_of
-from rig.lane_reductions import largest_of_rows, store_folded, totals_of_rows
-from rig.lanes import (
-    LANES,
-    as_bytes,
-    lanes_between,
-    larger,
-    larger_float,
+from rig.lane_memory import (
     load_bytes,
     load_float32,
     load_int16,
@@ -47,16 +29,17 @@ from rig.lanes import (
     read_float32,
     read_int16,
     read_int32,
-    smaller,
-    smaller_float,
     store_bytes,
     store_float32,
     store_int16,
-    to_float32,
     write_byte,
     write_float32,
     write_int32,
 )
+from rig.lane_order import PAD, PAIRS, STEPS, pair_bytes, place_of
+from rig.lane_reductions import largest_of_rows, store_folded, totals_of_rows
+from rig.lane_shuffles import lanes_between
+from rig.lanes import LANES, as_bytes, larger, larger_float, smaller, smaller_float, to_float32
 
 QUIET: Final = 0.9
 """Probability within 1 px from which the pixels behind the stripe teach the ambient light."""

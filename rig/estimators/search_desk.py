@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rig.estimators.closeup_kernels import Closeup
 from rig.estimators.screen_tables import Tables
-from rig.lanes import address_of
+from rig.lane_memory import address_of
 
 COUNT_LIMIT: Final = 63
 """Largest count the search works with; counts of more exposures are halved until they fit."""

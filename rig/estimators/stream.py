@@ -10,8 +10,8 @@ from rig.counting_kernels import add_runs, new_planes, rows_of_chunk
 from rig.estimators.judging import clear_found, nothing_found, quiet_of, stripes_of
 from rig.estimators.learning import next_lattice
 from rig.estimators.row_input import Lines
+from rig.estimators.search_buffers import search_memory
 from rig.estimators.search_desk import Desk, Found, Judge, desk_of
-from rig.estimators.search_kernels import search_memory
 from rig.estimators.stream_kernels import OpenColumn, carry_sums, search_frames
 from rig.geometry import SweepGeometry
 from rig.lane_order import padded_lanes, pixel_order

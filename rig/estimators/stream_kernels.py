@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from rig.counting import BYTE_FRAMES
 from rig.counting_kernels import CHUNK, PLANES, WORD_BYTES, add_frames, planes_for, rows_of_chunk
 from rig.estimators.row_search import halvings, judge_rows, keep_line, table_for
+from rig.estimators.search_buffers import BATCH, search_in
 from rig.estimators.search_desk import Desk, Found, Judge, desk_of
-from rig.estimators.search_kernels import BATCH, search_in
 from rig.geometry import WORD_PX
+from rig.lane_memory import add_bytes, address_of, load_bytes, read_int32, store_bytes
 from rig.lane_order import PAIRS, STEPS, halve_counts, read_counts, read_planes, sum_counts
-from rig.lanes import LANES, add_bytes, address_of, load_bytes, read_int32, store_bytes, zero_bytes
+from rig.lanes import LANES, zero_bytes
 
 SUM_LIMIT: Final = BYTE_FRAMES
 """Exposures after which the 8-bit sums are carried over."""

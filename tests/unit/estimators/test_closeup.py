@@ -19,18 +19,10 @@ from rig.estimators.closeup_kernels import (
 from rig.estimators.powers import lift_to_powers, powers
 from rig.estimators.row_kernels import FLOOR, LABEL_PX, LABELS, logit_table
 from rig.estimators.row_model import fine_profiles
-from rig.estimators.search_kernels import count_place, search_in, search_memory
+from rig.estimators.search_buffers import count_place, search_in, search_memory
+from rig.lane_memory import address_of, load_float32, load_int16, read_int16, store_float32, store_int16, write_byte
 from rig.lane_reductions import largest_of_rows, store_folded, totals_of_rows
-from rig.lanes import (
-    LANES,
-    address_of,
-    load_float32,
-    load_int16,
-    read_int16,
-    store_float32,
-    store_int16,
-    write_byte,
-)
+from rig.lanes import LANES
 
 TABLE = logit_table()
 AMBIENT, SHARE = 0.004, 0.1

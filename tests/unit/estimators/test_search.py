@@ -15,11 +15,12 @@ from rig.estimators.row_input import judge_line, row_buffers, row_fluxes, state_
 from rig.estimators.row_kernels import mode_of
 from rig.estimators.row_model import RowModel, line_profile, stripe_scale
 from rig.estimators.row_search import table_for
+from rig.estimators.search_buffers import BATCH, search_in, search_memory
 from rig.estimators.search_desk import desk_of
-from rig.estimators.search_kernels import BATCH, START, score_rows, search_in, search_memory
+from rig.estimators.search_kernels import START, score_rows
 from rig.estimators.stream_kernels import search_counts
+from rig.lane_memory import read_int16
 from rig.lane_order import STEPS, padded_lanes, read_counts
-from rig.lanes import read_int16
 from rig.row_threads import RowWorkers
 from tests.reference.geometry import Geometry
 from tests.unit.small_maps import geometry_of, simulated, volume_of

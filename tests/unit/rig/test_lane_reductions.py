@@ -4,21 +4,21 @@ import numba
 import numpy as np
 import pytest
 
-from rig import lanes
+from rig.lane_memory import address_of, load_float32, store_float32, store_int16
 from rig.lane_reductions import FOLDED, largest_of_rows, store_folded, totals_of_rows
-from rig.lanes import LANES, address_of
+from rig.lanes import LANES
 
 
 @numba.njit
 def largest(rows, out):
-    lanes.store_int16(address_of(out), 0, largest_of_rows(address_of(rows)))
+    store_int16(address_of(out), 0, largest_of_rows(address_of(rows)))
 
 
 @numba.njit
 def totals(rows, folded, out):
     for r in range(LANES):
-        store_folded(address_of(folded), r, lanes.load_float32(address_of(rows), r * LANES))
-    lanes.store_float32(address_of(out), 0, totals_of_rows(address_of(folded)))
+        store_folded(address_of(folded), r, load_float32(address_of(rows), r * LANES))
+    store_float32(address_of(out), 0, totals_of_rows(address_of(folded)))
 
 
 @pytest.mark.parametrize("seed", range(5))

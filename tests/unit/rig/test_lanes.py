@@ -4,8 +4,25 @@ import numba
 import numpy as np
 import pytest
 
-from rig import lanes
-from rig.lanes import LANES, UNPACKED, address_of
+from rig import lane_shuffles, lanes
+from rig.lane_memory import (
+    add_bytes,
+    address_of,
+    load_bytes,
+    load_float32,
+    load_int16,
+    load_two_rows,
+    read_float32,
+    read_int16,
+    read_int32,
+    store_bytes,
+    store_float32,
+    store_int16,
+    write_float32,
+    write_int16,
+    write_int32,
+)
+from rig.lanes import LANES, UNPACKED
 
 EDGES = np.array([-32768, -32767, -20000, -256, -1, 0, 1, 2, 127, 128, 255, 256, 12345, 32000, 32766, 32767], np.int16)
 
@@ -23,9 +40,7 @@ def compiled(operation):
 
     @numba.njit
     def kernel(a, b, out):
-        lanes.store_int16(
-            address_of(out), 0, operation(lanes.load_int16(address_of(a), 0), lanes.load_int16(address_of(b), 0))
-        )
+        store_int16(address_of(out), 0, operation(load_int16(address_of(a), 0), load_int16(address_of(b), 0)))
 
     return kernel
 
@@ -33,7 +48,7 @@ def compiled(operation):
 def reduced(operation):
     @numba.njit
     def kernel(a):
-        return operation(lanes.load_int16(address_of(a), 0))
+        return operation(load_int16(address_of(a), 0))
 
     return kernel
 
@@ -59,7 +74,7 @@ OPERATIONS = {
     "shift right": (numba.njit(lambda a, b: a >> 5), lambda a, b: a.view(np.uint16) >> 5),
     "shift left": (numba.njit(lambda a, b: a << 3), lambda a, b: wide(a) << 3),
     "with a number": (numba.njit(lambda a, b: (a & 0x55) + 7), lambda a, b: (a & 0x55) + 7),
-    "one lane up": (numba.njit(lambda a, b: lanes.up_1(a)), lambda a, b: np.append(0, a[:-1])),
+    "one lane up": (numba.njit(lambda a, b: lane_shuffles.up_1(a)), lambda a, b: np.append(0, a[:-1])),
 }
 
 
@@ -75,7 +90,7 @@ def test_lanes_do_what_numpy_does(name):
 
 
 def test_running_sums_are_sums_of_all_lanes_below():
-    kernel = compiled(numba.njit(lambda a, b: lanes.running_sum(a)))
+    kernel = compiled(numba.njit(lambda a, b: lane_shuffles.running_sum(a)))
     rng = np.random.default_rng(2)
     out = np.empty(LANES, np.int16)
     for _ in range(20):
@@ -87,12 +102,12 @@ def test_running_sums_are_sums_of_all_lanes_below():
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_running_sums_stop_at_the_limits(sign):
     a, out = np.full(LANES, sign * 5000, np.int16), np.empty(LANES, np.int16)
-    compiled(numba.njit(lambda a, b: lanes.running_sum(a)))(a, a, out)
+    compiled(numba.njit(lambda a, b: lane_shuffles.running_sum(a)))(a, a, out)
     np.testing.assert_array_equal(out, saturated(np.cumsum(a.astype(np.int64))))
 
 
 def test_the_last_lane():
-    last = reduced(lanes.last_lane)
+    last = reduced(lane_shuffles.last_lane)
     for a, _ in samples():
         assert last(a) == a[-1]
 
@@ -100,8 +115,8 @@ def test_the_last_lane():
 def test_equal_lanes_and_their_lowest():
     @numba.njit
     def mask_of(a, number):
-        mask = lanes.equal_mask(lanes.load_int16(address_of(a), 0), number)
-        return mask, lanes.lowest_bit(mask)
+        mask = lane_shuffles.equal_mask(load_int16(address_of(a), 0), number)
+        return mask, lane_shuffles.lowest_bit(mask)
 
     for a, b in samples():
         for number in (a[3], a[15], b[0]):
@@ -115,7 +130,7 @@ def test_equal_lanes_and_their_lowest():
 def test_lanes_between(first, end):
     @numba.njit
     def mask_of(first, end, out):
-        lanes.store_int16(address_of(out), 0, lanes.lanes_between(first, end))
+        store_int16(address_of(out), 0, lane_shuffles.lanes_between(first, end))
 
     out = np.empty(LANES, np.int16)
     mask_of(first, end, out)
@@ -128,8 +143,8 @@ def bytes_kernel(operation):
 
     @numba.njit
     def kernel(a, b, out):
-        one, other = lanes.load_bytes(address_of(a), 0), lanes.load_bytes(address_of(b), 0)
-        lanes.store_bytes(address_of(out), 0, operation(one, other))
+        one, other = load_bytes(address_of(a), 0), load_bytes(address_of(b), 0)
+        store_bytes(address_of(out), 0, operation(one, other))
 
     return kernel
 
@@ -145,11 +160,11 @@ def random_bytes(seed, n=2 * LANES):
         (numba.njit(lambda a, b: (a >> 3) & 0x55), lambda a, b: (a >> 3) & 0x55),
         (numba.njit(lambda a, b: (a & 0xAA) | (b << 2)), lambda a, b: (a & 0xAA) | (b << 2)),
         (
-            numba.njit(lambda a, b: lanes.first_row_pairs(a, b)),
+            numba.njit(lambda a, b: lane_shuffles.first_row_pairs(a, b)),
             lambda a, b: np.stack([a[:LANES], b[:LANES]], axis=1).ravel(),
         ),
         (
-            numba.njit(lambda a, b: lanes.second_row_pairs(a, b)),
+            numba.njit(lambda a, b: lane_shuffles.second_row_pairs(a, b)),
             lambda a, b: np.stack([a[LANES:], b[LANES:]], axis=1).ravel(),
         ),
     ],
@@ -165,7 +180,7 @@ def test_bytes_do_what_numpy_does(operation, wanted):
 def test_two_rows_of_bytes_are_loaded_side_by_side():
     @numba.njit
     def loaded(a, first, second, out):
-        lanes.store_bytes(address_of(out), 0, lanes.load_two_rows(address_of(a), first, second))
+        store_bytes(address_of(out), 0, load_two_rows(address_of(a), first, second))
 
     a, out = random_bytes(1, 100), np.empty(2 * LANES, np.uint8)
     for first, second in ((0, 16), (3, 77), (50, 50)):
@@ -181,8 +196,8 @@ def test_products_of_pairs_are_added_and_stop_at_the_limits(one_instruction, mon
 
     @numba.njit
     def dot(counts, weights, out):
-        pairs = lanes.dot_pairs(lanes.load_bytes(address_of(counts), 0), lanes.load_bytes(address_of(weights), 0))
-        lanes.store_int16(address_of(out), 0, pairs)
+        pairs = lanes.dot_pairs(load_bytes(address_of(counts), 0), load_bytes(address_of(weights), 0))
+        store_int16(address_of(out), 0, pairs)
 
     rng = np.random.default_rng(2)
     for largest in (1, 64, 255):
@@ -198,7 +213,7 @@ def test_products_of_pairs_are_added_and_stop_at_the_limits(one_instruction, mon
 def test_bytes_are_added_to_wide_numbers():
     @numba.njit
     def add(sums, a):
-        lanes.add_bytes(address_of(sums), 3, lanes.load_bytes(address_of(a), 0))
+        add_bytes(address_of(sums), 3, load_bytes(address_of(a), 0))
 
     sums, a = np.arange(40, dtype=np.int32) * 10**6, random_bytes(5)
     wanted = sums.copy()
@@ -210,11 +225,11 @@ def test_bytes_are_added_to_wide_numbers():
 def test_bytes_of_16_bit_lanes_and_equal_numbers_a_step_apart():
     @numba.njit
     def split(a, out):
-        lanes.store_bytes(address_of(out), 0, lanes.as_bytes(lanes.load_int16(address_of(a), 0)))
+        store_bytes(address_of(out), 0, lanes.as_bytes(load_int16(address_of(a), 0)))
 
     @numba.njit
     def mask(a, at, step, number):
-        return lanes.equal_bits(address_of(a), at, step, number)
+        return lane_shuffles.equal_bits(address_of(a), at, step, number)
 
     out = np.empty(2 * LANES, np.uint8)
     split(EDGES, out)
@@ -247,8 +262,8 @@ def test_float_lanes_do_what_numpy_does(name):
 
     @numba.njit
     def kernel(a, b, out):
-        one, other = lanes.load_float32(address_of(a), 0), lanes.load_float32(address_of(b), 0)
-        lanes.store_float32(address_of(out), 0, operation(one, other))
+        one, other = load_float32(address_of(a), 0), load_float32(address_of(b), 0)
+        store_float32(address_of(out), 0, operation(one, other))
 
     rng = np.random.default_rng(3)
     for _ in range(20):
@@ -261,9 +276,9 @@ def test_float_lanes_do_what_numpy_does(name):
 def test_bfloat16_patterns_become_numbers_in_the_order_that_is_said():
     @numba.njit
     def numbers_of(a, out, unpacked):
-        patterns = lanes.load_int16(address_of(a), 0)
-        lanes.store_float32(address_of(out), 0, lanes.from_bfloat16(patterns))
-        lanes.store_float32(address_of(unpacked), 0, lanes.from_bfloat16_unpacked(patterns))
+        patterns = load_int16(address_of(a), 0)
+        store_float32(address_of(out), 0, lanes.from_bfloat16(patterns))
+        store_float32(address_of(unpacked), 0, lanes.from_bfloat16_unpacked(patterns))
 
     numbers = np.array([0, 1, 2, 0.5, -3, 1e30, 1e-30, 7, 1.5, 2.5, 100, -0.25, 3e5, 1e-5, 96, 12], np.float32)
     patterns = (numbers.view(np.uint32) >> 16).astype(np.uint16).view(np.int16)
@@ -278,7 +293,7 @@ def test_bfloat16_patterns_become_numbers_in_the_order_that_is_said():
 def test_floats_lose_their_fraction_on_the_way_to_integers():
     @numba.njit
     def cut(a, out):
-        lanes.store_int16(address_of(out), 0, lanes.to_int16(lanes.load_float32(address_of(a), 0)))
+        store_int16(address_of(out), 0, lanes.to_int16(load_float32(address_of(a), 0)))
 
     a = np.array(
         [-32000, -1.9, -1, -0.5, 0, 0.5, 0.99, 1, 1.5, 2.999, 100, 255.5, 1e4, 31999.9, -12345.6, 3], np.float32
@@ -291,9 +306,9 @@ def test_floats_lose_their_fraction_on_the_way_to_integers():
 def test_single_numbers_are_read_and_written_where_they_are_said_to_be():
     @numba.njit
     def move(a, b, c, x, y, z):
-        lanes.write_int16(address_of(x), 2, lanes.read_int16(address_of(a), 5))
-        lanes.write_int32(address_of(y), 3, lanes.read_int32(address_of(b), 4))
-        lanes.write_float32(address_of(z), 4, lanes.read_float32(address_of(c), 1))
+        write_int16(address_of(x), 2, read_int16(address_of(a), 5))
+        write_int32(address_of(y), 3, read_int32(address_of(b), 4))
+        write_float32(address_of(z), 4, read_float32(address_of(c), 1))
 
     a, b, c = np.arange(9, dtype=np.int16) - 4, np.arange(9, dtype=np.int32) * 10**8, np.arange(9, dtype=np.float32) / 8
     x, y, z = np.zeros(9, np.int16), np.zeros(9, np.int32), np.zeros(9, np.float32)
@@ -306,9 +321,9 @@ def test_single_numbers_are_read_and_written_where_they_are_said_to_be():
 def test_constants():
     @numba.njit
     def zeros(numbers, fractions, counts):
-        lanes.store_int16(address_of(numbers), 0, lanes.zero_int16())
-        lanes.store_float32(address_of(fractions), 0, lanes.zero_float32())
-        lanes.store_bytes(address_of(counts), 0, lanes.zero_bytes())
+        store_int16(address_of(numbers), 0, lanes.zero_int16())
+        store_float32(address_of(fractions), 0, lanes.zero_float32())
+        store_bytes(address_of(counts), 0, lanes.zero_bytes())
 
     out = np.ones(LANES, np.int16), np.ones(LANES, np.float32), np.ones(2 * LANES, np.uint8)
     zeros(*out)
