@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import FrameTally, SweepLayout, SweepTally
-from rig.counting_kernels import add_runs, new_planes, rows_of_chunk
+from rig.counting_kernels import WORD_BYTES, add_runs, new_planes, rows_of_chunk
 from rig.estimators.judging import clear_found, nothing_found, quiet_of, stripes_of
 from rig.estimators.learning import next_lattice
 from rig.estimators.row_input import Lines
 from rig.estimators.search_buffers import search_memory
 from rig.estimators.search_desk import Desk, Found, Judge, desk_of
 from rig.estimators.stream_kernels import OpenColumn, carry_sums, search_frames
-from rig.geometry import SweepGeometry
+from rig.geometry import WORD_PX, SweepGeometry
 from rig.lane_order import padded_lanes, pixel_order
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
@@ -71,9 +71,9 @@ class ColumnJudge:
         self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
     ) -> None:
         """Add frames, see `Counter`; columns that they complete are judged."""
-        first_word = x0 // np.int32(64)
+        first_word = x0 // np.int32(WORD_PX)
         self._tally.note(bins, column, first_word)
-        words, row_words = bits.reshape(-1).view(np.uint64), bits.shape[2] // 8
+        words, row_words = bits.reshape(-1).view(np.uint64), bits.shape[2] // WORD_BYTES
         self._judge_block(words, bins, first_word, row_words, end=False)
         if np.any(bins == -1):
             layout = self._layout
@@ -115,7 +115,7 @@ class ColumnJudge:
     ) -> None:  # fmt: skip
         layout = self._layout
         # Frames of whole rows begin at the sensor's first word, whatever part of them is used.
-        if row_words == layout.padded_width // 64:
+        if row_words == layout.padded_width // WORD_PX:
             first_word = np.zeros_like(first_word)
         if self._row_words not in (0, row_words):
             raise ValueError(f"frames of {row_words} words a row behind those of {self._row_words}; begin a new sweep")
