@@ -5,7 +5,6 @@ its neighbours while the laser crosses the whole picture is hot, whatever the sc
 mean.
 """
 
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,7 +22,7 @@ HOT_SIGMA = 6.0
 
 
 def ambient_map(
-    tally: FrameTally, intensity: NDArray[np.uint32], geometry: SweepGeometry, quiet: NDArray[np.integer[Any]] | None
+    tally: FrameTally, intensity: NDArray[np.uint32], geometry: SweepGeometry, quiet: NDArray[np.float64] | None
 ) -> NDArray[np.float32]:
     """Photons per exposure (rows, width) float32 from dark frames, `quiet` (2, rows, width) counts and hot pixels.
 

@@ -11,7 +11,7 @@ from rig.estimators.row_input import TABLE, State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
 from rig.estimators.row_search import QUIET_STEP, SIGNAL_REACH_PX, halvings, turned
 from rig.estimators.screen_tables import NONE, SCREENS, WEIGHT_LIMIT, Tables, fill_tables
-from rig.estimators.search_desk import COUNT_LIMIT, FIELDS, Found, Judge, count_fluxes
+from rig.estimators.search_desk import COUNT_LIMIT, EXPOSURE_PARTS, FIELDS, Found, Judge, count_fluxes
 from rig.geometry import WORD_PX, SweepGeometry
 from rig.lane_order import PAIRS, STEPS, padded_lanes, pair_bytes, pixel_order, places_of
 from rig.lanes import LANES
@@ -156,10 +156,10 @@ def stripes_of(found: Found, judge: Judge, workers: RowWorkers) -> StripeTable:
     return StripeTable(*out)
 
 
-def quiet_of(found: Found, width: int) -> NDArray[np.int32]:
-    """Ones and exposures of pixels while clearly behind a stripe, int32 (2, rows, width)."""
+def quiet_of(found: Found, width: int) -> NDArray[np.float64]:
+    """Ones and exposures of pixels while clearly behind a stripe, float64 (2, rows, width); both as halved."""
     exposures = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), STEPS, axis=1)[:, :width]
-    return np.stack([pixel_order(found.quiet, width), exposures])
+    return np.stack([pixel_order(found.quiet, width), exposures / EXPOSURE_PARTS])
 
 
 def _limits(geometry: SweepGeometry) -> NDArray[np.int16]:

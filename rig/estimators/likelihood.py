@@ -108,7 +108,7 @@ class Likelihood:
 
     def _search(
         self, volume: CountVolume, geometry: SweepGeometry, model: RowModel
-    ) -> tuple[StripeTable, NDArray[np.int32]]:
+    ) -> tuple[StripeTable, NDArray[np.float64]]:
         """Stripes under `model`, and the ones and exposures of pixels behind clear stripes (2, rows, width)."""
         exposures = volume.exposures
         if exposures is None:
@@ -131,7 +131,7 @@ def _teach(
     tally: FrameTally,
     intensity: NDArray[np.uint32],
     key: "_JudgeKey",
-    quiet: NDArray[np.int32],
+    quiet: NDArray[np.float64],
     lines: Lines,
 ) -> "_Lesson":
     """The model carried on by one sweep, and the judge that follows from it, on one thread beside the stream."""

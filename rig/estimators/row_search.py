@@ -17,7 +17,7 @@ from rig.estimators.powers import lift_to_powers, powers, powers_in_order
 from rig.estimators.row_kernels import LABEL_PX
 from rig.estimators.screen_tables import NONE, OUTSIDE, SCREENS
 from rig.estimators.search_buffers import BATCH, Search, Table, count_place
-from rig.estimators.search_desk import COUNT_LIMIT, FIELDS, Desk
+from rig.estimators.search_desk import COUNT_LIMIT, EXPOSURE_PARTS, FIELDS, Desk
 from rig.estimators.search_kernels import START, fit_lanes, fit_positions, score_rows
 from rig.geometry import WORD_PX
 from rig.lane_memory import (
@@ -208,7 +208,7 @@ def _measure_light(desk, search, table, first, rows, c, exposures, stripe):  # t
 
 @numba.njit(forceinline=True)
 def _read_light(desk, search, table, rows, exposures, reach):  # type: ignore[no-untyped-def]
-    flux = desk.flux + 4 * (COUNT_LIMIT + 2) * np.int64(exposures)
+    flux = desk.flux + 4 * (COUNT_LIMIT + 2) * np.int64(EXPOSURE_PARTS * exposures)
     for r in range(rows):
         n, x = search.n + r * search.n_bytes, np.int64(read_int16(search.x, r))
         light = np.float32(0.0)
@@ -286,8 +286,9 @@ def _learn_quiet(desk: Desk, lanes: int, n: int, y: int, c: int, x: int, exposur
             counts = load_bytes(n, q * pair_bytes(lanes) + 2 * (PAD + v)) & quiet
             store_bytes(sums, at, load_bytes(sums, at) + counts)
     steps = desk.quiet_exposures + 4 * (y * (desk.sum_lanes + 1) + np.int64(read_int32(desk.x0, c)) // STEPS)
-    write_int32(steps, begin, read_int32(steps, begin) + np.int32(exposures))
-    write_int32(steps, end, read_int32(steps, end) - np.int32(exposures))
+    parts = np.int32(EXPOSURE_PARTS * exposures)
+    write_int32(steps, begin, read_int32(steps, begin) + parts)
+    write_int32(steps, end, read_int32(steps, end) - parts)
 
 
 @numba.njit(cache=True, nogil=True)

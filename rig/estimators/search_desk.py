@@ -12,6 +12,8 @@ from rig.lane_memory import address_of
 
 COUNT_LIMIT: Final = 63
 """Largest count the search works with; counts of more exposures are halved until they fit."""
+EXPOSURE_PARTS: Final = 4
+"""Exposures whose counts were halved are broken numbers: 65 become 32.5, 65535 become 63.999."""
 FIELDS: Final = 5
 """x_px, confidence, x_sd_px, signal, haze: see `StripeTable`."""
 
@@ -57,7 +59,7 @@ class Found(NamedTuple):
 
     stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 where there is nothing. quiet: int32 (rows, PAIRS,
     lanes of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
-    (rows, lanes + 1), their exposures as steps up and down. light: int32, like quiet, ones of every pixel within the
+    (rows, lanes + 1), their exposures in 1/EXPOSURE_PARTS as steps up and down. light: int32, like quiet, ones of every pixel within the
     windows. The last ones of both are still in quiet_here and light_here, uint8 (rows, PAIRS, lanes of the window, 2).
     lines: int32 (lines, window), counts of the rows that the learning reads; line_start: int32 (columns + 1,) and
     line_row: int32, the rows of each column in order.
@@ -154,9 +156,12 @@ def desk_of(judge: Judge, found: Found, memory: NDArray[np.uint8]) -> Desk:
 
 
 def count_fluxes() -> NDArray[np.float32]:
-    """Photons per exposure that n ones in k exposures speak for, (k, n) float32: nearly unbiased, finite also at n = k.
+    """Photons per exposure that n ones in k exposures speak for, float32: nearly unbiased, finite also at n = k.
+
+    Rows are k in steps of 1/EXPOSURE_PARTS, columns n.
 
     Halved counts are rounded up, so that n may exceed the limit by one.
     """
-    k, n = np.mgrid[: COUNT_LIMIT + 1, : COUNT_LIMIT + 2]
+    parts, n = np.mgrid[: EXPOSURE_PARTS * (COUNT_LIMIT + 1), : COUNT_LIMIT + 2]
+    k = parts / EXPOSURE_PARTS
     return np.log((k + 0.5) / (np.maximum(k - n, 0) + 0.5)).astype(np.float32)

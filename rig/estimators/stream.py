@@ -31,7 +31,7 @@ class SearchedSweep(FrameTally):
 
     stripe: StripeTable
     light: NDArray[np.uint32]
-    quiet: NDArray[np.int32]
+    quiet: NDArray[np.float64]
     lines: Lines
 
     def intensity(self) -> NDArray[np.uint32]:

@@ -214,6 +214,6 @@ def search_counts(
             for y in range(max(first_row, band * desk.band_rows), end, BATCH):
                 rows = min(BATCH, end - y)
                 for r in range(rows):
-                    read_counts(counts[c, y + r], halved, search.n + r * search.n_bytes, search.lanes)
+                    read_counts(counts[c, y + r], halved, search.n + r * search.n_bytes, search.lanes, c)
                 judge_rows(desk, search, table, y, rows, c, exposures)
     carry_sums(desk, sums_x0, first_row, last_row)

@@ -19,7 +19,7 @@ from rig.estimators.learning import next_lattice
 from rig.estimators.likelihood import Likelihood
 from rig.estimators.row_search import halvings
 from rig.estimators.screen_tables import WEIGHT_LIMIT
-from rig.estimators.search_desk import COUNT_LIMIT, count_fluxes
+from rig.estimators.search_desk import COUNT_LIMIT, EXPOSURE_PARTS, count_fluxes
 from rig.row_threads import RowWorkers
 from tests.reference.geometry import Geometry
 from tests.unit.small_maps import RIGS, geometry_of, simulated
@@ -103,9 +103,9 @@ def test_counts_are_halved_until_they_fit(exposures, times):
 def test_count_fluxes_are_what_ones_among_exposures_speak_for():
     flux = count_fluxes()
     assert np.isfinite(flux).all()
-    assert flux[0, 0] == flux[63, 0] == 0.0
-    assert np.all(np.diff(flux[63, :64]) > 0)
-    assert flux[60, 30] == pytest.approx(np.log(2), abs=0.01)
+    assert flux[0, 0] == flux[EXPOSURE_PARTS * 63, 0] == 0.0
+    assert np.all(np.diff(flux[EXPOSURE_PARTS * 63, :64]) > 0)
+    assert flux[EXPOSURE_PARTS * 60, 30] == pytest.approx(np.log(2), abs=0.01)
 
 
 @pytest.mark.parametrize("rig", RIGS)
