@@ -72,7 +72,7 @@ def _read(noted: dict[str, Any]) -> SpadInfo:
 def _told_by(recording: RunRecording) -> SpadInfo:
     """What the blocks alone say."""
     first = recording.runs[0].header
-    rate = first.tick_hz / (first.frame_period_ticks or first.exposure_ticks)
+    rate = first.tick_hz / (first.frame_period_ticks or max(1, first.exposure_ticks))
     most = max(run.end_frame for run in recording.runs)
     link = float(rate) * frame_bytes(first.sensor_width, first.sensor_height)
     burst = bool(first.flags & BlockFlag.BURST)

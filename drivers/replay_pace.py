@@ -68,18 +68,16 @@ class Pace:
         self._halted = False
         self.closed = False
         """Whether nothing will ever wait again."""
-        self._origin_s = 0.0
-        self._sums = [0, 0.0, 0.0, 0.0]
-        self._held_s = 0.0
+        self._origin_ns = 0
+        self._late_s = _Lateness()
+        self._held_ns = 0
 
     @property
     def report(self) -> PaceReport:
         """Of all runs so far."""
-        n, total, squares, most = self._sums
-        if not n:
-            return PaceReport(held_s=self._held_s)
-        mean = total / n
-        return PaceReport(int(n), mean, math.sqrt(max(0.0, squares / n - mean * mean)), most, self._held_s)
+        late = self._late_s
+        sd_s = math.sqrt(late.squares / late.blocks) if late.blocks else 0.0
+        return PaceReport(late.blocks, late.mean, sd_s, late.most, self._held_ns / NS_PER_S)
 
     @property
     def speed(self) -> float | None:
@@ -103,7 +101,7 @@ class Pace:
     def start(self) -> None:
         """A run begins now."""
         self._halted = False
-        self._origin_s = self._now_s()
+        self._origin_ns = self._clock.now_ns()
 
     def step(self) -> None:
         """One step more."""
@@ -136,29 +134,44 @@ class Pace:
         """A full ring held a block up for `waited_s`, which was due `due_s` after the run's start."""
         if self._what.speed is None:
             return
-        late_s = self._now_s() - self._origin_s - due_s / self._what.speed
-        held_s = max(0.0, min(waited_s, late_s))
-        self._origin_s += held_s
-        self._held_s += held_s
+        late_ns = self._clock.now_ns() - self._due_ns(due_s, self._what.speed)
+        held_ns = max(0, min(round(waited_s * NS_PER_S), late_ns))
+        self._origin_ns += held_ns
+        self._held_ns += held_ns
 
     def wait(self, due_s: float, timeout_s: float) -> bool:
         """Wait until what is due `due_s` (recorded time) after the run's start; False where that is not in time."""
         if self._what.speed is None:
             return not self._halted
-        at_s = self._origin_s + due_s / self._what.speed
-        ends_s = self._now_s() + timeout_s
-        while not self._halted and (left_s := at_s - self._now_s()) > 0:
-            if self._now_s() >= ends_s:
+        at_ns = self._due_ns(due_s, self._what.speed)
+        ends_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
+        # Whole nanoseconds: in seconds a clock that has long been running would never quite get there.
+        while not self._halted and (left_ns := at_ns - self._clock.now_ns()) > 0:
+            if self._clock.now_ns() >= ends_ns:
                 return False
-            self._clock.sleep(min(left_s, _SLICE_S))
+            self._clock.sleep(min(left_ns / NS_PER_S, _SLICE_S))
         if self._halted:
             return False
-        self._note(max(0.0, self._now_s() - at_s))
+        self._late_s.note(max(0, self._clock.now_ns() - at_ns) / NS_PER_S)
         return True
 
-    def _note(self, late_s: float) -> None:
-        n, total, squares, most = self._sums
-        self._sums = [n + 1, total + late_s, squares + late_s * late_s, max(most, late_s)]
+    def _due_ns(self, due_s: float, speed: float) -> int:
+        return self._origin_ns + round(due_s / speed * NS_PER_S)
 
-    def _now_s(self) -> float:
-        return self._clock.now_ns() / NS_PER_S
+
+@dataclass(slots=True)
+class _Lateness:
+    """Mean, sum of squares about it, and most of what was noted (Welford 1962: no difference of large sums)."""
+
+    blocks: int = 0
+    mean: float = 0.0
+    squares: float = 0.0
+    most: float = 0.0
+
+    def note(self, late_s: float) -> None:
+        """Take up one more."""
+        self.blocks += 1
+        off = late_s - self.mean
+        self.mean += off / self.blocks
+        self.squares += off * (late_s - self.mean)
+        self.most = max(self.most, late_s)

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import ClassVar, Literal
 
+from drivers.clock import NS_PER_S, Clock
 from drivers.interfaces import (
     BeamScanner,
-    LaserLimits,
-    LaserStatus,
-    LineLaser,
     Pulse,
     ScannerLimits,
     ScannerStatus,
@@ -19,6 +17,7 @@ from drivers.interfaces import (
     SyncSource,
     SyncStatus,
 )
+from drivers.plain_laser import PlainLaser
 from drivers.registry import Kind, KindConfig, Surroundings
 
 LIMITS = ScannerLimits(
@@ -27,11 +26,11 @@ LIMITS = ScannerLimits(
     acceleration_per_s2=1e15,
     step=2.0,
     rms_duty=1.0,
-    max_points=1 << 31,
+    max_points=1 << 24,
     point_rate_hz=(1e-3, 1e9),
 )
 """Of a mirror that has followed already."""
-LASER_LIMITS = LaserLimits(0.0, 1e3)
+MAX_POWER_W = 1e3
 RESOLUTION_S = 1e-9
 _LARGEST_DIVISOR = 100_000
 """Point clocks are quotients of whole numbers up to some 50 000; a float says which."""
@@ -46,9 +45,13 @@ class StandInConfig(KindConfig):
 
 
 class RecordedScanner(BeamScanner):
-    """A scanner that has scanned already."""
+    """A scanner that has scanned already: it takes its time and moves nothing."""
 
-    _moving = False
+    def __init__(self, clock: Clock) -> None:
+        super().__init__("recorded scanner")
+        self._clock = clock
+        self._takes_s = 0.0
+        self._ends_s = 0.0
 
     @property
     def limits(self) -> ScannerLimits:
@@ -56,19 +59,19 @@ class RecordedScanner(BeamScanner):
         return LIMITS
 
     def _do_status(self) -> ScannerStatus:
-        return ScannerStatus(moving=self._moving, fault=None, position=None)
+        return ScannerStatus(moving=self._now_s() < self._ends_s, fault=None, position=None)
 
     def _do_point_clock(self, requested_hz: float) -> Fraction:
         return Fraction(requested_hz).limit_denominator(_LARGEST_DIVISOR)
 
     def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None:
-        pass
+        self._takes_s = float(repeats * len(waveform.command) / clock_hz)
 
     def _do_start(self) -> None:
-        self._moving = True
+        self._ends_s = self._now_s() + self._takes_s
 
     def _do_stop(self) -> None:
-        self._moving = False
+        self._ends_s = 0.0
 
     def _do_park(self) -> None:
         pass  # `stop` came first
@@ -76,39 +79,8 @@ class RecordedScanner(BeamScanner):
     def _do_close(self) -> None:
         pass  # no handles
 
-
-class RecordedLaser(LineLaser):
-    """A laser that has shone already."""
-
-    _armed = _emission = False
-
-    @property
-    def limits(self) -> LaserLimits:
-        """Wide ones."""
-        return LASER_LIMITS
-
-    def _do_status(self) -> LaserStatus:
-        return LaserStatus(
-            emission=self._emission,
-            armed=self._armed,
-            interlock_closed=True,
-            fault=None,
-            key_on=None,
-            warming_up=False,
-            input_mode="recorded",
-        )
-
-    def _do_arm(self, power_w: float) -> None:
-        self._armed = self._emission = True
-
-    def _do_pause(self) -> None:
-        self._emission = False
-
-    def _do_disarm(self) -> None:
-        self._armed = self._emission = False
-
-    def _do_close(self) -> None:
-        self._armed = self._emission = False
+    def _now_s(self) -> float:
+        return self._clock.now_ns() / NS_PER_S
 
 
 class RecordedSync(SyncSource):
@@ -141,11 +113,11 @@ class RecordedSync(SyncSource):
 
 
 def _scanner(config: StandInConfig, surroundings: Surroundings) -> RecordedScanner:
-    return RecordedScanner("recorded scanner")
+    return RecordedScanner(surroundings.clock)
 
 
-def _laser(config: StandInConfig, surroundings: Surroundings) -> RecordedLaser:
-    return RecordedLaser("recorded laser")
+def _laser(config: StandInConfig, surroundings: Surroundings) -> PlainLaser:
+    return PlainLaser("recorded laser", MAX_POWER_W)
 
 
 def _sync(config: StandInConfig, surroundings: Surroundings) -> RecordedSync:

@@ -115,6 +115,8 @@ def _show_verification(found: "Verification") -> None:
         say(f"and {len(found.problems) - MOST_LINES} more")
     for run, first, last in found.gaps[:MOST_LINES]:
         say(f"start {run}: frames {first} to {last} were lost")
+    if found.ended is not None:
+        say(f"the recording ended before the run: {found.ended}")
     print(f"{found.frames} frames in {found.blocks} blocks of {found.segments} segments are sound, {found.lost} lost")
     print(f"{found.verdict.value}: {_ADVICE[found.verdict.value]}")
 
@@ -122,7 +124,7 @@ def _show_verification(found: "Verification") -> None:
 _ADVICE = {
     "intact": "every frame that was recorded is there",
     "gaps": "frames were lost, and every other one is there",
-    "unfinished": "the run is not over, or was killed; 'rig repair' ends it behind its last whole block",
+    "unfinished": "the recording is not over, or was cut short; 'rig repair' ends it behind its last whole block",
     "damaged": "not all is there that was recorded; 'rig repair' keeps what is sound",
 }
 

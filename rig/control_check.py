@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.control_words import Spoken, Word
-from drivers.transports.tap import CONTROL_FILE, read_taps
+from drivers.transports.tap import read_taps
 
 SWAP_TOLERANCE_S = 2e-3
 """Most that a buffer may come earlier or later than in the recording."""
@@ -42,11 +42,6 @@ class ControlCheck:
             f"{self.commands} commands as recorded, {self.swaps} buffer swaps at most {self.worst_swap_s * 1e3:.1f} ms "
             "from their times"
         )
-
-
-def has_control(run: Path) -> bool:
-    """Whether control traffic was recorded."""
-    return (run / CONTROL_FILE).exists()
 
 
 def check_control(recorded: Path, now: Path, *, devices: Sequence[str], tolerance_s: float | None) -> ControlCheck:

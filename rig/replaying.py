@@ -9,14 +9,14 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from calibration.model import RigModel
 from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
 from drivers.recorded import RecordedRun, RunRecording
-from drivers.replay import ReplaySpad
+from drivers.recorded.segments import NO_SEGMENT, segment_files
 from drivers.replay_pace import Pace, PaceReport, ReplayClock
 from rig.config import EstimateConfig, RigConfig, ScanConfig
 from rig.config_files import parse_config
@@ -24,7 +24,7 @@ from rig.errors import DamagedRecordingError, UsageError
 from rig.estimators import Learned
 from rig.plan import spad_request
 from rig.recording.inputs import CALIBRATION_FILE, read_plan
-from rig.recording.manifest import MANIFEST, inputs_problems, read_manifest
+from rig.recording.manifest import MANIFEST, is_cut_short, read_manifest, require_inputs
 from rig.recording.part import part_learned, part_starts
 from rig.scan_plan import ScanPlan
 from rig.sweeps import SweepStart
@@ -36,6 +36,26 @@ ENDLESS = 1_000_000_000
 """Maps of a loop that nobody counts."""
 RECORDED = ("scanner", "laser", "sync")
 """Slots that a recording can play all by itself."""
+
+
+@runtime_checkable
+class PlaysRecording(Protocol):
+    """A SPAD that gives the frames of a recording."""
+
+    @property
+    def recording(self) -> RunRecording:
+        """What it plays."""
+        ...
+
+    @property
+    def pace(self) -> Pace:
+        """When its frames come due."""
+        ...
+
+    @property
+    def loops(self) -> bool:
+        """Whether it begins again behind the last start."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +91,13 @@ def replay_config(
     """
     if not run.is_dir():
         raise UsageError(f"{run} is no folder of a run; name one that was taken with --record")
+    if not segment_files(run):
+        raise UsageError(f"{run} {NO_SEGMENT}")
     plan = read_plan(run)
     manifest = read_manifest(run)
     if manifest is None:
         raise DamagedRecordingError(f"{run / MANIFEST} is missing; 'rig repair' writes a new one")
-    if problems := inputs_problems(run, manifest):
-        raise DamagedRecordingError("\n".join(f"{line}; take it from a copy of the recording" for line in problems))
+    require_inputs(run, manifest)
     recorded = manifest.get("config") or {}
     calibration = run / CALIBRATION_FILE
     scan = recorded.get("scan") or _scan_of(plan)
@@ -102,9 +123,11 @@ def replay_config(
     return parse_config(content)
 
 
-def replay_plan(spad: ReplaySpad, scan: ScanConfig, model: RigModel | None) -> tuple[ScanPlan, SpadTiming]:
+def replay_plan(
+    spad: SpadArray, recording: RunRecording, scan: ScanConfig, model: RigModel | None
+) -> tuple[ScanPlan, SpadTiming]:
     """The plan that the frames were taken with, for the calibration that there is, and the SPAD configured for it."""
-    plan = read_plan(spad.recording.path)
+    plan = read_plan(recording.path)
     if model is not None:
         from rig.recalibrated import recalibrated
 
@@ -116,7 +139,7 @@ def replay_plan(spad: ReplaySpad, scan: ScanConfig, model: RigModel | None) -> t
 class Replayed:
     """What a run needs to know of the recording that its SPAD plays. maps: to take."""
 
-    def __init__(self, spad: ReplaySpad, plan: ScanPlan, maps: int | None) -> None:
+    def __init__(self, spad: PlaysRecording, plan: ScanPlan, maps: int | None) -> None:
         self._spad = spad
         self._sweeps = recorded_sweeps(spad.recording, plan)
         there = sum(self._sweeps)
@@ -129,7 +152,7 @@ class Replayed:
     @classmethod
     def of(cls, spad: SpadArray, plan: ScanPlan, maps: int | None) -> "Replayed | None":
         """None for a SPAD that plays no recording. UsageError where that has not so many maps."""
-        return cls(spad, plan, maps) if isinstance(spad, ReplaySpad) else None
+        return cls(spad, plan, maps) if isinstance(spad, PlaysRecording) else None
 
     @property
     def report(self) -> PaceReport:
@@ -162,12 +185,12 @@ class Replayed:
 
 def pace_of(spad: SpadArray) -> Pace:
     """What steps are told to."""
-    assert isinstance(spad, ReplaySpad), "opened from a config of `replay_config`"
+    assert isinstance(spad, PlaysRecording), "opened from a config of `replay_config`"
     return spad.pace
 
 
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[int]:
-    """How many sweeps each start of the SPAD gave, as the run took them; of a run that was killed the whole ones.
+    """How many sweeps each start of the SPAD gave, as the run took them; of one that was cut short the whole ones.
 
     DamagedRecordingError where a start is missing: its maps would be taken for those of others.
     """
@@ -185,10 +208,10 @@ def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[int]:
             "take the missing segments from a copy"
         )
     planned = planned[: len(found)]
-    if manifest.get("sweeps") is not None:
-        return _limited(planned, len(manifest["sweeps"]))
-    planned[-1] = min(planned[-1], _whole_sweeps(recording, recording.runs[-1], plan))
-    return _limited(planned, sum(planned))
+    sweeps = manifest.get("sweeps")
+    if sweeps is None or is_cut_short(manifest):
+        planned[-1] = min(planned[-1], _whole_sweeps(recording, recording.runs[-1], plan))
+    return _limited(planned, sum(planned) if sweeps is None else len(sweeps))
 
 
 def recorded_truth(folder: Path, index: int) -> SweepTruth | None:

@@ -17,14 +17,11 @@ from rig.control_check import ControlCheck
 from rig.errors import UsageError
 from rig.outputs import Rays, RunFolder
 from rig.reconstruction import MapResult
-from rig.recording.manifest import file_crc32
+from rig.recording.manifest import UNFINISHED, file_crc32
 from rig.recording.writer import Recording
 from rig.saving import SavePolicy
 from rig.stages import PipelineStats
 from rig.summary import MapTally, RunFrames, Summary, Synchronisation, Verdict
-
-RECORDING = "recording"
-"""Verdict of a manifest whose run is not over, or was killed."""
 
 Progress = Callable[[int, int], None]
 """Called now and then with what is done and what there is to do, in frames or maps."""
@@ -101,7 +98,7 @@ class Run:
 
         def begun() -> None:
             assert self._recording is not None, "tells of its starts only"
-            content = {"versions": versions(), **manifest, "inputs": self._inputs, "verdict": RECORDING}
+            content = {"versions": versions(), **manifest, "inputs": self._inputs, "verdict": UNFINISHED}
             content["recording"] = self._recording.content()
             folder.write_json("manifest.json", content)
 

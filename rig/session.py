@@ -18,14 +18,13 @@ from drivers.errors import DeviceError
 from drivers.guard import Guard
 from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SpadTiming, SyncSource, World
 from drivers.registry import KindConfig, Surroundings, lookup
-from drivers.replay import ReplaySpad
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import TapFile
 from rig.config import RigConfig, ScanConfig
 from rig.cube import cube_columns
 from rig.errors import DevicesError, PlanError, UsageError
 from rig.plan import compile_plan, spad_request
-from rig.replaying import replay_plan
+from rig.replaying import PlaysRecording, replay_plan
 from rig.scan_plan import ScanPlan
 
 _log = logging.getLogger(__name__)
@@ -62,17 +61,26 @@ class HoldsColumns(Protocol):
 
 
 @runtime_checkable
+class PlansEffects(Protocol):
+    """A world that leaves out what makes no difference to a scan."""
+
+    def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
+        """Choose what is simulated, for frames of that exposure, so many to a column, at that power or less."""
+        ...
+
+
+@runtime_checkable
 class EmulatesDevices(Protocol):
-    """A world that plugs in devices of its own, until its `with` block ends."""
+    """A world that plugs in devices of its own, until it is closed."""
 
     @property
     def ports(self) -> Mapping[str, Endpoint]:
         """Where they are, by the names that `port: emulated:NAME` means."""
         ...
 
-    def __enter__(self) -> "EmulatesDevices": ...
-
-    def __exit__(self, *exit: object) -> None: ...
+    def close(self) -> None:
+        """Unplug them."""
+        ...
 
 
 @contextmanager
@@ -82,7 +90,7 @@ def open_rig(
     """Open every device of the config; on exit the sync source is closed first, then laser, scanner and SPAD.
 
     clock: by default virtual time for a simulated rig and the host's for a real one. seed: of everything simulated.
-    tap: records what passes the ports of scanner, laser and sync source.
+    tap: records what passes the ports of all devices, of the SPAD's its control traffic.
     Raises UsageError where config or calibration are at fault, DevicesError where devices are; each lists all problems.
     """
     with ExitStack() as stack:
@@ -106,14 +114,16 @@ def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSour
 def prepare(rig: OpenRig, scan: ScanConfig | None = None) -> tuple[ScanPlan, SpadTiming]:
     """Configure the SPAD and compile the plan; nothing moves and nothing lights. scan: the config's by default."""
     scan = rig.config.scan if scan is None else scan
-    if isinstance(rig.spad, ReplaySpad):  # what was scanned is bound by the plan that it was scanned with
-        return replay_plan(rig.spad, scan, rig.model)
+    if isinstance(rig.spad, PlaysRecording):  # what was scanned is bound by the plan that it was scanned with
+        return replay_plan(rig.spad, rig.spad.recording, scan, rig.model)
     most_w = rig.laser.limits.max_power_w
     if scan.power is not None and scan.power > most_w:
         raise PlanError(
             f"scan.power is {scan.power * 1e3:g} mW, the most {rig.laser.name} may give is {most_w * 1e3:g} mW; "
             "lower scan.power"
         )
+    if isinstance(rig.world, PlansEffects):
+        rig.world.plan_for(most_w if scan.power is None else scan.power, scan.exposure_s, scan.exposures)
     info, scanner = rig.spad.info, rig.scanner
     nominal = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info)
     timing = rig.spad.configure(spad_request(scan, nominal))
@@ -144,8 +154,9 @@ def _open(config: RigConfig, clock: Clock | None, seed: int, tap: TapFile | None
         # Closing runs backwards: the gate goes low before the laser pauses, the mirror parks and the SPAD stops.
         for slot in ("spad", "scanner", "laser", "sync"):
             try:
-                tapped = surroundings if tap is None else replace(surroundings, tap=tap.tap(slot))
-                opened[slot] = stack.enter_context(_open_device(slot, getattr(config, slot), tapped, guard))
+                opened[slot] = stack.enter_context(
+                    _open_device(slot, getattr(config, slot), _tapped(surroundings, slot, tap, stack), guard)
+                )
             except DeviceError as error:
                 devices.append(f"{slot}: {error}")
     if "laser" in opened:
@@ -167,8 +178,20 @@ def _surroundings(config: RigConfig, clock: Clock | None, seed: int, stack: Exit
     if config.world is None:
         return bare
     world = _create("world", config.world, bare)
-    ports = stack.enter_context(world).ports if isinstance(world, EmulatesDevices) else {}
-    return replace(bare, world=world, ports=ports)
+    found = replace(bare, world=world)
+    if isinstance(world, EmulatesDevices):
+        stack.callback(world.close)
+        found = replace(found, ports=world.ports)
+    return found
+
+
+def _tapped(surroundings: Surroundings, slot: str, file: TapFile | None, stack: ExitStack) -> Surroundings:
+    """With a tap for the device of a slot, where its traffic is recorded; it is written once the device is closed."""
+    if file is None:
+        return surroundings
+    tap = file.tap(slot)
+    stack.callback(tap.flush)
+    return replace(surroundings, tap=tap)
 
 
 def _guard_of(config: RigConfig, ports: Mapping[str, Endpoint], tap: TapFile | None, stack: ExitStack) -> Guard | None:

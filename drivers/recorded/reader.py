@@ -5,6 +5,7 @@ up with the disk. What is damaged is left out, as frames that were lost, and tol
 """
 
 import logging
+import math
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -24,6 +25,9 @@ READERS: Final = 2
 """One thread checks 4 GB/s."""
 BLOCKS_AHEAD: Final = 6
 READ_AHEAD_BYTES: Final = 32 * 2**20
+_ROUNDING_TICKS: Final = 1e-6
+"""Seconds are no whole number of ticks in binary: so much less than one still is that one."""
+_MOST_TICKS: Final = 2.0**62
 
 _log = logging.getLogger(__name__)
 
@@ -53,6 +57,20 @@ class RecordedRun:
     def frames(self) -> int:
         """Frames recorded."""
         return int(self.entries["n_frames"].sum())
+
+    def frame_at(self, seconds: float) -> int:
+        """Number of the first frame, lost ones included, that begins `seconds` or later after the run's first one.
+
+        Where frames are triggered from outside, the first one of a block stands for all of it.
+        """
+        since = self.entries["t0_ticks"].astype(np.int64)
+        since -= since[0]
+        tick = max(0, math.ceil(min(seconds * float(self.header.tick_hz) - _ROUNDING_TICKS, _MOST_TICKS)))
+        at = max(0, int(np.searchsorted(since, tick, "right")) - 1)
+        period = self.header.frame_period_ticks
+        behind = -(-(tick - int(since[at])) // period) if period else 0
+        next_block = int(self.entries["first_frame"][at + 1]) if at + 1 < len(since) else self.end_frame
+        return min(int(self.entries["first_frame"][at]) + behind, next_block)
 
     def gaps(self) -> list[tuple[int, int]]:
         """(first, last) numbers of the frames that lie between its blocks and are in none."""

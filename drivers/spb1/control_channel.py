@@ -10,6 +10,7 @@ from drivers.spb1.control import ACK, ACK_BLOCK_BYTES, Ack, Command, Op, read_ac
 from drivers.spb1.layout import REGISTER_ACK
 from drivers.spb1.reader import read_control, read_header
 from drivers.transports.bulk_link import BulkLink
+from drivers.transports.tap import IN, OUT, Tap
 
 _ANSWER_S = 1.0
 """Longest wait for an acknowledgement."""
@@ -22,13 +23,21 @@ _QUIET_S = 0.003
 """A stream that gives nothing for so long is empty: what the device has ready comes within microseconds."""
 _DRAIN_S = 1.0
 _TRIES = 3
+TAP_PORT = "control"
+"""What a tap calls it, whatever endpoints it goes over."""
 
 
 class ControlChannel:
-    """The control plane over a link. For one thread at a time. ack_in: None where acknowledgements come as blocks."""
+    """The control plane over a link. For one thread at a time. ack_in: None where acknowledgements come as blocks.
 
-    def __init__(self, link: BulkLink, command_out: int, ack_in: int | None, stream_in: int) -> None:
+    tap: told of commands and acknowledgements; what is left of a run in their way is not for it.
+    """
+
+    def __init__(
+        self, link: BulkLink, command_out: int, ack_in: int | None, stream_in: int, tap: Tap | None = None
+    ) -> None:
         self._link = link
+        self._tap = tap
         self._command_out = command_out
         self._ack_in = ack_in
         self._stream_in = stream_in
@@ -83,11 +92,11 @@ class ControlChannel:
         if self._ack_in is not None:
             self.send(op, value)
         else:
-            self._link.write(self._command_out, self._command(op, 0, value).packed(), _ANSWER_S)
+            self._tell([self._command(op, 0, value)])
 
     def forget_run(self) -> None:
         """Abort a run, if there is one, and drop what it sent; the answer among it."""
-        self._link.write(self._command_out, self._command(Op.ABORT, 0, 0).packed(), _ANSWER_S)
+        self._tell([self._command(Op.ABORT, 0, 0)])
         self.drain()
 
     def drain(self) -> None:
@@ -104,13 +113,22 @@ class ControlChannel:
         self._request_id = (self._request_id + 1) & 0xFFFF
         return Command(op, self._request_id, address, value)
 
+    def _tell(self, commands: Iterable[Command]) -> None:
+        data = b"".join(command.packed() for command in commands)
+        self._note(OUT, data)
+        self._link.write(self._command_out, data, _ANSWER_S)
+
+    def _note(self, direction: str, data: bytes) -> None:
+        if self._tap is not None:
+            self._tap.note(TAP_PORT, direction, data)
+
     def _ask(self, requests: Sequence[tuple[int, int, int]]) -> list[Ack]:
         """Send commands, some at a time, and return their acknowledgements in order."""
         acks = []
         for at in range(0, len(requests), _AT_ONCE):
             commands = [self._command(*request) for request in requests[at : at + _AT_ONCE]]
             self._received.clear()  # late answers to what was given up
-            self._link.write(self._command_out, b"".join(command.packed() for command in commands), _ANSWER_S)
+            self._tell(commands)
             ends_at = time.monotonic() + _ANSWER_S
             for command in commands:
                 ack = self._answer(command, ends_at)
@@ -135,7 +153,9 @@ class ControlChannel:
 
     def _read_acks(self, left_s: float) -> list[Ack]:
         if self._ack_in is not None:
-            return read_acks(self._link.read(self._ack_in, _ACK_READ_BYTES, left_s))
+            acks = self._link.read(self._ack_in, _ACK_READ_BYTES, left_s)
+            self._note(IN, acks)
+            return read_acks(acks)
         data = np.frombuffer(self._link.read(self._stream_in, ACK_BLOCK_BYTES, left_s), np.uint8)
         try:
             fields = read_header(data)
@@ -144,4 +164,6 @@ class ControlChannel:
             payload = read_control(data, fields)
         except CorruptBlock:
             return []  # what a run left behind; the answer is still to come, or the time runs out
-        return read_acks(payload[: len(payload) - len(payload) % ACK.size])
+        acks = payload[: len(payload) - len(payload) % ACK.size]
+        self._note(IN, acks)
+        return read_acks(acks)

@@ -2,7 +2,7 @@
 
 `control.jsonl` has a line for each: {"t_ns": 1234, "device": "laser", "port": "serial", "dir": ">", "bytes": "3f0d"},
 t_ns from the run's start on the host's monotonic clock, ">" towards the device. Several processes may write one file:
-each line is one write at its end. Ports of the SPAD are not tapped; its frames are in the recording.
+each line is one write at its end. Of the SPAD it is the control traffic alone; its frames are in the recording.
 """
 
 import json
@@ -12,6 +12,7 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from drivers.errors import ProtocolError
@@ -20,6 +21,10 @@ _log = logging.getLogger(__name__)
 
 CONTROL_FILE = "control.jsonl"
 OUT, IN = ">", "<"
+FLUSH_S = 1.0
+"""Longest wait for the disk, once a device is closed."""
+
+_Lines = SimpleQueue[bytes | threading.Event | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,17 +56,17 @@ class TapFile:
 
 
 class Tap:
-    """Notes what passes a device's ports. Any thread."""
+    """Notes what passes a device's ports. Any thread; a thread of its own writes, so that no disk holds a device up."""
 
     def __init__(self, file: TapFile, device: str) -> None:
         self._file = file
         self._device = device
-        self._lock = threading.Lock()
-        self._handle: int | None = None
-        self._full = False
+        self._lines: _Lines = SimpleQueue()
+        self._writer = threading.Thread(target=_write, args=(file.path, self._lines), name="tap", daemon=True)
+        self._starting = threading.Lock()
 
     def note(self, port: str, direction: str, data: bytes) -> None:
-        """A piece of bytes; of none nothing is noted."""
+        """A piece of bytes; of none nothing is noted. Returns at once."""
         if not data:
             return
         t_ns = time.monotonic_ns() - self._file.start_ns
@@ -69,23 +74,41 @@ class Tap:
             f'{{"t_ns": {t_ns}, "device": "{self._device}", "port": "{port}", "dir": "{direction}", '
             f'"bytes": "{bytes(data).hex()}"}}\n'
         )
-        with self._lock:
-            if self._full:
-                return
-            try:
-                if self._handle is None:
-                    self._handle = os.open(
-                        self._file.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644
-                    )
-                os.write(self._handle, line.encode())
-            except OSError as error:  # never a reason to let go of a device; the recording itself ends the run
-                self._full = True
-                _log.warning("%s ends here: %s", self._file.path, error.strerror or error)
+        self._lines.put(line.encode())
+        if self._writer.ident is None:
+            with self._starting:
+                if self._writer.ident is None:
+                    self._writer.start()
+
+    def flush(self, timeout_s: float = FLUSH_S) -> None:
+        """Wait until all that was noted so far is written, but no longer than that."""
+        if self._writer.ident is not None:
+            written = threading.Event()
+            self._lines.put(written)
+            written.wait(timeout_s)
 
     def __del__(self) -> None:
-        """Closed with the last who holds it: devices are closed in any order, and their threads after them."""
-        if self._handle is not None:
-            os.close(self._handle)
+        """The writer ends with the last who holds this: devices are closed in any order, their threads after them."""
+        self._lines.put(None)
+
+
+def _write(path: str, lines: _Lines) -> None:
+    """The writer: one write for each line; None ends it."""
+    handle: int | None = None
+    full = False
+    while (line := lines.get()) is not None:
+        if isinstance(line, threading.Event):
+            line.set()
+        elif not full:
+            try:
+                if handle is None:
+                    handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+                os.write(handle, line)
+            except OSError as error:  # never a reason to let go of a device; the recording itself ends the run
+                full = True
+                _log.warning("%s ends here: %s", path, error.strerror or error)
+    if handle is not None:
+        os.close(handle)
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ from drivers.recorded import RunRecording
 from drivers.spb1 import BlockLayout, block_views
 from rig.bench.machine import machine
 from rig.bench.recorded import PERIOD_TICKS, header_of
-from rig.errors import UsageError
+from rig.errors import RecordingError, UsageError
 from rig.recording.segment import Staging, paged
 from rig.recording.writer import WRITERS, Recording
 
@@ -69,7 +69,10 @@ class DiskReport:
 
 
 def measure_disk(folder: Path, progress: Callable[[int, int], None] | None = None) -> DiskReport:
-    """Measure the disk of `folder`. UsageError where there is none, or not room for the bytes twice."""
+    """Measure the disk of `folder`.
+
+    UsageError where there is none, or not room for the bytes twice; RecordingError where it does not take them.
+    """
     if not folder.is_dir():
         raise UsageError(f"--disk {folder} is no folder; name one on the disk that scans are recorded to")
     if not hasattr(os, "pwritev"):
@@ -77,6 +80,15 @@ def measure_disk(folder: Path, progress: Callable[[int, int], None] | None = Non
     need, free = 2 * GIGABYTES, shutil.disk_usage(folder).free / 1e9
     if need > free:
         raise UsageError(f"the bench needs {need:.3g} GB in {folder}, the disk has {free:.3g} GB free; free some")
+    try:
+        return _measured(folder, progress)
+    except OSError as error:
+        raise RecordingError(
+            f"cannot measure the disk of {folder}: {error.strerror or error}; name another folder with --disk"
+        ) from error
+
+
+def _measured(folder: Path, progress: Callable[[int, int], None] | None) -> DiskReport:
     source = _Source(round(GIGABYTES * 1e9))
     found: dict[str, list[tuple[float, float]]] = {}
     with tempfile.TemporaryDirectory(prefix="spadrig-disk-", dir=folder) as name:

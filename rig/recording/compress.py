@@ -15,8 +15,9 @@ from drivers.errors import ProtocolError
 from drivers.recorded.seekable import table_bytes, unpack_frame, zstandard_or_error
 from drivers.recorded.segments import PACKED_SUFFIX, PackedSegment, PlainSegment
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
+from rig.recording.manifest import UNFINISHED
 from rig.recording.sync import sync_folder
-from rig.recording.verify import UNFINISHED, Integrity, examine
+from rig.recording.verify import Integrity, examine
 
 LEVEL: Final = 3
 """Of zstd, its default: binary frames are noise to it, and higher levels find little more."""

@@ -5,6 +5,7 @@ its maps again comes along: plan, calibration, learned states and, where it was 
 """
 
 import json
+import math
 import re
 import shutil
 from collections.abc import Sequence
@@ -12,20 +13,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from drivers.recorded import RecordedRun, RunRecording
 from rig.binding import MAX_RESIDUAL_COLUMNS
 from rig.blanking import MAX_CLOCK_ERROR
-from rig.errors import DamagedRecordingError, UsageError
+from rig.errors import DamagedRecordingError, RecordingError, UsageError
 from rig.outputs import RunFolder
-from rig.recording.manifest import MANIFEST
+from rig.recording.manifest import MANIFEST, UNFINISHED, require_inputs
 from rig.recording.maps import MapSpan, map_spans
 from rig.recording.opening import manifest_or_none, open_recording
 from rig.recording.writer import Recording
+from rig.summary import Verdict
 
 OF_MAPS: Final = ("learned", "truth")
 """Folders with a file for each map, which a part takes along."""
+
+_VERDICT_WITHOUT_GAPS: Final = {Verdict.GAPS: Verdict.COMPLETE, UNFINISHED: Verdict.ABORTED}
+"""Of a part, by that of the whole: its gaps may lie elsewhere, and a part is over whatever the run is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +54,15 @@ def cut(
     """Write a part of a recording to a new folder (`rig cut`); its manifest.
 
     Exactly one of: maps 'A:B', frames 'A:B' of a run, time 'A:B' in seconds of its frame clock from its first frame;
-    each from A to before B, either left out for the first or the end, a single number for one of them.
-    run: of frames and time. UsageError for what there is not, RecordingError where `out` cannot be written.
+    each from A to before B, either left out for the first or the end; a single number for one map or frame.
+    run: of frames and time. UsageError for what there is not, or where `out` cannot be written, DamagedRecordingError
+    for what is not as it was recorded, RecordingError where the disk is full.
     """
     recording = open_recording(folder)
     manifest, trouble = manifest_or_none(folder)
     if manifest is None:
         raise DamagedRecordingError(f"{folder}: {trouble}")
+    require_inputs(folder, manifest)
     spans = map_spans(recording, manifest)
     parts = _parts(recording, spans, maps, frames, time, run)
     with RunFolder(out) as target:
@@ -76,7 +81,13 @@ def cut(
                 f"{folder} is damaged: {'; '.join(recording.problems[:3]) or 'no frame is left there'}; 'rig repair' it"
             )
         content = _manifest(manifest, parts, written.content(), lost)
-        _copy_inputs(folder, target.place("."), manifest, content["cut"]["maps"])
+        try:
+            _copy_inputs(folder, target.place("."), manifest, content["cut"]["maps"])
+        except OSError as error:
+            raise RecordingError(
+                f"cannot copy {error.filename} to {out}: {error.strerror or error}; free the space it needs or name "
+                "another --out"
+            ) from error
         target.write_json(MANIFEST, content)
         target.publish()
     return content
@@ -90,7 +101,7 @@ def _parts(
     if len(asked) != 1:
         raise UsageError(f"say what to cut by exactly one of {', '.join(given)}; {len(asked)} were given")
     if not 0 <= run < len(recording.runs):
-        raise UsageError(f"run {run} is not in {recording.path}; it has {len(recording.runs)}, counted from 0")
+        raise UsageError(f"--start {run} is not in {recording.path}; it has {len(recording.runs)}, counted from 0")
     of = recording.runs[run]
     name, text = asked[0]
     if name == "--maps":
@@ -98,9 +109,13 @@ def _parts(
     if name == "--frames":
         first, end = _range(name, text, of.first_frame, of.end_frame)
     else:
-        first, end = _frames_at(of, text)
+        first_s, end_s = _range_s(text)
+        first = of.first_frame if first_s is None else of.frame_at(first_s)
+        end = of.end_frame if end_s is None else of.frame_at(end_s)
     if max(first, of.first_frame) >= min(end, of.end_frame):
-        raise UsageError(f"{name} {text} holds no frame of run {run}, which has {of.first_frame} to {of.end_frame - 1}")
+        raise UsageError(
+            f"{name} {text} holds no frame of start {run}, which has {of.first_frame} to {of.end_frame - 1}"
+        )
     inside = [i for i, s in enumerate(spans) if s.run == run and s.first_frame >= first and s.end_frame < end]
     maps_in = (inside[0], inside[-1] + 1) if inside else (0, 0)
     return [Part(of, max(first, of.first_frame), min(end, of.end_frame), *maps_in)]
@@ -108,12 +123,13 @@ def _parts(
 
 def _map_parts(recording: RunRecording, spans: Sequence[MapSpan], first: int, end: int) -> list[Part]:
     """A part of each run that the maps are of, with the frame of the marker that closes its last map."""
-    if not 0 <= first < end <= len(spans):
-        raise UsageError(f"maps {first}:{end} are not all in {recording.path}; it has {len(spans)}, counted from 0")
     if not any(run.entries["sweep"].any() for run in recording.runs):
         raise UsageError(
-            f"{recording.path} has no markers: its sweeps are found by the light of the whole run; cut it with --frames"
+            f"{recording.path} has no markers to tell maps apart (sweeps are found by the light of a whole run, if at "
+            "all); cut it with --frames or --time"
         )
+    if not 0 <= first < end <= len(spans):
+        raise UsageError(f"maps {first}:{end} are not all in {recording.path}; it has {len(spans)}, counted from 0")
     parts = []
     for run in recording.runs:
         mine = [i for i in range(first, end) if spans[i].run == run.number]
@@ -121,24 +137,6 @@ def _map_parts(recording: RunRecording, spans: Sequence[MapSpan], first: int, en
             last = spans[mine[-1]].end_frame + 1
             parts.append(Part(run, spans[mine[0]].first_frame, min(last, run.end_frame), mine[0], mine[-1] + 1))
     return parts
-
-
-def _frames_at(run: RecordedRun, text: str) -> tuple[int, int]:
-    """The frames of a run that begin in a span of time."""
-    hz, start = float(run.header.tick_hz), int(run.entries["t0_ticks"][0])
-    first_s, end_s = _range_s(text)
-    period = run.header.frame_period_ticks
-
-    def frame_at(seconds: float | None, default: int) -> int:
-        if seconds is None:
-            return default
-        tick = start + seconds * hz
-        at = max(0, int(np.searchsorted(run.entries["t0_ticks"].astype(np.float64), tick, "right")) - 1)
-        entry = run.entries[at]
-        behind = int(np.ceil((tick - int(entry["t0_ticks"])) / period)) if period else 0
-        return int(entry["first_frame"]) + min(max(0, behind), int(entry["n_frames"]))
-
-    return frame_at(first_s, run.first_frame), frame_at(end_s, run.end_frame)
 
 
 def _range(name: str, text: str, first: int, end: int) -> tuple[int, int]:
@@ -151,9 +149,10 @@ def _range(name: str, text: str, first: int, end: int) -> tuple[int, int]:
 
 
 def _range_s(text: str) -> tuple[float | None, float | None]:
-    parts = text.split(":")
     try:
-        first, end = (float(part) if part.strip() else None for part in parts)
+        first, end = (float(part) if part.strip() else None for part in text.split(":"))
+        if not all(math.isfinite(one) for one in (first, end) if one is not None):
+            raise ValueError(text)
     except ValueError:
         raise UsageError(f"--time {text!r} is no range; write seconds from the first frame, as 0.5:1.25") from None
     return first, end
@@ -164,16 +163,16 @@ def _manifest(
 ) -> dict[str, Any]:
     """The whole's manifest, with the part's frames, maps and verdict."""
     first_map, end_map = parts[0].first_map, parts[-1].end_map
-    sweeps = manifest.get("sweeps")
+    sweeps, verdict = manifest.get("sweeps"), manifest.get("verdict", UNFINISHED)
     content = {
         key: value
         for key, value in manifest.items()
-        if key not in ("counters", "missing", "repaired", "gaps", "sweeps")
+        if key not in ("counters", "counters_when_recorded", "missing", "repaired", "gaps", "sweeps")
     }
     before = (manifest.get("cut") or {}).get("maps", [0])[0]
     content |= {
         "command": "cut",
-        "verdict": "gaps" if lost else manifest.get("verdict"),
+        "verdict": Verdict.GAPS if lost else _VERDICT_WITHOUT_GAPS.get(verdict, verdict),
         "recording": recording,
         "gaps": lost,
         "cut": {
@@ -183,10 +182,22 @@ def _manifest(
             "clock_ratios": [_clock_ratio(manifest, part, i == 0) for i, part in enumerate(parts)],
         },
     }
+    if "repaired" in manifest:
+        content |= {"repaired": manifest["repaired"], "missing": _missing(manifest.get("missing") or [], parts)}
     if sweeps is not None:
         content["sweeps"] = sweeps[first_map:end_map]
         content["maps"] = end_map - first_map
     return content
+
+
+def _missing(known: Sequence[Sequence[int]], parts: Sequence[Part]) -> list[list[int]]:
+    """What a repair found missing in the whole, [run, first, last], as far as it lies within the parts."""
+    return [
+        [number, first, last]
+        for number, part in enumerate(parts)
+        for run, first, last in known
+        if run == part.run.number and part.first_frame < first and last < part.end_frame - 1
+    ]
 
 
 def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
@@ -194,9 +205,8 @@ def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
     sweeps = manifest.get("sweeps") or []
     known = (manifest.get("cut") or {}).get("clock_ratios") or []
     ratio = float(known[part.run.number]) if part.run.number < len(known) else 1.0
-    for i in range(part.first_map) if is_first else ():
-        sweep: dict[str, Any] = sweeps[i] if i < len(sweeps) else {}
-        if i and sweep.get("first_frame", 0) < sweeps[i - 1]["end_frame"]:
+    for i, sweep in enumerate(sweeps[: part.first_map] if is_first else ()):
+        if i and sweep["first_frame"] < sweeps[i - 1]["end_frame"]:
             ratio = 1.0  # another start of the SPAD
         residual, error = sweep.get("residual_columns"), float(sweep.get("clock_error") or 0.0)
         if residual is not None and residual <= MAX_RESIDUAL_COLUMNS and abs(error) <= MAX_CLOCK_ERROR:

@@ -33,10 +33,13 @@ def read_plan(folder: Path) -> ScanPlan:
     file = folder / PLAN_FILE
     try:
         content = yaml.load(file.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except OSError as error:
+    except FileNotFoundError:
         raise UsageError(
-            f"cannot read {file}: {error.strerror or error}; name the folder of a run that was taken with --record"
-        ) from error
+            f"{folder} has no {PLAN_FILE}, by which its frames would be bound to columns; name a run taken with "
+            "--record, or 'rig export' the frames as npy and 'rig reconstruct' those with a plan and a calibration"
+        ) from None
+    except OSError as error:
+        raise UsageError(f"cannot read {file}: {error.strerror or error}; take it from a copy") from error
     except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise UsageError(f"{file} is no YAML; take it from a copy of the recording") from error
     head = (content.get("format"), content.get("version")) if isinstance(content, dict) else None

@@ -14,6 +14,8 @@ from rig.errors import DamagedRecordingError
 
 MANIFEST: Final = "manifest.json"
 SEAL: Final = "crc32"
+UNFINISHED: Final = "recording"
+"""Verdict of a run that is not over, or was killed."""
 _PIECE_BYTES: Final = 1 << 20
 
 
@@ -41,6 +43,19 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     return content
 
 
+def is_cut_short(manifest: Mapping[str, Any]) -> bool:
+    """Whether it is known that frames behind the first maps may be gone: the disk was full, or it was repaired."""
+    return "repaired" in manifest or ended_early(manifest) is not None
+
+
+def ended_early(manifest: Mapping[str, Any]) -> str | None:
+    """Why a recording ended before its run did, a full disk for one; None where it did not, or was repaired since."""
+    if "repaired" in manifest:
+        return None
+    failed = (manifest.get("recording") or {}).get("failed")
+    return None if failed is None else str(failed)
+
+
 def file_crc32(path: Path) -> int:
     """CRC-32 of a file, for the manifest. Raises OSError."""
     crc = 0
@@ -60,6 +75,12 @@ def inputs_problems(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
         except OSError as error:
             problems.append(f"{name} cannot be read: {error.strerror or error}")
     return problems
+
+
+def require_inputs(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """DamagedRecordingError, a line each, where files beside the frames are not what the manifest says."""
+    if problems := inputs_problems(folder, manifest):
+        raise DamagedRecordingError("\n".join(f"{line}; take it from a copy of the recording" for line in problems))
 
 
 def _crc32(content: Mapping[str, Any]) -> int:

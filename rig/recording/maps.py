@@ -9,6 +9,7 @@ import numpy as np
 
 from drivers.frames import FrameBlock, Mark
 from drivers.recorded import RecordedRun, RunRecording
+from rig.recording.manifest import is_cut_short
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,8 +23,14 @@ class MapSpan:
 
 def map_spans(recording: RunRecording, manifest: dict[str, Any] | None) -> list[MapSpan]:
     """The whole maps of a recording, in order."""
-    sweeps = (manifest or {}).get("sweeps")
-    return list(_marked(recording)) if sweeps is None else list(_stated(recording, sweeps))
+    manifest = manifest or {}
+    sweeps = manifest.get("sweeps")
+    if sweeps is None:
+        return list(_marked(recording))
+    spans = list(_stated(recording, sweeps))
+    while spans and is_cut_short(manifest) and spans[-1].end_frame >= recording.runs[spans[-1].run].end_frame:
+        del spans[-1]  # the run made a map of frames that are not in the recording
+    return spans
 
 
 def _stated(recording: RunRecording, sweeps: list[dict[str, Any]]) -> Iterator[MapSpan]:

@@ -11,12 +11,19 @@ from rig.recording.manifest import read_manifest
 
 def open_recording(folder: Path) -> RunRecording:
     """The recording of a run. UsageError where there is none, DamagedRecordingError where nothing of it is left."""
+    require_folder(folder)
     try:
         return RunRecording(folder)
     except DeviceNotFound as error:
         raise UsageError(str(error)) from None
     except ProtocolError as error:
         raise DamagedRecordingError(str(error)) from None
+
+
+def require_folder(path: Path) -> None:
+    """UsageError for one file of a recording."""
+    if path.is_file():
+        raise UsageError(f"{path} is a file; name the folder that it lies in")
 
 
 def manifest_or_none(folder: Path) -> tuple[dict[str, Any] | None, str | None]:

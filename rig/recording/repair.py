@@ -19,13 +19,12 @@ from drivers.recorded.segments import PlainSegment, Segment
 from rig.errors import RecordingError, UsageError
 from rig.recording.checking import SoundBlock
 from rig.recording.holding import is_held
-from rig.recording.manifest import MANIFEST, sealed_text
+from rig.recording.manifest import MANIFEST, UNFINISHED, ended_early, sealed_text
 from rig.recording.sync import sync_folder
-from rig.recording.verify import UNFINISHED, Examined, Verification, examine, verify
+from rig.recording.verify import Examined, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
+from rig.summary import Verdict
 
-ABORTED: Final = "aborted"
-GAPS: Final = "gaps"
 _PIECE_BYTES: Final = 1 << 24
 
 Range = tuple[int, int]
@@ -157,7 +156,9 @@ def _write_manifest(folder: Path, found: Examined, done: list[str]) -> None:
         done.append(f"{MANIFEST} written anew, from the blocks alone: plan and calibration are as they lie here")
         manifest = {"verdict": UNFINISHED}
     elif manifest.get("verdict") == UNFINISHED:
-        done.append(f"{MANIFEST}: the run was not over; its verdict is '{ABORTED}' now")
+        done.append(f"{MANIFEST}: the run was not over; its verdict is '{Verdict.ABORTED}' now")
+    elif (why := ended_early(manifest)) is not None:
+        done.append(f"{MANIFEST}: says that the recording ended before the run ({why}), and how many frames it has")
     elif not (done or found.problems):
         return
     recording = {**(manifest.get("recording") or {}), **_recording(found)}
@@ -177,8 +178,8 @@ def _write_manifest(folder: Path, found: Examined, done: list[str]) -> None:
 def _verdict(manifest: dict[str, Any], recording: dict[str, Any], missing: list[Any]) -> str:
     before = (manifest.get("recording") or {}).get("blocks")
     if missing or (manifest["verdict"] != UNFINISHED and before is not None and before > recording["blocks"]):
-        return GAPS
-    return ABORTED if manifest["verdict"] == UNFINISHED else str(manifest["verdict"])
+        return Verdict.GAPS
+    return Verdict.ABORTED if manifest["verdict"] == UNFINISHED else str(manifest["verdict"])
 
 
 def _recording(found: Examined) -> dict[str, Any]:

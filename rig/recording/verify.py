@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +14,8 @@ from drivers.recorded.index import INDEX_FILE, INDEX_RECORD
 from drivers.recorded.segments import Segment, open_segments
 from rig.errors import DamagedRecordingError, UsageError
 from rig.recording.checking import Continuity, Gap, SoundBlock, check_segments, continuity
-from rig.recording.manifest import MANIFEST, inputs_problems, read_manifest
-
-UNFINISHED: Final = "recording"
-"""Verdict of the manifest of a run that is not over, or was killed."""
+from rig.recording.manifest import MANIFEST, UNFINISHED, ended_early, inputs_problems, read_manifest
+from rig.recording.opening import require_folder
 
 
 class Integrity(StrEnum):
@@ -27,7 +25,7 @@ class Integrity(StrEnum):
     GAPS = "gaps"
     """Whole, but the device lost frames, and said so."""
     UNFINISHED = "unfinished"
-    """The run is not over, or was killed; nothing else is wrong."""
+    """The run is not over, or was killed, or went on without the recording; nothing else is wrong."""
     DAMAGED = "damaged"
 
 
@@ -36,7 +34,7 @@ class Verification:
     """The verdict and what it rests on.
 
     blocks, frames, bytes: sound ones. lost: frames that the device lost, gaps: [run, first, last] where. problems: a
-    line each; run: the verdict of the run that was recorded.
+    line each; run: the verdict of the run that was recorded. ended: why the recording ended before the run, else None.
     """
 
     verdict: Integrity
@@ -49,6 +47,7 @@ class Verification:
     gaps: list[Gap]
     problems: list[str]
     run: str | None
+    ended: str | None
 
     @property
     def exit_code(self) -> int:
@@ -97,11 +96,13 @@ def verify(folder: Path) -> Verification:
         gaps=found.joined.gaps,
         problems=found.problems,
         run=None if found.manifest is None else found.manifest.get("verdict"),
+        ended=None if found.manifest is None else ended_early(found.manifest),
     )
 
 
 def examine(folder: Path) -> Examined:
     """Everything that `verify` and `repair` need to know. UsageError where there is no recording."""
+    require_folder(folder)
     try:
         segments = open_segments(folder)
     except DeviceNotFound as error:
@@ -177,7 +178,8 @@ def _against_manifest(
         if stated is not None and stated != found
     ]
     counters = manifest.get("counters") or {}
-    if counters.get("delivered") not in (None, frames):
+    delivered = counters.get("delivered")
+    if delivered not in (None, frames) and (delivered < frames or ended_early(manifest) is None):
         problems.append(f"the device delivered {counters['delivered']} frames, {frames} are recorded")
     if counters.get("lost") is not None and counters["lost"] < joined.lost:
         problems.append(f"the device says that it lost {counters['lost']} frames, its blocks say {joined.lost}")
@@ -187,6 +189,7 @@ def _against_manifest(
 def _verdict(found: Examined) -> Integrity:
     if found.problems or not found.runs:
         return Integrity.DAMAGED
-    if found.manifest is not None and found.manifest.get("verdict") == UNFINISHED:
+    manifest = found.manifest
+    if manifest is not None and (manifest.get("verdict") == UNFINISHED or ended_early(manifest) is not None):
         return Integrity.UNFINISHED
     return Integrity.GAPS if found.joined.gaps else Integrity.INTACT

@@ -223,11 +223,12 @@ class Recording:
                 self.busy_s += time.perf_counter() - begun
 
     def _count(self, placed: _Placed) -> None:
-        """Index every block before which nothing is missing any more."""
+        """Index every block before which nothing is missing any more: one that could not be written is never done."""
         with self._lock:
             placed.done = True
-            while self._order and self._order[0].done and self._failure is None:
+            while self._order and self._order[0].done:
                 first = self._order[0]
+                self._index.seek(HEADER_BYTES + self.blocks * RECORD_BYTES)  # a record may have been cut short before
                 if self._index.write(first.index_record) != RECORD_BYTES:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
                 self._order.popleft()

@@ -10,8 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -210,16 +209,6 @@ class RecordedWorld:
         """Unplug them."""
         for server in self._servers:
             server.close()
-
-    def __enter__(self) -> Self:
-        """The world, its devices plugged in."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close."""
-        self.close()
 
 
 def create(config: RecordedWorldConfig, surroundings: Surroundings) -> RecordedWorld:

@@ -37,7 +37,8 @@ class LaserCase:
 class SyncCase:
     """A sync source, open. `trigger` gives its input one scan marker; `pins` reads the outputs, also after close.
 
-    tells_waiting: its status tells a program that waits from one that plays.
+    tells_waiting: its status tells a program that waits from one that plays. plays: its outputs follow the program; of
+    a stand-in they are low for good.
     """
 
     device: SyncSource
@@ -45,6 +46,7 @@ class SyncCase:
     trigger: Callable[[], None]
     pins: Callable[[], int]
     tells_waiting: bool = True
+    plays: bool = True
 
     @property
     def waiting(self) -> str:

@@ -21,6 +21,7 @@ from tests.conformance.emulated_lasers import EMULATED_LASERS
 from tests.conformance.emulated_scanners import EMULATED_SCANNERS
 from tests.conformance.emulated_spads import EMULATED_SPADS
 from tests.conformance.emulated_syncs import EMULATED_SYNCS, GUARDED_LASERS
+from tests.conformance.recorded_devices import recorded_laser, recorded_scanner, recorded_sync
 from tests.conformance.replayed_spads import replayed_spads
 
 ROWS, WIDTH = 24, 100
@@ -128,9 +129,14 @@ SPADS: dict[str, Factory] = {
     **EMULATED_SPADS,
     **replayed_spads(simulated_spad, simulated_lossy_spad, simulated_window_spad, EMULATED_SPADS["spb-usb, burst"]),
 }
-SCANNERS: dict[str, Factory] = {"simulated": simulated_scanner, **EMULATED_SCANNERS}
-LASERS: dict[str, Factory] = {"simulated": simulated_laser, **EMULATED_LASERS, **GUARDED_LASERS}
-SYNCS: dict[str, Factory] = {"simulated": simulated_sync, **EMULATED_SYNCS}
+SCANNERS: dict[str, Factory] = {"simulated": simulated_scanner, "replay": recorded_scanner, **EMULATED_SCANNERS}
+LASERS: dict[str, Factory] = {
+    "simulated": simulated_laser,
+    "replay": recorded_laser,
+    **EMULATED_LASERS,
+    **GUARDED_LASERS,
+}
+SYNCS: dict[str, Factory] = {"simulated": simulated_sync, "replay": recorded_sync, **EMULATED_SYNCS}
 WORLDS: dict[str, Factory] = {"simulated": simulated_world}
 
 

@@ -107,6 +107,7 @@ def test_over_speed_is_refused_with_value_and_limit_before_anything_moves(scanne
     wave, limits = gentle(scanner), scanner.device.limits
     low, high = limits.command_range
     jumps = np.where(np.arange(POINTS) % 2, low, high)
+    wave = replace(wave, point_rate_hz=scanner.device.point_clock(0.99 * limits.point_rate_hz[1]))
     with pytest.raises(LimitExceeded, match=r"(step|velocity|acceleration) of \S+ .*exceeds \S+") as refused:
         scanner.device.load(replace(wave, command=jumps), 1)
     named = (limits.step, limits.velocity_per_s, limits.acceleration_per_s2)

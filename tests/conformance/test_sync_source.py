@@ -13,13 +13,20 @@ SWEEP = (Pulse(OUT_MARKER, None), Pulse(0, STEP_S), Pulse(OUT_GATE | OUT_FRAME, 
 """Wait for the scan marker, settle, light, dark."""
 
 
+@pytest.fixture
+def playing(sync: SyncCase) -> None:
+    """Only sources whose outputs follow their program."""
+    if not sync.plays:
+        pytest.skip("a stand-in plays nothing")
+
+
 def running(case: SyncCase, repeats: int = 2) -> None:
     """The program, triggered once, in the middle of its lit word."""
     case.device.program(SWEEP, repeats)
     case.device.run()
     case.trigger()
     case.clock.sleep(1.5 * STEP_S)
-    assert case.pins() == OUT_GATE | OUT_FRAME
+    assert case.pins() == (OUT_GATE | OUT_FRAME if case.plays else 0)
 
 
 def test_it_is_found_with_all_outputs_low(sync: SyncCase) -> None:
@@ -90,6 +97,7 @@ def test_loading_a_program_plays_nothing(sync: SyncCase) -> None:
     assert sync.pins() == 0
 
 
+@pytest.mark.usefixtures("playing")
 def test_it_waits_dark_for_the_scan_marker_however_long(sync: SyncCase) -> None:
     sync.device.program(SWEEP, 1)
     sync.device.run()
@@ -102,6 +110,7 @@ def test_it_waits_dark_for_the_scan_marker_however_long(sync: SyncCase) -> None:
     assert sync.device.state is DeviceState.RUNNING
 
 
+@pytest.mark.usefixtures("playing")
 def test_each_scan_marker_plays_the_program_once_and_the_end_is_low(sync: SyncCase) -> None:
     sync.device.program(SWEEP, 2)
     sync.device.run()
@@ -126,6 +135,7 @@ def test_each_scan_marker_plays_the_program_once_and_the_end_is_low(sync: SyncCa
     assert sync.device.status.state == sync.waiting
 
 
+@pytest.mark.usefixtures("playing")
 def test_a_program_that_ends_on_a_high_word_ends_low(sync: SyncCase) -> None:
     sync.device.program([Pulse(OUT_GATE | OUT_MARKER, STEP_S)], 2)
     sync.device.run()

@@ -8,7 +8,8 @@ import pytest
 import yaml
 
 import rig.replay_run
-from drivers.transports.tap import read_taps
+from drivers.spb1.control import ACK, COMMAND
+from drivers.transports.tap import IN, OUT, read_taps
 from rig import api
 from rig.config_files import load_config
 from rig.errors import DivergedError, UsageError
@@ -61,7 +62,10 @@ def hil(folder: Path, laser: dict[str, Any]) -> Path:
 
 def test_what_passed_the_ports_of_a_scan_is_recorded_with_it(taken: Path) -> None:
     passed = read_taps(taken / "control.jsonl")
-    assert {one.device for one in passed} == {"scanner", "laser", "sync"}
+    assert {one.device for one in passed} == {"spad", "scanner", "laser", "sync"}
+    spad = [one for one in passed if one.device == "spad"]
+    assert {(one.port, one.direction) for one in spad} == {("control", OUT), ("control", IN)}
+    assert {len(one.data) % (COMMAND if one.direction == OUT else ACK).size for one in spad} == {0}
     assert any(one.data.startswith(b"SOUR:AM:STAT ON") for one in passed)
     assert api.verify(taken).exit_code == 0
 

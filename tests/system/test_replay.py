@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import rig.scanning
+from drivers.recorded import RunRecording
 from rig import api
 from rig.acquisition import Acquisition
 from rig.errors import DamagedRecordingError, UsageError
@@ -102,15 +104,22 @@ def test_another_estimator_can_be_tried_on_the_same_frames(learned: Path) -> Non
     assert result.summary.truth is not None
 
 
-def test_a_recording_that_was_killed_gives_its_whole_maps(learned: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("why", ["killed", "disk full"])
+def test_a_recording_that_was_cut_short_gives_its_whole_maps(learned: Path, tmp_path: Path, why: str) -> None:
     run = tmp_path / "torn"
     shutil.copytree(learned, run)
     manifest = read_manifest(run)
     assert manifest is not None
-    bare = {key: value for key, value in manifest.items() if key not in ("sweeps", "gaps", "counters")}
-    (run / "manifest.json").write_text(sealed_text(json.dumps({**bare, "verdict": "recording"})))
+    if why == "killed":
+        bare = {key: value for key, value in manifest.items() if key not in ("sweeps", "gaps", "counters")}
+        manifest = {**bare, "verdict": "recording"}
+    else:  # whose maps went on to be made of what was in the ring
+        manifest = {**manifest, "verdict": "aborted", "recording": {**manifest["recording"], "failed": "no space"}}
+    (run / "manifest.json").write_text(sealed_text(json.dumps(manifest)))
     (segment,) = run.glob("frames-*.spb")
-    os.truncate(segment, segment.stat().st_size * 3 // 4)
+    in_the_third = next(entry for entry in RunRecording(run).runs[0].entries if entry["sweep"] == 3)
+    os.truncate(segment, int(in_the_third["offset"]) + 5000)
+    assert api.recording_info(run).maps == 2
     result = api.replay(run, clock="max", out=tmp_path / "again")
     assert result.summary.maps == 2
     assert arrays(tmp_path / "again").items() < arrays(learned).items()
@@ -132,6 +141,22 @@ def test_the_command_plays_and_reports_how_the_clock_was_held(learned: Path, rig
     assert summary["replay"]["blocks"] > 0
     assert summary["replay"]["late_max_s"] >= summary["replay"]["late_mean_s"] >= 0
     assert json.loads(Path("again/manifest.json").read_text())["command"] == "replay"
+    ran = rig("replay", learned, "--clock", "x8", "--maps", 1, "--estimator", "argmax", "--out", "for-people")
+    (line,) = (line for line in ran.out.splitlines() if line.startswith("clock"))
+    assert re.match(r"clock +blocks late by \S+ \+- \S+ ms, at most \S+ ms", line)
+
+
+def test_a_folder_without_frames_and_frames_without_a_plan_are_told_apart(
+    learned: Path, rig: Rig, tmp_path: Path
+) -> None:
+    (tmp_path / "maps-only").mkdir()
+    shutil.copyfile(learned / "plan.yaml", tmp_path / "maps-only" / "plan.yaml")
+    assert "holds no recording" in rig("replay", tmp_path / "maps-only").problems[0]
+    imported = tmp_path / "imported"
+    imported.mkdir()
+    for file in ("frames-000000.spb", "frames.idx"):
+        shutil.copyfile(learned / file, imported / file)
+    assert re.search(r"has no plan.yaml, .*'rig export'", rig("replay", imported).problems[0])
 
 
 def test_a_wrong_clock_and_a_wrong_folder_are_the_users(learned: Path, rig: Rig, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ REQUEST = SpadRequest(Fraction(100_000), 9e-6, "stream", block_frames=16)
 SCANS = (5, 40, 75)
 
 
-def block(run_id: int, seq: int, first: int, n: int, lost: int) -> FrameBlock:
+def block(run_id: int, seq: int, first: int, n: int, lost: int, **header_fields: int) -> FrameBlock:
     """Frames whose pixels say their number and run."""
     layout = BlockLayout(n, WIDTH, HEIGHT)
     buffer = np.zeros(layout.min_stride, np.uint8)
@@ -52,7 +52,7 @@ def block(run_id: int, seq: int, first: int, n: int, lost: int) -> FrameBlock:
         sensor_width=WIDTH,
         sensor_height=HEIGHT,
     )
-    return seal_block(buffer, header, layout, frames_lost=lost, payload_crc=True)
+    return seal_block(buffer, replace(header, **header_fields), layout, frames_lost=lost, payload_crc=True)
 
 
 def two_starts() -> list[FrameBlock]:
@@ -171,6 +171,14 @@ def test_what_was_not_recorded_cannot_be_asked_for(recording: Path) -> None:
         ):
             with pytest.raises(LimitExceeded):
                 device.configure(other)
+
+
+@pytest.mark.parametrize("exposure_ticks", [900, 0])
+def test_frames_without_a_rate_are_not_played_and_the_next_step_is_said(tmp_path: Path, exposure_ticks: int) -> None:
+    unpaced = block(7, 0, 0, 10, 0, frame_period_ticks=0, exposure_ticks=exposure_ticks)
+    (tmp_path / "frames-000000.spb").write_bytes(b"".join(bytes(part) for part in block_parts(unpaced)))
+    with replay(tmp_path) as device, pytest.raises(LimitExceeded, match=r"at what rate .* import them again with"):
+        device.configure(REQUEST)
 
 
 def test_a_full_ring_that_does_not_wait_loses_frames_and_says_so(recording: Path) -> None:

@@ -33,6 +33,21 @@ def test_rows_are_of_the_same_bytes_and_leave_nothing_behind(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_disk_that_fills_up_on_the_way_is_said_in_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(disk, "GIGABYTES", 0.05)
+    monkeypatch.setattr(disk.os, "pwritev", full)
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["bench", "--disk", str(tmp_path)])
+    assert ended.value.code == 3
+    assert capsys.readouterr().err.splitlines()[-1].startswith("error: cannot measure the disk of ")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_that_is_none_or_has_no_room_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UsageError, match="is no folder"):
         api.bench_disk(tmp_path / "absent")

@@ -1,5 +1,8 @@
 """What drivers said is compared with the recording: the first byte that differs is shown, questions do not count."""
 
+import json
+import os
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -117,6 +120,8 @@ def test_taps_of_several_devices_write_one_file_and_are_read_in_time(tmp_path: P
     scanner.note("02", OUT, bytes(range(256)))
     laser.note("serial", IN, b"")
     laser.note("serial", IN, b"OK\r\n")
+    laser.flush()
+    scanner.flush()
     file.sync()
     with (tmp_path / CONTROL_FILE).open("a") as torn:
         torn.write('{"t_ns": 1, "dev')
@@ -130,3 +135,18 @@ def test_taps_of_several_devices_write_one_file_and_are_read_in_time(tmp_path: P
     (tmp_path / CONTROL_FILE).write_text("{}\n")
     with pytest.raises(ProtocolError, match="line 1"):
         read_taps(tmp_path / CONTROL_FILE)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="a pipe with a name stands for a disk that does not answer")
+def test_a_disk_that_hangs_holds_no_device_up_and_loses_nothing(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / CONTROL_FILE)  # opening it waits for somebody who reads
+    tap = TapFile.begin(tmp_path / CONTROL_FILE).tap("sync")
+    begun = time.monotonic()
+    for command in (b"abt\n", b"man 0\n"):
+        tap.note("serial", OUT, command)
+    tap.flush(timeout_s=0.1)
+    assert time.monotonic() - begun < 1.0
+    with (tmp_path / CONTROL_FILE).open("rb", buffering=0) as pipe:
+        tap.flush()
+        lines = pipe.read(10_000).splitlines()
+    assert [bytes.fromhex(json.loads(line)["bytes"]) for line in lines] == [b"abt\n", b"man 0\n"]

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,18 @@ def frames_in(recording: RunRecording, run: int, first: int, end: int) -> tuple[
 @pytest.mark.parametrize("stated", [True, False])
 def test_maps_are_found_by_manifest_and_by_markers(tmp_path: Path, runs: list[list[FrameBlock]], stated: bool) -> None:
     folder = record(tmp_path, runs, **({"sweeps": sweeps()} if stated else {}))
+    assert map_spans(RunRecording(folder), read_manifest(folder)) == true_spans()
+
+
+@pytest.mark.parametrize("known", [{"recording": {"failed": "full", "starts": []}}, {"repaired": ["its end"]}])
+def test_maps_that_were_made_of_frames_behind_the_end_are_not_in_a_recording_cut_short(
+    tmp_path: Path, runs: list[list[FrameBlock]], known: dict[str, object]
+) -> None:
+    short = [runs[0], runs[1][: len(runs[1]) * 2 // 3]]
+    folder = record(tmp_path / "short", short, sweeps=sweeps(), **known)
+    recording, manifest = RunRecording(folder), read_manifest(folder)
+    assert map_spans(recording, manifest) == map_spans(recording, None) == true_spans()[:-2]
+    folder = record(tmp_path / "whole", runs, sweeps=sweeps(), **known)
     assert map_spans(RunRecording(folder), read_manifest(folder)) == true_spans()
 
 
@@ -110,6 +123,57 @@ def test_frames_and_times_are_cut_out(
     assert not verify(tmp_path / "part").problems
 
 
+def test_frames_are_found_by_their_time(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    run = RunRecording(record(tmp_path, runs)).runs[1]
+    times_s = (-1.0, 0.0, 0.4e-5, 1e-5, 1.001e-5, 1.39e-3, 1.42e-3, 1.45e-3, 1e9, float("inf"))
+    last = run.end_frame
+    assert [run.frame_at(time_s) for time_s in times_s] == [0, 0, 1, 1, 2, 139, 142, 145, last, last]  # 142 is lost
+
+
+def test_a_part_is_over_and_has_its_own_verdict(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    folder = record(tmp_path / "run", runs, verdict="gaps")
+    assert cut(folder, tmp_path / "without", frames=":20")["verdict"] == "complete"
+    assert cut(folder, tmp_path / "with", frames="100:200", run=1)["verdict"] == "gaps"
+    killed = record(tmp_path / "killed", runs, verdict="recording")
+    assert cut(killed, tmp_path / "part", frames=":20")["verdict"] == "aborted"
+    assert verify(tmp_path / "part").verdict is Integrity.INTACT
+
+
+def test_what_a_repair_found_missing_is_known_to_be_missing_in_a_part(
+    tmp_path: Path, runs: list[list[FrameBlock]]
+) -> None:
+    folder = record(tmp_path / "run", [runs[0], [*runs[1][:2], *runs[1][3:]]])
+    repair(folder)
+    cut(folder, tmp_path / "around", frames="10:100", run=1)
+    found = verify(tmp_path / "around")
+    assert (found.verdict, found.gaps) == (Integrity.GAPS, [(0, 32, 47)])
+    cut(folder, tmp_path / "behind", frames="40:100", run=1)
+    assert verify(tmp_path / "behind").verdict is Integrity.INTACT
+
+
+@pytest.mark.parametrize("what", ["lost", "changed"])
+def test_nothing_is_cut_without_the_plan_that_it_was_taken_with(
+    tmp_path: Path, runs: list[list[FrameBlock]], what: str
+) -> None:
+    folder = record(tmp_path / "run", runs, inputs={"plan.yaml": 0})
+    if what == "changed":
+        (folder / "plan.yaml").write_bytes(b"other")
+    with pytest.raises(DamagedRecordingError, match=r"plan.yaml .* from a copy"):
+        cut(folder, tmp_path / "part", maps="0:2")
+    assert not (tmp_path / "part").exists()
+
+
+def test_maps_cannot_be_cut_where_there_are_no_markers(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    def unmarked(block: FrameBlock) -> FrameBlock:
+        records = block.records.copy()
+        records["marks"] = records["sweep"] = records["line"] = 0
+        return replace(block, header=replace(block.header, sweep=0), records=records)
+
+    folder = record(tmp_path / "run", [list(map(unmarked, runs[0]))])
+    with pytest.raises(UsageError, match="no markers to tell maps apart"):
+        cut(folder, tmp_path / "part", maps="0:2")
+
+
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
@@ -120,6 +184,10 @@ def test_frames_and_times_are_cut_out(
         ({"frames": "900:"}, "holds no frame"),
         ({"frames": "1", "run": 2}, "it has 2"),
         ({"time": "1:2:3"}, "no range"),
+        ({"time": "nan:1"}, "no range"),
+        ({"time": "0:inf"}, "no range"),
+        ({"time": "1e300:"}, "holds no frame"),
+        ({"frames": "9" * 30 + ":"}, "holds no frame"),
     ],
 )
 def test_what_is_not_there_is_not_cut(

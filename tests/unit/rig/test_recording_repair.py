@@ -100,6 +100,40 @@ def test_a_killed_run_is_repaired(tmp_path: Path, runs: list[list[FrameBlock]]) 
     assert files_of(folder) == before
 
 
+def test_a_recording_that_ended_before_its_run_says_why_until_it_is_repaired(
+    tmp_path: Path, runs: list[list[FrameBlock]]
+) -> None:
+    full = "No space left on device"
+    delivered = sum(block.n_frames for block in runs[0]) + 100
+    folder = record(tmp_path, runs[:1], verdict="aborted", counters={"delivered": delivered, "lost": 0})
+    assert verify(folder).verdict is Integrity.DAMAGED  # nobody says why they are not there
+    content = json.loads((folder / MANIFEST).read_text())
+    content["recording"]["failed"] = full
+    (folder / MANIFEST).write_text(sealed_text(json.dumps(content)))
+    found = verify(folder)
+    assert (found.verdict, found.exit_code, found.ended, found.problems) == (Integrity.UNFINISHED, 1, full, [])
+    done = repair(folder)
+    assert (done.after.verdict, done.after.run, done.after.ended) == (Integrity.INTACT, "aborted", None)
+    assert repair(folder).done == []
+
+
+def test_more_frames_than_the_device_delivered_are_damage_however_the_recording_ended(
+    tmp_path: Path, runs: list[list[FrameBlock]]
+) -> None:
+    folder = record(tmp_path, runs[:1], counters={"delivered": 1, "lost": 0}, recording={"failed": "full"})
+    assert verify(folder).verdict is Integrity.DAMAGED
+
+
+def test_one_file_of_a_recording_is_refused_and_left(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    folder = record(tmp_path, runs)
+    change(folder / FIRST, 4096 + 500)
+    before = files_of(folder)
+    for act in (verify, repair):
+        with pytest.raises(UsageError, match="is a file; name the folder"):
+            act(folder / FIRST)
+    assert files_of(folder) == before
+
+
 def test_damage_in_the_middle_becomes_a_gap(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
     folder = record(tmp_path, runs)
     whole = (folder / FIRST).read_bytes()

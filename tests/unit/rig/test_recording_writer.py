@@ -115,20 +115,22 @@ def test_what_was_recorded_is_synced_in_time_blocks_before_index(
     assert recording.longest_unsynced_s > 0
 
 
-def test_nothing_counts_behind_a_block_that_could_not_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("slow", "submitted"), [(7, 12), (4, 8)], ids=["behind it is written", "before it is not"])
+def test_all_blocks_before_one_that_could_not_be_written_count_and_none_behind_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow: int, submitted: int
 ) -> None:
     write = Segment.write
 
     def failing(self: Segment, block: FrameBlock, *others: object) -> None:
+        if block.header.block_seq == slow:
+            time.sleep(0.05)  # the other writers are through by then
         if block.header.block_seq == 7:
-            time.sleep(0.05)  # those behind it are written by then
             raise OSError(errno.EIO, "Input/output error")
         write(self, block, *others)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Segment, "write", failing)
     recording = Recording(tmp_path, expected_bytes=sum(SIZES))
-    under_way = [recording.submit(block) for block in BLOCKS[:12]]
+    under_way = [recording.submit(block) for block in BLOCKS[:submitted]]
     wait(under_way)
     with pytest.raises(RecordingError, match=r"frames-000000.spb beyond .* MB: Input/output error"):
         under_way[7].result()
