@@ -37,6 +37,7 @@ campaign: .venv/.installed-tests
 	$(BIN)/python -m tests.campaigns.recording_kill
 	$(BIN)/python -m tests.campaigns.recording_corruptions --sequences 100000
 	$(BIN)/python -m tests.campaigns.recording_depth --sequences 1000
+	$(BIN)/python -m tests.campaigns.kernel_usb
 
 .venv/.created:
 	@test -n "$(PYTHON)" || { echo "error: no python3 found; install Python 3.11 or newer, or call make PYTHON=/path/to/python" >&2; exit 2; }

@@ -169,4 +169,9 @@ def _dialect(line: Dialogue, model: str) -> Dialect:
     raise DeviceFault(f"cobolt laser {model} is no 06-01 type; this driver runs 06-MLD and newer 06-01 lasers")
 
 
-KIND = Kind(config=CoboltConfig, create=create, off=b"l0\r")
+def _off(config: CoboltConfig) -> bytes:
+    """No line end before it: an empty command may count as one, and what follows within 0.1 s is not heeded."""
+    return b"l0\r"
+
+
+KIND = Kind(config=CoboltConfig, create=create, off=_off)

@@ -21,6 +21,8 @@ class Dac(Protocol):
     """An open board. Powered up its mirror stands at the centre, drive 0."""
 
     name: str
+    identity: str
+    """See `Device.identity`."""
     highest_rate_hz: float
     closes_at: float | None
     """Drive that giving the board back jumps to; None: it holds."""
@@ -57,6 +59,11 @@ class DacScanner(BeamScanner):
         self._limits = config.limits(dac.highest_rate_hz)
         self._player = RunPlayer(dac.name, dac.halt, position=0.0)
         self._loaded: tuple[ScanWaveform, int] | None = None
+
+    @property
+    def identity(self) -> str:
+        """What the board says of itself."""
+        return self._dac.identity
 
     @property
     def limits(self) -> ScannerLimits:

@@ -261,12 +261,13 @@ def _identify(config: ObisConfig, clock: Clock, framing: ObisFraming, line: Dial
 
 
 def _base_range(line: Dialogue) -> TemperatureRange | None:
-    """None: this unit does not say; its own fault word judges then."""
+    """None: this unit does not say, or states no range; its own fault word judges then."""
     try:
         low, high = (line.ask_surely(f"SOUR:TEMP:PROT:BAS:{end}?", CELSIUS) for end in ("LOW", "HIGH"))
     except CommandRefused:
         return None
-    return TemperatureRange(_celsius(low), _celsius(high))
+    found = TemperatureRange(_celsius(low), _celsius(high))
+    return found if found.low_c < found.high_c else None
 
 
 def _celsius(reply: str) -> float:
@@ -275,4 +276,9 @@ def _celsius(reply: str) -> float:
     return float(match[1])
 
 
-KIND = Kind(config=ObisConfig, create=create, off=b"SOUR:AM:STAT OFF\r\n")
+def _off(config: ObisConfig) -> bytes:
+    """The line end before it ends what a program that died had begun to say."""
+    return b"\r\n" + ObisFraming(config.channel).encode("SOUR:AM:STAT OFF")
+
+
+KIND = Kind(config=ObisConfig, create=create, off=_off)

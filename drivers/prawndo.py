@@ -92,12 +92,19 @@ class PrawnDo(SyncSource):
         try:
             self._line.connect(max(MAX_WORDS.values()))
             clock_hz = float(INTERNAL_HZ) if config.external_clock is None else config.external_clock
-            self._board = Board(self.name, clock_hz, self._identify(), config.trigger_pulse)
+            self._firmware, max_words = self._identify()
+            self._board = Board(self.name, clock_hz, max_words, config.trigger_pulse)
             self._set_clock()
             self._line.command("cls")
         except BaseException:
             self._line.close()
             raise
+
+    @property
+    def identity(self) -> str:
+        """Firmware, memory and clock; a board has no serial number of its own."""
+        board = self._board
+        return f"{self.name} firmware {self._firmware}, {board.max_words} words, {board.clock_hz / 1e6:g} MHz"
 
     @property
     def resolution_s(self) -> float:
@@ -148,22 +155,22 @@ class PrawnDo(SyncSource):
     def _do_close(self) -> None:
         self._line.close()
 
-    def _identify(self) -> int:
-        """Words that the board holds; ProtocolError where its firmware is too old."""
-        version = "".join(self._line.transact("ver"))
+    def _identify(self) -> tuple[str, int]:
+        """Firmware, and words that the board holds; ProtocolError where its firmware is too old."""
+        version = "".join(self._line.transact("ver")).removeprefix("Version: ")
         try:
-            numbers = tuple(int(part) for part in version.removeprefix("Version: ").split(".")[:2])
+            numbers = tuple(int(part) for part in version.split(".")[:2])
         except ValueError:
             raise ProtocolError(f"{self.name}: no version in {version!r}; is this a PrawnDO?") from None
         if numbers < OLDEST_FIRMWARE:
             raise ProtocolError(
-                f"{self.name}: firmware {version.removeprefix('Version: ')} is older than "
-                f"{'.'.join(map(str, OLDEST_FIRMWARE))}; install a newer one"
+                f"{self.name}: firmware {version} is older than {'.'.join(map(str, OLDEST_FIRMWARE))}; install a "
+                "newer one"
             )
         board = "".join(self._line.transact("brd"))
         if board not in MAX_WORDS:
             raise ProtocolError(f"{self.name}: unknown board {board!r}; known are {', '.join(MAX_WORDS)}")
-        return MAX_WORDS[board]
+        return version, MAX_WORDS[board]
 
     def _set_clock(self) -> None:
         wanted_hz = self._config.external_clock

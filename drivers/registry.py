@@ -51,9 +51,9 @@ class Kind:
 
     config: type[BaseModel]
     create: Callable[[Any, Surroundings], Any]
-    off: bytes = b""
-    """What a laser on a serial port is sent where there is no time to open it first: emission off, whatever it answers.
-    """
+    off: Callable[[Any], bytes] | None = None
+    """What a laser on a serial port is sent, by its config, where there is no time to open it first: emission off,
+    whatever it answers."""
 
 
 def kinds(slot: str) -> tuple[str, ...]:

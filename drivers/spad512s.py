@@ -22,16 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.errors import DeviceFault, DeviceTimeout, LimitExceeded, WrongState
+from drivers.errors import DeviceFault, DeviceTimeout, LimitExceeded
 from drivers.frames import BlockFlag, BlockHeader
-from drivers.interfaces import BurstMode, SpadArray, SpadCounters, SpadInfo, SpadRequest, SpadTiming
+from drivers.interfaces import BurstMode, SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
 from drivers.orientation import QuarterTurn, turn_packed, turned_size
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.ring import BlockRing
-from drivers.spad512s_line import Deadlines, Spad512sHealth, Spad512sIdentity, Spad512sLine
+from drivers.spad512s_line import Deadlines, Spad512sLine
 from drivers.spad512s_run import SLICE_S, Spad512sRun
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from drivers.transports.endpoints import Endpoint, resolve
+from drivers.transports.tap import Tap
 from drivers.units import BytesPerSecond, ExactHertz
 
 COLUMNS = 512
@@ -39,6 +40,8 @@ ROW_BYTES = COLUMNS // 8
 TICK_HZ = 100_000_000
 """Nominal: the vendor's stream carries no time. Where it does not divide the period, a multiple of the frame rate."""
 TICKS_PER_FRAME = 1024
+_TEMPERATURES = ("master FPGA", "slave FPGA", "board", "chip")
+"""What `R` measures first."""
 _US_SLACK = 1e-6
 """Microseconds by which a whole number of them may miss as a float in seconds."""
 
@@ -64,10 +67,12 @@ class Spad512sConfig(KindConfig):
 class Spad512s(SpadArray):
     """A SPAD512S, connected."""
 
-    def __init__(self, config: Spad512sConfig, endpoint: Endpoint, deadlines: Deadlines | None = None) -> None:
+    def __init__(
+        self, config: Spad512sConfig, endpoint: Endpoint, deadlines: Deadlines | None = None, tap: Tap | None = None
+    ) -> None:
         super().__init__("SPAD512S")
         self._config = config
-        self._line = Spad512sLine(self.name, endpoint.address, deadlines or Deadlines())
+        self._line = Spad512sLine(self.name, endpoint.address, deadlines or Deadlines(), tap)
         self._busy = threading.Lock()
         """Held while the line is in use, so that `stop` waits for `fill`."""
         self._halt = threading.Event()
@@ -97,17 +102,18 @@ class Spad512s(SpadArray):
         return self._info
 
     @property
-    def identity(self) -> Spad512sIdentity:
+    def identity(self) -> str:
         """Serial numbers and versions."""
-        return self._identity
+        return f"{self.name}: {self._identity}"
 
-    def health(self) -> Spad512sHealth:
-        """Temperatures, clocks and bias. `WrongState` during a run: the one line is busy."""
+    def _do_health(self) -> SpadHealth:
+        """`R`: four temperatures, the laser's clock and the frames'; `V`: quench and excess bias."""
         with self._busy:
-            if self._run is not None:
-                raise WrongState(f"{self.name}: its line carries a run; ask for temperatures before or after it")
             self._connect_where_lost()
-            return Spad512sHealth(*self._line.ask_numbers("R", 6), *self._line.ask_numbers("V", 2))
+            *celsius, _, frame_clock_hz = self._line.ask_numbers("R", 6)
+            _, excess_v = self._line.ask_numbers("V", 2)
+        temperatures = dict(zip(_TEMPERATURES, celsius, strict=True))
+        return SpadHealth(temperatures, excess_bias_v=excess_v, frame_clock_hz=frame_clock_hz)
 
     def _do_counters(self) -> SpadCounters:
         return self._counters
@@ -280,7 +286,7 @@ class Spad512s(SpadArray):
 
 def create(config: Spad512sConfig, surroundings: Surroundings) -> Spad512s:
     """The SPAD512S at the config's port."""
-    return Spad512s(config, resolve(config.port, surroundings.ports))
+    return Spad512s(config, resolve(config.port, surroundings.ports), tap=surroundings.tap)
 
 
 KIND = Kind(config=Spad512sConfig, create=create)

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceFault, DeviceTimeout, ProtocolError
+from drivers.transports.tap import IN, OUT, Tap
 from drivers.transports.tcp_stream import TcpStream
 
 _log = logging.getLogger(__name__)
@@ -52,32 +53,26 @@ class Spad512sIdentity:
     flavour: str
     intensity: bool
 
+    def __str__(self) -> str:
+        """For people."""
+        return (
+            f"{self.detector} {self.flavour}, FPGAs {self.master_serial} and {self.slave_serial}, software "
+            f"{self.software}, firmware {self.firmware}, hardware {self.hardware}"
+        )
+
     @property
     def rows(self) -> int:
         """1024 for the 1M flavour, else 512."""
         return 1024 if "1M" in self.flavour else 512
 
 
-@dataclass(frozen=True, slots=True)
-class Spad512sHealth:
-    """What the device measures: temperatures of FPGAs, board and chip and the clocks it sees (`R`), its bias (`V`)."""
-
-    master_c: float
-    slave_c: float
-    board_c: float
-    chip_c: float
-    laser_clock_hz: float
-    frame_clock_hz: float
-    quench_v: float
-    excess_v: float
-    """Excess bias: bright light at a high one ages the chip."""
-
-
 class Spad512sLine:
     """The line, open once `connect` returned. For one thread at a time."""
 
-    def __init__(self, name: str, address: str, deadlines: Deadlines) -> None:
+    def __init__(self, name: str, address: str, deadlines: Deadlines, tap: Tap | None = None) -> None:
+        """tap: told of commands and answers, not of pixels."""
         self.address = address
+        self._tap = tap
         self._name = name
         self._deadlines = deadlines
         self._stream: TcpStream | None = None
@@ -105,7 +100,7 @@ class Spad512sLine:
     def tell(self, command: str) -> None:
         """Send a command whose answer is pixels, or none."""
         with self._given_up_on_silence():
-            self._open().send(command.encode("ascii"), self._deadlines.answer_s)
+            self._send(self._open(), command)
 
     def ask(self, command: str) -> str:
         """Send a command and return its answer; DeviceFault where that is an ERROR."""
@@ -113,7 +108,7 @@ class Spad512sLine:
         with self._given_up_on_silence():
             stream = self._open()
             stream.drain(0.0, answer_s)  # what came unasked is no answer to this
-            stream.send(command.encode("ascii"), answer_s)
+            self._send(stream, command)
             answer = self._read_text(stream, answer_s)
             if not answer:
                 raise DeviceTimeout(f"{self._name} did not answer {command} within {answer_s:g} s")
@@ -222,6 +217,15 @@ class Spad512sLine:
             raise DeviceFault(f"{self._name} {identity.master_serial}: intensity imaging is not enabled on this unit")
         return identity
 
+    def _send(self, stream: TcpStream, command: str) -> None:
+        data = command.encode("ascii")
+        self._note(OUT, data)
+        stream.send(data, self._deadlines.answer_s)
+
+    def _note(self, direction: str, data: bytes) -> None:
+        if self._tap is not None:
+            self._tap.note("tcp", direction, data)
+
     def _read_text(self, stream: TcpStream, deadline_s: float) -> str:
         """What comes until the line is quiet or says DONE, at most for `deadline_s`; empty where nothing came."""
         ends_at = time.monotonic() + deadline_s
@@ -231,6 +235,7 @@ class Spad512sLine:
             if not more:
                 break
             data = (data + more)[-_MOST_TEXT_BYTES:]
+        self._note(IN, data)
         return data.decode("utf-8", "replace").strip()
 
 

@@ -12,9 +12,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from drivers.errors import DeviceError, DeviceFault, DeviceTimeout, LimitExceeded, WrongState
+from drivers.errors import DeviceError, DeviceFault, DeviceTimeout, LimitExceeded
 from drivers.frames import frame_bytes
-from drivers.interfaces import SpadArray, SpadCounters, SpadInfo, SpadRequest, SpadTiming
+from drivers.interfaces import SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.ring import BlockRing
 from drivers.spb1.control import Op, Register, State
@@ -27,6 +27,7 @@ from drivers.transports.bulk_link import BulkLink
 from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.plain_link import PlainLink
 from drivers.transports.queued_link import QueuedLink
+from drivers.transports.tap import Tap
 from drivers.transports.usb_device import UsbDevice, find_device
 from drivers.units import Seconds
 
@@ -62,8 +63,11 @@ class SpbUsbConfig(KindConfig):
 class SpbUsb(SpadArray):
     """An SPB1 SPAD over an open link."""
 
-    def __init__(self, config: SpbUsbConfig, link: BulkLink) -> None:
-        """Check who is there and, where asked for, its test pattern. The link is closed with the device."""
+    def __init__(self, config: SpbUsbConfig, link: BulkLink, tap: Tap | None = None) -> None:
+        """Check who is there and, where asked for, its test pattern. The link is closed with the device.
+
+        tap: told of its control traffic.
+        """
         super().__init__(link.label)
         self._config = config
         self._link = link
@@ -76,7 +80,7 @@ class SpbUsb(SpadArray):
         try:
             wiring.open_session(link)
             ack_in = wiring.ack_in if wiring.ack_in in link.endpoints else None
-            self._control = ControlChannel(link, wiring.command_out, ack_in, wiring.stream_in)
+            self._control = ControlChannel(link, wiring.command_out, ack_in, wiring.stream_in, tap)
             self._identity = identify(self._control, self.name)
             if config.test_pattern:
                 require_order(self._control, link, wiring.stream_in, self._identity, config.heartbeat)
@@ -89,13 +93,9 @@ class SpbUsb(SpadArray):
         """Geometry and abilities."""
         return self._identity.info
 
-    @property
-    def fifo_high_water(self) -> int:
-        """Most bytes that waited in the device's memory in the last run. `WrongState` while one is under way."""
+    def _do_health(self) -> SpadHealth:
         with self._busy:
-            if self._receiver is not None:
-                raise WrongState(f"{self.name}: ask for the high-water mark of its memory behind the run")
-            return self._control.read(Register.FIFO_HIGH_WATER)
+            return SpadHealth(memory_high_water_bytes=self._control.read(Register.FIFO_HIGH_WATER))
 
     def _do_counters(self) -> SpadCounters:
         return self._counters
@@ -270,7 +270,7 @@ def open_link(config: SpbUsbConfig, endpoint: Endpoint) -> BulkLink:
 
 def create(config: SpbUsbConfig, surroundings: Surroundings) -> SpbUsb:
     """The SPAD at the config's port."""
-    return SpbUsb(config, open_link(config, resolve(config.port, surroundings.ports)))
+    return SpbUsb(config, open_link(config, resolve(config.port, surroundings.ports)), surroundings.tap)
 
 
 KIND = Kind(config=SpbUsbConfig, create=create)

@@ -78,6 +78,7 @@ _ALL = (
     Dimension("angle", {"rad": Fraction(1), "mrad": Fraction(1, 10**3), "deg": _DEGREE}, "3 deg"),
     Dimension("illuminance", {"lx": Fraction(1), "lux": Fraction(1), "klx": Fraction(10**3)}, "200 lx"),
     Dimension("ratio", {"ppm": Fraction(1, 10**6), "%": Fraction(1, 100), "ppb": Fraction(1, 10**9)}, "20 ppm"),
+    Dimension("speed", {"m/s": Fraction(1), "mm/s": Fraction(1, 10**3), "km/h": Fraction(1000, 3600)}, "1.5 m/s"),
     Dimension("rain rate", {"m/h": Fraction(1), "mm/h": Fraction(1, 10**3)}, "20 mm/h"),
     Dimension("count rate", {"cps": Fraction(1), "kcps": Fraction(10**3), "Mcps": Fraction(10**6)}, "20 cps"),
     Dimension(
@@ -200,6 +201,7 @@ Radians = Annotated[float, _Text("angle")]
 Lux = Annotated[float, _Text("illuminance")]
 Ppm = Annotated[float, _Text("ratio")]
 """A plain ratio in code: "20 ppm" is 2e-05."""
+MetresPerSecond = Annotated[float, _Text("speed")]
 MetresPerHour = Annotated[float, _Text("rain rate")]
 CountsPerSecond = Annotated[float, _Text("count rate")]
 PerSecond = Annotated[float, _Text("rate")]

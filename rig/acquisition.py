@@ -10,12 +10,13 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, fields
 from fractions import Fraction
 
-from drivers.clock import Clock, VirtualClock
+from drivers.clock import Clock
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
+from rig.burst import lead_s, require_memory
 from rig.counting import SweepLayout
-from rig.errors import DevicesError, PlanError
+from rig.errors import DevicesError
 from rig.map_queue import AcquiredMap
 from rig.mapping import MakesMaps
 from rig.monitor import Watch
@@ -33,9 +34,6 @@ SILENCE_S = 5.0
 """A SPAD that sends nothing for so long, with the ring empty, has failed."""
 WARM_UP_S = 120.0
 """Longest wait for a laser to warm up."""
-BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
-"""Time between the SPAD's start and the first scan marker that a burst must have room for, on virtual time and where a
-host starts one device after the other over USB and serial ports."""
 TELL_S = 0.1
 """Time from one report of progress to the next."""
 
@@ -91,7 +89,7 @@ class Acquisition:
         self._groups = groups
         self._starts = starts
         if groups is None:
-            self._require_memory()
+            require_memory(rig, plan)
         self._timing = timing
         self._maps = maps
         self._maker = maker
@@ -105,18 +103,6 @@ class Acquisition:
         self._stats_before = PipelineStats()
         self._counters_before = SpadCounters(0, 0, 0, 0, 0)
         self._frames_before = 0
-
-    def _require_memory(self) -> None:
-        """PlanError where the SPAD's memory would be full before one map is whole."""
-        if self._plan.burst_frames is None:
-            return
-        need = math.ceil(self._plan.frames_for(1) + self._lead_s * float(self._plan.frame_rate_hz))
-        if need > self._plan.burst_frames:
-            raise PlanError(
-                f"a burst of one map takes {need} frames, with the {self._lead_s:g} s until the scanner has started; "
-                f"the memory of {self._rig.spad.name} holds {self._plan.burst_frames}; lower scan.exposures, "
-                "scan.columns or scan.frame_rate"
-            )
 
     @property
     def frames_planned(self) -> int:
@@ -154,10 +140,6 @@ class Acquisition:
             yield from self._run_group(assembler, group, done)
             done += group
 
-    @property
-    def _lead_s(self) -> float:
-        return BURST_LEAD_S if isinstance(self._rig.clock, VirtualClock) else HOST_LEAD_S
-
     def _group(self, done: int) -> int:
         """Sweeps of the next start: as many as the SPAD's memory holds in a burst and the sync source's program."""
         if self._groups is not None:
@@ -167,7 +149,7 @@ class Acquisition:
             return 1
         if self._plan.burst_frames is None:
             return left
-        spare = self._plan.burst_frames - self._lead_s * float(self._plan.frame_rate_hz) - self._plan.frames_for(0)
+        spare = self._plan.burst_frames - lead_s(self._rig) * float(self._plan.frame_rate_hz) - self._plan.frames_for(0)
         return max(1, min(left, int(spare / float(self._plan.frames_per_sweep))))
 
     @property
@@ -180,7 +162,7 @@ class Acquisition:
     def _burst_frames(self, sweeps: int) -> int | None:
         if self._plan.burst_frames is None:
             return None
-        lead = Fraction(self._lead_s) * self._plan.frame_rate_hz
+        lead = Fraction(lead_s(self._rig)) * self._plan.frame_rate_hz
         return min(self._plan.burst_frames, math.ceil(self._plan.frames_for(sweeps) + lead))
 
     def _run_group(self, assembler: SweepAssembler, sweeps: int, done: int) -> Generator[AcquiredMap, None, None]:
@@ -219,6 +201,9 @@ class Acquisition:
                 while pipeline.streaming:
                     if (found := pipeline.take_streaming(TELL_S)) is not None:
                         yield found
+                    if rig.guard is not None and rig.guard.failure is not None:
+                        pipeline.end_source(rig.guard.failure)  # the SPAD may be what is silent: not waited for
+                        break
                     self._check_scanner()
                     self._tell(assembler, done)
             finally:

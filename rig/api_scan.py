@@ -86,6 +86,7 @@ def plan_scan(
     Devices are opened, asked for their limits and closed again: nothing moves and nothing shines, so that no `arm` is
     needed. Raises DevicesError, a line per device, where real ones are not there.
     """
+    from rig.burst import require_memory
     from rig.overload import require_policy
     from rig.session import open_rig, prepare
 
@@ -93,7 +94,9 @@ def plan_scan(
     _, overload = _checked_policies(maps, seed, save, on_overload)
     with open_rig(settings) as rig:
         require_policy(overload, rig.spad.info)
-        return prepare(rig)[0]
+        plan, _ = prepare(rig)
+        require_memory(rig, plan)
+        return plan
 
 
 def replay(

@@ -31,5 +31,5 @@ class MarkerLine:
         spread = float(weight @ (x - middle) ** 2)
         place = np.array(self.place)
         level = float(weight @ place / weight.sum())
-        slope = float((weight * (x - middle)) @ place / spread)
+        slope = float((weight * (x - middle)) @ (place - level) / spread)
         return level - slope * middle, math.sqrt(1 / weight.sum() + middle**2 / spread), slope

@@ -124,9 +124,9 @@ class Pipeline:
         """The next map of what is left in the ring; None after `timeout_s`, or at once where none will come."""
         return self._queue.take_rest(timeout_s)
 
-    def end_source(self) -> None:
-        """Fill no more. Returns at once."""
-        self._source.end()
+    def end_source(self, why: BaseException | None = None) -> None:
+        """Fill no more. Returns at once. why: what the readers are told behind the last block."""
+        self._source.end(why)
 
     def join_source(self) -> bool:
         """Wait for the source thread after the SPAD was stopped; False where it hangs."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drivers.frames import frame_bytes
 from drivers.interfaces import OUT_GATE, Pulse, ScanWaveform, SpadMode, WindowTable
@@ -190,8 +190,7 @@ class ScanPlan:
 
     def command_at(self, column: Array) -> Array:
         """Mirror command of fractional columns, any shape, NaN staying NaN."""
-        first, last = self.command_range
-        return first + (np.asarray(column, np.float64) + 0.5) * ((last - first) / self.columns)
+        return column_command(column, self.command_range, self.columns)
 
     @property
     def pilots(self) -> int:
@@ -294,6 +293,13 @@ class ScanPlan:
         if self.windows is None or self.windows_hz is None:
             return text
         return f"{text}, windows of {self.windows.width_px} pixels up to {rounded(self.windows_hz / 1e3)} kHz"
+
+
+def column_command(column: ArrayLike, command_range: tuple[float, float], columns: int) -> Array:
+    """Mirror command of fractional columns, any shape, where `columns` of them share the range evenly."""
+    first, last = command_range
+    result: Array = first + (np.asarray(column, np.float64) + 0.5) * ((last - first) / columns)
+    return result
 
 
 def rounded(value: float) -> str:

@@ -35,6 +35,7 @@ class Source:
         self._on_end = on_end
         self._on_frame = on_frame
         self._over = threading.Event()
+        self._why: BaseException | None = None
         self._thread = StageThread(self._run, "spad source")
         self._busy_s = 0.0
         self.silences: list[DeviceTimeout] = []
@@ -54,8 +55,9 @@ class Source:
         """Begin to fill."""
         self._thread.start()
 
-    def end(self) -> None:
-        """Fill no more after the present block. Any thread; returns at once."""
+    def end(self, why: BaseException | None = None) -> None:
+        """Fill no more after the present block. Any thread; returns at once. why: handed to the readers behind it."""
+        self._why = self._why or why
         self._over.set()
         self._ring.end_waits()
 
@@ -72,7 +74,7 @@ class Source:
                 pass
         except BaseException as caught:  # handed to the readers, who raise it on their threads
             error = caught
-        self._ring.finish(error)
+        self._ring.finish(error or self._why)
         self._on_end()
 
     def _fill(self) -> bool:

@@ -46,21 +46,26 @@ class Owned:
         self._trouble = ""
         kind = lookup(slot, config["kind"])
         endpoints = {name: Endpoint(address, emulated=True) for name, address in ports.items()}
-        tapped = None if tap is None else TapFile(**tap).tap(slot)
-        surroundings = Surroundings(SystemClock(), None, 0, endpoints, tapped)
+        self._tap = None if tap is None else TapFile(**tap).tap(slot)
+        surroundings = Surroundings(SystemClock(), None, 0, endpoints, self._tap)
         model = kind.config.model_validate(config)
         self._create: Callable[[], Any] = lambda: kind.create(model, surroundings)
 
     def open(self) -> dict[str, Any]:
         """Open the device; returns what its proxy tells of it without asking. DeviceError."""
         self.device = self._create()
-        about: dict[str, Any] = {"name": self.device.name}
+        about: dict[str, Any] = {"name": self.device.name, "identity": self.device.identity}
         if isinstance(self.device, LineLaser):
             limits = self.device.limits
             about["limits"] = [limits.min_power_w, limits.max_power_w]
         else:
             about["resolution_s"] = self.device.resolution_s
         return about
+
+    def flush(self) -> None:
+        """Wait until what passed its port is written, where that is recorded."""
+        if self._tap is not None:
+            self._tap.flush()
 
     @property
     def port_lost(self) -> bool:

@@ -3,7 +3,9 @@
 The main thread never touches a device: it reads messages, looks at the application every 10 ms and gives jobs to lanes.
 What ends the light ("trip"): the application ended, was stopped or takes no frames; a port hung up; the laser reports
 an open interlock or a fault, or stops answering. Then, at the same time: all outputs of the gate low, the laser paused.
-After it: an application that cannot help itself is killed, the laser disarmed, the ports closed.
+After it: an application that cannot help itself is killed, the laser disarmed, the ports closed. Where frames stop
+because the gate's program has come to its end, the laser is paused and nothing else happens: it has nothing to shine
+for, and an application that waits for a silent SPAD may take seconds to say so.
 """
 
 import logging
@@ -31,6 +33,8 @@ POLL_S = 1.0
 """Between questions to an armed laser about interlock and faults (hardware.md section 4: at 1 Hz or more)."""
 CHECK_S = 0.05
 """Time for the gate to say whether its program has ended, before it is taken for still running."""
+END_CHECK_S = 0.2
+"""Between questions for that to the gate of an application at work, which may be late with its frames for longer."""
 HELP_ITSELF_S = 0.5
 """Time for an application that lives but takes no frames to make its rig safe, before it is killed."""
 GATE_FIRST_S = 0.1
@@ -58,6 +62,7 @@ class GuardProcess:
         self._safe_asked = False
         self._ending = False
         self._check_until: float | None = None
+        self._next_end_check = 0.0
         self._silence_noted = False
         self._next_poll = 0.0
         self._terminated = False
@@ -188,6 +193,11 @@ class GuardProcess:
         now = time.monotonic()
         if trouble is not None:
             self._suspect(trouble, stopped, now)
+        elif watch.quiet and now >= self._next_end_check:
+            self._next_end_check = now + END_CHECK_S
+            sync = self._owned.get("sync")
+            if sync is not None and sync.lane.idle:
+                sync.lane.do(lambda: self._note_end(sync))
         if self._kill_at is not None and now >= self._kill_at:
             self._kill_at = None
             if not self._safe_asked:
@@ -204,21 +214,36 @@ class GuardProcess:
             sync.urgent.do(lambda: self._check_end(sync, trouble), first=True)
 
     def _check_end(self, sync: Owned, trouble: str) -> None:
-        """On the gate's lane."""
+        """On a lane of the gate's."""
+        if not self._note_end(sync):
+            self._trip_application(f"{trouble}; check the SPAD's cable and trigger, or unload the computer", False)
+        self._check_until = None
+
+    def _note_end(self, sync: Owned) -> bool:
+        """Whether the gate's program has come to its end; then the laser rests. On a lane of the gate's."""
         try:
             status = sync.device.status
-            ended = status.state == "stopped" and status.outputs == 0
         except DeviceError:
-            ended = False
-        if ended:
-            self._watch.stop()
-        else:
-            self._trip_application(trouble, stopped=False)
-        self._check_until = None
+            return False
+        if status.state != "stopped" or status.outputs != 0:
+            return False
+        self._watch.stop()
+        laser = self._owned.get("laser")
+        if laser is not None and laser.emits and not laser.enabling:
+            laser.urgent.do(lambda: self._rest(laser))  # what the application asks for afterwards stands behind it
+        return True
+
+    def _rest(self, laser: Owned) -> None:
+        """On the laser's lane."""
+        try:
+            laser.call("pause", [])
+        except DeviceError as error:
+            if laser.device.state is not DeviceState.CLOSED:
+                self._trip(error)
 
     def _trip_application(self, trouble: str, stopped: bool) -> None:
         self._safe_asked = False
-        if self._trip(DeviceTimeout(f"the application {trouble}; the guard took its light")):
+        if self._trip(DeviceTimeout(f"the guard took the light: the application {trouble}")):
             self._kill_at = time.monotonic() + (GATE_FIRST_S if stopped else HELP_ITSELF_S)
 
     def _poll_laser(self, now: float) -> None:
@@ -286,6 +311,8 @@ class GuardProcess:
                 owned.device.close()
             except DeviceError as error:
                 _log.error("%s: %s", owned.slot, error)
+        for owned in self._owned.values():
+            owned.flush()
         self._channel.send({"bye": True}, within_s=0.1)
         return 0 if self._tripped is None else 1
 

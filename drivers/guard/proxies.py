@@ -25,7 +25,13 @@ class GuardedLaser(LineLaser):
     def __init__(self, guard: Asks, about: dict[str, Any]) -> None:
         super().__init__(about["name"])
         self._guard = guard
+        self._identity = str(about["identity"])
         self._limits = LaserLimits(*about["limits"])
+
+    @property
+    def identity(self) -> str:
+        """As the guard found it."""
+        return self._identity
 
     @property
     def limits(self) -> LaserLimits:
@@ -58,7 +64,13 @@ class GuardedSync(SyncSource):
     def __init__(self, guard: Asks, about: dict[str, Any]) -> None:
         super().__init__(about["name"])
         self._guard = guard
+        self._identity = str(about["identity"])
         self._resolution_s = float(about["resolution_s"])
+
+    @property
+    def identity(self) -> str:
+        """As the guard found it."""
+        return self._identity
 
     @property
     def resolution_s(self) -> float:

@@ -31,12 +31,12 @@ class Rescue:
         """Finds the drivers now: there will be no time to import them."""
         surroundings = Surroundings(SystemClock(), None, 0, ports)
         self._create: dict[str, Callable[[], Any]] = {}
-        self._off: dict[str, tuple[str, bytes]] = {}
+        self._off: dict[str, tuple[Callable[[], Endpoint], bytes]] = {}
         for slot, config in configs.items():
             kind = lookup(slot, config.kind)
             self._create[slot] = partial(kind.create, config, surroundings)
-            if kind.off:
-                self._off[slot] = resolve(config.port, ports).address, kind.off
+            if kind.off is not None:
+                self._off[slot] = partial(resolve, config.port, ports), kind.off(config)
         self._outcome: dict[str, str] = {}
 
     def run(self, slots: set[str], armed: bool) -> str:
@@ -69,7 +69,8 @@ class Rescue:
 
     def _switch_off(self, slot: str) -> None:
         """Off, before anything is asked: to open a laser that takes ten commands a second takes more than one."""
-        address, off = self._off[slot]
+        place, off = self._off[slot]
+        address = place().address
         port = _once_free(lambda: SerialPort(slot, address))
         try:
             for _ in range(OFF_TIMES):

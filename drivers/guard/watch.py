@@ -56,6 +56,11 @@ class FrameWatch:
         """The last frame number seen."""
         return self._last
 
+    @property
+    def quiet(self) -> bool:
+        """Whether the next frame is later than it may be for an application that sleeps."""
+        return self._watching and self._begun and self._silent_s > self.limits.frames_within_s
+
     def start(self, frame: int) -> None:
         """The gate may open from now on; `frame` is the last number told before."""
         self._last, self._begun, self._silent_s, self._watching = frame, False, 0.0, True

@@ -52,6 +52,11 @@ class Device(ABC):
         return self._name
 
     @property
+    def identity(self) -> str:
+        """Its name, and what else tells it from others of its kind: model, serial number, firmware."""
+        return self._name
+
+    @property
     def state(self) -> DeviceState:
         """Where the device stands, as far as its verbs tell."""
         return self._state

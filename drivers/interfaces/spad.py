@@ -2,7 +2,8 @@
 
 import logging
 from abc import abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Literal
 
@@ -94,6 +95,19 @@ class SpadCounters:
     resyncs: int | None
 
 
+@dataclass(frozen=True, slots=True)
+class SpadHealth:
+    """What a SPAD array measures of itself. Empty and None: it does not say."""
+
+    temperatures_c: Mapping[str, float] = field(default_factory=dict)
+    """By the place where each is measured."""
+    excess_bias_v: float | None = None
+    """Bright light at a high one ages the chip."""
+    frame_clock_hz: float | None = None
+    memory_high_water_bytes: int | None = None
+    """Most that waited in its memory in the last run."""
+
+
 class SpadArray(Device):
     """A binary SPAD sensor. configure -> start -> fill until it returns False (or stop) -> start again."""
 
@@ -108,9 +122,20 @@ class SpadArray(Device):
         """Geometry and abilities."""
 
     @property
+    def identity(self) -> str:
+        """Model and serial number."""
+        return " ".join(part for part in (f"{self._name}:", self.info.model, self.info.serial) if part)
+
+    @property
     def counters(self) -> SpadCounters:
         """Counts of the present run, or of the last one; also after `close`. Any thread."""
         return self._do_counters()
+
+    @property
+    def health(self) -> SpadHealth:
+        """Ask the device. `WrongState` during a run: its line may be busy."""
+        self._require("health", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
+        return self._do_health()
 
     def configure(self, request: SpadRequest) -> SpadTiming:
         """Set the frame timing. `LimitExceeded` when the device cannot do it; nothing is rounded silently."""
@@ -213,6 +238,9 @@ class SpadArray(Device):
 
     def _make_safe(self) -> None:
         self.stop()
+
+    def _do_health(self) -> SpadHealth:
+        return SpadHealth()
 
     @abstractmethod
     def _do_configure(self, request: SpadRequest) -> SpadTiming: ...

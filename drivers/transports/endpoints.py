@@ -5,6 +5,9 @@ from dataclasses import dataclass
 
 from drivers.errors import DeviceNotFound
 
+UDEV_RULES = "config/udev/70-spadrig.rules"
+"""Gives devices and ports to group plugdev; messages about permissions name it, its first lines say how to install it.
+"""
 EMULATED_PREFIX = "emulated:"
 """`port: emulated:laser` in a config means the endpoint that the rig's emulating world calls "laser"."""
 

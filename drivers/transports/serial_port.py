@@ -25,15 +25,13 @@ from drivers.errors import (
     DeviceTimeout,
     ProtocolError,
 )
+from drivers.transports.endpoints import UDEV_RULES
 from drivers.transports.tap import IN, OUT, Tap
 
 try:
     from termios import error as _termios_error
 except ImportError:  # no such module, and no such error, on Windows
     _termios_error = OSError  # type: ignore[assignment,misc]
-
-UDEV_RULES = "config/udev/70-spadrig.rules"
-"""The rules that give a lab user access to the ports; messages about permissions name them."""
 
 _FOREIGN = (serial.SerialException, OSError, _termios_error)
 _SLICE_S = 0.02

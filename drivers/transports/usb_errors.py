@@ -19,9 +19,7 @@ from drivers.errors import (
     DeviceTimeout,
     ProtocolError,
 )
-
-UDEV_RULES = "config/udev/70-spadrig.rules"
-"""Gives the devices to group plugdev; its first lines say how to install it."""
+from drivers.transports.endpoints import UDEV_RULES
 
 USBFS_HINT = "echo 256 | sudo tee /sys/module/usbcore/parameters/usbfs_memory_mb"
 """Linux lets all queued transfers hold 16 MB unless told otherwise."""

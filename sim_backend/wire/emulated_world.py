@@ -11,8 +11,7 @@ exposed; the SPAD's memory has room for a simulation that takes longer than that
 import os
 import threading
 from bisect import bisect_right
-from types import TracebackType
-from typing import ClassVar, Literal, Protocol, Self
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,8 @@ from drivers.registry import Kind, Surroundings
 from drivers.transports.endpoints import Endpoint
 from sim_backend.bench import Happening
 from sim_backend.devices.markers import MarkerInputs, windows_at
+from sim_backend.effects.setting import FrameTimes
+from sim_backend.flux import FluxModel
 from sim_backend.gate_program import gate_shares
 from sim_backend.photons import PhotonSource
 from sim_backend.wire.cobolt import CoboltModel
@@ -89,6 +90,7 @@ class EmulatedWorld(SimulatedWorld):
         self._emission_lock = threading.Lock()
         self._emission: list[tuple[float, float]] = [(-np.inf, 0.0)]
         self.laser = (CoboltModel if config.laser == "cobolt" else ObisModel)(on_emission=self._note_emission)
+        _ = self.flux_model  # made before time counts
         self.sync = PrawnDoModel(self._scan_marker, board=PICO_2)
         self.scanner = HeliosModel(clock_error=config.scanner_clock_error)
         self._frames = WorldFrames(self)
@@ -119,25 +121,15 @@ class EmulatedWorld(SimulatedWorld):
             self.spad512s_wire.close()
         self._frames.close()
 
-    def __enter__(self) -> Self:
-        """The world itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close."""
-        self.close()
-
     @property
     def seed(self) -> int:
         """Of all that is random here."""
         return self._seed
 
-    def photon_source(self, exposure_s: float) -> PhotonSource:
-        """What draws frames of that exposure."""
+    def photon_source(self, times: FrameTimes) -> PhotonSource:
+        """What draws frames that follow one another like that."""
         threads = min(MAX_THREADS, os.cpu_count() or 1)
-        return PhotonSource(self.flux_model, self.model.planes, exposure_s, self._seed, threads)
+        return PhotonSource(self.flux_model, self.model.planes, times, self._seed, threads)
 
     def during(self, start_s: Array, exposure_s: float, period_s: float) -> tuple[Happening, Array]:
         """What happened during frames that start at start_s (n,), ascending, one period apart, and the laser's power.
@@ -221,7 +213,7 @@ class WorldFrames:
         self._world = world
         self._markers = MarkerInputs()
         self._photons: PhotonSource | None = None
-        self._exposure_s = 0.0
+        self._made_for: tuple[FrameTimes, FluxModel] | None = None
 
     def started(self) -> None:
         """A run begins: counters of markers are 0."""
@@ -236,7 +228,8 @@ class WorldFrames:
         records["x0"] = x0
         if bits is not None:
             held = self._world.grid.hold(happening.mirror)
-            self._source(span.exposure_s).expose(span.first_frame, held, power_w * happening.share, x0, bits)
+            source = self._source(FrameTimes(span.exposure_s, span.period_s))
+            source.expose(span.first_frame, held, power_w * happening.share, x0, bits, start_s)
         return sweep
 
     def whole(self, first_frame: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
@@ -252,10 +245,11 @@ class WorldFrames:
             self._photons.close()
             self._photons = None
 
-    def _source(self, exposure_s: float) -> PhotonSource:
-        if self._photons is None or exposure_s != self._exposure_s:
+    def _source(self, times: FrameTimes) -> PhotonSource:
+        wanted = times, self._world.flux_model
+        if self._photons is None or wanted != self._made_for:
             self.close()
-            self._photons, self._exposure_s = self._world.photon_source(exposure_s), exposure_s
+            self._photons, self._made_for = self._world.photon_source(times), wanted
         return self._photons
 
 

@@ -11,7 +11,8 @@ import numpy as np
 
 
 class Fault(Enum):
-    """One thing that goes wrong with one reply."""
+    """One thing that goes wrong with one reply, acted out by `FaultSchedule.shape`; the last three strike the whole
+    device and are the transport's to act out."""
 
     LATE = "late"
     """Comes whole, after `late_s`."""
@@ -33,12 +34,6 @@ class Fault(Enum):
     """The cable is pulled before it comes."""
     HANG = "hang"
     """The firmware hangs: it takes and says nothing from now on; its outputs stay as they are."""
-
-
-SHAPING = (Fault.LATE, Fault.SPLIT, Fault.MERGED, Fault.TRUNCATED, Fault.CORRUPTED, Fault.REPEATED, Fault.LOST)
-"""Faults of one reply, acted out by `FaultSchedule.shape`."""
-FINAL = (Fault.STALL, Fault.UNPLUG, Fault.HANG)
-"""Faults of the whole device, acted out by the transport."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,7 +45,9 @@ _CAN = 0x01 | 0x04 | 0x10
 """Capabilities: zero packets, no limit of 16 KiB a transfer, reaping after a disconnect."""
 
 _USBFS_LIMIT_BYTES = 16 << 20
-"""`usbfs_memory_mb` as Linux ships it: what all queued transfers may hold."""
+"""`usbfs_memory_mb` as Linux ships it: what all queued transfers may hold..."""
+_URB_BYTES = 512
+"""...and about what the kernel keeps of each besides (drivers/usb/core/devio.c): 16 of 1 MiB do not fit."""
 
 
 @dataclass(eq=False)
@@ -185,7 +187,8 @@ class UsbFile:
         if not self._device.present:
             raise UsbFailure(errno.ENODEV)
         with self._lock:
-            if length + sum(urb.length for urb in (*self._queued, *self.over)) > _USBFS_LIMIT_BYTES:
+            held = sum(urb.length + _URB_BYTES for urb in (*self._queued, *self.over))
+            if held + length + _URB_BYTES > _USBFS_LIMIT_BYTES:
                 raise UsbFailure(errno.ENOMEM)
         setup, data = None, b""
         if kind == _URB_CONTROL:

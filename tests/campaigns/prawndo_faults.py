@@ -30,7 +30,6 @@ DEADLINE_S = 5.0
 LATE_S = 0.08
 STALL_S = 0.1
 VERBS = 6
-PERIOD_CYCLES = 3
 
 
 @dataclass

@@ -1,14 +1,23 @@
-"""Test bodies that run in a process of their own under umockdev, over real libusb: there, and seen from here."""
+"""Test bodies that run in a process of their own, over real libusb: there, and seen from here."""
 
 import json
 import subprocess
 import sys
 import traceback
 from collections.abc import Callable
+from typing import Protocol
 
-from sim_backend.wire.umockdev_server import UmockdevBus
+from sim_backend.wire.usb_model import AttachedDevice, UsbModel
 
 WITHIN_S = 120
+
+
+class ServesProcesses(Protocol):
+    """A bus for other processes: umockdev's, or a kernel's."""
+
+    def plug(self, model: UsbModel) -> AttachedDevice: ...
+
+    def environment(self) -> dict[str, str]: ...
 
 
 def report(bodies: dict[str, Callable[[], None]]) -> None:
@@ -23,7 +32,7 @@ def report(bodies: dict[str, Callable[[], None]]) -> None:
     print(json.dumps(outcomes))
 
 
-def outcomes(bus: UmockdevBus, module: str, *arguments: str) -> dict[str, str]:
+def outcomes(bus: ServesProcesses, module: str, *arguments: str) -> dict[str, str]:
     """What became of each body of a module that reports when it is run, with the devices of a bus."""
     command = [sys.executable, "-m", module, *arguments]
     done = subprocess.run(command, env=bus.environment(), capture_output=True, text=True, timeout=WITHIN_S, check=False)

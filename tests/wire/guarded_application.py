@@ -3,7 +3,7 @@
     python -m tests.wire.guarded_application LASER_PATH SYNC_PATH [MODE]
 
 Says "lit" once it scans. MODE: beat (default), hang (stops beating after "lit", asleep), spin (the same, computing),
-end (says goodbye after "lit"), error (raises after "lit"), labours (beats on beside much other work).
+vanish (exits at once after "lit").
 """
 
 import os
@@ -31,17 +31,13 @@ def main(laser_port: str, sync_port: str, mode: str = "beat") -> None:
         sync.run()
         guard.beat(0)
         print("lit", guard.pid, flush=True)
-        if mode == "labours":
-            labour()
         frame = 0
         try:
             while True:
                 frame += 100
                 guard.beat(frame)
-                if frame > 20_000 and mode not in ("beat", "labours"):
+                if frame > 20_000 and mode != "beat":
                     misbehave(mode)
-                if mode == "end" and frame > 20_000:
-                    break
                 time.sleep(0.001)
         finally:
             for step in (sync.abort, laser.pause):
@@ -77,8 +73,6 @@ def misbehave(mode: str) -> None:
             ends_at = time.monotonic() + 60
             while time.monotonic() < ends_at:
                 pass
-        case "error":
-            raise RuntimeError("on the way")
         case "vanish":
             os._exit(7)
 

@@ -1,20 +1,26 @@
-"""A Helios driven through real libusb, in a process under umockdev: `python -m tests.wire.helios_over_libusb`.
+"""A Helios driven through real libusb, in a process of its own: `python -m tests.wire.helios_over_libusb`.
 
 Plays three repeats of a wave, then parks. Prints the point clock and the position as JSON. With the argument `endless`
 it prints a line once it scans, and scans until it is killed.
 """
 
 import json
+import subprocess
 import sys
 import time
 
 import numpy as np
+import pytest
 
 from drivers.clock import SystemClock
 from drivers.interfaces import MARKER_SCAN, BeamScanner, ScanWaveform
 from drivers.registry import Surroundings, lookup
-from tests.wire.scanners import GALVO
+from sim_backend.wire.helios import BLUE, HeliosModel
+from tests.wire.bodies import ServesProcesses
+from tests.wire.scanners import GALVO, PATIENCE_S
 
+COMMAND = [sys.executable, "-m", "tests.wire.helios_over_libusb"]
+TOLERANCE_S = 1e-6
 POINTS, REPEATS, PARK = 3000, 3, 0.5
 
 
@@ -36,6 +42,44 @@ def main() -> None:
         fault = device.status.fault
         device.park()
         print(json.dumps({"clock_hz": float(clock), "fault": fault, "position": device.status.position}))
+
+
+# In the test's own process, on a bus for others.
+
+
+def a_run_is_played_and_parked(bus: ServesProcesses) -> None:
+    model = HeliosModel()
+    bus.plug(model)
+    done = subprocess.run(COMMAND, env=bus.environment(), capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == {"clock_hz": 20_000.0, "fault": None, "position": PARK}
+    scans = model.history.rising(BLUE, 0, 1e12)
+    assert np.diff(scans) == pytest.approx([POINTS / 20_000] * (REPEATS - 1), abs=TOLERANCE_S)
+    assert not model.shutter
+
+
+def kill_9_stops_the_mirror_through_alternate_0(bus: ServesProcesses) -> None:
+    model = HeliosModel()
+    attached = bus.plug(model)
+
+    def moving() -> bool:
+        with attached.lock:
+            return model.moving(time.monotonic())
+
+    with subprocess.Popen([*COMMAND, "endless"], env=bus.environment(), stdout=subprocess.PIPE, text=True) as client:
+        assert client.stdout is not None
+        assert client.stdout.readline() == "scanning\n"
+        time.sleep(0.2)
+        assert moving()
+        client.kill()
+    end = time.monotonic() + PATIENCE_S
+    while moving():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert model.played < 100  # stopped, not played to the end of its repeats
+
+
+BODIES = (a_run_is_played_and_parked, kill_9_stops_the_mirror_through_alternate_0)
 
 
 if __name__ == "__main__":

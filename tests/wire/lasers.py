@@ -1,5 +1,7 @@
 """Real laser drivers on emulated wires, for conformance and wire tests."""
 
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -10,6 +12,7 @@ from drivers.clock import NS_PER_S, Clock, VirtualClock
 from drivers.cobolt import CoboltConfig
 from drivers.cobolt import create as create_cobolt
 from drivers.dialogue import LineTiming
+from drivers.errors import DeviceError
 from drivers.interfaces import LineLaser
 from drivers.obis import ObisConfig
 from drivers.obis import create as create_obis
@@ -56,6 +59,25 @@ def bring_up(laser: LineLaser, clock: Clock, power_w: float = 0.05) -> None:
             return
         clock.sleep(0.5)
     pytest.fail("no emission")
+
+
+@contextmanager
+def arming(laser: LineLaser) -> Iterator[list[DeviceError]]:
+    """`arm` is under way on another thread inside the block and over behind it; the list has what it raised."""
+    raised: list[DeviceError] = []
+
+    def arm() -> None:
+        try:
+            laser.arm(0.05)
+        except DeviceError as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=arm)
+    thread.start()
+    time.sleep(0.3)
+    yield raised
+    thread.join(5.0)
+    assert not thread.is_alive()
 
 
 class Silent:

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -174,7 +174,7 @@ def scan_bench(applications: Applications, laser: str) -> Iterator[ScanBench]:
                 "command_grid": {"first": -0.8, "last": 0.8, "columns": COLUMNS},
             }
         )
-        with EmulatedWorld(settings, Surroundings(SystemClock(), None, 1), bus) as world:
+        with closing(EmulatedWorld(settings, Surroundings(SystemClock(), None, 1), bus)) as world:
             if laser == "cobolt":
                 world.laser.warm_up_s = 0.2
             else:

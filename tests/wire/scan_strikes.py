@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from tests.wire.guard_strikes import EMISSION_S, GONE_S, NEVER_S
+from tests.wire.guard_strikes import BUSY_S, EMISSION_S, GONE_S, NEVER_S
 from tests.wire.scan_rig import STEP_S, Applications, ScanBench, scan_bench
 
 MAPS = 40
@@ -23,7 +23,7 @@ _END_S = 12.0
 @dataclass(frozen=True)
 class ScanStrike:
     """A blow. at_once: it may come before any light. record: frames are written. own_end: the application goes on
-    living, says what happened and ends with code 3."""
+    living, says what happened and ends with code 3. light_s, emission_s: until they are gone, at most."""
 
     blow: Callable[[ScanBench], None]
     at_once: bool = False
@@ -31,6 +31,7 @@ class ScanStrike:
     own_end: bool = False
     laser_answers: bool = True
     light_s: float = GONE_S
+    emission_s: float = EMISSION_S
 
 
 def _signal(number: int) -> Callable[[ScanBench], None]:
@@ -53,6 +54,12 @@ def _hang_gate(bench: ScanBench) -> None:
     os.kill(bench.number, signal.SIGKILL)
 
 
+def _silence_spad(bench: ScanBench) -> None:
+    """Its firmware hangs: no frame, no answer. The application lives and feeds its scanner: it is at work."""
+    with bench.world.spad_plug.lock:
+        bench.world.spad.deaf = True
+
+
 def _unplug_gate(bench: ScanBench) -> None:
     """Its cable is its power: pull-downs hold the outputs low (hardware.md section 6)."""
     bench.world.gate_wire.unplug()
@@ -67,6 +74,7 @@ SCAN_STRIKES = {
     "guard stopped": ScanStrike(lambda bench: os.kill(bench.guard(), signal.SIGSTOP), own_end=True),
     "gate's firmware hangs": ScanStrike(_hang_gate, light_s=NEVER_S),
     "spad unplugged": ScanStrike(lambda bench: bench.world.spad_plug.unplug(), own_end=True),
+    "spad falls silent": ScanStrike(_silence_spad, own_end=True, light_s=BUSY_S, emission_s=BUSY_S + 0.5),
     "scanner unplugged": ScanStrike(lambda bench: bench.world.scanner_plug.unplug(), own_end=True),
     "gate unplugged": ScanStrike(_unplug_gate, own_end=True),
     "laser unplugged": ScanStrike(lambda bench: bench.world.laser_wire.unplug(), own_end=True, laser_answers=False),
@@ -93,11 +101,11 @@ class ScanOutcome:
 
 
 def strike_scan(
-    applications: Applications, name: str, laser: str, share: float, wait_s: float = EMISSION_S + 0.05
+    applications: Applications, name: str, laser: str, share: float, wait_s: float | None = None
 ) -> ScanOutcome:
     """Start a scan and strike: share (0 to 1) of the way from its first light, or its start, to beyond its end.
 
-    wait_s: how long light and emission are looked at after it.
+    wait_s: how long light and emission are looked at after it; by default until they have to be gone.
     """
     made = SCAN_STRIKES[name]
     with scan_bench(applications, laser) as bench:
@@ -114,7 +122,7 @@ def strike_scan(
         was_lit = bool(bench.light(at_s - 0.05))
         if not over:
             made.blow(bench)
-        time.sleep(wait_s)
+        time.sleep(made.emission_s + 0.05 if wait_s is None else wait_s)
         light, resting = bench.light(at_s), bench.light_at_rest(bench.started_s)
         code = applications.exit_code(bench.number, _END_S)
         return ScanOutcome(
@@ -134,7 +142,7 @@ def trouble_of(name: str, outcome: ScanOutcome) -> list[str]:
     found = []
     if outcome.light_s > max(NEVER_S, made.light_s):
         found.append(f"light after {1e3 * outcome.light_s:.0f} ms")
-    if made.laser_answers and outcome.emission_s > EMISSION_S:
+    if made.laser_answers and outcome.emission_s > made.emission_s:
         found.append(f"emission after {outcome.emission_s:.2f} s")
     if outcome.rest_s:
         found.append(f"{1e3 * outcome.rest_s:.2f} ms of light at rest")

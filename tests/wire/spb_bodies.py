@@ -86,7 +86,7 @@ def the_kernels_16_mb_grant_fewer_reads() -> None:
     with opened("queued") as device:
         buffers = [np.zeros(1 << 20, np.uint8) for _ in range(20)]
         granted = [device._link.submit(device._wiring.stream_in, buffer) for buffer in buffers]
-        assert granted == [True] * 16 + [False] * 4
+        assert granted == [True] * 15 + [False] * 5
         device._link.cancel()
         _, blocks = take(device, 100)
         assert require_right(blocks) == list(range(100))

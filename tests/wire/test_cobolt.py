@@ -1,6 +1,5 @@
 """The Cobolt driver through real pyserial against a model of its firmware: bytes of hardware.md, and every trap."""
 
-import threading
 import time
 
 import pytest
@@ -9,10 +8,10 @@ from drivers.clock import SystemClock
 from drivers.cobolt import CoboltConfig
 from drivers.cobolt import create as create_cobolt
 from drivers.cobolt_dialects import classify
-from drivers.errors import DeviceError, DeviceFault, InterlockOpen, ProtocolError, WrongState
+from drivers.errors import DeviceFault, InterlockOpen, ProtocolError, WrongState
 from sim_backend.wire.cobolt import MODELS, CoboltModel, Family
 from sim_backend.wire.faults import Fault, FaultScript
-from tests.wire.lasers import bring_up, now_s, open_cobolt, wire
+from tests.wire.lasers import arming, bring_up, now_s, open_cobolt, wire
 
 FAMILIES: tuple[Family, ...] = ("06-MLD", "06-01")
 
@@ -346,19 +345,7 @@ def test_arm_that_fails_half_way_leaves_it_dark() -> None:
 def test_a_pause_from_another_thread_ends_an_arm_before_it_lights() -> None:
     model = CoboltModel()
     with wire(model, clock=SystemClock()) as (_, surroundings), open_cobolt(surroundings) as laser:
-        caught: list[DeviceError] = []
-
-        def arm() -> None:
-            try:
-                laser.arm(0.05)
-            except DeviceError as error:
-                caught.append(error)
-
-        thread = threading.Thread(target=arm)
-        thread.start()
-        time.sleep(0.3)
-        laser.pause()
-        thread.join(5.0)
-        assert not thread.is_alive()
-        assert isinstance(caught[0], WrongState)
+        with arming(laser) as raised:
+            laser.pause()
+        assert isinstance(raised[0], WrongState)
         assert not model.emitting

@@ -1,5 +1,7 @@
 """The guard on emulated wires, with real processes that are really killed: light is what is measured, not commands."""
 
+import os
+import signal
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,7 +15,9 @@ from drivers.guard import Guard, GuardLimits
 from drivers.obis import ObisConfig
 from drivers.prawndo import PrawnDo, PrawnDoConfig
 from drivers.registry import Surroundings
-from tests.wire.guard_strikes import NEVER_S, STRIKES, Outcome, strike
+from sim_backend.wire.obis import ObisModel
+from sim_backend.wire.serial_server import SerialServer
+from tests.wire.guard_strikes import EMISSION_S, NEVER_S, STRIKES, Outcome, strike
 from tests.wire.guarded_application import SWEEP
 from tests.wire.guarded_rig import POWER_W, GuardedRig, guarded_rig
 
@@ -94,12 +98,36 @@ def test_errors_come_through_with_their_type_and_text(rig: GuardedRig) -> None:
             guard.sync.program([SWEEP[0], type(SWEEP[0])(0, 2e-8)], 1)
 
 
-def test_what_cannot_be_opened_is_told_device_by_device(rig: GuardedRig) -> None:
-    laser = CoboltConfig.model_validate({"port": "/dev/spadrig-nothing", "max_power": "50 mW"})
+@pytest.mark.parametrize(
+    ("port", "told"), [("/dev/spadrig-nothing", "is not there"), ("emulated:nothing", "this rig emulates no devices")]
+)
+def test_what_cannot_be_opened_is_told_device_by_device(port: str, told: str, rig: GuardedRig) -> None:
+    laser = CoboltConfig.model_validate({"port": port, "max_power": "50 mW"})
     with Guard(laser=laser, sync=PrawnDoConfig(port=rig.sync.path)) as guard:
-        with pytest.raises(DeviceNotFound, match="/dev/spadrig-nothing is not there"):
+        with pytest.raises(DeviceNotFound, match=f"{port}.*{told}"):
             _ = guard.laser
         assert guard.sync.status.outputs == 0
+
+
+@pytest.mark.parametrize("channel", [None, 2])
+def test_a_laser_is_off_before_it_is_opened_once_the_guard_is_gone(channel: int | None) -> None:
+    model = ObisModel(cdrh_delay_s=0.0, channel=channel)
+    with SerialServer(model) as server:
+        config = ObisConfig.model_validate({"port": server.path, "max_power": "50 mW", "channel": channel})
+        with Guard(laser=config) as guard:
+            guard.laser.arm(POWER_W)
+            assert model.emitting
+            with server.lock:
+                model.receive(b"SOUR:AM:ST", time.monotonic())  # what the guard had begun to say
+            before = len(model.commands)
+            os.kill(guard.pid, signal.SIGKILL)
+            with pytest.raises(GuardLost, match="made safe by the application"):
+                guard.laser.pause()
+        assert not model.emitting
+        address = "" if channel is None else str(channel)
+        said = model.commands[before:]
+        assert said.index(f"SOUR{address}:AM:STAT OFF") < said.index("SYST:COMM:HAND?")  # the first one of opening it
+        assert not any(command.startswith("SOUR:AM:STSOUR") for command in said)
 
 
 def test_a_device_without_config_is_not_guarded(rig: GuardedRig) -> None:
@@ -117,19 +145,23 @@ def test_the_guard_holds_the_ports_and_gives_them_back(rig: GuardedRig) -> None:
     PrawnDo(config, surroundings).close()
 
 
-def test_a_program_that_ends_by_itself_is_no_hang(rig: GuardedRig) -> None:
+@pytest.mark.parametrize("at_work", [False, True])
+def test_a_program_that_ends_by_itself_is_no_hang_and_its_laser_rests(at_work: bool, rig: GuardedRig) -> None:
     with guard_of(rig) as guard:
         guard.sync.program(SWEEP, 2)
         guard.laser.arm(POWER_W)
         guard.sync.run()
         guard.beat(1)
-        for _ in range(40):  # no more frames: the program's two sweeps are over
-            status = guard.sync.status
-            if status.state == "stopped":
-                break
-        assert status.state == "stopped"
-        time.sleep(0.3)
+        assert guard.laser.status.emission
+        ends_at = time.monotonic() + EMISSION_S  # no more frames: the program's two sweeps are over
+        while rig.emission.levels[-1] and time.monotonic() < ends_at:
+            if not at_work:
+                time.sleep(0.01)
+        assert not rig.emission.levels[-1]
         assert guard.failure is None
+        guard.sync.abort()
+        guard.laser.pause()
+        guard.laser.arm(POWER_W)
         assert guard.laser.status.emission
 
 

@@ -1,12 +1,9 @@
 """The Helios driver against the firmware model. Golden bytes and traps: hardware.md 3.1."""
 
-import json
 import logging
 import re
 import struct
-import subprocess
-import sys
-import time
+from collections.abc import Callable
 from fractions import Fraction
 from itertools import pairwise
 
@@ -30,8 +27,9 @@ from sim_backend.wire.helios import BLUE, COMMANDS, FRAMES, GREEN, INTENSITY, RE
 from sim_backend.wire.umockdev_server import UmockdevBus, missing
 from sim_backend.wire.usb_backend import EmulatedUsb
 from sim_backend.wire.usb_model import Answer
-from tests.wire.helios_over_libusb import PARK, REPEATS
-from tests.wire.scanners import PATIENCE_S, HeliosRecorder, cosine, finish, open_scanner, opened, plug
+from tests.wire import helios_over_libusb
+from tests.wire.bodies import ServesProcesses
+from tests.wire.scanners import HeliosRecorder, cosine, finish, open_scanner, opened, plug
 
 TOLERANCE_S = 1e-6
 
@@ -427,34 +425,7 @@ def test_slices_follow_each_other() -> None:
 
 
 @pytest.mark.skipif(bool(missing()), reason=missing())
-def test_a_run_through_real_libusb() -> None:
-    model = HeliosModel()
-    command = [sys.executable, "-m", "tests.wire.helios_over_libusb"]
+@pytest.mark.parametrize("body", helios_over_libusb.BODIES, ids=lambda body: body.__name__)
+def test_through_real_libusb(body: Callable[[ServesProcesses], None]) -> None:
     with UmockdevBus(SystemClock()) as bus:
-        bus.plug(model)
-        done = subprocess.run(command, env=bus.environment(), capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == {"clock_hz": 20_000.0, "fault": None, "position": PARK}
-    scans = model.history.rising(BLUE, 0, 1e12)
-    assert np.diff(scans) == pytest.approx([3000 / 20_000] * (REPEATS - 1), abs=TOLERANCE_S)
-    assert not model.shutter
-
-
-@pytest.mark.skipif(bool(missing()), reason=missing())
-def test_kill_9_of_the_process_stops_the_mirror_through_alternate_0() -> None:
-    model = HeliosModel()
-    clock = SystemClock()
-    command = [sys.executable, "-m", "tests.wire.helios_over_libusb", "endless"]
-    with UmockdevBus(clock) as bus:
-        bus.plug(model)
-        with subprocess.Popen(command, env=bus.environment(), stdout=subprocess.PIPE, text=True) as client:
-            assert client.stdout is not None
-            assert client.stdout.readline() == "scanning\n"
-            time.sleep(0.2)
-            assert model.moving(clock.now_ns() / 1e9)
-            client.kill()
-        end = time.monotonic() + PATIENCE_S
-        while model.moving(clock.now_ns() / 1e9):
-            assert time.monotonic() < end
-            time.sleep(0.01)
-        assert model.played < 100  # stopped, not played to the end of its repeats
+        body(bus)

@@ -1,13 +1,11 @@
 """The OBIS driver through real pyserial against a model of its firmware: bytes of hardware.md, and every trap."""
 
-import threading
 import time
 
 import pytest
 
 from drivers.clock import SystemClock
 from drivers.errors import (
-    DeviceError,
     DeviceFault,
     DeviceNotFound,
     DeviceTimeout,
@@ -20,7 +18,7 @@ from drivers.guard import Guard
 from drivers.obis import FAULTS, ObisConfig
 from drivers.obis_framing import ERRORS
 from sim_backend.wire.obis import ObisModel
-from tests.wire.lasers import bring_up, now_s, open_obis, wire
+from tests.wire.lasers import arming, bring_up, now_s, open_obis, wire
 
 HANDSHAKES = (True, False)
 
@@ -171,21 +169,9 @@ def test_trap_a_deferred_on_of_somebody_else_counts_as_emission_and_a_pause_ends
 def test_a_pause_from_another_thread_ends_the_wait_for_the_warm_up() -> None:
     model = ObisModel(warm_up_s=60.0)
     with wire(model, clock=SystemClock()) as (_, surroundings), open_obis(surroundings) as laser:
-        caught: list[DeviceError] = []
-
-        def arm() -> None:
-            try:
-                laser.arm(0.05)
-            except DeviceError as error:
-                caught.append(error)
-
-        thread = threading.Thread(target=arm)
-        thread.start()
-        time.sleep(0.3)
-        laser.pause()
-        thread.join(5.0)
-        assert not thread.is_alive()
-        assert isinstance(caught[0], WrongState)
+        with arming(laser) as raised:
+            laser.pause()
+        assert isinstance(raised[0], WrongState)
         assert not model.state_on
 
 
@@ -296,9 +282,10 @@ def test_a_base_plate_outside_the_limits_that_the_laser_states_is_a_fault(base_c
         assert laser.status.fault == "0x00000001 (base temperature); base plate at 60 C, outside 10 to 50 C"
 
 
-def test_a_unit_that_states_no_limits_judges_its_temperature_itself() -> None:
+@pytest.mark.parametrize("stated", [None, (0.0, 0.0)])
+def test_a_unit_that_states_no_limits_judges_its_temperature_itself(stated: tuple[float, float] | None) -> None:
     model = ObisModel()
-    model.base_range_c, model.base_c = None, 60.0
+    model.base_range_c, model.base_c = stated, 60.0
     with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
         assert laser.status.fault is None
         assert laser.status.temperature_c == pytest.approx(60.0)

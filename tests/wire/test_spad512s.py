@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from drivers.ring import BlockRing, OnFull
 from drivers.spad512s import Spad512s, Spad512sConfig
 from drivers.spad512s_line import Deadlines
 from drivers.transports.endpoints import Endpoint
+from drivers.transports.tap import CONTROL_FILE, IN, OUT, TapFile, read_taps
 from sim_backend.wire.spad512s import Spad512sModel
 from sim_backend.wire.tcp_server import TcpServer
 from tests.wire.spads import take_run
@@ -116,6 +118,18 @@ def test_trap_bits_come_most_significant_first_and_frames_lie_on_their_side() ->
     assert not block.records["marks"].any()
 
 
+def test_commands_and_answers_are_tapped_and_pixels_are_not(tmp_path: Path) -> None:
+    tap = TapFile.begin(tmp_path / CONTROL_FILE).tap("spad")
+    script = ((b"D", INFO), (b"PU,0", b"ok"), (b"I,1,20,2,0,1,0,1\n", bytes(2 * FRAME_BYTES) + b"DONE"))
+    with scripted(*script) as (address, _), Spad512s(Spad512sConfig(), Endpoint(address, True), tap=tap) as device:
+        take(device, 2)
+    tap.flush()
+    passed = read_taps(tmp_path / CONTROL_FILE)
+    assert [one.data for one in passed if one.direction == OUT] == [command for command, _ in script]
+    assert INFO in [one.data for one in passed if one.direction == IN]
+    assert sum(len(one.data) for one in passed) < 500
+
+
 def test_frames_come_as_they_were_taken() -> None:
     with connected(Spad512sModel(noise)) as (device, _):
         blocks = take(device, 100)
@@ -158,7 +172,7 @@ def test_trap_a_program_that_was_restarted_calibrates_again() -> None:
         model.restarted()
         server.plug()
         with pytest.raises(DeviceDisconnected):
-            device.health()
+            _ = device.health
         model.commands.clear()
         assert len(take(device, 16)) == 1
         assert model.commands[:3] == ["D", "D", "PU,0"]
@@ -235,9 +249,10 @@ def test_trap_frames_without_numbers_may_come_twice_in_place_of_others() -> None
 
 def test_trap_done_glued_to_text_answers() -> None:
     with connected(Spad512sModel(noise, glued_done=True, extra_fields=True)) as (device, _):
-        health = device.health()
-        assert (health.frame_clock_hz, health.excess_v) == (97_656.25, 4.0)
-        assert device.identity.firmware == "1.4"
+        health = device.health
+        assert (health.frame_clock_hz, health.excess_bias_v) == (97_656.25, 4.0)
+        assert list(health.temperatures_c) == ["master FPGA", "slave FPGA", "board", "chip"]
+        assert "firmware 1.4" in device.identity
         assert len(take(device, 16)) == 1
 
 
@@ -251,9 +266,9 @@ def test_trap_commands_are_never_pipelined() -> None:
 
     model = Strict(noise, glued_done=True)
     with connected(model) as (device, _):
-        device.health()
+        _ = device.health
         take(device, 16)
-        device.health()
+        _ = device.health
     assert not model.early
     assert model.commands == ["D", "R", "V", "PU,0", "I,1,20,16,0,1,0,1", "R", "V"]
 
@@ -339,8 +354,8 @@ def test_trap_a_stop_may_not_be_heeded_and_the_device_is_ready_for_the_next_run(
         ring = BlockRing(4, timing.stride)
         device.start(10_000)
         device.fill(ring, 5.0)
-        with pytest.raises(WrongState, match="its line carries a run"):
-            device.health()
+        with pytest.raises(WrongState, match="health is not possible while running"):
+            _ = device.health
         begun = time.monotonic()
         device.stop()
         assert time.monotonic() - begun < 3.0

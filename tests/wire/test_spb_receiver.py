@@ -143,12 +143,12 @@ def test_the_high_water_mark_of_its_memory_is_told_behind_a_run() -> None:
         timing = spad.configure(REQUEST)
         ring = BlockRing(50, timing.stride)
         spad.start(200)
-        with pytest.raises(WrongState, match="behind the run"):
-            _ = spad.fifo_high_water
+        with pytest.raises(WrongState, match="health is not possible while running"):
+            _ = spad.health
         time.sleep(0.01)  # the memory fills up
         while spad.fill(ring, 1.0):
             pass
-        assert spad.fifo_high_water == 64 * (16 + 384)
+        assert spad.health.memory_high_water_bytes == 64 * (16 + 384)
         assert spad.counters.lost
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.transports.usb_errors import UDEV_RULES
+from drivers.transports.endpoints import UDEV_RULES
 
 ROOT = Path(__file__).parents[2]
 IDS = sorted(

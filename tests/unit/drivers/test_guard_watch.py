@@ -37,6 +37,16 @@ def test_one_at_work_has_the_long_one(watch: FrameWatch) -> None:
     assert silence_until_trouble(watch, busy=True) == pytest.approx(0.41, abs=1.5 * TICK_S)
 
 
+def test_late_frames_are_told_to_whoever_asks_also_of_one_at_work(watch: FrameWatch) -> None:
+    watch.look(TICK_S, 1, False, lambda: True)
+    assert not watch.quiet
+    for _ in range(8):
+        assert watch.look(TICK_S, 1, False, lambda: True) is None
+    assert watch.quiet
+    watch.look(TICK_S, 2, False, lambda: True)
+    assert not watch.quiet
+
+
 def test_the_first_frame_may_take_longer_and_work_is_no_excuse(watch: FrameWatch) -> None:
     assert silence_until_trouble(watch, busy=True, frame=0) == pytest.approx(1.01, abs=1.5 * TICK_S)
 

@@ -1,6 +1,7 @@
 import dataclasses
 import itertools
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from rig.counting import SweepCounter, SweepLayout
 from rig.errors import DevicesError
 from rig.row_threads import RowWorkers
 from rig.sweeps import SweepAssembler
-from tests.unit.rig.fakes import START, STOP, acquisition, fake_rig
+from tests.unit.rig.fakes import PATIENCE_S, START, STOP, acquisition, fake_rig
 from tests.unit.rig.streams import HEIGHT, SPAD, WIDTH, plan_of, scan, stream_of
 
 LAG = Lag(1e-4, 2e-4)
@@ -112,6 +113,26 @@ def test_trouble_while_stopping_is_noted_on_the_error_that_led_there():
     with pytest.raises(ValueError) as caught:
         run.throw(ValueError("first"))
     assert caught.value.__notes__ == ["scanner: stuck"]
+
+
+def test_a_guard_that_took_the_light_ends_a_scan_whose_spad_is_silent():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)])
+    failure = DeviceTimeout("the guard took the light")
+    guard = SimpleNamespace(failure=None, beat=lambda frame: None, expect=lambda limits: None)
+    rig = dataclasses.replace(rig, guard=guard)
+    one_map = int(PLAN.frames_for(1)) // rig.spad.size + 2
+
+    def silent(seq):
+        if seq == one_map:
+            guard.failure = failure
+            assert rig.spad.stopped.wait(PATIENCE_S)
+
+    rig.spad.behaviour = silent
+    run = acquisition(rig, PLAN, 2, silence_s=2 * PATIENCE_S).run()
+    assert next(run).sweep.index == 0
+    with pytest.raises(DeviceTimeout, match="the guard took the light"):
+        next(run)
+    assert log == START + STOP
 
 
 def test_an_error_of_the_source_reaches_the_caller():

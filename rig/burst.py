@@ -1,0 +1,30 @@
+"""A burst: what of a SPAD's memory goes to the time until the scanner has started, and whether the rest holds a map."""
+
+import math
+
+from drivers.clock import VirtualClock
+from rig.errors import PlanError
+from rig.scan_plan import ScanPlan
+from rig.session import OpenRig
+
+BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
+"""Time between the SPAD's start and the first scan marker that a burst must have room for, on virtual time and where a
+host starts one device after the other over USB and serial ports."""
+
+
+def lead_s(rig: OpenRig) -> float:
+    """Seconds of a burst before its first scan marker."""
+    return BURST_LEAD_S if isinstance(rig.clock, VirtualClock) else HOST_LEAD_S
+
+
+def require_memory(rig: OpenRig, plan: ScanPlan) -> None:
+    """PlanError where the SPAD's memory would be full before one map is whole."""
+    if plan.burst_frames is None:
+        return
+    need = math.ceil(plan.frames_for(1) + lead_s(rig) * float(plan.frame_rate_hz))
+    if need > plan.burst_frames:
+        raise PlanError(
+            f"a burst of one map takes {need} frames, with the {lead_s(rig):g} s until the scanner has started; "
+            f"the memory of {rig.spad.name} holds {plan.burst_frames}; lower scan.exposures, scan.columns or "
+            "scan.frame_rate"
+        )

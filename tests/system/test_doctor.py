@@ -1,0 +1,159 @@
+"""The doctor on a small rig with emulated devices: what it shows, and that it says no wherever a scan could not run."""
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.obis import ObisConfig
+from rig import api
+from rig.api_config import configure
+from rig.doctor import Finding
+from rig.errors import PlanError
+from sim_backend.wire.emulated_world import EmulatedWorld
+from sim_backend.wire.helios import GREEN
+from tests.system.small_rig import config, write_rig
+
+Examine = Callable[..., dict[str, Finding]]
+
+EMULATED: dict[str, Any] = {
+    **config(),
+    "world": {"kind": "emulated", "geometry": "./rig.yaml", "scene": "street-clear", "laser": "obis"},
+    "spad": {"kind": "spb-usb", "port": "emulated:spad", "reads": "plain"},
+    "scanner": {
+        "kind": "helios",
+        "port": "emulated:scanner",
+        "max_velocity": "4000 /s",
+        "max_acceleration": "4e6 /s2",
+        "rms_duty": 1.0,
+        "frame": "200 ms",
+    },
+    "laser": {"kind": "obis", "port": "emulated:laser", "max_power": "50 mW"},
+    "sync": {"kind": "prawndo", "port": "emulated:gate"},
+}
+EMULATED["scan"] = {**EMULATED["scan"], "columns": 40, "exposures": 10, "frame_rate": "12.5 kHz"}
+
+
+@pytest.fixture
+def examine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Examine:
+    """The findings about a rig by name; `alter` changes the world's devices before they are opened."""
+
+    def found(alter: Callable[[EmulatedWorld], None] = lambda world: None, **sections: Any) -> dict[str, Finding]:
+        made = EmulatedWorld.__init__
+
+        def altered(world: EmulatedWorld, *arguments: Any, **options: Any) -> None:
+            made(world, *arguments, **options)
+            alter(world)
+
+        monkeypatch.setattr(EmulatedWorld, "__init__", altered)
+        content = copy.deepcopy(EMULATED)
+        for section, changes in sections.items():
+            content[section] |= changes
+        return {one.name: one for one in api.doctor(write_rig(tmp_path / "rig", content), out=tmp_path)}
+
+    return found
+
+
+def test_it_shows_who_is_there_and_how_they_are(examine: Examine) -> None:
+    found = examine()
+    assert all(one.ok for one in found.values()), found
+    for name, words in {
+        "spad": ("SPB-0001", "96 x 40 px"),
+        "scanner": ("Helios", "firmware 6", "ready"),
+        "sync": ("firmware 1.3", "60000 words", "10 ns"),
+        "laser": ("interlock closed", "no fault", "24.6 C", "up to 50 mW"),
+        "guard": ("owns laser and gate",),
+        "plan": ("40 columns x 10 exposures", "of the link's 400 MB/s"),
+        "frames": ("MB/s", "0 lost, 0 damaged"),
+        "dark counts": ("% of the pixels",),
+        "markers": ("2 scan", "lines a second", "jitter", "ppm"),
+        "trigger": ("starts the sync source's program",),
+        "memory": ("waited in the SPAD",),
+        "disk": ("GB free", "MB/s"),
+    }.items():
+        assert all(word in found[name].text for word in words), found[name]
+    rate_hz = float(found["markers"].text.split(" lines a second")[0].split()[-1])
+    assert rate_hz == pytest.approx(12_500 / 10, rel=0.01)
+
+
+def open_interlock(world: EmulatedWorld) -> None:
+    world.laser.interlock_open = True
+
+
+def overheat(world: EmulatedWorld) -> None:
+    world.laser.base_c = 60.0
+
+
+def turn_key_off(world: EmulatedWorld) -> None:
+    world.laser.key_on = False
+
+
+@pytest.mark.parametrize(
+    ("alter", "words"),
+    [
+        (open_interlock, "interlock open"),
+        (overheat, "base plate at 60 C, outside 10 to 50 C"),
+        (turn_key_off, "key off"),
+    ],
+)
+def test_a_laser_that_could_not_be_armed(alter: Callable[[EmulatedWorld], None], words: str, examine: Examine) -> None:
+    found = examine(alter)
+    assert not found["laser"].ok
+    assert words in found["laser"].text
+
+
+def test_a_scan_marker_that_does_not_reach_the_sync_source(examine: Examine) -> None:
+    def cut(world: EmulatedWorld) -> None:
+        world.sync._trigger = lambda from_s, until_s: None
+
+    found = examine(cut)
+    assert found["markers"].ok
+    assert not found["trigger"].ok
+    assert "check that line" in found["trigger"].text
+
+
+def test_line_markers_of_which_every_other_one_is_missing(examine: Examine) -> None:
+    def thin(world: EmulatedWorld) -> None:
+        rising = world.scanner.history.rising
+
+        def thinned(line: int, from_s: float, until_s: float) -> Any:
+            if line != GREEN:
+                return rising(line, from_s, until_s)
+            every = rising(line, -np.inf, until_s)
+            return every[::2][every[::2] >= from_s]
+
+        world.scanner.history.rising = thinned
+
+    found = examine(thin)
+    assert not found["markers"].ok
+
+
+def test_a_memory_that_holds_no_map_is_found_by_the_doctor_and_by_a_dry_run(tmp_path: Path) -> None:
+    usual = configure("lab-spad512s-emulated")
+    assert usual.world is not None
+    made = usual.model_copy(
+        update={
+            "world": usual.world.model_copy(update={"laser": "obis"}),
+            "laser": ObisConfig.model_validate({"port": "emulated:laser", "max_power": "50 mW"}),
+            "spad": usual.spad.model_copy(update={"burst_frames": 3500}),
+        }
+    )
+    found = {one.name: one for one in api.doctor(made, out=tmp_path)}
+    assert not found["devices"].ok
+    assert "the memory of SPAD512S holds 3500; lower scan.exposures" in found["devices"].text
+    assert "chip -9.5 C, excess bias 4 V, frame clock 97656.2 Hz" in found["spad"].text
+    with pytest.raises(PlanError, match="the memory of SPAD512S holds 3500"):
+        api.plan_scan(made)
+
+
+def test_a_full_disk(examine: Examine, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Usage:
+        free = 10**6
+
+    monkeypatch.setattr("rig.doctor.shutil.disk_usage", lambda folder: Usage)
+    found = examine()
+    assert not found["disk"].ok
+    assert "make room" in found["disk"].text
