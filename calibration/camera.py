@@ -62,7 +62,9 @@ class Camera:
         """(u, v) seen at raw pixel positions (broadcast together); NaN where the lens has no inverse."""
         x, y = np.broadcast_arrays(np.asarray(x_px, np.float64), np.asarray(y_px, np.float64))
         m = self.matrix
-        u, v = self._lens.undistort(np.atleast_1d((x - m[0, 2]) / m[0, 0]), np.atleast_1d((y - m[1, 2]) / m[1, 1]))
+        with np.errstate(all="ignore"):
+            at_x, at_y = (x - m[0, 2]) / m[0, 0], (y - m[1, 2]) / m[1, 1]
+        u, v = self._lens.undistort(np.atleast_1d(at_x), np.atleast_1d(at_y))
         return u.reshape(x.shape), v.reshape(x.shape)
 
     def tangent_slopes(self, u: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
@@ -77,6 +79,8 @@ class Camera:
         points = np.asarray(points_m, np.float64)
         with np.errstate(all="ignore"):
             z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
-            x, y = self._lens.distort(points[..., 0] / z, points[..., 1] / z)
-        m = self.matrix
-        return m[0, 0] * x + m[0, 2], m[1, 1] * y + m[1, 2]
+            u, v = self._lens.distort(points[..., 0] / z, points[..., 1] / z)
+            m = self.matrix
+            x, y = m[0, 0] * u + m[0, 2], m[1, 1] * v + m[1, 2]
+            seen = np.isfinite(x) & np.isfinite(y)
+        return np.where(seen, x, np.nan), np.where(seen, y, np.nan)

@@ -8,13 +8,16 @@ followed, with 14 terms, by the homography of a sensor tilted by (tau_x, tau_y).
 Order of the terms: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]].
 
 The model folds back on itself past some radius. A tangent counts as valid when the Jacobian determinant stays positive
-on the whole segment from the optical axis to it; only there is the inverse unique, and everything else is NaN.
+on the whole segment from the optical axis to it; only there is the inverse unique, and everything else is NaN. Where
+only k1 to k6 are used, the fold is a root of a polynomial in r2; else the segment is tested at points on it, among them
+one in every ring where k1 to k6 alone fold.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
@@ -28,7 +31,13 @@ _SEGMENT_SAMPLES = np.linspace(0.0, 1.0, 17)[1:]
 """Where the segment from the axis to a tangent is tested for a fold."""
 
 _RESIDUAL_LIMIT = 1e-10
-"""Largest accepted |forward(inverse) - target|, in tangents: 1e-7 px at f = 1000 px."""
+"""Largest accepted |forward(inverse) - target|, in tangents: 1e-7 px at f = 1000 px; relative to targets above 1."""
+
+_HALVINGS = 60
+"""Of a radius of up to _MAX_TANGENT: down to its last bits."""
+
+_RING = 1e-3
+"""Step, in tangents, at which a fold is looked for."""
 
 _MAX_TANGENT = 20.0
 """Rays steeper than 87 degrees are beyond any lens this model describes."""
@@ -66,6 +75,9 @@ class LensModel:
         full[: values.size] = values
         self._terms = full
         self._ideal = not np.any(full[:12])
+        self._radial = not np.any(full[[2, 3, 8, 9, 10, 11]])
+        with np.errstate(all="ignore"):
+            self._fold_r2, self._folded_r2 = _folds(full)
         self._tilt = _tilt_homography(full[12], full[13])
         self._untilt: Array = np.asarray(np.linalg.inv(self._tilt), dtype=np.float64)
 
@@ -104,9 +116,10 @@ class LensModel:
                 return target_u, target_v
             u, v, good = self._solve(target_u, target_v, target_u, target_v)
             if not np.all(good):
-                # Rare: far from the axis or past the fold. Follow the solution outwards in small steps from the axis.
+                # Rare: far from the axis or past the fold, where the target itself is no place to start from.
                 hard = ~good
-                u[hard], v[hard], good[hard] = self._follow(target_u[hard], target_v[hard])
+                u_hard, v_hard = target_u[hard], target_v[hard]
+                u[hard], v[hard], good[hard] = self._solve(*self._across_radius(u_hard, v_hard), u_hard, v_hard)
         u[~good] = np.nan
         v[~good] = np.nan
         return u, v
@@ -131,9 +144,13 @@ class LensModel:
         good: NDArray[np.bool_] = np.isfinite(u) & np.isfinite(v)
         if self._ideal:
             return good
-        good &= u * u + v * v < _MAX_TANGENT**2
         with np.errstate(all="ignore"):
-            for share in _SEGMENT_SAMPLES:
+            r2 = u * u + v * v
+            good &= r2 < _MAX_TANGENT**2
+            if self._radial:
+                return good & (r2 < self._fold_r2)
+            in_rings = [np.sqrt(np.minimum(folded_r2 / r2, 1.0)) for folded_r2 in self._folded_r2]
+            for share in (*_SEGMENT_SAMPLES, *in_rings):
                 at = self.forward(share * u, share * v)
                 good &= at.sound & (at.determinant > 0)
         return good
@@ -154,14 +171,49 @@ class LensModel:
         u, v = self._newton(u, v, target_u, target_v, steps=10)
         at = self.forward(u, v)
         miss = np.abs(at.u - target_u) + np.abs(at.v - target_v)
-        return u, v, (miss < _RESIDUAL_LIMIT) & self.valid(u, v)
+        limit = _RESIDUAL_LIMIT * np.maximum(1, np.abs(target_u) + np.abs(target_v))
+        return u, v, (miss < limit) & self.valid(u, v)
 
-    def _follow(self, target_u: Array, target_v: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        u, v = np.zeros_like(target_u), np.zeros_like(target_v)
-        # Steps shrink towards the target: the slope of the inverse grows without bound at the fold.
-        for share in np.sin(np.linspace(0.0, np.pi / 2, 33))[1:-1]:
-            u, v = self._newton(u, v, share * target_u, share * target_v, steps=3)
-        return self._solve(u, v, target_u, target_v)
+    def _across_radius(self, target_u: Array, target_v: Array) -> tuple[Array, Array]:
+        """The tangent that k1 to k6 alone put where the target is, by bisection up to their fold."""
+        seen = np.hypot(target_u, target_v)
+        low, high = np.zeros_like(seen), np.full_like(seen, min(np.sqrt(self._fold_r2), _MAX_TANGENT))
+        k1, k2, _, _, k3, k4, k5, k6 = self._terms[:8]
+        for _ in range(_HALVINGS):
+            r = (low + high) / 2
+            r2 = r * r
+            g = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+            beyond = r * g > seen
+            low, high = np.where(beyond, low, r), np.where(beyond, r, high)
+        share = low / seen
+        return target_u * share, target_v * share
+
+
+def _folds(terms: Array) -> tuple[float, list[float]]:
+    """Of k1 to k6 alone: r2 of the first fold, inf where there is none, and an r2 within each ring that is folded.
+
+    With g = n / d a ring is folded where n, d or the slope of r g, n d + 2 r2 (n' d - n d'), is not positive. Rings
+    narrower than _RING are no lens's.
+    """
+    k1, k2, _, _, k3, k4, k5, k6 = terms[:8]
+    n, d = Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])
+    slope = n * d + Polynomial([0, 2]) * (n.deriv() * d - n * d.deriv())
+
+    def folded(r: Array) -> NDArray[np.bool_]:
+        inside: NDArray[np.bool_] = ~np.all([p(r * r) > 0 for p in (n, d, slope)], axis=0)
+        return inside
+
+    radii = np.arange(0, _MAX_TANGENT, _RING)
+    inside = folded(radii)
+    if not inside.any():
+        return np.inf, []
+    high = radii[np.argmax(inside)]
+    low = high - _RING
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if folded(np.array(middle)) else (middle, high)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]))).reshape(-1, 2)
+    return float(low) ** 2, [float(radii[(a + b) // 2]) ** 2 for a, b in edges]
 
 
 def _tilt_homography(tau_x: float, tau_y: float) -> Array:

@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 _ROUNDING = 1e-15
 """A few units in the last place of 1.0."""
+_MOST_ANGLE_RAD = 1e3
+"""Sines of larger angles lose digits; no mirror turns that far."""
 
 
 class Scanner(Protocol):
@@ -51,15 +53,17 @@ class PlaneTable:
             raise CalibrationError(
                 f"plane table has {len(rows)} planes for {command.size} commands; they must be as many"
             )
-        length = np.linalg.norm(rows[:, :3], axis=1)
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1) | (length == 0))
+        with np.errstate(all="ignore"):
+            scaled = _near_one(rows, rows[:, :3])
+            scaled /= _exactly_one(np.linalg.norm(scaled[:, :3], axis=1))[:, None]
+        bad = np.flatnonzero(~(np.isfinite(rows) & np.isfinite(scaled)).all(axis=1))
         if bad.size:
             first = rows[bad[0]].tolist()
             raise CalibrationError(f"plane {bad[0]} of the table is {first}; it needs a finite, non-zero normal")
         if not np.all(np.isfinite(command)) or np.any(np.diff(command) <= 0):
             at = int(np.argmax(~(np.diff(command) > 0))) if len(command) > 1 else 0
             raise CalibrationError(f"plane table's commands must increase; not so after row {at} ({command[at]:g})")
-        rows /= _exactly_one(length)[:, None]
+        rows = scaled
         turned = np.sum(rows[1:, :3] * rows[:-1, :3], axis=1) < 0
         rows[1:][np.cumsum(turned) % 2 == 1] *= -1
         if np.sum(rows[:, 0]) < 0:
@@ -101,14 +105,21 @@ class PivotScanner:
         point = _vector(self.axis_point_m, "axis_point_m")
         axis = _unit(_vector(self.axis_direction, "axis_direction"), "axis_direction")
         normal = _vector(self.zero_normal, "zero_normal")
-        along = float(axis @ normal)
-        normal = _unit(normal - axis * (along if abs(along) > _ROUNDING else 0.0), "zero_normal (across the axis)")
+        normal = _near_one(normal, normal)
+        normal = _across(_across(normal, axis), axis)  # twice: what is left of a normal close to the axis is inexact
         angle = np.array(self.angle_rad, dtype=np.float64)
         if angle.ndim != 1 or angle.size == 0 or not np.all(np.isfinite(angle)):
             raise CalibrationError("pivot scanner's angle_rad must be finite polynomial terms, constant first")
         low, high = self.command_range
         if not (np.isfinite(low) and np.isfinite(high) and low < high):
             raise CalibrationError(f"scanner command_range is [{low:g}, {high:g}]; the first must be the smaller one")
+        with np.errstate(over="ignore"):
+            reach = float(np.polynomial.polynomial.polyval(max(abs(low), abs(high)), np.abs(angle)))
+        if not reach <= _MOST_ANGLE_RAD:
+            raise CalibrationError(
+                f"pivot scanner's angle_rad reaches {reach:.3g} rad over command_range [{low:g}, {high:g}], more than "
+                f"{_MOST_ANGLE_RAD:g}; give the optical angle in radians as a polynomial in the command"
+            )
         parts = {"axis_point_m": point, "axis_direction": axis, "zero_normal": normal, "angle_rad": angle}
         for name, value in parts.items():
             value.flags.writeable = False
@@ -146,9 +157,26 @@ def _vector(value: ArrayLike, name: str) -> Array:
     return vector
 
 
+def _near_one(values: Array, vectors: Array) -> Array:
+    """Values (..., m) by the power of two that brings the vectors (..., n) to length about one: their bits stay."""
+    _, exponent = np.frexp(np.abs(vectors).max(axis=-1, keepdims=True))
+    result: Array = np.ldexp(values, -exponent)
+    return result
+
+
+def _across(normal: Array, axis: Array) -> Array:
+    """Unit vector along the part of `normal` across the unit vector `axis`."""
+    along = float(axis @ normal)
+    across = normal - axis * (along if abs(along) > _ROUNDING else 0.0)
+    if np.abs(across).max() < 1e-9:
+        raise CalibrationError("pivot scanner's zero_normal (across the axis) has length zero")
+    return _unit(across, "zero_normal")
+
+
 def _unit(vector: Array, name: str) -> Array:
+    vector = _near_one(vector, vector)
     length = float(np.linalg.norm(vector))
-    if length < 1e-9:
+    if length == 0:
         raise CalibrationError(f"pivot scanner's {name} has length zero")
     result: Array = vector / _exactly_one(np.array(length))
     return result

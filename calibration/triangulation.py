@@ -2,7 +2,10 @@
 
 Ray r = (u, v, 1), plane n.X = d:  z = d / (n.r). Along an image row dz/dx = -(z^2 / d) (n . dr/dx), whose sign says on
 which side of the stripe the near points lie. Everything broadcasts; NaN is 'no depth', never inf, never a warning.
+n.r cancels where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps 1e-9 of z at the least.
 """
+
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,23 +14,42 @@ from calibration.camera import Camera
 
 Array = NDArray[np.float64]
 
+NEARLY_PARALLEL: Final = 1e-6
+"""Sine of the angle between ray and plane below which there is no depth: 1e-3 px, finer than any calibration."""
+LEAST_OFFSET_M: Final = 1e-6
+"""A plane that passes the camera closer than this gives no depth: all its points are seen on one line."""
+
 
 def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
-    """1/z (1/m) of rays (u, v) on planes (..., 4); negative behind the camera, 0 for parallel rays, NaN for d = 0."""
+    """1/z (1/m) of rays (u, v) on planes (..., 4), |n| = 1; negative behind the camera, 0 for parallel rays.
+
+    NaN for planes through the camera (LEAST_OFFSET_M).
+    """
     p = np.asarray(planes, np.float64)
+    offset = p[..., 3]
     with np.errstate(all="ignore"):
-        along = p[..., 0] * np.asarray(u, np.float64) + p[..., 1] * np.asarray(v, np.float64) + p[..., 2]
-        # A plane through the camera centre sees every one of its points on one line: no depth.
-        result: Array = along / np.where(p[..., 3] == 0, np.nan, p[..., 3])
+        result: Array = _along(u, v, p) / np.where(np.abs(offset) < LEAST_OFFSET_M, np.nan, offset)
     return np.where(np.isfinite(result), result, np.nan)
 
 
 def depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
-    """Depth z (m) of rays (u, v) on planes (..., 4); NaN where they do not meet in front of the camera."""
+    """Depth z (m) of rays (u, v) on planes (..., 4), |n| = 1; NaN where they do not meet in front of the camera.
+
+    Nor do they where they are nearly parallel: z is at most 1 / NEARLY_PARALLEL times the plane's distance.
+    """
     inverse = inverse_depth(u, v, planes)
     with np.errstate(all="ignore"):
-        z = 1.0 / np.where(inverse > 0, inverse, np.nan)
-    return np.where(np.isfinite(z), z, np.nan)
+        length = np.sqrt(np.square(np.asarray(u, np.float64)) + np.square(np.asarray(v, np.float64)) + 1)
+        met = (inverse > 0) & (np.abs(_along(u, v, planes)) >= NEARLY_PARALLEL * length)
+        z: Array = 1.0 / np.where(met, inverse, np.nan)
+    return z
+
+
+def _along(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
+    """n.r, the ray's way along the plane's normal."""
+    p = np.asarray(planes, np.float64)
+    result: Array = p[..., 0] * np.asarray(u, np.float64) + p[..., 1] * np.asarray(v, np.float64) + p[..., 2]
+    return result
 
 
 def depth_slope(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -> Array:
@@ -47,6 +69,8 @@ def near_side(u: ArrayLike, v: ArrayLike, planes: ArrayLike, camera: Camera) -> 
     """
     p = np.asarray(planes, np.float64)
     du, dv = camera.tangent_slopes(u, v)
+    offset = np.where(np.abs(p[..., 3]) < LEAST_OFFSET_M, 0.0, p[..., 3])
     with np.errstate(all="ignore"):
-        sign = np.sign(p[..., 3] * (p[..., 0] * du + p[..., 1] * dv))
-    return np.nan_to_num(sign).astype(np.int8)
+        sign = np.sign(offset) * np.sign(p[..., 0] * du + p[..., 1] * dv)
+    side: NDArray[np.int8] = np.nan_to_num(sign).astype(np.int8)
+    return side

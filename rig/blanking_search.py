@@ -33,6 +33,8 @@ STEPS = 8
 PHASES = np.arange(4) / 4
 """Places tried per frame while nothing is known."""
 _FIT_STEPS = 4
+_NO_LIGHT = 1e-300
+"""Ones per frame that no frame has: where there are none at all, nothing stands out by 0 standard deviations."""
 _GRAIN = 64
 """The rough search takes shares of a frame in whole parts of this: its sums are exact, in whatever order."""
 
@@ -133,7 +135,7 @@ def _judged(cross: Array, left: float, total: Array, mean: Array, n: int) -> tup
     """Score, and what remains beyond the scatter of photons as a share of what is explained."""
     explained = cross**2 / left
     rest = np.maximum(total - explained, 0)
-    scatter = np.maximum(rest / (n - 4), mean)
+    scatter = np.maximum(rest / (n - 4), np.maximum(mean, _NO_LIGHT))
     return np.sign(cross) * np.sqrt(explained / scatter), np.maximum(rest - n * mean, 0) / explained
 
 

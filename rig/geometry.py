@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.model import RigModel
-from calibration.triangulation import near_side
+from calibration.triangulation import LEAST_OFFSET_M, near_side
 from rig.errors import UsageError
 
 WORD_PX: Final = 64
@@ -92,11 +92,11 @@ def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: 
     u, v = np.ascontiguousarray(u64, dtype=np.float32), np.ascontiguousarray(v64, dtype=np.float32)
     planes = np.ascontiguousarray(planes, dtype=np.float64)
     offset = planes[:, 3]
-    if np.any(np.abs(offset) < 1e-6):
+    if np.any(np.abs(offset) < LEAST_OFFSET_M):
         worst = int(np.argmin(np.abs(offset)))
         raise UsageError(
-            f"light plane of column {worst} passes {abs(offset[worst]):.1e} m from the camera, less than 1e-6 m: "
-            "depth is not determined; check the baseline in the calibration"
+            f"light plane of column {worst} passes {abs(offset[worst]):.1e} m from the camera, less than "
+            f"{LEAST_OFFSET_M:g} m: depth is not determined; check the baseline in the calibration"
         )
     plane = planes[:, :3] / offset[:, None]
     near_is_left = bool(near_side(0.0, 0.0, planes[len(planes) // 2], model.camera) < 0)

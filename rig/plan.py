@@ -35,7 +35,7 @@ from rig.config import ScanConfig
 from rig.errors import PlanError, UsageError
 from rig.mirror_path import SweepPath, mirrored
 from rig.path_search import PathDemand, find_path, remedy
-from rig.scan_plan import Leg, ScanPlan, rounded
+from rig.scan_plan import Leg, ScanPlan, column_command, rounded
 from rig.windows import LEAST_MARKER_FRAMES, LEAST_MARKER_POINTS, moving_windows, window_widths
 
 __all__ = ["Leg", "ScanPlan", "compile_plan", "spad_request"]
@@ -198,9 +198,7 @@ def _plan(
     """The plan along a mirror path; whether the SPAD's link carries it is for the caller to judge."""
     legs = _legs(path, scan, model.lag_s if model is not None else Lag(), demand.gate_margin_s, rate)
     step, markers = _markers(path, scan)
-    first, last = scan.command_range
-    centres: NDArray[np.float64] = np.arange(scan.columns, dtype=np.float64) + 0.5
-    commands = first + centres * ((last - first) / scan.columns)
+    commands = column_command(np.arange(scan.columns), scan.command_range, scan.columns)
     x0, window = _windows(model, commands, scan, info)
     plan = ScanPlan(
         columns=scan.columns,

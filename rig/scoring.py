@@ -3,6 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+MISSING_PX = 10.0
+"""What a missing answer is charged, where leaving answers out must not help."""
+
 
 def stripe_errors(x_px: NDArray[np.float32], true_x_px: NDArray[np.float32]) -> dict[str, float | None]:
     """Errors in pixels over the (row, column) that have a true stripe; both arrays (rows, columns), NaN = none.
@@ -21,6 +24,15 @@ def stripe_errors(x_px: NDArray[np.float32], true_x_px: NDArray[np.float32]) -> 
         "within_1px": float(np.count_nonzero(given <= 1.0) / error.size),
         "missing": float(1.0 - given.size / error.size),
     }
+
+
+def charged_errors(x_px: NDArray[np.float32], true_x_px: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Error of every (row, column) in pixels, NaN where there is no true stripe; a missing answer, or one farther off,
+    counts as `MISSING_PX`.
+    """
+    error = np.abs(x_px.astype(np.float64) - true_x_px)
+    charged = np.where(np.isfinite(x_px), np.minimum(error, MISSING_PX), MISSING_PX)
+    return np.where(np.isfinite(true_x_px), charged, np.nan)
 
 
 def depth_errors(depth_m: NDArray[np.float32], true_depth_m: NDArray[np.float32]) -> dict[str, float | None]:

@@ -223,7 +223,7 @@ def _near_level(volume: CountVolume, geometry: SweepGeometry) -> float:
 
 def flux(ones: float, exposures: float) -> float:
     """Photons per exposure from ones among exposures; finite at all-ones, 0 where there are no exposures."""
-    return float(np.log((exposures + 0.5) / (exposures - ones + 0.5))) if exposures > 0 else 0.0
+    return float(np.log1p(ones / (exposures - ones + 0.5))) if exposures > 0 else 0.0
 
 
 def maximise(
@@ -297,7 +297,8 @@ def _level(sums: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.f
     few = exposures < 50
     weight = np.where(few, 1.0, exposures)
     gain = np.where(few, 1.0, geometric) / weight
-    total = np.log((weight + 0.5) / (weight - np.where(few, 0.0, ones) + 0.5))
+    some = np.where(few, 0.0, ones)
+    total = np.log1p(some / (weight - some + 0.5))
     variance = np.expm1(total) / weight + 1.0 / weight**2
     level = (total - ambient / weight) / gain
     return np.where(few, np.nan, level), np.where(few, np.nan, variance / gain**2)

@@ -56,10 +56,13 @@ def peak_confidence(
             around += counts[t]
             pixels += 1.0
     rest = (total - around) / max(length - pixels, 1.0)
-    p_peak = (counts[peak] + 0.5) / (k + 1.0)
-    p_rest = min((max(rest, 0.0) + 0.5 / length) / (k + 1.0 / length), p_peak)
-    gain = np.log(p_peak / (1.0 - p_peak)) - np.log(p_rest / (1.0 - p_rest))
-    evidence = gain * counts[peak] + k * (np.log1p(-p_peak) - np.log1p(-p_rest))
+    # 1 - p from the counts themselves: at K = 10^6 half of its digits would be lost.
+    p_peak, q_peak = (counts[peak] + 0.5) / (k + 1.0), (k - counts[peak] + 0.5) / (k + 1.0)
+    rest_k = k + 1.0 / length
+    p_rest = min((max(rest, 0.0) + 0.5 / length) / rest_k, p_peak)
+    q_rest = max((k - max(rest, 0.0) + 0.5 / length) / rest_k, q_peak)
+    gain = np.log(p_peak / q_peak) - np.log(p_rest / q_rest)
+    evidence = gain * counts[peak] + k * (np.log(q_peak) - np.log(q_rest))
     near = 0.0
     everything = length * NO_STRIPE / (1.0 - NO_STRIPE) * np.exp(-min(max(evidence, -60.0), 60.0))
     for t in range(length):
@@ -189,4 +192,4 @@ def _edge_scores(
 @numba.njit(cache=True, nogil=True)
 def _flux(count: float, k: float) -> float:
     """Photons per exposure from a mean count over k exposures, finite at saturation."""
-    return float(np.log((k + 0.5) / (k - count + 0.5)))
+    return float(np.log1p(count / (k - count + 0.5)))  # ln((k + 0.5) / (k - count + 0.5)), exact for few counts too

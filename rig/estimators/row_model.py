@@ -18,6 +18,8 @@ from rig.estimators.row_kernels import LABEL_PX, LABELS
 BINS = 64
 AMPLITUDES = 4
 EXTINCTION_MAX_PER_M = 5.0
+OPTICAL_DEPTH_MAX = 50.0
+"""Most extinction times path at which haze is looked for: e^-100 of it would come back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,8 @@ class HazeFit:
 def fit_haze(path_m: NDArray[np.float64], flux: NDArray[np.float64], variance: NDArray[np.float64]) -> HazeFit | None:
     """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,); None where there is no haze.
 
-    Gauss-Newton on amplitude and extinction, the latter kept in 0 to EXTINCTION_MAX_PER_M.
+    Gauss-Newton on amplitude and extinction, the latter kept in 0 to EXTINCTION_MAX_PER_M and OPTICAL_DEPTH_MAX at the
+    nearest haze.
     """
     used = np.isfinite(flux) & np.isfinite(variance) & (variance > 0)
     if used.sum() < 4:
@@ -113,7 +116,8 @@ def fit_haze(path_m: NDArray[np.float64], flux: NDArray[np.float64], variance: N
     total = float(np.sum(weight * h) / np.sum(weight))
     if total <= 0 or total**2 * np.sum(weight) < 25.0:
         return None
-    candidates = np.concatenate([[0.0], np.geomspace(0.005, EXTINCTION_MAX_PER_M, 60)])
+    most = min(EXTINCTION_MAX_PER_M, OPTICAL_DEPTH_MAX / float(s.min()))
+    candidates = np.concatenate([[0.0], np.geomspace(min(0.005, most), most, 60)])
 
     def residual(extinction: float) -> tuple[float, float]:
         shape = np.exp(-2.0 * extinction * (s - s.min()))
@@ -131,9 +135,7 @@ def fit_haze(path_m: NDArray[np.float64], flux: NDArray[np.float64], variance: N
             break
         step = float(np.linalg.solve(normal, (design * weight) @ (h - amplitude * shape))[1])
         extinction = float(
-            np.clip(
-                extinction + np.clip(step, -0.5 * extinction - 0.01, 0.5 * extinction + 0.01), 0.0, EXTINCTION_MAX_PER_M
-            )
+            np.clip(extinction + np.clip(step, -0.5 * extinction - 0.01, 0.5 * extinction + 0.01), 0.0, most)
         )
         if abs(step) < 1e-7:
             break

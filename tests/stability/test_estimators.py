@@ -86,7 +86,7 @@ def test_many_exposures(name, exposures):
     if name == "likelihood":
         errors = sweep.errors(table.x_px)
         assert np.median(errors) < 0.12
-        # Counts of 65535 exposures are divided by 2048, which leaves 32 levels.
+        # Counts of 65535 exposures are divided by 1024, which leaves 64 levels.
         assert np.mean(errors <= 1) > 0.97
 
 

@@ -1,0 +1,35 @@
+"""The table of the largest errors that the stability tests find, printed at their end as docs/results.md has it."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+Worst = Callable[[str, str, object, float], None]
+_PROPERTY = "largest error"
+
+
+@pytest.fixture
+def worst(record_property) -> Worst:
+    """worst(what, against, errors, limit): note the largest error for the table, and hold it below the limit."""
+
+    def note(what: str, against: str, errors: object, limit: float) -> None:
+        largest = float(np.max(np.abs(np.asarray(errors, np.float64)), initial=0.0))
+        record_property(_PROPERTY, [what, against, largest, limit])
+        assert largest <= limit, f"{what}: {largest:.3g} off {against}, more than {limit:g}"
+
+    return note
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    rows: dict[str, tuple[float, str, float]] = {}
+    for report in terminalreporter.getreports("passed") + terminalreporter.getreports("failed"):
+        for name, value in report.user_properties:
+            if name == _PROPERTY:
+                what, against, largest, limit = value
+                rows[what] = max(rows.get(what, (0.0, against, limit)), (largest, against, limit))
+    if rows:
+        terminalreporter.section("largest errors")
+        terminalreporter.write_line("| what | against | largest error | limit |\n|---|---|---|---|")
+        for what, (largest, against, limit) in rows.items():
+            terminalreporter.write_line(f"| {what} | {against} | {largest:.1e} | {limit:.0e} |")

@@ -1,0 +1,89 @@
+"""Which public numeric functions there are, and by what each is held to its whole domain.
+
+A test says with `@covers("calibration.triangulation:depth")` whose domain it goes through; what needs no such test is
+in `EXCUSED` with the reason. `test_inventory.py` fails where a function of `SCOPE` is in neither.
+"""
+
+import ast
+import os
+import re
+from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import TypeVar
+
+from hypothesis import settings
+
+ROOT = Path(__file__).parents[2]
+SCOPE = (
+    "calibration/*.py",
+    *(f"drivers/{name}.py" for name in ("clock", "frames", "mirror_ramps", "replay_pace", "units")),
+    *(
+        f"rig/{name}.py"
+        for name in ("binding*", "blanking*", "counting*", "cube", "depth*", "geometry*", "marker_line")
+    ),
+    *(f"rig/{name}.py" for name in ("mirror_path", "path_search", "plan", "scan_plan", "scoring", "stripes", "sweeps")),
+    "rig/windows.py",
+    "rig/estimators/*.py",
+    *(
+        f"sim_backend/{name}.py"
+        for name in ("exponential", "flux", "light_sheet*", "line_width", "medium", "mirror_motion")
+    ),
+    *(f"sim_backend/{name}.py" for name in ("optics", "photon*", "scene", "view", "weather")),
+    "sim_backend/effects/*.py",
+)
+"""Files whose functions compute; the others move bytes, words and files, which tests/unit and tests/wire hold."""
+NUMERIC = {"int", "float", "complex", "NDArray", "ArrayLike", "Array", "Fraction", "Pixels", "Counts"}
+"""Names in an annotation by which a function takes or gives numbers."""
+
+EXAMPLES = settings(
+    max_examples=int(os.environ.get("STABILITY_EXAMPLES", "25")),
+    derandomize="STABILITY_EXAMPLES" not in os.environ,
+    deadline=None,
+    database=None,
+)
+"""Few and always the same, unless the environment asks for more: STABILITY_EXAMPLES=3000 pytest tests/stability."""
+
+Test = TypeVar("Test", bound=Callable[..., object])
+
+
+def covers(*names: str) -> Callable[[Test], Test]:
+    """Says which functions ("module:Name" or "module:Class.name") a test takes through their domain."""
+
+    def unchanged(test: Test) -> Test:
+        return test
+
+    return unchanged
+
+
+def public_functions() -> Iterator[str]:
+    """Every public function and method within SCOPE that takes or gives numbers, as "module:Class.name"."""
+    for path in sorted(ROOT.glob("[cdrs]*/**/*.py")):
+        file = path.relative_to(ROOT).as_posix()
+        if any(fnmatch(file, pattern) for pattern in SCOPE):
+            module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+            for name in _numeric(ast.parse(path.read_text(encoding="utf-8")).body):
+                yield f"{module}:{name}"
+
+
+def covered() -> set[str]:
+    """What the tests of this folder say they cover; read from their source, so that none of them has to be run."""
+    found = set()
+    for path in Path(__file__).parent.glob("test_*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "covers":
+                found |= {ast.literal_eval(name) for name in node.args}
+    return found
+
+
+def _numeric(body: list[ast.stmt], of: str = "") -> Iterator[str]:
+    for node in body:
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            if "Protocol" not in {ast.unparse(base) for base in node.bases}:
+                yield from _numeric(node.body, f"{of}{node.name}.")
+        elif isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            notes = [note for note in (*(a.annotation for a in arguments), node.returns) if note is not None]
+            # Compiled pieces that take whatever they are given carry no annotations.
+            if any(NUMERIC & set(re.findall(r"\w+", ast.unparse(note))) for note in notes) or (arguments and not notes):
+                yield of + node.name

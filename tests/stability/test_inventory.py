@@ -1,0 +1,82 @@
+"""Every public numeric function is taken through its domain by a test of this folder, or excused with a reason."""
+
+from fnmatch import fnmatchcase
+
+from tests.stability.inventory import ROOT, covered, public_functions
+
+ELSEWHERE = {
+    "exact whole numbers, against unpacked sums": (
+        "tests/unit/rig/test_counting_kernels.py", "rig.counting_kernels:*",
+    ),
+    "columns from the frame number, exactly": ("tests/unit/rig/test_cube.py", "rig.cube:*"),
+    "what a sweep is made of, frame by frame": (
+        "tests/unit/rig/test_binding.py", "rig.binding_kernels:cover", "rig.sweeps:*",
+    ),
+    "places and numbers that the light gives, with the patterns of test_plans.py": (
+        "tests/unit/rig/test_blanking.py", "rig.blanking_sync:*",
+    ),
+    "asks the search of test_plans.py again": ("tests/unit/rig/test_plan.py", "rig.path_search:remedy"),
+    "whole-number tables and lanes of the compiled search; its answers for any counts in test_estimators.py": (
+        "tests/unit/estimators/test_search.py", "rig.estimators.best_kernels:*", "rig.estimators.row_search:*",
+        "rig.estimators.screen_tables:*", "rig.estimators.search_*:*", "rig.estimators.judging:*",
+    ),
+    "labels around the best position, against the likelihood itself": (
+        "tests/unit/estimators/test_closeup.py", "rig.estimators.closeup_kernels:*",
+    ),
+    "powers of two off the bits of a number": ("tests/unit/estimators/test_powers.py", "rig.estimators.powers:*"),
+    "the search, column by column: the same bits": (
+        "tests/unit/estimators/test_stream.py", "rig.estimators.stream*:*", "rig.estimators.likelihood:*",
+    ),
+    "which lines are read and how they are weighted": (
+        "tests/unit/estimators/test_learning.py", "rig.estimators.learning:*",
+        "rig.estimators.likelihood_kernels:*", "rig.estimators.row_model:RowModel.*",
+    ),
+    "rows as the kernels read them; any rays and windows in test_estimators.py": (
+        "tests/stability/test_estimators.py", "rig.estimators.row_input:*", "rig.estimators:*",
+    ),
+    "against 50 digits, for kernels only": ("tests/stability/test_photon_bits.py", "sim_backend.exponential:*"),
+    "statistics of the bits": (
+        "tests/unit/sim/test_photons.py", "sim_backend.photon_kernels:*", "sim_backend.photons:*",
+    ),
+    "what a scene file says, validated with units": (
+        "tests/unit/sim/test_scene.py", "sim_backend.scene:*", "sim_backend.medium:Medium.*",
+    ),
+    "sizes and speeds of drops and flakes, against their sources": (
+        "tests/unit/sim/test_weather.py", "sim_backend.weather:*",
+    ),
+    "particles, one by one; any scene's light in test_light.py": (
+        "tests/unit/sim/test_particles.py", "sim_backend.effects.particle*:*",
+    ),
+    "surfaces that move": ("tests/unit/sim/test_motion.py", "sim_backend.effects.motion:*"),
+    "grains": ("tests/unit/sim/test_speckle.py", "sim_backend.effects.speckle:*"),
+    "widths of the line": ("tests/unit/sim/test_line_width.py", "sim_backend.line_width:*"),
+    "light of the row and its spread; closed forms in test_light.py": (
+        "tests/unit/sim/test_stripe.py", "sim_backend.effects.stripe:*",
+    ),
+    "a fit to path tracing": ("tests/unit/sim/test_halo.py", "sim_backend.effects.halo:*"),
+    "a measured distribution": ("tests/unit/sim/test_dark_counts.py", "sim_backend.effects.dark_counts:*"),
+    "the mirror's random error": ("tests/unit/sim/test_jitter.py", "sim_backend.mirror_motion:Jitter.*"),
+    "what sensors make of bits: statistics against closed forms": (
+        "tests/unit/sim/test_sensor_bits.py", "sim_backend.effects.afterpulsing:*", "sim_backend.effects.bit_errors:*",
+        "sim_backend.effects.crosstalk:*", "sim_backend.effects.defects:*", "sim_backend.effects.rare_bits:*",
+        "sim_backend.effects.setting:*",
+    ),
+    "waits on the host's clock": (
+        "tests/unit/drivers/test_clock.py", "drivers.clock:SystemClock.*", "drivers.replay_pace:Pace.wait_for_step",
+    ),
+}  # fmt: skip
+"""Why a function has no test here: the test that holds it, then the functions."""
+
+
+def test_every_public_numeric_function_is_held_to_its_domain() -> None:
+    excused = {pattern for _, *patterns in ELSEWHERE.values() for pattern in patterns}
+    patterns = covered() | excused
+    missing = [name for name in public_functions() if not any(fnmatchcase(name, p) for p in patterns)]
+    assert not missing, f"cover these in tests/stability, or excuse them in {__name__}: {missing}"
+
+
+def test_nothing_is_listed_that_is_not_there() -> None:
+    names = list(public_functions())
+    patterns = covered() | {pattern for _, *patterns in ELSEWHERE.values() for pattern in patterns}
+    assert not [p for p in sorted(patterns) if not any(fnmatchcase(name, p) for name in names)]
+    assert not [file for file, *_ in ELSEWHERE.values() if not (ROOT / file).is_file()]

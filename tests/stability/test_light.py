@@ -1,0 +1,152 @@
+"""The simulated light from clear air to optical depth 50; bits and their probabilities are in test_photon_bits.py."""
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_backend.effects.catalogue import CATALOGUE
+from sim_backend.flux import FluxModel
+from sim_backend.light_sheet import empty_sheet
+from sim_backend.medium import henyey_greenstein
+from sim_backend.optics import Line, Optics, Sensor, ambient_irradiance, detections_per_radiance
+from sim_backend.scenes.surfaces import checked
+from tests.stability.exactly import relative
+from tests.stability.inventory import EXAMPLES, covers
+from tests.unit.sim.rigs import effect_rate, rig, setting, wall
+
+WALL_M, BASELINE_M, FOCAL_PX = 2.5, 0.3, 110.0
+DEPTHS = (1e-300, 1e-12, 0.01, 1.0, 10.0, 50.0)
+"""Optical depths, one way, of the wall."""
+
+
+@covers("sim_backend.medium:henyey_greenstein")
+def test_phase_functions_are_exact_also_at_their_peak(worst) -> None:
+    cosine, g = np.meshgrid(
+        [-1.0, -0.999999, -0.3, 0.0, 0.5, 0.9999999, 1.0], [-0.999999, -0.5, 0.0, 1e-9, 0.85, 0.999999]
+    )
+
+    def exact(c, g):
+        return (1 - g * g) / (4 * mpmath.pi * (1 + g * g - 2 * g * c) ** mpmath.mpf("1.5"))
+
+    got = np.vectorize(henyey_greenstein)(cosine, g)
+    worst("Henyey-Greenstein, g to +-0.999999", "mpmath, 50 digits", relative(got, exact, cosine, g), 1e-9)
+
+
+def closed_forms(setup, extinction: float, plane: np.ndarray, row: int):
+    """(x, haze before the stripe, stripe integrated along the row) of a wall across the axis, by mpmath."""
+    m = mpmath.mpf
+    sheet = setup.view.sheet(plane)
+    u_p, v, b, sigma = -m(plane[2]) / m(plane[0]), m(row - 31.5) / 110, m(BASELINE_M), m(extinction)
+    density = mpmath.sqrt(1 + u_p**2) / m(setup.line.fan)
+    x = [x for x in range(96) if sheet.x_stripe_px[row] - x > 5]
+    q_p = mpmath.sqrt(u_p**2 + v**2 + 1)
+    haze = []
+    for at in x:
+        u = (m(at) - m("47.5")) / 110
+        q_c, z = mpmath.sqrt(u**2 + v**2 + 1), b / (u_p - u)
+        haze.append(m("0.9") * sigma * m("0.05") * density / q_p * q_c / b * mpmath.exp(-sigma * z * (q_p + q_c)))
+    u = u_p - b / m(WALL_M)
+    q_c = mpmath.sqrt(u**2 + v**2 + 1)
+    # Camera-side cosine: |N.q| / Z^2 per unit of u, 110 pixels each; facing wall, so N.q = 1.
+    power = m("0.5") / mpmath.pi * density / q_p**2 / m(WALL_M) ** 2 * mpmath.exp(-sigma * m(WALL_M) * (q_p + q_c))
+    return x, [m(setup.gain) * h for h in haze], m(setup.gain) * power * FOCAL_PX
+
+
+@covers("sim_backend.effects.stripe:Stripe.add", "sim_backend.effects.fog:Haze.add", "sim_backend.view:View.sheet")
+@pytest.mark.parametrize("depth", [0.0, *DEPTHS])
+def test_stripe_and_haze_follow_beer_and_lambert_to_optical_depth_50(depth, worst) -> None:
+    extinction = depth / WALL_M
+    model = rig(baseline_m=BASELINE_M, focal_px=FOCAL_PX)
+    fog = {"medium": {"extinction": f"{extinction!r} /m", "scattering_share": 0.9, "multiple_scattering": False}}
+    setup = setting(model, wall(model, (0.0, 0.0, 1.0), WALL_M), **(fog if depth else {}))
+    plane = model.planes(0.2)
+    stripe = effect_rate(setup, "stripe", plane)
+    haze = effect_rate(setup, "fog", plane) if depth else np.zeros_like(stripe)
+    for row in (0, 31, 63):
+        x, exact, total = closed_forms(setup, extinction, plane, row)
+        off = (stripe[row].sum() - total) / total
+        worst("stripe, optical depth 0 to 50", "closed form, 50 digits", float(off), 2e-6)
+        if not depth:
+            assert not haze.any()
+            continue
+        off = [float(abs(haze[row, at] - e) / e) for at, e in zip(x, exact, strict=True)]
+        worst("haze before the stripe, optical depth 1e-300 to 50", "closed form, 50 digits", off, 1e-11)
+
+
+SCENE = st.fixed_dictionaries(
+    {},
+    optional={
+        "medium": st.one_of(
+            st.sampled_from([1e-12, 1e-3, 0.1, 20.0, 1e3]).map(lambda e: {"extinction": f"{e!r} /m"}),
+            st.sampled_from([0.3, 40.0, 1e6]).map(lambda v: {"fog": {"visibility": f"{v!r} m"}}),
+            st.sampled_from([-0.999, 0.0, 0.999]).map(lambda g: {"smoke": {"extinction": "0.5 /m"}, "phase": {"g": g}}),
+        ),
+        "rain": st.sampled_from([{"rate": "1e-3 mm/h"}, {"rate": "300 mm/h"}]),
+        "snow": st.sampled_from([{"rate": "1e-3 mm/h"}, {"rate": "50 mm/h"}]),
+        "ambient": st.sampled_from([0.0, 1e-6, 100.0, 1e5]).map(lambda e: {"illuminance": f"{e!r} lx"}),
+    },
+)
+
+
+@covers(
+    "sim_backend.flux:FluxModel.*",
+    "sim_backend.flux:hold_s",
+    "sim_backend.light_sheet:empty_sheet",
+    "sim_backend.view:View.*",
+)
+@covers("sim_backend.effects.*:*.rate", "sim_backend.effects.*:*.add", "sim_backend.effects.dark_counts:dark_rates")
+@covers("sim_backend.light_sheet_kernels:trace_rows")
+@EXAMPLES
+@given(
+    scene=SCENE, baseline=st.sampled_from([-0.3, 1e-9, 1e-3, 0.3, 30.0]), command=st.floats(-1, 1),
+    distance=st.sampled_from([1e-3, 0.3, 3.0, 1e6]), tilt=st.floats(-1.2, 1.2), gap=st.booleans(), lens=st.booleans(),
+)  # fmt: skip
+def test_the_light_of_every_scene_is_finite_and_never_negative(
+    scene, baseline, command, distance, tilt, gap, lens
+) -> None:
+    model = rig(size=(8, 24), focal_px=30.0, baseline_m=baseline, k1=-2.0 if lens else 0.0)
+    u, _ = model.camera.tangents()
+    with np.errstate(divide="ignore"):
+        depth = (distance / (np.sin(tilt) * u + np.cos(tilt))).astype(np.float32)
+    depth[~(depth > 0)] = np.inf
+    depth[:, 10:12] = np.inf if gap else depth[:, 10:12]
+    surfaces = checked("wall", depth, np.full(u.shape, 0.5), np.ones(u.shape, bool), u.shape)
+    view = setting(model, surfaces, **scene)
+    whole = FluxModel(view, [e for e in CATALOGUE if e.kind in ("laser", "steady") and e.called(view)[0]])
+    flux = whole.flux(model.planes(command), 1e-5, 0.02)
+    assert np.isfinite(flux).all()
+    assert np.all(flux >= 0)
+
+
+@covers("sim_backend.light_sheet:empty_sheet")
+def test_a_sheet_through_the_camera_is_seen_by_nobody() -> None:
+    model = rig(size=(8, 24))
+    setup = setting(model, wall(model, (0.0, 0.0, 1.0), 3.0), medium={"extinction": "0.1 /m"})
+    plane = np.array([1.0, 0.0, -0.1, 0.0])
+    assert np.isnan(empty_sheet(plane, 8).inverse).all()
+    assert np.isnan(setup.view.sheet(plane).x_end_px).all()
+    for name in ("stripe", "fog"):
+        assert not effect_rate(setup, name, plane).any()
+
+
+@covers("sim_backend.optics:detections_per_radiance", "sim_backend.optics:ambient_irradiance")
+def test_radiometry_is_exact(worst) -> None:
+    optics, sensor, line = Optics(), Sensor(), Line()
+
+    def exact(_):
+        h, c = mpmath.mpf("6.62607015e-34"), mpmath.mpf("299792458")
+        area = mpmath.pi / 4 / mpmath.mpf(optics.f_number) ** 2 * mpmath.mpf(sensor.pitch) ** 2
+        share = (
+            mpmath.mpf(sensor.fill_factor) * mpmath.mpf(sensor.detection_probability) * mpmath.mpf(optics.transmission)
+        )
+        return share * area * mpmath.mpf(line.wavelength) / (h * c)
+
+    worst(
+        "detections per radiance",
+        "mpmath, 50 digits",
+        relative(detections_per_radiance(optics, sensor, line), exact, 0),
+        1e-14,
+    )
+    assert ambient_irradiance(0.0, optics) == 0

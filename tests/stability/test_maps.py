@@ -1,0 +1,228 @@
+"""Windows, counts, stripes and depth maps at the ends of their ranges: K = 10^6, ties, dead and empty rows."""
+
+from dataclasses import replace
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibration.camera import Camera
+from calibration.errors import CalibrationError
+from calibration.model import RigModel
+from calibration.scanner import PlaneTable
+from rig.counting import BIN_DARK, CountVolume, SweepCounter, SweepLayout, SweepTally
+from rig.depth import depth_map
+from rig.errors import UsageError
+from rig.estimators import ESTIMATORS, create_estimator
+from rig.estimators.ambient import ambient_map, hot_pixels
+from rig.estimators.median import median_filter
+from rig.geometry import sweep_geometry, uncalibrated_geometry
+from rig.row_threads import RowWorkers
+from rig.scoring import MISSING_PX, charged_errors, depth_errors, stripe_errors
+from rig.stripes import StripeTable
+from tests.stability.inventory import EXAMPLES, covers
+from tests.unit.small_maps import rows_of, simulated, volume_of
+
+NAN = st.just(np.nan)
+
+
+@covers("rig.geometry:sweep_geometry", "rig.geometry:SweepGeometry.*", "rig.geometry_kernels:row_windows")
+@EXAMPLES
+@given(
+    focal=st.sampled_from([1.0, 60.0, 6e4]), k1=st.sampled_from([-2.0, -0.3, 0.0, 0.5]), width=st.integers(1, 130),
+    planes=st.lists(st.tuples(st.floats(-1.2, 1.2), *[st.floats(-0.5, 0.5)] * 2), min_size=1, max_size=6),
+    offset=st.sampled_from([-1e3, -0.3, 2e-6, 0.3]), near=st.floats(1e-3, 1e3), ratio=st.floats(1.001, 1e6),
+)  # fmt: skip
+def test_windows_hold_what_lies_in_the_depth_range_and_nothing_else(
+    focal, k1, width, planes, offset, near, ratio
+) -> None:
+    camera = Camera(width, 5, np.array([[focal, 0, width / 2], [0, focal, 2], [0, 0, 1]]), np.array([k1, 0, 0, 0]))
+    normal = np.array([[np.cos(a) * np.cos(b), np.sin(b), -np.sin(a) * np.cos(b)] for a, b, _ in planes])
+    rows = np.column_stack([normal, offset * (1 + np.array([c for *_, c in planes]))])
+    commands = np.arange(len(rows), dtype=float)
+    try:
+        model = RigModel(camera, PlaneTable(commands, rows))
+        geometry = sweep_geometry(model, model.planes(commands), (near, near * ratio))
+    except (CalibrationError, UsageError):
+        return
+    assert (geometry.rows, geometry.width, geometry.columns) == (5, width, len(rows))
+    assert np.isfinite(geometry.reference_px()).all()
+    assert geometry.window % 64 == 0
+    assert np.all((geometry.x0 % 64 == 0) & (geometry.x0 >= 0))
+    u, v = geometry.u.astype(float), geometry.v.astype(float)
+    w = np.einsum("cd,dyx->cyx", geometry.plane, np.stack([u, v, np.ones_like(u)]))
+    x = np.arange(width)
+    inside = (x >= geometry.x_lo.T[..., None]) & (x <= geometry.x_hi.T[..., None])
+    assert np.isfinite(w[inside]).all()
+    # Pixels within the rounding of float32 rays of a limit may go either way.
+    slack = 1e-5 * np.abs(geometry.plane).sum(axis=1)[:, None, None] * (1 + np.abs(u) + np.abs(v))
+    assert np.all(w[inside] <= (1 / near + slack)[inside])
+    assert np.all(w[inside] >= (1 / (near * ratio) - slack)[inside])
+
+
+@covers("rig.geometry:uncalibrated_geometry")
+@EXAMPLES
+@given(rows=st.integers(1, 4), width=st.integers(1, 200), columns=st.integers(1, 4))
+def test_without_a_model_the_whole_row_is_searched(rows, width, columns) -> None:
+    geometry = uncalibrated_geometry(rows, width, columns)
+    assert np.all(geometry.x_lo == 0)
+    assert np.all(geometry.x_hi == width - 1)
+    assert np.isfinite(geometry.reference_px()).all()
+
+
+@covers(
+    "rig.depth:depth_map",
+    "rig.depth_kernels:fill_rows",
+    "rig.stripes:StripeTable.empty",
+    "rig.estimators.median:median_filter",
+)
+@EXAMPLES
+@given(
+    seed=st.integers(0, 10**6),
+    spread=st.sampled_from([0.0, 1e-6, 1.0, 100.0]),
+    missing=st.floats(0, 1),
+    sd=st.floats(0, 1e3),
+)
+def test_depth_lies_in_the_depth_range_or_there_is_none(seed, spread, missing, sd) -> None:
+    sweep = simulated(rows=4, columns=24)
+    geometry, rng = sweep.geometry, np.random.default_rng(seed)
+    x = (geometry.reference_px() + rng.normal(0, 1, sweep.point.x_true.shape) * spread).clip(-3, geometry.width + 3)
+    x[rng.random(x.shape) < missing] = np.nan
+    empty = StripeTable.empty(*x.shape)
+    table = replace(
+        empty, x_px=x.astype(np.float32), confidence=rng.choice([0, 0.5, 1], x.shape).astype(np.float32),
+        x_sd_px=np.full(x.shape, sd, np.float32),
+    )  # fmt: skip
+    for answer in (table, median_filter(table, geometry.reference_px())):
+        np.testing.assert_array_equal(np.isnan(answer.x_px), np.isnan(table.x_px))
+        assert np.all((answer.confidence >= 0) & (answer.confidence <= 1 + 1e-6))
+        depth = depth_map(answer, geometry, 0.5)
+        near, far = geometry.depth_range_m
+        seen = np.isfinite(depth)
+        assert not np.isinf(depth).any()
+        assert np.all((depth[seen] > 0.9 * near) & (depth[seen] < far / 0.89))
+    assert np.isnan(depth_map(empty, geometry, 0.5)).all()
+
+
+@covers("rig.scoring:stripe_errors", "rig.scoring:depth_errors", "rig.scoring:charged_errors")
+@EXAMPLES
+@given(
+    x=st.lists(st.floats(-(2.0**99), 2.0**99, width=32) | NAN, min_size=4, max_size=4),
+    true=st.lists(st.floats(-(2.0**99), 2.0**99, width=32) | NAN, min_size=4, max_size=4),
+)
+def test_scores_are_numbers_or_none(x, true) -> None:
+    a, b = np.array([x], np.float32), np.array([true], np.float32)
+    for scores in (stripe_errors(a, b), depth_errors(a, b)):
+        assert all(value is None or np.isfinite(value) for value in scores.values())
+    charged = charged_errors(a, b)
+    np.testing.assert_array_equal(np.isnan(charged), np.isnan(b))
+    assert np.all((charged[~np.isnan(b)] >= 0) & (charged[~np.isnan(b)] <= MISSING_PX))
+    scores = stripe_errors(a, b)
+    if scores["missing"] is not None:
+        assert 0 <= scores["within_1px"] <= 1 - scores["missing"] + 1e-12
+
+
+@covers(
+    "rig.counting:SweepCounter.*", "rig.counting:SweepTally.*", "rig.counting:SweepLayout.*",
+    "rig.counting:FrameTally.*", "rig.counting:CountVolume.*",
+)  # fmt: skip
+def test_a_million_exposures_are_counted_to_the_last_one(worst) -> None:
+    layout = SweepLayout(columns=2, rows=1, width=64, x0=np.zeros(2, np.int32), window=64, exposures=10**6)
+    counter = SweepCounter(layout, RowWorkers(1))
+    block = 50_000
+    bits = np.zeros((block, 1, 8), np.uint8)
+    bits[:, 0, 0] = 0x80
+    bits[::2, 0, 7] = 0x01
+    column = np.full(block, 0.1)
+    for _ in range(10**6 // block):
+        counter.add(bits, np.zeros(block, np.int32), column, np.zeros(block, np.int32))
+    counter.add(bits[:3], np.array([1, BIN_DARK, -2], np.int32), column[:3], np.zeros(3, np.int32))
+    volume = counter.finish()
+    assert volume.counts[0, 0, 0] == 10**6
+    assert volume.counts[0, 0, 63] == 10**6 // 2
+    assert volume.counts[0, 0, 1:63].sum() == 0
+    assert list(volume.n_frames) == [10**6, 1]
+    assert volume.intensity()[0, 0] == 10**6 + 1
+    with mpmath.workdps(50):
+        exact = mpmath.mpf(0.1)
+        worst("mean column of 10^6 frames", "mpmath, 50 digits", float((volume.column[0] - exact) / exact), 1e-10)
+    assert volume.bound_column()[1] == pytest.approx(0.1)
+    nothing = SweepTally(layout).finish()
+    assert np.isnan(nothing.column).all()
+    assert list(nothing.bound_column()) == [0, 1]
+
+
+@covers("rig.estimators.ambient:ambient_map", "rig.estimators.ambient:hot_pixels")
+@EXAMPLES
+@given(
+    k=st.sampled_from([1, 10, 10**6]), level=st.sampled_from([0.0, 1e-6, 0.3, 1.0]),
+    n_dark=st.sampled_from([0, 1, 10**6]), dark=st.sampled_from([0.0, 1e-6, 1.0]),
+    quiet=st.booleans(), seed=st.integers(0, 99),
+)  # fmt: skip
+def test_ambient_light_is_a_finite_flux_for_any_counts(k, level, n_dark, dark, quiet, seed) -> None:
+    rng = np.random.default_rng(seed)
+    counts = rng.binomial(k, level, (3, 6, 64)).astype(np.uint32)
+    geometry = uncalibrated_geometry(6, 64, 3)
+    geometry.defects[2] = True
+    volume = CountVolume(
+        counts=counts, x0=geometry.x0, n_frames=np.full(3, k, np.int32), column=np.arange(3.0), width=64,
+        dark_counts=rng.binomial(n_dark, dark, (6, 64)).astype(np.uint32) if n_dark else None, n_dark=n_dark,
+    )  # fmt: skip
+    behind = np.stack([rng.binomial(k, level, (6, 64)), np.full((6, 64), k)]) if quiet else None
+    ambient = ambient_map(volume, volume.intensity(), geometry, behind)
+    assert np.isfinite(ambient).all()
+    assert np.all(ambient >= 0)
+    hot = hot_pixels(np.stack([counts.sum(axis=0), np.full((6, 64), 3 * k)]).astype(np.uint32))
+    assert np.isfinite(hot).all()
+    assert np.all(hot >= 0)
+
+
+EVERY = pytest.mark.parametrize("name", ESTIMATORS)
+
+
+@covers("rig.estimators.peak_kernels:peak_rows")
+@EVERY
+@pytest.mark.parametrize("level", [0, 1])
+def test_a_million_exposures_of_nothing_or_all_ones(name, level) -> None:
+    geometry = simulated(rows=4, columns=24).geometry
+    counts = np.full((24, 4, 512), level * 10**6, np.uint32)
+    table = create_estimator(name).estimate(volume_of(counts, geometry, 10**6), geometry)
+    asked = geometry.x_lo <= geometry.x_hi
+    for values in (table.x_px, table.x_sd_px, table.signal, table.haze):
+        np.testing.assert_array_equal(np.isfinite(values), asked)
+    assert np.all((table.confidence >= 0) & (table.confidence <= 1))
+
+
+@EVERY
+def test_ties_dead_and_saturated_rows_give_the_same_answer_on_any_number_of_threads(name) -> None:
+    sweep = simulated(rows=16, columns=24)
+    counts = sweep.counts.copy()
+    counts[:, 2] = 0
+    counts[:, 5] = sweep.exposures
+    counts[:, 8] = 3
+    counts[:, 9, ::2] = sweep.exposures
+    tables = [
+        create_estimator(name, threads=n).estimate(volume_of(counts, sweep.geometry, 10), sweep.geometry)
+        for n in (1, 2, 5)
+    ]
+    for other in tables[1:]:
+        for field in ("x_px", "confidence", "x_sd_px", "signal", "haze"):
+            np.testing.assert_array_equal(getattr(other, field), getattr(tables[0], field))
+
+
+@pytest.mark.parametrize("near_is_left", [True, False])
+@pytest.mark.parametrize("name", ["argmax", "edge"])
+def test_ties_go_to_the_smallest_x_and_peaks_at_the_edge_stay_there(name, near_is_left) -> None:
+    counts = np.zeros((4, 1, 64), np.uint8)
+    counts[0, 0, [20, 40]] = 7
+    counts[1, 0, 10] = 7
+    counts[2, 0, 53] = 7
+    counts[3, 0, 30:34] = 7
+    volume, geometry = rows_of(counts, 10, near_is_left=near_is_left, x_lo=10, x_hi=53)
+    x = create_estimator(name).estimate(volume, geometry).x_px[0]
+    assert x[0] == 20 or name == "edge"
+    assert x[1] == 10
+    assert x[2] == 53
+    assert 29.5 <= x[3] <= 33.5
