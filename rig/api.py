@@ -8,7 +8,7 @@ result.last.depth_m, result.summary.truth
 from rig.api_config import SIMULATED, Config, PathLike, configure
 from rig.api_reconstruct import reconstruct
 from rig.api_recordings import compress, cut, export_run, import_frames, recording_info, repair, verify
-from rig.api_rig import bench, bench_disk, devices, doctor, effects, laser_off, soak, warm_up
+from rig.api_rig import bench, bench_disk, bench_simulator, devices, doctor, effects, flux_row, laser_off, soak, warm_up
 from rig.api_scan import MAX_SEED, plan_scan, replay, scan
 from rig.run import RunResult
 
@@ -20,6 +20,7 @@ __all__ = [
     "RunResult",
     "bench",
     "bench_disk",
+    "bench_simulator",
     "compress",
     "configure",
     "cut",
@@ -27,6 +28,7 @@ __all__ = [
     "doctor",
     "effects",
     "export_run",
+    "flux_row",
     "import_frames",
     "laser_off",
     "plan_scan",

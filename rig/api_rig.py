@@ -10,17 +10,36 @@ from rig.run import Progress
 if TYPE_CHECKING:
     from rig.attached import Attached
     from rig.bench.disk import DiskReport
+    from rig.bench.simulator import SimulatorReport
     from rig.bench.soak import SoakReport
     from rig.bench.speed import SpeedReport
     from rig.doctor import Finding
-    from rig.effects import Effect
+    from rig.effects import Flux, SceneEffects
 
 
-def effects(config: Config = SIMULATED, *, scene: str | None = None) -> "tuple[Effect, ...]":
-    """Which effects a simulated scene calls for, why, and what leaving each out would change (`rig effects`)."""
+def effects(
+    config: Config = SIMULATED, *, scene: str | None = None, trials: bool = True, progress: Progress | None = None
+) -> "SceneEffects":
+    """Which effects a simulated scene calls for, why, and what each is worth (`rig effects`).
+
+    trials: measure by how much each changes the stripe error, in pairs of short scans (seconds); progress: called with
+    those done and all.
+    """
     from rig.effects import scene_effects
 
-    return scene_effects(configure(config, scene=scene))
+    return scene_effects(configure(config, scene=scene), trials=trials, progress=progress)
+
+
+def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int | None, column: int | None) -> "Flux":
+    """Noise-free photons per exposure of one image row while the line is at a column's centre (`rig effects --row`).
+
+    Arrays (width,): x_px, total, and by name what each effect brings.
+    """
+    from rig.effects import flux_row as row_of
+
+    if row is None or column is None:
+        raise UsageError("the flux is that of one image row at one column of the scan; give both --row and --column")
+    return row_of(configure(config, scene=scene), row, column)
 
 
 def doctor(config: Config = SIMULATED, *, out: PathLike = "runs") -> "list[Finding]":
@@ -67,6 +86,16 @@ def bench_disk(folder: PathLike, *, progress: Progress | None = None) -> "DiskRe
     from rig.bench.disk import measure_disk
 
     return measure_disk(Path(folder), progress)
+
+
+def bench_simulator(config: Config = SIMULATED, *, progress: Progress | None = None) -> "SimulatorReport":
+    """How fast the simulator draws frames of a clear, a foggy and a crowded scene, beside plain numpy.
+
+    progress: called with rows done and all, of all rounds.
+    """
+    from rig.bench.simulator import measure_simulator
+
+    return measure_simulator(lambda scene: configure(config, scene=scene), progress=progress)
 
 
 def soak(

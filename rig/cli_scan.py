@@ -125,16 +125,38 @@ def reconstruct_command(
 
 @command
 def effects_command(
-    config: ConfigArgument = "simulated", scene: SceneOption = None, as_json: JsonOption = False
+    config: ConfigArgument = "simulated",
+    config_option: Annotated[
+        str | None, typer.Option("--config", metavar="CONFIG", help="the same as CONFIG", show_default=False)
+    ] = None,
+    scene: SceneOption = None,
+    trials: Annotated[
+        bool, typer.Option(help="measure by how much each effect changes the stripe error, in short scans")
+    ] = True,
+    row: Annotated[
+        int | None, typer.Option("--row", help="with --column: noise-free flux of this image row", show_default=False)
+    ] = None,
+    column: Annotated[
+        int | None, typer.Option("--column", help="of the scan, from 0: where the line is", show_default=False)
+    ] = None,
+    as_json: JsonOption = False,
 ) -> int:
-    """Which physical effects a scene calls for, why, and what leaving each out would change."""
+    """Which physical effects a scene calls for, why, and what each is worth; or the noise-free flux of an image row."""
     from rig import api
+    from rig.report_text import effects_table, flux_table
 
-    effects = api.effects(config, scene=scene)
+    chosen = config if config_option is None else config_option
+    if row is not None or column is not None:
+        flux = api.flux_row(chosen, scene=scene, row=row, column=column)
+        if as_json:
+            print_json(flux)
+        else:
+            flux_table(flux)
+        return 0
+    with progress("trial scans") as bar:
+        effects = api.effects(chosen, scene=scene, trials=trials, progress=bar)
     if as_json:
-        print_json({"effects": [effect.as_json() for effect in effects]})
+        print_json(effects.as_json())
     else:
-        from rig.report_text import effects_table
-
         effects_table(effects)
     return 0

@@ -1,12 +1,12 @@
 """Results for people: a run's pictures, errors and verdict; the effects of a scene."""
 
 import sys
-from collections.abc import Sequence
 
 from rich.console import Console
 from rich.table import Table
 
-from rig.effects import Effect
+from drivers.replay_pace import PaceReport
+from rig.effects import Effect, Flux, SceneEffects
 from rig.run import RunResult
 from rig.stages import PipelineStats
 from rig.summary import Summary, Synchronisation, Verdict
@@ -43,27 +43,44 @@ def run_table(result: RunResult) -> None:
     _console().print(table)
 
 
-def effects_table(effects: Sequence[Effect]) -> None:
-    """Print which effects are on, what they contribute and why, to stdout."""
+def effects_table(scene: SceneEffects) -> None:
+    """Print which effects are on, what each is worth and why, to stdout."""
     table = Table(box=None, pad_edge=False)
-    for name, justify in (
-        ("effect", "left"),
-        ("", "left"),
-        ("photons", "right"),
-        ("left out changes at most", "right"),
-    ):
-        table.add_column(name, justify="right" if justify == "right" else "left", no_wrap=True)
+    for name in ("effect", "", "photons", "stripe error", "decisions changed", "us per frame"):
+        table.add_column(name, justify="right" if name not in ("effect", "") else "left", no_wrap=True)
     table.add_column("why")
-    for effect in effects:
-        bound = _share_of_decisions(effect.changed_decisions_bound) if effect.on else "-"
+    for effect in scene:
+        bound = effect.changed_decisions_bound
         table.add_row(
             effect.effect,
             "on" if effect.on else "off",
             f"{effect.share:.1%}" if effect.on else "-",
-            f"{bound}, negligible" if effect.on and effect.negligible else bound,
+            _error_change(effect),
+            "-" if bound is None or not (effect.on or bound) else f"<= {bound:.2g}",
+            "-" if effect.cost_us_per_frame is None or not effect.on else f"{effect.cost_us_per_frame:.1f}",
             effect.why,
         )
     _console().print(table)
+    most = scene.planned_for
+    print(
+        f"left out together: <= {scene.changed_decisions_bound:.2g} of decisions changed, for columns of up to "
+        f"{most['exposures']:g} frames, {most['exposure_s'] * 1e3:g} ms and {most['power_w'] * 1e3:g} mW"
+    )
+
+
+def flux_table(flux: Flux) -> None:
+    """Print the flux of a row, a line for each pixel and a column for each effect, to stdout."""
+    print("  ".join(f"{name:>12}" for name in flux))
+    for x, *parts in zip(*flux.values(), strict=True):
+        print("  ".join([f"{x:>12}", *(f"{part:>12.6g}" for part in parts)]))
+
+
+def _error_change(effect: Effect) -> str:
+    if effect.stripe_error_change_px is None:
+        return "-"
+    if effect.basis == "bound":
+        return f"<= {effect.stripe_error_change_px:.2g} px" if effect.stripe_error_change_px else "-"
+    return f"{effect.stripe_error_change_px:+.3f} +- {effect.stripe_error_change_sd_px or 0.0:.3f} px"
 
 
 def _console() -> Console:
@@ -83,6 +100,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         ),
         *(() if summary.sync is None else (("sync", _sync(summary.sync)),)),
         *(() if summary.stages is None else (("stages", _stages(summary.stages)),)),
+        *(() if summary.replay is None or not summary.replay.blocks else (("clock", _clock(summary.replay)),)),
         ("filled", f"{_percent(summary.valid_fraction)} of the pixels have a depth"),
     ]
     fog = summary.fog
@@ -112,6 +130,14 @@ def _sync(sync: Synchronisation) -> str:
     return f"by {sync.by}{found}, residual {_number(sync.residual_columns, 2)} columns, clock {sync.clock_error:+.2g}"
 
 
+def _clock(report: PaceReport) -> str:
+    held = "" if report.held_s < LEAST_WAIT_S else f"; held up for {report.held_s:.3g} s by a full ring"
+    return (
+        f"blocks late by {report.late_mean_s * 1e3:.2g} +- {report.late_sd_s * 1e3:.2g} ms, at most "
+        f"{report.late_max_s * 1e3:.2g} ms{held}"
+    )
+
+
 def _stages(stages: PipelineStats) -> str:
     source = f"source {stages.source_fill_s:.3g} s" + (
         f" and {stages.source_wait_s:.3g} s of waiting" if stages.source_wait_s >= LEAST_WAIT_S else ""
@@ -131,10 +157,6 @@ def _stages(stages: PipelineStats) -> str:
 
 def _number(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}g}"
-
-
-def _share_of_decisions(bound: float) -> str:
-    return "every decision" if bound >= 1 else f"{100 * bound:.2g} % of decisions"
 
 
 def _percent(value: float | None) -> str:

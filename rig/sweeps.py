@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drivers.errors import ProtocolError
 from drivers.frames import FrameBlock, Mark
 from rig.binding import BoundFrames, FrameBinder, SweepClock
-from rig.counting import Counter, FrameTally
+from rig.counting import BIN_UNUSABLE, Counter, FrameTally
 from rig.geometry import WORD_PX
 from rig.scan_plan import ScanPlan
 
@@ -104,8 +104,9 @@ class SweepAssembler:
         self._binder = FrameBinder(plan, self._start.clock_ratio)
         self._adds: deque[int] = deque(maxlen=MOST_UNDER_WAY)
         self._next_frame: int | None = None
+        self._last_tick: int | None = None
         self._gaps: list[Gap] = []
-        self._received = self._lit = self._dark = 0
+        self._received = self._lit = self._dark = self._repeated = 0
         self._count_s = 0.0
         self._run_id: int | None = None
         self._width: int | None = None
@@ -121,6 +122,7 @@ class SweepAssembler:
         begun = time.perf_counter()
         bound, clocks = self._binder.bind(block)
         x0 = self._windows(block, bound)
+        repeated = self._note_repeated(block, bound)
         self._count_s += time.perf_counter() - begun
         self.frames_seen += block.n_frames
         self._adds.append(0)
@@ -138,7 +140,7 @@ class SweepAssembler:
             begun = time.perf_counter()
             bins = bound.bins[a:b]
             lit, dark = self._cover(bins, x0[a:b], self._used_px, self._column_x0, self._plan.window)
-            self._received += b - a
+            self._received += b - a - int(np.count_nonzero((repeated >= a) & (repeated < b)))
             self._lit += lit
             self._dark += dark
             self._counter.add(block.bits[a:b], bins, bound.column[a:b], x0[a:b])
@@ -189,6 +191,21 @@ class SweepAssembler:
         if self._next_frame is not None and first > self._next_frame:
             self._gaps.append((self._next_frame, first - 1))
         self._next_frame = first + block.n_frames
+
+    def _note_repeated(self, block: FrameBlock, bound: BoundFrames) -> NDArray[np.int64]:
+        """Indices of frames whose ticks do not rise: the one before them once more, in their place. They are lost."""
+        ticks = block.start_ticks
+        before = ticks[0] - 1 if self._last_tick is None else self._last_tick
+        repeated = np.flatnonzero(np.diff(ticks, prepend=before) <= 0)
+        self._last_tick = int(ticks[-1])
+        if repeated.size:
+            bound.bins[repeated] = BIN_UNUSABLE
+            numbers = block.frame_numbers[repeated].tolist()
+            self._gaps += [(number, number) for number in numbers]
+            if not self._repeated:
+                _log.warning("frame %d has the ticks of the one before it; such frames count as lost", numbers[0])
+            self._repeated += len(numbers)
+        return repeated
 
     def _windows(self, block: FrameBlock, bound: BoundFrames) -> NDArray[np.int32]:
         """First pixel used of each frame, int32 (n,): what its record says, or for full frames what the plan says."""

@@ -15,7 +15,7 @@ from calibration.model import Lag
 from drivers.clock import NS_PER_S, Clock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, Pulse, ScanWaveform
 from sim_backend.gate_program import GateProgram, gate_shares
-from sim_backend.mirror_motion import Motion, Playing, Resting
+from sim_backend.mirror_motion import Jitter, Motion, Playing, Resting
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,8 @@ class Happening:
 
     mirror: (n,) mirror position, as a command, in the middle of each exposure. share: (n,) part of the exposure with
     the gate high. edge: (n,) bool, the gate changed during the exposure. backward: (n,) bool, direction level at the
-    start. line_s, scan_s: times of marker edges. power_w: emitted power, 0 while paused."""
+    start. line_s, scan_s: times of marker edges. power_w: emitted power, 0 while paused. jitter: (n,) or 0, by how much
+    the mirror is off that position."""
 
     mirror: Array
     share: Array
@@ -35,6 +36,7 @@ class Happening:
     line_s: Array
     scan_s: Array
     power_w: float
+    jitter: Array | float = 0.0
 
 
 class Bench:
@@ -42,13 +44,15 @@ class Bench:
 
     def __init__(self, clock: Clock, lag: Lag) -> None:
         self.clock = clock
-        self._lag = lag
+        self.lag = lag
         self._epoch_ns = clock.now_ns()
         self._lock = threading.RLock()
         self._motion: Motion = Resting(0.0)
         self._program: GateProgram | None = None
         self._aborted = False
         self._power_w = 0.0
+        self.jitter = Jitter(0.0, 0)
+        """How the mirror shakes."""
 
     def now_s(self) -> float:
         """Present time of the bench."""
@@ -62,7 +66,7 @@ class Bench:
         """Start the mirror, `latency_s` from now."""
         with self._lock:
             start_s = self.now_s() + latency_s
-            self._motion = Playing(waveform, repeats, start_s, rate_hz, self._lag.forward, self._lag.backward)
+            self._motion = Playing(waveform, repeats, start_s, rate_hz, self.lag.forward, self.lag.backward)
 
     def rest(self, command: float) -> None:
         """Stop the mirror at a command, now."""
@@ -130,6 +134,7 @@ class Bench:
                 line_s=motion.edges(MARKER_LINE, float(start_s[0]), until_s),
                 scan_s=motion.edges(MARKER_SCAN, float(start_s[0]), until_s),
                 power_w=self._power_w,
+                jitter=self.jitter.error(start_s + 0.5 * exposure_s) if self.jitter.rms else 0.0,
             )
 
     def _gate(self, start_s: Array, exposure_s: float, until_s: float) -> tuple[Array, NDArray[np.bool_]]:

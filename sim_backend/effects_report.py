@@ -1,70 +1,151 @@
-"""Which effects a scene calls for, what share of the photons each brings, and what leaving it out would change.
+"""What every effect of a world is worth: on or off, why, its share of the photons, what it costs; and a row's flux.
 
-A change D of the flux matters only through its divergence, per pixel and exposure about D^2 / (2 (e^lambda - 1)). With
-eps the sum over a row's pixels and a column's exposures, the data of a row differ in total variation by at most
-sqrt(eps/2) (Pinsker's inequality). An effect with eps below 2e-4 changes at most 1 % of the decisions."""
+An effect's light is what the flux is more (or less) once it has acted on that of the effects before it, so that the
+effects' lights add up to the flux. Costs are medians of one thread's time, measured when asked for: light per column,
+divided among the frames that share it, what happens to bits per whole frame; light that does not depend on the laser is
+made once for all.
+"""
 
+import time
+from collections.abc import Mapping
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.effects.catalogue import CATALOGUE, Entry
-from sim_backend.flux import FluxModel
+from sim_backend.effect_planner import Decision
+from sim_backend.effects.catalogue import CATALOGUE, MEASURED
+from sim_backend.effects.setting import FrameTimes, Words
+from sim_backend.flux import FluxModel, hold_s
+from sim_backend.light_sheet import LightSheet
+from sim_backend.random_lanes import WORD_PX
 
 if TYPE_CHECKING:
     from sim_backend.world import SimulatedWorld
 
 Array = NDArray[np.float64]
 
-NEGLIGIBLE = 2e-4
-"""Divergence per row and column below which at most 1 % of decisions change."""
-SAMPLED_COLUMNS = 16
+MOTION = "motion"
+TIMED_FRAMES = 50
+TIMED_ROUNDS = 5
+SPARSITY = 6
+"""Bits are timed on frames with 1 pixel in 2^6 lit, as in fog."""
 
 
-def effects_report(
-    world: "SimulatedWorld", *, power_w: float, exposure_s: float, exposures: int
-) -> list[dict[str, Any]]:
-    """One entry per known effect, means over the rows of 16 mirror positions spread over the range.
+def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
+    """For columns of `exposures` frames at a power.
 
-    Keys: effect; on; why; share (of all detected photons, before saturation); divergence (eps above, with `exposures`
-    exposures); changed_decisions_bound (sqrt(eps/2), at most 1); negligible (eps < 2e-4).
+    planned_for: power_w, exposure_s (of a column's frames together) and exposures that the plan holds for.
+    changed_decisions_bound: of all that was left out together. effects: one mapping for each of the catalogue, with
+    effect, on, why, share (of the detected photons, before saturation, over 16 mirror positions),
+    changed_decisions_bound (None: unknown), removable (whether the world can do without), cost_us_per_frame (None: a
+    device's own).
     """
-    low, high = world.model.scanner.command_range
-    planes = world.model.planes(low + (np.arange(SAMPLED_COLUMNS) + 0.5) * (high - low) / SAMPLED_COLUMNS)
-    called = {entry.name: entry.called(world.scene, world.config.sensor) for entry in CATALOGUE}
-    parts = {e.name: _part(world, e, planes, exposure_s, power_w) for e in CATALOGUE if called[e.name][0]}
-    total = np.sum([np.broadcast_to(part, (SAMPLED_COLUMNS, *world.size)) for part in parts.values()], axis=0)
-    counted = -np.expm1(-total)
-    report = []
-    for entry in CATALOGUE:
-        on, why = called[entry.name]
-        report.append(_line(entry.name, on, why, parts.get(entry.name, np.zeros((1, 1, 1))), total, exposures))
-    why = "a pixel counts at most one photon per exposure"
-    report.append(_line("saturation", True, why, total - counted, total, exposures))
-    return report
-
-
-def _part(world: "SimulatedWorld", entry: Entry, planes: Array, exposure_s: float, power_w: float) -> Array:
-    """Photons per exposure of one effect alone, (columns or 1, rows, width)."""
-    alone = FluxModel(world.setting, [entry])
-    if not entry.from_laser:
-        return exposure_s * alone.steady_per_s[None]
-    return np.stack([alone.flux(plane, exposure_s, power_w) for plane in planes])
-
-
-def _line(name: str, on: bool, why: str, part: Array, total: Array, exposures: int) -> dict[str, Any]:
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        each = np.where(part > 0, part * part / (2 * np.expm1(total)), 0.0)
-    eps = exposures * float(each.sum(axis=-1).mean()) if on else 0.0
-    whole = float(total.sum())
-    share = float(np.broadcast_to(part, total.shape).sum()) / whole if whole > 0 and on else 0.0
+    plan, model = world.effect_plan, world.flux_model
+    photons, laser_us = _light(world, model, power_w * exposure_s, exposure_s, exposures)
+    photons |= {name: exposure_s * float(rate.sum()) for name, rate in model.steady.items()}
+    whole = sum(photons.values())
+    costs: dict[str, float | None] = {**laser_us, **_bits_us(world, model, FrameTimes(exposure_s, exposure_s))}
+    costs |= {entry.name: None for entry in CATALOGUE if entry.kind == "device"}
     return {
-        "effect": name,
-        "on": on,
-        "why": why,
-        "share": share,
-        "divergence": eps,
-        "changed_decisions_bound": min(1.0, float(np.sqrt(eps / 2))),
-        "negligible": eps < NEGLIGIBLE,
+        "planned_for": {
+            "power_w": plan.planned_for.power_w,
+            "exposure_s": plan.planned_for.exposure_s,
+            "exposures": plan.planned_for.exposures,
+        },
+        "changed_decisions_bound": plan.changes,
+        "effects": [
+            _line(decision, photons.get(decision.entry.name, 0.0) / whole if whole > 0 else 0.0, costs)
+            for decision in plan.decisions
+        ],
     }
+
+
+def flux_row(
+    world: "SimulatedWorld", row: int, plane: Array, *, power_w: float, exposure_s: float
+) -> Mapping[str, Array]:
+    """Photons per exposure (width,) of a row by effect of light or dark counts, zeros for those that are off."""
+    model = world.flux_model
+    lit = {name: rate[0] for name, (rate, _) in _parts(model, world.setting.view.sheet(plane), row, row + 1).items()}
+    found = {}
+    for entry in CATALOGUE:
+        if entry.kind == "laser":
+            found[entry.name] = exposure_s * power_w * lit.get(entry.name, np.zeros(world.size[1]))
+        elif entry.kind == "steady":
+            steady = model.steady.get(entry.name)
+            found[entry.name] = np.zeros(world.size[1]) if steady is None else exposure_s * steady[row]
+    return found
+
+
+def _line(decision: Decision, share: float, costs: Mapping[str, float | None]) -> dict[str, Any]:
+    entry = decision.entry
+    return {
+        "effect": entry.name,
+        "on": decision.on,
+        "why": decision.why,
+        "share": share,
+        "changed_decisions_bound": decision.changes,
+        "removable": entry.name != MEASURED and entry.kind != "device",
+        "cost_us_per_frame": costs.get(entry.name, 0.0) if decision.on else 0.0,
+    }
+
+
+def _light(
+    world: "SimulatedWorld", model: FluxModel, joules: float, exposure_s: float, exposures: int
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Of every effect of the laser: mean photons per frame over the mirror positions, and us per frame."""
+    sheets = [world.setting.view.sheet(plane) for plane in world.sampled_planes]
+    _parts(model, sheets[0], 0, 1)  # compiled, and in the cache
+    parts = [_parts(model, sheet, 0, world.size[0]) for sheet in sheets]
+    photons, us = {}, {}
+    for name, effect in model.laser.items():
+        held = hold_s(effect)
+        frames = exposures if held == 0 else min(exposures, max(1, round(held / exposure_s)))
+        photons[name] = joules * float(np.mean([part[name][0].sum() for part in parts]))
+        took_s = [part[name][1] for part in parts]
+        if name == MOTION:  # its work is the view that all others ask for, whatever the columns
+            took_s = [_view_s(world, (turn + 1) * held) for turn in range(TIMED_ROUNDS)]
+            frames = max(1, round(held / exposure_s))
+        us[name] = 1e6 * median(took_s) / frames
+    return photons, us
+
+
+def _view_s(world: "SimulatedWorld", time_s: float) -> float:
+    """Seconds that the view of a new time takes."""
+    begun_s = time.perf_counter()
+    world.setting.view.at(time_s)
+    return time.perf_counter() - begun_s
+
+
+def _parts(model: FluxModel, sheet: LightSheet, first_row: int, last_row: int) -> dict[str, tuple[Array, float]]:
+    """What each effect of the laser adds, detections per second and watt (rows, width), and the seconds it took."""
+    rate = np.zeros_like(model.steady_per_s)
+    parts = {}
+    for name, effect in model.laser.items():
+        before = rate[first_row:last_row].copy()
+        begun_s = time.perf_counter()
+        effect.add(sheet, first_row, last_row, rate)
+        took_s = time.perf_counter() - begun_s
+        parts[name] = rate[first_row:last_row] - before, took_s
+    return parts
+
+
+def _bits_us(world: "SimulatedWorld", model: FluxModel, times: FrameTimes) -> dict[str, float]:
+    """Of every effect on the bits: microseconds per whole frame."""
+    rows, width = world.size
+    rng = np.random.default_rng(0)
+    shape = (TIMED_FRAMES + 1, rows, -(-width // WORD_PX))
+    frames: Words = rng.integers(0, 2**64, shape, np.uint64)
+    for _ in range(SPARSITY - 1):
+        frames &= rng.integers(0, 2**64, shape, np.uint64)
+    us = {}
+    for name, effect in model.bits.items():
+        took_s = []
+        for turn in range(TIMED_ROUNDS + 1):
+            words = frames[1:].copy()
+            begun_s = time.perf_counter()
+            effect.apply(np.uint64(turn), 1, words, frames[0], times)
+            took_s.append(time.perf_counter() - begun_s)
+        us[name] = 1e6 * median(took_s[1:]) / TIMED_FRAMES
+    return us

@@ -1,4 +1,4 @@
-"""The flux of every pixel: detected photons per exposure for one mirror command, from the effects a scene calls for.
+"""The flux of every pixel: detected photons per exposure for one mirror command, from the effects that are run.
 
     lambda = exposure (steady + share power sheet),     p = 1 - exp(-lambda)
 
@@ -6,13 +6,14 @@ share is the part of the exposure during which the gate let light out. `steady` 
 about 3 ms for 512 x 512 pixels in fog on one core.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_backend.effects.catalogue import CATALOGUE, Entry
-from sim_backend.effects.setting import LaserEffect, Setting, SteadyEffect
+from sim_backend.effects.setting import BitEffect, LaserEffect, Setting
 from sim_backend.light_sheet import LightSheet
 
 Array = NDArray[np.float64]
@@ -22,21 +23,47 @@ class FluxModel:
     """Sums the effects of one rig in one scene. Reads only; any thread may use it."""
 
     def __init__(self, setting: Setting, entries: Sequence[Entry] | None = None) -> None:
-        """entries: the effects to use; by default those that the scene calls for."""
+        """entries: the effects to use, in the catalogue's order; by default all that the scene calls for."""
         if entries is None:
-            entries = [entry for entry in CATALOGUE if entry.called(setting.scene, setting.sensor)[0]]
+            entries = [entry for entry in CATALOGUE if entry.called(setting)[0]]
         self.setting = setting
-        self.names = tuple(entry.name for entry in entries)
-        self._laser: list[LaserEffect] = [entry.load()(setting) for entry in entries if entry.from_laser]
-        steady: list[SteadyEffect] = [entry.load()(setting) for entry in entries if not entry.from_laser]
-        self.steady_per_s: Array = np.zeros(setting.view.u.shape)
+        loaded = {entry: entry.load()(setting) for entry in entries if entry.kind != "device"}
+        self.laser: Mapping[str, LaserEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "laser"}
+        """By name, in the order in which they add: a later one may act on what the earlier ones brought."""
+        self.steady: Mapping[str, Array] = {e.name: effect.rate() for e, effect in loaded.items() if e.kind == "steady"}
+        """Detections per second (rows, width) by name."""
+        self.bits: Mapping[str, BitEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "bits"}
+        """What the sensor does to the bits, by name, in the order in which it does."""
+        self.steady_per_s: Array = sum(self.steady.values(), np.zeros(setting.view.u.shape))
         """Detections per second without the laser, float64 (rows, width)."""
-        for effect in steady:
-            self.steady_per_s += effect.rate()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The effects whose code runs."""
+        return (*self.laser, *self.steady, *self.bits)
+
+    @property
+    def bit_effects(self) -> tuple[BitEffect, ...]:
+        """What the sensor does to the bits, in the order in which it does."""
+        return tuple(self.bits.values())
+
+    @property
+    def hold_s(self) -> float:
+        """For how long the sheet's light may be taken as constant; 0: nothing moves, it is constant for ever."""
+        return min((held for effect in self.laser.values() if (held := hold_s(effect)) > 0), default=0.0)
+
+    def without(self, names: Collection[str]) -> "FluxModel":
+        """The same with fewer effects, which are not made anew."""
+        fewer = copy(self)
+        fewer.laser = {name: effect for name, effect in self.laser.items() if name not in names}
+        fewer.steady = {name: rate for name, rate in self.steady.items() if name not in names}
+        fewer.bits = {name: effect for name, effect in self.bits.items() if name not in names}
+        fewer.steady_per_s = sum(fewer.steady.values(), np.zeros_like(self.steady_per_s))
+        return fewer
 
     def add_sheet(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt from the sheet to `rate`, rows first_row..last_row-1. Releases the GIL."""
-        for effect in self._laser:
+        for effect in self.laser.values():
             effect.add(sheet, first_row, last_row, rate)
 
     def flux(self, plane: Array, exposure_s: float, power_w: float, share: float = 1.0) -> Array:
@@ -46,3 +73,8 @@ class FluxModel:
         rate = np.zeros_like(self.steady_per_s)
         self.add_sheet(sheet, 0, view.rows, rate)
         return exposure_s * (self.steady_per_s + share * power_w * rate)
+
+
+def hold_s(effect: LaserEffect) -> float:
+    """For how long an effect's light stands still; 0: it does not move."""
+    return float(getattr(effect, "hold_s", 0.0))

@@ -1,16 +1,14 @@
-"""From light to detections: lens, sensor, laser line and dark counts of the simulated rig.
+"""From light to detections: lens, sensor and laser line of the simulated rig.
 
 Detections per second of a pixel that sees radiance L:  FF PDP T (pi/4)/N^2 pitch^2 L / (h c / wavelength).
 """
 
 import math
-from typing import Annotated
+from typing import Annotated, Self
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from drivers.units import CountsPerSecond, Metres, Radians
+from drivers.units import CountsPerSecond, Metres, Ppm, Radians, Seconds
 
 PLANCK_J_S = 6.62607015e-34
 LIGHT_M_PER_S = 299792458.0
@@ -18,14 +16,6 @@ LIGHT_M_PER_S = 299792458.0
 DAYLIGHT_W_PER_M3_LUX = 1.4e4
 """Spectral irradiance of daylight near 520 nm per lux, W/m^2 per metre of wavelength: 1.5 W/m^2/nm at 110 klux
 (ASTM G173 global sunlight)."""
-
-_TAIL_SHARE = 0.01
-_TAIL_START, _TAIL_POWER = 10.0, math.log(5) / math.log(10)
-"""1 % of the pixels lie above 10 times the median dark rate, a fifth of those above 100 times: a power law of exponent
-log10(5), as in published dark count maps of arrays of this class."""
-_BODY_WIDTH = 0.5
-"""Standard deviation of ln(dark rate) of the ordinary pixels."""
-_MAX_DARK_RATIO = 1e5
 
 
 class _Part(BaseModel):
@@ -39,6 +29,8 @@ class Optics(_Part):
     transmission: float = Field(default=0.85, gt=0, le=1)
     filter_width: Annotated[Metres, Field(gt=0)] = 10e-9
     """Bandwidth of the filter around the laser line; it decides how much ambient light gets in."""
+    focus: Annotated[Metres, Field(gt=0)] | None = None
+    """Depth at which the picture is sharp; leave out for a lens that is sharp at every depth."""
 
 
 class Sensor(_Part):
@@ -50,7 +42,29 @@ class Sensor(_Part):
     dark_rate: Annotated[CountsPerSecond, Field(ge=0)] = 20.0
     """Median over the pixels; the distribution has a heavy tail of hot ones."""
     pixel_seed: int = Field(default=1, ge=0)
-    """Which pixels are hot: a property of the one sensor, the same in every run."""
+    """Which pixels are hot or dead: a property of the one sensor, the same in every run."""
+    dead_share: Annotated[Ppm, Field(ge=0, le=1)] = 0.0
+    """Pixels that read 0 in every frame."""
+    hot_share: Annotated[Ppm, Field(ge=0, le=1)] = 0.0
+    """Pixels that read 1 in every frame, beyond those in the tail of `dark_rate`."""
+    crosstalk: Annotated[Ppm, Field(ge=0, le=0.5)] = 0.0
+    """Neighbours that a detection sets off, on average; 0.1 to 0.2 % in arrays of this class."""
+    afterpulsing: Annotated[Ppm, Field(ge=0, le=0.5)] = 0.0
+    """Detections that a detection is followed by, whenever; 0.1 to 1 %."""
+    trap_lifetime: Annotated[Seconds, Field(gt=0, le=1)] = 100e-9
+    """Mean time until an afterpulse."""
+    dead_time: Annotated[Seconds, Field(ge=0, le=1e-6)] = 0.0
+    """How long a pixel is blind after a detection."""
+    bit_error_rate: Annotated[Ppm, Field(ge=0, le=0.5)] = 0.0
+    """Chance of every pixel of a frame to be read wrongly."""
+
+    @model_validator(mode="after")
+    def _one_defect_a_pixel(self) -> Self:
+        if self.dead_share + self.hot_share > 1:
+            raise ValueError(
+                f"dead_share {self.dead_share:g} and hot_share {self.hot_share:g} are more than all pixels"
+            )
+        return self
 
 
 class Line(_Part):
@@ -61,6 +75,12 @@ class Line(_Part):
     """The power is spread evenly over this angle; it is taken to cover the picture."""
     sigma_px: float = Field(default=0.6, gt=0.05, le=20)
     """Gaussian width of the stripe in the picture, pixels: line width and blur of the lens together."""
+    spread: Annotated[Radians, Field(ge=0, lt=0.1)] = 0.0
+    """Full angle (1/e^2) by which the sheet gets thicker on its way, on top of `sigma_px`."""
+    thickness: Annotated[Metres, Field(gt=0, le=0.1)] = 2e-3
+    """Full thickness (1/e^2) of the sheet where it leaves the mirror: which drops and flakes are in it."""
+    speckle: bool = False
+    """Whether the laser is coherent enough for its light to come back grainy."""
 
 
 def detections_per_radiance(optics: Optics, sensor: Sensor, line: Line) -> float:
@@ -73,12 +93,3 @@ def detections_per_radiance(optics: Optics, sensor: Sensor, line: Line) -> float
 def ambient_irradiance(illuminance_lux: float, optics: Optics) -> float:
     """Daylight within the filter's band, W/m^2."""
     return illuminance_lux * DAYLIGHT_W_PER_M3_LUX * optics.filter_width
-
-
-def dark_rates(sensor: Sensor, size: tuple[int, int]) -> NDArray[np.float64]:
-    """Dark counts per second of every pixel, float64 (rows, width), the same for the same sensor."""
-    rng = np.random.default_rng(sensor.pixel_seed)
-    ratio = np.exp(_BODY_WIDTH * rng.standard_normal(size))
-    hot = rng.random(size) < _TAIL_SHARE
-    tail = _TAIL_START * (1 - rng.random(size)) ** (-1 / _TAIL_POWER)
-    return sensor.dark_rate * np.where(hot, np.minimum(tail, _MAX_DARK_RATIO), ratio)

@@ -1,97 +1,56 @@
-"""What a scene file says: surfaces, medium, ambient light. Unknown keys are refused, quantities carry units.
+"""What a scene file says: surfaces, medium, weather, ambient light, motion. Unknown keys are refused, quantities carry
+units.
 
 surfaces: street              # the built-in street, or a folder with world.npz or with disparity.npy and left.png
-medium: {fog: {visibility: 30 m}, backscatter: 0.05 /sr}      # or {extinction: 0.13 /m}; leave out for clear air
-ambient: {illuminance: 100 lux}                               # leave out for darkness
+medium: {fog: {visibility: 30 m}, backscatter: 0.05 /sr}      # or smoke, `sim_backend.medium`; none: clear air
+rain: {rate: 20 mm/h}                                         # or snow: {rate: 2 mm/h}, `sim_backend.weather`
+ambient: {illuminance: 100 lux}                               # none: darkness
+motion: {velocity: [0 m/s, 0 m/s, -2 m/s]}                    # of all surfaces: x right, y down, z away from the camera
+seed: 1                                                       # where the drops are
 """
 
-import re
 from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, ValidationError, model_validator
+from pydantic import Field, ValidationError
 
 from drivers.errors import DeviceError
-from drivers.units import Lux, Metres, PerMetre
+from drivers.units import Lux, MetresPerSecond
+from sim_backend.medium import Medium, Section
 from sim_backend.scenes.prepared import load_folder
 from sim_backend.scenes.surfaces import Surfaces
 from sim_backend.view import Array
+from sim_backend.weather import Rain, Snow
 
-KOSCHMIEDER = 3.912
-"""-ln(0.02): extinction times visibility at 2 % contrast (Koschmieder's law)."""
 SCENE_FOLDER = Path(__file__).parent.parent / "config" / "scenes"
 """Where the bundled scenes are found by name."""
 
-_PER_STERADIAN = re.compile(r"\s*(\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+)\s*/sr\s*", re.ASCII)
 
-
-def _parse_per_steradian(text: object) -> float:
-    match = _PER_STERADIAN.fullmatch(text) if isinstance(text, str) else None
-    if match is None:
-        raise ValueError(f'{text!r} is no phase function value; write a number per steradian such as "0.05 /sr"')
-    return float(match[1])
-
-
-PerSteradian = Annotated[
-    float,
-    PlainValidator(_parse_per_steradian),
-    PlainSerializer(lambda value: f"{value!r} /sr", return_type=str, when_used="json"),
-]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Fog(_Section):
-    """Fog by how far one sees in it (2 % contrast)."""
-
-    visibility: Annotated[Metres, Field(gt=0)]
-
-
-class Medium(_Section):
-    """A homogeneous scattering medium. Exactly one of `fog` and `extinction` says how dense it is."""
-
-    fog: Fog | None = None
-    extinction: Annotated[PerMetre, Field(gt=0)] | None = None
-    backscatter: PerSteradian = 0.05
-    """Phase function near 180 degrees. Water droplets about 0.05 /sr (lidar ratio 18 to 20 sr), isotropic 0.0796."""
-    scattering_share: float = Field(default=1.0, ge=0, le=1)
-    """Scattering over extinction; droplets hardly absorb visible light."""
-
-    @model_validator(mode="after")
-    def _one_density(self) -> "Medium":
-        if (self.fog is None) == (self.extinction is None):
-            raise ValueError("give exactly one of 'fog' and 'extinction', e.g. fog: {visibility: 30 m}")
-        return self
-
-    @property
-    def extinction_per_m(self) -> float:
-        """Extinction coefficient in 1/m."""
-        if self.fog is not None:
-            return KOSCHMIEDER / self.fog.visibility
-        assert self.extinction is not None, "the validator lets exactly one be absent"
-        return self.extinction
-
-    @property
-    def scattering_per_m(self) -> float:
-        """Scattering coefficient in 1/m."""
-        return self.scattering_share * self.extinction_per_m
-
-
-class Ambient(_Section):
+class Ambient(Section):
     """Daylight or lamps on the scene, diffuse."""
 
     illuminance: Annotated[Lux, Field(ge=0)]
 
 
-class SceneFile(_Section):
+class Motion(Section):
+    """How the surfaces move, all of them together and straight on, from the bench's time 0 on."""
+
+    velocity: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond]
+    """Along x (right), y (down), z (away from the camera)."""
+
+
+class SceneFile(Section):
     """A whole scene file."""
 
     surfaces: str = "street"
     medium: Medium | None = None
+    rain: Rain | None = None
+    snow: Snow | None = None
     ambient: Ambient | None = None
+    motion: Motion | None = None
+    seed: int = Field(default=1, ge=0, lt=2**63)
+    """Which drops and flakes there are, where, and which speckle."""
 
     @property
     def illuminance_lux(self) -> float:
@@ -100,8 +59,13 @@ class SceneFile(_Section):
 
     @property
     def extinction_per_m(self) -> float:
-        """Extinction coefficient in 1/m, 0 in clear air."""
-        return 0.0 if self.medium is None else self.medium.extinction_per_m
+        """Extinction coefficient in 1/m of all that is in the air, 0 in clear air."""
+        return sum((part.extinction_per_m for part in (self.medium, self.rain, self.snow) if part is not None), 0.0)
+
+    @property
+    def diffuse_extinction_per_m(self) -> float:
+        """The same for light that may be turned a little on its way: what haze, airlight and ambient light feel."""
+        return self.extinction_per_m - (0.0 if self.medium is None else self.medium.forward_per_m)
 
 
 def bundled_scenes() -> tuple[str, ...]:

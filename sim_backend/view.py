@@ -1,6 +1,7 @@
 """What the camera sees of a scene, per pixel, as the light transport needs it: rays, inverse depth, facets, albedo."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +14,21 @@ from sim_backend.scenes.surfaces import Surfaces
 Array = NDArray[np.float64]
 
 
+class Moves(Protocol):
+    """What makes the surfaces move."""
+
+    def view(self, still: "View", time_s: float) -> "View":
+        """The view at a time of the bench; `still` is that at time 0. Any thread may ask."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
     """Rays and surfaces on the camera's pixel grid. All maps float64 (rows, width).
 
     u, v: ray tangents, NaN where the lens has no inverse. u_x, v_x: their slopes per pixel along the row.
     surface: inverse depth in 1/m (0: nothing there). facet: (rows, width, 3), the plane m.X = 1 through each surface
-    point. albedo: 0..1. source_m: (3,) where the light leaves the mirror."""
+    point. albedo: 0..1. source_m: (3,) where the light leaves the mirror. motion: None where nothing moves."""
 
     u: Array
     v: Array
@@ -29,6 +38,11 @@ class View:
     facet: Array
     albedo: Array
     source_m: Array
+    motion: Moves | None = None
+
+    def at(self, time_s: float) -> "View":
+        """The view at a time of the bench."""
+        return self if self.motion is None else self.motion.view(self, time_s)
 
     @property
     def rows(self) -> int:
@@ -40,9 +54,20 @@ class View:
         """Pixels per row."""
         return int(self.u.shape[1])
 
-    def sheet(self, plane: Array) -> LightSheet:
-        """The light sheet of the plane (4,) = nx, ny, nz, d, traced on every row."""
-        sheet = empty_sheet(plane, self.rows)
+    @property
+    def focal_px(self) -> float:
+        """Pixels along the row per unit of tangent, in the middle of the picture."""
+        return 1.0 / abs(float(self.u_x[self.rows // 2, self.width // 2]))
+
+    @property
+    def median_depth_m(self) -> float:
+        """Of the surfaces in the picture; 0 where there is none."""
+        lit = self.surface[self.surface > 0]
+        return 1.0 / float(np.median(lit)) if len(lit) else 0.0
+
+    def sheet(self, plane: Array, time_s: float = 0.0) -> LightSheet:
+        """The light sheet of the plane (4,) = nx, ny, nz, d at a time of the bench, traced on every row."""
+        sheet = empty_sheet(plane, self.rows, time_s)
         self.trace(sheet, 0, self.rows)
         return sheet
 
@@ -51,7 +76,7 @@ class View:
         trace_rows(
             self.u,
             self.v,
-            self.surface,
+            self.at(sheet.time_s).surface,
             sheet.inverse,
             first_row,
             last_row,
@@ -62,7 +87,7 @@ class View:
         )
 
 
-def make_view(model: RigModel, surfaces: Surfaces) -> View:
+def make_view(model: RigModel, surfaces: Surfaces, motion: Moves | None = None) -> View:
     """View of the surfaces through the model's camera. The model must know where its light comes from (`source_m`)."""
     assert model.source_m is not None, "checked by the world"
     u, v = model.camera.tangents()
@@ -79,6 +104,7 @@ def make_view(model: RigModel, surfaces: Surfaces) -> View:
         facet=_facets(surface, (u, v), (u_x, v_x, u_y, v_y)),
         albedo=surfaces.albedo.astype(np.float64),
         source_m=np.array(model.source_m, dtype=np.float64),
+        motion=motion,
     )
 
 
@@ -86,7 +112,11 @@ def _slope(tangent: Array, axis: int) -> Array:
     if tangent.shape[axis] < 2:
         return np.zeros_like(tangent)
     slope: Array = np.gradient(tangent, axis=axis)
-    return slope
+    # Beside a pixel without a ray the step to the other neighbour counts; a pixel alone has no slope.
+    step, none = np.diff(tangent, axis=axis), np.full_like(np.take(tangent, [0], axis), np.nan)
+    for one_sided in (np.concatenate([step, none], axis), np.concatenate([none, step], axis)):
+        slope = np.where(np.isnan(slope), one_sided, slope)
+    return np.where(np.isnan(slope) & ~np.isnan(tangent), 0.0, slope)
 
 
 def _facets(surface: Array, rays: tuple[Array, Array], slopes: tuple[Array, Array, Array, Array]) -> Array:

@@ -1,11 +1,13 @@
 """The simulated world: a scene in front of a rig, the bench its devices stand on, and the truth of a sweep."""
 
+from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from calibration.errors import CalibrationError
 from calibration.files import load_rig_model
@@ -13,17 +15,31 @@ from calibration.model import RigModel
 from drivers.errors import DeviceError
 from drivers.interfaces import SweepTruth
 from drivers.registry import Kind, KindConfig, Surroundings
-from sim_backend.bench import Bench
+from sim_backend.bench import Bench, Happening
 from sim_backend.command_grid import column_grid, fine_grid
-from sim_backend.effects.setting import Setting
+from sim_backend.effect_planner import MOST, SAMPLED_COLUMNS, EffectPlan, Wanted, is_wanted, plan_effects
+from sim_backend.effects.catalogue import CATALOGUE
+from sim_backend.effects.setting import FrameTimes, PlannedFor, Setting
 from sim_backend.flux import FluxModel
 from sim_backend.optics import Line, Optics, Sensor, detections_per_radiance
+from sim_backend.photons import PhotonSource
 from sim_backend.scene import load_scene, load_surfaces
 from sim_backend.view import make_view
+
+if TYPE_CHECKING:
+    from sim_backend.numpy_frames import NumpyFrames
 
 Array = NDArray[np.float64]
 
 DEFAULT_GEOMETRY = Path(__file__).parent.parent / "config" / "simulated-rig.yaml"
+
+
+def _known(wanted: Wanted) -> Wanted:
+    names = [entry.name for entry in CATALOGUE]
+    unknown = [name for name in wanted if name not in names] if isinstance(wanted, tuple) else []
+    if unknown:
+        raise ValueError(f"unknown effect {unknown[0]!r}; name some of: {', '.join(names)}; or write planned or all")
+    return wanted
 
 
 class CommandGridConfig(BaseModel):
@@ -49,6 +65,10 @@ class WorldConfig(KindConfig):
     optics: Optics = Field(default_factory=Optics)
     sensor: Sensor = Field(default_factory=Sensor)
     line: Line = Field(default_factory=Line)
+    effects: Annotated[Wanted, AfterValidator(_known)] = "planned"
+    """Which of the effects that the scene calls for are simulated: without those that provably change next to nothing,
+    `all`, or a list of names (for ablations).
+    """
     command_grid: CommandGridConfig | None = None
     """Mirror commands at which the flux is held, for use without an application that says `hold_columns`."""
 
@@ -66,16 +86,54 @@ class SimulatedWorld:
         self.surfaces = load_surfaces(self.scene, folder, u, v)
         """Depth, albedo and where they are trusted; the truth behind `truth`."""
         gain = detections_per_radiance(config.optics, config.sensor, config.line)
+        motion = None
+        if self.scene.motion is not None and is_wanted("motion", config.effects):
+            from sim_backend.effects.motion import MovingSurfaces
+
+            motion = MovingSurfaces(self.scene.motion.velocity)
         self.setting = Setting(
-            make_view(self.model, self.surfaces), self.scene, config.optics, config.sensor, config.line, gain
+            make_view(self.model, self.surfaces, motion), self.scene, config.optics, config.sensor, config.line, gain
         )
-        self.flux_model = FluxModel(self.setting)
+        self._planned_for = MOST
+        self._planned: tuple[EffectPlan, FluxModel] | None = None
         self.bench = Bench(surroundings.clock, self.model.lag_s)
         self.grid = fine_grid(camera.width, self.model.scanner.command_range)
         """Mirror positions the flux is computed at."""
         if config.command_grid is not None:
             grid = config.command_grid
             self.hold_columns(np.linspace(grid.first, grid.last, grid.columns))
+
+    def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
+        """Choose the effects for frames of that exposure, so many to a column, at that power or less.
+
+        To be called before the SPAD is configured; without it they are chosen for `MOST`.
+        """
+        frames = exposures + 1  # as many as a column can get, since the clocks are independent
+        planned_for = PlannedFor(power_w, frames * exposure_s, frames)
+        if planned_for != self._planned_for:
+            self._planned_for, self._planned = planned_for, None
+        self._plan()
+
+    @property
+    def effect_plan(self) -> EffectPlan:
+        """Which effects are simulated and why, decided when first asked for: the devices are there by then."""
+        return self._plan()[0]
+
+    @property
+    def flux_model(self) -> FluxModel:
+        """The light of the effects that are simulated."""
+        return self._plan()[1]
+
+    def _plan(self) -> tuple[EffectPlan, FluxModel]:
+        if self._planned is None:
+            self._planned = plan_effects(self.setting, self.sampled_planes, self._planned_for, self.config.effects)
+        return self._planned
+
+    @cached_property
+    def sampled_planes(self) -> Array:
+        """Planes (n, 4) of mirror positions spread over the range."""
+        low, high = self.model.scanner.command_range
+        return self.model.planes(low + (np.arange(SAMPLED_COLUMNS) + 0.5) * (high - low) / SAMPLED_COLUMNS)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -89,23 +147,47 @@ class SimulatedWorld:
         """
         self.grid = column_grid(commands, self.model.scanner.command_range)
 
-    def truth(self, commands: Array) -> SweepTruth:
-        """Where the stripe of each column (commands (columns,)) truly is, and the depth of every pixel."""
-        view = self.setting.view
+    def held(self, happening: Happening) -> Array:
+        """Mirror positions (n,) whose light n frames see, NaN past the ends of the grid: those of the columns, with the
+        mirror's jitter."""
+        low, high = self.model.scanner.command_range
+        return np.clip(self.grid.hold(happening.mirror) + happening.jitter, low, high)
+
+    def truth(self, commands: Array, time_s: float = 0.0) -> SweepTruth:
+        """Where the stripe of each column (commands (columns,)) truly is, and the depth of every pixel.
+
+        time_s: of the bench, where surfaces move; a scan asks for time 0, that is for the scene before it moved.
+        """
+        view = self.setting.view.at(time_s)
         x_px = np.full((view.rows, len(commands)), np.nan, np.float32)
         for column, plane in enumerate(self.model.planes(np.asarray(commands, dtype=np.float64))):
             x_px[:, column] = view.sheet(plane).x_stripe_px
-        depth = self.surfaces.depth_m.copy()
+        with np.errstate(divide="ignore"):
+            depth = self.surfaces.depth_m.copy() if view is self.setting.view else (1 / view.surface).astype(np.float32)
         depth[~np.isfinite(depth) | np.isnan(view.u)] = np.nan
         return SweepTruth(x_px=x_px, depth_m=depth)
 
-    def effects_report(
-        self, power_w: float = 0.05, exposure_s: float = 1e-5, exposures: int = 10
-    ) -> list[dict[str, Any]]:
-        """Each effect: on or off, why, its share of the photons, and what leaving it out would cost."""
+    def effects_report(self, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
+        """Each effect as planned: on or off, why, its share of the photons, what it can change and what it costs."""
         from sim_backend.effects_report import effects_report
 
         return effects_report(self, power_w=power_w, exposure_s=exposure_s, exposures=exposures)
+
+    def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
+        """Photons per exposure of every pixel of an image row, noise-free, by effect; those that are off bring none."""
+        from sim_backend.effects_report import flux_row
+
+        return flux_row(self, row, self.model.planes(command), power_w=power_w, exposure_s=exposure_s)
+
+    def frame_source(self, exposure_s: float, seed: int, threads: int) -> PhotonSource:
+        """What draws frames that follow one another without a gap."""
+        return PhotonSource(self.flux_model, self.model.planes, FrameTimes(exposure_s, exposure_s), seed, threads)
+
+    def numpy_frames(self, exposure_s: float, seed: int) -> "NumpyFrames":
+        """The straightforward way to the same frames, to compare with."""
+        from sim_backend.numpy_frames import NumpyFrames
+
+        return NumpyFrames(self.setting, self.flux_model.steady_per_s, exposure_s, seed)
 
 
 def _load_geometry(path: Path) -> RigModel:

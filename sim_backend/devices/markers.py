@@ -23,11 +23,10 @@ class MarkerInputs:
         self.sweep = 0
 
     def record(self, happening: Happening, start_s: Array, period_s: float, records: NDArray[np.void]) -> int:
-        """Fill marks, line and sweep of consecutive frames that start at start_s (n,).
+        """Fill marks, line and sweep of consecutive frames that start at start_s (n,), about one period apart.
 
         Returns the scan markers since START at the first of them, which the records' own counters cut to 16 bits.
         """
-        first = self.sweep + int(np.count_nonzero(happening.scan_s < start_s[0] + period_s))
         marks = np.zeros(len(start_s), np.int64)
         marks[happening.edge] |= Mark.GATE_EDGE
         marks[~happening.edge & (happening.share > 0)] |= Mark.GATE_HIGH
@@ -37,10 +36,12 @@ class MarkerInputs:
         events = [(float(t), 0, Mark.SCAN) for t in happening.scan_s] + [
             (float(t), 1, Mark.LINE) for t in happening.line_s
         ]
+        first = self.sweep
         for time_s, _, mark in sorted(events):
-            at = (time_s - float(start_s[0])) / period_s
-            frame = min(max(int(at), 0), len(start_s) - 1)
-            place = min(int((at - frame) * SUBFRAME_STEPS), SUBFRAME_STEPS - 1)
+            frame = max(int(np.searchsorted(start_s, time_s, side="right")) - 1, 0)
+            if frame == 0 and mark is Mark.SCAN:
+                first += 1
+            place = min(int((time_s - float(start_s[frame])) / period_s * SUBFRAME_STEPS), SUBFRAME_STEPS - 1)
             marks[frame] = (int(marks[frame]) & ~(0xFF << SUBFRAME_SHIFT)) | mark | (max(place, 0) << SUBFRAME_SHIFT)
             if mark is Mark.SCAN:
                 self.sweep, self.line = self.sweep + 1, 0

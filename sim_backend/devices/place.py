@@ -23,3 +23,9 @@ def world_of(surroundings: Surroundings, device: str) -> SimulatedWorld:
             f"{device} has nothing to look at: the rig has no simulated world; add world: {{kind: simulated}}"
         )
     return world
+
+
+def note_effect(surroundings: Surroundings, effect: str, why: str) -> None:
+    """Tell the world that a device has an effect of its own, one of the catalogue's of kind `device`, and which."""
+    if isinstance(surroundings.world, SimulatedWorld):
+        surroundings.world.setting.devices[effect] = why

@@ -10,7 +10,8 @@ from drivers.interfaces import BeamScanner, ScannerLimits, ScannerStatus, ScanWa
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.units import Ppm, Seconds
 from sim_backend.bench import Bench
-from sim_backend.devices.place import bench_of
+from sim_backend.devices.place import bench_of, note_effect
+from sim_backend.mirror_motion import Jitter
 
 MASTER_HZ = 48_000_000
 """The point clock is this divided by a whole number, as in a timer of a microcontroller."""
@@ -34,9 +35,11 @@ class SimulatedScannerConfig(KindConfig):
 
     kind: Literal["simulated"] = "simulated"
     clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 20e-6
-    """Relative error of the scanner's crystal against the SPAD's."""
+    """Relative error of the scanner's crystal."""
     start_latency: Annotated[Seconds, Field(ge=0)] = 1.3373e-3
     """From `start` to the first point; no whole number of frames."""
+    jitter: float = Field(default=0.0, ge=0, le=0.1)
+    """Standard deviation of the mirror's random error, in units of the drive; a column of the bundled rig is 3.5e-3."""
 
 
 class SimulatedScanner(BeamScanner):
@@ -83,7 +86,14 @@ class SimulatedScanner(BeamScanner):
 
 def create(config: SimulatedScannerConfig, surroundings: Surroundings) -> SimulatedScanner:
     """The scanner on the world's bench."""
-    return SimulatedScanner(config, bench_of(surroundings))
+    bench = bench_of(surroundings)
+    bench.jitter = Jitter(config.jitter, surroundings.seed)
+    forward_us, backward_us = 1e6 * bench.lag.forward, 1e6 * bench.lag.backward
+    if forward_us or backward_us:
+        note_effect(surroundings, "galvo lag", f"the mirror lags {forward_us:g} us, on the way back {backward_us:g} us")
+    if config.jitter:
+        note_effect(surroundings, "galvo jitter", f"the mirror is off by {config.jitter:g} of its drive (rms)")
+    return SimulatedScanner(config, bench)
 
 
 KIND = Kind(config=SimulatedScannerConfig, create=create)

@@ -1,7 +1,7 @@
 """The simulated SPAD array: asks the bench what happened during its frames and draws them, block by block.
 
 On a `VirtualClock` time passes as frames are made; on any other clock a block comes when its last frame has been
-exposed. Its tick counter is the rig's time base: the clock's own rate, without error."""
+exposed. Its tick counter runs on a crystal of its own (`clock_error`, `clock_wander`)."""
 
 import os
 from fractions import Fraction
@@ -11,17 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.clock import NS_PER_S, VirtualClock, ticks_to_ns
+from drivers.clock import NS_PER_S, VirtualClock
 from drivers.errors import DeviceTimeout, LimitExceeded
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader
 from drivers.interfaces import SpadArray, SpadCounters, SpadInfo, SpadRequest, SpadTiming, StreamMode, WindowTable
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, seal_block
-from drivers.units import BytesPerSecond, ExactHertz
+from drivers.units import BytesPerSecond, ExactHertz, Ppm
+from sim_backend.bench import Happening
+from sim_backend.devices.frame_link import FrameLink
 from sim_backend.devices.markers import MarkerInputs, windows_at
-from sim_backend.devices.place import world_of
-from sim_backend.photon_kernels import dropped_frames
+from sim_backend.devices.place import note_effect, world_of
+from sim_backend.devices.tick_clock import TickClock
+from sim_backend.effects.setting import FrameTimes
 from sim_backend.photons import PhotonSource
 from sim_backend.world import SimulatedWorld
 
@@ -47,6 +50,12 @@ class SimulatedSpadConfig(KindConfig):
     """Numbers of frames that get lost on the way, to try gaps with."""
     loss_probability: float = Field(default=0.0, ge=0, le=1)
     """Chance of every frame to get lost on the way."""
+    duplicate_probability: float = Field(default=0.0, ge=0, le=1)
+    """Chance of every frame to be replaced by the one before it in its block, which so comes twice."""
+    clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 0.0
+    """Relative error of the crystal."""
+    clock_wander: Annotated[Ppm, Field(ge=0, le=1e-3)] = 0.0
+    """What a second adds to that error at random, as a standard deviation; it grows with the root of time."""
 
 
 class SimulatedSpad(SpadArray):
@@ -62,7 +71,8 @@ class SimulatedSpad(SpadArray):
         self._threads = threads or min(MAX_THREADS, os.cpu_count() or 1)
         self._photons: PhotonSource | None = None
         self._window: WindowTable | None = None
-        self._lost_frames = np.array(sorted(set(config.lost_frames)), dtype=np.int64)
+        faults = config.lost_frames, config.loss_probability, config.duplicate_probability
+        self._link = FrameLink(*faults, seed)
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._run_id = 0
         self._n_frames: int | None = None
@@ -109,8 +119,9 @@ class SimulatedSpad(SpadArray):
         if self._photons is not None:
             self._photons.close()
         world = self._world
-        exposure_s = float(exposure / tick_hz)
-        self._photons = PhotonSource(world.flux_model, world.model.planes, exposure_s, self._seed, self._threads)
+        self._exposure_s, self._period_s = float(exposure / tick_hz), float(period / tick_hz)
+        times = FrameTimes(self._exposure_s, self._period_s)
+        self._photons = PhotonSource(world.flux_model, world.model.planes, times, self._seed, self._threads)
         return self._timing
 
     def _do_start(self, n_frames: int | None) -> None:
@@ -118,12 +129,15 @@ class SimulatedSpad(SpadArray):
         tick_hz = self._timing.tick_hz
         # The counter runs since the bench was set up; a run starts at its next tick.
         self._t0_ticks = -(-clock.now_ns() * tick_hz.numerator // (NS_PER_S * tick_hz.denominator))
+        start_s = float(self._t0_ticks / tick_hz - Fraction(self._world.bench.clock_ns(0.0), NS_PER_S))
         self._n_frames = n_frames
         self._next_frame = self._block_seq = 0
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._markers = MarkerInputs()
         self._just_lost = False
         self._run_id = (self._run_id + 1) & 0xFFFF
+        crystal = self._config.clock_error, self._config.clock_wander
+        self._ticks = TickClock(float(1 / tick_hz), start_s, *crystal, [self._seed & 0xFFFFFFFFFFFFFFFF, self._run_id])
 
     def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
         silent_s = 0.0
@@ -157,20 +171,21 @@ class SimulatedSpad(SpadArray):
         """How many frames the next block holds, or (n, True): how many of the next frames get lost."""
         first = self._next_frame
         n = self._block_frames if self._n_frames is None else min(self._block_frames, self._n_frames - first)
-        lost = dropped_frames(np.uint64(self._seed & 0xFFFFFFFFFFFFFFFF), first, n, self._config.loss_probability)
-        named = self._lost_frames[np.searchsorted(self._lost_frames, first) :]
-        lost[named[named < first + n] - first] = True
+        lost = self._link.loses(first, n)
         change = np.flatnonzero(lost != lost[0])
         return (int(change[0]) if len(change) else n), bool(lost[0])
 
     def _pass_over(self, n: int) -> float:
         """Expose n frames that get lost: time passes and markers count. Returns the seconds they took."""
-        start_s, period_s, exposure_s = self._times(n)
-        happening = self._world.bench.during(start_s, exposure_s, period_s)
-        self._markers.record(happening, start_s, period_s, np.zeros(n, FRAME_RECORD))
+        start_s, happening = self._frames(n)
+        self._markers.record(happening, start_s, self._period_s, np.zeros(n, FRAME_RECORD))
+        if any(effect.reads_before for effect in self._world.flux_model.bit_effects):
+            # The next frame depends on the last of these, whether anybody gets to see it or not.
+            unseen = np.empty((1, self._info.height, self._layout(1).row_bytes), np.uint8)
+            self._draw(happening, start_s, np.zeros(n, np.int32), unseen, first=n - 1)
         self._advance(n, lost=n)
         self._just_lost = True
-        return n * period_s
+        return n * self._period_s
 
     def _expose_block(self, ring: BlockRing, n: int, timeout_s: float) -> None:
         waits = self._info.can_wait and ring.waits
@@ -183,17 +198,15 @@ class SimulatedSpad(SpadArray):
             self._pass_over(n)
             ring.mark_overflow(n)
             return
-        assert self._photons is not None, "configured before started"
         layout = self._layout(n)
         records, bits = block_views(buffer, layout)
-        start_s, period_s, exposure_s = self._times(n)
-        happening = self._world.bench.during(start_s, exposure_s, period_s)
-        sweep = self._markers.record(happening, start_s, period_s, records)
+        start_s, happening = self._frames(n)
+        sweep = self._markers.record(happening, start_s, self._period_s, records)
         x0 = windows_at(self._window, sweep, records)
         records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
         records["x0"], records["y0"] = x0, 0
-        held = self._world.grid.hold(happening.mirror)
-        self._photons.expose(self._next_frame, held, happening.power_w * happening.share, x0, bits)
+        self._draw(happening, start_s, x0, bits)
+        self._link.repeat(self._next_frame, records, bits)
         header = self._header(sweep, n)
         block = seal_block(buffer, header, layout, frames_lost=header.lost_before, payload_crc=True)
         self._advance(n, lost=0)
@@ -201,14 +214,26 @@ class SimulatedSpad(SpadArray):
         self._block_seq += 1
         self._just_lost = False
 
+    def _draw(
+        self,
+        happening: Happening,
+        start_s: NDArray[np.float64],
+        x0: NDArray[np.int32],
+        bits: NDArray[np.uint8],
+        first: int = 0,
+    ) -> None:
+        """Draw the next frames, without the first few, into `bits`."""
+        assert self._photons is not None, "configured before started"
+        held, power_w = self._world.held(happening)[first:], (happening.power_w * happening.share)[first:]
+        self._photons.expose(self._next_frame + first, held, power_w, x0[first:], bits, start_s[first:])
+
     def _advance(self, n: int, *, lost: int) -> None:
         """Let the time of n frames pass."""
         self._next_frame += n
         old = self._counters
         exposed, all_lost = self._next_frame, (old.lost or 0) + lost
         self._counters = SpadCounters(exposed, exposed - all_lost, all_lost, 0, 0)
-        timing, clock = self._timing, self._world.bench.clock
-        end_ns = ticks_to_ns(self._t0_ticks + self._next_frame * timing.frame_period_ticks, timing.tick_hz)
+        clock, end_ns = self._world.bench.clock, self._world.bench.clock_ns(self._end_s)
         if isinstance(clock, VirtualClock):
             clock.advance_to_ns(end_ns)
         else:
@@ -241,18 +266,27 @@ class SimulatedSpad(SpadArray):
             sensor_height=self._info.height,
         )
 
-    def _times(self, n: int) -> tuple[NDArray[np.float64], float, float]:
-        """Start of each of the next n frames, period and exposure, in seconds of the bench."""
-        timing, bench = self._timing, self._world.bench
-        ticks = self._t0_ticks + np.arange(self._next_frame, self._next_frame + n) * timing.frame_period_ticks
-        epoch_ticks = bench.clock_ns(0.0) * timing.tick_hz / NS_PER_S
-        seconds = float(1 / timing.tick_hz)
-        start_s = (ticks.astype(np.float64) - float(epoch_ticks)) * seconds
-        return start_s, timing.frame_period_ticks * seconds, timing.exposure_ticks * seconds
+    def _frames(self, n: int) -> tuple[NDArray[np.float64], Happening]:
+        """Start of each of the next n frames in seconds of the bench, and what happens during them."""
+        period_ticks = self._timing.frame_period_ticks
+        start_s = self._ticks.times_s(self._next_frame * period_ticks, period_ticks, n + 1)
+        self._end_s = float(start_s[n])
+        happening = self._world.bench.during(start_s[:n], self._exposure_s, self._end_s - float(start_s[n - 1]))
+        return start_s[:n], happening
 
 
 def create(config: SimulatedSpadConfig, surroundings: Surroundings) -> SimulatedSpad:
     """The SPAD that looks at the world."""
+    if config.lost_frames or config.loss_probability:
+        why = f"the SPAD loses {len(config.lost_frames)} named frames and {config.loss_probability:g} of all others"
+        note_effect(surroundings, "lost frames", why)
+    if config.duplicate_probability:
+        why = f"the SPAD sends {config.duplicate_probability:g} of its frames in place of the next one, too"
+        note_effect(surroundings, "duplicated frames", why)
+    if config.clock_error or config.clock_wander:
+        error, wander = 1e6 * config.clock_error, 1e6 * config.clock_wander
+        why = f"the SPAD's crystal is off by {error:g} ppm and wanders by {wander:g} ppm per root second"
+        note_effect(surroundings, "clock drift", why)
     return SimulatedSpad(config, world_of(surroundings, "simulated SPAD"), surroundings.seed)
 
 

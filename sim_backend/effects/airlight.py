@@ -26,5 +26,5 @@ class Airlight:
         with np.errstate(divide="ignore"):
             path_m = np.sqrt(np.nan_to_num(view.u) ** 2 + np.nan_to_num(view.v) ** 2 + 1) / view.surface
         thick = medium.scattering_share * ambient_irradiance(s.scene.illuminance_lux, s.optics) / math.pi
-        result: Array = -s.gain * thick * np.expm1(-medium.extinction_per_m * path_m)
+        result: Array = -s.gain * thick * np.expm1(-s.scene.diffuse_extinction_per_m * path_m)
         return result

@@ -21,7 +21,8 @@ class Ambient:
         view = s.view
         with np.errstate(divide="ignore"):
             path_m = np.sqrt(np.nan_to_num(view.u) ** 2 + np.nan_to_num(view.v) ** 2 + 1) / view.surface
-        transmission = np.exp(-s.scene.extinction_per_m * path_m) if s.scene.extinction_per_m > 0 else 1.0
+        extinction_per_m = s.scene.diffuse_extinction_per_m
+        transmission = np.exp(-extinction_per_m * path_m) if extinction_per_m > 0 else 1.0
         radiance = view.albedo / math.pi * ambient_irradiance(s.scene.illuminance_lux, s.optics) * transmission
         result: Array = np.where(view.surface > 0, s.gain * radiance, 0.0)
         return result

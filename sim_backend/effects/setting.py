@@ -1,6 +1,6 @@
 """What every effect is made from, and what an effect is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -12,11 +12,14 @@ from sim_backend.scene import SceneFile
 from sim_backend.view import View
 
 Array = NDArray[np.float64]
+Words = NDArray[np.uint64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """The rig in its scene. gain: detections per second of a pixel per W/(m^2 sr)."""
+    """The rig in its scene. gain: detections per second of a pixel per W/(m^2 sr). devices: by effect, what simulated
+    devices said they do when they were made.
+    """
 
     view: View
     scene: SceneFile
@@ -24,6 +27,31 @@ class Setting:
     sensor: Sensor
     line: Line
     gain: float
+    devices: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedFor:
+    """The most that a column of frames gets in what is planned for: laser power in W, exposure of all its frames
+    together in s, and how many they are.
+    """
+
+    power_w: float
+    exposure_s: float
+    exposures: int
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTimes:
+    """How a run's frames follow one another."""
+
+    exposure_s: float
+    period_s: float
+
+    @property
+    def gap_s(self) -> float:
+        """From the end of an exposure to the start of the next."""
+        return max(0.0, self.period_s - self.exposure_s)
 
 
 class SteadyEffect(Protocol):
@@ -39,4 +67,22 @@ class LaserEffect(Protocol):
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt to `rate` (rows, width), rows first_row..last_row-1. Releases the GIL."""
+        ...
+
+
+class BitEffect(Protocol):
+    """What the sensor makes of the photons' bits."""
+
+    reads_before: bool
+    """Whether `before` is read: what one frame does to the next costs the frame before each block's first."""
+
+    def apply(self, seed: np.uint64, first_frame: int, words: Words, before: Words, times: FrameTimes) -> None:
+        """Change whole frames first_frame, first_frame + 1, ... in place: `words` (frames, rows, words) uint64 in
+        packbits order (`sim_backend.photon_kernels`), pad bits stay 0.
+
+        seed: of the run. before: (rows, words), the bits of frame first_frame - 1 as this effect found them, zeros
+        where there is none. The outcome for a frame depends on seed, its number, its own and its predecessor's bits
+        only, not on how frames come in blocks.
+        Releases the GIL.
+        """
         ...

@@ -54,15 +54,45 @@ def test_an_unknown_command_is_one_line(rig: Rig) -> None:
     assert (ran.code, len(ran.err.splitlines())) == (2, 1)
 
 
-def test_effects_says_which_a_scene_calls_for_and_why(rig: Rig, small: Path) -> None:
-    clear = json.loads(rig("effects", small, "--json").out)["effects"]
-    foggy = json.loads(rig("effects", small, "--scene", "street", "--json").out)["effects"]
-    states = [{line["effect"]: line["on"] for line in lines} for lines in (clear, foggy)]
-    assert [state["fog"] for state in states] == [False, True]
-    assert all(line["why"] for line in clear)
-    told = rig("effects", small)
+def test_effects_says_which_a_scene_calls_for_why_and_what_each_is_worth(rig: Rig, small: Path) -> None:
+    clear = json.loads(rig("effects", small, "--json", "--no-trials").out)["effects"]
+    foggy = json.loads(rig("effects", "--config", small, "--scene", "street", "--json").out)["effects"]
+    clear, foggy = ({line["effect"]: line for line in lines} for lines in (clear, foggy))
+    assert (clear["fog"]["on"], foggy["fog"]["on"]) == (False, True)
+    assert all(line["why"] for line in clear.values())
+    assert foggy["fog"]["share"] > 0
+    assert foggy["fog"]["cost_us_per_frame"] > 0
+    assert foggy["fog"]["basis"] == "trial"
+    assert abs(foggy["fog"]["stripe_error_change_px"]) < 10
+    assert foggy["stripe"]["basis"] is None
+    told = rig("effects", small, "--no-trials")
     assert told.code == 0
     assert "medium" in told.out
+    assert "of decisions changed" in told.out
+
+
+def test_effects_gives_the_flux_of_an_image_row(rig: Rig, small: Path) -> None:
+    asked = ("effects", "--config", small, "--scene", "street", "--row", 20, "--column", 100)
+    row = json.loads(rig(*asked, "--json").out)
+    assert row["x_px"] == list(range(96))
+    parts = [part for name, part in row.items() if name not in ("x_px", "total")]
+    assert row["total"] == pytest.approx([sum(each) for each in zip(*parts, strict=True)])
+    assert max(row["stripe"]) > max(row["fog"]) > 0
+    assert len(rig(*asked).out.splitlines()) == 97
+
+
+@pytest.mark.parametrize(
+    ("place", "problem"),
+    [
+        (("--row", 40, "--column", 3), "row is 40; the camera has rows 0 to 39"),
+        (("--row", 3, "--column", -1), "column is -1; the scan has columns 0 to 199"),
+        (("--row", 3), "both --row and --column"),
+    ],
+)
+def test_a_row_that_is_not_there_is_one_line(rig: Rig, small: Path, place: tuple[object, ...], problem: str) -> None:
+    ran = rig("effects", small, *place)
+    assert (ran.code, len(ran.problems)) == (2, 1)
+    assert problem in ran.problems[0]
 
 
 def test_effects_of_a_scene_that_is_not_there(rig: Rig, small: Path) -> None:

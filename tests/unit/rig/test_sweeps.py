@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 
 from drivers.recorded.reader import block_part
-from rig.counting import BIN_DARK
+from rig.counting import BIN_DARK, BIN_UNUSABLE
 from rig.sweeps import SweepAssembler, SweepStart
 from tests.unit.rig.streams import plan_of, scan, stand_still, stream_of
 
@@ -93,3 +93,24 @@ def test_maps_of_a_part_begin_with_the_sweep_that_is_whole():
     assert [sweep.index for sweep in found] == [0, 1]
     assert [sweep.volume for sweep in found] == [sweep.volume for sweep in sweeps[1:]]
     assert part.complete
+
+
+def test_a_frame_that_comes_twice_is_lost_where_it_comes_again_whatever_the_blocks():
+    plan = plan_of(scan(columns=30))
+    whole, doubled = stream_of(plan, 1), stream_of(plan, 1)
+    twice = [doubled.scan_frames[0] + 5, doubled.scan_frames[0] + 100, doubled.scan_frames[0] + 101]
+    for frame in twice:
+        doubled.records[frame], doubled.ticks[frame] = doubled.records[frame - 1], doubled.ticks[frame - 1]
+    (missed,) = sweeps(plan, whole.blocks(itertools.repeat(50), twice))
+    for size in (1, 7, twice[0], 500):
+        (sweep,) = sweeps(plan, doubled.blocks(itertools.repeat(size)))
+        assert sweep.frames == missed.frames
+        assert [gap for first, last in sweep.gaps for gap in range(first, last + 1)] == twice
+        bins = np.array(sweep.volume)
+        assert bins[bins != BIN_UNUSABLE].tolist() == [found for found in missed.volume if found != BIN_UNUSABLE]
+
+
+def sweeps(plan, blocks):
+    """Of one map."""
+    assembler = SweepAssembler(plan, Noting(), maps=1)
+    return [found for block in blocks for found in assembler.add(block)]

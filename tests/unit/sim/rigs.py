@@ -45,9 +45,11 @@ def wall(model: RigModel, normal: tuple[float, float, float], distance_m: float,
     return checked("wall", depth, np.full(u.shape, albedo), np.ones(u.shape, bool), u.shape)
 
 
-def setting(model: RigModel, surfaces: Surfaces, **scene: Any) -> Setting:
-    """Default optics in a scene given by the keys of a scene file."""
-    optics, sensor, line = Optics(), Sensor(), Line()
+def setting(
+    model: RigModel, surfaces: Surfaces, *, optics: Optics | None = None, line: Line | None = None, **scene: Any
+) -> Setting:
+    """A scene given by the keys of a scene file, in front of default optics unless others are given."""
+    optics, sensor, line = optics or Optics(), Sensor(), line or Line()
     parsed = SceneFile.model_validate(scene)
     gain = detections_per_radiance(optics, sensor, line)
     return Setting(make_view(model, surfaces), parsed, optics, sensor, line, gain)

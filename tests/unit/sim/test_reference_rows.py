@@ -1,59 +1,57 @@
-"""Rows of an independent path tracer: single scattering and stripe agree, within its noise."""
-
-from pathlib import Path
+"""Rows of an independent path tracer: single scattering and stripe agree within its noise; what they lack is known."""
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from calibration.camera import Camera
-from calibration.model import RigModel
-from calibration.scanner import PlaneTable
-from tests.unit.sim.rigs import effect_rate, setting, wall
-
-FOLDER = Path(__file__).parents[4] / "shared" / "reference"
-FOCAL, CENTRE, BASELINE, TANGENT = 277.128, 159.5, 0.4, (240 - 159.5) / 277.128
+from tests.reference.path_traced import (
+    BEFORE,
+    FOLDER,
+    PEAK,
+    STRIPE_PX,
+    fog,
+    means,
+    radiance,
+    table,
+    traced_fog,
+    traced_row,
+)
 
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="no reference rows beside this checkout")
 
 
-def _rows(name: str) -> NDArray[np.void]:
-    return np.genfromtxt(FOLDER / name, delimiter=",", names=True)
-
-
-def _model() -> RigModel:
-    plane = np.array([[1.0, 0.0, -TANGENT, -BASELINE]])
-    camera = Camera(320, 3, np.array([[FOCAL, 0, CENTRE], [0, FOCAL, 1.0], [0, 0, 1.0]]), np.zeros(5))
-    return RigModel(camera, PlaneTable(np.array([0.0]), plane), source_m=np.array([-BASELINE, 0.0, 0.0]))
-
-
-def _radiance(effect: str, **scene: object) -> NDArray[np.float64]:
-    """Radiance of the middle row where the tracer's column (1 px wide, 1 W/m^2 on the plane z = 1) is lit."""
-    model = _model()
-    setup = setting(model, wall(model, (0.0, 0.0, 1.0), 5.0), **scene)
-    per_radian = 1 / FOCAL * np.sqrt(1 + TANGENT**2)
-    rate = effect_rate(setup, effect, model.planes(0.0))
-    result: NDArray[np.float64] = rate[1] / setup.gain * per_radian * setup.line.fan
-    return result
-
-
 def test_the_stripe_in_clear_air() -> None:
-    traced = _rows("clear_row.csv")["radiance"]
-    ours = _radiance("stripe")
+    traced = traced_row("clear_row.csv")["radiance"]
+    ours = radiance("stripe")
     assert ours.sum() == pytest.approx(traced.sum(), rel=0.005)
     x = np.arange(320)
-    assert ours @ x / ours.sum() == pytest.approx(217.830, abs=2e-3)
-    assert traced @ x / traced.sum() == pytest.approx(217.830, abs=0.05)
+    assert ours @ x / ours.sum() == pytest.approx(STRIPE_PX, abs=2e-3)
+    assert traced @ x / traced.sum() == pytest.approx(STRIPE_PX, abs=0.05)
 
 
 @pytest.mark.parametrize("tau", [0.5, 1.0])
 def test_single_scattering_in_fog(tau: float) -> None:
-    traced = _rows(f"fog_row_isotropic_tau{tau}.csv")
-    medium = {"extinction": f"{tau / 5} /m", "scattering_share": 0.999, "backscatter": f"{1 / (4 * np.pi)} /sr"}
-    haze, stripe = _radiance("fog", medium=medium), _radiance("stripe", medium=medium)
+    traced = traced_fog(tau)
+    haze, stripe = radiance("fog", medium=fog(tau)), radiance("stripe", medium=fog(tau))
     for area in (slice(10, 70), slice(70, 130), slice(130, 190), slice(190, 214)):
         difference = np.sum(haze[area] - traced["single"][area])
         error = np.sqrt(np.sum(traced["single_se"][area] ** 2)) + 0.01 * haze[area].sum()
         assert abs(difference) < 3 * error
-    peak = slice(214, 222)
-    assert np.sum((haze + stripe)[peak]) == pytest.approx(np.sum(traced["single"][peak]), rel=0.02)
+    assert np.sum((haze + stripe)[PEAK]) == pytest.approx(np.sum(traced["single"][PEAK]), rel=0.02)
+
+
+@pytest.mark.parametrize("tau", [0.5, 1.0])
+def test_the_haze_has_the_shape_and_the_strength_beside_the_stripe(tau: float) -> None:
+    traced = traced_fog(tau)["single"]
+    haze, stripe = radiance("fog", medium=fog(tau)), radiance("stripe", medium=fog(tau))
+    assert np.corrcoef(means(haze), means(traced))[0, 1] > 0.99
+    ours = haze[BEFORE].mean() / stripe.sum()
+    theirs = traced[BEFORE].mean() / (traced[PEAK].sum() - haze[PEAK].sum())
+    assert ours == pytest.approx(theirs, rel=0.05)
+
+
+def test_what_single_scattering_lacks_is_a_table() -> None:
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table().splitlines()[2:]]
+    found = {(float(tau), row): [float(value) for value in values] for tau, row, *values in lines}
+    for tau, before, behind in ((0.5, 1.27, 0.16), (1.0, 1.50, 0.28)):  # as docs/simulation.md says
+        assert found[tau, "traced, all orders"][:2] == pytest.approx([before, behind], abs=0.015)
+        assert found[tau, "traced, single scattering"][:2] == pytest.approx([1, 0], abs=0.03)

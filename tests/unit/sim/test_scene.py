@@ -1,31 +1,49 @@
 """Scene files and folders: what they say, what they refuse, and the bundled street."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
 from drivers.registry import Surroundings
-from sim_backend.optics import Line, Optics, Sensor, ambient_irradiance, dark_rates, detections_per_radiance
+from sim_backend.effects.catalogue import CATALOGUE, Entry
+from sim_backend.optics import Line, Optics, Sensor, ambient_irradiance, detections_per_radiance
 from sim_backend.scene import SceneFile, bundled_scenes, load_scene, load_surfaces
 from sim_backend.scenes.prepared import load_folder
 from sim_backend.scenes.stereo import prepare
 from sim_backend.scenes.street import street
 from sim_backend.world import KIND, WorldConfig
+from tests.system.small_rig import calibration
 from tests.unit.sim.rigs import rig
 
 SCENES = Path(__file__).parents[4] / "shared" / "scenes"
 
 
-@pytest.mark.parametrize("name", ["street", "street-clear", "street-dense-fog"])
-def test_bundled_scenes_load(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("street", "medium ambient"),
+        ("street-clear", "ambient"),
+        ("street-light-fog", "medium ambient"),
+        ("street-dense-fog", "medium ambient"),
+        ("street-smoke", "medium ambient"),
+        ("street-rain", "rain ambient"),
+        ("street-snow", "snow ambient"),
+        ("street-everything", "medium rain snow ambient motion"),
+    ],
+)
+def test_bundled_scenes_load(name: str, parts: str) -> None:
     assert name in bundled_scenes()
     scene, _ = load_scene(name)
-    assert (scene.medium is None) == (name == "street-clear")
+    there = [part for part in ("medium", "rain", "snow", "ambient", "motion") if getattr(scene, part) is not None]
+    assert there == parts.split()
 
 
 def test_visibility_is_that_of_two_percent_contrast() -> None:
@@ -121,42 +139,64 @@ def test_photons_of_a_worked_example() -> None:
     assert gain * ambient * 1e-5 == pytest.approx(0.08, rel=0.2)
 
 
-def test_dark_rates_have_a_heavy_tail_and_belong_to_the_sensor() -> None:
-    rates = dark_rates(Sensor(), (512, 512))
-    assert np.median(rates) == pytest.approx(20, rel=0.05)
-    assert np.mean(rates > 200) == pytest.approx(0.01, rel=0.2)
-    assert np.mean(rates > 2000) == pytest.approx(0.002, rel=0.3)
-    assert np.array_equal(rates, dark_rates(Sensor(), (512, 512)))
-
-
-def test_effects_that_are_not_called_for_are_not_imported() -> None:
+@pytest.fixture(scope="module", params=["bare", "foggy"])
+def planned(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[set[str], set[str]]:
+    """Effects that a scene calls for, and the modules that a program has imported once it has planned them."""
+    folder = tmp_path_factory.mktemp("scenes")
+    (folder / "bare.yaml").write_text("surfaces: street\n")
+    (folder / "rig.yaml").write_text(yaml.safe_dump(calibration()))
+    bare = {"scene": str(folder / "bare.yaml"), "sensor": {"dark_rate": "0 cps"}}
+    config = {"geometry": str(folder / "rig.yaml"), **(bare if request.param == "bare" else {"scene": "street"})}
     program = (
-        "import sys; from sim_backend.world import KIND, WorldConfig;"
+        "import json, sys; from sim_backend.world import KIND, WorldConfig;"
         "from drivers.registry import Surroundings; from drivers.clock import VirtualClock;"
-        "config = WorldConfig(scene='street-clear', sensor={'dark_rate': '0 cps'});"
-        "KIND.create(config, Surroundings(VirtualClock(), None, 0));"
-        "print(sorted(m.rpartition('.')[2] for m in sys.modules if m.startswith('sim_backend.effects.')))"
+        "config = WorldConfig(**json.loads(sys.argv[1]));"
+        "KIND.create(config, Surroundings(VirtualClock(), None, 0)).flux_model;"
+        "print(json.dumps(list(sys.modules)))"
     )
-    root = Path(__file__).parents[3]
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=root)
-    assert done.stdout.strip() == "['ambient', 'catalogue', 'setting', 'stripe']"
+    command, root = [sys.executable, "-c", program, json.dumps(config)], Path(__file__).parents[3]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=root)
+    setting = KIND.create(WorldConfig(**config), Surroundings(VirtualClock(), None, 0)).setting
+    return {entry.name for entry in CATALOGUE if entry.called(setting)[0]}, set(json.loads(done.stdout))
+
+
+@pytest.mark.parametrize("entry", [e for e in CATALOGUE if e.code], ids=lambda entry: entry.name)
+def test_an_effect_that_is_not_called_for_is_not_even_imported(
+    entry: Entry, planned: tuple[set[str], set[str]]
+) -> None:
+    called, loaded = planned
+    module = entry.code.partition(":")[0]
+    assert (module in loaded) == any(e.code.startswith(f"{module}:") for e in CATALOGUE if e.name in called)
+
+
+def test_a_bare_scene_calls_for_the_stripe_alone(planned: tuple[set[str], set[str]]) -> None:
+    called = {entry.name for entry in CATALOGUE if entry.name in planned[0] and entry.kind != "device"}
+    assert called >= {"stripe", "fog", "ambient", "airlight", "dark counts"} or called == {"stripe"}
 
 
 def test_the_report_says_which_effects_are_on_and_what_they_weigh() -> None:
-    foggy = KIND.create(WorldConfig(scene="street"), Surroundings(VirtualClock(), None, 0))
-    report = {line["effect"]: line for line in foggy.effects_report(power_w=0.05)}
-    assert set(report) == {"stripe", "fog", "ambient", "airlight", "dark counts", "saturation"}
-    assert all(line["on"] for line in report.values())
-    shares = [line["share"] for name, line in report.items() if name != "saturation"]
-    assert sum(shares) == pytest.approx(1)
-    assert not report["stripe"]["negligible"]
-    more = {line["effect"]: line for line in foggy.effects_report(power_w=0.05, exposures=20)}
-    assert more["fog"]["divergence"] == pytest.approx(2 * report["fog"]["divergence"])
-    clear = KIND.create(WorldConfig(scene="street-clear"), Surroundings(VirtualClock(), None, 0))
-    off = {line["effect"]: line for line in clear.effects_report()}
-    assert not off["fog"]["on"]
-    assert off["fog"]["share"] == 0
-    assert "no medium" in off["airlight"]["why"]
+    def report(scene: str) -> dict[str, dict[str, Any]]:
+        world = KIND.create(WorldConfig(scene=scene), Surroundings(VirtualClock(), None, 0))
+        return {line["effect"]: line for line in world.effects_report(0.05, 1e-5, 10)["effects"]}
+
+    foggy, clear = report("street"), report("street-clear")
+    assert list(foggy) == [entry.name for entry in CATALOGUE]
+    assert {"stripe", "fog", "ambient", "airlight", "dark counts"} <= {name for name in foggy if foggy[name]["on"]}
+    assert sum(line["share"] for line in foggy.values()) == pytest.approx(1)
+    assert foggy["fog"]["cost_us_per_frame"] > 0
+    assert not foggy["stripe"]["removable"]
+    assert not clear["fog"]["on"]
+    assert clear["fog"]["share"] == clear["fog"]["cost_us_per_frame"] == 0
+    assert "no medium" in clear["airlight"]["why"]
+
+
+def test_the_flux_of_a_row_is_the_sum_of_its_effects() -> None:
+    world = KIND.create(WorldConfig(scene="street"), Surroundings(VirtualClock(), None, 0))
+    parts = world.flux_row(200, 0.1, 0.05, 1e-5)
+    assert list(parts) == [entry.name for entry in CATALOGUE if entry.kind in ("laser", "steady")]
+    whole = world.flux_model.flux(world.model.planes(0.1), 1e-5, 0.05)[200]
+    np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-12)
+    assert min(part.sum() for name, part in parts.items() if name in world.flux_model.names) > 0
 
 
 def test_a_world_without_a_light_source_is_refused(tmp_path: Path) -> None:

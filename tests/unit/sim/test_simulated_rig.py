@@ -31,10 +31,12 @@ from drivers.registry import Surroundings
 from drivers.ring import BlockRing, OnFull
 from drivers.spb1 import walk_blocks
 from sim_backend.devices import laser, scanner, spad, sync
+from sim_backend.optics import Sensor
 from sim_backend.world import KIND as WORLD
 from sim_backend.world import SimulatedWorld, WorldConfig
 from tests.unit.sim.rigs import rig
 
+_SENSOR = Sensor()
 POINTS, RATE_HZ = 400, 100_000
 GATE_OPEN_S, GATE_S = 5e-4, 3e-3
 
@@ -114,12 +116,16 @@ def _record(rig: Rig, ring: BlockRing) -> Recording:
     )
 
 
-def _open(folder: Path, seed: int = 1, scene: str = "street-clear", **spad_config: object) -> Rig:
+def _open(
+    folder: Path, seed: int = 1, scene: str = "street-clear", sensor: Sensor = _SENSOR, **spad_config: object
+) -> Rig:
     geometry = folder / "rig.yaml"
     if not geometry.exists():
         save_rig_model(rig(size=(20, 70), focal_px=80.0), geometry)
     clock = VirtualClock(123_457)
-    world = WORLD.create(WorldConfig(geometry=str(geometry), scene=scene), Surroundings(clock, None, seed))
+    world = WORLD.create(
+        WorldConfig(geometry=str(geometry), scene=scene, sensor=sensor), Surroundings(clock, None, seed)
+    )
     around = Surroundings(clock, world, seed)
     return Rig(
         clock,
@@ -234,6 +240,23 @@ def test_a_block_of_windows_is_an_spb1_block(small: Rig) -> None:
     assert np.array_equal(read.bits, block.bits)
 
 
+def test_bit_errors_of_the_sensor_lie_in_blocks_with_sound_checksums(tmp_path: Path) -> None:
+    blocks = []
+    for sensor in (_SENSOR, Sensor(bit_error_rate="5 %")):
+        opened = _open(tmp_path, sensor=sensor)
+        ring = opened.start(block_frames=10)
+        reader = ring.reader("test")
+        opened.spad.fill(ring, 1.0)
+        block = reader.next(0.1)
+        assert block is not None
+        slot = next(memory for memory in ring._memory if np.shares_memory(memory, block.bits))
+        blocks += list(walk_blocks(slot, ring.stride, check_payload=True))
+    clean, damaged = blocks
+    assert isinstance(damaged, FrameBlock)
+    flipped = np.bitwise_count(clean.bits ^ damaged.bits).sum() / (10 * 20 * 70)
+    assert flipped == pytest.approx(0.05, abs=0.01)
+
+
 def test_only_virtual_time_can_wait(small: Rig) -> None:
     assert small.spad.info.can_wait
     small.world.bench.clock = SystemClock()
@@ -274,14 +297,16 @@ def test_time_passes_as_frames_are_made(small: Rig) -> None:
     assert small.clock.now_ns() - before == pytest.approx(6_000_000, abs=10)
 
 
-def test_lost_frames_close_the_block_and_are_counted(tmp_path: Path) -> None:
-    clean, gappy = _open(tmp_path), _open(tmp_path, lost_frames=(0, 40, 41, 999))
+@pytest.mark.parametrize("sensor", [_SENSOR, Sensor(afterpulsing="50 %", trap_lifetime="8 us")])
+def test_lost_frames_close_the_block_and_are_counted(tmp_path: Path, sensor: Sensor) -> None:
+    clean = _open(tmp_path, sensor=sensor)
+    gappy = _open(tmp_path, sensor=sensor, lost_frames=(0, 140, 141, 999))
     whole, run = _record(clean, clean.start()), _record(gappy, gappy.start())
-    kept = np.setdiff1d(np.arange(1000), [0, 40, 41, 999])
+    kept = np.setdiff1d(np.arange(1000), [0, 140, 141, 999])
     assert np.array_equal(run.frames, kept)
     assert np.array_equal(run.bits, whole.bits[kept])
     assert np.array_equal(run.records["sweep"], whole.records["sweep"][kept])
-    after_gap = [h for h in run.headers if h.first_frame in (1, 42)]
+    after_gap = [h for h in run.headers if h.first_frame in (1, 142)]
     assert [h.lost_before for h in after_gap] == [1, 3]
     assert all(h.flags & BlockFlag.LOST_BEFORE for h in after_gap)
     counters = gappy.spad.counters
@@ -295,6 +320,38 @@ def test_frames_lost_at_random_differ_by_seed(tmp_path: Path) -> None:
         runs.append(_record(opened, opened.start()).frames)
     assert all(900 < len(frames) < 990 for frames in runs)
     assert not np.array_equal(*[np.isin(np.arange(1000), frames) for frames in runs])
+
+
+def test_a_frame_that_comes_twice_has_markers_counters_and_ticks_of_the_first_time(tmp_path: Path) -> None:
+    clean, doubled = _open(tmp_path), _open(tmp_path, duplicate_probability=0.1)
+    whole, run = _record(clean, clean.start()), _record(doubled, doubled.start())
+    assert np.array_equal(run.frames, whole.frames)
+    twice = np.flatnonzero(np.diff(run.ticks) == 0) + 1
+    assert 60 < len(twice) < 140
+    assert not np.isin(twice, [header.first_frame for header in run.headers]).any()
+    for name in ("marks", "line", "sweep"):
+        assert np.array_equal(run.records[name][twice], run.records[name][twice - 1])
+    assert np.array_equal(run.bits[twice], run.bits[twice - 1])
+    once = np.setdiff1d(run.frames, twice)
+    assert np.array_equal(run.ticks[once], whole.ticks[once])
+    assert np.array_equal(run.bits[once], whole.bits[once])
+    assert doubled.spad.counters == clean.spad.counters
+
+
+@pytest.mark.parametrize("wander", ["0 ppm", "900 ppm"])
+def test_a_spad_clock_that_is_off_sees_the_scanner_run_by_its_own_ticks(tmp_path: Path, wander: str) -> None:
+    runs = []
+    for block_frames in (31, 7, 600):
+        opened = _open(tmp_path, clock_error="-900 ppm", clock_wander=wander)
+        runs.append(_record(opened, opened.start(block_frames=block_frames)))
+    run = runs[0]
+    scans = np.flatnonzero(run.marked(Mark.SCAN))
+    times = run.ticks[scans] / 1000 + (((run.records["marks"][scans] >> 8) & 0xFF) + 0.5) / 256
+    expected = 400 * (1 - 900e-6) / (1 + 20e-6)
+    assert np.diff(times)[0] == pytest.approx(expected, abs=1 / 256 if wander == "0 ppm" else 0.1)
+    for other in runs[1:]:
+        assert np.array_equal(other.records[["marks", "line", "sweep"]], run.records[["marks", "line", "sweep"]])
+        assert np.array_equal(other.bits, run.bits)
 
 
 def test_a_spad_that_loses_everything_times_out(tmp_path: Path) -> None:

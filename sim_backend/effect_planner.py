@@ -1,0 +1,196 @@
+"""Plans which effects to run: what the scene calls for, but for what provably changes next to no decision.
+
+Let a pixel detect m photons in a column's K frames, on average, and m + D with an effect. Per exposure the divergence
+of its bits is at most (D/K)^2 / (2 (e^(m/K) - 1)), so that over pixels and frames it is at most eps = sum D^2 / (2 m),
+and the data differ in total variation by at most sqrt(eps/2) (Pinsker's inequality [1]). They also differ by no more
+than the probability that one of the D photons is seen at all, at most D: the better bound in the dark. Pixels with
+D < m are taken by the first, the others by the second, and the two add up (triangle inequality). No rule of decision on
+a row's data can then differ more often than that.
+
+Both grow with power and exposure, so a plan for the most that a column gets holds for all that is less. Bounds of light
+that does not depend on the laser take it as off, and the worst row. The laser's effects are evaluated on sampled
+columns and rows that have a stripe, all other effects present: twice the mean. Where an effect's catalogue entry has a
+closed form that is small enough, its code is not even loaded. The smallest are left out first, until all that is left
+out together would change more than `MOST_CHANGED` of the decisions.
+
+[1] A. B. Tsybakov, "Introduction to nonparametric estimation", Springer 2009, section 2.4.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backend.effects.catalogue import CATALOGUE, MEASURED, Entry
+from sim_backend.effects.setting import PlannedFor, Setting
+from sim_backend.flux import FluxModel, hold_s
+from sim_backend.light_sheet import LightSheet, empty_sheet
+
+Array = NDArray[np.float64]
+Wanted = Literal["planned", "all"] | tuple[str, ...]
+"""Which of the effects that a scene calls for are run: without the negligible ones, all, or these."""
+
+MOST_CHANGED = 0.01
+"""Share of decisions that may change by all that is left out: eps = 2e-4."""
+MOST = PlannedFor(power_w=1.0, exposure_s=1e-3, exposures=100)
+"""What a plan holds for where nobody says what is to be scanned: more than a line laser and an ordinary scan have."""
+SAFETY = 2.0
+"""Times the mean over sampled rows: their spread over rows and columns is less."""
+SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Whether an effect is run, and why. changes: the largest share of decisions that can differ without it, at most 1,
+    where it is known.
+    """
+
+    entry: Entry
+    on: bool
+    why: str
+    changes: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EffectPlan:
+    """The decision on every effect of the catalogue. changes: the bound on all together that is left out."""
+
+    planned_for: PlannedFor
+    decisions: tuple[Decision, ...]
+    changes: float
+
+
+def plan_effects(
+    setting: Setting, planes: Array, planned_for: PlannedFor, wanted: Wanted = "planned"
+) -> tuple[EffectPlan, FluxModel]:
+    """The plan, and the model with the effects that it keeps. planes: (n, 4), of mirror positions over the range."""
+    calls = {entry: entry.called(setting) for entry in CATALOGUE}
+    candidates = [entry for entry, (called, _) in calls.items() if called and is_wanted(entry.name, wanted)]
+    changes: dict[str, float] = {}
+    left_out: set[str] = set()
+    total = 0.0
+    if wanted == "planned":
+        changes = {entry.name: float(entry.changes(setting, planned_for)) for entry in candidates if entry.changes}
+        left_out, total = _smallest(changes)
+    model = FluxModel(setting, [entry for entry in candidates if entry.name not in left_out])
+    if wanted == "planned":
+        bounds = _Bounds(model, planes, planned_for)
+        alone = {name: bounds.changes({name}) for name in bounds.names}
+        changes |= {name: min(bound, changes.get(name, bound)) for name, bound in alone.items()}
+        more, evaluated = bounds.largest_set(alone, MOST_CHANGED - total)
+        model, left_out, total = model.without(more), left_out | more, total + evaluated
+    decisions = tuple(_decision(entry, calls[entry], wanted, changes, left_out) for entry in CATALOGUE)
+    return EffectPlan(planned_for, decisions, total), model
+
+
+def is_wanted(name: str, wanted: Wanted) -> bool:
+    """Whether an effect is to be run where the scene calls for it."""
+    return wanted in ("planned", "all") or name in wanted
+
+
+def _decision(
+    entry: Entry, call: tuple[bool, str], wanted: Wanted, changes: dict[str, float], left_out: Collection[str]
+) -> Decision:
+    called, why = call
+    if called and not is_wanted(entry.name, wanted):
+        return Decision(entry, False, "not among the world's effects")
+    bound = min(1.0, changes[entry.name]) if entry.name in changes else None
+    if entry.name in left_out:
+        return Decision(entry, False, f"{why}; without it at most {bound:.2g} of decisions change", bound)
+    return Decision(entry, called, why, bound if called else 0.0)
+
+
+def _smallest(changes: dict[str, float]) -> tuple[set[str], float]:
+    """As many of the effects as stay within `MOST_CHANGED` together, the smallest first, and their sum."""
+    taken, total = set(), 0.0
+    for name in sorted(changes, key=changes.__getitem__):
+        if total + changes[name] > MOST_CHANGED:
+            break
+        taken.add(name)
+        total += changes[name]
+    return taken, total
+
+
+class _Bounds:
+    """Bounds of what may be left out of a model, by evaluation."""
+
+    def __init__(self, model: FluxModel, planes: Array, planned_for: PlannedFor) -> None:
+        self._model = model
+        self._seconds, self._joules = planned_for.exposure_s, planned_for.exposure_s * planned_for.power_w
+        light = [name for name, effect in model.laser.items() if name != MEASURED and hold_s(effect) == 0]
+        self.names = (*light, *model.steady)
+        """What can be bounded: light that stands still, and dark counts."""
+        self._bands = _bands(model.setting.view.rows)
+        self._sheets = _sheets(model, planes, self._bands) if light else []
+        self._whole = self._sampled(()) if light else np.zeros(0)
+
+    def changes(self, names: Collection[str]) -> float:
+        """Largest share of decisions that differ without these effects; may exceed 1."""
+        model = self._model
+        dark = [model.steady[name] for name in names if name in model.steady]
+        rest = self._seconds * model.without(names).steady_per_s
+        found = float(_changed(self._seconds * np.sum(dark, axis=0), rest).max()) if dark else 0.0
+        if any(name in model.laser for name in names):
+            without = self._sampled(names)
+            least = _rows(rest, self._bands) + self._joules * np.minimum(self._whole, without)
+            each = _changed(self._joules * np.abs(self._whole - without), least)
+            seen = np.stack([~np.isnan(_rows(sheet.x_stripe_px, self._bands)) for sheet in self._sheets])
+            found += SAFETY * float(each[seen].mean() if seen.any() else each.mean())
+        return found
+
+    def largest_set(self, alone: dict[str, float], most: float) -> tuple[set[str], float]:
+        """The effects that can be left out together within a bound, the smallest first, and their bound."""
+        taken: set[str] = set()
+        total = 0.0
+        for name in sorted(alone, key=alone.__getitem__):
+            bound = self.changes({*taken, name}) if taken else alone[name]
+            if bound > most:
+                break
+            taken.add(name)
+            total = bound
+        return taken, total
+
+    def _sampled(self, without: Collection[str]) -> Array:
+        """Detections per second and watt, (columns, sampled rows, width), without some effects."""
+        model = self._model.without(without)
+        rate = np.zeros_like(model.steady_per_s)
+        found = []
+        for sheet in self._sheets:
+            for first, last in self._bands:
+                rate[first:last] = 0.0
+                model.add_sheet(sheet, first, last, rate)
+            found.append(_rows(rate, self._bands))
+        return np.stack(found)
+
+
+def _changed(change: Array, least: Array) -> Array:
+    """The bound above per row for photons (..., width) of a column: by how much they change, and the least they are."""
+    small = change < least
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = np.where(small, change * change / least, 0.0).sum(axis=-1)
+    result: Array = 0.5 * np.sqrt(spread) + np.where(small, 0.0, change).sum(axis=-1)
+    return result
+
+
+def _bands(rows: int) -> list[tuple[int, int]]:
+    """Bands of rows that are looked at, spread over the picture; all rows of a small one."""
+    if rows <= SAMPLED_BANDS * BAND_ROWS:
+        return [(0, rows)]
+    middles = (np.arange(SAMPLED_BANDS) + 0.5) * rows / SAMPLED_BANDS
+    return [(int(middle) - BAND_ROWS // 2, int(middle) + BAND_ROWS // 2) for middle in middles]
+
+
+def _rows(values: Array, bands: Sequence[tuple[int, int]]) -> Array:
+    return np.concatenate([values[first:last] for first, last in bands])
+
+
+def _sheets(model: FluxModel, planes: Array, bands: Sequence[tuple[int, int]]) -> list[LightSheet]:
+    """Sheets of the planes, traced on the bands."""
+    view = model.setting.view
+    sheets = [empty_sheet(plane, view.rows) for plane in planes]
+    for sheet in sheets:
+        for first, last in bands:
+            view.trace(sheet, first, last)
+    return sheets

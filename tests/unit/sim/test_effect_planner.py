@@ -1,0 +1,166 @@
+"""The planner leaves out only what provably changes next to no decision, and says so."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from drivers.clock import VirtualClock
+from drivers.registry import Surroundings
+from sim_backend import effect_planner
+from sim_backend.effect_planner import MOST, MOST_CHANGED, Decision, EffectPlan, _changed, plan_effects
+from sim_backend.effects.catalogue import CATALOGUE, Entry
+from sim_backend.effects.setting import PlannedFor, Setting
+from sim_backend.flux import FluxModel
+from sim_backend.optics import Sensor
+from sim_backend.world import KIND, WorldConfig
+from tests.unit.sim.rigs import rig, setting, wall
+
+MODEL = rig()
+PLANES = MODEL.planes(np.linspace(-0.6, 0.9, 9))
+PLANNED_FOR = PlannedFor(power_w=0.05, exposure_s=1e-3, exposures=100)
+
+
+def _setting(extinction: str | None = None, **scene: object) -> Setting:
+    """In fog of that extinction that scatters only once; a sensor without dark counts."""
+    if extinction is not None:
+        scene["medium"] = {"extinction": extinction, "multiple_scattering": False}
+    made = setting(MODEL, wall(MODEL, (0.1, 0.0, 1.0), 2.5), **scene)
+    return replace(made, sensor=Sensor(dark_rate="0 cps"))
+
+
+def _decisions(plan: EffectPlan) -> dict[str, Decision]:
+    return {decision.entry.name: decision for decision in plan.decisions}
+
+
+def _total_variation(exposures: int, least: list[float], change: list[float]) -> float:
+    """Exactly, of the counts of two pixels, from fluxes of all exposures together."""
+    joint = []
+    for flux in (least, [m + d for m, d in zip(least, change, strict=True)]):
+        counts = []
+        for photons in flux:
+            p = -math.expm1(-photons / exposures)
+            counts.append([math.comb(exposures, n) * p**n * (1 - p) ** (exposures - n) for n in range(exposures + 1)])
+        joint.append(np.outer(*counts))
+    return 0.5 * float(np.abs(joint[0] - joint[1]).sum())
+
+
+@pytest.mark.parametrize("exposures", [1, 7])
+def test_the_bound_is_one(exposures: int) -> None:
+    rng = np.random.default_rng(exposures)
+    closest = 0.0
+    for _ in range(300):
+        least, change = 10.0 ** rng.uniform(-4, 1, 2), 10.0 ** rng.uniform(-5, 0.5, 2)
+        exact, bound = _total_variation(exposures, list(least), list(change)), float(_changed(change, least))
+        assert exact <= bound * (1 + 1e-9) + 1e-12
+        closest = max(closest, exact / bound)
+    assert closest > 0.5  # nor does it exaggerate much
+
+
+def test_no_change_is_none_even_in_the_dark() -> None:
+    assert _changed(np.zeros((2, 3)), np.zeros((2, 3))).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize(("extinction", "on"), [("1e-9 /m", False), ("0.1 /m", True)])
+def test_fog_is_left_out_where_it_is_thin_enough(extinction: str, on: bool) -> None:
+    plan, model = plan_effects(_setting(extinction), PLANES, PLANNED_FOR)
+    fog = _decisions(plan)["fog"]
+    assert fog.on == on == ("fog" in model.names)
+    assert "extinction" in fog.why
+    assert ("of decisions change" in fog.why) != on
+    assert fog.changes is not None
+    assert (fog.changes < MOST_CHANGED) != on
+    assert plan.changes == (0.0 if on else fog.changes)
+    assert "stripe" in model.names
+
+
+def test_what_is_left_out_together_stays_within_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = _setting()
+
+    def entry(name: str, changes: float) -> Entry:
+        return Entry(name, "bits", "no.such.module:Effect", lambda _: (True, "always"), lambda *_: changes)
+
+    extra = (entry("small", 0.004), entry("smaller", 0.003), entry("smallest", 0.002), entry("large", 0.005))
+    monkeypatch.setattr(effect_planner, "CATALOGUE", (*CATALOGUE, *extra[:3]))
+    plan, model = plan_effects(made, PLANES, PLANNED_FOR)  # and no such module is looked for
+    assert plan.changes == pytest.approx(0.009)
+    assert model.names == ("stripe",)
+    monkeypatch.setattr(effect_planner, "CATALOGUE", (*CATALOGUE, *extra))
+    with pytest.raises(ModuleNotFoundError):
+        plan_effects(made, PLANES, PLANNED_FOR)
+
+
+def test_a_plan_holds_for_all_that_is_less() -> None:
+    made = _setting("1e-5 /m", ambient={"illuminance": "5 lux"})
+    bounds = [
+        _decisions(plan_effects(made, PLANES, replace(PLANNED_FOR, power_w=power, exposure_s=exposure))[0])["fog"]
+        for power, exposure in ((0.05, 1e-3), (0.01, 1e-3), (0.05, 1e-4))
+    ]
+    most, *less = [bound.changes for bound in bounds]
+    assert all(bound < most for bound in less)
+
+
+def test_all_and_lists_are_kept_as_they_are() -> None:
+    made = _setting("1e-9 /m", ambient={"illuminance": "1e-9 lux"})
+    plan, model = plan_effects(made, PLANES, PLANNED_FOR)
+    assert model.names == ("stripe",)
+    assert 0 < plan.changes < MOST_CHANGED
+    plan, model = plan_effects(made, PLANES, PLANNED_FOR, "all")
+    assert set(model.names) == {"stripe", "fog", "ambient", "airlight"}
+    assert plan.changes == 0
+    plan, model = plan_effects(made, PLANES, PLANNED_FOR, ("stripe", "ambient", "dark counts"))
+    assert model.names == ("stripe", "ambient")
+    assert "not among" in _decisions(plan)["fog"].why
+
+
+def test_an_effect_that_is_none_is_refused() -> None:
+    assert WorldConfig(effects=["stripe", "fog"]).effects == ("stripe", "fog")
+    with pytest.raises(ValidationError, match=r"unknown effect 'fogg'.*airlight"):
+        WorldConfig(effects=["fogg"])
+
+
+@pytest.mark.parametrize("name", ["fog", "halo"])
+def test_what_is_sampled_bounds_the_whole_street(name: str, tmp_path: Path) -> None:
+    """All rows of a hundred columns, against twice the mean over a few."""
+    (tmp_path / "haze.yaml").write_text("surfaces: street\nmedium: {fog: {visibility: 20 km}}\n")
+    world = KIND.create(WorldConfig(scene=str(tmp_path / "haze.yaml")), Surroundings(VirtualClock(), None, 0))
+    world.plan_for(0.05, 1e-5, 9)
+    found = _decisions(world.effect_plan)[name].changes
+    model, view = FluxModel(world.setting), world.setting.view
+    fewer, joules, each = model.without({name}), 0.05 * 1e-4, []
+    for plane in world.model.planes(np.linspace(-0.87, 0.87, 100)):
+        sheet = view.sheet(plane)
+        light = [np.zeros((view.rows, view.width)) for _ in range(2)]
+        model.add_sheet(sheet, 0, view.rows, light[0])
+        fewer.add_sheet(sheet, 0, view.rows, light[1])
+        seen = ~np.isnan(sheet.x_stripe_px)
+        change, least = joules * np.abs(light[0] - light[1]), 1e-4 * model.steady_per_s + joules * np.minimum(*light)
+        each.append(_changed(change, least)[seen])
+    exact = float(np.concatenate(each).mean())
+    assert found is not None
+    assert exact < found < 4 * exact
+
+
+def test_a_world_plans_for_the_scan_that_it_is_told_of() -> None:
+    world = KIND.create(WorldConfig(scene="street-clear"), Surroundings(VirtualClock(), None, 0))
+    assert world.effect_plan.planned_for == MOST
+    world.plan_for(0.02, 1e-5, 10)
+    assert world.effect_plan.planned_for == PlannedFor(0.02, pytest.approx(1.1e-4), 11)  # a column can get one more
+    model = world.flux_model
+    world.plan_for(0.02, 1e-5, 10)
+    assert world.flux_model is model
+    world.plan_for(0.02, 1e-5, 11)
+    assert world.flux_model is not model
+
+
+def test_without_keeps_the_others_as_they_are() -> None:
+    made = _setting("0.1 /m", ambient={"illuminance": "5 lux"})
+    whole = FluxModel(made)
+    fewer, again = whole.without({"fog", "airlight"}), FluxModel(_setting(ambient={"illuminance": "5 lux"}))
+    assert fewer.names == again.names == ("stripe", "ambient")
+    assert fewer.laser["stripe"] is whole.laser["stripe"]
+    assert np.array_equal(fewer.steady_per_s, whole.steady["ambient"])
+    assert whole.names == ("stripe", "fog", "ambient", "airlight")

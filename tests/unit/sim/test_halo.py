@@ -1,0 +1,95 @@
+"""Light of more than one scattering: the halo's totals, the pedestal, and all orders of the path-traced rows."""
+
+import numpy as np
+import pytest
+
+from sim_backend.effects.catalogue import CATALOGUE
+from sim_backend.effects.halo import halo_share
+from tests.reference.path_traced import FOLDER, fog, radiance, traced_fog
+from tests.unit.sim.rigs import effect_rate, rig, setting, wall
+
+HALO = next(entry for entry in CATALOGUE if entry.name == "halo")
+
+
+@pytest.mark.parametrize(
+    ("tau", "forward", "even"), [(0.5, 0.7, (0.15, 0.18)), (1.0, 0.64, (0.15, 0.18)), (2.0, 0.5, (0.15, 0.18))]
+)
+def test_the_halo_over_the_ballistic_stripe(tau: float, forward: float, even: tuple[float, float]) -> None:
+    whole = np.expm1(2 * tau)
+    assert halo_share(2 * tau, 1.0) / whole == pytest.approx(forward, abs=0.015)
+    assert even[0] <= halo_share(2 * tau, 0.0) / whole <= even[1]
+
+
+def test_the_halo_passes_the_stripe_near_an_optical_depth_of_a_half() -> None:
+    assert halo_share(2 * 0.4, 1.0) < 1 < halo_share(2 * 0.5, 1.0)
+
+
+@pytest.mark.parametrize("x_command", [0.05, 0.053, 0.056])
+def test_its_light_is_all_there_and_symmetrical(x_command: float) -> None:
+    """Narrow exponentials: a wide picture holds nearly all of the halo; the pedestal is taken off at its borders."""
+    model = rig(size=(4, 801), focal_px=60.0, baseline_m=0.0001)
+    scene = {"medium": {"extinction": "0.2 /m", "scattering_share": 0.9}}
+    setup = setting(model, wall(model, (0.0, 0.0, 1.0), 2.5), **scene)
+    plane = model.planes(x_command)
+    halo, stripe = effect_rate(setup, "halo", plane)[1], effect_rate(setup, "stripe", plane)[1]
+    centre = setup.view.sheet(plane).x_stripe_px[1]
+    behind = np.arange(801) > centre
+    behind_level = halo[-1]
+    r_m = np.linalg.norm([2.5 * (centre - 400) / 60 + 0.0001, 0, 2.5])
+    way_m = r_m + 2.5 * np.hypot(1, (centre - 400) / 60)
+    total = stripe.sum() * halo_share(0.2 * 0.9 * way_m, 1.0)
+    right = np.sum(halo[behind] - behind_level)
+    share_right = _share_right_of(np.floor(centre) + 0.5 - centre)
+    assert right == pytest.approx(total * share_right, rel=2e-3)
+
+
+def _share_right_of(off_px: float) -> float:
+    """Share of the halo beyond a border that lies off_px to the right of its centre."""
+    scales = 60 * np.radians(1.7), 60 * np.radians(6.0)
+    each = [0.5 * np.exp(-abs(off_px) / s) if off_px > 0 else 1 - 0.5 * np.exp(-abs(off_px) / s) for s in scales]
+    return float(np.mean(each))
+
+
+def test_a_medium_that_scatters_calls_for_it() -> None:
+    model = rig()
+    surfaces = wall(model, (0.0, 0.0, 1.0), 2.5)
+    for medium, called in (
+        ({"extinction": "0.1 /m"}, True),
+        ({"extinction": "0.1 /m", "multiple_scattering": False}, False),
+        ({"extinction": "0.1 /m", "scattering_share": 0.0}, False),
+    ):
+        on, why = HALO.called(setting(model, surfaces, medium=medium))
+        assert (on, bool(why)) == (called, True)
+    assert not HALO.called(setting(model, surfaces))[0]
+
+
+@pytest.mark.skipif(not FOLDER.is_dir(), reason="no reference rows beside this checkout")
+@pytest.mark.parametrize("tau", [0.5, 1.0])
+def test_traced_rows_in_isotropic_fog(tau: float) -> None:
+    traced = traced_fog(tau)
+    ours = radiance("halo", medium=fog(tau))
+    more = traced["all_orders"] - traced["single"]
+    for area in ((10, 70), (70, 130), (130, 190), (190, 212), (224, 240), (240, 270), (270, 320)):
+        part = slice(*area)
+        assert ours[part].mean() == pytest.approx(np.median(more[part]), rel=0.31)  # rare bright paths: medians
+
+
+@pytest.mark.parametrize(("tau", "low", "high"), [(0.5, 0.08, 0.13), (1.0, 0.18, 0.32), (2.0, 0.35, 0.46)])
+def test_the_pedestal_behind_the_stripe(tau: float, low: float, high: float) -> None:
+    """Fog alone: a black wall; 10 px before the stripe."""
+    from tests.reference import path_traced
+
+    was, path_traced.ALBEDO = path_traced.ALBEDO, 0.0
+    try:
+        row = radiance(medium={**fog(tau), "phase": {"g": 0.85}})
+    finally:
+        path_traced.ALBEDO = was
+    assert low < row[260] / row[208] < high
+
+
+def test_depths_that_nothing_comes_back_from_stay_finite() -> None:
+    model = rig()
+    setup = setting(model, wall(model, (0.0, 0.0, 1.0), 2.5), medium={"extinction": "1000 /m"})
+    rate = effect_rate(setup, "halo", model.planes(0.1))
+    assert np.isfinite(rate).all()
+    assert rate.min() >= 0

@@ -1,0 +1,160 @@
+"""Drops and flakes: how many are in the sheet, what one sends back, and that a time says where they are."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sim_backend.effects.particle_kernels import find_pixel, share
+from sim_backend.effects.particles import MOST, Particles, make_particles
+from sim_backend.effects.rain import RainDrops
+from sim_backend.effects.setting import Setting
+from sim_backend.effects.snow import SnowFlakes
+from sim_backend.optics import Line
+from sim_backend.scenes.surfaces import Surfaces
+from sim_backend.weather import Rain
+from tests.unit.sim.rigs import pixel_solid_angle, rig, setting, wall
+
+CONE = np.array([[-0.5, 1.0], [-0.4, 0.8]])
+RAIN = Rain.model_validate({"rate": "20 mm/h", "wind": "1 m/s"})
+WEATHER = {"rain": {"rate": "50 mm/h"}, "snow": {"rate": "2 mm/h", "wind": "-1 m/s"}}
+
+
+def _wet(**scene: object) -> Setting:
+    model = rig(k1=-0.1)
+    return setting(model, wall(model, (0.0, 0.0, 1.0), 3.0), **(scene or WEATHER))
+
+
+@pytest.mark.parametrize("time_s", [0.0, 0.05, 4321.0])
+def test_the_sheet_holds_density_times_thickness_times_area(time_s: float) -> None:
+    drops = make_particles(RAIN, CONE, 4.0, np.random.default_rng(3))
+    point = drops.points(time_s)
+    thickness, faintest = 0.08, np.min(drops.diameter_mm / drops.z_m**1.5)
+    z = np.linspace(0.61, 4.0, 2001)
+    for x in (-0.2, 0.1, 0.3):
+        above = np.array([RAIN.sizes.density_per_m3(float(d)) for d in faintest * z**1.5])
+        expected = thickness * np.mean(above * CONE[1, 1] * z) * (z[-1] - z[0])
+        found = np.sum((np.abs(point[:, 0] - x) < thickness / 2) & (point[:, 2] > z[0]))
+        assert expected > 300
+        assert found == pytest.approx(expected, abs=4 * np.sqrt(expected))
+
+
+def test_the_number_of_particles_is_bounded() -> None:
+    storm = Rain.model_validate({"rate": "200 mm/h"})
+    drops = make_particles(storm, CONE, 10.0, np.random.default_rng(1))
+    assert 0.8 * MOST < len(drops.z_m) < 1.01 * MOST
+    assert np.all((drops.z_m >= 0.1) & (drops.z_m <= 10))
+
+
+def test_drops_fall_with_their_speed_and_drift_with_the_wind() -> None:
+    drops = make_particles(RAIN, CONE, 4.0, np.random.default_rng(5))
+    way = drops.points(1e-3) - drops.points(0.0)
+    inside = np.linalg.norm(way, axis=1) < 0.1  # the others have come in again at the other side
+    assert inside.mean() > 0.95
+    np.testing.assert_allclose(way[inside, 0], 1e-3, rtol=1e-6)
+    np.testing.assert_allclose(way[inside, 1], 1e-3 * RAIN.fall_m_per_s(drops.diameter_mm)[inside], rtol=1e-6)
+    assert np.all(way[:, 2] == 0)
+
+
+def _one(z: float, u: float, v: float, fall_per_s: float = 0.0) -> Particles:
+    at = (np.array([[u, v]]) - CONE[:, 0]) / CONE[:, 1]
+    per_s = np.array([[0.0, fall_per_s / z / CONE[1, 1]]])
+    return Particles(CONE, np.array([z]), np.array([1.0]), np.array([1e-6]), at, per_s)
+
+
+@pytest.mark.parametrize("fall", [0.0, 9.0])
+def test_a_drop_sends_back_what_falls_on_it(fall: float) -> None:
+    model = rig(k1=-0.1)
+    line = Line(thickness="4 mm", spread="2 mrad")  # type: ignore[arg-type]
+    rain = {"rain": {"rate": "20 mm/h"}, "medium": {"extinction": "0.2 /m"}}
+    setup = setting(model, wall(model, (0.0, 0.0, 1.0), 3.0), line=line, **rain)
+    effect, plane = RainDrops(setup), model.planes(0.4)
+    z, v, aside_m = 1.0, 0.03, 5e-4
+    u = (plane[3] + aside_m - plane[1] * v * z - plane[2] * z) / (plane[0] * z)
+    effect.light.particles = _one(z, u, v, fall)
+    rate = np.zeros((64, 96))
+    effect.add(setup.view.sheet(plane), 0, 64, rate)
+    point = np.array([u, v, 1.0]) * z
+    assert model.source_m is not None
+    r, camera_m = np.linalg.norm(point - model.source_m), np.linalg.norm(point)
+    sigma_m = np.hypot(4e-3, 2e-3 * r) / 4
+    across = np.exp(-0.5 * (aside_m / sigma_m) ** 2) / (sigma_m * np.sqrt(2 * np.pi))
+    irradiance = across / r / line.fan * np.exp(-setup.scene.extinction_per_m * (r + camera_m))
+    solid = pixel_solid_angle(model, np.array(u), np.array(v))
+    assert rate.sum() == pytest.approx(setup.gain * irradiance * 1e-6 / camera_m**2 / solid, rel=0.01)
+    x, y = model.camera.project(point)
+    rows = np.arange(64) @ rate.sum(axis=1) / rate.sum()
+    assert np.arange(96) @ rate.sum(axis=0) / rate.sum() == pytest.approx(float(x), abs=0.02)
+    assert rows == pytest.approx(float(y) + 0.5 * fall * 2e-4 * 110, abs=0.02)
+
+
+def test_a_streak_is_a_box_blurred() -> None:
+    pixels = np.arange(-30, 60)
+    for length in (0.0, 0.01, 0.06, 3.0, 12.0):
+        shares = np.array([share(int(i), 0.3, length, 0.7) for i in pixels])
+        assert shares.sum() == pytest.approx(1, abs=1e-6)
+        mean = shares @ pixels
+        assert mean == pytest.approx(0.3 + length / 2, abs=1e-3)
+        assert shares @ (pixels - mean) ** 2 == pytest.approx(0.49 + 1 / 12 + length**2 / 12, rel=5e-3)
+
+
+def test_drops_behind_a_surface_are_not_lit() -> None:
+    model = rig()
+    setup = setting(model, wall(model, (0.0, 0.0, 1.0), 3.0), rain={"rate": "20 mm/h"})
+    near = setting(model, wall(model, (0.0, 0.0, 1.0), 1.5), rain={"rate": "20 mm/h"})
+    plane = model.planes(0.2)
+    for z, lit in ((1.2, (True, True)), (2.0, (True, False)), (3.5, (False, False))):
+        u = (plane[3] - plane[2] * z) / (plane[0] * z)
+        for scene, seen in zip((setup, near), lit, strict=True):
+            effect = RainDrops(scene)
+            effect.light.particles = _one(z, u, 0.0)
+            rate = np.zeros((64, 96))
+            effect.add(scene.view.sheet(plane), 0, 64, rate)
+            assert (rate.sum() > 0) == seen
+
+
+@pytest.mark.parametrize("effect", [RainDrops, SnowFlakes])
+def test_a_time_says_where_they_are_whatever_the_rows(effect: type[RainDrops] | type[SnowFlakes]) -> None:
+    setup = _wet()
+    plane = rig().planes(0.3)
+
+    def light(time_s: float, cuts: tuple[int, ...] = (0, 64)) -> NDArray[np.float64]:
+        made, rate = effect(setup), np.zeros((64, 96))
+        for first, last in pairwise(cuts):
+            made.add(setup.view.sheet(plane, time_s), first, last, rate)
+        return rate
+
+    whole = light(7.0)
+    assert whole.sum() > 0
+    assert np.array_equal(whole, light(7.0, (0, 1, 13, 40, 64)))
+    assert np.array_equal(whole, light(7.00019))  # stands still for 0.2 ms
+    assert not np.array_equal(whole, light(7.05))  # and has fallen on by the next sweep
+    other = setting(rig(k1=-0.1), wall(rig(k1=-0.1), (0, 0, 1.0), 3.0), seed=2, **WEATHER)
+    rate = np.zeros((64, 96))
+    effect(other).add(other.view.sheet(plane, 7.0), 0, 64, rate)
+    assert not np.array_equal(whole, rate)
+
+
+def test_nothing_falls_in_front_of_a_camera_without_picture() -> None:
+    model = rig()
+    surfaces = wall(model, (0.0, 0.0, 1.0), 3.0)
+    sky = Surfaces(np.full_like(surfaces.depth_m, np.inf), surfaces.albedo, surfaces.trusted)
+    setup = setting(model, sky, rain={"rate": "20 mm/h"})
+    rate = np.zeros((64, 96))
+    effect = RainDrops(setup)
+    effect.add(setup.view.sheet(model.planes(0.3)), 0, 64, rate)
+    assert rate.sum() > 0  # lit in front of open sky
+    effect.add(setup.view.sheet(np.array([1.0, 0.0, 0.0, 0.0])), 0, 64, np.zeros((64, 96)))  # edge-on: no error
+
+
+def test_a_pixel_is_found_through_a_distorting_lens() -> None:
+    model = rig(k1=-0.2)
+    u, v = model.camera.tangents()
+    for x, y in ((3.2, 60.4), (47.0, 31.0), (94.6, 0.2)):
+        j, i = int(y), int(x)
+        s, t = x - i, y - j
+        corner = np.array([[(1 - s) * (1 - t), s * (1 - t)], [(1 - s) * t, s * t]])
+        at_u, at_v = np.sum(corner * u[j : j + 2, i : i + 2]), np.sum(corner * v[j : j + 2, i : i + 2])
+        found = find_pixel(u, v, float(at_u), float(at_v))
+        assert found[:2] == pytest.approx((x, y), abs=1e-2)

@@ -1,0 +1,106 @@
+"""AES rounds against FIPS 197, with and without instructions for them, and the order of a word's pixels."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from llvmlite import binding, ir
+from numba import types
+from numba.extending import intrinsic
+
+from sim_backend import random_lanes
+from sim_backend.random_lanes import PLACE, block_numbers, drawn_word, enciphered, place_levels, sure_word
+
+START_OF_ROUND = 0x193DE3BEA0F4E22B9AC68D2AE9F84808
+ROUND_KEY = 0xA0FAFE1788542CB123A339392A6C7605
+AFTER_ROUND = 0xA49C7FF2689F352B6B5BEA43026A5049
+"""FIPS 197, appendix B: round 1 of its example, first byte highest."""
+
+
+def _halves(number: int) -> list[np.uint64]:
+    return [np.uint64(half) for half in np.frombuffer(number.to_bytes(16, "big"), np.uint64)]
+
+
+def _compiled(code_of_round: Callable[..., Any]) -> Any:
+    make: Any = intrinsic
+
+    @make
+    def one_round(typing, s0, s1, k0, k1):  # type: ignore[no-untyped-def]
+        def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+            block = ir.VectorType(ir.IntType(64), 2)
+            whole = []
+            for halves in (args[:2], args[2:]):
+                vector = ir.Constant(block, ir.Undefined)
+                for i, half in enumerate(halves):
+                    vector = builder.insert_element(vector, half, ir.Constant(ir.IntType(32), i))
+                whole.append(vector)
+            state = code_of_round(builder, *whole)
+            return context.make_tuple(
+                builder,
+                signature.return_type,
+                [builder.extract_element(state, ir.Constant(ir.IntType(32), i)) for i in (0, 1)],
+            )
+
+        u64 = types.uint64
+        return types.UniTuple(u64, 2)(u64, u64, u64, u64), code
+
+    return numba.njit(lambda a, b, c, d: one_round(a, b, c, d))
+
+
+@pytest.mark.parametrize("way", ["this processor", "tables"])
+def test_a_round_is_that_of_the_standard(way: str) -> None:
+    code = random_lanes.round_of_block if way == "this processor" else random_lanes.round_by_table
+    found = _compiled(code)(*_halves(START_OF_ROUND), *_halves(ROUND_KEY))
+    assert list(found) == _halves(AFTER_ROUND)
+
+
+def test_the_round_for_arm_compiles() -> None:
+    module, block = ir.Module(), ir.VectorType(ir.IntType(64), 2)
+    module.triple = "aarch64-unknown-linux-gnu"
+    function = ir.Function(module, ir.FunctionType(block, [block, block]), "one_round")
+    builder = ir.IRBuilder(function.append_basic_block())
+    builder.ret(random_lanes.round_by_arm(builder, *function.args))
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()
+    try:
+        target = binding.Target.from_triple(module.triple)
+    except RuntimeError:
+        pytest.skip("this LLVM knows no ARM")
+    written = target.create_target_machine(features="+aes").emit_assembly(binding.parse_assembly(str(module)))
+    assert "aese" in written
+    assert "aesmc" in written
+
+
+def test_numbers_without_instructions_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    def both(seed, row, levels, blocks):  # type: ignore[no-untyped-def]
+        key = enciphered(seed, seed, np.uint64(7), row)
+        return key, drawn_word(key, blocks.ctypes.data, levels.ctypes.data)
+
+    args = np.uint64(5), np.uint64(9), np.full(64, 12000, np.int16), block_numbers(4)[3]
+    expected = numba.njit(both)(*args)
+    monkeypatch.setattr(random_lanes, "_has", lambda feature: False)
+    assert numba.njit(both)(*args) == expected
+
+
+@numba.njit
+def _words(values, key, blocks, levels, words):  # type: ignore[no-untyped-def]
+    place_levels(values.ctypes.data, levels.ctypes.data)
+    for i in range(len(words)):
+        block = blocks.ctypes.data + i % len(blocks) * blocks.shape[1] * 8
+        drawn = drawn_word((key, np.uint64(i // len(blocks))), block, levels.ctypes.data)
+        words[i] = drawn | sure_word(levels.ctypes.data)
+
+
+def test_levels_belong_to_pixels_in_packbits_order() -> None:
+    rng = np.random.default_rng(1)
+    values = rng.integers(-(2**15), 2**15, 64).astype(np.int16)
+    values[[0, 7, 8, 63]] = -(2**15), 2**15 - 1, 2**15 - 1, -(2**15)
+    levels, words = np.zeros(64, np.int16), np.zeros(4000, np.uint64)
+    _words(values, np.uint64(11), block_numbers(8), levels, words)
+    assert np.array_equal(levels[list(PLACE)], values)
+    rate = np.unpackbits(words.view(np.uint8).reshape(4000, 8), axis=1).mean(axis=0)
+    p = (2**15 - 1 - values.astype(np.float64)) / 2**16
+    np.testing.assert_allclose(rate, p, rtol=0, atol=4.5 * np.sqrt(0.25 / 4000))
+    assert rate[[0, 7, 8, 63]].tolist() == [1, 0, 0, 1]
