@@ -34,11 +34,16 @@ def bench_command(
         Path | None,
         typer.Option("--disk", metavar="FOLDER", help="measure recording to this folder's disk, nothing else"),
     ] = None,
+    simulator: Annotated[
+        bool, typer.Option("--simulator", help="measure how fast frames of simulated scenes are drawn, nothing else")
+    ] = False,
     as_json: JsonOption = False,
 ) -> int:
     """How fast this machine counts and estimates, beside how fast it reads its memory."""
     from rig import api
 
+    if simulator:
+        return _bench_simulator(as_json)
     if disk is not None:
         return _bench_disk(disk, as_json)
     stream = None
@@ -73,6 +78,20 @@ def _bench_disk(folder: Path, as_json: bool) -> int:
         from rig.bench.table import disk_table
 
         disk_table(found)
+    return 0
+
+
+def _bench_simulator(as_json: bool) -> int:
+    from rig import api
+
+    with progress("rows") as bar:
+        found = api.bench_simulator(progress=bar)
+    if as_json:
+        print_json(found.as_json())
+    else:
+        from rig.bench.table import simulator_table
+
+        simulator_table(found)
     return 0
 
 

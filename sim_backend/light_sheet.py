@@ -19,7 +19,7 @@ class LightSheet:
     x_stripe_px: (rows,) float64, sub-pixel stripe position, NaN = no stripe.
     x_end_px: (rows,) float64, end of the lit part, NaN = nothing lit.
     start_px, step: (rows,) int64, first pixel on the light's way and its direction along the row (+1, -1, 0 = not
-    seen)."""
+    seen). time_s: of the bench, for what moves."""
 
     normal: Array
     offset_m: float
@@ -28,9 +28,10 @@ class LightSheet:
     x_end_px: Array
     start_px: NDArray[np.int64]
     step: NDArray[np.int64]
+    time_s: float = 0.0
 
 
-def empty_sheet(plane: Array, rows: int) -> LightSheet:
+def empty_sheet(plane: Array, rows: int, time_s: float = 0.0) -> LightSheet:
     """A sheet of the plane (4,) = nx, ny, nz, d that has not been traced on any row yet."""
     offset = float(plane[3])
     inverse = plane[:3] / offset if offset != 0 else np.full(3, np.nan)  # through the camera: seen edge-on, no depth
@@ -42,4 +43,5 @@ def empty_sheet(plane: Array, rows: int) -> LightSheet:
         x_end_px=np.full(rows, np.nan),
         start_px=np.zeros(rows, np.int64),
         step=np.zeros(rows, np.int64),
+        time_s=time_s,
     )

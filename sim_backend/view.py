@@ -1,6 +1,6 @@
 """What the camera sees of a scene, per pixel, as the light transport needs it: rays, inverse depth, facets, albedo."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calibration.model import RigModel
 from sim_backend.light_sheet import LightSheet, empty_sheet
-from sim_backend.light_sheet_kernels import DEPTH_JUMP, trace_rows
+from sim_backend.light_sheet_kernels import DEPTH_JUMP, span_bounds, trace_rows
 from sim_backend.scenes.surfaces import Surfaces
 
 Array = NDArray[np.float64]
@@ -39,6 +39,11 @@ class View:
     albedo: Array
     source_m: Array
     motion: Moves | None = None
+    bounds: Array = field(init=False)
+    """Of u, v and surface (`span_bounds`)."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "bounds", span_bounds(self.u, self.v, self.surface))
 
     def at(self, time_s: float) -> "View":
         """The view at a time of the bench."""
@@ -73,10 +78,12 @@ class View:
 
     def trace(self, sheet: LightSheet, first_row: int, last_row: int) -> None:
         """Trace rows first_row..last_row-1 of a sheet in place. Releases the GIL."""
+        now = self.at(sheet.time_s)
         trace_rows(
-            self.u,
-            self.v,
-            self.at(sheet.time_s).surface,
+            now.u,
+            now.v,
+            now.surface,
+            now.bounds,
             sheet.inverse,
             first_row,
             last_row,

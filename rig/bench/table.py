@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rig.bench.disk import DiskReport
+from rig.bench.simulator import SimulatorReport
 from rig.bench.soak import SoakReport
 from rig.bench.speed import Row, SpeedReport
 
@@ -61,6 +62,31 @@ def disk_table(report: DiskReport) -> None:
         of_plain = "" if row.of_plain is None else f"{row.of_plain:.2f}"
         table.add_row(row.stage, f"{row.mb_per_s:.0f}", f"{row.cpu_s_per_gb:.2f}", of_plain)
     console.print(table)
+
+
+def simulator_table(report: SimulatorReport) -> None:
+    """Print the simulator's rows to stdout."""
+    console = Console(highlight=False, width=WIDTH)
+    _print_machine(console, report.machine)
+    console.print(f"memory read, one thread: {report.memory_read_gb_per_s:.1f} GB/s")
+    rows, width = report.size
+    console.print(f"frames of {rows} x {width}; ready: one column's light stands; fresh: computed for every column")
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("row", "scene", "threads", "K", "kframes/s", "us/frame", "real time", "x numpy"):
+        table.add_column(name, justify="left" if name in ("row", "scene") else "right", no_wrap=True)
+    for row in report.rows:
+        table.add_row(
+            row.stage.removeprefix("simulator-"),
+            row.scene,
+            str(row.threads),
+            str(row.exposures),
+            f"{row.frames_per_s / 1e3:.4g}",
+            f"{row.us_per_frame:.4g}",
+            f"{row.times_real_time:.2g}",
+            _number(row.times_numpy),
+        )
+    console.print(table)
+    console.print(f"x numpy: of whole-array numpy in the foggy scene, one thread; measured in {report.seconds:.0f} s")
 
 
 def soak_table(report: SoakReport) -> None:

@@ -5,7 +5,6 @@ its neighbours while the laser crosses the whole picture is hot, whatever the sc
 mean.
 """
 
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -5,17 +5,45 @@ With J = P/F the power per radian of fan and n.X = d the sheet, a ray q = (u, v,
     L = sigma_s p J |q| / (r |n.q|) exp(-sigma (r + z |q|)),      r = |z q - S| from the source S
 
 For a rectified rig all powers of z cancel: sigma_s p I0 du |q_p||q_c|/b exp(-sigma z (|q_p| + |q_c|)). The phase
-function p is taken constant: scattering angles are all near 180 degrees. The haze ends where the sheet's light ends: at
-the object, blurred like the stripe, and in the sheet's own shadow along the row."""
+function p is constant (`backscatter`: scattering angles are all near 180 degrees) or a sum of Henyey-Greenstein terms
+at the cosine -(z q - S).q/(r |q|). The haze ends where the sheet's light ends: at the object, blurred like the stripe,
+and in the sheet's own shadow along the row. Called for by `medium`.
+
+Per row everything is straight-line over the lit pixels, in two loops, so that it becomes vector instructions, and only
+those under the blurred end are walked one by one: 0.36 ms a mirror position for 512 x 512 pixels, half of them lit, in
+float64 and 0.19 in float32, where a walk with its own square roots, exponential and tests in every pixel took 2.2 ms in
+the same run. Kernels run in the precision of what they add to. In float32 the haze is right to 1e-5 at an optical depth
+of 10: by the divergence of `sim_backend.effect_planner` that is 1e-8 for a row's pixels in a column, of 2e-4."""
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Array, Setting
+from sim_backend.exponential import HALVING, LOG2_E, power_of_half
+from sim_backend.gaussian_edge import edge_sum
 from sim_backend.light_sheet import LightSheet
+
+REACH_SIGMAS = 5.0
+"""The blurred end is cut here."""
+LEAST_INVERSE_DEPTH = 1e-12
+"""In 1/m: what lies farther or behind the camera is taken as there."""
+Rays = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Numbers:
+    """What the kernel takes, in one precision. rays: u, v, |q| (rows, width) and source (3,); terms: (n, 3) weight, |g|
+    and sign of each Henyey-Greenstein term; halving: see `power_of_half`; simple: 0, 1, 2 and least inverse depth."""
+
+    rays: Rays
+    terms: NDArray[Any]
+    halving: tuple[Any, ...]
+    simple: tuple[Any, ...]
 
 
 class Haze:
@@ -24,85 +52,121 @@ class Haze:
     def __init__(self, setting: Setting) -> None:
         medium = setting.scene.medium
         assert medium is not None, "fog is asked for by scenes with a medium only"
-        self._view = setting.view
-        self._scale = setting.gain / setting.line.fan * medium.scattering_per_m * medium.backscatter
-        self._extinction_per_m = medium.extinction_per_m
+        view, terms = setting.view, medium.phase_terms
+        rays = view.u, view.v, np.sqrt(view.u**2 + view.v**2 + 1), view.source_m
+        self._scale = setting.gain / setting.line.fan * medium.scattering_per_m
+        if terms is None:
+            self._scale *= medium.backscatter
+        of_terms = [[w * (1 - g * g) / (4 * math.pi), abs(g), math.copysign(1, g)] for w, g in terms or ()]
+        self._numbers = {
+            np.dtype(kind): _Numbers(
+                rays=tuple(part.astype(kind) for part in rays),  # type: ignore[arg-type]
+                terms=np.array(of_terms, kind).reshape(-1, 3),
+                halving=HALVING[kind],
+                simple=tuple(map(kind, (0.0, 1.0, 2.0, LEAST_INVERSE_DEPTH))),
+            )
+            for kind in (np.float64, np.float32)
+        }
+        self._extinction_per_m = setting.scene.diffuse_extinction_per_m
         self._sigma_px = setting.line.sigma_px
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt of laser power."""
-        view = self._view
+        kind, numbers = rate.dtype, self._numbers[rate.dtype]
         _add_haze(
-            view.u,
-            view.v,
-            view.source_m,
-            sheet.inverse,
-            sheet.offset_m,
+            numbers.rays,
+            sheet.inverse.astype(kind),
             sheet.x_stripe_px,
             sheet.x_end_px,
             sheet.start_px,
             sheet.step,
-            self._scale,
+            kind.type(self._scale / abs(sheet.offset_m) if sheet.offset_m != 0 else 0.0),
             self._sigma_px,
-            self._extinction_per_m,
+            kind.type(LOG2_E * self._extinction_per_m),
+            numbers.terms,
+            numbers.halving,
+            numbers.simple,
             first_row,
             last_row,
             rate,
         )
 
 
-@numba.njit(cache=True, nogil=True)
-def _lit_share(distance_px: float, sigma_px: float) -> float:
-    """Share of a pixel that lies before an end blurred by sigma; distance from pixel centre to the end."""
-    total = 0.0
-    for sign in (1.0, -1.0):
-        a = (distance_px + 0.5 * sign) / sigma_px
-        normal = 0.5 * math.erfc(-a / math.sqrt(2.0))
-        total += sign * sigma_px * (a * normal + math.exp(-0.5 * a * a) / math.sqrt(2.0 * math.pi))
-    return total
-
-
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _add_haze(
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
-    source: NDArray[np.float64],
+    rays: Rays,
     inverse: NDArray[np.float64],
-    offset_m: float,
     x_stripe: NDArray[np.float64],
     x_end: NDArray[np.float64],
     start: NDArray[np.int64],
     step: NDArray[np.int64],
     scale: float,
     sigma_px: float,
-    extinction_per_m: float,
+    halvings_per_m: float,
+    terms: NDArray[np.float64],
+    halving: tuple[float, ...],
+    simple: tuple[float, ...],
     first_row: int,
     last_row: int,
     rate: NDArray[np.float64],
 ) -> None:
-    width = rate.shape[1]
-    reach = 5.0 * sigma_px + 0.5
+    # What arrays and tuples are asked for stands before the loops: within, each would be counted a reference. Numbers
+    # come from outside, too: written here they would be float64.
+    u, v, q, source = rays
+    a, b, c = inverse
+    source_x, source_y, source_z = source
+    zero, unit, two, least = simple
+    width, n_terms = rate.shape[1], len(terms)
+    light, halvings, phase = np.empty(width, u.dtype), np.empty(width, u.dtype), np.empty(width, u.dtype)
+    reach = REACH_SIGMAS * sigma_px + 0.5
     for y in range(first_row, last_row):
-        end = x_end[y]
-        if np.isnan(end):
+        end, move, row = x_end[y], step[y], np.uint64(y)
+        if np.isnan(end) or move == 0:
             continue
-        move = step[y]
-        soft = not np.isnan(x_stripe[y])
-        x = start[y]
-        while 0 <= x < width:
-            ahead = (end - x) * move
-            if ahead < (-reach if soft else 0.0):
-                break
-            ray_u, ray_v = u[y, x], v[y, x]
-            w = inverse[0] * ray_u + inverse[1] * ray_v + inverse[2]
-            if not w > 0.0:
-                break
-            z = 1.0 / w
-            away_x, away_y, away_z = z * ray_u - source[0], z * ray_v - source[1], z - source[2]
-            r = math.sqrt(away_x**2 + away_y**2 + away_z**2)
-            q = math.sqrt(ray_u * ray_u + ray_v * ray_v + 1.0)
-            light = scale * q / (r * w * abs(offset_m)) * math.exp(-extinction_per_m * (r + z * q))
-            if soft and ahead < reach:
-                light *= _lit_share(ahead, sigma_px)
-            rate[y, x] += light
-            x += move
+        soft = reach if not np.isnan(x_stripe[y]) else 0.0
+        # Pixels that are lit at all, and those that are lit whole, in ascending order.
+        if move > 0:
+            low, high = start[y], min(math.floor(end + soft), width - 1) + 1
+            low_whole, high_whole = low, max(min(math.floor(end - soft) + 1, high), low)
+        else:
+            low, high = max(math.ceil(end - soft), 0), start[y] + 1
+            low_whole, high_whole = min(max(math.ceil(end + soft), low), high), high
+        for i in range(high - low):
+            x = np.uint64(low) + np.uint64(i)
+            ray_u, ray_v, length = u[row, x], v[row, x], q[row, x]
+            # Everything times w = 1/z, so that one division does; w is kept from 0, where all light has faded.
+            w = max(a * ray_u + b * ray_v + c, least)
+            away_x, away_y, away_z = ray_u - w * source_x, ray_v - w * source_y, unit - w * source_z
+            r2 = away_x * away_x + away_y * away_y + away_z * away_z
+            r, one = math.sqrt(r2), unit / (r2 * w)
+            light[x] = scale * length * (one * (r * w))
+            halvings[x] = halvings_per_m * ((r + length) * (one * r2))
+        for i in range(high - low):  # a loop of its own: more pixels are then under way at a time
+            x = np.uint64(low) + np.uint64(i)
+            light[x] *= power_of_half(halvings[x], halving)
+        if n_terms > 0:
+            phase[:] = zero
+        for k in range(n_terms):
+            weight, sharp, sign = terms[k, 0], terms[k, 1], terms[k, 2]
+            for i in range(high - low):
+                x = np.uint64(low) + np.uint64(i)
+                ray_u, ray_v, length = u[row, x], v[row, x], q[row, x]
+                w = a * ray_u + b * ray_v + c
+                away_x, away_y, away_z = ray_u - w * source_x, ray_v - w * source_y, unit - w * source_z
+                r = math.sqrt(away_x * away_x + away_y * away_y + away_z * away_z)
+                cosine = -(away_x * ray_u + away_y * ray_v + away_z) / (r * length)
+                spread = (unit - sharp) * (unit - sharp) + two * sharp * (unit - sign * cosine)
+                phase[x] += weight / (spread * math.sqrt(spread))
+        if n_terms > 0:
+            for i in range(high - low):
+                x = np.uint64(low) + np.uint64(i)
+                light[x] = light[x] * phase[x] if light[x] > zero else zero  # no ray, no phase
+        for i in range(high_whole - low_whole):
+            whole = np.uint64(low_whole) + np.uint64(i)
+            rate[row, whole] += light[whole]
+        first, last = (high_whole, high) if move > 0 else (low, low_whole)
+        near = edge_sum((end - first + 0.5) * move / sigma_px)
+        for edge in range(first, last):
+            far = edge_sum((end - edge - 0.5) * move / sigma_px)
+            rate[y, edge] += light[edge] * sigma_px * abs(near - far)
+            near = far

@@ -66,7 +66,10 @@ class LaserEffect(Protocol):
     """Light that comes from the laser's sheet."""
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Add detections per second and watt to `rate` (rows, width), rows first_row..last_row-1. Releases the GIL."""
+        """Add detections per second and watt to `rate` (rows, width), rows first_row..last_row-1. Releases the GIL.
+
+        rate is float64, or float32 where frames are drawn: seven digits of the light are more than photons can tell.
+        """
         ...
 
 

@@ -97,7 +97,7 @@ SCENE = st.fixed_dictionaries(
     "sim_backend.view:View.*",
 )
 @covers("sim_backend.effects.*:*.rate", "sim_backend.effects.*:*.add", "sim_backend.effects.dark_counts:dark_rates")
-@covers("sim_backend.light_sheet_kernels:trace_rows")
+@covers("sim_backend.light_sheet_kernels:trace_rows", "sim_backend.light_sheet_kernels:span_bounds")
 @EXAMPLES
 @given(
     scene=SCENE, baseline=st.sampled_from([-0.3, 1e-9, 1e-3, 0.3, 30.0]), command=st.floats(-1, 1),

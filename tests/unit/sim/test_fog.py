@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sim_backend.effects.fog import Haze
 from sim_backend.scenes.surfaces import Surfaces
 from tests.unit.sim.rigs import effect_rate, pixel_solid_angle, rig, setting, wall
 
@@ -92,3 +93,16 @@ def test_clear_air_has_no_haze_code_and_no_haze() -> None:
     from sim_backend.flux import FluxModel
 
     assert "fog" not in FluxModel(setting(model, wall(model, (0.0, 0.0, 1.0), 3.0))).names
+
+
+@pytest.mark.parametrize("phase", [{}, {"phase": {"terms": [[0.9, 0.9], [0.1, -0.5]]}}], ids=["constant", "terms"])
+def test_haze_for_drawing_in_float32_is_that_in_float64_to_five_digits(phase: dict[str, object]) -> None:
+    model = rig(roll=0.12, k1=-0.2)
+    medium = {"medium": {"extinction": "2 /m", **phase}}
+    setup = setting(model, wall(model, (0.1, 0.0, 1.0), 2.5), **medium)
+    haze, sheet = Haze(setup), setup.view.sheet(model.planes(0.1))
+    exact, drawn = (np.zeros((64, 96), kind) for kind in (np.float64, np.float32))
+    haze.add(sheet, 0, 64, exact)
+    haze.add(sheet, 0, 64, drawn)
+    assert np.count_nonzero(exact) > 2000
+    np.testing.assert_allclose(drawn, exact, rtol=2e-5, atol=1e-9 * exact.max())

@@ -1,55 +1,85 @@
 """Binary frames: exact statistics, packed order, and the same bits however the work is cut."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sim_backend.effects.setting import FrameTimes, Words
 from sim_backend.flux import FluxModel
-from sim_backend.photon_kernels import PLANES, bit_planes, draw_frames, dropped_frames, frame_key
+from sim_backend.photon_kernels import (
+    CHANCE,
+    LEVELS,
+    NEVER,
+    Levels,
+    draw_frames,
+    dropped_frames,
+    frame_key,
+    new_levels,
+    set_levels,
+)
 from sim_backend.photons import PhotonSource
+from sim_backend.random_lanes import PLACE
 from tests.unit.sim.rigs import rig, setting, wall
 
+TIMES = FrameTimes(1e-5, 1e-5)
 
-def _planes(flux: NDArray[np.float64]) -> NDArray[np.uint64]:
-    rows, width = flux.shape
-    planes = np.zeros((rows, -(-width // 64), PLANES), np.uint64)
-    bit_planes(flux, np.zeros_like(flux), 1.0, 0.0, np.zeros((0, 1, PLANES), np.uint64), 0, rows, planes)
-    return planes
+
+def _levels(flux: NDArray[np.float64]) -> Levels:
+    rows, words = len(flux), -(-flux.shape[1] // 64)
+    levels, lit = new_levels(rows, words), np.ones((rows, words), bool)
+    with np.errstate(over="ignore"):
+        steady = flux.astype(np.float32)
+    set_levels(steady, np.zeros_like(steady), 0.0, 0, rows, new_levels(0, words), lit, levels)
+    return levels
 
 
 def _draw(flux: NDArray[np.float64], frames: int, seed: int = 3, first: int = 0) -> NDArray[np.uint8]:
-    planes = _planes(flux)
-    words = np.empty((frames, *planes.shape[:2]), np.uint64)
-    draw_frames(planes, np.uint64(seed), first, 0, len(flux), np.zeros(frames, np.int32), words)
+    levels = _levels(flux)
+    words = np.empty((frames, *levels[1].shape), np.uint64)
+    first_word = np.zeros(frames, np.int32)
+    args = 1.0, 0.0, np.uint64(seed), first, 0, len(flux), first_word, words
+    draw_frames(levels, flux, np.zeros_like(flux, np.float32), *args)
     return np.unpackbits(words.view(np.uint8).reshape(frames, len(flux), -1), axis=-1)
 
 
-def test_bit_planes_hold_the_probability_to_32_bits_in_packbits_order() -> None:
+def test_what_is_drawn_anew_makes_every_probability_exact() -> None:
     rng = np.random.default_rng(5)
-    flux = np.exp(rng.uniform(-14, 2.5, (7, 100)))
-    bits = np.unpackbits(_planes(flux).view(np.uint8).reshape(7, 2, PLANES, 8), axis=-1)
-    p = np.einsum("ywpi,p->ywi", bits, 2.0 ** -np.arange(1, PLANES + 1)).reshape(7, 128)
-    np.testing.assert_allclose(p[:, :100], -np.expm1(-flux), rtol=0, atol=0.6 * 2.0**-32)
-    assert np.all(p[:, 100:] == 0)
-
-
-def test_every_pixel_counts_as_bernoulli_says() -> None:
-    rng = np.random.default_rng(6)
-    flux = rng.choice([1e-3, 0.01, 0.1, 0.7, 2.0, 5.0], (16, 70))
-    n = 20_000
-    counts = sum(_draw(flux, 2000, first=2000 * i).sum(axis=0, dtype=np.int64) for i in range(10))
+    flux = np.exp(rng.uniform(-42, 4, (50, 100)))
+    flux[0, :3] = 0.0, 1e3, 1e300
+    stored, sure = _levels(flux)
+    level = NEVER - stored[:, :, list(PLACE)].reshape(50, 128).astype(np.float64)
+    assert np.all(level[:, 100:] == 0)
+    level[level == LEVELS - 1] = LEVELS
+    assert np.array_equal(np.unpackbits(sure.view(np.uint8), axis=1), level == LEVELS)
     p = -np.expm1(-flux)
-    z = (counts[:, :70] - n * p) / np.sqrt(n * p * (1 - p))
-    assert abs(z.mean()) < 4 / np.sqrt(z.size)
-    assert z.std() == pytest.approx(1.0, abs=4 / np.sqrt(2 * z.size))
-    assert np.all(counts[:, 70:] == 0)
+    share = (p - (1 - CHANCE) * level[:, :100] / LEVELS) / CHANCE
+    assert share.min() >= 0
+    assert share.max() <= 1
+    assert level[0, :3].tolist() == [0, LEVELS, LEVELS]
+    assert share[0, :3].tolist() == [0, 1, 1]
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-4], ids=["levels", "drawn anew"])
+def test_every_pixel_counts_as_bernoulli_says(scale: float) -> None:
+    rng = np.random.default_rng(6)
+    flux = scale * rng.choice([1e-3, 0.01, 0.1, 0.7, 2.0, 5.0], (64, 230))
+    n = 8000
+    counts = sum(_draw(flux, 1000, first=1000 * i).sum(axis=0, dtype=np.int64) for i in range(8))
+    assert np.all(counts[:, 230:] == 0)
+    for value in np.unique(flux):
+        here, p = counts[:, :230][flux == value], -np.expm1(-value)
+        assert here.sum() == pytest.approx(n * here.size * p, abs=4.5 * np.sqrt(n * here.size * p * (1 - p)) + 1)
+        spread = 4.5 * np.sqrt((2 + 1 / (n * p)) / here.size)
+        assert here.var() / (n * p * (1 - p)) == pytest.approx(1.0, abs=spread)
 
 
 def test_pixels_and_frames_are_independent() -> None:
     bits = _draw(np.full((8, 64), np.log(2.0)), 4000).astype(np.float64) - 0.5
     flat = bits.reshape(4000, -1) * 2
     n = 4000
-    for lag in (1, 2, 7, 64, 65):  # neighbours along the row, along the column
+    for lag in (1, 2, 7, 8, 16, 32, 64, 65):  # neighbours along the row, in the vector, along the column
         c = (flat[:, lag:] * flat[:, :-lag]).mean(axis=0)
         assert np.sqrt((c**2).mean()) == pytest.approx(1 / np.sqrt(n), rel=0.15)
     following = (flat[1:] * flat[:-1]).mean(axis=0)
@@ -57,8 +87,9 @@ def test_pixels_and_frames_are_independent() -> None:
 
 
 def test_certain_and_impossible_pixels() -> None:
-    flux = np.array([[0.0, 1e3, 40.0, 0.0]])
-    assert np.array_equal(_draw(flux, 3)[:, 0, :4], [[0, 1, 1, 0]] * 3)
+    flux = np.tile(np.array([0.0, 1e3, 40.0, 0.0]), (500, 16))
+    bits = _draw(flux, 500)
+    assert np.array_equal(bits, np.broadcast_to(flux > 0, bits.shape))
 
 
 def test_seeds_and_frames_have_streams_of_their_own() -> None:
@@ -66,41 +97,88 @@ def test_seeds_and_frames_have_streams_of_their_own() -> None:
     assert len(keys) == 50 * 200
 
 
+@dataclass
+class _Carries:
+    """Sets what was set in the frame before, as this effect found it; a light that moves."""
+
+    reads_before = True
+    hold_s = 3e-5
+
+    def apply(self, seed: np.uint64, first_frame: int, words: Words, before: Words, times: FrameTimes) -> None:
+        words |= np.concatenate([before[None], words[:-1]])
+
+
+def _model(size: tuple[int, int], sensor: bool) -> tuple[FluxModel, PhotonSource]:
+    model = rig(size=size)
+    flux = FluxModel(setting(model, wall(model, (0.1, 0, 1), 2.0), medium={"extinction": "0.1 /m"}))
+    if sensor:
+        flux.bits = {"first": _Carries(), "second": _Carries()}
+    return flux, model.planes
+
+
+@pytest.mark.parametrize("sensor", [False, True], ids=["photons", "sensor"])
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("block", [1, 7, 40])
-def test_bits_do_not_depend_on_block_size_or_threads(threads: int, block: int) -> None:
-    model = rig(size=(21, 70))
-    flux = FluxModel(setting(model, wall(model, (0.1, 0, 1), 2.0), medium={"extinction": "0.1 /m"}))
+def test_bits_do_not_depend_on_block_size_or_threads(threads: int, block: int, sensor: bool) -> None:
+    flux, planes = _model((21, 70), sensor)
 
     def frames(block: int, threads: int) -> NDArray[np.uint8]:
-        source = PhotonSource(flux, model.planes, 1e-5, 9, threads)
+        source = PhotonSource(flux, planes, TIMES, 9, threads)
         held = np.repeat([np.nan, 0.1, 0.2, 0.1, np.nan], 8)
         power = np.full(40, 0.5)
         power[11], power[20:23] = 0.2, 0.0
-        bits = np.full((40, 21, 16), 255, np.uint8)
+        bits, time_s = np.full((40, 21, 16), 255, np.uint8), np.arange(40) * 1e-5
         for first in range(0, 40, block):
             part = slice(first, first + block)
-            source.expose(100 + first, held[part], power[part], np.zeros(len(bits[part]), np.int32), bits[part])
+            x0 = np.zeros(len(bits[part]), np.int32)
+            source.expose(100 + first, held[part], power[part], x0, bits[part], time_s[part])
         source.close()
         return bits
 
     assert np.array_equal(frames(block, threads), frames(40, 1))
 
 
-def test_a_window_has_the_very_bits_of_the_whole_frame() -> None:
-    model = rig(size=(9, 200))
-    flux = FluxModel(setting(model, wall(model, (0.1, 0, 1), 2.0), medium={"extinction": "0.1 /m"}))
+@pytest.mark.parametrize("sensor", [False, True], ids=["photons", "sensor"])
+def test_a_window_has_the_very_bits_of_the_whole_frame(sensor: bool) -> None:
+    flux, planes = _model((9, 200), sensor)
     held, power = np.repeat([np.nan, 0.1, 0.2], 4), np.full(12, 0.5)
     x0 = np.array([0, 64, 128, 0] * 3, np.int32)
-    source = PhotonSource(flux, model.planes, 1e-5, 9, 2)
+    source = PhotonSource(flux, planes, TIMES, 9, 2)
     whole, window = np.empty((12, 9, 32), np.uint8), np.empty((12, 9, 16), np.uint8)
-    source.expose(7, held, power, np.zeros(12, np.int32), whole)
-    source.expose(7, held, power, x0, window)
+    source.expose(7, held, power, np.zeros(12, np.int32), whole, np.zeros(12))
+    source.expose(7, held, power, x0, window, np.zeros(12))
     source.close()
     assert whole.any()
     for frame in range(12):
         at = x0[frame] // 8
         assert np.array_equal(window[frame], whole[frame, :, at : at + 16])
+
+
+def test_light_that_moves_is_made_anew_at_each_step_of_its_time_whatever_the_block() -> None:
+    flux, planes = _model((9, 64), False)
+    seen: list[float] = []
+
+    class Moves:
+        hold_s = 3e-5
+
+        def add(self, sheet, first_row, last_row, rate) -> None:  # type: ignore[no-untyped-def]
+            seen.append(sheet.time_s)
+            rate[first_row:last_row] += sheet.time_s * 1e9
+
+    flux.laser = {"moves": Moves()}
+    times = np.arange(12) * 1e-5 + 6e-5
+    both = []
+    for block in (12, 5):
+        source, bits = PhotonSource(flux, planes, TIMES, 9, 1), np.zeros((12, 9, 8), np.uint8)
+        for first in range(0, 12, block):
+            n = len(bits[first : first + block])
+            part = slice(first, first + n)
+            lit = np.full(n, 0.1), np.full(n, 0.5), np.zeros(n, np.int32)
+            source.expose(first, *lit, bits[part], times[part])
+        source.close()
+        both.append(bits)
+    assert np.array_equal(*both)
+    np.testing.assert_allclose(seen, 2 * [6e-5, 9e-5, 12e-5, 15e-5], rtol=1e-12)
 
 
 def test_frames_get_lost_with_the_given_chance_whatever_the_block() -> None:
