@@ -61,8 +61,8 @@ class Found(NamedTuple):
     lanes of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
     (rows, lanes + 1), their exposures in 1/EXPOSURE_PARTS as steps up and down. light: int32, like quiet, ones of every
     pixel within the windows. The last ones of both are still in quiet_here and light_here, uint8 (rows, PAIRS, lanes of
-    the window, 2). lines: int32 (lines, window), counts of the rows that the learning reads; line_start: int32 (columns + 1,) and
-    line_row: int32, the rows of each column in order.
+    the window, 2). lines: int32 (lines, window), counts of the rows that the learning reads; line_start:
+    int32 (columns + 1,) and line_row: int32, the rows of each column in order.
     """
 
     stripe: NDArray[np.float32]
