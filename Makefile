@@ -38,6 +38,7 @@ campaign: .venv/.installed-tests
 	$(BIN)/python -m tests.campaigns.recording_corruptions --sequences 100000
 	$(BIN)/python -m tests.campaigns.recording_depth --sequences 1000
 	$(BIN)/python -m tests.campaigns.effect_ablation
+	$(BIN)/python -m tests.campaigns.photon_bits
 	$(BIN)/python -m tests.campaigns.kernel_usb
 
 .venv/.created:

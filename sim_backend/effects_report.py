@@ -96,13 +96,13 @@ def _light(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Of every effect of the laser: mean photons per frame over the mirror positions, and us per frame."""
     sheets = [world.setting.view.sheet(plane) for plane in world.sampled_planes]
-    _parts(model, sheets[0], 0, 1)  # compiled, and in the cache
-    parts = [_parts(model, sheet, 0, world.size[0]) for sheet in sheets]
+    _parts(model, sheets[0], 0, 1, np.float32)  # compiled, and in the cache; in the precision that frames are drawn in
+    parts = [_parts(model, sheet, 0, world.size[0], np.float32) for sheet in sheets]
     photons, us = {}, {}
     for name, effect in model.laser.items():
         held = hold_s(effect)
         frames = exposures if held == 0 else min(exposures, max(1, round(held / exposure_s)))
-        photons[name] = joules * float(np.mean([part[name][0].sum() for part in parts]))
+        photons[name] = joules * float(np.mean([part[name][0].sum(dtype=np.float64) for part in parts]))
         took_s = [part[name][1] for part in parts]
         if name == MOTION:  # its work is the view that all others ask for, whatever the columns
             took_s = [_view_s(world, (turn + 1) * held) for turn in range(TIMED_ROUNDS)]
@@ -118,9 +118,11 @@ def _view_s(world: "SimulatedWorld", time_s: float) -> float:
     return time.perf_counter() - begun_s
 
 
-def _parts(model: FluxModel, sheet: LightSheet, first_row: int, last_row: int) -> dict[str, tuple[Array, float]]:
+def _parts(
+    model: FluxModel, sheet: LightSheet, first_row: int, last_row: int, kind: type[np.floating[Any]] = np.float64
+) -> dict[str, tuple[Array, float]]:
     """What each effect of the laser adds, detections per second and watt (rows, width), and the seconds it took."""
-    rate = np.zeros_like(model.steady_per_s)
+    rate: Any = np.zeros(model.steady_per_s.shape, kind)
     parts = {}
     for name, effect in model.laser.items():
         before = rate[first_row:last_row].copy()

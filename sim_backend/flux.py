@@ -2,8 +2,8 @@
 
     lambda = exposure (steady + share power sheet),     p = 1 - exp(-lambda)
 
-share is the part of the exposure during which the gate let light out. `steady` is made once, `sheet` once per command;
-about 3 ms for 512 x 512 pixels in fog on one core.
+share is the part of the exposure during which the gate let light out. `steady` is made once, `sheet` once per command
+(what that costs: `sim_backend.photons`).
 """
 
 from collections.abc import Collection, Mapping, Sequence

@@ -13,6 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import DeviceError
 from sim_backend.optics import Line, Optics, Sensor
 from sim_backend.view import View
 
@@ -20,13 +21,19 @@ Array = NDArray[np.float64]
 
 
 def line_width(view: View, optics: Optics, sensor: Sensor, line: Line) -> Array:
-    """What `sigma_px` takes: (4,) variance in px^2, spread in px, defocus in px m, inverse focus in 1/m."""
+    """What `sigma_px` takes: (4,) variance in px^2, spread in px, defocus in px m, inverse focus in 1/m.
+
+    DeviceError where the focus lies within the focal length: a lens makes no picture of what is there."""
     focal_px = view.focal_px
     defocus = 0.0
     if optics.focus is not None:
         focal_m = focal_px * sensor.pitch
-        bellows = 1 - focal_m / optics.focus
-        defocus = focal_m**2 / (optics.f_number * sensor.pitch * bellows) / 4 if bellows > 0 else math.inf
+        if optics.focus <= focal_m:
+            raise DeviceError(
+                f"optics.focus is {1e3 * optics.focus:g} mm, within the focal length of {1e3 * focal_m:.3g} mm "
+                "that the geometry's camera matrix and sensor.pitch make; give a depth beyond it, e.g. 3 m"
+            )
+        defocus = focal_m**2 / (optics.f_number * sensor.pitch * (1 - focal_m / optics.focus)) / 4
     inverse_focus = 0.0 if optics.focus is None else 1 / optics.focus
     return np.array([line.sigma_px**2, focal_px * line.spread / 4, defocus, inverse_focus])
 

@@ -37,7 +37,7 @@ class Jitter:
         if self.rms == 0:
             return np.zeros(time_s.shape)
         step = np.floor(time_s / JITTER_HOLD_S).astype(np.int64).view(np.uint64)
-        start = _mix(np.uint64(self.seed % 2**64) + _STEP) + np.uint64(2) * step * _STEP
+        start = _mix(np.uint64((self.seed + int(_STEP)) % 2**64)) + np.uint64(2) * step * _STEP
         uniform = [(_mix(start + which * _STEP) >> np.uint64(11)) + 0.5 for which in np.arange(2, dtype=np.uint64)]
         radius = np.sqrt(-2 * np.log(uniform[0] / 2.0**53))
         result: Array = self.rms * radius * np.cos(2 * np.pi * uniform[1] / 2.0**53)

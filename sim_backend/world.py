@@ -21,6 +21,7 @@ from sim_backend.effect_planner import MOST, SAMPLED_COLUMNS, EffectPlan, Wanted
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.setting import FrameTimes, PlannedFor, Setting
 from sim_backend.flux import FluxModel
+from sim_backend.line_width import line_width
 from sim_backend.optics import Line, Optics, Sensor, detections_per_radiance
 from sim_backend.photons import PhotonSource
 from sim_backend.scene import load_scene, load_surfaces
@@ -77,7 +78,7 @@ class SimulatedWorld:
     """One scene, one rig, one bench. Reading is safe from any thread."""
 
     def __init__(self, config: WorldConfig, surroundings: Surroundings) -> None:
-        """DeviceError where the geometry or the scene cannot be used."""
+        """DeviceError where the geometry, the scene or the focus cannot be used."""
         self.config = config
         self.model = _load_geometry(DEFAULT_GEOMETRY if config.geometry is None else Path(config.geometry))
         camera = self.model.camera
@@ -91,9 +92,9 @@ class SimulatedWorld:
             from sim_backend.effects.motion import MovingSurfaces
 
             motion = MovingSurfaces(self.scene.motion.velocity)
-        self.setting = Setting(
-            make_view(self.model, self.surfaces, motion), self.scene, config.optics, config.sensor, config.line, gain
-        )
+        view = make_view(self.model, self.surfaces, motion)
+        line_width(view, config.optics, config.sensor, config.line)  # refuses a focus within the lens, before any plan
+        self.setting = Setting(view, self.scene, config.optics, config.sensor, config.line, gain)
         self._planned_for = MOST
         self._planned: tuple[EffectPlan, FluxModel] | None = None
         self.bench = Bench(surroundings.clock, self.model.lag_s)

@@ -168,5 +168,6 @@ def _add_haze(
         near = edge_sum((end - first + 0.5) * move / sigma_px)
         for edge in range(first, last):
             far = edge_sum((end - edge - 0.5) * move / sigma_px)
-            rate[y, edge] += light[edge] * sigma_px * abs(near - far)
+            if light[edge] > zero:  # a pixel without a ray sees nothing
+                rate[y, edge] += light[edge] * sigma_px * abs(near - far)
             near = far

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_backend.gaussian_edge import edge, edge_sum
 from sim_backend.line_width import sigma_px
 
 Array = NDArray[np.float64]
@@ -49,22 +50,15 @@ def find_pixel(u: Array, v: Array, at_u: float, at_v: float) -> tuple[float, flo
 
 
 @numba.njit(cache=True, nogil=True)
-def _ramp(a: float, sigma: float) -> float:
-    """Integral of the Gaussian's distribution function up to a."""
-    b = a / sigma
-    return a * 0.5 * math.erfc(-b / math.sqrt(2.0)) + sigma * math.exp(-0.5 * b * b) / math.sqrt(2.0 * math.pi)
-
-
-@numba.njit(cache=True, nogil=True)
 def share(pixel: int, first: float, length: float, sigma: float) -> float:
     """Share of a streak (first..first + length, blurred by sigma) that falls within a pixel, in one dimension."""
     a, b = pixel - 0.5 - first, pixel + 0.5 - first
     if length < SHORT_PX:
-        unit = 1.0 / (sigma * math.sqrt(2.0))
         middle = 0.5 * length
-        return 0.5 * (math.erf((b - middle) * unit) - math.erf((a - middle) * unit))
-    before, after = _ramp(b, sigma) - _ramp(a, sigma), _ramp(b - length, sigma) - _ramp(a - length, sigma)
-    return max((before - after) / length, 0.0)
+        return max(edge((b - middle) / sigma) - edge((a - middle) / sigma), 0.0)
+    before = edge_sum(b / sigma) - edge_sum(a / sigma)
+    after = edge_sum((b - length) / sigma) - edge_sum((a - length) / sigma)
+    return max((before - after) * sigma / length, 0.0)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim_backend.effects.fog import Haze
-from sim_backend.scenes.surfaces import Surfaces
+from sim_backend.scenes.surfaces import Surfaces, checked
 from tests.unit.sim.rigs import effect_rate, pixel_solid_angle, rig, setting, wall
 
 EXTINCTION, PHASE = 0.15, 0.05
@@ -106,3 +106,16 @@ def test_haze_for_drawing_in_float32_is_that_in_float64_to_five_digits(phase: di
     haze.add(sheet, 0, 64, drawn)
     assert np.count_nonzero(exact) > 2000
     np.testing.assert_allclose(drawn, exact, rtol=2e-5, atol=1e-9 * exact.max())
+
+
+@pytest.mark.parametrize("command", [0.8, 0.9, 1.0])
+def test_pixels_without_a_ray_see_no_haze(command: float) -> None:
+    """Where the lens has no inverse the end of the light may lie beside such pixels."""
+    model = rig(size=(48, 96), focal_px=60.0, k1=-0.8)
+    blind = np.isnan(model.camera.tangents()[0])
+    depth, albedo = np.where(blind, np.inf, 2.5), np.full(blind.shape, 0.5)
+    setup = setting(model, checked("wall", depth, albedo, ~blind, blind.shape), medium={"extinction": "0.1 /m"})
+    assert blind.any()
+    rate = effect_rate(setup, "fog", model.planes(command))
+    assert np.all(rate[blind] == 0)
+    assert np.isfinite(rate).all()

@@ -41,6 +41,11 @@ def test_its_light_is_all_there_and_symmetrical(x_command: float) -> None:
     right = np.sum(halo[behind] - behind_level)
     share_right = _share_right_of(np.floor(centre) + 0.5 - centre)
     assert right == pytest.approx(total * share_right, rel=2e-3)
+    # The light travels to the right: to the left there is more of the pedestal.
+    middle = round(centre)
+    rise = 0.8 * -np.expm1(-(middle - np.arange(middle)) / (60 * np.radians(6.0)))
+    left = np.sum(halo[:middle] - behind_level * (1 + rise))
+    assert left == pytest.approx(total * _share_right_of(centre - (middle - 0.5)), rel=2e-3)
 
 
 def _share_right_of(off_px: float) -> float:

@@ -25,6 +25,7 @@ def test_a_time_says_what_it_is() -> None:
     assert np.array_equal(jitter.error(time_s)[300:400], jitter.error(time_s[300:400]))
     assert 99 <= len(np.unique(jitter.error(time_s))) <= 102
     assert np.array_equal(Jitter(0.0, 1).error(time_s), np.zeros(1000))
+    assert Jitter(1e-3, 2**64 - 1).error(time_s).std() > 0  # the largest seed, and no warning
 
 
 def test_frames_see_the_mirror_where_it_shakes_to_within_its_range() -> None:

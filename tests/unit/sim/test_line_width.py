@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 
+from drivers.clock import VirtualClock
+from drivers.errors import DeviceError
+from drivers.registry import Surroundings
 from sim_backend.line_width import line_width, sigma_px
 from sim_backend.optics import Line, Optics, Sensor
+from sim_backend.world import KIND, WorldConfig
 from tests.unit.sim.rigs import effect_rate, rig, setting, wall
 
 
@@ -46,3 +50,16 @@ def test_without_either_it_is_as_wide_everywhere() -> None:
     view = setting(model, wall(model, (0.0, 0.0, 1.0), 2.0)).view
     width = line_width(view, Optics(), Sensor(), Line())
     assert {sigma_px(width, w, r) for w in (0.1, 1.0, 5.0) for r in (0.2, 3.0)} == {0.6}
+
+
+@pytest.mark.parametrize("focus", ["1 mm", "9.828 mm"])
+def test_a_focus_within_the_focal_length_is_refused(focus: str) -> None:
+    model = rig(focal_px=600.0)  # times 16.38 um: 9.828 mm
+    view = setting(model, wall(model, (0.0, 0.0, 1.0), 2.0)).view
+    with pytest.raises(DeviceError, match=r"optics\.focus.*focal length of 9\.83 mm.*beyond"):
+        line_width(view, Optics.model_validate({"focus": focus}), Sensor(), Line())
+
+
+def test_a_world_refuses_such_a_focus_before_anything_is_planned() -> None:
+    with pytest.raises(DeviceError, match=r"optics\.focus is 5 mm"):
+        KIND.create(WorldConfig.model_validate({"optics": {"focus": "5 mm"}}), Surroundings(VirtualClock(), None, 0))

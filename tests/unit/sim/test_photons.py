@@ -61,6 +61,24 @@ def test_what_is_drawn_anew_makes_every_probability_exact() -> None:
     assert share[0, :3].tolist() == [0, 1, 1]
 
 
+def test_so_it_does_under_the_laser_when_lit_words_come_and_go() -> None:
+    rng = np.random.default_rng(7)
+    steady_per_s, exposure_s, power_w = np.exp(rng.uniform(-5, 14, (6, 200))), 1e-5, 0.05
+    dark = _levels(exposure_s * steady_per_s)
+    levels, lit = new_levels(6, 4), np.ones((6, 4), bool)
+    for first, last in ((0, 200), (70, 120), (130, 131), (0, 0), (10, 199)):
+        rate = np.zeros((6, 200), np.float32)
+        rate[:, first:last] = np.exp(rng.uniform(-10, 18, (6, last - first)))
+        set_levels((exposure_s * steady_per_s).astype(np.float32), rate, exposure_s * power_w, 0, 6, dark, lit, levels)
+        level = NEVER - levels[0][:, :, list(PLACE)].reshape(6, 256)[:, :200].astype(np.float64)
+        level[level == LEVELS - 1] = LEVELS
+        p = -np.expm1(-exposure_s * (steady_per_s + power_w * rate.astype(np.float64)))
+        share = (p - (1 - CHANCE) * level / LEVELS) / CHANCE
+        assert share.min() >= 0
+        assert share.max() <= 1
+        assert lit.any() == (last > first)
+
+
 @pytest.mark.parametrize("scale", [1.0, 1e-4], ids=["levels", "drawn anew"])
 def test_every_pixel_counts_as_bernoulli_says(scale: float) -> None:
     rng = np.random.default_rng(6)
