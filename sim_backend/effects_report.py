@@ -39,15 +39,15 @@ def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float
     planned_for: power_w, exposure_s (of a column's frames together) and exposures that the plan holds for.
     changed_decisions_bound: of all that was left out together. effects: one mapping for each of the catalogue, with
     effect, on, why, share (of the detected photons, before saturation, over 16 mirror positions),
-    changed_decisions_bound (None: unknown), removable (whether the world can do without), cost_us_per_frame (None: a
-    device's own).
+    changed_decisions_bound (None: unknown), removable (whether the world can do without), cost_us_per_frame (None: it
+    is worked in elsewhere).
     """
     plan, model = world.effect_plan, world.flux_model
     photons, laser_us = _light(world, model, power_w * exposure_s, exposure_s, exposures)
     photons |= {name: exposure_s * float(rate.sum()) for name, rate in model.steady.items()}
     whole = sum(photons.values())
     costs: dict[str, float | None] = {**laser_us, **_bits_us(world, model, FrameTimes(exposure_s, exposure_s))}
-    costs |= {entry.name: None for entry in CATALOGUE if entry.kind == "device"}
+    costs |= {entry.name: None for entry in CATALOGUE if entry.kind == "within"}
     return {
         "planned_for": {
             "power_w": plan.planned_for.power_w,
@@ -86,7 +86,7 @@ def _line(decision: Decision, share: float, costs: Mapping[str, float | None]) -
         "why": decision.why,
         "share": share,
         "changed_decisions_bound": decision.changes,
-        "removable": entry.name != MEASURED and entry.kind != "device",
+        "removable": entry.name != MEASURED and entry.kind != "within",
         "cost_us_per_frame": costs.get(entry.name, 0.0) if decision.on else 0.0,
     }
 

@@ -27,7 +27,7 @@ class FluxModel:
         if entries is None:
             entries = [entry for entry in CATALOGUE if entry.called(setting)[0]]
         self.setting = setting
-        loaded = {entry: entry.load()(setting) for entry in entries if entry.kind != "device"}
+        loaded = {entry: entry.load()(setting) for entry in entries if entry.kind != "within"}
         self.laser: Mapping[str, LaserEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "laser"}
         """By name, in the order in which they add: a later one may act on what the earlier ones brought."""
         self.steady: Mapping[str, Array] = {e.name: effect.rate() for e, effect in loaded.items() if e.kind == "steady"}

@@ -10,15 +10,16 @@ from sim_backend.effects.setting import PlannedFor, Setting
 from sim_backend.optics import ambient_irradiance
 
 Call = tuple[bool, str]
-EffectKind = Literal["laser", "steady", "bits", "device"]
+EffectKind = Literal["laser", "steady", "bits", "within"]
 """What an effect acts on: the sheet's light (`LaserEffect`), light or counts that are there without it
-(`SteadyEffect`), the sensor's bits (`BitEffect`), or a simulated device, which then holds its code itself."""
+(`SteadyEffect`), the sensor's bits (`BitEffect`); `within`: it is worked into a simulated device, another effect or the
+gain, which hold its code."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One effect: its name, what it acts on, its class as module:name ("" for a device's own), and the rule that calls
-    for it.
+    """One effect: its name, what it acts on, its class as module:name ("" where it is worked in elsewhere), and the
+    rule that calls for it.
 
     `called(setting)` gives yes or no and the reason in words. `changes(setting, planned_for)`, in closed form: the
     largest share of decisions on a row and column that can differ without the effect (may exceed 1). None: there is no
@@ -195,8 +196,8 @@ MEASURED = "stripe"
 
 CATALOGUE = (
     Entry("stripe", "laser", "sim_backend.effects.stripe:Stripe", _stripe),
-    Entry("texture and cosine", "device", "", _surface),
-    Entry("line width and defocus", "device", "", _defocus),
+    Entry("texture and cosine", "within", "", _surface),
+    Entry("line width and defocus", "within", "", _defocus),
     # Acts on what the effects before it brought, and that is the stripe.
     Entry("speckle", "laser", "sim_backend.effects.speckle:Speckle", _speckle),
     Entry("fog", "laser", "sim_backend.effects.fog:Haze", _fog),
@@ -205,15 +206,15 @@ CATALOGUE = (
     Entry("rain", "laser", "sim_backend.effects.rain:RainDrops", _rain),
     Entry("snow", "laser", "sim_backend.effects.snow:SnowFlakes", _snow),
     Entry("motion", "laser", "sim_backend.effects.motion:Motion", _motion),
-    Entry("inter-reflection", "device", "", _between_surfaces),
+    Entry("inter-reflection", "within", "", _between_surfaces),
     Entry("ambient", "steady", "sim_backend.effects.ambient:Ambient", _ambient, _ambient_changes),
     Entry("airlight", "steady", "sim_backend.effects.airlight:Airlight", _airlight, _ambient_changes),
     Entry("dark counts", "steady", "sim_backend.effects.dark_counts:DarkCounts", _dark_counts),
-    Entry("quantum efficiency and fill factor", "device", "", _efficiency),
+    Entry("quantum efficiency and fill factor", "within", "", _efficiency),
     # The one that reads the frame before is the first on the bits: those are then the photons' own.
     Entry("afterpulsing and dead time", "bits", "sim_backend.effects.afterpulsing:Afterpulsing", _afterpulsing),
     Entry("crosstalk", "bits", "sim_backend.effects.crosstalk:Crosstalk", _crosstalk, _crosstalk_changes),
     Entry("hot and dead pixels", "bits", "sim_backend.effects.defects:Defects", _defects, _defects_change),
     Entry("bit errors", "bits", "sim_backend.effects.bit_errors:BitErrors", _bit_errors, _bit_errors_change),
-    *(Entry(name, "device", "", _of_device(name)) for name in DEVICES_OWN),
+    *(Entry(name, "within", "", _of_device(name)) for name in DEVICES_OWN),
 )

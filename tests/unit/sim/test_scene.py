@@ -172,7 +172,7 @@ def test_an_effect_that_is_not_called_for_is_not_even_imported(
 
 def test_a_bare_scene_calls_for_the_stripe_alone(planned: tuple[str, set[str], set[str]]) -> None:
     scene, names, _ = planned
-    called = {entry.name for entry in CATALOGUE if entry.name in names and entry.kind != "device"}
+    called = {entry.name for entry in CATALOGUE if entry.name in names and entry.kind != "within"}
     assert called == {"bare": {"stripe"}, "foggy": {"stripe", "fog", "ambient", "airlight", "dark counts"}}[scene]
 
 
