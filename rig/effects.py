@@ -57,8 +57,8 @@ class Effect:
     on, why: whether it is simulated, and the reason. share: of all detected photons. changed_decisions_bound: the share
     of decisions that can change at most without it, None where there is no bound. cost_us_per_frame: of one thread;
     None: it is worked in elsewhere. stripe_error_change_px: how much larger the mean stripe error is with it than
-    without it, and its standard error; `basis` says whether that was measured in a pair of trial scans or is the bound of an effect
-    that is left out; None: neither.
+    without it, and its standard error; `basis` says whether that was measured in a pair of trial scans or is the bound
+    of an effect that is left out; None: neither.
     """
 
     effect: str
