@@ -7,20 +7,19 @@ the bench.
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interfaces import LEVEL_BACKWARD, ScanWaveform
+from sim_backend.split_mix import GOLDEN, mixed
 
 Array = NDArray[np.float64]
 
 
 JITTER_HOLD_S = 1e-4
 """For how long the mirror's error stays the same: a small galvo answers within 100 us."""
-_STEP, _MIX_1, _MIX_2 = (np.uint64(n) for n in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
-"""SplitMix64 (Steele, Lea, Flood 2014)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,18 +36,14 @@ class Jitter:
         if self.rms == 0:
             return np.zeros(time_s.shape)
         step = np.floor(time_s / JITTER_HOLD_S).astype(np.int64).view(np.uint64)
-        start = _mix(np.uint64((self.seed + int(_STEP)) % 2**64)) + np.uint64(2) * step * _STEP
-        uniform = [(_mix(start + which * _STEP) >> np.uint64(11)) + 0.5 for which in np.arange(2, dtype=np.uint64)]
+        with np.errstate(over="ignore"):
+            start = mixed(np.uint64((self.seed + int(GOLDEN)) % 2**64)) + np.uint64(2) * step * GOLDEN
+            uniform = [
+                (mixed(start + which * GOLDEN) >> np.uint64(11)) + 0.5 for which in np.arange(2, dtype=np.uint64)
+            ]
         radius = np.sqrt(-2 * np.log(uniform[0] / 2.0**53))
         result: Array = self.rms * radius * np.cos(2 * np.pi * uniform[1] / 2.0**53)
         return result
-
-
-def _mix(z: Any) -> Any:
-    with np.errstate(over="ignore"):
-        z = (z ^ (z >> np.uint64(30))) * _MIX_1
-        z = (z ^ (z >> np.uint64(27))) * _MIX_2
-    return z ^ (z >> np.uint64(31))
 
 
 class Motion(Protocol):

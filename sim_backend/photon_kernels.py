@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from sim_backend.exponential import ROUGHLY, one_minus_exp_minus, roughly_one_minus_exp_minus
 from sim_backend.random_lanes import PLACE, WORD_PX, block_numbers, drawn_word, enciphered, place_levels, sure_word
+from sim_backend.split_mix import FRAME_STEP, GOLDEN, frame_key, mixed_word
 
 LEVELS = 2**16
 NEVER = LEVELS // 2 - 1
@@ -42,30 +43,12 @@ _WORD_BYTES = WORD_PX * 2
 """Of levels."""
 _PER_SKIP = 1.0 / math.log1p(-CHANCE)
 
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-_MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
-_MIX_2 = np.uint64(0x94D049BB133111EB)
-_FRAME_STEP = np.uint64(0xD1342543DE82EF95)
-"""SplitMix64 (Steele, Lea, Flood 2014) and an odd multiplier that spreads frame numbers."""
-_S11, _S27, _S30, _S31 = np.uint64(11), np.uint64(27), np.uint64(30), np.uint64(31)
+_S11 = np.uint64(11)
 _ANEW = np.uint64(2**32)
 """In the place of the row: the streams of what is drawn anew."""
 _STRIP_ROWS = 64
 _UNIT = 2.0**-53
 _PLACE = np.array(PLACE, np.uint8)
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _mix(z: np.uint64) -> np.uint64:
-    z = (z ^ (z >> _S30)) * _MIX_1
-    z = (z ^ (z >> _S27)) * _MIX_2
-    return z ^ (z >> _S31)
-
-
-@numba.njit(cache=True, nogil=True)
-def frame_key(seed: np.uint64, frame: np.uint64) -> np.uint64:
-    """Start of a frame's random stream."""
-    return _mix(_mix(seed + _GOLDEN) + frame * _FRAME_STEP)
 
 
 Levels = tuple[NDArray[np.int16], NDArray[np.uint64]]
@@ -175,7 +158,7 @@ def draw_frames(
     window begins; its bits are those of the whole frame.
     """
     frames, _, n_words = words.shape
-    key = _mix(seed + _GOLDEN), _mix(seed + _FRAME_STEP)
+    key = mixed_word(seed + GOLDEN), mixed_word(seed + FRAME_STEP)
     stored, sure = levels
     row_words = stored.shape[1]
     blocks = block_numbers(row_words)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sim_backend.effects.setting import Array, Setting
 from sim_backend.light_sheet import LightSheet
 from sim_backend.optics import Line, Optics, Sensor
-from sim_backend.photon_kernels import frame_key
+from sim_backend.split_mix import frame_key
 
 POLARISATIONS = 2
 

@@ -15,12 +15,12 @@ from sim_backend.photon_kernels import (
     Levels,
     draw_frames,
     dropped_frames,
-    frame_key,
     new_levels,
     set_levels,
 )
 from sim_backend.photons import PhotonSource
 from sim_backend.random_lanes import PLACE
+from sim_backend.split_mix import frame_key
 from tests.unit.sim.rigs import rig, setting, wall
 
 TIMES = FrameTimes(1e-5, 1e-5)

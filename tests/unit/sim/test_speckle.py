@@ -6,7 +6,7 @@ import pytest
 from sim_backend.effects.speckle import Speckle, gamma_of, grains
 from sim_backend.effects.stripe import Stripe
 from sim_backend.optics import Line, Optics, Sensor
-from sim_backend.photon_kernels import frame_key
+from sim_backend.split_mix import frame_key
 from tests.unit.sim.rigs import Array, rig, setting, wall
 
 
