@@ -20,6 +20,8 @@ _SILENT_S = 0.5
 """So long no proper status: the device hangs."""
 _PATIENCE_S = 1.0
 """Beyond the time its frames take, for the buffer to fall free."""
+_WIRE_BYTES_PER_S = 1.216e6
+"""Most that a full-speed bulk endpoint carries: 19 packets of 64 bytes a millisecond (USB 2.0, table 5-9)."""
 _DRIFT = 1e-3
 """Most that the device's crystal and the host's clock differ."""
 
@@ -43,32 +45,39 @@ class HeliosRun:
         """Durations of the frames in the two buffers; 0: none."""
         self._earliest_end_s = self._latest_end_s = 0.0
         """When the playing frame ends, on the host's clock."""
+        self._next: tuple[bytes, float] | None = None
+        """The frame to be sent next and its duration: made while another plays, not when the time for it has come."""
         if self._unsendable():
             source.pad_start()
 
     def begin(self) -> None:
-        """Send the first frame; it plays at once."""
+        """Send the first frame; it plays once it is whole."""
         self._wait_until_idle()
-        duration_s, began_s, arrived_s = self._send(FLAG_SINGLE | FLAG_START)
-        self._playing_s = duration_s
-        self._earliest_end_s = began_s + duration_s * (1 - _DRIFT)
+        first = self._made(FLAG_SINGLE | FLAG_START)
+        self._next = self._made() if self.source.left else None
+        self._playing_s = duration_s = first[1]
+        earliest_s, arrived_s = self._send(first[0])
+        self._earliest_end_s = earliest_s + duration_s * (1 - _DRIFT)
         self._latest_end_s = arrived_s + duration_s * (1 + _DRIFT)
 
     def feed(self, stopping: threading.Event) -> None:
         """Send all that is left; returns when the mirror rests. Brakes once `stopping` is set."""
         stopped = False
-        while self.source.left:
+        while self._next is not None:
             if not stopped and stopping.is_set():
                 stopped = True
                 self._brake()
             elif self._wait_until_free(None if stopped else stopping):
-                self._append()
+                self._append(*self._next)
+            else:
+                continue
+            self._next = self._made() if self.source.left else None
         latest_s = self._latest_end_s + self._pending_s * (1 + _DRIFT)
         self._clock.sleep(latest_s - self._now_s())
 
-    def _append(self) -> None:
+    def _append(self, frame: bytes, duration_s: float) -> None:
         """One more frame, behind the playing one."""
-        duration_s, _, arrived_s = self._send(FLAG_SINGLE)
+        _, arrived_s = self._send(frame)
         late_s = arrived_s - self._earliest_end_s
         if late_s > 0:
             raise DeviceFault(
@@ -95,16 +104,20 @@ class HeliosRun:
     def _raise_dropped(self) -> None:
         raise DeviceFault(f"{self._link.name}: dropped a frame in silence; check the cable, then start again")
 
-    def _send(self, flags: int) -> tuple[float, float, float]:
-        """Duration of the frame, and the host's times before and after sending it."""
+    def _made(self, flags: int = FLAG_SINGLE) -> tuple[bytes, float]:
+        """The next frame and its duration."""
         points = self.source.take(slice_points(self.source.left, self._most))
-        frame = encode(points, self._axis, self._pps, flags)
+        return encode(points, self._axis, self._pps, flags), len(points) / self._rate_hz
+
+    def _send(self, frame: bytes) -> tuple[float, float]:
+        """The host's times between which the frame arrived."""
         began_s = self._now_s()
         self._link.send_frame(frame)
         self._sent += 1
-        return len(points) / self._rate_hz, began_s, self._now_s()
+        return began_s + len(frame) / _WIRE_BYTES_PER_S, self._now_s()
 
     def _brake(self) -> None:
+        self.source.give_back()
         self.source.stop()
         if self._unsendable():
             self.source.pad_end()

@@ -49,6 +49,7 @@ class PointSource:
         self._end = len(way) + repeats * len(self._wave.command)
         self._at = 0
         self._before = self.last = position
+        self._former = 0, position, position
 
     @property
     def left(self) -> int:
@@ -67,6 +68,7 @@ class PointSource:
 
     def take(self, most: int) -> Points:
         """The next points, at most so many."""
+        self._former = self._at, self._before, self.last
         at = np.arange(self._at, min(self._at + most, self._end))
         self._at += len(at)
         lit = at >= len(self._way)
@@ -76,6 +78,10 @@ class PointSource:
         command[~lit] = self._way[at[~lit]]
         self._note(command)
         return Points(command, markers, lit)
+
+    def give_back(self) -> None:
+        """Undo the last `take`: its points were not played."""
+        self._at, self._before, self.last = self._former
 
     def stop(self) -> None:
         """Replace what is left by the shortest way to rest."""

@@ -18,6 +18,7 @@ def configure(
     config: Config = SIMULATED,
     *,
     scene: str | None = None,
+    fog: str | None = None,
     exposures: int | None = None,
     estimator: Estimator | None = None,
     filter: Filter | None = None,
@@ -25,18 +26,21 @@ def configure(
 ) -> RigConfig:
     """The validated config that `scan` would use; options that are None stay as the config says.
 
-    config: a bundled rig's name, a file or a RigConfig. Raises UsageError with one line per problem.
+    config: a bundled rig's name, a file or a RigConfig. fog: in place of the scene's, a visibility such as '20 m', or
+    'clear'. Raises UsageError with one line per problem.
     """
     options = {
         "world.scene": scene,
+        "world.fog": fog,
         "scan.exposures": exposures,
         "estimate.estimator": estimator,
         "estimate.filter": filter,
         "estimate.min_confidence": min_confidence,
     }
     loaded = config if isinstance(config, RigConfig) else load_config(os.fspath(config))
-    if scene is not None and loaded.world is None:
-        raise UsageError(f"scene {scene!r} was asked for, but {loaded.name} is a real rig; leave --scene out")
+    for name, asked in (("scene", scene), ("fog", fog)):
+        if asked is not None and loaded.world is None:
+            raise UsageError(f"{name} {asked!r} was asked for, but {loaded.name} is a real rig; leave --{name} out")
     given = {key: value for key, value in options.items() if value is not None}
     if not given:
         return loaded

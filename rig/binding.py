@@ -325,7 +325,7 @@ _WHOLE = np.dtype((np.void, FRAME_RECORD.itemsize))
 
 def _plan_terms(plan: ScanPlan) -> PlanTerms:
     return PlanTerms(
-        plan.columns,
+        plan.places,
         float(plan.column_s),
         float(plan.point_rate_hz),
         plan.sweep_points,

@@ -26,10 +26,12 @@ def unseen_pattern(plan: ScanPlan, model: RigModel | None) -> list[str]:
 
     problems = []
     for leg in plan.legs:
+        # Of several lines the one that lights the first column then: that is where the pattern is looked for.
+        offset = 0.0 if plan.lines is None else plan.lines.offsets[plan.lines.line[0 if leg.columns_rise else -1]]
         first, last = plan.command_range if leg.columns_rise else plan.command_range[::-1]
         middle_s = plan.pattern_s(leg) + plan.blanking.length_s / 2
-        here = float(plan.command_at(plan.column(np.array([middle_s]), leg))[0])
-        tried = np.linspace(here, last, COMMANDS_TRIED)
+        here = float(plan.command_at(plan.column(np.array([middle_s]), leg))[0]) + offset
+        tried = np.linspace(here, last + offset, COMMANDS_TRIED)
         visible = np.flatnonzero(seen(tried))
         if len(visible) and visible[0] == 0:
             continue

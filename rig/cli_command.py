@@ -30,7 +30,7 @@ SceneOption = Annotated[
     typer.Option("--scene", help="a bundled scene, a scene file or a folder (simulated rigs)", show_default=False),
 ]
 EstimatorOption = Annotated[
-    str | None, typer.Option("--estimator", help="argmax, edge or likelihood", show_default=False)
+    str | None, typer.Option("--estimator", help="argmax, edge, likelihood or joint", show_default=False)
 ]
 FilterOption = Annotated[str | None, typer.Option("--filter", help="none or median (5 x 5)", show_default=False)]
 ConfidenceOption = Annotated[

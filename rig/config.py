@@ -21,11 +21,12 @@ from pydantic import (
 from drivers.errors import UnknownKind
 from drivers.registry import KindConfig, kinds, lookup
 from drivers.units import ExactHertz, Metres, Seconds, Watts
+from rig.multi_line_config import LineOffsets, LinePower, line_problems
 
 MIN_DARK_FRACTION = 0.05
 """Share of a live sweep's frames that must be dark: the dark rate is learned from them."""
 
-Estimator = Literal["argmax", "edge", "likelihood"]
+Estimator = Literal["argmax", "edge", "likelihood", "joint"]
 Filter = Literal["none", "median"]
 
 
@@ -169,8 +170,21 @@ class RigConfig(Section):
     scanner: Annotated[SerializeAsAny[KindConfig], _of_slot("scanner")]
     laser: Annotated[SerializeAsAny[KindConfig], _of_slot("laser")]
     sync: Annotated[SerializeAsAny[KindConfig], _of_slot("sync")]
+    line_offsets: LineOffsets = (0.0,)
+    line_power: LinePower = Field(
+        default="shared",
+        description="whether lines share the laser's power (a diffractive element) or each has it (more lasers)",
+        examples=["shared"],
+    )
     scan: ScanConfig
     estimate: EstimateConfig = EstimateConfig()
+
+    @model_validator(mode="after")
+    def _lines_fit(self) -> Self:
+        problems = line_problems(self.line_offsets, self.scan.columns, self.scan.command_range)
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
 
 
 class CubePlan(Section):

@@ -38,6 +38,7 @@ _BOUNDS = {
 }
 FLAGS: Mapping[Key, str] = {
     ("world", "scene"): "--scene",
+    ("world", "fog"): "--fog",
     ("scan", "exposures"): "--exposures",
     ("estimate", "estimator"): "--estimator",
     ("estimate", "filter"): "--filter",

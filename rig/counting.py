@@ -189,6 +189,16 @@ class SweepTally:
         )  # fmt: skip
 
 
+def with_room(counts: Counts, n_frames: NDArray[np.int32]) -> Counts:
+    """The counts, as wide as so many frames of a column need before they can overflow."""
+    most = int(n_frames.max(initial=0))
+    for wider in (np.uint16, np.uint32):
+        if most <= np.iinfo(counts.dtype).max:
+            break
+        counts = counts.astype(wider)
+    return counts
+
+
 class SweepCounter:
     """The `Counter` that keeps the counts of a whole sweep: a `CountVolume`."""
 
@@ -211,7 +221,7 @@ class SweepCounter:
 
         layout, first_word = self._layout, x0 // np.int32(WORD_PX)
         self._tally.note(bins, column, first_word)
-        self._make_room()
+        self._counts = with_room(self._counts, self._tally.n_frames)
         words, row_words = bits.reshape(-1).view(np.uint64), bits.shape[2] // 8
 
         def work(first: int, last: int) -> None:
@@ -224,14 +234,6 @@ class SweepCounter:
 
     def settle(self, under_way: int = 0) -> None:
         """Nothing is left over by `add`."""
-
-    def _make_room(self) -> None:
-        """Widen the counts before they can overflow."""
-        most = int(self._tally.n_frames.max(initial=0))
-        for wider in (np.uint16, np.uint32):
-            if most <= np.iinfo(self._counts.dtype).max:
-                return
-            self._counts = self._counts.astype(wider)
 
     def finish(self) -> CountVolume:
         """The counts so far."""

@@ -14,9 +14,11 @@ from drivers.interfaces import World
 from drivers.registry import Surroundings, lookup
 from rig.config import RigConfig
 from rig.errors import PlanError, UsageError
+from rig.multi_line import line_grid
 from rig.run import Progress
 from rig.scan_plan import column_command
 from rig.scoring import MISSING_PX, charged_errors
+from rig.session import ProjectsLines
 
 Array = NDArray[np.float64]
 Flux = dict[str, NDArray[Any]]
@@ -130,9 +132,18 @@ def flux_row(config: RigConfig, row: int, column: int) -> Flux:
         ]
         if problems:
             raise UsageError.of(problems)
-        command = float(column_command(column, scan.command_range, scan.columns))
+        command = _mirror_command(config, column)
         parts = world.flux_row(row, command, power_w, scan.exposure_s)
     return {"x_px": np.arange(width), "total": sum(parts.values(), np.zeros(width)), **parts}
+
+
+def _mirror_command(config: RigConfig, column: int) -> float:
+    """Where the mirror stands while a column is lit."""
+    scan, offsets = config.scan, config.line_offsets
+    if len(offsets) > 1:
+        grid, _ = line_grid(offsets, scan.columns, scan.command_range)
+        column = int(grid.place[column])
+    return float(column_command(column, scan.command_range, scan.columns // len(offsets)))
 
 
 @contextmanager
@@ -146,6 +157,8 @@ def open_world(config: RigConfig) -> Iterator[tuple[ReportsEffects, float]]:
             world: Any = lookup("world", config.world.kind).create(config.world, alone)
         except DeviceError as error:  # a scene that is not there is the config's fault
             raise UsageError(f"world: {error}") from error
+        if isinstance(world, ProjectsLines):
+            world.project_lines(config.line_offsets, shared=config.line_power == "shared")
         if hasattr(world, "close"):
             stack.enter_context(closing(world))
         if not isinstance(world, ReportsEffects):
@@ -170,7 +183,7 @@ def _trials(
     """
     if config.world is None or config.world.real_time:
         return {}
-    columns = min(TRIAL_COLUMNS, config.scan.columns)
+    columns = min(TRIAL_COLUMNS - TRIAL_COLUMNS % -len(config.line_offsets), config.scan.columns)
     while True:
         try:
             whole = _trial(config, columns, on)

@@ -124,6 +124,13 @@ smaller = _named("smin")
 smaller_float = _named("minnum")
 """smaller_float(a, b): the smaller one of two float32 in each lane."""
 
+add_saturated_unsigned = _named("uadd.sat")
+"""add_saturated_unsigned(a, b): sum of unsigned integers that stops at the largest of the type."""
+sub_saturated_unsigned = _named("usub.sat")
+"""sub_saturated_unsigned(a, b): difference of unsigned integers that stops at 0."""
+smaller_unsigned = _named("umin")
+"""smaller_unsigned(a, b): the smaller one of two unsigned integers in each lane."""
+
 for _operator, _operation in (
     (operator.add, _add),
     (operator.sub, _sub),
@@ -193,7 +200,7 @@ square_root = _conversion(FLOAT32, lambda b, a: called(b, f"llvm.sqrt.{vector_na
 """square_root(a): of float32 lanes."""
 
 
-def _has_avx2() -> bool:
+def has_avx2() -> bool:
     """Whether numba compiles for a processor with AVX2: this one, unless its settings name another."""
     settings: Any = config
     if settings.CPU_NAME is None and settings.CPU_FEATURES is None:
@@ -208,7 +215,7 @@ def dot_pairs(typing: Any, counts: Any, weights: Any) -> VectorCode:
     counts: unsigned bytes; weights: signed.
     """
     # LLVM has no name of its own for what is one instruction on x86, and does not always recognise it.
-    one_instruction = _has_avx2()
+    one_instruction = has_avx2()
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         if one_instruction:
@@ -243,3 +250,13 @@ def _constant(lanes: Lanes, number: float) -> Any:
 zero_bytes = _constant(BYTES, 0)
 zero_int16 = _constant(INT16, 0)
 zero_float32 = _constant(FLOAT32, 0.0)
+
+
+@intrinsic_of
+def smallest_byte(typing: Any, a: Any) -> VectorCode:
+    """smallest_byte(a): the smallest one of 32 unsigned bytes."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return called(builder, f"llvm.vector.reduce.umin.{vector_name(BYTES.llvm)}", ir.IntType(8), args[0])
+
+    return types.uint8(BYTES), code

@@ -38,7 +38,7 @@ def depth_picture(depth_m: NDArray[np.float32], limits: tuple[float, float] | No
     bar = np.linspace(low, high, bottom - top)
     left = width + 8
     picture[top:bottom, left : left + _BAR_PX] = _colours(bar, limits)[:, None]
-    for value in _round_values(low, high, min(_LABELS, max(1, rows // 40))):
+    for value in round_values(low, high, min(_LABELS, max(1, rows // 40))):
         y = top + round((value - low) / (high - low) * (bottom - top - 1))
         cv2.line(picture, (left + _BAR_PX, y), (left + _BAR_PX + 3, y), (255, 255, 255), 1)
         at = (left + _BAR_PX + 6, min(max(y + _TEXT_HEIGHT_PX // 2, _TEXT_HEIGHT_PX), rows - 2))
@@ -92,7 +92,7 @@ def _colours(depth_m: NDArray[np.floating], limits: tuple[float, float]) -> NDAr
     return colours
 
 
-def _round_values(low: float, high: float, most: int) -> list[float]:
+def round_values(low: float, high: float, most: int) -> list[float]:
     """At most `most` + 1 round numbers between low and high, 1, 2 or 5 times a power of ten apart."""
     rough = (high - low) / max(most, 1)
     power = 10.0 ** np.floor(np.log10(rough))

@@ -5,7 +5,7 @@ timing that the SPAD answers the plan is compiled once more.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 
@@ -34,6 +34,7 @@ from rig.blanking_view import unseen_pattern
 from rig.config import ScanConfig
 from rig.errors import PlanError, UsageError
 from rig.mirror_path import SweepPath, mirrored
+from rig.multi_line import LineGrid, line_grid, window_overlap
 from rig.path_search import PathDemand, find_path, remedy
 from rig.scan_plan import Leg, ScanPlan, column_command, rounded
 from rig.windows import LEAST_MARKER_FRAMES, LEAST_MARKER_POINTS, moving_windows, window_widths
@@ -71,16 +72,18 @@ def compile_plan(
     model: RigModel | None,
     info: SpadInfo,
     timing: SpadTiming | None = None,
+    line_offsets: Sequence[float] = (0.0,),
 ) -> ScanPlan:
     """The plan of a scan, checked.
 
     point_clock: the scanner's exact clock for a requested rate (`BeamScanner.point_clock`). model: None where the rig
     is not calibrated; there is then no lag and the window is the whole row. timing: what the SPAD answered to
-    `spad_request`; its nominal rate where None. Raises PlanError with one line per problem.
+    `spad_request`; its nominal rate where None. line_offsets: of the rig, which fit the scan. Raises PlanError with one
+    line per problem.
     """
 
     def draft(scan: ScanConfig) -> tuple[ScanPlan | None, list[str]]:
-        return _draft(scan, limits, point_clock, model, info, timing)
+        return _draft(scan, limits, point_clock, model, info, timing, line_offsets)
 
     plan, problems = draft(scan)
     too_fast = [*_beyond_sensor(scan, info)]
@@ -148,15 +151,20 @@ def _draft(
     model: RigModel | None,
     info: SpadInfo,
     timing: SpadTiming | None,
+    line_offsets: Sequence[float],
 ) -> tuple[ScanPlan | None, list[str]]:
     """The plan, where there is a mirror path for it, and everything that stands against scanner and calibration."""
+    places, lines = scan.columns // len(line_offsets), None
+    commands = column_command(np.arange(scan.columns), scan.command_range, scan.columns)
+    if len(line_offsets) > 1:
+        lines, commands = line_grid(line_offsets, scan.columns, scan.command_range)
     frame_rate = scan.frame_rate if timing is None else timing.tick_hz / timing.frame_period_ticks
     blanking = None
     if not info.markers:
-        blanking = blanking_for(scan.columns, scan.exposures, frame_rate)
+        blanking = blanking_for(places, scan.exposures, frame_rate)
     demand = PathDemand(
         edges=scan.command_range,
-        columns=scan.columns,
+        columns=places,
         column_s=scan.exposures / frame_rate,
         frame_s=1 / frame_rate,
         lag_s=max(model.lag_s if model is not None else Lag()),
@@ -167,16 +175,16 @@ def _draft(
         bidirectional=scan.bidirectional,
         lead_s=0.0 if blanking is None else blanking.lead_s + MARGIN_FRAMES / float(frame_rate),
     )
-    wrong_model = _model_problems(scan, model, info, demand.speed_per_s)
+    wrong_model = _model_problems(scan, model, info, demand.speed_per_s, line_offsets)
     found = find_path(demand, limits, point_clock)
     advice = remedy(demand, scan.exposures, limits, point_clock) if found.problems else ""
     first, last = scan.command_range
-    asked = f"scan of {scan.columns} columns x {scan.exposures} exposures over command_range [{first:g}, {last:g}]"
+    asked = f"scan of {places} columns x {scan.exposures} exposures over command_range [{first:g}, {last:g}]"
     problems = [*wrong_model, *(f"{asked}: {problem}; {advice}" for problem in found.problems)]
     if found.path is None or problems:
         return None, problems
     try:
-        plan = _plan(scan, found.path, found.rate_hz, demand, model, info, timing, blanking)
+        plan = _plan(scan, found.path, found.rate_hz, demand, model, info, timing, blanking, commands, lines)
         check_waveform(plan.waveform, limits, plan.point_rate_hz, seamless=True)
     except LimitExceeded as error:
         return None, [f"scan: {error}"]
@@ -194,12 +202,13 @@ def _plan(
     info: SpadInfo,
     timing: SpadTiming | None,
     blanking: Blanking | None,
+    commands: NDArray[np.float64],
+    lines: LineGrid | None,
 ) -> ScanPlan:
     """The plan along a mirror path; whether the SPAD's link carries it is for the caller to judge."""
     legs = _legs(path, scan, model.lag_s if model is not None else Lag(), demand.gate_margin_s, rate)
-    step, markers = _markers(path, scan)
-    commands = column_command(np.arange(scan.columns), scan.command_range, scan.columns)
-    x0, window = _windows(model, commands, scan, info)
+    step, markers = _markers(path, demand.columns, scan.exposures)
+    x0, window, lines = _windows(model, commands, scan, info, lines)
     plan = ScanPlan(
         columns=scan.columns,
         exposures=scan.exposures,
@@ -225,9 +234,11 @@ def _plan(
         windows=None,
         windowed=False,
         blanking=blanking,
+        lines=lines,
     )
-    # Line markers move the windows, also in whole frames; without them every pixel of a frame is used.
-    return _transported(plan if blanking else _with_windows(plan, info.roi_step_px), info.burst)
+    # Line markers move the windows, also in whole frames; without them every pixel of a frame is used, and so it is
+    # where the windows of several lines lie all over the picture.
+    return _transported(plan if blanking or lines else _with_windows(plan, info.roi_step_px), info.burst)
 
 
 def _with_windows(plan: ScanPlan, step_px: int) -> ScanPlan:
@@ -255,14 +266,16 @@ def _transported(plan: ScanPlan, burst: BurstMode | None) -> ScanPlan:
     )
 
 
-def _model_problems(scan: ScanConfig, model: RigModel | None, info: SpadInfo, speed_per_s: float) -> list[str]:
+def _model_problems(
+    scan: ScanConfig, model: RigModel | None, info: SpadInfo, speed_per_s: float, line_offsets: Sequence[float]
+) -> list[str]:
     if model is None:
         return []
     problems = []
     checks: tuple[Callable[[], object], ...] = (
         lambda: model.check_sensor(info.width, info.height),
         lambda: model.check_speed(speed_per_s),
-        lambda: model.planes(np.array(scan.command_range)),
+        lambda: model.planes(np.add.outer(np.array(scan.command_range), np.array(line_offsets))),
     )
     for check in checks:
         try:
@@ -285,14 +298,14 @@ def _legs(path: SweepPath, scan: ScanConfig, lag: Lag, margin_s: float, rate: Fr
     return (out, leg(mirrored(path), not rising, False)) if scan.bidirectional else (out,)
 
 
-def _markers(path: SweepPath, scan: ScanConfig) -> tuple[int, NDArray[np.int64]]:
+def _markers(path: SweepPath, columns: int, exposures: int) -> tuple[int, NDArray[np.int64]]:
     """Columns per line marker, and the point of each marker within a sweep."""
-    points_per_column = path.lit_points / scan.columns
+    points_per_column = path.lit_points / columns
     step = max(
         math.ceil(LEAST_MARKER_POINTS / points_per_column),
-        math.ceil(LEAST_MARKER_FRAMES / Fraction(scan.exposures)),
+        math.ceil(LEAST_MARKER_FRAMES / Fraction(exposures)),
     )
-    points = [math.floor(path.lit_start + j * step * points_per_column) for j in range(scan.columns // step + 1)]
+    points = [math.floor(path.lit_start + j * step * points_per_column) for j in range(columns // step + 1)]
     return step, np.array(points, np.int64)
 
 
@@ -317,14 +330,17 @@ def _waveform(legs: tuple[Leg, ...], marker_points: NDArray[np.int64], rate: Fra
 
 
 def _windows(
-    model: RigModel | None, commands: NDArray[np.float64], scan: ScanConfig, info: SpadInfo
-) -> tuple[NDArray[np.int32], int]:
+    model: RigModel | None, commands: NDArray[np.float64], scan: ScanConfig, info: SpadInfo, lines: LineGrid | None
+) -> tuple[NDArray[np.int32], int, LineGrid | None]:
+    """First pixel of each column's window and their width; the lines, told how far they share them."""
     if model is None:
-        return np.zeros(scan.columns, np.int32), -(-info.width // 64) * 64
+        return np.zeros(scan.columns, np.int32), -(-info.width // 64) * 64, lines
     from rig.geometry import sweep_geometry
 
     try:
         geometry = sweep_geometry(model, model.planes(commands), scan.depth_range)
     except UsageError as error:
         raise PlanError(f"scan.depth_range: {error}") from error
-    return geometry.x0, geometry.window
+    if lines is not None:
+        lines = replace(lines, overlap=window_overlap(lines, geometry))
+    return geometry.x0, geometry.window, lines

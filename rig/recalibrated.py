@@ -8,6 +8,7 @@ from calibration.errors import CalibrationError
 from calibration.model import RigModel
 from rig.errors import UsageError
 from rig.geometry import sweep_geometry
+from rig.multi_line import window_overlap
 from rig.scan_plan import ScanPlan
 
 
@@ -26,4 +27,7 @@ def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
         raise UsageError(f"calibration: {error}") from error
     lags = {1: model.lag_s.forward, -1: model.lag_s.backward}
     legs = tuple(replace(leg, lag_s=lags[leg.direction]) for leg in plan.legs)
-    return replace(plan, legs=legs, x0=geometry.x0, window=geometry.window)
+    lines = plan.lines
+    if lines is not None:
+        lines = replace(lines, overlap=window_overlap(lines, geometry))
+    return replace(plan, legs=legs, x0=geometry.x0, window=geometry.window, lines=lines)

@@ -15,6 +15,8 @@ from rig.depth import depth_map
 from rig.errors import UsageError
 from rig.estimators import ESTIMATORS, FILTERS, Learned, create_estimator, recalling
 from rig.geometry import SweepGeometry, sweep_geometry, uncalibrated_geometry
+from rig.multi_line import LineGrid
+from rig.multi_line_counter import LineCounter
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
@@ -52,7 +54,8 @@ class Reconstructor:
     """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
 
     model: rig model, None for an uncalibrated rig (stripes only). column_commands: (columns,) mirror command of each
-    column's centre. estimator, filter: of ESTIMATORS and FILTERS. Raises UsageError for what does not fit.
+    column's centre. estimator, filter: of ESTIMATORS and FILTERS. lines: which line lights which column where there are
+    several. Raises UsageError for what does not fit.
     """
 
     def __init__(
@@ -67,6 +70,7 @@ class Reconstructor:
         min_confidence: float = 0.5,
         threads: int = 2,
         learned: Sequence[Learned] = (),
+        lines: LineGrid | None = None,
     ) -> None:
         if estimator not in ESTIMATORS:
             raise UsageError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
@@ -76,6 +80,7 @@ class Reconstructor:
         self._commands = np.asarray(column_commands, dtype=np.float64)
         self._min_confidence = min_confidence
         self._filter = filter
+        self._lines = lines
         self._workers = RowWorkers(threads)
         self.estimator = recalling(learned, threads) if learned else create_estimator(estimator, threads)
         if model is not None:
@@ -87,6 +92,8 @@ class Reconstructor:
 
     def counter(self, layout: SweepLayout) -> Counter:
         """A counter whose sweeps `map` takes, one after the other and each before frames of the next are added."""
+        if self._lines is not None:
+            return LineCounter(layout, self._lines, self._workers)
         return self.estimator.counter(layout, self.geometry)
 
     def map(self, sweep: Any) -> MapResult:
@@ -96,8 +103,13 @@ class Reconstructor:
         """
         begun = time.perf_counter()
         stripe = self.estimator.estimate(sweep, self.geometry)
+        return self.complete(stripe, sweep, self._filter, time.perf_counter() - begun)
+
+    def complete(self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float) -> MapResult:
+        """The map of a sweep whose stripe table the estimator gave, in `estimate_s`: filter, depth and intensity."""
+        begun = time.perf_counter() - estimate_s
         geometry = self._bound(sweep)
-        if self._filter == "median":
+        if filter == "median":
             from rig.estimators.median import median_filter
 
             stripe = median_filter(stripe, geometry.reference_px())
@@ -112,8 +124,12 @@ class Reconstructor:
         """Geometry with the planes where the frames of each column really were."""
         if self._model is None:
             return self.geometry
-        columns = np.arange(len(self._commands))
-        planes = self._model.planes(np.interp(sweep.bound_column(), columns, self._commands))
+        column = sweep.bound_column()
+        if self._lines is None:
+            commands = np.interp(column, np.arange(len(self._commands)), self._commands)
+        else:
+            commands = self._lines.bound_commands(self._commands, column)
+        planes = self._model.planes(commands)
         return replace(self.geometry, planes=planes, plane=planes[:, :3] / planes[:, 3:])
 
     def _fog(self) -> FogEstimate:

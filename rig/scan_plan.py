@@ -7,7 +7,7 @@ spans c - 0.5 to c + 0.5; column 0 begins at `command_range[0]`, the last ends a
 too.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 
 import numpy as np
@@ -17,6 +17,7 @@ from drivers.frames import frame_bytes
 from drivers.interfaces import OUT_GATE, Pulse, ScanWaveform, SpadMode, WindowTable
 from rig.blanking import CODE, Blanking
 from rig.mirror_path import SweepPath
+from rig.multi_line import LineGrid
 
 Array = NDArray[np.float64]
 
@@ -48,7 +49,7 @@ class ScanPlan:
     each column's window; window: stored pixels per row; both multiples of 64. windows: the pixels of each frame that
     are used, by the markers before it; None: all. windowed: whether the SPAD sends only these. link_bytes_per_s: what
     its link carries, None where it cannot stream. blanking: the pattern that binds frames where the SPAD has no markers
-    for them; None: it has.
+    for them; None: it has. lines: which line lights which column where there are several; None: one lights all.
     """
 
     columns: int
@@ -75,6 +76,12 @@ class ScanPlan:
     windows: WindowTable | None
     windowed: bool
     blanking: Blanking | None = None
+    lines: LineGrid | None = field(default=None, metadata={"since": "several lines"})
+
+    @property
+    def places(self) -> int:
+        """Places of the mirror in a sweep: as many as columns where one line lights them all."""
+        return self.columns if self.lines is None else self.lines.places
 
     @property
     def sweeps_per_period(self) -> int:
@@ -111,7 +118,7 @@ class ScanPlan:
     @property
     def speed_per_s(self) -> float:
         """Speed of the command over the lit part, per second, positive."""
-        return abs(self.command_range[1] - self.command_range[0]) / float(self.columns * self.column_s)
+        return abs(self.command_range[1] - self.command_range[0]) / float(self.places * self.column_s)
 
     @property
     def map_rate_hz(self) -> float:
@@ -181,16 +188,21 @@ class ScanPlan:
         return float(leg.path.lit_start / self.point_rate_hz) + leg.lag_s
 
     def column(self, tau_s: Array, leg: Leg) -> Array:
-        """Fractional column the mirror stands at `tau_s` after the scan marker of a sweep of this leg.
+        """Fractional column the mirror stands at `tau_s` after the scan marker of a sweep of this leg; of several lines,
+        its place.
 
-        Continued linearly outside the lit part (below -0.5, above columns - 0.5), where the mirror is on no column.
+        Continued linearly outside the lit part (below -0.5, above places - 0.5), where the mirror is on no column.
         """
         done = (np.asarray(tau_s, np.float64) - self.lit_start_s(leg)) / float(self.column_s)
-        return done - 0.5 if leg.columns_rise else self.columns - 0.5 - done
+        return done - 0.5 if leg.columns_rise else self.places - 0.5 - done
 
     def command_at(self, column: Array) -> Array:
-        """Mirror command of fractional columns, any shape, NaN staying NaN."""
-        return column_command(column, self.command_range, self.columns)
+        """Mirror command of fractional places, any shape, NaN staying NaN."""
+        return column_command(column, self.command_range, self.places)
+
+    def line_commands(self, column: Array) -> Array:
+        """Commands (columns,) at which one line alone would stand where each column's did: its bound column's."""
+        return self.command_at(column) if self.lines is None else self.lines.bound_commands(self.commands, column)
 
     @property
     def pilots(self) -> int:
@@ -257,8 +269,8 @@ class ScanPlan:
         gate = self.legs[0]
         step = f"{self.columns_per_marker} columns" if self.columns_per_marker > 1 else "column"
         lines = (
-            f"columns     {self.columns} x {self.exposures} frames at {rate / 1e3:g} kHz, "
-            f"{float(self.column_s) * 1e6:g} us each",
+            f"columns     {self.places} x {self.exposures} frames at {rate / 1e3:g} kHz, "
+            f"{float(self.column_s) * 1e6:g} us each" + self._describe_lines(),
             f"mirror      command {low:g} to {high:g}, {sides}, {self.speed_per_s:.3g} /s, lag {lag}",
             f"sweep       {float(self.sweep_s) * 1e3:.2f} ms, {self.sweep_points} points at "
             f"{float(self.point_rate_hz):g} Hz, a line marker every {step}",
@@ -270,6 +282,14 @@ class ScanPlan:
             f"link        {self._describe_link()}",
         )
         return "\n".join(lines)
+
+    def _describe_lines(self) -> str:
+        if self.lines is None:
+            return ""
+        return (
+            f", for {self.lines.lines} lines at once: {self.columns} columns\n"
+            f"ambiguity   {self.lines.overlap:.0%} of a column's window is other lines' too"
+        )
 
     def _describe_sync(self) -> str:
         if self.blanking is None:

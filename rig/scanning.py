@@ -61,7 +61,7 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
     replayed = Replayed.of(rig.spad, plan, maps)
     maps = maps or 1 if replayed is None else replayed.maps
     threads = rig.config.estimate.threads or os.cpu_count() or 1
-    reconstructor = _reconstructor(
+    reconstructor = make_reconstructor(
         rig, plan, threads, () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
     )
     geometry = reconstructor.geometry
@@ -196,7 +196,10 @@ def calibration_content(model: RigModel | None) -> dict[str, Any] | None:
     return None if model is None else {"id": model.fingerprint(), "provenance": dict(model.provenance)}
 
 
-def _reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned]) -> Reconstructor:
+def make_reconstructor(
+    rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned] = ()
+) -> Reconstructor:
+    """What makes the maps of a plan, as the config says."""
     estimate = rig.config.estimate
     return Reconstructor(
         rig.model,
@@ -208,6 +211,7 @@ def _reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence
         min_confidence=estimate.min_confidence,
         threads=threads,
         learned=learned,
+        lines=plan.lines,
     )
 
 
@@ -226,7 +230,7 @@ def _collect(
             if replayed is not None:
                 truth = replayed.truth(found.sweep.index)
             elif rig.world is not None:  # asked only now: no estimate ever sees it
-                truth = rig.world.truth(plan.command_at(found.column))
+                truth = rig.world.truth(plan.line_commands(found.column))
             sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
             run.add(found.result, found.compute_s, truth)
 

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
@@ -57,6 +57,15 @@ class HoldsColumns(Protocol):
 
     def hold_columns(self, commands: NDArray[np.float64]) -> None:
         """Hold the light at these mirror commands (columns,)."""
+        ...
+
+
+@runtime_checkable
+class ProjectsLines(Protocol):
+    """A world whose laser can send out several lines at once."""
+
+    def project_lines(self, offsets: Sequence[float], *, shared: bool) -> None:
+        """Send out a line at each of these offsets, in units of the mirror command."""
         ...
 
 
@@ -125,16 +134,17 @@ def prepare(rig: OpenRig, scan: ScanConfig | None = None) -> tuple[ScanPlan, Spa
     if isinstance(rig.world, PlansEffects):
         rig.world.plan_for(most_w if scan.power is None else scan.power, scan.exposure_s, scan.exposures)
     info, scanner = rig.spad.info, rig.scanner
-    nominal = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info)
+    lines = rig.config.line_offsets
+    nominal = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, None, lines)
     timing = rig.spad.configure(spad_request(scan, nominal))
-    plan = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, timing)
+    plan = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, timing, lines)
     if plan.frame_rate_hz != nominal.frame_rate_hz:  # its windows may be others, its timing is the same again
         timing = rig.spad.configure(spad_request(scan, plan))
     if isinstance(rig.world, HoldsColumns):
         # A frame's light may be held this far from where the mirror is: the mean over a column's frames is then
         # within 1/20 column of the mean that the binding gives, at any number of exposures.
         parts = math.ceil(HOLD_EXPOSURES / plan.exposures)
-        rig.world.hold_columns(plan.command_at((np.arange(plan.columns * parts) + 0.5) / parts - 0.5))
+        rig.world.hold_columns(plan.command_at((np.arange(plan.places * parts) + 0.5) / parts - 0.5))
     return plan, timing
 
 
@@ -178,6 +188,8 @@ def _surroundings(config: RigConfig, clock: Clock | None, seed: int, stack: Exit
     if config.world is None:
         return bare
     world = _create("world", config.world, bare)
+    if isinstance(world, ProjectsLines):
+        world.project_lines(config.line_offsets, shared=config.line_power == "shared")
     found = replace(bare, world=world)
     if isinstance(world, EmulatesDevices):
         stack.callback(world.close)

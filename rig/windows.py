@@ -59,7 +59,7 @@ def _spans(plan: ScanPlan, leg: Leg, grid: int) -> tuple[Pixels, Pixels]:
     # The window is taken at a frame's start and used at the middle of its exposure, up to a frame later.
     at = np.sort([plan.column(edges_s[:-1], leg), plan.column(edges_s[1:] + frame_s, leg)], axis=0)
     low, high = (
-        np.clip(np.floor(column + 0.5), 0, plan.columns - 1).astype(np.int64)
+        np.clip(np.floor(column + 0.5), 0, plan.places - 1).astype(np.int64)
         for column in (at[0] - SLACK_COLUMNS, at[1] + SLACK_COLUMNS)
     )
     x0 = plan.x0.astype(np.int64)

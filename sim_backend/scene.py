@@ -16,8 +16,8 @@ import yaml
 from pydantic import Field, ValidationError
 
 from drivers.errors import DeviceError
-from drivers.units import Lux, MetresPerSecond
-from sim_backend.medium import Medium, Section
+from drivers.units import Lux, MetresPerSecond, parse_quantity
+from sim_backend.medium import Fog, Medium, Section
 from sim_backend.scenes.prepared import load_folder
 from sim_backend.scenes.surfaces import Surfaces
 from sim_backend.view import Array
@@ -25,6 +25,8 @@ from sim_backend.weather import Rain, Snow
 
 SCENE_FOLDER = Path(__file__).parent.parent / "config" / "scenes"
 """Where the bundled scenes are found by name."""
+CLEAR = "clear"
+"""In place of a visibility: no fog."""
 
 
 class Ambient(Section):
@@ -99,6 +101,17 @@ def load_scene(name: str) -> tuple[SceneFile, Path]:
             f"{'.'.join(str(part) for part in item['loc']) or 'file'}: {item['msg']}" for item in error.errors()
         )
         raise DeviceError(f"scene file {file}: {problems}") from error
+
+
+def with_fog(scene: SceneFile, visibility: str) -> SceneFile:
+    """The scene with another fog: of that visibility (text with a unit), or CLEAR; how it scatters stays the scene's."""
+    if visibility == CLEAR:
+        return scene.model_copy(update={"medium": None})
+    fog = Fog(visibility=visibility)  # type: ignore[arg-type]
+    if scene.medium is None:
+        return scene.model_copy(update={"medium": Medium(fog=fog)})
+    medium = scene.medium.model_copy(update={"fog": fog, "smoke": None, "extinction": None})
+    return scene.model_copy(update={"medium": medium})
 
 
 def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surfaces:

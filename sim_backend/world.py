@@ -1,6 +1,6 @@
 """The simulated world: a scene in front of a rig, the bench its devices stand on, and the truth of a sweep."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -15,16 +15,18 @@ from calibration.model import RigModel
 from drivers.errors import DeviceError
 from drivers.interfaces import SweepTruth
 from drivers.registry import Kind, KindConfig, Surroundings
+from drivers.units import parse_quantity
 from sim_backend.bench import Bench, Happening
 from sim_backend.command_grid import column_grid, fine_grid
 from sim_backend.effect_planner import MOST, SAMPLED_COLUMNS, EffectPlan, Wanted, is_wanted, plan_effects
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.setting import FrameTimes, PlannedFor, Setting
 from sim_backend.flux import FluxModel
+from sim_backend.line_fan import ONE_LINE, LineFan, line_fan
 from sim_backend.line_width import line_width
 from sim_backend.optics import Line, Optics, Sensor, detections_per_radiance
 from sim_backend.photons import PhotonSource
-from sim_backend.scene import load_scene, load_surfaces
+from sim_backend.scene import CLEAR, load_scene, load_surfaces, with_fog
 from sim_backend.view import make_view
 
 if TYPE_CHECKING:
@@ -41,6 +43,18 @@ def _known(wanted: Wanted) -> Wanted:
     if unknown:
         raise ValueError(f"unknown effect {unknown[0]!r}; name some of: {', '.join(names)}; or write planned or all")
     return wanted
+
+
+def _known_fog(fog: str | None) -> str | None:
+    if fog in (None, CLEAR):
+        return fog
+    try:
+        visibility_m = parse_quantity(fog, "length")
+    except ValueError as error:
+        raise ValueError(f"{error}; or write {CLEAR}") from error
+    if visibility_m <= 0:
+        raise ValueError(f"is {fog!r}; a visibility is more than 0 m; for air without fog write {CLEAR}")
+    return fog
 
 
 class CommandGridConfig(BaseModel):
@@ -63,6 +77,8 @@ class WorldConfig(KindConfig):
     """Rig-model file of the rig as it really is; the bundled simulated rig by default."""
     scene: str = "street"
     """A bundled scene's name, a scene file, or a folder of surfaces."""
+    fog: Annotated[str | None, AfterValidator(_known_fog)] = None
+    """How far one sees in the scene's air, in place of what the scene says: a visibility such as `20 m`, or `clear`."""
     optics: Optics = Field(default_factory=Optics)
     sensor: Sensor = Field(default_factory=Sensor)
     line: Line = Field(default_factory=Line)
@@ -83,6 +99,8 @@ class SimulatedWorld:
         self.model = _load_geometry(DEFAULT_GEOMETRY if config.geometry is None else Path(config.geometry))
         camera = self.model.camera
         self.scene, folder = load_scene(config.scene)
+        if config.fog is not None:
+            self.scene = with_fog(self.scene, config.fog)
         u, v = camera.tangents()
         self.surfaces = load_surfaces(self.scene, folder, u, v)
         """Depth, albedo and where they are trusted; the truth behind `truth`."""
@@ -98,6 +116,8 @@ class SimulatedWorld:
         self._planned_for = MOST
         self._planned: tuple[EffectPlan, FluxModel] | None = None
         self.bench = Bench(surroundings.clock, self.model.lag_s)
+        self.fan: LineFan = ONE_LINE
+        """The lines that leave the mirror together."""
         self.grid = fine_grid(camera.width, self.model.scanner.command_range)
         """Mirror positions the flux is computed at."""
         if config.command_grid is not None:
@@ -110,7 +130,8 @@ class SimulatedWorld:
         To be called before the SPAD is configured; without it they are chosen for `MOST`.
         """
         frames = exposures + 1  # as many as a column can get, since the clocks are independent
-        planned_for = PlannedFor(power_w, frames * exposure_s, frames)
+        # Photons of several lines add up: what can be left out of one with all their power can be left out of each.
+        planned_for = PlannedFor(power_w * self.fan.power_factor, frames * exposure_s, frames)
         if planned_for != self._planned_for:
             self._planned_for, self._planned = planned_for, None
         self._plan()
@@ -140,6 +161,13 @@ class SimulatedWorld:
     def size(self) -> tuple[int, int]:
         """Rows and width of the camera in pixels."""
         return self.model.camera.height, self.model.camera.width
+
+    def project_lines(self, offsets: Sequence[float], *, shared: bool) -> None:
+        """Send out a line at each of these offsets (in units of the mirror command) from where a single one would be.
+
+        shared: they share the laser's power; else each has all of it. To be called before the SPAD is configured.
+        """
+        self.fan = line_fan(offsets, shared=shared)
 
     def hold_columns(self, commands: Array) -> None:
         """Hold the flux at these mirror commands (columns,): all frames of a column then share the p of its centre.
@@ -175,14 +203,24 @@ class SimulatedWorld:
         return effects_report(self, power_w=power_w, exposure_s=exposure_s, exposures=exposures)
 
     def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
-        """Photons per exposure of every pixel of an image row, noise-free, by effect; those that are off bring none."""
+        """Photons per exposure of every pixel of an image row, noise-free, by effect; those that are off bring none.
+
+        command: of the mirror; power_w: of the laser.
+        """
         from sim_backend.effects_report import flux_row
 
-        return flux_row(self, row, self.model.planes(command), power_w=power_w, exposure_s=exposure_s)
+        scanner = self.model.scanner
+        (planes,) = self.fan.planes(scanner.planes, np.array([command]), scanner.command_range)
+        return flux_row(self, row, planes, power_w=power_w * self.fan.share, exposure_s=exposure_s)
 
     def frame_source(self, exposure_s: float, seed: int, threads: int) -> PhotonSource:
         """What draws frames that follow one another without a gap."""
-        return PhotonSource(self.flux_model, self.model.planes, FrameTimes(exposure_s, exposure_s), seed, threads)
+        return self.photons(FrameTimes(exposure_s, exposure_s), seed, threads)
+
+    def photons(self, times: FrameTimes, seed: int, threads: int) -> PhotonSource:
+        """What draws frames that follow one another like that."""
+        model = self.model
+        return PhotonSource(self.flux_model, model.planes, times, seed, threads, self.fan, model.scanner.command_range)
 
     def numpy_frames(self, exposure_s: float, seed: int) -> "NumpyFrames":
         """The straightforward way to the same frames, to compare with."""

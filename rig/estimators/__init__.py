@@ -10,9 +10,9 @@ from rig.counting import Counter, SweepLayout
 from rig.geometry import SweepGeometry
 from rig.stripes import StripeTable
 
-ESTIMATORS = ("argmax", "edge", "likelihood")
+ESTIMATORS = ("argmax", "edge", "likelihood", "joint")
 FILTERS = ("none", "median")
-LEARNING = frozenset({"likelihood"})
+LEARNING = frozenset({"likelihood", "joint"})
 """Estimators that learn from the stream, for which the first map takes much longer than those after it."""
 
 
@@ -64,6 +64,10 @@ def create_estimator(name: str, threads: int = 2) -> Estimator:
         from rig.estimators.likelihood import Likelihood
 
         return Likelihood(threads)
+    if name == "joint":
+        from rig.estimators.joint import Joint
+
+        return Joint(threads)
     from rig.estimators.peaks import Peaks
 
     return {"argmax": Peaks(False, threads), "edge": Peaks(True, threads)}[name]

@@ -112,7 +112,7 @@ def _hot_of_windows(
     for x0 in range(0, int(geometry.x0.max(initial=0)) + 1, WORD_PX):
         # Hot pixels of windows that no column has are left out.
         inside = hot[:, x0 : x0 + geometry.window] if x0 in geometry.x0 else hot[:, :0]
-        y, x = np.nonzero(inside)
+        y, x = (np.ascontiguousarray(index) for index in np.nonzero(inside))  # else: another kernel, compiled when used
         starts.append(before + np.searchsorted(y, np.arange(rows + 1)))
         at.append(x.astype(np.int16))
         places.append(PAIRS * pair_bytes(lanes) * y.astype(np.int32) + places_of(x, lanes))

@@ -119,6 +119,38 @@ def row_buffers(window: int, amplitudes: int) -> Row:
     )  # fmt: skip
 
 
+@numba.njit(inline="always")
+def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
+    """Length of the light's path to the plane's points on row y per unit of depth, and the strength of the haze there.
+
+    middle: pixel of the row that its v is taken from.
+    """
+    plane, vy = sweep.plane[c], sweep.v[y, middle]
+    # Tangent at which this row meets the plane infinitely far away: the direction of the light in the row.
+    path_u = -(plane[1] * vy + plane[2]) / plane[0]
+    path_p = np.sqrt(1.0 + path_u * path_u + vy * vy)
+    return path_p, state.row_gain[y] * state.column_gain[c] * path_p
+
+
+@numba.njit(inline="always")
+def fluxes_at(sweep, state, y, x, plane, path_p, strength):  # type: ignore[no-untyped-def]
+    """Flux before and behind the stripe, its scale, geometry factor, inverse depth and profile bin of one pixel."""
+    profile = state.profile
+    ux, vx = sweep.u[y, x], sweep.v[y, x]
+    path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
+    w = plane[0] * ux + plane[1] * vx + plane[2]
+    b = min(max((w * 2.0 / (path_p + path_c) - state.w_lo) * state.per_w, 0.0), profile.shape[0] - 1.001)
+    i = int(b)
+    f = np.float32(b - i)
+    gain = strength * path_c
+    haze = gain * (profile[i, 0] + f * (profile[i + 1, 0] - profile[i, 0]))
+    rest = gain * (profile[i, 1] + f * (profile[i + 1, 1] - profile[i, 1]))
+    ambient = state.ambient[y, x]
+    before = min(max(ambient + haze, FLUX_MIN), FLUX_MAX)
+    behind = min(max(ambient + rest, FLUX_MIN), FLUX_MAX)
+    return before, behind, profile[i, 2] + f * (profile[i + 1, 2] - profile[i, 2]), gain, w, int(b + 0.5)
+
+
 @numba.njit(cache=True, nogil=True)
 def row_fluxes(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[int, int, int, int]:
     """Fill before to log_prior of `row` for row y of column c: what is expected there, whatever was counted.
@@ -129,7 +161,7 @@ def row_fluxes(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[in
     lo, hi, x0 = sweep.x_lo[y, c], sweep.x_hi[y, c], sweep.x0[c]
     if lo > hi:
         return 0, 0, -1, 0
-    plane, u, v, profile = sweep.plane[c], sweep.u, sweep.v, state.profile
+    plane, u, profile = sweep.plane[c], sweep.u, state.profile
     first = max(lo - MARGIN_PX, x0, 0)
     last = min(hi + MARGIN_PX, x0 + sweep.window - 1, u.shape[1] - 1)
     while first < last and np.isnan(u[y, first]):
@@ -143,32 +175,16 @@ def row_fluxes(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[in
     begin = max(begin, 0)
     if begin > end:
         return 0, 0, -1, 0
-    top = profile.shape[0] - 1.001
-    vy = v[y, (first + last) // 2]
-    # Tangent at which this row meets the plane infinitely far away: the direction of the light in the row.
-    path_u = -(plane[1] * vy + plane[2]) / plane[0]
-    path_p = np.sqrt(1.0 + path_u * path_u + vy * vy)
-    strength = state.row_gain[y] * state.column_gain[c] * path_p
+    path_p, strength = line_light(sweep, state, y, c, (first + last) // 2)
     for t in range(length):
-        x = start + step * t
-        ux, vx = u[y, x], v[y, x]
-        path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
-        w = plane[0] * ux + plane[1] * vx + plane[2]
-        b = min(max((w * 2.0 / (path_p + path_c) - state.w_lo) * state.per_w, 0.0), top)
-        i = int(b)
-        f = np.float32(b - i)
-        gain = strength * path_c
-        haze = gain * (profile[i, 0] + f * (profile[i + 1, 0] - profile[i, 0]))
-        rest = gain * (profile[i, 1] + f * (profile[i + 1, 1] - profile[i, 1]))
-        ambient = state.ambient[y, x]
-        row.before[t] = min(max(ambient + haze, FLUX_MIN), FLUX_MAX)
-        row.behind[t] = min(max(ambient + rest, FLUX_MIN), FLUX_MAX)
-        row.scale[t] = profile[i, 2] + f * (profile[i + 1, 2] - profile[i, 2])
-        nearest = int(b + 0.5)
-        row.cell[t] = nearest
+        before, behind, scale, gain, w, cell = fluxes_at(sweep, state, y, start + step * t, plane, path_p, strength)
+        row.before[t] = before
+        row.behind[t] = behind
+        row.scale[t] = scale
+        row.cell[t] = cell
         row.gain[t] = gain
         row.w[t] = w
-        row.log_prior[t] = profile[nearest, 3]
+        row.log_prior[t] = profile[cell, 3]
     return length, begin, end, start
 
 

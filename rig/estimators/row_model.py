@@ -72,21 +72,21 @@ def stripe_scale(path_m: NDArray[np.float64], extinction_per_m: float) -> NDArra
 
 def line_profile(sigma_px: float) -> NDArray[np.float32]:
     """Share of a Gaussian line in the pixels 0, 1, ... T px from its centre; T = 2 to 6 covers 2.5 sigma."""
-    return _pixel_shares(sigma_px, np.arange(_reach(sigma_px) + 1, dtype=np.float64))
+    return pixel_shares(sigma_px, np.arange(_reach(sigma_px) + 1, dtype=np.float64))
 
 
 def fine_profiles(sigma_px: float) -> NDArray[np.float32]:
     """Share of the line in pixels -R..R for centres a quarter pixel apart around 0, (LABELS, 2R + 1) float32."""
     reach = _reach(sigma_px) + 1
     centres = (np.arange(LABELS) - LABELS // 2) * LABEL_PX
-    return _pixel_shares(sigma_px, np.arange(-reach, reach + 1) - centres[:, None])
+    return pixel_shares(sigma_px, np.arange(-reach, reach + 1) - centres[:, None])
 
 
 def _reach(sigma_px: float) -> int:
     return int(min(max(2, math.ceil(2.5 * sigma_px)), 6))
 
 
-def _pixel_shares(sigma_px: float, distance_px: NDArray[np.float64]) -> NDArray[np.float32]:
+def pixel_shares(sigma_px: float, distance_px: NDArray[np.float64]) -> NDArray[np.float32]:
     """Integral of a unit Gaussian over the pixels at the given distances."""
     erf = np.vectorize(math.erf, otypes=[np.float64])
     scale = 1.0 / (math.sqrt(2.0) * sigma_px)

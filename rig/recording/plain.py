@@ -1,7 +1,8 @@
 """Dataclasses as plain values for YAML and JSON, and back, exactly: what a recording keeps of its plan and devices.
 
 Fractions become text ("100000/3"), arrays their dtype and values; floats are written so that they read back as the same
-number. Fields that a dataclass computes for itself (init=False) are left out.
+number. Fields that a dataclass computes for itself (init=False) are left out, and so are those marked `SINCE` while they
+have no value: files written before there were any are read as they are.
 """
 
 import types
@@ -14,11 +15,15 @@ import numpy as np
 
 T = TypeVar("T")
 
+SINCE = "since"
+"""Key of a field's metadata: came later than the first recordings, None by default."""
+
 
 def to_plain(value: Any) -> Any:
     """Numbers, text, lists and mappings that `from_plain` reads. TypeError for what has no such form."""
     if is_dataclass(value):
-        return {field.name: to_plain(getattr(value, field.name)) for field in fields(value) if field.init}
+        kept = [(field, getattr(value, field.name)) for field in fields(value) if field.init]
+        return {field.name: to_plain(one) for field, one in kept if one is not None or SINCE not in field.metadata}
     if isinstance(value, np.ndarray):
         return {"dtype": value.dtype.name, "values": value.tolist()}
     if isinstance(value, Fraction):
@@ -66,7 +71,9 @@ def _read(kind: Any, content: Any, where: str) -> Any:
 def _read_dataclass(kind: Any, content: Any, where: str) -> Any:
     given = _need(content, Mapping, where)
     hints = get_type_hints(kind)
-    names = [field.name for field in fields(kind) if field.init]
+    names = [
+        field.name for field in fields(kind) if field.init and (SINCE not in field.metadata or field.name in given)
+    ]
     if set(names) != set(given):
         odd = ", ".join(sorted(set(names) ^ set(given)))
         raise ValueError(f"{where}: {odd} is unknown or missing; it was written by another version of the program")

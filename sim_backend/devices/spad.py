@@ -121,7 +121,7 @@ class SimulatedSpad(SpadArray):
         world = self._world
         self._exposure_s, self._period_s = float(exposure / tick_hz), float(period / tick_hz)
         times = FrameTimes(self._exposure_s, self._period_s)
-        self._photons = PhotonSource(world.flux_model, world.model.planes, times, self._seed, self._threads)
+        self._photons = world.photons(times, self._seed, self._threads)
         return self._timing
 
     def _do_start(self, n_frames: int | None) -> None:

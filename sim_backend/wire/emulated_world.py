@@ -11,6 +11,7 @@ exposed; the SPAD's memory has room for a simulation that takes longer than that
 import os
 import threading
 from bisect import bisect_right
+from contextlib import closing
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
@@ -90,7 +91,7 @@ class EmulatedWorld(SimulatedWorld):
         self._emission_lock = threading.Lock()
         self._emission: list[tuple[float, float]] = [(-np.inf, 0.0)]
         self.laser = (CoboltModel if config.laser == "cobolt" else ObisModel)(on_emission=self._note_emission)
-        _ = self.flux_model  # made before time counts
+        self._draw_once()
         self.sync = PrawnDoModel(self._scan_marker, board=PICO_2)
         self.scanner = HeliosModel(clock_error=config.scanner_clock_error)
         self._frames = WorldFrames(self)
@@ -129,7 +130,15 @@ class EmulatedWorld(SimulatedWorld):
     def photon_source(self, times: FrameTimes) -> PhotonSource:
         """What draws frames that follow one another like that."""
         threads = min(MAX_THREADS, os.cpu_count() or 1)
-        return PhotonSource(self.flux_model, self.model.planes, times, self._seed, threads)
+        return self.photons(times, self._seed, threads)
+
+    def _draw_once(self) -> None:
+        """Draw a lit frame before time counts: once the laser is armed, nothing may be left to plan or to compile."""
+        rows, width = self.size
+        bits = np.zeros((1, rows, packed_row_bytes(width)), np.uint8)
+        held, power_w, x0 = np.array([np.mean(self.model.scanner.command_range)]), np.ones(1), np.zeros(1, np.int32)
+        with closing(self.photon_source(FrameTimes(1e-5, 1e-5))) as source:
+            source.expose(0, held, power_w, x0, bits, np.zeros(1))
 
     def during(self, start_s: Array, exposure_s: float, period_s: float) -> tuple[Happening, Array]:
         """What happened during frames that start at start_s (n,), ascending, one period apart, and the laser's power.

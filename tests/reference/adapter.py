@@ -23,28 +23,39 @@ def reconstruct(
     threads: int = 2,
 ) -> Any:
     """The project's MapResult of one map of counts (columns, H, W); it reads the calibration from a file."""
+    reconstructor = reconstructor_of(point, estimator, filter, threads)
+    geometry = reconstructor.geometry
+    part = windowed(counts, geometry.x0, geometry.window)
+    return reconstructor.map(volume_of(reconstructor, part, exposures))
+
+
+def reconstructor_of(point: WorkingPoint, estimator: str, filter: str = "none", threads: int = 2) -> Any:
+    """The project's Reconstructor for the rig of a working point; it has learned nothing yet."""
     from calibration.files import load_rig_model
-    from rig.counting import CountVolume
     from rig.reconstruction import Reconstructor
 
     with tempfile.TemporaryDirectory() as folder:
         model = load_rig_model(point.write_calibration(Path(folder)))
-    columns = counts.shape[0]
-    commands = np.arange(columns, dtype=np.float64)
-    reconstructor = Reconstructor(
+    commands = np.arange(point.geometry.columns, dtype=np.float64)
+    return Reconstructor(
         model, commands, DEPTH_RANGE_M, estimator=estimator, filter=filter, min_confidence=0.5, threads=threads
     )
-    x0, window = reconstructor.geometry.x0, reconstructor.geometry.window
-    volume = CountVolume(
-        counts=windowed(counts, x0, window),
-        x0=x0,
+
+
+def volume_of(reconstructor: Any, counts: NDArray[np.unsignedinteger], exposures: int) -> Any:
+    """One sweep of counts (columns, H, window) in the reconstructor's windows."""
+    from rig.counting import CountVolume
+
+    columns = counts.shape[0]
+    return CountVolume(
+        counts=counts,
+        x0=reconstructor.geometry.x0,
         n_frames=np.full(columns, exposures, np.int32),
-        column=commands,
+        column=np.arange(columns, dtype=np.float64),
         dark_counts=None,
         n_dark=0,
-        width=counts.shape[2],
+        width=reconstructor.geometry.width,
     )
-    return reconstructor.map(volume)
 
 
 def windowed(counts: NDArray[np.unsignedinteger], x0: NDArray[np.int32], window: int) -> Any:

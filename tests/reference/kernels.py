@@ -7,9 +7,11 @@ while 1/z of the plane exceeds 1/z of the object; the first change of that order
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 JUMP = 0.02  # relative depth step between neighbouring pixels across which no stripe is seen
 PROFILE_REACH_PX = 4
@@ -19,6 +21,39 @@ _MIX_A = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_B = np.uint64(0x94D049BB133111EB)
 _TO_UNIT = 1.0 / 9007199254740992.0  # 2^-53
 _MEAN_PER_DRAW = 20.0  # counts are drawn in parts so that exp(-mean) stays far from underflow
+
+
+class Optics(NamedTuple):
+    """What is the same for all stripes: rays (H, W), planes (columns, 4), where the light comes from, medium, sensor.
+
+    ambient: (H, W), with the dark counts of each pixel. halo_px: reaches of the halo's two exponentials.
+    """
+
+    u: NDArray[np.float64]
+    v: NDArray[np.float64]
+    planes: NDArray[np.float64]
+    scanner: NDArray[np.float64]
+    extinction: float
+    haze: float
+    ambient: NDArray[np.float64]
+    sigma_px: float
+    halo_px: tuple[float, float]
+
+
+class Ends(NamedTuple):
+    """Where the sheet ends and what it leaves there, arrays (H, columns); photons per exposure, 0 where nothing.
+
+    halo: its total over both sides; pedestal: per pixel just behind the end; second: stripe of a nearer surface that
+    light passes.
+    """
+
+    x_true: NDArray[np.float64]
+    x_end: NDArray[np.float64]
+    stripe: NDArray[np.float64]
+    halo: NDArray[np.float64]
+    pedestal: NDArray[np.float64]
+    x_second: NDArray[np.float64]
+    second: NDArray[np.float64]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -101,54 +136,74 @@ def haze_at(u, v, inverse_z, scanner, extinction):  # type: ignore[no-untyped-de
 
 
 @numba.njit(cache=True, nogil=True)
-def flux_row(u, v, plane, scanner, extinction, haze, ambient, sigma_px, x_true, x_end, stripe, out):  # type: ignore[no-untyped-def]
-    """Photons per exposure of one row (W,) into `out`; the pixel that the object's edge cuts keeps its lit share."""
+def flux_row(optics, ends, y, c, out):  # type: ignore[no-untyped-def]
+    """Photons per exposure of row y (W,) into `out`; the pixel that the object's edge cuts keeps its lit share."""
     width = out.shape[0]
-    n0, n1, n2, d = plane
+    n0, n1, n2, d = optics.planes[c]
     step = 1.0 if n0 / d < 0 else -1.0
+    x_end = ends.x_end[y, c]
     for x in range(width):
         lit = min(1.0, max(0.0, (x_end - x) * step + 0.5))
-        out[x] = ambient
-        if lit > 0.0 and haze > 0.0:
-            out[x] += haze * lit * haze_at(u[x], v[x], (n0 * u[x] + n1 * v[x] + n2) / d, scanner, extinction)
-    if stripe > 0.0:
-        centre = round(x_true)
-        scale = 1.0 / (sigma_px * math.sqrt(2.0))
-        for x in range(max(0, centre - PROFILE_REACH_PX), min(width, centre + PROFILE_REACH_PX + 1)):
-            share = 0.5 * (math.erf((x + 0.5 - x_true) * scale) - math.erf((x - 0.5 - x_true) * scale))
-            out[x] += stripe * share
+        out[x] = optics.ambient[y, x]
+        if lit > 0.0 and optics.haze > 0.0:
+            u, v = optics.u[y, x], optics.v[y, x]
+            inverse_z = (n0 * u + n1 * v + n2) / d
+            out[x] += optics.haze * lit * haze_at(u, v, inverse_z, optics.scanner, optics.extinction)
+        if lit < 1.0 and ends.pedestal[y, c] > 0.0:
+            behind_px = max(0.0, (x - x_end) * step)
+            out[x] += ends.pedestal[y, c] * (1.0 - lit) * math.exp(-behind_px / optics.halo_px[1])
+    add_line(ends.x_true[y, c], ends.stripe[y, c], optics.sigma_px, out)
+    add_line(ends.x_second[y, c], ends.second[y, c], optics.sigma_px, out)
+    if ends.halo[y, c] > 0.0:
+        for reach_px in optics.halo_px:
+            # integral over a pixel of exp(-|r| / reach) / (2 reach), an even share for each reach
+            share = 0.5 * math.sinh(0.5 / reach_px)
+            for x in range(width):
+                out[x] += ends.halo[y, c] * share * math.exp(-abs(x - ends.x_true[y, c]) / reach_px)
 
 
 @numba.njit(cache=True, nogil=True)
-def flux_columns(u, v, planes, scanner, extinction, haze, ambient, sigma_px, x_true, x_end, stripe, c0, c1, out):  # type: ignore[no-untyped-def]
+def add_line(x_line, light, sigma_px, out):  # type: ignore[no-untyped-def]
+    """Add a Gaussian line of `light` photons at x_line, integrated over the pixels; nothing where there is none."""
+    if light <= 0.0:
+        return
+    centre = round(x_line)
+    scale = 1.0 / (sigma_px * math.sqrt(2.0))
+    for x in range(max(0, centre - PROFILE_REACH_PX), min(out.shape[0], centre + PROFILE_REACH_PX + 1)):
+        share = 0.5 * (math.erf((x + 0.5 - x_line) * scale) - math.erf((x - 0.5 - x_line) * scale))
+        out[x] += light * share
+
+
+@numba.njit(cache=True, nogil=True)
+def flux_columns(optics, ends, c0, c1, out):  # type: ignore[no-untyped-def]
     """Photons per exposure of columns c0..c1 into out (c1 - c0, H, W)."""
-    row = np.empty(u.shape[1], np.float64)
+    row = np.empty(out.shape[2], np.float64)
     for c in range(c0, c1):
-        for y in range(u.shape[0]):
-            flux_row(
-                u[y], v[y], planes[c], scanner, extinction, haze, ambient, sigma_px,
-                x_true[y, c], x_end[y, c], stripe[y, c], row,
-            )  # fmt: skip
+        for y in range(out.shape[1]):
+            flux_row(optics, ends, y, c, row)
             out[c - c0, y, :] = row
 
 
 @numba.njit(cache=True, nogil=True)
-def draw_counts(  # type: ignore[no-untyped-def]
-    u, v, planes, scanner, extinction, haze, ambient, sigma_px, x_true, x_end, stripe, exposures, seed, c0, c1, out
-):
-    """Binomial counts of columns c0..c1 into out (columns, H, W): inversion, one uniform number a pixel and part."""
-    width = u.shape[1]
+def draw_counts(optics, ends, exposures, seed, x0, c0, c1, out):  # type: ignore[no-untyped-def]
+    """Binomial counts of columns c0..c1 into out (columns, H, window): inversion, one uniform number a pixel and part.
+
+    The window of column c begins at pixel x0[c] and may pass the picture's end, where it stays 0; what is drawn for a
+    pixel does not depend on the window.
+    """
+    width, window = optics.u.shape[1], out.shape[2]
     row = np.empty(width, np.float64)
     for c in range(c0, c1):
-        for y in range(u.shape[0]):
-            flux_row(
-                u[y], v[y], planes[c], scanner, extinction, haze, ambient, sigma_px,
-                x_true[y, c], x_end[y, c], stripe[y, c], row,
-            )  # fmt: skip
+        stop = min(width, x0[c] + window)
+        for y in range(out.shape[1]):
+            flux_row(optics, ends, y, c, row[:stop])
             state = stream_of(seed, c, y)
-            for x in range(width):
-                odds = math.expm1(row[x])
+            for x in range(stop):
                 part = max(1, min(exposures, int(_MEAN_PER_DRAW / max(row[x], 1e-9))))
+                if x < x0[c]:
+                    state += _GOLDEN * np.uint64((exposures + part - 1) // part)
+                    continue
+                odds = math.expm1(row[x])
                 left = exposures
                 total = 0
                 while left > 0:
@@ -163,7 +218,33 @@ def draw_counts(  # type: ignore[no-untyped-def]
                         term *= odds * (trials - n) / (n + 1)
                         n += 1
                     total += n
-                out[c, y, x] = total
+                out[c, y, x - x0[c]] = total
+
+
+@numba.njit(cache=True, nogil=True)
+def sub_pixel_information(optics, ends, step_px, rows, c0, c1, out):  # type: ignore[no-untyped-def]
+    """Fisher information of one exposure on the place of stripe and haze's end, sum of lambda'^2 / (e^lambda - 1).
+
+    `rows`: which rows of out (H, columns) are filled, 0 where there is no stripe. The derivative is a central
+    difference over +-step_px; amplitude and light are taken as known.
+    """
+    width = optics.u.shape[1]
+    here, less, more = np.empty(width), np.empty(width), np.empty(width)
+    for c in range(c0, c1):
+        for y in rows:
+            out[y, c] = 0.0
+            if ends.stripe[y, c] <= 0.0:
+                continue
+            flux_row(optics, ends, y, c, here)
+            x_true, x_end = ends.x_true[y, c], ends.x_end[y, c]
+            ends.x_true[y, c], ends.x_end[y, c] = x_true - step_px, x_end - step_px
+            flux_row(optics, ends, y, c, less)
+            ends.x_true[y, c], ends.x_end[y, c] = x_true + step_px, x_end + step_px
+            flux_row(optics, ends, y, c, more)
+            ends.x_true[y, c], ends.x_end[y, c] = x_true, x_end
+            for x in range(width):
+                slope = (more[x] - less[x]) / (2.0 * step_px)
+                out[y, c] += slope * slope / math.expm1(here[x])
 
 
 @numba.njit(cache=True, nogil=True)

@@ -6,7 +6,7 @@ procedural one stands in for a smaller test.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,18 @@ TRUSTED_REACH_PX = 2
 
 
 @dataclass(frozen=True, slots=True)
+class Pane:
+    """A surface in front that sends back some light and lets the share `passes` through, each way.
+
+    depth_m: float32 (H, W), inf where there is none.
+    """
+
+    depth_m: NDArray[np.float32]
+    albedo: float
+    passes: float
+
+
+@dataclass(frozen=True, slots=True)
 class Scene:
     """A 2.5-D world on the camera's raw pixel grid: `depth_m` and `albedo` float32 (H, W), `trusted` bool (H, W)."""
 
@@ -25,6 +37,7 @@ class Scene:
     depth_m: NDArray[np.float32]
     albedo: NDArray[np.float32]
     trusted: NDArray[np.bool_]
+    pane: Pane | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -38,8 +51,9 @@ class Scene:
         if min(top, left) < 0:
             raise ValueError(f"crop {height} x {width} is larger than the scene {self.shape}")
         part = np.s_[top : top + height, left : left + width]
+        pane = None if self.pane is None else replace(self.pane, depth_m=self.pane.depth_m[part])
         depth_m, albedo = np.ascontiguousarray(self.depth_m[part]), np.ascontiguousarray(self.albedo[part])
-        return Scene(self.name, depth_m, albedo, np.ascontiguousarray(self.trusted[part]))
+        return Scene(self.name, depth_m, albedo, np.ascontiguousarray(self.trusted[part]), pane)
 
 
 def scene_names() -> tuple[str, ...]:
@@ -75,10 +89,11 @@ def procedural_scene(height: int = 512, width: int = 512, seed: int = 0) -> Scen
     rng = np.random.default_rng(seed)
     patches = rng.uniform(np.log(0.03), np.log(0.9), (height // 24 + 1, width // 24 + 1))
     albedo = np.exp(np.kron(patches, np.ones((24, 24)))[:height, :width])
-    return Scene("procedural", depth.astype(np.float32), albedo.astype(np.float32), _away_from_steps(depth))
+    return Scene("procedural", depth.astype(np.float32), albedo.astype(np.float32), away_from_steps(depth))
 
 
-def _away_from_steps(depth_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+def away_from_steps(depth_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Where no depth step is within 2 px (H, W)."""
     near, far = depth_m.copy(), depth_m.copy()
     reach = TRUSTED_REACH_PX
     padded = np.pad(depth_m, reach, mode="edge")

@@ -4,7 +4,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rig.estimators import likelihood
+from rig.estimators import lessons
 from rig.estimators.likelihood import Likelihood
 from rig.stripes import StripeTable
 from tests.unit.small_maps import simulated, volume_of
@@ -54,8 +54,8 @@ def test_threads_change_nothing():
 
 def test_the_saved_model_gives_the_very_same_table_again(monkeypatch):
     _, estimator = estimated()
-    monkeypatch.setattr(likelihood, "TEACH_FRAMES", 1)
-    monkeypatch.setattr(likelihood, "LAG_FRAMES", 1)
+    monkeypatch.setattr(lessons, "TEACH_FRAMES", 1)
+    monkeypatch.setattr(lessons, "LAG_FRAMES", 1)
     saved, later = estimator.model, simulated(seed=2)
     again, twice = Likelihood(model=saved), Likelihood(3, model=saved)
     for _ in range(3):
@@ -241,8 +241,8 @@ def test_a_second_map_is_no_worse_than_the_first():
 
 def test_a_map_teaches_when_enough_frames_have_come_and_is_heeded_some_later(monkeypatch):
     # 960 frames a map: the third one teaches, the one after the next has waited long enough.
-    monkeypatch.setattr(likelihood, "TEACH_FRAMES", 2000)
-    monkeypatch.setattr(likelihood, "LAG_FRAMES", 1000)
+    monkeypatch.setattr(lessons, "TEACH_FRAMES", 2000)
+    monkeypatch.setattr(lessons, "LAG_FRAMES", 1000)
     sweep = simulated()
     estimator, models = Likelihood(), []
     for _ in range(6):
@@ -265,8 +265,8 @@ def test_a_first_map_without_contrast_teaches_nothing(level):
 
 
 def test_a_later_map_of_a_closed_shutter_teaches_nothing(monkeypatch):
-    monkeypatch.setattr(likelihood, "TEACH_FRAMES", 1)
-    monkeypatch.setattr(likelihood, "LAG_FRAMES", 1)
+    monkeypatch.setattr(lessons, "TEACH_FRAMES", 1)
+    monkeypatch.setattr(lessons, "LAG_FRAMES", 1)
     sweep, model = simulated(), estimated()[1].model
     estimator = Likelihood(model=model)
     for _ in range(3):

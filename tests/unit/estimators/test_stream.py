@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rig.counting import BIN_DARK, BIN_UNUSABLE, BYTE_EXPOSURES, CountVolume, SweepCounter, SweepLayout
-from rig.estimators import likelihood
+from rig.estimators import lessons
 from rig.estimators.likelihood import Likelihood
 from rig.estimators.row_model import RowModel
 from rig.estimators.stream import ColumnJudge, SearchedSweep
@@ -121,8 +121,8 @@ def assert_same(found, wanted):
 
 @pytest.fixture(autouse=True)
 def every_map_teaches(monkeypatch):
-    monkeypatch.setattr(likelihood, "TEACH_FRAMES", 1)
-    monkeypatch.setattr(likelihood, "LAG_FRAMES", 1)
+    monkeypatch.setattr(lessons, "TEACH_FRAMES", 1)
+    monkeypatch.setattr(lessons, "LAG_FRAMES", 1)
 
 
 @pytest.mark.parametrize("rig", RIGS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rig.errors import UsageError
-from rig.estimators import likelihood
+from rig.estimators import lessons
 from rig.reconstruction import MapResult, Reconstructor
 from tests.reference.geometry import DEPTH_RANGE_M, Geometry
 from tests.reference.scene import Scene
@@ -145,8 +145,8 @@ def test_the_median_filter_leaves_light_alone_and_brings_positions_nearer():
 
 
 def test_what_a_map_taught_serves_the_ones_after_the_next(monkeypatch):
-    monkeypatch.setattr(likelihood, "TEACH_FRAMES", 1)
-    monkeypatch.setattr(likelihood, "LAG_FRAMES", 1)
+    monkeypatch.setattr(lessons, "TEACH_FRAMES", 1)
+    monkeypatch.setattr(lessons, "LAG_FRAMES", 1)
     sweep, later = simulated(exposures=1), simulated(exposures=1, seed=2)
     rebuilt = reconstructor(sweep)
     assert rebuilt.estimator.model is None

@@ -1,0 +1,145 @@
+"""Estimator `joint`: the row likelihood tied across rows and columns, for a whole map at a time.
+
+Each label of a row and column (`label_grid`) gets a cost from the counts (`label_volume`), costs are tied to those of
+the neighbours along four paths (`aggregation_kernels`), and the best label of each is the answer. What the rows know of
+light and medium is learned as by `likelihood`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.counting import Counter, CountVolume, SweepCounter, SweepLayout
+from rig.estimators.aggregation_answer import Answer, answer_settings, new_answer
+from rig.estimators.aggregation_kernels import Penalties, along_columns, along_rows
+from rig.estimators.joint_confidence import confidence_of
+from rig.estimators.joint_kernels import add_quiet, read_light, read_positions
+from rig.estimators.label_grid import PER_PX, LabelGrid, label_grid
+from rig.estimators.label_volume import Costs, costs_of
+from rig.estimators.learning import lines_of, next_lattice
+from rig.estimators.lessons import Lessons, Seen, Setting
+from rig.estimators.row_input import State, Sweep, state_of, sweep_of
+from rig.estimators.row_model import RowModel
+from rig.estimators.volume_search import nominal_exposures
+from rig.geometry import SweepGeometry
+from rig.row_threads import RowWorkers
+from rig.stripes import StripeTable
+
+BAND_ROWS = 16
+"""Rows whose costs stay in the cache from one step to the next."""
+QUIET_COLUMNS = 8
+"""Every so manieth column teaches the ambient light where there are dark frames too."""
+
+
+class _Tables(NamedTuple):
+    """What is made once per model."""
+
+    grid: LabelGrid
+    costs: Costs
+    sweep: Sweep
+    state: State
+    dark: bool
+
+
+class _Memory(NamedTuple):
+    """Room for one map after the other: costs and messages (rows, columns, labels) uint8, and the answers."""
+
+    cost: NDArray[np.uint8]
+    message: NDArray[np.uint8]
+    answer: Answer
+
+
+class Joint:
+    """The row likelihood tied to the neighbours', with the state it has learned so far.
+
+    Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
+    learns: whether later maps change that state.
+    """
+
+    def __init__(self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True) -> None:
+        self._workers = RowWorkers(threads)
+        self._lessons = Lessons(_tables, model, learns=learns)
+        self._memory: _Memory | None = None
+        self.used: RowModel | None = None
+        """The state that the last map was estimated with."""
+
+    @property
+    def model(self) -> RowModel | None:
+        """The state that the next map will be estimated with."""
+        return self._lessons.model
+
+    @model.setter
+    def model(self, model: RowModel) -> None:
+        self._lessons.model = model
+
+    def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
+        """A counter whose sweeps `estimate` takes; geometry: nominal, as of every sweep."""
+        return SweepCounter(layout, self._workers)
+
+    def estimate(self, sweep: CountVolume, geometry: SweepGeometry) -> StripeTable:
+        """Stripe table of one sweep; afterwards `model` is what the next sweep will be estimated with."""
+        model = self._lessons.model_for(sweep, geometry, self._workers)
+        setting = Setting(model, geometry, nominal_exposures(sweep), sweep.dark_counts is not None)
+        tables = self._lessons.tables(setting, self._workers)
+        stripes = self._stripes(sweep, tables)
+        self.used = model
+        self._lessons.attend(
+            stripes, model, int(sweep.n_frames.sum()), lambda: self._seen(sweep, geometry, tables, stripes)
+        )
+        return stripes
+
+    def _stripes(self, volume: CountVolume, tables: _Tables) -> StripeTable:
+        grid, workers = tables.grid, self._workers
+        rows, columns = grid.x_far.shape
+        memory = self._room(rows, columns, grid.labels)
+        settings, penalties = answer_settings(grid.stripes, grid.none), Penalties()
+
+        def tie_rows(first: int, last: int) -> None:
+            for band in range(first, last, BAND_ROWS):
+                end = min(band + BAND_ROWS, last)
+                tables.costs.fill(volume, band, end, memory.cost)
+                along_rows(memory.cost, memory.message, penalties, band, end)
+
+        def tie_columns(first: int, last: int) -> None:
+            along_columns(memory.cost, memory.message, penalties, settings, first, last, memory.answer)
+
+        x_px, signal, haze = (np.empty((rows, columns), np.float32) for _ in range(3))
+
+        def read(first: int, last: int) -> None:
+            read_positions(grid.x_far, grid.side, memory.answer, first, last, x_px)
+            read_light(volume.counts, volume.n_frames, tables.sweep, tables.state, x_px, first, last, signal, haze)
+
+        workers.over(rows, tie_rows)
+        workers.over(columns, tie_columns)
+        workers.over(rows, read)
+        confidence, sd = confidence_of(memory.answer, PER_PX)
+        nothing = np.isnan(signal)
+        for field, empty in ((x_px, np.nan), (confidence, 0.0), (sd, np.nan)):
+            field[nothing] = empty
+        return StripeTable(x_px, confidence, sd, signal, haze)
+
+    def _room(self, rows: int, columns: int, labels: int) -> _Memory:
+        memory = self._memory
+        if memory is None or memory.cost.shape != (rows, columns, labels):
+            cost, message = (np.zeros((rows, columns, labels), np.uint8) for _ in range(2))
+            memory = self._memory = _Memory(cost, message, new_answer(rows, columns))
+        return memory
+
+    def _seen(self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable) -> Seen:
+        quiet = np.zeros((2, geometry.rows, geometry.width))
+
+        def work(first: int, last: int) -> None:
+            add_quiet(
+                volume.counts, volume.n_frames, tables.sweep, stripes.x_px, stripes.confidence,
+                QUIET_COLUMNS if tables.dark else 1, first, last, quiet,
+            )  # fmt: skip
+
+        self._workers.over(geometry.rows, work)
+        return Seen(volume, quiet, lines_of(volume, next_lattice(geometry)))
+
+
+def _tables(setting: Setting, workers: RowWorkers) -> _Tables:
+    grid = label_grid(setting.geometry)
+    costs = costs_of(setting.model, setting.geometry, grid, setting.exposures, workers)
+    return _Tables(grid, costs, sweep_of(setting.geometry), state_of(setting.model), setting.dark)

@@ -1,0 +1,124 @@
+"""When an estimator learns, and what it goes by until then.
+
+The first map is learned from before it is estimated. Now and then a later map teaches, on a thread beside the stream,
+and is heeded a fixed number of frames later, so that a live scan never waits and results do not depend on speed.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.counting import CountVolume, FrameTally
+from rig.estimators.ambient import ambient_map
+from rig.estimators.judging import judge_of
+from rig.estimators.learning import Expectation, learn_first, learn_next, lines_of, next_lattice
+from rig.estimators.row_input import Lines
+from rig.estimators.row_model import RowModel
+from rig.estimators.volume_search import nominal_exposures, search_volume
+from rig.geometry import SweepGeometry
+from rig.row_threads import RowWorkers, yield_to_others
+from rig.stripes import StripeTable
+
+LEAST_SURE = 0.02
+"""Share of confident answers below which a map teaches nothing: a closed shutter must not spoil the maps after it."""
+TEACH_FRAMES = 100_000
+"""Lit frames from one map that teaches to the next: a second at 100 kHz. Learning costs some 0.2 s of one core."""
+LAG_FRAMES = 50_000
+"""Lit frames from a map that teaches to the first one that heeds it: time to learn beside the stream."""
+
+Tables = TypeVar("Tables")
+"""What an estimator makes ready under a model, for sweeps of one geometry."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setting:
+    """What tables are made for. exposures: of most columns; dark: whether sweeps have dark frames."""
+
+    model: RowModel
+    geometry: SweepGeometry
+    exposures: int
+    dark: bool
+
+    def same(self, other: "Setting") -> bool:
+        """Whether the other's tables would be the same ones."""
+        made = self.model is other.model and self.geometry is other.geometry
+        return made and (self.exposures, self.dark) == (other.exposures, other.dark)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """What a sweep can teach: its tally, ones and exposures of pixels behind clear stripes, some lines of counts."""
+
+    tally: FrameTally
+    quiet: NDArray[np.float64]
+    lines: Lines
+
+
+class Lessons(Generic[Tables]):
+    """The model that an estimator goes by, `None` before a map that taught, and the tables it made under it.
+
+    make: makes tables; called on the thread beside the stream too. learns: whether later maps change the model.
+    """
+
+    def __init__(self, make: Callable[[Setting, RowWorkers], Tables], model: RowModel | None, *, learns: bool) -> None:
+        self._make = make
+        self._learns = learns
+        self.model = model
+        self._made: tuple[Setting, Tables] | None = None
+        self._taught: Expectation | None = None
+        self._lesson: Future[tuple[Setting, Expectation, Tables]] | None = None
+        self._tutor = ThreadPoolExecutor(1, thread_name_prefix="learning", initializer=yield_to_others)
+        self._frames_since = 0
+        """Lit frames since the last map that taught."""
+
+    def model_for(self, volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> RowModel:
+        """The model to estimate a sweep with, learned from it where there is none yet."""
+        return self.model if self.model is not None else first_model(volume, geometry, workers)
+
+    def tables(self, setting: Setting, workers: RowWorkers) -> Tables:
+        """Tables for a setting; made once while it stays the same."""
+        if self._made is None or not self._made[0].same(setting):
+            self._made = setting, self._make(setting, workers)
+        return self._made[1]
+
+    def attend(self, stripes: StripeTable, used: RowModel, frames: int, see: Callable[[], Seen]) -> None:
+        """After a map of so many lit frames, estimated with `used`; see: called where the map is to teach."""
+        self._frames_since += frames
+        sure = bool(np.mean(stripes.confidence > 0.5) >= LEAST_SURE)
+        if sure and self.model is None:
+            self.model = used
+        if self._lesson is None:
+            if self._learns and sure and self._frames_since >= TEACH_FRAMES:
+                self._frames_since = 0
+                assert self._made is not None, "a map has been estimated"
+                self._lesson = self._tutor.submit(self._teach, self._made[0], see(), self._taught)
+        elif self._frames_since >= LAG_FRAMES:
+            # Waits where the lesson is not over: which map is estimated with what never depends on speed.
+            setting, self._taught, tables = self._lesson.result()
+            self.model, self._made = setting.model, (setting, tables)
+            self._lesson = None
+
+    def _teach(self, setting: Setting, seen: Seen, before: Expectation | None) -> tuple[Setting, Expectation, Tables]:
+        """The setting carried on by one sweep, and the tables that follow from it, on one thread beside the stream."""
+        ambient = ambient_map(seen.tally, seen.tally.intensity(), setting.geometry, seen.quiet)
+        with RowWorkers(1) as workers:
+            model, taught = learn_next(
+                seen.lines, setting.geometry, replace(setting.model, ambient=ambient), before, workers
+            )
+            setting = replace(setting, model=model)
+            return setting, taught, self._make(setting, workers)
+
+
+def first_model(volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> RowModel:
+    """Learn from the first sweep; it is searched once to find which pixels were quiet behind the stripe."""
+    intensity = volume.intensity()
+    model = learn_first(volume, geometry, ambient_map(volume, intensity, geometry, None), workers)
+    dark = volume.dark_counts is not None
+    judge = judge_of(model, geometry, nominal_exposures(volume), workers, dark=dark)
+    _, quiet = search_volume(volume, geometry, judge, workers)
+    model = replace(model, ambient=ambient_map(volume, intensity, geometry, quiet))
+    return learn_next(lines_of(volume, next_lattice(geometry)), geometry, model, None, workers)[0]

@@ -1,0 +1,122 @@
+"""Which setting to use: the least error within a time, or the least time within an error.
+
+A setting is judged by its worst among the scenes and fogs that were tried, since what is asked for has to hold in all
+of them.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from drivers.units import parse_quantity
+from rig.errors import UsageError
+from rig.tradeoff_rows import Clock, Setting, TradeoffRow
+
+_PIXELS = re.compile(r"\s*(\d+\.?\d*(?:[eE][+-]?\d{1,3})?|\.\d+)\s*px\s*", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What is asked for: exactly one of a time and an error; of: whose time counts."""
+
+    time_ms: float | None = None
+    error_px: float | None = None
+    of: Clock = "sensor"
+
+    def __str__(self) -> str:
+        """In words."""
+        if self.time_ms is not None:
+            return f"at most {self.time_ms:g} ms of {self.of} time a map"
+        return f"at most {self.error_px:g} px of error"
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The setting to use, or where none does what was asked for, the nearest; figures of its worst scene and fog."""
+
+    wish: Wish
+    fits: bool
+    setting: Setting
+    mean_abs_px: float
+    sensor_ms: float
+    compute_ms: float
+
+    def __str__(self) -> str:
+        """In words."""
+        figures = (
+            f"{self.setting}: {self.mean_abs_px:.3g} px in {self.sensor_ms:.3g} ms of sensor and "
+            f"{self.compute_ms:.3g} ms of computing a map"
+        )
+        if self.fits:
+            return f"for {self.wish}: {figures}"
+        return f"nothing tried gives {self.wish}; nearest is {figures}; try other --exposures or --estimators"
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        wish = {"time_budget_ms": self.wish.time_ms, "error_px": self.wish.error_px, "of": self.wish.of}
+        return {"asked": wish, "fits": self.fits, **asdict(self.setting), **self._figures()}
+
+    def _figures(self) -> dict[str, float]:
+        return {"mean_abs_px": self.mean_abs_px, "sensor_ms": self.sensor_ms, "compute_ms": self.compute_ms}
+
+
+def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
+    """What two options ask for, None where neither is given. UsageError, a line per problem."""
+    problems = []
+    time_ms = error_px = None
+    if of not in ("sensor", "compute"):
+        problems.append(f"--of is {of!r}; the time is that of sensor or compute")
+    if time_budget is not None and error is not None:
+        problems.append("--time-budget and --error ask for two things; give one of them")
+    if time_budget is not None:
+        try:
+            time_ms = 1e3 * parse_quantity(time_budget, "time")
+        except ValueError as wrong:
+            problems.append(f"--time-budget {wrong}")
+    if error is not None:
+        match = _PIXELS.fullmatch(error)
+        if match is None:
+            problems.append(f"--error {error!r} is no number of pixels; write e.g. '0.1 px'")
+        else:
+            error_px = float(match[1])
+    for name, value in (("--time-budget", time_ms), ("--error", error_px)):
+        if value is not None and value <= 0:
+            problems.append(f"{name} is {value:g}; it must be more than 0")
+    if problems:
+        raise UsageError.of(problems)
+    if time_ms is None and error_px is None:
+        return None
+    return Wish(time_ms, error_px, "compute" if of == "compute" else "sensor")
+
+
+def choose(rows: Sequence[TradeoffRow], wish: Wish) -> Answer | None:
+    """The setting to use; None where too many answers are missing in every one."""
+    by_setting: dict[Setting, list[TradeoffRow]] = {}
+    for row in rows:
+        by_setting.setdefault(row.setting, []).append(row)
+    places = max((len(found) for found in by_setting.values()), default=0)
+    answers = [
+        _answer(wish, setting, found)
+        for setting, found in by_setting.items()
+        if len(found) == places and all(row.counts for row in found)
+    ]
+    if not answers:
+        return None
+
+    def time_ms(answer: Answer) -> float:
+        return answer.sensor_ms if wish.of == "sensor" else answer.compute_ms
+
+    fitting = [answer for answer in answers if answer.fits]
+    by_error = (wish.time_ms is not None) == bool(fitting)
+    if by_error:
+        return min(fitting or answers, key=lambda answer: (answer.mean_abs_px, time_ms(answer)))
+    return min(fitting or answers, key=lambda answer: (time_ms(answer), answer.mean_abs_px))
+
+
+def _answer(wish: Wish, setting: Setting, rows: Sequence[TradeoffRow]) -> Answer:
+    error_px = max(row.mean_abs_px for row in rows)
+    sensor_ms, compute_ms = max(row.sensor_ms for row in rows), max(row.compute_ms for row in rows)
+    time_ms = sensor_ms if wish.of == "sensor" else compute_ms
+    fits = (wish.time_ms is None or time_ms <= wish.time_ms) and (wish.error_px is None or error_px <= wish.error_px)
+    return Answer(wish, fits, setting, error_px, sensor_ms, compute_ms)

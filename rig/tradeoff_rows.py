@@ -1,0 +1,173 @@
+"""One line of a trade-off: what a setting's error and its time are, with an interval, and whether anything beats it."""
+
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.interfaces import SweepTruth
+from rig.errors import UsageError
+from rig.intervals import Interval, blocks_interval, blocks_of, repeats_interval
+from rig.reconstruction import MapResult
+from rig.scoring import MISSING_PX, depth_errors
+
+MOST_MISSING = 0.05
+"""A figure counts only where at most this share of the true stripes has no answer."""
+
+Clock = Literal["sensor", "compute"]
+"""Whose time an error is traded for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What can be chosen: estimator, filter, exposures of a column and lines at once."""
+
+    estimator: str
+    filter: str
+    exposures: int
+    lines: int = 1
+
+    def __str__(self) -> str:
+        """In words."""
+        filtered = "" if self.filter == "none" else f" + {self.filter}"
+        lines = "" if self.lines == 1 else f", {self.lines} lines"
+        return f"{self.estimator}{filtered}, {self.exposures} exposure{'s' * (self.exposures != 1)}{lines}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapScore:
+    """Errors of one map against the world's truth, over every (row, column) with a true stripe, and its times.
+
+    mean_abs_px: a missing answer counts as `MISSING_PX`. sums, numbers: of the blocks of `rig.intervals`.
+    """
+
+    mean_abs_px: float
+    within_1px: float
+    missing: float
+    depth_mm: float | None
+    sensor_ms: float
+    compute_ms: float
+    sums: NDArray[np.float64]
+    numbers: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class TradeoffRow:
+    """A setting in one scene and fog, over all repeats.
+
+    fog: a visibility or 'clear', None: as the scene says. sensor_ms: of one map, with dark frames and fly-back.
+    compute_ms: of a map after the first, counting and all. depth_mm: None where no pixel has a depth. ci95: of
+    mean_abs_px. times_limit: mean_abs_px over the statistical limit, None where that is not known. pareto,
+    pareto_compute: whether no other setting in the same scene and fog has less error in as little time of sensor or
+    computer, and no less time.
+    """
+
+    scene: str
+    fog: str | None
+    estimator: str
+    filter: str
+    exposures: int
+    lines: int
+    sensor_ms: float
+    compute_ms: float
+    mean_abs_px: float
+    within_1px: float
+    missing: float
+    depth_mm: float | None
+    ci95: Interval
+    times_limit: float | None = None
+    pareto: bool = False
+    pareto_compute: bool = False
+
+    @property
+    def counts(self) -> bool:
+        """Whether so few answers are missing that its error says something."""
+        return self.missing <= MOST_MISSING
+
+    @property
+    def setting(self) -> Setting:
+        """What was chosen."""
+        return Setting(self.estimator, self.filter, self.exposures, self.lines)
+
+    def time_ms(self, of: Clock) -> float:
+        """Of sensor or computer."""
+        return self.sensor_ms if of == "sensor" else self.compute_ms
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms: float) -> MapScore:
+    """Errors of a map. UsageError where the world has no stripe to be found."""
+    true_px = truth.x_px.astype(np.float64)
+    if not np.isfinite(true_px).any():
+        raise UsageError("the line is nowhere seen in this scene; check the scene and scan.command_range")
+    errors = np.abs(result.stripe.x_px - true_px)
+    missing = np.isfinite(true_px) & ~np.isfinite(result.stripe.x_px)
+    errors[missing] = MISSING_PX
+    sums, numbers = blocks_of(errors)
+    total = int(numbers.sum())
+    depth_m = depth_errors(result.depth_m, truth.depth_m)["mean_abs"]
+    return MapScore(
+        mean_abs_px=float(sums.sum() / total),
+        within_1px=float(np.count_nonzero((errors <= 1) & ~missing) / total),
+        missing=float(np.count_nonzero(missing) / total),
+        depth_mm=None if depth_m is None else 1e3 * depth_m,
+        sensor_ms=sensor_ms,
+        compute_ms=compute_ms,
+        sums=sums,
+        numbers=numbers,
+    )
+
+
+def row_of(scene: str, fog: str | None, setting: Setting, scores: Sequence[MapScore]) -> TradeoffRow:
+    """The line of a setting from the maps of its repeats."""
+    mean = statistics.fmean
+    errors = [score.mean_abs_px for score in scores]
+    depths = [score.depth_mm for score in scores if score.depth_mm is not None]
+    alone = scores[0]
+    return TradeoffRow(
+        scene=scene,
+        fog=fog,
+        estimator=setting.estimator,
+        filter=setting.filter,
+        exposures=setting.exposures,
+        lines=setting.lines,
+        sensor_ms=mean(score.sensor_ms for score in scores),
+        compute_ms=statistics.median(score.compute_ms for score in scores),
+        mean_abs_px=mean(errors),
+        within_1px=mean(score.within_1px for score in scores),
+        missing=mean(score.missing for score in scores),
+        depth_mm=mean(depths) if depths else None,
+        ci95=repeats_interval(errors) if len(errors) > 1 else blocks_interval(alone.sums, alone.numbers),
+    )
+
+
+def with_fronts(rows: Sequence[TradeoffRow]) -> tuple[TradeoffRow, ...]:
+    """The rows, marked where they lie on the Pareto front of their scene and fog."""
+    sensor, compute = _fronts(rows, lambda row: row.sensor_ms), _fronts(rows, lambda row: row.compute_ms)
+    return tuple(
+        replace(row, pareto=i in sensor, pareto_compute=i in compute) for i, row in enumerate(rows)
+    )
+
+
+def _fronts(rows: Sequence[TradeoffRow], time_ms: Callable[[TradeoffRow], float]) -> set[int]:
+    found: set[int] = set()
+    for place in dict.fromkeys((row.scene, row.fog) for row in rows):
+        here = [i for i, row in enumerate(rows) if (row.scene, row.fog) == place and row.counts]
+        found |= {i for i, least in _least_so_far(here, rows, time_ms) if least}
+    return found
+
+
+def _least_so_far(
+    here: Iterable[int], rows: Sequence[TradeoffRow], time_ms: Callable[[TradeoffRow], float]
+) -> Iterable[tuple[int, bool]]:
+    """Each row by rising time, and whether it has less error than all before it."""
+    best = float("inf")
+    for i in sorted(here, key=lambda i: (time_ms(rows[i]), rows[i].mean_abs_px)):
+        yield i, rows[i].mean_abs_px < best
+        best = min(best, rows[i].mean_abs_px)

@@ -1,0 +1,80 @@
+"""Which kernels scans compile once the laser is armed: `python -m tests.system.compiled_late FOLDER`.
+
+In a process of its own, since what an earlier scan compiled would hide it. Prints a line for each kernel and signature
+that came after arming: over emulated wires of anything, and of a scan long enough to learn from a later map.
+"""
+
+import gc
+import sys
+from pathlib import Path
+from typing import Any
+
+from numba.core.dispatcher import Dispatcher
+
+from rig import api
+from rig.acquisition import Acquisition
+from tests.system.small_rig import config, write_rig
+
+LEARNS_AFTER_MAPS = 200
+"""Maps of 800 lit frames: more than from one lesson to the end of the next."""
+EMULATED: dict[str, Any] = {
+    "world": {"kind": "emulated", "geometry": "./rig.yaml", "scene": "street", "laser": "obis"},
+    "spad": {"kind": "spb-usb", "port": "emulated:spad", "reads": "plain", "heartbeat": "10 s"},
+    "scanner": {
+        "kind": "helios",
+        "port": "emulated:scanner",
+        "max_velocity": "4000 /s",
+        "max_acceleration": "4e6 /s2",
+        "rms_duty": 1.0,
+        "frame": "250 ms",
+    },
+    "laser": {"kind": "obis", "port": "emulated:laser", "max_power": "50 mW"},
+    "sync": {"kind": "prawndo", "port": "emulated:gate"},
+}
+SCAN = {"columns": 40, "exposures": 12, "frame_rate": "12.5 kHz"}
+
+
+def main(folder: Path) -> None:
+    """Run the scans."""
+    emulated = {**config(), **EMULATED, "scan": {**config()["scan"], **SCAN}}
+    _say_late("", write_rig(folder / "emulated", emulated), maps=3, estimator="likelihood", filter="median")
+    for estimator in ("argmax", "edge"):
+        _say_late("rig.", write_rig(folder / estimator), maps=3, estimator=estimator, filter="median")
+    _say_late("rig.", write_rig(folder / "long"), maps=LEARNS_AFTER_MAPS, estimator="likelihood")
+
+
+def _say_late(of: str, file: Path, **options: Any) -> None:
+    """Scan, and print what was compiled late of the modules whose names begin so."""
+    armed: set[str] = set()
+    arm = Acquisition._arm
+
+    def note(acquisition: Acquisition) -> None:
+        arm(acquisition)
+        armed.update(_compiled(of))
+
+    Acquisition._arm = note  # type: ignore[method-assign]
+    try:
+        run = api.scan(file, out=file.parent / "run", save="last", record=True, **options)
+    finally:
+        Acquisition._arm = arm  # type: ignore[method-assign]
+    assert armed, "the laser was armed"
+    print(f"scanned {run.summary.maps}")
+    for kernel in sorted(_compiled(of) - armed):
+        print(f"late: {kernel}")
+
+
+def _compiled(of: str) -> set[str]:
+    """Kernels of this project with their signatures, compiled or loaded from numba's cache."""
+    packages = ("rig", "sim_backend", "calibration", "drivers")
+    return {
+        f"{name}.{kernel.py_func.__qualname__} {signature}"
+        for kernel in gc.get_objects()
+        if isinstance(kernel, Dispatcher)
+        and (name := kernel.py_func.__module__).split(".")[0] in packages
+        and name.startswith(of)
+        for signature in kernel.signatures
+    }
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
