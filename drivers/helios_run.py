@@ -53,12 +53,12 @@ class HeliosRun:
     def begin(self) -> None:
         """Send the first frame; it plays once it is whole."""
         self._wait_until_idle()
-        first = self._made(FLAG_SINGLE | FLAG_START)
-        self._next = self._made() if self.source.left else None
-        self._playing_s = duration_s = first[1]
-        earliest_s, arrived_s = self._send(first[0])
+        first, duration_s = self._made(FLAG_SINGLE | FLAG_START)
+        earliest_s, arrived_s = self._send(first)
+        self._playing_s = duration_s
         self._earliest_end_s = earliest_s + duration_s * (1 - _DRIFT)
         self._latest_end_s = arrived_s + duration_s * (1 + _DRIFT)
+        self._next = self._made() if self.source.left else None
 
     def feed(self, stopping: threading.Event) -> None:
         """Send all that is left; returns when the mirror rests. Brakes once `stopping` is set."""

@@ -54,6 +54,9 @@ class SpbUsbConfig(KindConfig):
     """USB chip of the board: Cypress FX3, or FTDI FT601."""
     reads: Literal["queued", "plain"] = "queued"
     """queued: many reads in flight (libusb1); plain: one after the other (pyusb), for slow streams."""
+    silence: Annotated[Seconds, Field(ge=0.04, le=1.5)] = 0.04
+    """Asked in vain for so long while light may fall, it has failed: the guard takes the light. One that is emulated
+    shares this computer's processors and needs longer."""
     heartbeat: Annotated[Seconds, Field(ge=0.02, le=60)] = 1.0
     """The device ends a run and drops its gate where it hears nothing of this program for so long."""
     test_pattern: bool = True
@@ -150,6 +153,7 @@ class SpbUsb(SpadArray):
             self._receiver = BlockReceiver(self._link, self._wiring.stream_in, armed, self.name)
             self._counters = SpadCounters(0, 0, 0, 0, 0)
             self._pinged_at = self._heard_at = time.monotonic()
+            self._waited_s = 0.0
 
     def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
         with self._busy:
@@ -169,13 +173,15 @@ class SpbUsb(SpadArray):
         took = Took.NOTHING
         while took is not Took.FRAMES and not receiver.ended:
             self._ping_when_due(receiver)
+            asked_at = time.monotonic()
             try:
-                took = receiver.take(ring, min(_SLICE_S, max(0.0, ends_at - time.monotonic())))
+                took = receiver.take(ring, min(_SLICE_S, max(0.0, ends_at - asked_at)))
             finally:
                 self._count(receiver)
             if self._halt.is_set():
                 return False
             now = time.monotonic()
+            self._note_wait(took, min(now - asked_at, _SLICE_S))
             if took is not Took.NOTHING:
                 self._heard_at = now
             elif now - self._heard_at >= _SILENCE_S and self._has_ended():
@@ -189,6 +195,12 @@ class SpbUsb(SpadArray):
             return True
         self._finish(receiver)
         return False
+
+    def _note_wait(self, took: Took, seconds: float) -> None:
+        """A thread that comes late asks for what is there already: only waiting itself counts."""
+        self._waited_s = 0.0 if took is Took.FRAMES else self._waited_s + seconds
+        if self._waited_s and self.on_wait is not None:
+            self.on_wait(self._waited_s)
 
     def _has_ended(self) -> bool:
         """Whether the device runs no more: then its last block got lost."""

@@ -14,7 +14,8 @@ from drivers.clock import Clock
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
-from rig.burst import lead_s, require_memory
+from drivers.transports.endpoints import EMULATED_PREFIX
+from rig.burst import lead_s, require_memory, spare_lead_s
 from rig.counting import SweepLayout
 from rig.errors import DevicesError
 from rig.map_queue import AcquiredMap
@@ -114,7 +115,7 @@ class Acquisition:
         """The SPAD's own counts over all its starts so far. Any thread."""
         if self._pipeline is None:
             return self._counters_before
-        return _added(self._counters_before, self._rig.spad.counters)
+        return added_counters(self._counters_before, self._rig.spad.counters)
 
     @property
     def stages(self) -> PipelineStats:
@@ -162,7 +163,7 @@ class Acquisition:
     def _burst_frames(self, sweeps: int) -> int | None:
         if self._plan.burst_frames is None:
             return None
-        lead = Fraction(lead_s(self._rig)) * self._plan.frame_rate_hz
+        lead = Fraction(lead_s(self._rig) + spare_lead_s(self._rig)) * self._plan.frame_rate_hz
         return min(self._plan.burst_frames, math.ceil(self._plan.frames_for(sweeps) + lead))
 
     def _run_group(self, assembler: SweepAssembler, sweeps: int, done: int) -> Generator[AcquiredMap, None, None]:
@@ -187,6 +188,7 @@ class Acquisition:
         )
         if rig.guard is not None:
             rig.guard.expect(self._guard_limits(sweeps))
+            rig.spad.on_wait = rig.guard.wait
         if self._recording is not None:
             self._recording.begin(sweeps)
         trouble: list[str] = []
@@ -233,8 +235,16 @@ class Acquisition:
         return GuardLimits(
             frames_within_s=max(usual.frames_within_s, block_s),
             busy_within_s=max(usual.busy_within_s, block_s),
+            waits_within_s=max(self._silence_of_spad_s(), block_s),
             first_frame_s=usual.first_frame_s + exposed_s,
         )
+
+    def _silence_of_spad_s(self) -> float:
+        """For how long the SPAD may be asked in vain while light may fall."""
+        spad, usual = self._rig.config.spad, GuardLimits()
+        if str(getattr(spad, "port", "")).startswith(EMULATED_PREFIX):  # on the processors of this very process
+            return usual.busy_within_s
+        return float(getattr(spad, "silence", usual.waits_within_s))
 
     def _end_group(self, pipeline: Pipeline, assembler: SweepAssembler) -> None:
         pipeline.close()
@@ -304,7 +314,7 @@ def _wait_until_warm(rig: OpenRig, clock: Clock) -> None:
         waited_s += 0.2
 
 
-def _added(before: SpadCounters, now: SpadCounters) -> SpadCounters:
+def added_counters(before: SpadCounters, now: SpadCounters) -> SpadCounters:
     """Counts of two runs; None where the device does not say."""
     counts = (
         None if (a := getattr(before, field.name)) is None or (b := getattr(now, field.name)) is None else a + b

@@ -1,6 +1,6 @@
 """The calls that acquire: `scan`, `plan_scan`, and `replay`, which does so from a recording."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ def scan(
     estimator: Estimator | None = None,
     filter: Filter | None = None,
     min_confidence: float | None = None,
+    adaptive: Mapping[str, object] | None = None,
     seed: int = 0,
     save: str = "all",
     arm: bool = False,
@@ -61,6 +62,7 @@ def scan(
         estimator=estimator,
         filter=filter,
         min_confidence=min_confidence,
+        adaptive=adaptive,
     )
     policy, overload = _checked_policies(maps, seed, save, on_overload, _problems(settings, arm, out, record))
     options = ScanOptions(overload, record, monitor, _both(progress, live))
@@ -86,6 +88,7 @@ def plan_scan(
     Devices are opened, asked for their limits and closed again: nothing moves and nothing shines, so that no `arm` is
     needed. Raises DevicesError, a line per device, where real ones are not there.
     """
+    from rig.adaptive_decision import first_pass
     from rig.burst import require_memory
     from rig.overload import require_policy
     from rig.session import open_rig, prepare
@@ -96,6 +99,8 @@ def plan_scan(
         require_policy(overload, rig.spad.info)
         plan, _ = prepare(rig)
         require_memory(rig, plan)
+        if settings.scan.adaptive is not None:
+            first_pass(rig, plan)
         return plan
 
 

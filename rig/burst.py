@@ -11,10 +11,19 @@ BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
 """Time between the SPAD's start and the first scan marker that a burst must have room for, on virtual time and where a
 host starts one device after the other over USB and serial ports."""
 
+SPARE_LEAD_S = 0.35
+"""More of it where the memory has it and reading ends with the last scan marker: a host that has much else to do starts
+its devices late."""
+
 
 def lead_s(rig: OpenRig) -> float:
     """Seconds of a burst before its first scan marker."""
     return BURST_LEAD_S if isinstance(rig.clock, VirtualClock) else HOST_LEAD_S
+
+
+def spare_lead_s(rig: OpenRig) -> float:
+    """More seconds, which a burst may have room for."""
+    return 0.0 if isinstance(rig.clock, VirtualClock) or not rig.spad.info.markers else SPARE_LEAD_S
 
 
 def require_memory(rig: OpenRig, plan: ScanPlan) -> None:

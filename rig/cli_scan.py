@@ -45,6 +45,13 @@ def scan_command(
     estimator: EstimatorOption = None,
     filter: FilterOption = None,
     min_confidence: ConfidenceOption = None,
+    adaptive: Annotated[
+        bool, typer.Option("--adaptive", help="maps in passes: more exposures where rows are still undecided")
+    ] = False,
+    time_budget: Annotated[
+        str | None,
+        typer.Option("--time-budget", help="most sensor time of an adaptive map, e.g. '30 ms'", show_default=False),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", help="of everything simulated")] = 0,
     save: Annotated[str, typer.Option("--save", help="maps to write: all, last or every N")] = "all",
     out: OutOption = None,
@@ -65,6 +72,7 @@ def scan_command(
         "estimator": estimator,
         "filter": filter,
         "min_confidence": min_confidence,
+        "adaptive": _passes(adaptive, time_budget),
     }
     if dry_run:
         plan = api.plan_scan(config, maps=maps, seed=seed, save=save, on_overload=on_overload, **options)
@@ -83,6 +91,13 @@ def scan_command(
             **options,
         )
     return report(result, as_json)
+
+
+def _passes(adaptive: bool, time_budget: str | None) -> dict[str, str] | None:
+    """Settings of a scan in passes, where one is asked for."""
+    if time_budget is not None:
+        return {"time_budget": time_budget}
+    return {} if adaptive else None
 
 
 def _show_plan(plan: "ScanPlan", as_json: bool) -> int:

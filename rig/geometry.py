@@ -32,6 +32,8 @@ class SweepGeometry:
     x0: int32 (columns,) first stored pixel; window: stored pixels per row, a multiple of 64.
     near_is_left: True where near points lie at smaller x than far ones (scanner on the left).
     depth_range_m: nearest and farthest depth. defects: bool (rows, width), True where a pixel is not to be used.
+    others: float64 (columns, lines - 1, 3), `plane` of the columns that other lines light together with each; None: a
+    line is alone.
     """
 
     u: NDArray[np.float32]
@@ -45,6 +47,7 @@ class SweepGeometry:
     near_is_left: bool
     depth_range_m: tuple[float, float]
     defects: NDArray[np.bool_]
+    others: NDArray[np.float64] | None = None
 
     @property
     def rows(self) -> int:

@@ -17,7 +17,7 @@ BLOCK_ROWS, BLOCK_COLUMNS = 32, 25
 RESAMPLES = 1000
 _Z = 1.959964
 """97.5 % quantile of the normal distribution."""
-_T = {1: 12.7062, 2: 4.3027, 3: 3.1824, 4: 2.7764}
+_T = {1: 12.7062, 2: 4.3027, 3: 3.1824, 4: 2.7764, 5: 2.5706}
 """The same of Student's t by degrees of freedom, where the series of `t_quantile` is off by more than 0.1 %."""
 
 Interval = tuple[float, float]

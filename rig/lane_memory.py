@@ -11,7 +11,7 @@ import numba
 from llvmlite import ir
 from numba import types
 
-from rig.lanes import BYTES, FLOAT32, INT16, LANES, VectorCode, called, intrinsic_of, place_list
+from rig.lanes import BLOCK, BYTES, FLOAT32, FOUR, INT16, LANES, VectorCode, called, intrinsic_of, place_list
 
 _I8, _I16, _I32, _F32 = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.FloatType()
 
@@ -55,16 +55,22 @@ def _writer(numba_type: Any, element: Any, whole: Any, align: int) -> Any:
 
 load_bytes = _reader(BYTES, _I8, BYTES.llvm, 1)
 """load_bytes(address, index): 32 bytes from `index` on."""
+load_block = _reader(BLOCK, _I8, BLOCK.llvm, 1)
+"""load_block(address, index): 128 bytes from `index` on."""
 load_int16 = _reader(INT16, _I16, INT16.llvm, 2)
 """load_int16(address, index): 16 of the int16 at `address`, from number `index` on."""
 load_float32 = _reader(FLOAT32, _F32, FLOAT32.llvm, 4)
 """load_float32(address, index): the same of float32."""
+load_four = _reader(FOUR, _F32, FOUR.llvm, 4)
+"""load_four(address, index): four of the float32."""
 store_bytes = _writer(BYTES, _I8, BYTES.llvm, 1)
 """store_bytes(address, index, bytes): write 32 bytes."""
 store_int16 = _writer(INT16, _I16, INT16.llvm, 2)
 """store_int16(address, index, lanes): write 16 int16."""
 store_float32 = _writer(FLOAT32, _F32, FLOAT32.llvm, 4)
 """store_float32(address, index, lanes): write 16 float32."""
+store_four = _writer(FOUR, _F32, FOUR.llvm, 4)
+"""store_four(address, index, lanes): write four float32."""
 read_byte = _reader(types.uint8, _I8, _I8, 1)
 read_int16 = _reader(types.int16, _I16, _I16, 2)
 read_int32 = _reader(types.int32, _I32, _I32, 4)
@@ -118,3 +124,15 @@ def prefetch(typing: Any, address: Any) -> VectorCode:
         return context.get_dummy_value()
 
     return types.void(types.intp), code
+
+
+@intrinsic_of
+def load_widened(typing: Any, address: Any, index: Any) -> VectorCode:
+    """load_widened(address, index): 16 unsigned bytes from `index` on as lanes of 16 bits."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        loaded = builder.load(_pointer(builder, args[0], args[1], _I8, ir.VectorType(_I8, LANES)))
+        loaded.align = 1
+        return builder.zext(loaded, INT16.llvm)
+
+    return INT16(types.intp, types.intp), code

@@ -7,18 +7,7 @@ import numba
 from llvmlite import ir
 from numba import types
 
-from rig.lanes import (
-    BYTES,
-    INT16,
-    LANES,
-    VectorCode,
-    add_saturated,
-    called,
-    has_avx2,
-    intrinsic_of,
-    place_list,
-    splat,
-)
+from rig.lanes import BLOCK, BYTES, INT16, LANES, VectorCode, add_saturated, intrinsic_of, place_list, splat
 
 _HALF: Final = LANES // 2
 _I16, _I32 = ir.IntType(16), ir.IntType(32)
@@ -142,49 +131,6 @@ def lanes_between(typing: Any, first: Any, end: Any) -> VectorCode:
     return INT16(types.int64, types.int64), code
 
 
-def _bytes_moved(by: int) -> Any:
-    """Byte i takes what byte i - by had, 255 where there is none."""
-    count = BYTES.count
-    source = [i - by if 0 <= i - by < count else count for i in range(count)]
-
-    @intrinsic_of
-    def move(typing: Any, a: Any) -> VectorCode:
-        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            largest = ir.Constant(BYTES.llvm, [255] * count)
-            return builder.shuffle_vector(args[0], largest, place_list(source))
-
-        return BYTES(BYTES), code
-
-    return move
-
-
-bytes_up, bytes_down = _bytes_moved(1), _bytes_moved(-1)
-"""bytes_up(a): byte i takes what byte i - 1 had, the first one 255; bytes_down(a): i + 1, the last one."""
-
-
-@intrinsic_of
-def bytes_at(typing: Any, a: Any, places: Any) -> VectorCode:
-    """bytes_at(a, places): each byte takes that of the same half of `a` at its place 0..15, 0 where that is 128."""
-    # LLVM knows shuffles by constants only.
-    one_instruction = has_avx2()
-
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        if one_instruction:
-            return called(builder, "llvm.x86.avx2.pshuf.b", BYTES.llvm, *args)
-        found, zero = ir.Constant(BYTES.llvm, ir.Undefined), ir.Constant(ir.IntType(8), 0)
-        for i in range(BYTES.count):
-            place = builder.extract_element(args[1], ir.Constant(_I32, i))
-            at = builder.add(builder.zext(builder.and_(place, ir.Constant(place.type, LANES - 1)), _I32),
-                             ir.Constant(_I32, i - i % LANES))  # fmt: skip
-            byte = builder.select(
-                builder.icmp_signed("<", place, zero), zero, builder.extract_element(args[0], at)
-            )
-            found = builder.insert_element(found, byte, ir.Constant(_I32, i))
-        return found
-
-    return BYTES(BYTES, BYTES), code
-
-
 @intrinsic_of
 def equal_bytes(typing: Any, a: Any, b: Any) -> VectorCode:
     """equal_bytes(a, number): bit i is set where byte i equals the number."""
@@ -194,3 +140,21 @@ def equal_bytes(typing: Any, a: Any, b: Any) -> VectorCode:
         return builder.bitcast(builder.icmp_signed("==", args[0], number), ir.IntType(BYTES.count))
 
     return types.uint32(BYTES, b), code
+
+
+@intrinsic_of
+def first_equal(typing: Any, a: Any, b: Any) -> VectorCode:
+    """first_equal(a, number): place of the first byte of a block that equals the number; 128 where none does."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        number = splat(context, builder, BLOCK, signature.args[1], args[1])
+        mask = builder.bitcast(builder.icmp_signed("==", args[0], number), ir.IntType(BLOCK.count))
+        return builder.trunc(builder.cttz(mask, ir.Constant(ir.IntType(1), 0)), ir.IntType(64))
+
+    return types.int64(BLOCK, b), code
+
+
+reversed_lanes = _shuffled(range(LANES - 1, -1, -1))
+"""reversed_lanes(a): the last lane first."""
+last_everywhere = _shuffled([LANES - 1] * LANES)
+"""last_everywhere(a): the highest lane in all of them."""

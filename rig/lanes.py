@@ -51,8 +51,12 @@ class _LanesModel(models.PrimitiveModel):
 
 BYTES = Lanes(8, count=2 * LANES)
 """Two bytes a lane."""
+BLOCK = Lanes(8, count=8 * LANES)
+"""128 bytes, as many registers as they take."""
 INT16 = Lanes(16)
 FLOAT32 = Lanes(32, real=True)
+FOUR = Lanes(32, real=True, count=4)
+"""Four float32."""
 
 
 def splat(context: Any, builder: Any, lanes: Lanes, number_type: Any, number: Any) -> Any:
@@ -200,7 +204,7 @@ square_root = _conversion(FLOAT32, lambda b, a: called(b, f"llvm.sqrt.{vector_na
 """square_root(a): of float32 lanes."""
 
 
-def has_avx2() -> bool:
+def _has_avx2() -> bool:
     """Whether numba compiles for a processor with AVX2: this one, unless its settings name another."""
     settings: Any = config
     if settings.CPU_NAME is None and settings.CPU_FEATURES is None:
@@ -215,7 +219,7 @@ def dot_pairs(typing: Any, counts: Any, weights: Any) -> VectorCode:
     counts: unsigned bytes; weights: signed.
     """
     # LLVM has no name of its own for what is one instruction on x86, and does not always recognise it.
-    one_instruction = has_avx2()
+    one_instruction = _has_avx2()
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         if one_instruction:
@@ -250,13 +254,29 @@ def _constant(lanes: Lanes, number: float) -> Any:
 zero_bytes = _constant(BYTES, 0)
 zero_int16 = _constant(INT16, 0)
 zero_float32 = _constant(FLOAT32, 0.0)
+zero_four = _constant(FOUR, 0.0)
 
 
 @intrinsic_of
 def smallest_byte(typing: Any, a: Any) -> VectorCode:
-    """smallest_byte(a): the smallest one of 32 unsigned bytes."""
+    """smallest_byte(a): the smallest one of unsigned bytes."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return called(builder, f"llvm.vector.reduce.umin.{vector_name(BYTES.llvm)}", ir.IntType(8), args[0])
+        return called(builder, f"llvm.vector.reduce.umin.{vector_name(args[0].type)}", ir.IntType(8), args[0])
 
-    return types.uint8(BYTES), code
+    return types.uint8(a), code
+
+
+@intrinsic_of
+def scaled(typing: Any, a: Any, weights: Any) -> VectorCode:
+    """scaled(a, weights): a * weights / 2^15 rounded to the nearest, of signed 16-bit lanes; not both -32768."""
+    one_instruction = _has_avx2()
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if one_instruction:
+            return called(builder, "llvm.x86.avx2.pmul.hr.sw", INT16.llvm, *args)
+        product = builder.mul(builder.sext(args[0], _WIDE), builder.sext(args[1], _WIDE))
+        half, places = ir.Constant(_WIDE, [1 << 14] * LANES), ir.Constant(_WIDE, [15] * LANES)
+        return builder.trunc(builder.ashr(builder.add(product, half), places), INT16.llvm)
+
+    return INT16(INT16, INT16), code

@@ -20,7 +20,9 @@ LEAST_FRESH = 0.5
 LinePower = Literal["shared", "each"]
 
 
-def _ascending(value: tuple[float, ...]) -> tuple[float, ...]:
+def _in_order(value: tuple[float, ...]) -> tuple[float, ...]:
+    if not 1 <= len(value) <= MOST_LINES:
+        raise ValueError(f"names {len(value)} lines; a rig has 1 to {MOST_LINES}")
     if len(value) == 1 and value[0] != 0:
         raise ValueError(f"has the one offset {value[0]:g}; a single line stands at 0, add others or leave it out")
     for first, second in pairwise(value):
@@ -31,10 +33,8 @@ def _ascending(value: tuple[float, ...]) -> tuple[float, ...]:
 
 LineOffsets = Annotated[
     tuple[Annotated[float, Field(ge=-2, le=2, allow_inf_nan=False)], ...],
-    AfterValidator(_ascending),
+    AfterValidator(_in_order),
     Field(
-        min_length=1,
-        max_length=MOST_LINES,
         description="places of the lines that leave the mirror together, in units of its command, ascending",
         examples=["[-0.22, 0.22]"],
     ),

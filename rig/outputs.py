@@ -120,6 +120,10 @@ class RunFolder:
         except OSError as error:
             raise _unwritable(self.path, error) from error
 
+    def write_text(self, name: str, text: str) -> None:
+        """Write a file of text."""
+        self._write({name: text.encode()})
+
     def keep(self) -> None:
         """Leave everything as it is: what a run recorded is kept also where it does not come to its end."""
         assert self._in_place, "a run folder that is no recording appears whole or not at all"

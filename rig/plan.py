@@ -51,6 +51,8 @@ waits for its block to fill."""
 BLOCK_BYTES = 16 << 20
 """Most bytes of a block's frames: 512 whole frames of 512 x 512 pixels."""
 
+ColumnWindows = tuple[NDArray[np.int32], int]
+"""First pixel of each column's window (columns,), and their width."""
 PointClock = Callable[[float], Fraction]
 
 
@@ -73,17 +75,18 @@ def compile_plan(
     info: SpadInfo,
     timing: SpadTiming | None = None,
     line_offsets: Sequence[float] = (0.0,),
+    windows: ColumnWindows | None = None,
 ) -> ScanPlan:
     """The plan of a scan, checked.
 
     point_clock: the scanner's exact clock for a requested rate (`BeamScanner.point_clock`). model: None where the rig
     is not calibrated; there is then no lag and the window is the whole row. timing: what the SPAD answered to
-    `spad_request`; its nominal rate where None. line_offsets: of the rig, which fit the scan. Raises PlanError with one
-    line per problem.
+    `spad_request`; its nominal rate where None. line_offsets: of the rig, which fit the scan. windows: of the columns,
+    where they are given; else as narrow as the depth range allows. Raises PlanError with one line per problem.
     """
 
     def draft(scan: ScanConfig) -> tuple[ScanPlan | None, list[str]]:
-        return _draft(scan, limits, point_clock, model, info, timing, line_offsets)
+        return _draft(scan, limits, point_clock, model, info, timing, line_offsets, windows)
 
     plan, problems = draft(scan)
     too_fast = [*_beyond_sensor(scan, info)]
@@ -152,6 +155,7 @@ def _draft(
     info: SpadInfo,
     timing: SpadTiming | None,
     line_offsets: Sequence[float],
+    windows: ColumnWindows | None,
 ) -> tuple[ScanPlan | None, list[str]]:
     """The plan, where there is a mirror path for it, and everything that stands against scanner and calibration."""
     places, lines = scan.columns // len(line_offsets), None
@@ -159,10 +163,32 @@ def _draft(
     if len(line_offsets) > 1:
         lines, commands = line_grid(line_offsets, scan.columns, scan.command_range)
     frame_rate = scan.frame_rate if timing is None else timing.tick_hz / timing.frame_period_ticks
-    blanking = None
-    if not info.markers:
-        blanking = blanking_for(places, scan.exposures, frame_rate)
-    demand = PathDemand(
+    blanking = None if info.markers else blanking_for(places, scan.exposures, frame_rate)
+    demand = path_demand(scan, places, frame_rate, model, markers=info.markers)
+    wrong_model = _model_problems(scan, model, info, demand.speed_per_s, line_offsets)
+    found = find_path(demand, limits, point_clock)
+    advice = remedy(demand, scan.exposures, limits, point_clock) if found.problems else ""
+    first, last = scan.command_range
+    asked = f"scan of {places} columns x {scan.exposures} exposures over command_range [{first:g}, {last:g}]"
+    problems = [*wrong_model, *(f"{asked}: {problem}; {advice}" for problem in found.problems)]
+    if found.path is None or problems:
+        return None, problems
+    try:
+        plan = _plan(scan, found.path, found.rate_hz, demand, model, info, timing, blanking, commands, lines, windows)
+        check_waveform(plan.waveform, limits, plan.point_rate_hz, seamless=True)
+    except LimitExceeded as error:
+        return None, [f"scan: {error}"]
+    except PlanError as error:
+        return None, list(error.problems)
+    return plan, unseen_pattern(plan, model)
+
+
+def path_demand(
+    scan: ScanConfig, places: int, frame_rate: Fraction, model: RigModel | None, *, markers: bool
+) -> PathDemand:
+    """What a scan of so many line positions asks of the mirror. markers: whether the SPAD has any."""
+    blanking = None if markers else blanking_for(places, scan.exposures, frame_rate)
+    return PathDemand(
         edges=scan.command_range,
         columns=places,
         column_s=scan.exposures / frame_rate,
@@ -175,22 +201,6 @@ def _draft(
         bidirectional=scan.bidirectional,
         lead_s=0.0 if blanking is None else blanking.lead_s + MARGIN_FRAMES / float(frame_rate),
     )
-    wrong_model = _model_problems(scan, model, info, demand.speed_per_s, line_offsets)
-    found = find_path(demand, limits, point_clock)
-    advice = remedy(demand, scan.exposures, limits, point_clock) if found.problems else ""
-    first, last = scan.command_range
-    asked = f"scan of {places} columns x {scan.exposures} exposures over command_range [{first:g}, {last:g}]"
-    problems = [*wrong_model, *(f"{asked}: {problem}; {advice}" for problem in found.problems)]
-    if found.path is None or problems:
-        return None, problems
-    try:
-        plan = _plan(scan, found.path, found.rate_hz, demand, model, info, timing, blanking, commands, lines)
-        check_waveform(plan.waveform, limits, plan.point_rate_hz, seamless=True)
-    except LimitExceeded as error:
-        return None, [f"scan: {error}"]
-    except PlanError as error:
-        return None, list(error.problems)
-    return plan, unseen_pattern(plan, model)
 
 
 def _plan(
@@ -204,11 +214,12 @@ def _plan(
     blanking: Blanking | None,
     commands: NDArray[np.float64],
     lines: LineGrid | None,
+    windows: ColumnWindows | None,
 ) -> ScanPlan:
     """The plan along a mirror path; whether the SPAD's link carries it is for the caller to judge."""
     legs = _legs(path, scan, model.lag_s if model is not None else Lag(), demand.gate_margin_s, rate)
     step, markers = _markers(path, demand.columns, scan.exposures)
-    x0, window, lines = _windows(model, commands, scan, info, lines)
+    x0, window, lines = (*windows, lines) if windows is not None else _windows(model, commands, scan, info, lines)
     plan = ScanPlan(
         columns=scan.columns,
         exposures=scan.exposures,

@@ -1,6 +1,5 @@
 """From the counts of a sweep to its stripe table and depth map."""
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,25 +13,12 @@ from rig.counting import Counter, FrameTally, SweepLayout
 from rig.depth import depth_map
 from rig.errors import UsageError
 from rig.estimators import ESTIMATORS, FILTERS, Learned, create_estimator, recalling
+from rig.fog_meter import FogEstimate, read_fog
 from rig.geometry import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from rig.multi_line import LineGrid
 from rig.multi_line_counter import LineCounter
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
-
-VISIBILITY_CONTRAST = 3.912
-"""-ln(0.02): visibility is the distance at which contrast falls to 2 %, 3.912 / extinction (Koschmieder)."""
-RESOLVED_SIGMAS = 3.0
-"""Extinction is stated where it is at least this many standard deviations above zero."""
-
-
-@dataclass(frozen=True, slots=True)
-class FogEstimate:
-    """Extinction learned from the haze of the stream; all None where the haze does not resolve it."""
-
-    extinction_per_m: float | None
-    extinction_sd_per_m: float | None
-    visibility_m: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +68,11 @@ class Reconstructor:
         self._filter = filter
         self._lines = lines
         self._workers = RowWorkers(threads)
-        self.estimator = recalling(learned, threads) if learned else create_estimator(estimator, threads)
+        self.estimator = recalling(estimator, learned, threads) if learned else create_estimator(estimator, threads)
         if model is not None:
             self.geometry = sweep_geometry(model, model.planes(self._commands), depth_range_m)
+            if lines is not None:
+                self.geometry = replace(self.geometry, others=lines.others(self.geometry.plane))
         elif sensor is not None:
             self.geometry = uncalibrated_geometry(*sensor, len(self._commands))
         else:
@@ -108,7 +96,7 @@ class Reconstructor:
     def complete(self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float) -> MapResult:
         """The map of a sweep whose stripe table the estimator gave, in `estimate_s`: filter, depth and intensity."""
         begun = time.perf_counter() - estimate_s
-        geometry = self._bound(sweep)
+        geometry, fog = self._bound(sweep), self._fog(sweep, stripe)
         if filter == "median":
             from rig.estimators.median import median_filter
 
@@ -118,7 +106,7 @@ class Reconstructor:
         else:
             depth = depth_map(stripe, geometry, self._min_confidence, self._workers)
         compute_s = time.perf_counter() - begun
-        return MapResult(stripe, depth, sweep.intensity(), self._fog(), compute_s, self.estimator.used)
+        return MapResult(stripe, depth, sweep.intensity(), fog, compute_s, self.estimator.used)
 
     def _bound(self, sweep: FrameTally) -> SweepGeometry:
         """Geometry with the planes where the frames of each column really were."""
@@ -132,11 +120,7 @@ class Reconstructor:
         planes = self._model.planes(commands)
         return replace(self.geometry, planes=planes, plane=planes[:, :3] / planes[:, 3:])
 
-    def _fog(self) -> FogEstimate:
+    def _fog(self, sweep: FrameTally, stripe: StripeTable) -> FogEstimate:
+        """What the map says of the medium; nothing where its estimator learns none, or without a geometry."""
         state = self.estimator.used
-        if state is None or self._model is None:
-            return FogEstimate(None, None, None)
-        extinction, sd = state.extinction_per_m, state.extinction_sd_per_m
-        if not (math.isfinite(extinction) and math.isfinite(sd) and extinction > RESOLVED_SIGMAS * sd):
-            return FogEstimate(None, None, None)
-        return FogEstimate(extinction, sd, VISIBILITY_CONTRAST / extinction)
+        return FogEstimate() if state is None or self._model is None else read_fog(sweep, stripe, self.geometry, state)

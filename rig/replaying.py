@@ -26,6 +26,7 @@ from rig.plan import spad_request
 from rig.recording.inputs import CALIBRATION_FILE, read_plan
 from rig.recording.manifest import MANIFEST, is_cut_short, read_manifest, require_inputs
 from rig.recording.part import part_learned, part_starts
+from rig.recording.passes import pass_plan, recorded_passes
 from rig.scan_plan import ScanPlan
 from rig.sweeps import SweepStart
 
@@ -132,7 +133,10 @@ def replay_plan(
         from rig.recalibrated import recalibrated
 
         plan = recalibrated(plan, model)
-    request = replace(spad_request(scan, plan), frame_rate_hz=plan.frame_rate_hz, exposure_s=plan.exposure_s)
+    first = plan
+    if (recording.path / pass_plan(0)).exists():  # taken in passes: the SPAD begins with the first of them
+        first = read_plan(recording.path, pass_plan(0))
+    request = replace(spad_request(scan, first), frame_rate_hz=plan.frame_rate_hz, exposure_s=plan.exposure_s)
     return plan, spad.configure(request)
 
 
@@ -142,7 +146,9 @@ class Replayed:
     def __init__(self, spad: PlaysRecording, plan: ScanPlan, maps: int | None) -> None:
         self._spad = spad
         self._sweeps = recorded_sweeps(spad.recording, plan)
-        there = sum(self._sweeps)
+        self.passes = recorded_passes(spad.recording.path, self._sweeps)
+        """Of each map, where they were taken in several; None: they were not."""
+        there = self._there = sum(self._sweeps) if self.passes is None else len(self.passes)
         if there == 0:
             raise UsageError(f"{spad.recording.path} holds no whole sweep, so there is no map to be made of it")
         if maps is not None and maps > there and not spad.loops:
@@ -180,7 +186,7 @@ class Replayed:
 
     def truth(self, index: int) -> SweepTruth | None:
         """What was known of a map when it was recorded, where that was kept."""
-        return recorded_truth(self._spad.recording.path, index % sum(self._sweeps))
+        return recorded_truth(self._spad.recording.path, index % self._there)
 
 
 def pace_of(spad: SpadArray) -> Pace:

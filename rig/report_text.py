@@ -40,7 +40,7 @@ def run_table(result: RunResult) -> None:
     verdict = summary.verdict.value
     advice = _NEXT_STEP.get(summary.verdict)
     table.add_row("verdict", f"{verdict}: {advice}" if advice else verdict)
-    _console().print(table)
+    console().print(table)
 
 
 def effects_table(scene: SceneEffects) -> None:
@@ -60,7 +60,7 @@ def effects_table(scene: SceneEffects) -> None:
             "-" if effect.cost_us_per_frame is None or not effect.on else f"{effect.cost_us_per_frame:.1f}",
             effect.why,
         )
-    _console().print(table)
+    console().print(table)
     most = scene.planned_for
     print(
         f"left out together: <= {scene.changed_decisions_bound:.2g} of decisions changed, for columns of up to "
@@ -83,7 +83,8 @@ def _error_change(effect: Effect) -> str:
     return f"{effect.stripe_error_change_px:+.3f} +- {effect.stripe_error_change_sd_px or 0.0:.3f} px"
 
 
-def _console() -> Console:
+def console() -> Console:
+    """Writes to stdout."""
     # Into a file or a pipe nothing is wrapped.
     return Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
 

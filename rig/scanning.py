@@ -13,9 +13,13 @@ from drivers.interfaces import SpadTiming, SweepTruth
 from drivers.registry import KindConfig
 from drivers.transports.endpoints import EMULATED_PREFIX
 from rig.acquisition import SILENCE_S, Acquisition, ScanProgress
+from rig.adaptive_decision import ChoosesPasses, DecidedPasses
+from rig.adaptive_recording import PassNotes, RecordedPasses
+from rig.adaptive_scan import AdaptiveAcquisition
 from rig.config import RigConfig
 from rig.errors import RigError
 from rig.estimators import LEARNING, Learned
+from rig.geometry import SweepGeometry
 from rig.monitor import Watch
 from rig.overload import Overload, require_policy
 from rig.plan import spad_request
@@ -65,6 +69,7 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         rig, plan, threads, () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
     )
     geometry = reconstructor.geometry
+    passes = _passes(rig, plan, timing, geometry, threads, replayed)
     run.rays = (geometry.u, geometry.v) if rig.model is not None else None
 
     estimate = rig.config.estimate
@@ -80,31 +85,40 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         "maps": maps,
         "on_overload": options.policy.value,
     }
-    acquisition = Acquisition(
-        rig,
-        plan,
-        timing,
-        maps,
-        reconstructor,
-        policy=options.policy,
-        # Learning takes a second or more, and a live stream cannot stand still meanwhile.
-        first_alone=estimate.estimator in LEARNING and not rig.spad.info.can_wait,
-        groups=None if replayed is None else replayed.groups(),
-        starts=None if replayed is None else replayed.starts(),
-        recording=_recording(rig, run, plan, timing, maps, manifest) if options.record else None,
-        watch=options.watch,
-        on_progress=options.live,
-        silence_s=SILENCE_S if replayed is None else replayed.silence_s,
-    )
-    sweeps: list[SweepAccount] = []
+    settings: dict[str, Any] = {
+        "policy": options.policy,
+        "starts": None if replayed is None else replayed.starts(),
+        "recording": _recording(rig, run, plan, timing, maps, manifest) if options.record else None,
+        "watch": options.watch,
+        "on_progress": options.live,
+        "silence_s": SILENCE_S if replayed is None else replayed.silence_s,
+    }
+    acquisition: Acquisition | AdaptiveAcquisition
+    if passes is not None:
+        note = PassNotes(manifest, run if options.record else None).note
+        acquisition = AdaptiveAcquisition(rig, plan, maps, reconstructor, passes, threads, on_pass=note, **settings)
+    else:
+        acquisition = Acquisition(
+            rig,
+            plan,
+            timing,
+            maps,
+            reconstructor,
+            # Learning takes a second or more, and a live stream cannot stand still meanwhile.
+            first_alone=estimate.estimator in LEARNING and not rig.spad.info.can_wait,
+            groups=None if replayed is None else replayed.groups(),
+            **settings,
+        )
+    of_maps: list[tuple[SweepAccount, ...]] = []
     ended_by: BaseException | None = None
     try:
-        _collect(acquisition, rig, plan, run, sweeps, replayed)
+        _collect(acquisition, rig, plan, run, of_maps, replayed)
     except (KeyboardInterrupt, DeviceError, RigError) as error:
         if not run.worth_keeping and not isinstance(error, KeyboardInterrupt):
             raise
         ended_by = error
-    del sweeps[run.tally.maps :]
+    del of_maps[run.tally.maps :]
+    sweeps = [sweep for passes_of_map in of_maps for sweep in passes_of_map]
     frames = _frames(sweeps, acquisition.counters.crc_errors)
     result = run.finish(
         frames,
@@ -119,12 +133,27 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         acquisition.stages,
         _synchronisation(sweeps),
         None if replayed is None else replayed.report,
+        acquisition.figures(frames.lit) if isinstance(acquisition, AdaptiveAcquisition) else None,
     )
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:
-            ended_by.add_note(f"{len(sweeps)} of {maps} maps were whole and are in {result.folder}")
+            ended_by.add_note(f"{len(of_maps)} of {maps} maps were whole and are in {result.folder}")
         raise ended_by
     return result
+
+
+def _passes(
+    rig: OpenRig,
+    plan: ScanPlan,
+    timing: SpadTiming,
+    geometry: SweepGeometry,
+    threads: int,
+    replayed: Replayed | None,
+) -> ChoosesPasses | None:
+    """What chooses the passes of a map; None where a map is one sweep."""
+    if replayed is not None:
+        return None if replayed.passes is None else RecordedPasses(rig, plan, replayed.passes, timing)
+    return None if rig.config.scan.adaptive is None else DecidedPasses(rig, plan, geometry, threads)
 
 
 def _recording(
@@ -196,9 +225,7 @@ def calibration_content(model: RigModel | None) -> dict[str, Any] | None:
     return None if model is None else {"id": model.fingerprint(), "provenance": dict(model.provenance)}
 
 
-def make_reconstructor(
-    rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned] = ()
-) -> Reconstructor:
+def make_reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned] = ()) -> Reconstructor:
     """What makes the maps of a plan, as the config says."""
     estimate = rig.config.estimate
     return Reconstructor(
@@ -216,11 +243,11 @@ def make_reconstructor(
 
 
 def _collect(
-    acquisition: Acquisition,
+    acquisition: Acquisition | AdaptiveAcquisition,
     rig: OpenRig,
     plan: ScanPlan,
     run: Run,
-    sweeps: list[SweepAccount],
+    of_maps: list[tuple[SweepAccount, ...]],
     replayed: Replayed | None,
 ) -> None:
     running = acquisition.run()
@@ -231,7 +258,7 @@ def _collect(
                 truth = replayed.truth(found.sweep.index)
             elif rig.world is not None:  # asked only now: no estimate ever sees it
                 truth = rig.world.truth(plan.line_commands(found.column))
-            sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
+            of_maps.append(found.sweeps)  # before its map: whatever ends the run, no map is without its account
             run.add(found.result, found.compute_s, truth)
 
 

@@ -23,7 +23,7 @@ from drivers.transports.tap import TapFile
 from rig.config import RigConfig, ScanConfig
 from rig.cube import cube_columns
 from rig.errors import DevicesError, PlanError, UsageError
-from rig.plan import compile_plan, spad_request
+from rig.plan import ColumnWindows, compile_plan, spad_request
 from rig.replaying import PlaysRecording, replay_plan
 from rig.scan_plan import ScanPlan
 
@@ -120,8 +120,13 @@ def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSour
         yield opened["sync"], opened["laser"]
 
 
-def prepare(rig: OpenRig, scan: ScanConfig | None = None) -> tuple[ScanPlan, SpadTiming]:
-    """Configure the SPAD and compile the plan; nothing moves and nothing lights. scan: the config's by default."""
+def prepare(
+    rig: OpenRig, scan: ScanConfig | None = None, windows: ColumnWindows | None = None
+) -> tuple[ScanPlan, SpadTiming]:
+    """Configure the SPAD and compile the plan; nothing moves and nothing lights. scan: the config's by default.
+
+    windows: of the columns where the scan is a part of another one, which has been prepared before; None: it is not.
+    """
     scan = rig.config.scan if scan is None else scan
     if isinstance(rig.spad, PlaysRecording):  # what was scanned is bound by the plan that it was scanned with
         return replay_plan(rig.spad, rig.spad.recording, scan, rig.model)
@@ -131,13 +136,13 @@ def prepare(rig: OpenRig, scan: ScanConfig | None = None) -> tuple[ScanPlan, Spa
             f"scan.power is {scan.power * 1e3:g} mW, the most {rig.laser.name} may give is {most_w * 1e3:g} mW; "
             "lower scan.power"
         )
-    if isinstance(rig.world, PlansEffects):
+    if isinstance(rig.world, PlansEffects) and windows is None:
         rig.world.plan_for(most_w if scan.power is None else scan.power, scan.exposure_s, scan.exposures)
     info, scanner = rig.spad.info, rig.scanner
     lines = rig.config.line_offsets
-    nominal = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, None, lines)
+    nominal = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, None, lines, windows)
     timing = rig.spad.configure(spad_request(scan, nominal))
-    plan = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, timing, lines)
+    plan = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, timing, lines, windows)
     if plan.frame_rate_hz != nominal.frame_rate_hz:  # its windows may be others, its timing is the same again
         timing = rig.spad.configure(spad_request(scan, plan))
     if isinstance(rig.world, HoldsColumns):

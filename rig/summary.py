@@ -61,6 +61,20 @@ class Synchronisation:
     detection_probability: float | None
 
 
+@dataclass(frozen=True, slots=True)
+class AdaptiveFigures:
+    """Of maps taken in passes. passes: of all maps. mean_exposures: frames per column of a map, over all columns.
+
+    rest_s: wall time between the passes of a map, in which the host decided and no frame was exposed. wall_s: from the
+    first pass of a map to the whole map, added up.
+    """
+
+    passes: int
+    mean_exposures: float | None
+    rest_s: float
+    wall_s: float
+
+
 Errors = Mapping[str, float | None]
 
 
@@ -79,7 +93,7 @@ class Summary:
     maps: int
     map_rate_hz: float | None
     columns: int
-    exposures: int
+    exposures: float
     estimator: str
     filter: str
     frames: RunFrames
@@ -93,6 +107,7 @@ class Summary:
     stages: PipelineStats | None = None
     sync: Synchronisation | None = None
     replay: PaceReport | None = None
+    adaptive: AdaptiveFigures | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The summary as plain values; `truth` only where it is known, others only of a scan or of a replay."""
@@ -106,6 +121,8 @@ class Summary:
             del content["sync"]
         if self.replay is None:
             del content["replay"]
+        if self.adaptive is None:
+            del content["adaptive"]
         return content
 
 
@@ -149,6 +166,7 @@ class MapTally:
         stages: PipelineStats | None = None,
         sync: Synchronisation | None = None,
         replay: PaceReport | None = None,
+        adaptive: AdaptiveFigures | None = None,
     ) -> Summary:
         """The run so far."""
         errors = [each.errors for each in self._maps if each.errors is not None]
@@ -158,7 +176,7 @@ class MapTally:
             maps=self.maps,
             map_rate_hz=self.maps / sensor_time_s if sensor_time_s > 0 else None,
             columns=self.columns,
-            exposures=self.exposures,
+            exposures=(adaptive and adaptive.mean_exposures) or self.exposures,
             estimator=self.estimator,
             filter=self.filter,
             frames=frames,
@@ -172,6 +190,7 @@ class MapTally:
             stages=stages,
             sync=sync,
             replay=replay,
+            adaptive=adaptive,
         )
 
 

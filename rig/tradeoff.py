@@ -1,42 +1,78 @@
-"""What accuracy costs in time: scans of the simulated rig over settings, scored by the world's truth (`rig tradeoff`)."""
+"""What accuracy costs in time: scans of a simulated rig over settings, scored by the world's truth."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import product, starmap
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from rig.config import RigConfig
 from rig.errors import UsageError
 from rig.estimators import ESTIMATORS, FILTERS
 from rig.run import Progress
 from rig.tradeoff_choice import Answer, Wish, choose
+from rig.tradeoff_limits import SceneLimits
 from rig.tradeoff_rows import MapScore, Setting, TradeoffRow, row_of, with_fronts
-from rig.tradeoff_scan import score_methods
+from rig.tradeoff_scan import MAPS, Method, require_plan, score_methods
 
-MOST_REPEATS = 1000
+Made = TypeVar("Made")
+
+
+class Trial(NamedTuple):
+    """What one scan is of. scene, lines: None: as the config says; fog: None: as the scene says."""
+
+    scene: str | None
+    fog: str | None
+    exposures: int
+    lines: int | None
 
 
 @dataclass(frozen=True, slots=True)
 class Trials:
-    """What is to be tried: every scene in every fog, with every number of exposures, estimator and filter.
+    """What is to be tried: every scene in every fog, with every number of exposures and lines, estimator and filter.
 
-    configs: makes the config of a scene (None: the config's own), a fog (None: the scene's own) and exposures. repeat:
-    scans of each, seeds `seed`, `seed` + 1 and so on.
+    config_of: makes the config of one of them. repeat: scans of each, seeds `seed`, `seed` + 1 and so on.
     """
 
-    configs: Callable[[str | None, str | None, int], RigConfig]
+    config_of: Callable[[Trial], RigConfig]
     scenes: Sequence[str | None]
     fogs: Sequence[str | None]
     exposures: Sequence[int]
+    lines: Sequence[int | None]
     estimators: Sequence[str]
     filters: Sequence[str]
     repeat: int
     seed: int
+    limits: bool
 
-    def __iter__(self) -> Iterator[tuple[str | None, str | None, int]]:
-        """Scene, fog and exposures of every scan; repeats are scans of their own."""
-        return product(self.scenes, self.fogs, self.exposures)
+    def __iter__(self) -> Iterator[Trial]:
+        """Every one once; repeats are scans of their own."""
+        return starmap(Trial, product(self.scenes, self.fogs, self.exposures, self.lines))
+
+    def configs(self) -> dict[Trial, RigConfig]:
+        """The config of each. UsageError with all that is wrong with any."""
+        return _all_or_problems(self, self.config_of)
+
+    def require_plans(self) -> None:
+        """UsageError with all that stands against scanning so: of the fewest and the most exposures everywhere."""
+        ends = {min(self.exposures), max(self.exposures)}
+        configs = self.configs()
+        _all_or_problems(
+            [trial for trial in self if trial.exposures in ends], lambda trial: require_plan(configs[trial])
+        )
+
+
+def _all_or_problems(trials: Iterable[Trial], make: Callable[[Trial], Made]) -> dict[Trial, Made]:
+    found: dict[Trial, Made] = {}
+    problems: list[str] = []
+    for trial in trials:
+        try:
+            found[trial] = make(trial)
+        except UsageError as error:
+            problems += error.problems
+    if problems:
+        raise UsageError.of(problems)
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +99,7 @@ class Tradeoff:
 
 
 def run_tradeoff(trials: Trials, wish: Wish | None, progress: Progress | None = None) -> Tradeoff:
-    """Scan and score all of it. progress: called with frames taken and all, of all scans, nominally.
+    """Scan and score all of it. progress: called with frames taken and all, those on columns.
 
     An interrupt ends it after the last whole row; before there is one it is raised.
     """
@@ -97,52 +133,49 @@ def require_methods(estimators: Sequence[str], filters: Sequence[str]) -> list[s
 
 
 def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRow]]:
-    """The rows of one scene, fog and number of exposures after the other."""
-    scans = list(trials)
-    bar = _Bar(progress, trials.repeat * sum(exposures for _, _, exposures in scans))
-    # All configs before the first scan: what is wrong with one is said at once.
-    for (scene, fog, exposures), config in list(zip(scans, _configs(trials, scans), strict=True)):
-        scores: dict[tuple[str, str], list[MapScore]] = {}
+    """The rows of one trial after the other."""
+    configs = trials.configs()
+    bar = _Bar(progress, trials.repeat * sum(map(_frames_of, configs.values())))
+    limits = SceneLimits(max(trials.exposures))
+    for trial, config in configs.items():
+        scores: dict[Method, list[MapScore]] = {}
         for seed in range(trials.seed, trials.seed + trials.repeat):
-            found = score_methods(config, trials.estimators, trials.filters, seed, bar.within(exposures))
+            found = score_methods(config, trials.estimators, trials.filters, seed, bar.within(_frames_of(config)))
             for method, score in found.items():
                 scores.setdefault(method, []).append(score)
-            bar.add(exposures)
-        name = str(getattr(config.world, "scene", "")) if scene is None else scene
-        yield [row_of(name, fog, Setting(*method, exposures), each) for method, each in scores.items()]
+            bar.add(_frames_of(config))
+        scene = str(getattr(config.world, "scene", "")) if trial.scene is None else trial.scene
+        lines = len(config.line_offsets)
+        rows = [
+            row_of(scene, trial.fog, Setting(*method, trial.exposures, lines), each) for method, each in scores.items()
+        ]
+        yield limits.beside(rows, config) if trials.limits else rows
 
 
-def _configs(trials: Trials, scans: Sequence[tuple[str | None, str | None, int]]) -> list[RigConfig]:
-    configs, problems = [], []
-    for scan in scans:
-        try:
-            configs.append(trials.configs(*scan))
-        except UsageError as error:
-            problems += error.problems
-    if problems:
-        raise UsageError.of(problems)
-    return configs
+def _frames_of(config: RigConfig) -> int:
+    """Frames on columns of one scan."""
+    return MAPS * config.scan.columns * config.scan.exposures // len(config.line_offsets)
 
 
 class _Bar:
-    """Progress over scans that take as long as they have exposures, in thousandths."""
+    """Progress in frames on columns."""
 
     def __init__(self, progress: Progress | None, total: int) -> None:
         self._progress = progress
         self._total = total
         self._done = 0
 
-    def within(self, exposures: int) -> Callable[[int, int], None] | None:
-        """What a scan of so many exposures is to tell its frames to."""
+    def within(self, frames: int) -> Callable[[int, int], None] | None:
+        """What a scan of so many is to tell how far it is."""
         if self._progress is None:
             return None
-        return lambda done, planned: self._tell(self._done + exposures * min(1.0, done / max(planned, 1)))
+        return lambda done, planned: self._tell(self._done + frames * min(1.0, done / max(planned, 1)))
 
-    def add(self, exposures: int) -> None:
-        """A scan is done."""
-        self._done += exposures
+    def add(self, frames: int) -> None:
+        """A scan of so many is done."""
+        self._done += frames
         self._tell(self._done)
 
     def _tell(self, done: float) -> None:
         if self._progress is not None:
-            self._progress(round(1000 * done / self._total), 1000)
+            self._progress(round(done), self._total)

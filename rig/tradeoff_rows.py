@@ -150,9 +150,7 @@ def row_of(scene: str, fog: str | None, setting: Setting, scores: Sequence[MapSc
 def with_fronts(rows: Sequence[TradeoffRow]) -> tuple[TradeoffRow, ...]:
     """The rows, marked where they lie on the Pareto front of their scene and fog."""
     sensor, compute = _fronts(rows, lambda row: row.sensor_ms), _fronts(rows, lambda row: row.compute_ms)
-    return tuple(
-        replace(row, pareto=i in sensor, pareto_compute=i in compute) for i, row in enumerate(rows)
-    )
+    return tuple(replace(row, pareto=i in sensor, pareto_compute=i in compute) for i, row in enumerate(rows))
 
 
 def _fronts(rows: Sequence[TradeoffRow], time_ms: Callable[[TradeoffRow], float]) -> set[int]:

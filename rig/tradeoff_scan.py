@@ -32,7 +32,7 @@ MAPS = 2
 """The first one is learned from, the last one is scored."""
 TIMED_PASSES = 3
 """How often the last map is made, for the median of its time."""
-MOST_KEPT_BYTES = 4_000_000_000
+MOST_KEPT_BYTES = 2_000_000_000
 """Of frames of one sweep in memory."""
 
 Block = tuple[NDArray[np.uint8], NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]
@@ -45,7 +45,7 @@ Method = tuple[str, str]
 class KeptSweep(FrameTally):
     """The frames of a sweep themselves."""
 
-    blocks: Sequence[Block]
+    blocks: list[Block]
 
 
 class FrameKeeper:
@@ -111,25 +111,17 @@ class ManyMakers:
         """The first map is learned from, the last one made by all; gives back one of them."""
         assert isinstance(sweep, KeptSweep), "made by the counter above"
         self._maps += 1
-        for name, maker in self._makers.items():
-            if self._maps < MAPS:
-                stripe, counted, estimate_s = self._estimate(name, sweep)
-                continue
-            passes = [self._all_filters(name, sweep) for _ in range(TIMED_PASSES)]
-            for filter, (result, _) in passes[0].items():
-                seconds = statistics.median(each[filter][1] for each in passes)
+        for name in self._makers:
+            passes = [self._all_filters(name, sweep) for _ in range(1 if self._maps < MAPS else TIMED_PASSES)]
+            for filter, result in passes[0].items():
+                seconds = statistics.median(each[filter].compute_s for each in passes)
                 self.results[name, filter] = result, seconds
-        if self._maps < MAPS:
-            return maker.complete(stripe, counted, "none", estimate_s)
+        sweep.blocks.clear()  # the next sweep's frames need the room
         return result
 
-    def _all_filters(self, name: str, sweep: KeptSweep) -> dict[str, tuple[MapResult, float]]:
+    def _all_filters(self, name: str, sweep: KeptSweep) -> dict[str, MapResult]:
         stripe, counted, estimate_s = self._estimate(name, sweep)
-        made = {}
-        for filter in self._filters:
-            result = self._makers[name].complete(stripe, counted, filter, estimate_s)
-            made[filter] = result, result.compute_s
-        return made
+        return {filter: self._makers[name].complete(stripe, counted, filter, estimate_s) for filter in self._filters}
 
     def _estimate(self, name: str, sweep: KeptSweep) -> tuple[StripeTable, FrameTally, float]:
         """Stripe table, what was counted, and the seconds that counting and estimating took."""
@@ -157,7 +149,6 @@ def score_methods(
     with open_rig(config, seed=seed) as rig:
         assert rig.world is not None, "only simulated rigs are tried"
         plan, timing = prepare(rig)
-        _require_memory(plan)
         for estimator in estimators:
             for filter in filters:
                 warm_up(estimator, filter, plan.exposures, dark=True)
@@ -176,8 +167,10 @@ def score_methods(
     }
 
 
-def _require_memory(plan: ScanPlan) -> None:
-    """UsageError where the frames of a sweep are too many to be kept."""
+def require_plan(config: RigConfig) -> None:
+    """UsageError where there is no such scan, or its frames are too many to be kept."""
+    with open_rig(config) as rig:
+        plan, _ = prepare(rig)
     frame = plan.rows * (plan.used_px or plan.width) // 8
     kept = float(plan.frames_per_sweep) * frame
     if kept > MOST_KEPT_BYTES:

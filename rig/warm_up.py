@@ -6,6 +6,7 @@ from rig.binding import FrameBinder
 from rig.counting import BIN_DARK, SweepLayout
 from rig.depth import depth_map
 from rig.estimators import create_estimator
+from rig.fog_meter import read_fog
 from rig.geometry import WORD_PX, uncalibrated_geometry
 from rig.scan_plan import ScanPlan
 
@@ -38,6 +39,8 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
         sweep = counter.finish()
         stripe = maker.estimate(sweep, geometry)
         sweep.intensity()
+        if maker.used is not None:
+            read_fog(sweep, stripe, geometry, maker.used)
     if filter == "median":
         from rig.estimators.median import median_filter
 

@@ -16,7 +16,7 @@ import yaml
 from pydantic import Field, ValidationError
 
 from drivers.errors import DeviceError
-from drivers.units import Lux, MetresPerSecond, parse_quantity
+from drivers.units import Lux, MetresPerSecond
 from sim_backend.medium import Fog, Medium, Section
 from sim_backend.scenes.prepared import load_folder
 from sim_backend.scenes.surfaces import Surfaces
@@ -104,7 +104,7 @@ def load_scene(name: str) -> tuple[SceneFile, Path]:
 
 
 def with_fog(scene: SceneFile, visibility: str) -> SceneFile:
-    """The scene with another fog: of that visibility (text with a unit), or CLEAR; how it scatters stays the scene's."""
+    """The scene in another fog: of that visibility (text with a unit), or CLEAR; how it scatters is as in the scene."""
     if visibility == CLEAR:
         return scene.model_copy(update={"medium": None})
     fog = Fog(visibility=visibility)  # type: ignore[arg-type]

@@ -136,9 +136,14 @@ class Guard:
 
         Raises the guard's `failure`, so that a scan whose light was taken ends with the reason.
         """
+        self._heartbeat.waited_s = 0.0
         self._heartbeat.frame = frame
         if self._failure is not None:
             raise self._failure
+
+    def wait(self, waited_s: float) -> None:
+        """Tell for how long the SPAD has been asked in vain since its last frames. On the source thread."""
+        self._heartbeat.waited_s = waited_s
 
     def expect(self, limits: GuardLimits) -> None:
         """Other limits from now on, as for a burst, which is silent until it is read out."""

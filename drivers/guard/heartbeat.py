@@ -1,4 +1,4 @@
-"""The heartbeat: a page of memory that application and guard share, with the source thread's last frame number in it.
+"""The heartbeat: a page of memory that application and guard share, in which the source thread writes.
 
 To beat is one store: no lock, no system call, nothing that a full pipe, a stopped guard or a slow disk could hold up.
 """
@@ -9,7 +9,7 @@ import struct
 
 from drivers.errors import DeviceError
 
-_FRAME = struct.Struct("<q")
+_FRAME, _WAITED = struct.Struct("<q"), struct.Struct("<d")
 _NO_FRAME = -1
 
 
@@ -40,6 +40,15 @@ class Heartbeat:
     @frame.setter
     def frame(self, number: int) -> None:
         _FRAME.pack_into(self._page, 0, number)
+
+    @property
+    def waited_s(self) -> float:
+        """For how long the source thread has asked the SPAD in vain since its last frames, as it said last."""
+        return float(_WAITED.unpack_from(self._page, _FRAME.size)[0])
+
+    @waited_s.setter
+    def waited_s(self, seconds: float) -> None:
+        _WAITED.pack_into(self._page, _FRAME.size, seconds)
 
     def close(self) -> None:
         """Give the page back; again: nothing happens."""

@@ -189,7 +189,7 @@ class GuardProcess:
             application.note_progress()
         emits = any(owned.emits for owned in self._owned.values())
         stopped = (watch.watching or emits) and application.stopped
-        trouble = watch.look(elapsed_s, frame, stopped, application.busy)
+        trouble = watch.look(elapsed_s, frame, stopped, application.busy, self._heartbeat.waited_s)
         now = time.monotonic()
         if trouble is not None:
             self._suspect(trouble, stopped, now)

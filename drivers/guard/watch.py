@@ -2,7 +2,8 @@
 
 A deadline on frames alone would either be too long for the laser or trip on a busy machine. So there are two: a short
 one for an application that does nothing at all (all its threads asleep, or the process stopped), and a longer one for
-one that is at work or waits for a processor or a disk, as its threads' states tell.
+one that is at work or waits for a processor or a disk, as its threads' states tell. Work is no excuse where the source
+thread itself says that it has asked the SPAD in vain: then it is the SPAD that is silent.
 
 The guard's own time counts in short steps only: what stops the guard as well (a suspended or overloaded machine) is no
 silence of the application's.
@@ -32,6 +33,8 @@ class GuardLimits:
     only sleeps 1 ms was seen to wake 0.2 s late, one that shares its interpreter 0.35 s, and disks stall for a second:
     none of that may end a scan. The light meanwhile is that of a moving mirror, since each sweep waits, with its gate
     low, for a scan marker. An application that is killed or stopped never gets this long."""
+    waits_within_s: float = 0.04
+    """By one at work whose source thread says that it has asked the SPAD for so long in vain."""
     first_frame_s: float = 1.0
     """From `run` to the first one: SPAD, scanner and the scan marker come in between."""
 
@@ -69,10 +72,13 @@ class FrameWatch:
         """The gate is low."""
         self._watching = False
 
-    def look(self, elapsed_s: float, frame: int, stopped: bool, busy: Callable[[], bool]) -> str | None:
+    def look(
+        self, elapsed_s: float, frame: int, stopped: bool, busy: Callable[[], bool], waited_s: float = 0.0
+    ) -> str | None:
         """What is wrong with the application, `elapsed_s` after the last look; None: nothing that is known.
 
         stopped: it is, while the laser may shine. busy: asked only in doubt, since it costs a look at every thread.
+        waited_s: for how long the SPAD has been asked in vain, as the source thread says.
         """
         if stopped:
             return "is stopped"
@@ -85,6 +91,8 @@ class FrameWatch:
         limits = self.limits
         if self._silent_s <= (limits.frames_within_s if self._begun else limits.first_frame_s):
             return None
+        if self._begun and waited_s > limits.waits_within_s:
+            return f"waited for the SPAD in vain for {self._silent_s * 1e3:.0f} ms after frame {frame}"
         if self._begun and self._silent_s <= limits.busy_within_s and busy():
             return None
         return f"took no frame for {self._silent_s * 1e3:.0f} ms after frame {frame}"

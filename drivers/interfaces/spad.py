@@ -2,7 +2,7 @@
 
 import logging
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Literal
@@ -115,6 +115,9 @@ class SpadArray(Device):
         super().__init__(name)
         self._mode: SpadMode | None = None
         self._run_opened = False
+        self.on_wait: Callable[[float], None] | None = None
+        """Told within `fill` for how many seconds it has asked the device in vain since its last frames; a device that
+        cannot tell leaves it alone."""
 
     @property
     @abstractmethod

@@ -51,23 +51,37 @@ class Estimator(Protocol):
         ...
 
 
-def recalling(learned: Sequence[Learned], threads: int = 2) -> Estimator:
-    """The estimator that learned these states, to estimate the map of each again as with it; it learns nothing."""
+class LearnsFromStream(Estimator, Protocol):
+    """What those in LEARNING offer besides."""
+
+    model: Any
+    """The state that the next map will be estimated with, None before a map that taught."""
+
+
+def recalling(name: str, learned: Sequence[Learned], threads: int = 2) -> Estimator:
+    """The estimator of a name in LEARNING that learned these states, to estimate the map of each again as with it.
+
+    It learns nothing.
+    """
     from rig.estimators.recalled import Recalled
 
-    return Recalled(learned, threads)
+    return Recalled(_learning(name, threads, learns=False), learned)
 
 
 def create_estimator(name: str, threads: int = 2) -> Estimator:
     """Estimator of a name out of ESTIMATORS, fresh, for up to `threads` threads; KeyError for any other name."""
-    if name == "likelihood":
-        from rig.estimators.likelihood import Likelihood
-
-        return Likelihood(threads)
-    if name == "joint":
-        from rig.estimators.joint import Joint
-
-        return Joint(threads)
+    if name in LEARNING:
+        return _learning(name, threads, learns=True)
     from rig.estimators.peaks import Peaks
 
     return {"argmax": Peaks(False, threads), "edge": Peaks(True, threads)}[name]
+
+
+def _learning(name: str, threads: int, *, learns: bool) -> LearnsFromStream:
+    if name == "likelihood":
+        from rig.estimators.likelihood import Likelihood
+
+        return Likelihood(threads, learns=learns)
+    from rig.estimators.joint import Joint
+
+    return Joint(threads, learns=learns)

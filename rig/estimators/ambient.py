@@ -33,7 +33,8 @@ def ambient_map(
     if tally.dark_counts is not None:
         ones += tally.dark_counts
         exposures += tally.n_dark if tally.dark_frames is None else tally.dark_frames
-    if quiet is not None:
+    # Behind its stripe a pixel is not dark where other lines are lit together with it.
+    if quiet is not None and geometry.others is None:
         ones += quiet[0]
         exposures += quiet[1]
     totals = np.stack([intensity, np.broadcast_to(_window_exposures(tally, geometry), intensity.shape)])

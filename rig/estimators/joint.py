@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from rig.counting import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimators.aggregation_answer import Answer, answer_settings, new_answer
 from rig.estimators.aggregation_kernels import Penalties, along_columns, along_rows
+from rig.estimators.ambient import ambient_map
 from rig.estimators.joint_confidence import confidence_of
 from rig.estimators.joint_kernels import add_quiet, read_light, read_positions
 from rig.estimators.label_grid import PER_PX, LabelGrid, label_grid
 from rig.estimators.label_volume import Costs, costs_of
-from rig.estimators.learning import lines_of, next_lattice
-from rig.estimators.lessons import Lessons, Seen, Setting
+from rig.estimators.learning import learn_again, lines_of, next_lattice
+from rig.estimators.lessons import Lessons, Seen, Setting, first_model
 from rig.estimators.row_input import State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
 from rig.estimators.volume_search import nominal_exposures
@@ -28,6 +29,8 @@ from rig.stripes import StripeTable
 
 BAND_ROWS = 16
 """Rows whose costs stay in the cache from one step to the next."""
+FIRST_ROUNDS = 3
+"""Times that the first map's stripes teach what they are then estimated with again."""
 QUIET_COLUMNS = 8
 """Every so manieth column teaches the ambient light where there are dark frames too."""
 
@@ -79,7 +82,7 @@ class Joint:
 
     def estimate(self, sweep: CountVolume, geometry: SweepGeometry) -> StripeTable:
         """Stripe table of one sweep; afterwards `model` is what the next sweep will be estimated with."""
-        model = self._lessons.model_for(sweep, geometry, self._workers)
+        model = self._lessons.model_for(lambda: self._first_model(sweep, geometry))
         setting = Setting(model, geometry, nominal_exposures(sweep), sweep.dark_counts is not None)
         tables = self._lessons.tables(setting, self._workers)
         stripes = self._stripes(sweep, tables)
@@ -88,6 +91,18 @@ class Joint:
             stripes, model, int(sweep.n_frames.sum()), lambda: self._seen(sweep, geometry, tables, stripes)
         )
         return stripes
+
+    def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
+        """Learn from the first sweep: row by row, then from stripes that all rows together show far better."""
+        model = first_model(volume, geometry, self._workers)
+        exposures, dark = nominal_exposures(volume), volume.dark_counts is not None
+        for _ in range(FIRST_ROUNDS):
+            tables = _tables(Setting(model, geometry, exposures, dark), self._workers)
+            stripes = self._stripes(volume, tables)
+            quiet = self._quiet(volume, geometry, tables, stripes)
+            ambient = ambient_map(volume, volume.intensity(), geometry, quiet)
+            model = learn_again(volume, geometry, model, ambient, stripes, self._workers)
+        return model
 
     def _stripes(self, volume: CountVolume, tables: _Tables) -> StripeTable:
         grid, workers = tables.grid, self._workers
@@ -127,6 +142,12 @@ class Joint:
         return memory
 
     def _seen(self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable) -> Seen:
+        quiet = self._quiet(volume, geometry, tables, stripes)
+        return Seen(volume, quiet, lines_of(volume, next_lattice(geometry), stripes))
+
+    def _quiet(
+        self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable
+    ) -> NDArray[np.float64]:
         quiet = np.zeros((2, geometry.rows, geometry.width))
 
         def work(first: int, last: int) -> None:
@@ -136,7 +157,7 @@ class Joint:
             )  # fmt: skip
 
         self._workers.over(geometry.rows, work)
-        return Seen(volume, quiet, lines_of(volume, next_lattice(geometry)))
+        return quiet
 
 
 def _tables(setting: Setting, workers: RowWorkers) -> _Tables:

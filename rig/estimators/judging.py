@@ -250,7 +250,7 @@ def _largest(sweep: Sweep, state: State, light: NDArray[np.float32], reach: int)
     few = sweep._replace(
         x0=sweep.x0[columns], plane=np.ascontiguousarray(sweep.plane[columns]),
         x_lo=np.ascontiguousarray(sweep.x_lo[middle, columns]), x_hi=np.ascontiguousarray(sweep.x_hi[middle, columns]),
-        u=np.ascontiguousarray(sweep.u[middle]), v=np.ascontiguousarray(sweep.v[middle]),
+        u=np.ascontiguousarray(sweep.u[middle]), v=np.ascontiguousarray(sweep.v[middle]), others=sweep.others[columns],
     )  # fmt: skip
     part = state._replace(
         ambient=np.ascontiguousarray(state.ambient[middle]), row_gain=np.ascontiguousarray(state.row_gain[middle]),

@@ -1,125 +1,191 @@
 """Cost of every label on every row of every column: how much less likely than the best answer its counts make it.
 
-A label is a position of the stripe half a pixel nearer than the one before, counted from where the column's plane is
-at the far end of the depth range; behind the positions stands 'none', a row without stripe. The likelihood is that of
-`row_kernels`, with the line's profile at the label's own fraction of a pixel.
+A label is a position of the stripe half a pixel nearer than the one before (`label_grid`); behind the positions stands
+'none', a row without stripe. The likelihood is that of `row_kernels`, with the line's profile at the label's own
+fraction of a pixel, from tables that the rows of a band share (`label_tables`).
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.aligned import aligned_zeros
 from rig.counting import CountVolume
+from rig.estimators.judging import HOT_FACTOR, HOT_FLUX
 from rig.estimators.label_grid import LabelGrid
-from rig.estimators.row_input import State, Sweep, row_buffers, row_fluxes, state_of, sweep_of
-from rig.estimators.row_kernels import FLUX_MAX, cell_of, none_prior
+from rig.estimators.label_places import FAR_PX, FRACTIONS, PHASES, VARIANTS, label_pixels, places_of
+from rig.estimators.label_tables import LIGHTS, NONES, LabelTables, fill_tables, mark_rows, number_tables
+from rig.estimators.label_volume_kernels import Ways, fill_costs
+from rig.estimators.row_input import Row, State, Sweep, row_buffers, row_fluxes, state_of, sweep_of
+from rig.estimators.row_kernels import FLUX_MAX, cell_of
 from rig.estimators.row_model import RowModel, pixel_shares
-from rig.geometry import SweepGeometry
+from rig.geometry import MARGIN_PX, SweepGeometry
+from rig.lanes import LANES
 from rig.row_threads import RowWorkers
 
 UNITS: Final = 8
-"""Units of cost per nat."""
-COST_LIMIT: Final = 160
-"""Largest cost of a label that is not excluded."""
-EXCLUDED: Final = 255
-"""Cost of a label that cannot be: outside the picture or more than a pixel outside the row's search window."""
-FRACTIONS: Final = 8
-"""Parts of a pixel that the centre of a line is told apart in."""
-CHANGE_PX: Final = 8
-"""Positions of a change without a stripe that count as one with the likeliest."""
+"""Units of cost per nat, up to SHARP exposures."""
+SHARP: Final = 32
+"""Exposures from which on a unit of cost is worth more: the labels beside the best one must stay within the range."""
+BAND_ROWS: Final = 64
+"""Rows that share tables."""
+FINEST: Final = 6
+"""Scores are of at most 2^FINEST units per nat."""
+WEIGHT_BITS: Final = 12
+"""Weights of 2^WEIGHT_BITS units per nat reach to 8 nats per count."""
+RISE_LIMIT: Final = 22000
+"""Most that the score of a change may rise along a row, of a range of 40000."""
+TAPS_LIMIT: Final = 28000
+"""Most that the pixels around a position may add to its score."""
+SPARE_FRAMES: Final = 4
+"""A column may have half of its nominal frames and so many more; the counts of one with more are halved."""
+LOOKED_AT: Final = 32
+"""Columns, and rows, whose rise says in which units to keep those of all."""
+QUARTILES: Final = (0.25, 0.75)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Costs:
-    """Gives the costs of a sweep's counts under one model; made once per model by `costs_of`."""
+    """Gives the costs of a sweep's counts under one model; made once per model by `costs_of`.
 
-    sweep: Sweep
-    state: State
+    units_per_nat: of cost; UNITS up to SHARP nominal exposures, beyond them halved whenever those double, or less where
+    16 bits do not hold what haze says.
+    """
+
     grid: LabelGrid
-    shares: NDArray[np.float32]
+    tables: LabelTables
+    place: NDArray[np.int16]
+    hot_start: NDArray[np.int32]
+    hot_x: NDArray[np.int16]
+    ways: Ways
+    units_per_nat: float
 
     def fill(self, volume: CountVolume, first: int, last: int, out: NDArray[np.uint8]) -> None:
-        """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows; see UNITS.
+        """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows.
 
-        Cost: UNITS per nat below the likeliest label of that row and column, at most COST_LIMIT; EXCLUDED where a
-        label cannot be. Rows of columns without frames cost 0 everywhere. Threads may fill different rows at once.
+        Cost: by how much a label is less likely than the best one of that row and column, at most COST_LIMIT; EXCLUDED
+        where it cannot be. Rows without frames, or with nothing to search, cost 0 everywhere. Best called with 16 rows
+        or more at a time; threads may fill different rows at once.
         """
-        grid = self.grid
-        _fill(
-            self.sweep, self.state, volume.counts, volume.n_frames, grid.x_far, grid.side, grid.stripes, grid.none,
-            self.shares, first, last, out,
+        fill_costs(
+            volume.counts, volume.n_frames, volume.x0, self.place, self.tables, self.hot_start, self.hot_x, self.ways,
+            first, last, out,
         )  # fmt: skip
 
 
 def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposures: int, workers: RowWorkers) -> Costs:
     """All that `Costs.fill` reads, for columns of about `exposures` frames under `model`."""
-    reach = len(state_of(model).psi) - 1
+    sweep, state = sweep_of(geometry), state_of(model)
+    reach = len(state.psi) - 1
+    light = _lights(model)
+    ways, units_per_nat = _ways(sweep, state, grid, exposures, light, reach)
+    place = places_of(sweep, grid)
+    bands = -(-geometry.rows // BAND_ROWS)
+    at = np.empty((bands, geometry.columns, VARIANTS), np.int32)
+    tables = _empty_tables(at, number_tables(place, BAND_ROWS, at), grid, 2 * reach + 1)
+    ambient, hot = model.ambient, _hot(model.ambient)
     distance = np.arange(-reach, reach + 1) - (np.arange(FRACTIONS)[:, None] - FRACTIONS // 2) / FRACTIONS
-    return Costs(sweep_of(geometry), state_of(model), grid, pixel_shares(model.line_sigma_px, distance))
+    shares = pixel_shares(model.line_sigma_px, distance)
+    dark = state._replace(ambient=np.zeros_like(ambient), row_gain=_band_means(state.row_gain))
+    scale = 2.0**ways.bits
+
+    def work(first: int, last: int) -> None:
+        fill_tables(
+            sweep,
+            dark,
+            place,
+            ambient,
+            hot,
+            light,
+            shares,
+            ways.units * scale,
+            TAPS_LIMIT * scale / ways.most,
+            BAND_ROWS,
+            first,
+            last,
+            tables,
+        )
+
+    workers.over(bands, work)
+    mark_rows(place, hot, grid.side, BAND_ROWS, tables)
+    y, x = np.nonzero(hot)
+    hot_start = np.searchsorted(y, np.arange(geometry.rows + 1)).astype(np.int32)
+    return Costs(grid, tables, place, hot_start, x.astype(np.int16), ways, units_per_nat)
 
 
-@numba.njit(inline="always")
-def _level(n, k, flux, table):  # type: ignore[no-untyped-def]
-    """Log-likelihood of n ones in k exposures at a flux."""
-    cell = cell_of(min(flux, FLUX_MAX))
-    return n * table[0, cell] + k * table[1, cell]
+def _ways(
+    sweep: Sweep, state: State, grid: LabelGrid, exposures: int, light: NDArray[np.float32], reach: int
+) -> tuple[Ways, float]:
+    most = exposures + exposures // 2 + SPARE_FRAMES
+    bits = most.bit_length()
+    rise, gain = _largest(sweep, state, row_buffers(sweep.window, 1), light[-1])
+    largest = most * max(rise / RISE_LIMIT, gain / TAPS_LIMIT, 2.0**-FINEST / most)
+    fine = min(WEIGHT_BITS - bits, int(np.floor(-np.log2(largest))))
+    sharp = UNITS / 2.0 ** max(0, int(np.ceil(np.log2(max(exposures, 1) / SHARP))))
+    down = max(fine - int(np.log2(sharp)), 0)
+    ways = Ways(
+        units=2.0**fine, bits=bits, most=most, down=down, reach=reach, side=grid.side, stripes=grid.stripes,
+        none=grid.none, band_rows=BAND_ROWS,
+    )  # fmt: skip
+    return ways, 2.0 ** (fine - down)
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(
-    sweep: Sweep, state: State, counts: NDArray[Any], n_frames: NDArray[np.int32], x_far: NDArray[np.float64],
-    side: int, stripes: int, none: int, shares: NDArray[np.float32], first_row: int, last_row: int,
-    out: NDArray[np.uint8],
-) -> None:  # fmt: skip
-    reach, amplitudes = shares.shape[1] // 2, state.amplitude.shape[0]
-    row = row_buffers(sweep.window, 1)
-    score = np.empty(stripes)
-    near, far, edge = np.empty(sweep.window), np.empty(sweep.window), np.empty(sweep.window + 1)
-    for y in range(first_row, last_row):
-        for c in range(x_far.shape[1]):
-            cost = out[y, c]
-            cost[:] = EXCLUDED
-            k = n_frames[c]
-            length, first, last, start = row_fluxes(sweep, state, row, y, c)
-            if length == 0 or k == 0:
-                cost[:stripes] = 0
-                cost[none] = 0
-                continue
-            edge[0] = 0.0
-            top_edge = 0.0
+def _largest(sweep: Sweep, state: State, row: Row, light: float) -> tuple[float, float]:
+    """Largest sums along some rows, in nats.
+
+    Per exposure, what all pixels of a row say by lying behind the stripe instead of before it; per count, what the
+    pixels that a stripe of this light falls on say.
+    """
+    rise = gain = 0.0
+    rows, columns = sweep.x_lo.shape
+    for y in range(0, rows, max(rows // LOOKED_AT, 1)):
+        for c in range(0, columns, max(columns // LOOKED_AT, 1)):
+            length, _, _, _ = row_fluxes(sweep, state, row, y, c)
+            total = 0.0
             for t in range(length):
-                row.n[t] = counts[c, y, start + side * t - sweep.x0[c]]
-                near[t] = _level(row.n[t], k, row.before[t], state.table)
-                far[t] = _level(row.n[t], k, row.behind[t], state.table)
-                edge[t + 1] = edge[t] + near[t] - far[t]
-                top_edge = max(top_edge, edge[t + 1])
-            place = int(np.floor(FRACTIONS * side * x_far[y, c] + 0.5)) - FRACTIONS * side * start
-            behind, before, change = none_prior(sweep.w_near, sweep.w_far, row.w[first], row.w[last], state.none_weight)
-            share = np.log((1.0 - behind - before - change) / (last - first + 1))
-            best = max(np.log(behind), np.log(before) + edge[length])
-            best = max(best, np.log(change * CHANGE_PX / (length + 1)) + top_edge) - share
-            no_stripe = best
-            for label in range(stripes):
-                at = place - FRACTIONS // 2 * label
-                i = (at + FRACTIONS // 2) >> 3
-                f = at - FRACTIONS * i
-                score[label] = -np.inf
-                if i < 0 or i >= length or not FRACTIONS * (first - 1) <= at <= FRACTIONS * (last + 1):
-                    continue
-                for a in range(amplitudes):
-                    s = edge[max(0, i - reach)] + state.log_weight[a]
-                    for j in range(max(0, i - reach), min(length, i + reach + 1)):
-                        base = row.before[j] if j < i else row.behind[j]
-                        if j == i:
-                            base = row.behind[j] + (0.5 + f / FRACTIONS) * (row.before[j] - row.behind[j])
-                        flux = base + state.amplitude[a] * row.scale[i] * shares[f + FRACTIONS // 2, j - i + reach]
-                        s += _level(row.n[j], k, np.float32(flux), state.table) - far[j]
-                    score[label] = max(score[label], s)
-                best = max(best, score[label])
-            for label in range(stripes):
-                if score[label] > -np.inf:
-                    cost[label] = min(round(UNITS * (best - score[label])), COST_LIMIT)
-            cost[none] = min(round(UNITS * (best - no_stripe)), COST_LIMIT)
+                dark = cell_of(row.behind[t])
+                total += abs(state.table[1, dark] - state.table[1, cell_of(row.before[t])])
+                taps = 0.0
+                for d in range(1 - state.psi.shape[0], state.psi.shape[0]):
+                    flux = np.float32(row.behind[t] + light * row.scale[t] * state.psi[abs(d)])
+                    taps += state.table[0, cell_of(min(flux, FLUX_MAX))] - state.table[0, dark]
+                gain = max(gain, taps)
+            rise = max(rise, total)
+    return rise, gain
+
+
+def _empty_tables(at: NDArray[np.int32], tables: int, grid: LabelGrid, taps: int) -> LabelTables:
+    vectors = -(-label_pixels(grid) // LANES)
+    pixels = -(-(FAR_PX + label_pixels(grid) + MARGIN_PX) // LANES) * LANES
+    return LabelTables(
+        at=at,
+        edge=aligned_zeros((tables, pixels), np.int16),
+        edge_sum=aligned_zeros((tables, pixels), np.float32),
+        tap=aligned_zeros((tables, vectors, taps, PHASES, LIGHTS, LANES), np.int16),
+        constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.float32),
+        none=np.zeros((tables, NONES), np.float32),
+        span=np.zeros((tables, 2), np.int16),
+    )
+
+
+def _lights(model: RowModel) -> NDArray[np.float32]:
+    """The quartiles of the learned amplitudes."""
+    weight = np.maximum(model.weight, 1e-6)
+    middle = (np.cumsum(weight) - 0.5 * weight) / weight.sum()
+    return np.exp(np.interp(QUARTILES, middle, np.log(model.amplitude.astype(np.float64)))).astype(np.float32)
+
+
+def _hot(ambient: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Pixels (rows, width) that are far brighter than those of their column in the band."""
+    bands = np.arange(BAND_ROWS, ambient.shape[0], BAND_ROWS)
+    return np.concatenate([part > HOT_FACTOR * np.median(part, axis=0) + HOT_FLUX for part in np.split(ambient, bands)])
+
+
+def _band_means(gain: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Each row's gain as the mean of its band's."""
+    parts = np.split(gain, np.arange(BAND_ROWS, len(gain), BAND_ROWS))
+    return np.concatenate([np.full_like(part, part.mean()) for part in parts])

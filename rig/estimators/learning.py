@@ -17,6 +17,7 @@ from rig.estimators.row_input import Lines, State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import AMPLITUDES, BINS, RowModel, fit_haze, stripe_scale
 from rig.geometry import SweepGeometry
 from rig.row_threads import RowWorkers
+from rig.stripes import StripeTable
 
 LATTICE_LINES = 8192
 """Rows x columns of a sweep that a learning round reads: about 10^6 pixels."""
@@ -29,6 +30,8 @@ WIDTH_EVIDENCE = 3.0
 """Natural logarithm of the odds from which the width moves."""
 FIRST_ROUNDS = 8
 LAST_ROUNDS = 3
+MOST_TRUST = np.float32(0.98)
+"""Of what neighbours say of a stripe that is sure: its own row may know better."""
 LEVELS = 14
 """Sums per profile bin of an expectation, see `learn_rows`."""
 PIECES = 4
@@ -80,10 +83,19 @@ def lattice(geometry: SweepGeometry, lines: int) -> tuple[NDArray[np.int32], NDA
     return y[pick].astype(np.int32), c[pick].astype(np.int32)
 
 
-def lines_of(volume: CountVolume, where: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Lines:
-    """The counts of a volume at (rows, columns), each one row of its column's window."""
+def lines_of(
+    volume: CountVolume, where: tuple[NDArray[np.int32], NDArray[np.int32]], known: StripeTable | None = None
+) -> Lines:
+    """The counts of a volume at (rows, columns), each one row of its column's window.
+
+    known: stripes of which the neighbours' counts have had a say.
+    """
     rows, columns = where
-    return Lines(volume.counts[columns, rows].astype(np.int32), rows, columns, volume.n_frames[columns])
+    x_px, trust = (np.zeros(len(rows), np.float32) for _ in range(2))
+    if known is not None:
+        x_px = known.x_px[rows, columns]
+        trust = np.where(np.isnan(x_px), np.float32(0.0), known.confidence[rows, columns] * MOST_TRUST)
+    return Lines(volume.counts[columns, rows].astype(np.int32), rows, columns, volume.n_frames[columns], x_px, trust)
 
 
 def expect(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> Expectation:
@@ -109,7 +121,8 @@ def expect(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowW
 
 
 def _some(lines: Lines, part: slice) -> Lines:
-    return Lines(lines.counts[part], lines.row[part], lines.column[part], lines.exposures[part])
+    counts, row, column, exposures, x_px, trust = lines
+    return Lines(counts[part], row[part], column[part], exposures[part], x_px[part], trust[part])
 
 
 def _expect_piece(sweep: Sweep, state: State, lines: Lines, geometry: SweepGeometry, hot_flux: float) -> Expectation:
@@ -157,13 +170,30 @@ def learn_next(
 ) -> tuple[RowModel, Expectation]:
     """The model carried on by the lines of `next_lattice` of one more sweep.
 
-    before: what the sweeps before it taught; it is returned with this one's added, and fades by half a sweep.
+    before: what the sweeps before it taught; it is returned with this one's added, and fades by half a sweep. The
+    line's width stays where neighbours say where the line is: their say depends on the width.
     """
     seen = expect(lines, geometry, model, workers)
     if before is not None:
         seen = seen.plus(before.faded(FADE))
     model = maximise(model, seen, spread=False, gains=False)
+    if lines.trust.any():
+        return model, seen
     return fit_line_width(_some(lines, slice(None, None, WIDTH_STEP)), geometry, model, workers), seen
+
+
+def learn_again(
+    volume: CountVolume,
+    geometry: SweepGeometry,
+    model: RowModel,
+    ambient: NDArray[np.float32],
+    known: StripeTable,
+    workers: RowWorkers,
+) -> RowModel:
+    """The model of a first sweep once its stripes are known better than row by row."""
+    lines = lines_of(volume, lattice(geometry, LATTICE_LINES), known)
+    seen = expect(lines, geometry, replace(model, ambient=ambient), workers)
+    return maximise(replace(model, ambient=ambient), seen, spread=True, free_ambient=volume.dark_counts is None)
 
 
 def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> RowModel:

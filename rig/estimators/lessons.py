@@ -75,9 +75,9 @@ class Lessons(Generic[Tables]):
         self._frames_since = 0
         """Lit frames since the last map that taught."""
 
-    def model_for(self, volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> RowModel:
-        """The model to estimate a sweep with, learned from it where there is none yet."""
-        return self.model if self.model is not None else first_model(volume, geometry, workers)
+    def model_for(self, first: Callable[[], RowModel]) -> RowModel:
+        """The model to estimate a sweep with; first: learns it from the sweep where there is none yet."""
+        return self.model if self.model is not None else first()
 
     def tables(self, setting: Setting, workers: RowWorkers) -> Tables:
         """Tables for a setting; made once while it stays the same."""

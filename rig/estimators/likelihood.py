@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rig.counting import BYTE_EXPOSURES, Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimators.judging import judge_of
 from rig.estimators.learning import lines_of, next_lattice
-from rig.estimators.lessons import Lessons, Seen, Setting
+from rig.estimators.lessons import Lessons, Seen, Setting, first_model
 from rig.estimators.row_model import RowModel
 from rig.estimators.search_desk import Judge
 from rig.estimators.stream import ColumnJudge, SearchedSweep
@@ -55,7 +55,7 @@ class Likelihood:
             used, stripes = self.model, sweep.stripe
             seen = Seen(sweep, sweep.quiet, sweep.lines)
         else:
-            used = self._lessons.model_for(sweep, geometry, self._workers)
+            used = self._lessons.model_for(lambda: first_model(sweep, geometry, self._workers))
             setting = Setting(used, geometry, nominal_exposures(sweep), sweep.dark_counts is not None)
             stripes, quiet = search_volume(sweep, geometry, self._lessons.tables(setting, self._workers), self._workers)
             seen = Seen(sweep, quiet, lines_of(sweep, next_lattice(geometry)))

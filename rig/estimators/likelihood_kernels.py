@@ -16,6 +16,8 @@ CERTAIN: Final = 0.6
 CLEAR: Final = 0.97
 CLEAR_PX: Final = 6
 """Rows as certain as this, and pixels as far before their stripe, measure the haze itself."""
+LEAST_OWN: Final = 1e-3
+"""Least haze of a line, over that of the others at a pixel, that is told from none."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -103,6 +105,11 @@ def _learn_levels(
         ambient = state.ambient[y, start + step * t]
         if ambient > hot_flux:
             continue
+        gain, others = row.gain[t], row.others[t]
+        if others > 0.0:
+            # Other lines' haze is haze like this one's: what there is of both tells the strength of each.
+            own = row.before[t] - ambient - others
+            gain *= 1.0 + others / max(own, LEAST_OWN * others)
         # The stripe's own width counts for neither side.
         ahead = 0.0
         near = row.posterior[t]
@@ -115,7 +122,7 @@ def _learn_levels(
         b = row.cell[t]
         levels[b, 0] += is_before * row.n[t]
         levels[b, 1] += is_before * k
-        levels[b, 2] += is_before * k * row.gain[t]
+        levels[b, 2] += is_before * k * gain
         levels[b, 3] += is_before * k * ambient
         expected = is_before * k * -np.expm1(-row.before[t])
         rows_seen[y, 0] += is_before * row.n[t]
@@ -125,11 +132,11 @@ def _learn_levels(
         if clear and t < mode - CLEAR_PX:
             levels[b, 8] += row.n[t]
             levels[b, 9] += k
-            levels[b, 10] += k * row.gain[t]
+            levels[b, 10] += k * gain
             levels[b, 11] += k * ambient
         if certain:
             is_behind = max(passed - near, 0.0)
             levels[b, 4] += is_behind * row.n[t]
             levels[b, 5] += is_behind * k
             levels[b, 6] += is_behind * k * row.gain[t]
-            levels[b, 7] += is_behind * k * ambient
+            levels[b, 7] += is_behind * k * (ambient + others)

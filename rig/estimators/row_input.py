@@ -35,18 +35,22 @@ class Sweep(NamedTuple):
     v: Float32
     w_near: float
     w_far: float
+    others: NDArray[np.float64]
 
 
 class Lines(NamedTuple):
     """Some rows of some columns, with their counts.
 
-    counts: (lines, window) integers; row, column: int32 (lines,); exposures: int32 (lines,).
+    counts: (lines, window) integers; row, column: int32 (lines,); exposures: int32 (lines,). x_px, trust: float32
+    (lines,), where neighbours say the stripe is and how probably so; with a trust of 0 the line stands alone.
     """
 
     counts: NDArray[np.integer]
     row: NDArray[np.int32]
     column: NDArray[np.int32]
     exposures: NDArray[np.int32]
+    x_px: Float32
+    trust: Float32
 
 
 class State(NamedTuple):
@@ -70,8 +74,9 @@ class Row(NamedTuple):
     """Buffers of one row, filled by `row_fluxes` and `judge_line`, nearest pixel first; made once per thread.
 
     n: ones; before, behind: flux of each pixel in front of and behind the stripe; scale: stripe photons at amplitude 1;
-    cell: nearest profile bin; gain: geometry factor of the haze; w: inverse depth; log_prior: of positions; taps, edge,
-    score, posterior, by_amplitude: see `row_scores` and `row_posterior`.
+    cell: nearest profile bin; gain: geometry factor of the haze; others: flux of other lines' haze, in before and
+    behind; w: inverse depth; log_prior: of positions; taps, edge, score, posterior, by_amplitude: see `row_scores` and
+    `row_posterior`.
     """
 
     n: Float32
@@ -80,6 +85,7 @@ class Row(NamedTuple):
     scale: Float32
     cell: NDArray[np.int32]
     gain: Float32
+    others: Float32
     w: Float32
     log_prior: Float32
     taps: Float32
@@ -95,6 +101,7 @@ def sweep_of(geometry: SweepGeometry) -> Sweep:
     return Sweep(
         geometry.window, geometry.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left, geometry.plane, geometry.u,
         geometry.v, 1.0 / near_m, 1.0 / far_m,
+        np.zeros((geometry.columns, 0, 3)) if geometry.others is None else geometry.others,
     )  # fmt: skip
 
 
@@ -113,7 +120,8 @@ def row_buffers(window: int, amplitudes: int) -> Row:
     return Row(
         np.empty(window, np.float32), np.empty(window, np.float32), np.empty(window, np.float32),
         np.empty(window, np.float32), np.empty(window, np.int32), np.empty(window, np.float32),
-        np.empty(window, np.float32), np.empty(window, np.float32), np.empty((3, window), np.float32),
+        np.empty(window, np.float32), np.empty(window, np.float32), np.empty(window, np.float32),
+        np.empty((3, window), np.float32),
         np.empty(window + 1, np.float32), np.empty((amplitudes, window), np.float32), np.empty(window, np.float32),
         np.empty(amplitudes, np.float64),
     )  # fmt: skip
@@ -183,9 +191,42 @@ def row_fluxes(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[in
         row.scale[t] = scale
         row.cell[t] = cell
         row.gain[t] = gain
+        row.others[t] = 0.0
         row.w[t] = w
         row.log_prior[t] = profile[cell, 3]
+    if sweep.others.shape[1] > 0:
+        _add_others(sweep, state, row, y, c, length, start, step)
     return length, begin, end, start
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_others(sweep: Sweep, state: State, row: Row, y: int, c: int, length: int, start: int, step: int) -> None:
+    """Add the haze of lines that are lit together with column c to both sides of its stripe.
+
+    Where their own stripes lie is not known: their haze has not ended at a pixel with the share of the depth range that
+    lies behind it there, all of it where the pixel shows it nearer than the range begins.
+    """
+    profile = state.profile
+    vy = sweep.v[y, start + step * (length // 2)]
+    for other in range(sweep.others.shape[1]):
+        plane = sweep.others[c, other]
+        path_u = -(plane[1] * vy + plane[2]) / plane[0]
+        path_p = np.sqrt(1.0 + path_u * path_u + vy * vy)
+        for t in range(length):
+            x = start + step * t
+            ux, vx = sweep.u[y, x], sweep.v[y, x]
+            path_c = np.sqrt(1.0 + ux * ux + vx * vx)
+            w = plane[0] * ux + plane[1] * vx + plane[2]
+            there = min(max((w - sweep.w_far) / (sweep.w_near - sweep.w_far), 0.0), 1.0)
+            b = min(max((w * 2.0 / (path_p + path_c) - state.w_lo) * state.per_w, 0.0), profile.shape[0] - 1.001)
+            i = int(b)
+            f = b - i
+            haze = profile[i, 0] + f * (profile[i + 1, 0] - profile[i, 0])
+            rest = profile[i, 1] + f * (profile[i + 1, 1] - profile[i, 1])
+            light = state.row_gain[y] * path_p * path_c * (there * haze + (1.0 - there) * rest)
+            row.others[t] += light
+            row.before[t] = min(row.before[t] + light, FLUX_MAX)
+            row.behind[t] = min(row.behind[t] + light, FLUX_MAX)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -208,6 +249,8 @@ def judge_line(
         row.n, np.float32(lines.exposures[i]), row.before, row.behind, row.scale, length, state.amplitude, state.psi,
         state.table, row.taps, row.edge, row.score,
     )  # fmt: skip
+    if lines.trust[i] > 0.0:
+        _heed_neighbours(row, first, last, (lines.x_px[i] - start) * step, lines.trust[i])
     prior = none_prior(sweep.w_near, sweep.w_far, row.w[first], row.w[last], state.none_weight)
     none, evidence = row_posterior(
         row.score,
@@ -224,3 +267,14 @@ def judge_line(
     for t in range(length):
         evidence += row.taps[1, t]
     return length, first, last, start, none, prior[0] + prior[1] - 2.0 * prior[2], evidence
+
+
+@numba.njit(cache=True, nogil=True)
+def _heed_neighbours(row: Row, first: int, last: int, place: float, trust: float) -> None:
+    """Change the prior of positions for a stripe that lies within about a pixel of `place` with probability `trust`."""
+    mass = 0.0
+    for t in range(first, last + 1):
+        mass += np.exp(row.log_prior[t])
+    for t in range(first, last + 1):
+        near = np.exp(-0.5 * (t - place) ** 2) / np.sqrt(2.0 * np.pi)
+        row.log_prior[t] = np.log((1.0 - trust) * np.exp(row.log_prior[t]) / mass + trust * near + 1e-9)

@@ -100,13 +100,14 @@ class ColumnJudge:
         self._workers.settle()
         carry_sums(self._desk(0), self._opened().sums_x0, 0, layout.rows)
         rows, columns = self._lines
+        alone = np.zeros((2, len(rows)), np.float32)
         tally = self._tally.finish()
         return SearchedSweep(
             n_frames=tally.n_frames, column=tally.column, dark_counts=tally.dark_counts, n_dark=tally.n_dark,
             width=tally.width, dark_frames=tally.dark_frames, stripe=stripes_of(found, self._judge, self._workers),
             light=pixel_order(found.light, layout.width).astype(np.uint32),
             quiet=quiet_of(found, layout.width),
-            lines=Lines(found.lines.copy(), rows, columns, tally.n_frames[columns]),
+            lines=Lines(found.lines.copy(), rows, columns, tally.n_frames[columns], *alone),
         )  # fmt: skip
 
     def _judge_block(

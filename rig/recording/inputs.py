@@ -20,22 +20,27 @@ PLAN_VERSION: Final = 1
 
 def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None) -> None:
     """Write the compiled plan, every number of it, and the calibration, where there is one. Raises OSError."""
-    content = {"format": PLAN_FORMAT, "version": PLAN_VERSION, "plan": to_plain(plan)}
-    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-    text = yaml.dump(content, Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
-    (folder / PLAN_FILE).write_text(text, encoding="utf-8")
+    write_plan(folder / PLAN_FILE, plan)
     if model is not None:
         save_rig_model(model, folder / CALIBRATION_FILE)
 
 
-def read_plan(folder: Path) -> ScanPlan:
+def write_plan(file: Path, plan: ScanPlan) -> None:
+    """Write a compiled plan, every number of it. Raises OSError."""
+    content = {"format": PLAN_FORMAT, "version": PLAN_VERSION, "plan": to_plain(plan)}
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    text = yaml.dump(content, Dumper=dumper, sort_keys=False, default_flow_style=None, width=120)
+    file.write_text(text, encoding="utf-8")
+
+
+def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
     """The plan that a recording was taken with. UsageError where there is none that this program reads."""
-    file = folder / PLAN_FILE
+    file = folder / name
     try:
         content = yaml.load(file.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except FileNotFoundError:
         raise UsageError(
-            f"{folder} has no {PLAN_FILE}, by which its frames would be bound to columns; name a run taken with "
+            f"{folder} has no {name}, by which its frames would be bound to columns; name a run taken with "
             "--record, or 'rig export' the frames as npy and 'rig reconstruct' those with a plan and a calibration"
         ) from None
     except OSError as error:

@@ -1,8 +1,8 @@
 """Dataclasses as plain values for YAML and JSON, and back, exactly: what a recording keeps of its plan and devices.
 
 Fractions become text ("100000/3"), arrays their dtype and values; floats are written so that they read back as the same
-number. Fields that a dataclass computes for itself (init=False) are left out, and so are those marked `SINCE` while they
-have no value: files written before there were any are read as they are.
+number. Fields that a dataclass computes for itself (init=False) are left out, and so are those marked `SINCE` while
+they have no value: files written before there were any are read as they are.
 """
 
 import types

@@ -35,6 +35,9 @@ TICKS_PER_FRAME = 1024
 LINK_BYTES_PER_S = 8e9
 """More than any frame rate needs: unless the config names a `link`, it is no bottleneck."""
 MAX_THREADS = 4
+START_BITS = 48
+MOST_STARTS = 0x3FFF
+"""Photons are drawn by the number of a frame: those of the second start are numbered from 2^48 on, and so on."""
 
 
 class SimulatedSpadConfig(KindConfig):
@@ -74,7 +77,7 @@ class SimulatedSpad(SpadArray):
         faults = config.lost_frames, config.loss_probability, config.duplicate_probability
         self._link = FrameLink(*faults, seed)
         self._counters = SpadCounters(0, 0, 0, 0, 0)
-        self._run_id = 0
+        self._run_id = self._starts = 0
         self._n_frames: int | None = None
         self._next_frame = 0
         self._block_seq = 0
@@ -135,6 +138,8 @@ class SimulatedSpad(SpadArray):
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._markers = MarkerInputs()
         self._just_lost = False
+        self._first_draw = (self._starts & MOST_STARTS) << START_BITS
+        self._starts += 1
         self._run_id = (self._run_id + 1) & 0xFFFF
         crystal = self._config.clock_error, self._config.clock_wander
         self._ticks = TickClock(float(1 / tick_hz), start_s, *crystal, [self._seed & 0xFFFFFFFFFFFFFFFF, self._run_id])
@@ -225,7 +230,8 @@ class SimulatedSpad(SpadArray):
         """Draw the next frames, without the first few, into `bits`."""
         assert self._photons is not None, "configured before started"
         held, power_w = self._world.held(happening)[first:], (happening.power_w * happening.share)[first:]
-        self._photons.expose(self._next_frame + first, held, power_w, x0[first:], bits, start_s[first:])
+        number = self._first_draw + self._next_frame + first
+        self._photons.expose(number, held, power_w, x0[first:], bits, start_s[first:])
 
     def _advance(self, n: int, *, lost: int) -> None:
         """Let the time of n frames pass."""

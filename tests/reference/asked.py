@@ -129,7 +129,7 @@ def _extras(estimator: str, groups: Groups) -> Iterator[Finding]:
                     yield _finding(
                         f"{point}: {name}", k, estimator, f"at most {BOUND_TIMES}", value, "", value <= BOUND_TIMES
                     )
-                elif point == "thin":
+                elif name.startswith(("pole", "fence")):
                     yield _finding(
                         f"{point}: {name}", k, estimator, f"at least {THIN_WITHIN}", value, "", value >= THIN_WITHIN
                     )

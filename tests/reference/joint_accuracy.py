@@ -5,7 +5,7 @@
 
 Errors are in px against the continuous truth, over the stripes on trusted pixels of every `--row-step`-th row; a
 missing answer counts as 10 px. `mean` and `worst` are over scenes; each map is estimated by an estimator that knows
-nothing before it. Made scenes stand for what the prepared ones cannot show: `smooth`, `thin`, `pane` (light of `report`).
+nothing before it. Made scenes stand for what prepared ones cannot show: `smooth`, `thin`, `pane` (light of `report`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -72,8 +73,8 @@ class Campaign:
             world = WorkingPoint(scene, POINTS.get(point, REPORT))
             for k in exposures:
                 gathered: dict[str, list[Answers]] = {name: [] for name in self.estimators}
-                extras: dict[str, dict[str, float]] = {}
-                for seed in range(1, self.seeds + 1):
+                tables: dict[str, list[Any]] = {name: [] for name in self.estimators}
+                for seed in range(1, max(self.seeds, 2 if point == "smooth" else 1) + 1):
                     counts = None
                     for name in self.estimators:
                         reconstructor = reconstructor_of(world, name, threads=self.threads)
@@ -82,10 +83,10 @@ class Campaign:
                             counts = world.counts_in(geometry.x0, geometry.window, k, seed)
                         result = reconstructor.map(volume_of(reconstructor, counts, k))
                         gathered[name].append(Answers.of(world, result, kept))
-                        if seed == 1:
-                            extras[name] = figures_of(point, world, result.stripe, k)
+                        tables[name].append(result.stripe)
                 for name, answers in gathered.items():
-                    yield Measured(point, scene.name, k, name, pooled(answers), extras[name])
+                    extras = figures_of(point, world, tables[name], k)
+                    yield Measured(point, scene.name, k, name, pooled(answers), extras)
 
 
 def as_row(cells: Sequence[object]) -> str:

@@ -1,7 +1,7 @@
 """Which kernels scans compile once the laser is armed: `python -m tests.system.compiled_late FOLDER`.
 
 In a process of its own, since what an earlier scan compiled would hide it. Prints a line for each kernel and signature
-that came after arming: over emulated wires of anything, and of a scan long enough to learn from a later map.
+that came after arming: over emulated wires of anything, and of scans that learn from later maps.
 """
 
 import gc
@@ -13,10 +13,11 @@ from numba.core.dispatcher import Dispatcher
 
 from rig import api
 from rig.acquisition import Acquisition
+from rig.estimators import ESTIMATORS, lessons
 from tests.system.small_rig import config, write_rig
 
-LEARNS_AFTER_MAPS = 200
-"""Maps of 800 lit frames: more than from one lesson to the end of the next."""
+MAPS, LESSON_FRAMES = 8, 1600
+"""Maps of 800 lit frames, and how many there are from one lesson to the next."""
 EMULATED: dict[str, Any] = {
     "world": {"kind": "emulated", "geometry": "./rig.yaml", "scene": "street", "laser": "obis"},
     "spad": {"kind": "spb-usb", "port": "emulated:spad", "reads": "plain", "heartbeat": "10 s"},
@@ -38,9 +39,9 @@ def main(folder: Path) -> None:
     """Run the scans."""
     emulated = {**config(), **EMULATED, "scan": {**config()["scan"], **SCAN}}
     _say_late("", write_rig(folder / "emulated", emulated), maps=3, estimator="likelihood", filter="median")
-    for estimator in ("argmax", "edge"):
-        _say_late("rig.", write_rig(folder / estimator), maps=3, estimator=estimator, filter="median")
-    _say_late("rig.", write_rig(folder / "long"), maps=LEARNS_AFTER_MAPS, estimator="likelihood")
+    lessons.TEACH_FRAMES = lessons.LAG_FRAMES = LESSON_FRAMES
+    for estimator in ESTIMATORS:
+        _say_late("rig.", write_rig(folder / estimator), maps=MAPS, estimator=estimator, filter="median")
 
 
 def _say_late(of: str, file: Path, **options: Any) -> None:

@@ -160,7 +160,7 @@ class ScanBench:
 
 
 @contextmanager
-def scan_bench(applications: Applications, laser: str) -> Iterator[ScanBench]:
+def scan_bench(applications: Applications, laser: str, silence: str = "1.5 s") -> Iterator[ScanBench]:
     with tempfile.TemporaryDirectory() as name, UmockdevBus(SystemClock()) as bus:
         folder = Path(name)
         geometry = folder / "calibration.yaml"
@@ -180,7 +180,7 @@ def scan_bench(applications: Applications, laser: str) -> Iterator[ScanBench]:
             else:
                 world.laser.cdrh_delay_s = 0.2
             ports = {name: endpoint.address for name, endpoint in world.ports.items()}
-            (folder / "rig.yaml").write_text(yaml.safe_dump(_config(laser, ports)))
+            (folder / "rig.yaml").write_text(yaml.safe_dump(_config(laser, ports, silence)))
             bench = ScanBench(world, folder, {"UMOCKDEV_DIR": bus.environment()["UMOCKDEV_DIR"]}, applications)
             try:
                 yield bench
@@ -205,12 +205,12 @@ def _end(bench: ScanBench) -> None:
     bench.applications.exit_code(bench.number, 5.0)
 
 
-def _config(laser: str, ports: dict[str, str]) -> dict[str, Any]:
+def _config(laser: str, ports: dict[str, str], silence: str) -> dict[str, Any]:
     return {
         "name": "struck",
         "calibration": "calibration.yaml",
         # The emulated bus draws frames while a transfer is queued: 64 of them would take half a second.
-        "spad": {"kind": "spb-usb", "port": ports["spad"], "reads": "plain"},
+        "spad": {"kind": "spb-usb", "port": ports["spad"], "reads": "plain", "silence": silence},
         "scanner": {
             "kind": "helios",
             "port": ports["scanner"],

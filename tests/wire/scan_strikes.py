@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from tests.wire.guard_strikes import BUSY_S, EMISSION_S, GONE_S, NEVER_S
+from tests.wire.guard_strikes import EMISSION_S, GONE_S, NEVER_S
 from tests.wire.scan_rig import STEP_S, Applications, ScanBench, scan_bench
 
 MAPS = 40
@@ -23,13 +23,17 @@ _END_S = 12.0
 @dataclass(frozen=True)
 class ScanStrike:
     """A blow. at_once: it may come before any light. record: frames are written. own_end: the application goes on
-    living, says what happened and ends with code 3. light_s, emission_s: until they are gone, at most."""
+    living, says what happened and ends with code 3. silence: of the SPAD that the guard lets pass; long, since
+    an emulated one may itself be late. labours: threads fight the scan's for the interpreter. light_s, emission_s:
+    until they are gone, at most."""
 
     blow: Callable[[ScanBench], None]
     at_once: bool = False
     record: bool = False
     own_end: bool = False
     laser_answers: bool = True
+    silence: str = "1.5 s"
+    labours: bool = False
     light_s: float = GONE_S
     emission_s: float = EMISSION_S
 
@@ -74,7 +78,10 @@ SCAN_STRIKES = {
     "guard stopped": ScanStrike(lambda bench: os.kill(bench.guard(), signal.SIGSTOP), own_end=True),
     "gate's firmware hangs": ScanStrike(_hang_gate, light_s=NEVER_S),
     "spad unplugged": ScanStrike(lambda bench: bench.world.spad_plug.unplug(), own_end=True),
-    "spad falls silent": ScanStrike(_silence_spad, own_end=True, light_s=BUSY_S, emission_s=BUSY_S + 0.5),
+    "spad falls silent": ScanStrike(_silence_spad, own_end=True, silence="40 ms"),
+    "spad silent under labour": ScanStrike(
+        _silence_spad, own_end=True, silence="40 ms", labours=True, light_s=NEVER_S, emission_s=EMISSION_S + NEVER_S
+    ),
     "scanner unplugged": ScanStrike(lambda bench: bench.world.scanner_plug.unplug(), own_end=True),
     "gate unplugged": ScanStrike(_unplug_gate, own_end=True),
     "laser unplugged": ScanStrike(lambda bench: bench.world.laser_wire.unplug(), own_end=True, laser_answers=False),
@@ -108,8 +115,8 @@ def strike_scan(
     wait_s: how long light and emission are looked at after it; by default until they have to be gone.
     """
     made = SCAN_STRIKES[name]
-    with scan_bench(applications, laser) as bench:
-        bench.start(maps=MAPS, record=made.record)
+    with scan_bench(applications, laser, made.silence) as bench:
+        bench.start(maps=MAPS, record=made.record, labours=made.labours)
         opening_s = OPENING_S[laser] if made.at_once else 0.0
         into_s = share * (opening_s + LONG_S)
         if into_s < opening_s:

@@ -16,6 +16,7 @@ WAIT_S = 0.6
 SHARES = {name: 0.15 + 0.5 * i / len(SCAN_STRIKES) for i, name in enumerate(SCAN_STRIKES)}
 SHARES["application killed"] = 0.8  # most of the way is the opening
 SHARES["spad falls silent"] = 0.75  # soon before the end of the gate's program
+SHARES["spad silent under labour"] = 0.3
 SCANS_TRIED = 3
 """Where other tests keep all cores busy, the emulated SPAD's frames may stop for longer than the guard allows."""
 

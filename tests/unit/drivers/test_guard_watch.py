@@ -37,6 +37,15 @@ def test_one_at_work_has_the_long_one(watch: FrameWatch) -> None:
     assert silence_until_trouble(watch, busy=True) == pytest.approx(0.41, abs=1.5 * TICK_S)
 
 
+def test_work_is_no_excuse_where_the_spad_was_asked_in_vain(watch: FrameWatch) -> None:
+    watch.look(TICK_S, 1, False, lambda: True)
+    late = [watch.look(TICK_S, 1, False, lambda: True, LIMITS.waits_within_s * 1.1) for _ in range(7)]
+    assert late[:5] == [None] * 5
+    assert late[6] == "waited for the SPAD in vain for 70 ms after frame 1"
+    watch.look(TICK_S, 2, False, lambda: True)
+    assert [watch.look(TICK_S, 2, False, lambda: True, LIMITS.waits_within_s) for _ in range(20)] == [None] * 20
+
+
 def test_late_frames_are_told_to_whoever_asks_also_of_one_at_work(watch: FrameWatch) -> None:
     watch.look(TICK_S, 1, False, lambda: True)
     assert not watch.quiet

@@ -190,9 +190,9 @@ def test_two_rows_of_bytes_are_loaded_side_by_side():
 
 @pytest.mark.parametrize("one_instruction", [True, False])
 def test_products_of_pairs_are_added_and_stop_at_the_limits(one_instruction, monkeypatch):
-    if one_instruction and not lanes.has_avx2():
+    if one_instruction and not lanes._has_avx2():
         pytest.skip("this processor has no AVX2")
-    monkeypatch.setattr(lanes, "has_avx2", lambda: one_instruction)
+    monkeypatch.setattr(lanes, "_has_avx2", lambda: one_instruction)
 
     @numba.njit
     def dot(counts, weights, out):

@@ -1,0 +1,119 @@
+"""What the passes of a live map are decided by: an estimate of the counts so far, and the time that passes take."""
+
+import functools
+from typing import Protocol
+
+import numpy as np
+
+from calibration.errors import CalibrationError
+from drivers.interfaces import SpadTiming
+from rig.adaptive import Pass, Undecided, next_pass, thinned, undecided_rows
+from rig.config import AdaptiveConfig
+from rig.counting import CountVolume
+from rig.errors import PlanError
+from rig.estimators import create_estimator
+from rig.geometry import SweepGeometry
+from rig.path_search import find_path
+from rig.plan import path_demand
+from rig.scan_plan import ScanPlan
+from rig.session import OpenRig, prepare
+
+
+class ChoosesPasses(Protocol):
+    """Where the passes of the maps of a run come from: decided as it goes, or recorded."""
+
+    def next(self, index: int, taken: int, counts: CountVolume | None, spent_s: float) -> Pass | None:
+        """The next pass of map `index`, of which so many were taken in spent_s of sensor time; None: it is whole."""
+        ...
+
+    def prepare(self, one: Pass) -> tuple[ScanPlan, SpadTiming]:
+        """The plan of a pass, checked, with the SPAD configured for it."""
+        ...
+
+
+class DecidedPasses:
+    """Decides, between two passes of a map, whether and where to take another. whole: the plan of one plain sweep.
+
+    Its estimator is one of its own: what maps are estimated with does not depend on what was looked at on the way.
+    """
+
+    def __init__(self, rig: OpenRig, whole: ScanPlan, geometry: SweepGeometry, threads: int) -> None:
+        """Raises PlanError where not even the first pass can be made."""
+        assert rig.config.scan.adaptive is not None, "asked for by the config"
+        self._rig = rig
+        self._whole = whole
+        self._geometry = geometry
+        self._settings: AdaptiveConfig = rig.config.scan.adaptive
+        self._scout = create_estimator(rig.config.estimate.estimator, threads)
+        self._searched = geometry.x_lo <= geometry.x_hi
+        self._first = first_pass(rig, whole)
+        self._pass_time = functools.cache(functools.partial(pass_time_s, rig, whole))
+        self._budget_s = self._settings.time_budget or float(whole.sweep_s)
+
+    def next(self, index: int, taken: int, counts: CountVolume | None, spent_s: float) -> Pass | None:
+        """See `ChoosesPasses`."""
+        if counts is None:
+            return self._first
+        left_s = self._budget_s - spent_s
+        if taken >= self._settings.passes or left_s <= 0:
+            return None
+        undecided = self._look(counts)
+        if 1 - undecided.share >= self._settings.target_share:
+            return None
+        return next_pass(undecided, self._pass_time, left_s, self._settings.passes - taken)
+
+    def prepare(self, one: Pass) -> tuple[ScanPlan, SpadTiming]:
+        """See `ChoosesPasses`."""
+        return _prepared(self._rig, self._whole, one)
+
+    def _look(self, counts: CountVolume) -> Undecided:
+        """What is undecided, by all frames and by half of them."""
+        now, halved = (
+            undecided_rows(self._scout.estimate(seen, self._geometry).confidence, self._searched)
+            for seen in (counts, thinned(counts))
+        )
+        return Undecided(now, halved, counts.n_frames, self._geometry.rows)
+
+
+def first_pass(rig: OpenRig, whole: ScanPlan) -> Pass:
+    """The first pass of every map, its plan checked. PlanError where it cannot be, or takes more than a map may."""
+    settings = rig.config.scan.adaptive
+    assert settings is not None, "asked for by the config"
+    first = Pass(0, whole.columns, settings.first_exposures)
+    try:
+        _prepared(rig, whole, first)
+    except PlanError as error:
+        what = "scan.adaptive: the first pass: "
+        said = (problem.replace("scan.exposures", "first_exposures") for problem in error.problems)
+        raise PlanError(*(what + problem for problem in said)) from error
+    first_s = pass_time_s(rig, whole, first.columns, first.exposures)
+    budget_s = settings.time_budget or float(whole.sweep_s)
+    if first_s is not None and first_s > budget_s:
+        raise PlanError(
+            f"scan.adaptive: the first pass takes {first_s * 1e3:.1f} ms, all passes of a map may take "
+            f"{budget_s * 1e3:.1f} ms; raise time_budget or lower first_exposures"
+        )
+    return first
+
+
+def pass_time_s(rig: OpenRig, whole: ScanPlan, columns: int, exposures: int) -> float | None:
+    """Sensor time of a pass, run-in, fly-back and read-out too; None where mirror or calibration do not allow it."""
+    scan = Pass(0, columns, exposures).scan(rig.config.scan)
+    demand = path_demand(scan, columns, whole.frame_rate_hz, rig.model, markers=rig.spad.info.markers)
+    try:
+        if rig.model is not None:
+            rig.model.check_speed(demand.speed_per_s)
+    except CalibrationError:
+        return None
+    found = find_path(demand, rig.scanner.limits, rig.scanner.point_clock)
+    if found.path is None:
+        return None
+    sweep_s = float(found.path.points / found.rate_hz)
+    frames = sweep_s * float(whole.frame_rate_hz)
+    most = whole.burst_frames
+    return None if most is not None and frames > most else sweep_s + whole.readout_s(round(frames))
+
+
+def _prepared(rig: OpenRig, whole: ScanPlan, one: Pass) -> tuple[ScanPlan, SpadTiming]:
+    windows = np.ascontiguousarray(whole.x0[one.part]), whole.window
+    return prepare(rig, one.scan(rig.config.scan), windows)

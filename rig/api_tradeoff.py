@@ -1,0 +1,102 @@
+"""The call that tries settings: `tradeoff`."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rig.api_config import SIMULATED, Config, configure
+from rig.api_scan import MAX_SEED
+from rig.config import RigConfig
+from rig.errors import UsageError
+from rig.run import OutFolder, Progress
+
+if TYPE_CHECKING:
+    from rig.tradeoff import Tradeoff
+
+EXPOSURES = (1, 3, 10)
+"""Tried where no others are asked for."""
+
+
+def tradeoff(
+    config: Config = SIMULATED,
+    *,
+    scenes: Sequence[str] = (),
+    fogs: Sequence[str] = (),
+    exposures: Sequence[int] = EXPOSURES,
+    lines: Sequence[int] = (),
+    estimators: Sequence[str] = (),
+    filters: Sequence[str] = (),
+    repeat: int = 1,
+    seed: int = 0,
+    limits: bool = True,
+    time_budget: str | None = None,
+    error: str | None = None,
+    of: str = "sensor",
+    out: OutFolder = None,
+    progress: Progress | None = None,
+) -> "Tradeoff":
+    """Scan a simulated rig with all combinations of settings and score them by the world's truth (`rig tradeoff`).
+
+    scenes: as `configure`; fogs: visibilities such as '20 m', or 'clear'; lines: at once; none: as the config says.
+    estimators: none: all but argmax; filters: none: both. repeat: scans of each setting, seeds from `seed` on.
+    limits: compare each error with the least that the scene's light allows, which takes some seconds.
+    time_budget, such as '5 ms', or error, such as '0.1 px': ask for the setting to use; of: whose time, 'sensor' or
+    'compute'. out: a folder to write, None to write nothing. progress: called with what is done and all. Raises
+    UsageError, a line per problem. An interrupt ends it after the last whole row, with verdict 'aborted'.
+    """
+    from rig.estimators import ESTIMATORS, FILTERS
+    from rig.multi_line_config import with_lines
+    from rig.outputs import RunFolder
+    from rig.tradeoff import Trial, Trials, require_methods, run_tradeoff
+    from rig.tradeoff_choice import wish_of
+    from rig.tradeoff_files import write_files
+
+    problems = _of_rig(configure(config))
+    estimators = estimators or [name for name in ESTIMATORS if name != "argmax"]
+    problems += require_methods(estimators, filters)
+    problems += [
+        f"{name} names nothing; leave it out or name some" for name, some in (("exposures", exposures),) if not some
+    ]
+    if repeat < 1:
+        problems.append(f"repeat is {repeat}; it must be at least 1")
+    if not 0 <= seed <= MAX_SEED - repeat:
+        problems.append(f"seed is {seed}; it must be 0 or more and at most {MAX_SEED - repeat}")
+    wish = None
+    try:
+        wish = wish_of(time_budget, error, of)
+    except UsageError as wrong:
+        problems += wrong.problems
+    if problems:
+        raise UsageError.of(problems)
+
+    def config_of(trial: Trial) -> RigConfig:
+        tried = configure(config, scene=trial.scene, fog=trial.fog, exposures=trial.exposures)
+        return tried if trial.lines is None else with_lines(tried, trial.lines)
+
+    trials = Trials(
+        config_of, scenes or (None,), fogs or (None,), exposures, lines or (None,), estimators, filters or FILTERS,
+        repeat, seed, limits,
+    )  # fmt: skip
+    trials.require_plans()  # before a folder is claimed
+    if out is None:
+        return run_tradeoff(trials, wish, progress)
+    with RunFolder(out) as folder:
+        done = run_tradeoff(trials, wish, progress)
+        chosen = None
+        if done.answer is not None and done.answer.fits:
+            setting = done.answer.setting
+            trial = Trial(trials.scenes[0], trials.fogs[0], setting.exposures, setting.lines if lines else None)
+            chosen = configure(config_of(trial), estimator=setting.estimator, filter=setting.filter)  # type: ignore[arg-type]
+        return write_files(folder, done, chosen)
+
+
+def _of_rig(config: RigConfig) -> list[str]:
+    """What there is against trying settings on a rig."""
+    if config.world is None:
+        return [f"{config.name} is a real rig, whose truth nobody knows; name a simulated one, such as '{SIMULATED}'"]
+    if config.world.real_time:
+        return [
+            f"{config.name} runs in the host's time, not as fast as it can; name a simulated rig, such as '{SIMULATED}'"
+        ]
+    if config.calibration is None:
+        return [f"{config.name} has no calibration, so no depth; name one in the config"]
+    return []

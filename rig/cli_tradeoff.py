@@ -1,0 +1,106 @@
+"""What accuracy costs in time, and which setting to use: `rig tradeoff`."""
+
+from typing import Annotated, TypeVar
+
+import typer
+
+from rig.cli_command import (
+    EXIT_ABORTED,
+    ConfigArgument,
+    JsonOption,
+    OutOption,
+    command,
+    default_out,
+    print_json,
+    progress,
+    say,
+)
+
+Some = list[str] | None
+Value = TypeVar("Value")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command("tradeoff")(tradeoff_command)
+
+
+@command
+def tradeoff_command(
+    config: ConfigArgument = "simulated",
+    scene: Annotated[
+        Some, typer.Option("--scene", help="scenes, separated by commas", show_default="the config's")
+    ] = None,
+    fog: Annotated[
+        Some, typer.Option("--fog", help="visibilities, or clear: 20m,50m,clear", show_default="the scene's")
+    ] = None,
+    exposures: Annotated[Some, typer.Option("--exposures", help="frames per column (K)", show_default="1,3,10")] = None,
+    lines: Annotated[Some, typer.Option("--lines", help="lines at once", show_default="the config's")] = None,
+    estimators: Annotated[Some, typer.Option("--estimators", show_default="edge,likelihood,joint")] = None,
+    filters: Annotated[Some, typer.Option("--filters", show_default="none,median")] = None,
+    repeat: Annotated[int, typer.Option("--repeat", help="scans of each, for the confidence intervals")] = 1,
+    seed: Annotated[int, typer.Option("--seed", help="of the first of them")] = 0,
+    limits: Annotated[bool, typer.Option(help="compare with the statistical limit of the scene's light")] = True,
+    time_budget: Annotated[
+        str | None, typer.Option("--time-budget", help="'5 ms': what has the least error in it", show_default=False)
+    ] = None,
+    error: Annotated[
+        str | None, typer.Option("--error", help="'0.1 px': what takes the least time for it", show_default=False)
+    ] = None,
+    of: Annotated[str, typer.Option("--of", help="whose time these mean: sensor or compute")] = "sensor",
+    out: OutOption = None,
+    as_json: JsonOption = False,
+) -> int:
+    """What accuracy costs in time: error of a simulated rig over sensor time and compute time, and which setting to
+    use."""
+    from rig import api
+
+    with progress("frames") as bar:
+        done = api.tradeoff(
+            config,
+            scenes=_split(scene),
+            fogs=_split(fog),
+            exposures=_numbers("--exposures", exposures) or api.EXPOSURES,
+            lines=_numbers("--lines", lines),
+            estimators=_split(estimators),
+            filters=_split(filters),
+            repeat=repeat,
+            seed=seed,
+            limits=limits,
+            time_budget=time_budget,
+            error=error,
+            of=of,
+            out=default_out() if out is None else out,
+            progress=bar,
+        )
+    if as_json:
+        print_json(done.as_json())
+    else:
+        from rig.tradeoff_text import tradeoff_table
+
+        tradeoff_table(done)
+    if done.verdict == "aborted":
+        say("aborted: these are the rows that were whole by then")
+        return EXIT_ABORTED
+    if done.wish is None:
+        return 0
+    if done.answer is None:
+        say(f"error: every setting leaves more than 5 % of the answers out, so that none can be named for {done.wish}; "
+            "raise --exposures")  # fmt: skip
+        return 1
+    return 0 if done.answer.fits else 1
+
+
+def _split(given: Some) -> list[str]:
+    """The parts of an option that may be given several times and with commas."""
+    return [part.strip() for value in given or () for part in value.split(",") if part.strip()]
+
+
+def _numbers(option: str, given: Some) -> list[int]:
+    from rig.errors import UsageError
+
+    parts = _split(given)
+    wrong = [part for part in parts if not part.isdecimal()]
+    if wrong:
+        raise UsageError(f"{option} has {wrong[0]!r}, which is no whole number; write e.g. {option} 1,3,10")
+    return list(dict.fromkeys(int(part) for part in parts))

@@ -1,0 +1,263 @@
+"""Tables of the label costs: what a count at each pixel says of every label, per column, band of rows and variant.
+
+Haze, pedestal and ambient light vary slowly along a line, so the rows of a band share a table for each variant of
+`label_places` that occurs among them. Scores are relative to 'everything is before the stripe': a pixel behind it adds
+its edge weight, the pixels around a label their taps. Weights are for counts as `scaled` multiplies them; what does not
+depend on the counts is kept per exposure, since the number of frames differs from column to column.
+
+The stripe's brightness is not known: of two lights, the quartiles of what was learned, the likelier one counts, both
+as probable. After aggregation that errs by 0.251, 0.155 and 0.117 px at 1, 3 and 10 exposures (`cones`); the mean over
+all four learned ones, weighted, by 0.264, 0.170 and 0.116, a single light by 0.303, 0.216 and 0.210. The learned depth
+histogram as a prior made it 3 to 7 % worse.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimators.label_places import (
+    FAR_PX,
+    FRACTIONS,
+    LABEL,
+    LABEL_END,
+    MEND,
+    ODD,
+    PHASES,
+    START,
+    VALID,
+    VALID_END,
+    VARIANT,
+    VARIANTS,
+)
+from rig.estimators.row_input import State, Sweep, row_buffers, row_fluxes
+from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, cell_of, none_prior
+from rig.lanes import LANES
+
+LIGHTS: Final = 2
+"""Stripe brightnesses that are tried."""
+WEIGHT_LIMIT: Final = 32767
+"""Weights are cut there: a count that would say more says this much."""
+IMPOSSIBLE: Final = np.float32(-1e9)
+"""Constant of a position where no row of the band has a label."""
+CHANGE_PX: Final = 8
+"""Positions of a change without a stripe that count as one with the likeliest."""
+BEHIND, BEFORE, CHANGE = range(3)
+NONES: Final = 3
+_NEAR, _FAR = 0, 1
+
+
+class LabelTables(NamedTuple):
+    """See the module. P: pixels of a row, V: vectors of pixels that hold labels, the first one being pixel FAR_PX.
+
+    at: int32 (bands, columns, VARIANTS), index of the table, -1 where there is none.
+    edge: int16 (tables, P), weight of a count behind the stripe. edge_sum: float32 (tables, P), nats per exposure of
+    the pixels up to and including each lying behind.
+    tap: int16 (tables, V, taps, PHASES, LIGHTS, LANES), weight of the counts of the pixels around each position.
+    constant: float32 (tables, V, PHASES, LIGHTS, LANES), nats per exposure of each position.
+    none: float32 (tables, NONES), nats of 'no stripe': all behind, all before, a change somewhere.
+    span: int16 (tables, 2), pixels whose weights are not 0: from and up to.
+    """
+
+    at: NDArray[np.int32]
+    edge: NDArray[np.int16]
+    edge_sum: NDArray[np.float32]
+    tap: NDArray[np.int16]
+    constant: NDArray[np.float32]
+    none: NDArray[np.float32]
+    span: NDArray[np.int16]
+
+
+@numba.njit(cache=True, nogil=True)
+def number_tables(place: NDArray[np.int16], band_rows: int, at: NDArray[np.int32]) -> int:
+    """Fill `at` of LabelTables with the numbers of the tables that the rows need; returns how many those are."""
+    tables = 0
+    at[:] = -1
+    for b in range(at.shape[0]):
+        for c in range(at.shape[1]):
+            for y in range(b * band_rows, min((b + 1) * band_rows, place.shape[1])):
+                variant = place[c, y, VARIANT]
+                if variant >= 0 and at[b, c, variant] < 0:
+                    at[b, c, variant] = tables
+                    tables += 1
+    return tables
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_tables(
+    sweep: Sweep,
+    state: State,
+    place: NDArray[np.int16],
+    ambient: NDArray[np.float32],
+    hot: NDArray[np.bool_],
+    light: NDArray[np.float32],
+    shares: NDArray[np.float32],
+    per_nat: float,
+    most: float,
+    band_rows: int,
+    first_band: int,
+    last_band: int,
+    out: LabelTables,
+) -> None:
+    """Tables of bands first_band..last_band-1.
+
+    state: without ambient light, which is in `ambient` (rows, width), of pixels that are not `hot`. light: (LIGHTS,)
+    photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around centres -4/8 to 3/8 px off.
+    per_nat: units of weight; most: largest sum of a position's weights.
+    """
+    side = 1 if sweep.near_is_left else -1
+    pixels = out.edge.shape[1]
+    row = row_buffers(sweep.window, 1)
+    mean, number = np.empty(pixels, np.float32), np.empty(pixels, np.int32)
+    flux, level = np.empty((2, pixels), np.float32), np.empty((4, pixels), np.float32)
+    for b in range(first_band, last_band):
+        rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
+        for c in range(place.shape[0]):
+            if out.at[b, c].max() < 0:
+                continue
+            _mean_ambient(place, ambient, hot, side, c, rows, mean, number)
+            for variant in range(VARIANTS):
+                i = out.at[b, c, variant]
+                if i < 0:
+                    continue
+                y, label, label_end = _middle_row(place, c, rows, variant)
+                here = place[c, y]
+                length, first, last, start = row_fluxes(sweep, state, row, y, c)
+                to_t = side * (here[START] - start)
+                span = max(to_t - length + 1, 0), min(to_t + 1, pixels)
+                out.span[i, 0], out.span[i, 1] = span
+                for p in range(span[0], span[1]):
+                    for near in (_NEAR, _FAR):
+                        light_there = row.before[to_t - p] if near == _NEAR else row.behind[to_t - p]
+                        flux[near, p] = min(max(light_there + mean[p], FLUX_MIN), FLUX_MAX)
+                        cell = cell_of(flux[near, p])
+                        level[near, p], level[2 + near, p] = state.table[0, cell], state.table[1, cell]
+                _fill_edges(level, span, per_nat, out.edge[i], out.edge_sum[i])
+                _fill_taps(
+                    state.table, row.scale, to_t, span, flux, level, light, shares, variant, per_nat, most,
+                    (label, label_end), out.tap[i], out.constant[i],
+                )  # fmt: skip
+                behind, before, change = none_prior(
+                    sweep.w_near, sweep.w_far, row.w[first], row.w[last], state.none_weight
+                )
+                share = np.log((1.0 - behind - before - change) / (last - first + 1))
+                out.none[i, BEHIND], out.none[i, BEFORE] = np.log(behind) - share, np.log(before) - share
+                out.none[i, CHANGE] = np.log(change * CHANGE_PX / (length + 1)) - share
+
+
+@numba.njit(cache=True, nogil=True)
+def mark_rows(place: NDArray[np.int16], hot: NDArray[np.bool_], side: int, band_rows: int, tables: LabelTables) -> None:
+    """Fill MEND of the rows: their tables weigh pixels that they do not have, or that are hot."""
+    for c in range(place.shape[0]):
+        for y in range(place.shape[1]):
+            here = place[c, y]
+            if here[VARIANT] < 0:
+                continue
+            span = tables.span[tables.at[y // band_rows, c, here[VARIANT]]]
+            here[MEND] = 1 if here[VALID] > span[0] or here[VALID_END] < span[1] else 0
+            for p in range(max(here[VALID], span[0]), min(here[VALID_END], span[1])):
+                if hot[y, here[START] - side * p]:
+                    here[MEND] = 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _middle_row(place: NDArray[np.int16], c: int, rows: tuple[int, int], variant: int) -> tuple[int, int, int]:
+    """The row of that variant nearest the band's middle; first position and the one behind the last, of all its rows.
+
+    Positions count two a pixel, from the pixel that holds label 0 on.
+    """
+    middle = (rows[0] + rows[1]) // 2
+    best, first, end = -1, np.int64(1 << 15), np.int64(0)
+    for y in range(rows[0], rows[1]):
+        here = place[c, y]
+        if here[VARIANT] == variant:
+            if best < 0 or abs(y - middle) < abs(best - middle):
+                best = y
+            first = min(first, here[LABEL] + here[ODD])
+            end = max(end, here[LABEL_END] + here[ODD])
+    return best, first, end
+
+
+@numba.njit(cache=True, nogil=True)
+def _mean_ambient(
+    place: NDArray[np.int16], ambient: NDArray[np.float32], hot: NDArray[np.bool_], side: int, c: int,
+    rows: tuple[int, int], mean: NDArray[np.float32], number: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Mean ambient light of the band's rows at each pixel p; where none is to be had, that of the pixel before."""
+    mean[:] = 0.0
+    number[:] = 0
+    for y in range(rows[0], rows[1]):
+        here = place[c, y]
+        if here[VARIANT] < 0:
+            continue
+        for p in range(here[VALID], min(here[VALID_END], mean.shape[0])):
+            x = here[START] - side * p
+            if not hot[y, x]:
+                mean[p] += ambient[y, x]
+                number[p] += 1
+    last = FLUX_MIN
+    for p in range(mean.shape[0]):
+        if number[p]:
+            last = mean[p] / np.float32(number[p])
+        mean[p] = last
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_edges(
+    level: NDArray[np.float32], span: tuple[int, int], per_nat: float, edge: NDArray[np.int16],
+    edge_sum: NDArray[np.float32],
+) -> None:  # fmt: skip
+    total = 0.0
+    for p in range(edge.shape[0]):
+        edge[p] = 0
+        if span[0] <= p < span[1]:
+            edge[p] = _weight((level[_FAR, p] - level[_NEAR, p]) * per_nat)
+            total += level[2 + _FAR, p] - level[2 + _NEAR, p]
+        edge_sum[p] = total
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_taps(
+    table: NDArray[np.float32], scale: NDArray[np.float32], to_t: int, span: tuple[int, int],
+    flux: NDArray[np.float32], level: NDArray[np.float32], light: NDArray[np.float32], shares: NDArray[np.float32],
+    variant: int, per_nat: float, most: float, labels: tuple[int, int], tap: NDArray[np.int16],
+    constant: NDArray[np.float32],
+) -> None:  # fmt: skip
+    reach = shares.shape[1] // 2
+    half = np.float32(0.5)
+    for q in range(LANES * tap.shape[0]):
+        p, vector, lane = FAR_PX + q, q // LANES, q % LANES
+        for phase in range(PHASES):
+            inside = span[0] <= p < span[1] and labels[0] <= PHASES * q + phase < labels[1]
+            off = variant - VARIANTS * (1 - phase)
+            for m in range(LIGHTS):
+                total, largest = np.float32(0.0), 0.0
+                for d in range(2 * reach + 1):
+                    tap[vector, d, phase, m, lane] = 0
+                constant[vector, phase, m, lane] = IMPOSSIBLE
+                if not inside:
+                    continue
+                for d in range(max(-reach, span[0] - p), min(reach + 1, span[1] - p)):
+                    at = p + d
+                    # Relative to what the running sum takes the pixel for: behind up to here, before from here on.
+                    own = _FAR if d < 0 else _NEAR
+                    base = flux[own, at]
+                    if d == 0:
+                        nearer = half - np.float32(off) / np.float32(FRACTIONS)
+                        base = flux[_FAR, at] + nearer * (flux[_NEAR, at] - flux[_FAR, at])
+                    extra = light[m] * scale[to_t - p] * shares[off + VARIANTS, d + reach]
+                    cell = cell_of(min(base + extra, FLUX_MAX))
+                    weight = _weight((table[0, cell] - level[own, at]) * per_nat)
+                    tap[vector, d + reach, phase, m, lane] = weight
+                    largest += abs(weight)
+                    total += table[1, cell] - level[2 + own, at]
+                constant[vector, phase, m, lane] = total
+                if largest > most:
+                    for d in range(2 * reach + 1):
+                        tap[vector, d, phase, m, lane] = np.int16(tap[vector, d, phase, m, lane] * most / largest)
+
+
+@numba.njit(inline="always")
+def _weight(value):  # type: ignore[no-untyped-def]
+    return np.int16(round(min(max(value, np.float64(-WEIGHT_LIMIT)), np.float64(WEIGHT_LIMIT))))

@@ -1,0 +1,55 @@
+"""Tests as the only process of a virtual machine: the guest's half of `kernel_usb` and `kernel_serial`.
+
+    python -m tests.campaigns.kernel_guest PYTEST_ARGUMENT...     as process 1
+
+and `passed`, the host's half: starts the machine, shows what it says and tells whether its tests passed.
+"""
+
+import ctypes
+import os
+import subprocess
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+MOUNTS = (("proc", "/proc"), ("sysfs", "/sys"), ("tmpfs", "/tmp"), ("tmpfs", "/run"))
+"""Besides /dev, which is there."""
+POWER_OFF = 0x4321FEDC
+"""LINUX_REBOOT_CMD_POWER_OFF of reboot(2)."""
+HANGS_S = 120
+"""A test that takes longer says where it is."""
+PASSED = "kernel_guest: passed"
+
+
+def passed(command: Sequence[str | Path], within_s: float) -> bool:
+    """Run a machine whose terminal is its output. One that hangs is killed: it takes no other signal."""
+    found = False
+    limited = ["timeout", "-s", "KILL", str(within_s), *command]
+    with subprocess.Popen(limited, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            found = found or line.startswith(PASSED)
+            print(line, end="", flush=True)
+    return found
+
+
+def main(arguments: Sequence[str]) -> None:
+    """There is no other way to end than to switch the machine off."""
+    try:
+        for kind, place in MOUNTS:
+            subprocess.run(["mount", "-t", kind, kind, place], check=True)
+        os.chdir(ROOT)
+        environment = {"PATH": os.defpath, "HOME": "/tmp", "PYTHONDONTWRITEBYTECODE": "1"}
+        tests = [sys.executable, "-m", "pytest", "-q", "-o", f"faulthandler_timeout={HANGS_S}", "-p", "no:cacheprovider", "--color=no", *arguments]
+        ran = subprocess.run(tests, env=environment, check=False)
+        print(PASSED if ran.returncode == 0 else f"kernel_guest: pytest ended with {ran.returncode}", flush=True)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        ctypes.CDLL(None).reboot(POWER_OFF)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

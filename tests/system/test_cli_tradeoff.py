@@ -1,0 +1,90 @@
+"""`rig tradeoff` from its options to its files, on a small rig."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.system.conftest import Rig
+
+ASKED = {
+    "scene", "fog", "estimator", "filter", "exposures", "lines", "sensor_ms", "compute_ms", "mean_abs_px",
+    "within_1px", "depth_mm", "ci95", "times_limit", "pareto",
+}  # fmt: skip
+
+
+def test_rows_files_and_the_setting_to_use(rig: Rig, small: Path, tmp_path: Path) -> None:
+    ran = rig(
+        "tradeoff", small, "--fog", "60m,clear", "--exposures", "2,8", "--estimators", "argmax,edge", "--filters",
+        "none,median", "--error", "30 px", "--out", tmp_path / "out", "--json",
+    )  # fmt: skip
+    assert ran.code == 0, ran.err
+    told = json.loads(ran.out)
+    rows = told["rows"]
+    assert len(rows) == 2 * 2 * 2 * 2
+    assert all(set(row) >= ASKED for row in rows)
+    assert {row["fog"] for row in rows} == {"60m", "clear"}
+    assert told["ci95_by"] == "blocks of a map"
+    assert all(row["ci95"][0] <= row["mean_abs_px"] <= row["ci95"][1] for row in rows)
+    edge = {
+        (row["fog"], row["exposures"]): row for row in rows if (row["estimator"], row["filter"]) == ("edge", "none")
+    }
+    assert edge["clear", 8]["mean_abs_px"] < edge["clear", 2]["mean_abs_px"]
+    assert edge["clear", 8]["mean_abs_px"] < edge["60m", 8]["mean_abs_px"]
+    assert edge["clear", 8]["sensor_ms"] > edge["clear", 2]["sensor_ms"] > 200 * 2 / 100  # columns, exposures, kHz
+    assert all(row["times_limit"] > 0.7 for row in rows)
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {
+        "tradeoff.json", "tradeoff.csv", "tradeoff.svg", "setting.yaml",
+    }  # fmt: skip
+    answer = told["answer"]
+    assert answer["fits"]
+    again = rig("scan", tmp_path / "out" / "setting.yaml", "--out", tmp_path / "scan", "--json")
+    assert again.code == 0, again.err
+    scanned = json.loads(again.out)
+    setting = yaml.safe_load((tmp_path / "out" / "setting.yaml").read_text())
+    assert setting["world"]["fog"] == "60m"
+    for name in ("estimator", "filter", "exposures"):
+        assert scanned[name] == answer[name]
+
+
+def test_repeats_differ_and_what_cannot_be_had_ends_with_1_and_the_nearest(rig: Rig, small: Path) -> None:
+    ran = rig(
+        "tradeoff", small, "--exposures", "4", "--estimators", "argmax", "--filters", "none", "--repeat", "2", "--no-limits",
+        "--time-budget", "1 us", "--of", "compute", "--out", "out",
+    )  # fmt: skip
+    assert ran.code == 1
+    assert "nothing tried gives at most 0.001 ms of compute time a map; nearest is argmax, 4 exposures" in ran.out
+    (row,) = json.loads(Path("out/tradeoff.json").read_text())["rows"]
+    assert row["ci95"][0] < row["mean_abs_px"] < row["ci95"][1]
+    assert not Path("out/setting.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--exposures", "1,x"], "--exposures has 'x'"),
+        (["--exposures", "0"], "--exposures is 0"),
+        (["--fog", "7"], "'7' has no unit"),
+        (["--fog", "-1 m"], "more than 0 m"),
+        (["--exposures", "4", "--scene", "street,nowhere"], "scene 'nowhere'"),
+        (["--estimators", "best"], "estimator 'best' is unknown; choose of argmax"),
+        (["--filters", "mean"], "filter 'mean' is unknown"),
+        (["--repeat", "0"], "repeat is 0"),
+        (["--exposures", "60000"], "exposures above"),
+        (["--error", "1"], "write e.g. '0.1 px'"),
+    ],
+)
+def test_bad_options_are_one_line_each_and_leave_nothing(rig: Rig, small: Path, options: list[str], named: str) -> None:
+    ran = rig("tradeoff", small, *options, "--out", "out")
+    assert ran.code == 2
+    assert len(ran.problems) == 1
+    assert named in ran.problems[0]
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(("config", "named"), [("lab", "is a real rig"), ("lab-emulated", "the host's time")])
+def test_only_simulated_rigs_are_tried(rig: Rig, config: str, named: str) -> None:
+    ran = rig("tradeoff", config)
+    assert (ran.code, len(ran.problems)) == (2, 1)
+    assert named in ran.problems[0]

@@ -1,0 +1,201 @@
+"""Rows, fronts, choice and files of a trade-off; the command is in tests/system/test_cli_tradeoff.py."""
+
+import csv
+import io
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.interfaces import SweepTruth
+from rig.config_files import load_config
+from rig.counting import BIN_DARK, SweepCounter, SweepLayout
+from rig.errors import UsageError
+from rig.reconstruction import FogEstimate, MapResult
+from rig.row_threads import RowWorkers
+from rig.stripes import StripeTable
+from rig.tradeoff import Trials, run_tradeoff
+from rig.tradeoff_choice import Wish, choose, wish_of
+from rig.tradeoff_figure import tradeoff_svg
+from rig.tradeoff_files import csv_text
+from rig.tradeoff_rows import MOST_MISSING, MapScore, Setting, TradeoffRow, row_of, score_map, with_fronts
+from rig.tradeoff_scan import FrameKeeper
+
+ROW = TradeoffRow(
+    scene="street", fog=None, estimator="edge", filter="none", exposures=10, lines=1, sensor_ms=50.0, compute_ms=20.0,
+    mean_abs_px=0.5, within_1px=0.9, missing=0.0, depth_mm=10.0, ci95=(0.4, 0.6),
+)  # fmt: skip
+
+rows = st.lists(
+    st.builds(
+        replace,
+        st.just(ROW),
+        fog=st.sampled_from([None, "clear"]),
+        sensor_ms=st.integers(1, 6).map(float),
+        compute_ms=st.integers(1, 6).map(float),
+        mean_abs_px=st.integers(1, 6).map(float),
+        missing=st.sampled_from([0.0, 2 * MOST_MISSING]),
+    ),
+    max_size=12,
+)
+
+
+@given(rows)
+def test_a_row_is_on_the_front_where_no_other_in_its_scene_and_fog_beats_it(rows):
+    marked = with_fronts(rows)
+    for of in ("sensor", "compute"):
+        for i, row in enumerate(marked):
+            rivals = [other for other in rows if (other.scene, other.fog) == (row.scene, row.fog) and other.counts]
+            beaten = any(
+                other.mean_abs_px <= row.mean_abs_px
+                and other.time_ms(of) <= row.time_ms(of)
+                and (other.mean_abs_px, other.time_ms(of)) != (row.mean_abs_px, row.time_ms(of))
+                for other in rivals
+            )
+            twin = any(
+                (other.time_ms(of), other.mean_abs_px, other.fog) == (row.time_ms(of), row.mean_abs_px, row.fog)
+                for other in rows[:i]
+                if other.counts
+            )
+            on_front = row.pareto if of == "sensor" else row.pareto_compute
+            assert on_front == (row.counts and not beaten and not twin)
+
+
+@given(rows, st.sampled_from(["sensor", "compute"]), st.integers(1, 7), st.booleans())
+def test_the_answer_is_the_best_of_those_that_fit_and_else_the_nearest(rows, of, limit, by_time):
+    rows = [replace(row, exposures=1 + i) for i, row in enumerate(rows) if row.fog is None]
+    wish = Wish(float(limit), None, of) if by_time else Wish(None, float(limit), of)
+    answer = choose(rows, wish)
+    counting = [row for row in rows if row.counts]
+    if not counting:
+        assert answer is None
+        return
+
+    def asked(row):
+        return row.time_ms(of) if by_time else row.mean_abs_px
+
+    def other(row):
+        return row.mean_abs_px if by_time else row.time_ms(of)
+
+    fitting = [row for row in counting if asked(row) <= limit]
+    assert answer.fits == bool(fitting)
+    chosen = next(row for row in rows if row.setting == answer.setting)
+    if fitting:
+        assert (other(chosen), asked(chosen)) == min((other(row), asked(row)) for row in fitting)
+    else:
+        assert (asked(chosen), other(chosen)) == min((asked(row), other(row)) for row in counting)
+
+
+def test_a_setting_is_judged_by_its_worst_scene():
+    easy = [replace(ROW, mean_abs_px=0.1), replace(ROW, exposures=20, mean_abs_px=0.09, sensor_ms=100.0)]
+    hard = [replace(row, scene="fog", mean_abs_px=3 * row.mean_abs_px) for row in easy]
+    answer = choose(easy + hard, Wish(error_px=0.28))
+    assert (answer.setting.exposures, answer.mean_abs_px, answer.fits) == (20, pytest.approx(0.27), True)
+    missing = replace(hard[1], missing=0.06)
+    assert choose([*easy, hard[0], missing], Wish(error_px=0.28)).setting.exposures == 10
+
+
+@pytest.mark.parametrize(
+    ("time_budget", "error", "of", "named"),
+    [
+        ("5", None, "sensor", "'5' has no unit"),
+        ("-5 ms", None, "sensor", "must be more than 0"),
+        (None, "0.1", "sensor", "write e.g. '0.1 px'"),
+        (None, "0 px", "sensor", "must be more than 0"),
+        ("5 ms", "0.1 px", "sensor", "give one of them"),
+        ("5 ms", None, "wall", "sensor or compute"),
+    ],
+)
+def test_wishes_that_are_none_are_refused(time_budget, error, of, named):
+    with pytest.raises(UsageError, match=named):
+        wish_of(time_budget, error, of)
+
+
+def test_wishes_are_read_with_their_units():
+    assert wish_of("5 ms", None, "compute") == Wish(5.0, None, "compute")
+    assert wish_of(None, ".1px", "sensor") == Wish(None, 0.1, "sensor")
+    assert wish_of(None, None, "sensor") is None
+
+
+def test_missing_answers_are_charged_and_repeats_averaged():
+    truth = SweepTruth(np.array([[10, 20, np.nan, 30]], np.float32), np.full((1, 4), 2.0, np.float32))
+    none = np.zeros((1, 4), np.float32)
+    x_px = np.array([[10.5, 45, 7, np.nan]], np.float32)
+    stripe = StripeTable(x_px, none, none, none, none)
+    depth_m = np.array([[2.01, 1.97, np.nan, np.nan]], np.float32)
+    result = MapResult(stripe, depth_m, none.astype(np.uint32), FogEstimate(None, None, None), 0.0)
+    score = score_map(result, truth, 50.0, 20.0)
+    assert score.mean_abs_px == pytest.approx((0.5 + 25 + 10) / 3)
+    assert (score.within_1px, score.missing) == (pytest.approx(1 / 3), pytest.approx(1 / 3))
+    assert score.depth_mm == pytest.approx(20, rel=1e-4)
+    better = replace(score, mean_abs_px=score.mean_abs_px - 1, compute_ms=22.0)
+    row = row_of("street", "clear", Setting("edge", "none", 10), [score, better])
+    assert row.mean_abs_px == pytest.approx(score.mean_abs_px - 0.5)
+    assert row.ci95 == (pytest.approx(max(0, row.mean_abs_px - 12.7062 * 0.5)), row.mean_abs_px + 12.7062 * 0.5)
+    assert not row.counts
+
+
+def test_what_is_kept_of_frames_counts_as_the_frames_do():
+    rng = np.random.default_rng(3)
+    columns, rows, width, used = 12, 8, 256, 128
+    x0 = np.repeat([0, 64, 128], 4).astype(np.int32)
+    layout = SweepLayout(columns, rows, width, x0, 64, 3, used)
+    bins = np.repeat(np.arange(-1, columns), 3).astype(np.int32)
+    bins[bins < 0] = BIN_DARK
+    first = np.where(bins >= 0, x0[np.maximum(bins, 0)] // 128 * 64, 64).astype(np.int32)
+    bits = rng.integers(0, 256, (len(bins), rows, width // 8)).astype(np.uint8)
+    keeper, whole, kept = FrameKeeper(layout), *(SweepCounter(layout, RowWorkers(1)) for _ in range(2))
+    for part in (slice(0, 10), slice(10, None)):
+        block = bits[part], bins[part], bins[part].astype(float), first[part]
+        whole.add(*block)
+        keeper.add(*block)
+    for block in keeper.finish().blocks:
+        assert block[0].shape[2] == used // 8
+        kept.add(*block)
+    one, other = whole.finish(), kept.finish()
+    for name in ("counts", "n_frames", "column", "dark_counts"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+@pytest.mark.parametrize("whole", [0, 2])
+def test_an_interrupt_leaves_the_rows_that_are_whole(monkeypatch, whole):
+    config = load_config()
+    trials = Trials(
+        lambda trial: config, [None], ["clear"], [1, 3, 10], [None], ["edge"], ["none"], repeat=1, seed=0, limits=False
+    )
+    done = iter(range(whole))
+
+    def scanned(config, estimators, filters, seed, on_frames):
+        if next(done, None) is None:
+            raise KeyboardInterrupt
+        return {("edge", "none"): MapScore(0.5, 0.9, 0.0, 10.0, 50.0, 20.0, np.array([50.0]), np.array([100]))}
+
+    monkeypatch.setattr("rig.tradeoff.score_methods", scanned)
+    if not whole:
+        with pytest.raises(KeyboardInterrupt):
+            run_tradeoff(trials, None)
+        return
+    told = []
+    found = run_tradeoff(trials, None, lambda *frames: told.append(frames))
+    assert [row.exposures for row in found.rows] == [1, 3]
+    assert found.verdict == found.as_json()["verdict"] == "aborted"
+    assert told == [(1000, 14000), (4000, 14000)]
+
+
+def test_the_figure_is_sound_svg_and_shows_what_counts():
+    rows = with_fronts([replace(ROW, exposures=k, sensor_ms=5.0 * k, mean_abs_px=5 / k) for k in (1, 3, 10)])
+    rows += (replace(ROW, missing=0.5), replace(ROW, fog="20 m", estimator="<new>", depth_mm=None, filter="median"))
+    text = tradeoff_svg(rows, "repeats")
+    assert ElementTree.fromstring(text).tag.endswith("svg")
+    assert "nan" not in text
+    assert "missing answers: 1 of 5 rows" in text
+    assert text.count("&lt;new&gt; + median") == 1
+
+
+def test_the_table_for_programs_has_a_column_for_each_figure():
+    (line,) = csv.DictReader(io.StringIO(csv_text([ROW])))
+    assert (line["mean_abs_px"], line["ci95_low"], line["ci95_high"]) == ("0.5", "0.4", "0.6")
+    assert set(ROW.as_json()) - {"ci95"} < set(line)

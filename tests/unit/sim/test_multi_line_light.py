@@ -1,0 +1,98 @@
+"""Several lines at once in the simulated world: whose light there is, how much, and that one line stays as it was."""
+
+import numpy as np
+import pytest
+
+from drivers.clock import VirtualClock
+from drivers.registry import Surroundings
+from sim_backend.effects.setting import FrameTimes
+from sim_backend.flux import FluxModel
+from sim_backend.line_fan import ONE_LINE, LineFan, line_fan
+from sim_backend.photons import PhotonSource
+from sim_backend.world import SimulatedWorld, WorldConfig
+from tests.unit.sim.rigs import rig, setting, wall
+
+TIMES = FrameTimes(1e-5, 1e-5)
+OFFSETS = (-0.4, 0.1, 0.5)
+FOG = {"medium": {"extinction": "0.2 /m"}}
+
+
+def frames(flux, model, fan, n=12, power_w=0.05, threads=2):
+    source = PhotonSource(flux, model.planes, TIMES, 9, threads, fan, model.scanner.command_range)
+    bits = np.zeros((n, 64, 16), np.uint8)
+    try:
+        source.expose(0, np.full(n, 0.2), np.full(n, power_w), np.zeros(n, np.int32), bits, np.zeros(n))
+    finally:
+        source.close()
+    return np.unpackbits(bits, axis=-1)[:, :, :96]
+
+
+def mean_flux(model, flux, share):
+    """Flux of the three lines at command 0.2, summed by hand."""
+    whole = TIMES.exposure_s * flux.steady_per_s
+    for plane in model.planes(0.2 + np.array(OFFSETS)):
+        whole = whole + flux.flux(plane, TIMES.exposure_s, share * 0.05) - TIMES.exposure_s * flux.steady_per_s
+    return whole
+
+
+@pytest.mark.parametrize(("shared", "share"), [(True, 1 / 3), (False, 1.0)])
+def test_a_frame_has_the_light_of_all_lines_and_the_ambient_light_once(shared, share):
+    model = rig()
+    setup = setting(model, wall(model, (0, 0, 1), 3.0), ambient={"illuminance": "2000 lux"}, **FOG)
+    flux, n = FluxModel(setup), 3000
+    counts = frames(flux, model, line_fan(OFFSETS, shared=shared), n).sum(axis=0, dtype=np.int64)
+    p = -np.expm1(-mean_flux(model, flux, share))
+    z = (counts - n * p) / np.sqrt(n * p * (1 - p) + 1e-3)
+    assert np.abs(z).max() < 6
+    assert np.sqrt((z**2).mean()) == pytest.approx(1, abs=0.05)
+
+
+def test_one_line_is_drawn_as_if_there_were_no_others():
+    model = rig()
+    flux = FluxModel(setting(model, wall(model, (0, 0, 1), 3.0), **FOG))
+    assert np.array_equal(frames(flux, model, ONE_LINE), frames(flux, model, LineFan((0.0,), 1.0)))
+    # The way of several lines, taken with one.
+    assert np.array_equal(frames(flux, model, ONE_LINE), frames(flux, model, LineFan((0.0, 5.0), 1.0)))
+
+
+def test_threads_do_not_matter():
+    model = rig()
+    flux = FluxModel(setting(model, wall(model, (0, 0, 1), 3.0), **FOG))
+    fan = line_fan(OFFSETS, shared=True)
+    assert np.array_equal(frames(flux, model, fan, threads=1), frames(flux, model, fan, threads=3))
+
+
+def test_a_line_past_the_range_goes_nowhere():
+    model = rig()
+    low, high = model.scanner.command_range
+    fan = line_fan((-2.5, 0.0, 2.5), shared=True)
+    planes = fan.planes(model.planes, np.array([low, 0.0, high]), (low, high))
+    assert [len(one) for one in planes] == [1, 1, 1]
+    np.testing.assert_array_equal(planes[1][0], model.planes(0.0))
+
+
+def test_speckle_of_one_line_leaves_the_others_alone():
+    from sim_backend.optics import Line
+
+    model = rig()
+    setup = setting(model, wall(model, (0, 0, 1), 3.0), line=Line(speckle=True))
+    flux, n = FluxModel(setup), 3000
+    counts = frames(flux, model, line_fan(OFFSETS, shared=False), n).sum(axis=0, dtype=np.int64)
+    p = -np.expm1(-mean_flux(model, flux, 1.0))
+    assert np.abs((counts - n * p) / np.sqrt(n * p * (1 - p) + 1e-3)).max() < 6
+
+
+def test_the_world_plans_its_effects_for_the_light_of_all_lines_and_tells_their_flux():
+    world = SimulatedWorld(WorldConfig(scene="street-dense-fog", effects="all"), Surroundings(VirtualClock(), None, 0))
+    one = {name: part.copy() for name, part in world.flux_row(200, 0.1, 0.05, 1e-5).items()}
+    world.project_lines([-0.2, 0.3], shared=True)
+    two = world.flux_row(200, 0.1, 0.05, 1e-5)
+    world.project_lines([0.0], shared=True)
+    left, right = (world.flux_row(200, at, 0.05, 1e-5) for at in (-0.1, 0.4))
+    for name in ("stripe", "fog"):
+        np.testing.assert_allclose(two[name], (left[name] + right[name]) / 2, rtol=1e-9)
+    for name in ("ambient", "airlight", "dark counts"):
+        assert np.array_equal(two[name], one[name])
+    world.project_lines([-0.2, 0.3], shared=False)
+    world.plan_for(0.05, 1e-5, 3)
+    assert world.effect_plan.planned_for.power_w == 0.1
