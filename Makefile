@@ -40,6 +40,8 @@ campaign: .venv/.installed-tests
 	$(BIN)/python -m tests.campaigns.effect_ablation
 	$(BIN)/python -m tests.campaigns.photon_bits
 	$(BIN)/python -m tests.campaigns.kernel_usb
+	$(BIN)/python -m tests.campaigns.kernel_serial
+	$(BIN)/python -m tests.campaigns.hil_swaps
 
 .venv/.created:
 	@test -n "$(PYTHON)" || { echo "error: no python3 found; install Python 3.11 or newer, or call make PYTHON=/path/to/python" >&2; exit 2; }

@@ -80,10 +80,13 @@ class SpbUsb(SpadArray):
         self._halt = threading.Event()
         self._receiver: BlockReceiver | None = None
         self._counters = SpadCounters(0, 0, 0, 0, 0)
+        self._waited_s = 0.0
+        """Asked in vain since the last frames."""
         try:
             wiring.open_session(link)
             ack_in = wiring.ack_in if wiring.ack_in in link.endpoints else None
             self._control = ControlChannel(link, wiring.command_out, ack_in, wiring.stream_in, tap)
+            self._control.on_wait = self._note_wait
             self._identity = identify(self._control, self.name)
             if config.test_pattern:
                 require_order(self._control, link, wiring.stream_in, self._identity, config.heartbeat)
@@ -181,7 +184,10 @@ class SpbUsb(SpadArray):
             if self._halt.is_set():
                 return False
             now = time.monotonic()
-            self._note_wait(took, min(now - asked_at, _SLICE_S))
+            if took is Took.FRAMES:
+                self._waited_s = 0.0
+            else:
+                self._note_wait(min(now - asked_at, _SLICE_S))
             if took is not Took.NOTHING:
                 self._heard_at = now
             elif now - self._heard_at >= _SILENCE_S and self._has_ended():
@@ -196,10 +202,10 @@ class SpbUsb(SpadArray):
         self._finish(receiver)
         return False
 
-    def _note_wait(self, took: Took, seconds: float) -> None:
-        """A thread that comes late asks for what is there already: only waiting itself counts."""
-        self._waited_s = 0.0 if took is Took.FRAMES else self._waited_s + seconds
-        if self._waited_s and self.on_wait is not None:
+    def _note_wait(self, seconds: float) -> None:
+        """Asked in vain for so long. A thread that comes late finds what is there: only waiting itself counts."""
+        self._waited_s += seconds
+        if self.on_wait is not None:
             self.on_wait(self._waited_s)
 
     def _has_ended(self) -> bool:

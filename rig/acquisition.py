@@ -18,6 +18,7 @@ from drivers.transports.endpoints import EMULATED_PREFIX
 from rig.burst import lead_s, require_memory, spare_lead_s
 from rig.counting import SweepLayout
 from rig.errors import DevicesError
+from rig.fog_meter import FogEstimate
 from rig.map_queue import AcquiredMap
 from rig.mapping import MakesMaps
 from rig.monitor import Watch
@@ -44,7 +45,7 @@ class ScanProgress:
     """How far a run is, told several times a second and at its end.
 
     frames: received, of about frames_planned; lost: the SPAD's own count. sweeps: counted, of `maps`. stages: what each
-    stage has done so far.
+    stage has done so far. fog: as the newest map says, None before.
     """
 
     frames: int
@@ -53,6 +54,7 @@ class ScanProgress:
     sweeps: int
     maps: int
     stages: PipelineStats
+    fog: FogEstimate | None = None
 
 
 class Acquisition:
@@ -104,6 +106,7 @@ class Acquisition:
         self._stats_before = PipelineStats()
         self._counters_before = SpadCounters(0, 0, 0, 0, 0)
         self._frames_before = 0
+        self._fog: FogEstimate | None = None
 
     @property
     def frames_planned(self) -> int:
@@ -202,6 +205,7 @@ class Acquisition:
                 pipeline.start()
                 while pipeline.streaming:
                     if (found := pipeline.take_streaming(TELL_S)) is not None:
+                        self._fog = found.result.fog
                         yield found
                     if rig.guard is not None and rig.guard.failure is not None:
                         pipeline.end_source(rig.guard.failure)  # the SPAD may be what is silent: not waited for
@@ -213,6 +217,7 @@ class Acquisition:
             # Nothing moves or shines any more: what was received is still counted and estimated.
             while not pipeline.drained:
                 if (found := pipeline.take_rest(TELL_S)) is not None:
+                    self._fog = found.result.fog
                     yield found
                 self._tell(assembler, done)
             if (failure := pipeline.error()) is not None:
@@ -268,7 +273,7 @@ class Acquisition:
         stages = self.stages
         lost = self.counters.lost
         lost = stages.dropped_frames if lost is None else lost
-        self._on_progress(ScanProgress(frames, self.frames_planned, lost, sweeps, self._maps, stages))
+        self._on_progress(ScanProgress(frames, self.frames_planned, lost, sweeps, self._maps, stages, self._fog))
 
     def _arm(self) -> None:
         """Arm the laser behind a gate that reads back low and wait for it; a started SPAD would overflow meanwhile."""

@@ -1,8 +1,9 @@
 """Runs a scan whose maps are taken in passes: each is a start of the SPAD with a compiled plan of its own.
 
-Between two passes the host decides, which takes as long as an estimate: the rig is then as safe as behind any scan
-(gate low, laser paused, mirror parked, SPAD stopped), and no frame is exposed. The passes of a map follow one another
-without a frame of the next map, so nothing of `Acquisition` has to be known to the devices anew.
+Between two passes the host decides, which takes as long as two estimates: the rig is then as safe as behind any scan
+(gate low, laser paused, mirror parked, SPAD stopped), and no frame is exposed. A mirror that scanned on meanwhile would
+have to be met in phase by a plan that is not yet known, under a gate that must stay low. So each pass is an
+`Acquisition` of one sweep, and what holds for that in every respect of safety holds here.
 """
 
 import time
@@ -125,6 +126,7 @@ class AdaptiveAcquisition:
             self.taken += 1
         assert counts is not None, "there is a first pass"
         result = self._reconstructor.map(counts)
+        self.stages = replace(self.stages, estimation_s=self.stages.estimation_s + result.compute_s)
         return AcquiredMap(
             _whole_account(accounts), counts.bound_column(), result, count_s + result.compute_s, tuple(accounts)
         )

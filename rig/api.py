@@ -10,11 +10,10 @@ from rig.api_reconstruct import reconstruct
 from rig.api_recordings import compress, cut, export_run, import_frames, recording_info, repair, verify
 from rig.api_rig import bench, bench_disk, bench_simulator, devices, doctor, effects, flux_row, laser_off, soak, warm_up
 from rig.api_scan import MAX_SEED, plan_scan, replay, scan
-from rig.api_tradeoff import EXPOSURES, tradeoff
+from rig.api_tradeoff import tradeoff
 from rig.run import RunResult
 
 __all__ = [
-    "EXPOSURES",
     "MAX_SEED",
     "SIMULATED",
     "Config",

@@ -21,7 +21,7 @@ def tradeoff(
     *,
     scenes: Sequence[str] = (),
     fogs: Sequence[str] = (),
-    exposures: Sequence[int] = EXPOSURES,
+    exposures: Sequence[int] = (),
     lines: Sequence[int] = (),
     estimators: Sequence[str] = (),
     filters: Sequence[str] = (),
@@ -37,10 +37,10 @@ def tradeoff(
     """Scan a simulated rig with all combinations of settings and score them by the world's truth (`rig tradeoff`).
 
     scenes: as `configure`; fogs: visibilities such as '20 m', or 'clear'; lines: at once; none: as the config says.
-    estimators: none: all but argmax; filters: none: both. repeat: scans of each setting, seeds from `seed` on.
-    limits: compare each error with the least that the scene's light allows, which takes some seconds.
+    exposures: none: EXPOSURES; estimators: none: all but argmax; filters: none: both. repeat: scans of each setting,
+    seeds from `seed` on. limits: compare each error with the least that the scene's light allows, some seconds each.
     time_budget, such as '5 ms', or error, such as '0.1 px': ask for the setting to use; of: whose time, 'sensor' or
-    'compute'. out: a folder to write, None to write nothing. progress: called with what is done and all. Raises
+    'compute'. out: a folder to write, None to write nothing. progress: called with frames done and all. Raises
     UsageError, a line per problem. An interrupt ends it after the last whole row, with verdict 'aborted'.
     """
     from rig.estimators import ESTIMATORS, FILTERS
@@ -52,10 +52,8 @@ def tradeoff(
 
     problems = _of_rig(configure(config))
     estimators = estimators or [name for name in ESTIMATORS if name != "argmax"]
+    filters = filters or FILTERS
     problems += require_methods(estimators, filters)
-    problems += [
-        f"{name} names nothing; leave it out or name some" for name, some in (("exposures", exposures),) if not some
-    ]
     if repeat < 1:
         problems.append(f"repeat is {repeat}; it must be at least 1")
     if not 0 <= seed <= MAX_SEED - repeat:
@@ -73,9 +71,17 @@ def tradeoff(
         return tried if trial.lines is None else with_lines(tried, trial.lines)
 
     trials = Trials(
-        config_of, scenes or (None,), fogs or (None,), exposures, lines or (None,), estimators, filters or FILTERS,
-        repeat, seed, limits,
-    )  # fmt: skip
+        config_of,
+        scenes or (None,),
+        fogs or (None,),
+        exposures or EXPOSURES,
+        lines or (None,),
+        estimators,
+        filters,
+        repeat,
+        seed,
+        limits,
+    )
     trials.require_plans()  # before a folder is claimed
     if out is None:
         return run_tradeoff(trials, wish, progress)
@@ -96,6 +102,10 @@ def _of_rig(config: RigConfig) -> list[str]:
     if config.world.real_time:
         return [
             f"{config.name} runs in the host's time, not as fast as it can; name a simulated rig, such as '{SIMULATED}'"
+        ]
+    if config.scan.adaptive is not None:
+        return [
+            f"{config.name} has scan.adaptive, which chooses exposures itself; leave it out of the config to try some"
         ]
     if config.calibration is None:
         return [f"{config.name} has no calibration, so no depth; name one in the config"]

@@ -104,7 +104,7 @@ def print_json(content: Mapping[str, Any]) -> None:
 
 @contextmanager
 def progress(what: str) -> Iterator["Callable[..., None] | None"]:
-    """A progress bar on stderr while somebody is watching it, told what is done, all there is and how many got lost."""
+    """A progress bar on stderr while somebody is watching it: what is done, all there is, how many got lost, a note."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -116,17 +116,23 @@ def progress(what: str) -> Iterator["Callable[..., None] | None"]:
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=None)
 
-        def update(done: int, total: int, lost: int = 0) -> None:
-            bar.update(task, completed=done, total=total, description=f"{what}, {lost} lost" if lost else what)
+        def update(done: int, total: int, lost: int = 0, note: str = "") -> None:
+            parts = [what, *([f"{lost} lost"] if lost else []), *([note] if note else [])]
+            bar.update(task, completed=done, total=total, description=", ".join(parts))
 
         yield update
 
 
 @contextmanager
 def live_progress() -> Iterator["Callable[[ScanProgress], None] | None"]:
-    """The progress bar of an acquisition's frames."""
+    """The progress bar of an acquisition's frames, with what the fog meter says."""
     with progress("frames") as bar:
-        yield None if bar is None else lambda done: bar(done.frames, done.frames_planned, done.lost)
+
+        def tell(done: "ScanProgress") -> None:
+            assert bar is not None, "somebody is watching"
+            bar(done.frames, done.frames_planned, done.lost, "" if done.fog is None else done.fog.brief())
+
+        yield None if bar is None else tell
 
 
 def default_out() -> Path:

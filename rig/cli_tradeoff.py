@@ -60,7 +60,7 @@ def tradeoff_command(
             config,
             scenes=_split(scene),
             fogs=_split(fog),
-            exposures=_numbers("--exposures", exposures) or api.EXPOSURES,
+            exposures=_numbers("--exposures", exposures),
             lines=_numbers("--lines", lines),
             estimators=_split(estimators),
             filters=_split(filters),
@@ -93,7 +93,8 @@ def tradeoff_command(
 
 def _split(given: Some) -> list[str]:
     """The parts of an option that may be given several times and with commas."""
-    return [part.strip() for value in given or () for part in value.split(",") if part.strip()]
+    parts = (part.strip() for value in given or () for part in value.split(","))
+    return list(dict.fromkeys(part for part in parts if part))
 
 
 def _numbers(option: str, given: Some) -> list[int]:
@@ -103,4 +104,4 @@ def _numbers(option: str, given: Some) -> list[int]:
     wrong = [part for part in parts if not part.isdecimal()]
     if wrong:
         raise UsageError(f"{option} has {wrong[0]!r}, which is no whole number; write e.g. {option} 1,3,10")
-    return list(dict.fromkeys(int(part) for part in parts))
+    return [int(part) for part in parts]

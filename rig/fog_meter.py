@@ -55,6 +55,8 @@ STARTS_PER_M: Final = (0.0, 0.05, 0.15, 0.5, 1.5)
 STEPS: Final = 40
 REST_PRIOR: Final = 25.0
 """Inverse variance of `rest` before any count: 0.2, so that a map without pixels behind its stripes is solvable too."""
+RIDGE: Final = 1e-11
+"""Keeps the inverse of what says the same twice, as haze that is even and ambient light do, positive."""
 FLUX_MIN: Final = 1e-7
 FLUX_MAX: Final = 50.0
 """Photons per exposure; between these all logarithms are finite."""
@@ -78,6 +80,12 @@ class FogEstimate:
     veil_per_exposure: float | None = None
     veil_sd_per_exposure: float | None = None
     veil_to_signal: float | None = None
+
+    def brief(self) -> str:
+        """The visibility in three words, nothing where it is not resolved."""
+        if self.visibility_m is None or self.visibility_sd_m is None:
+            return ""
+        return f"visibility {self.visibility_m:.3g} +- {self.visibility_sd_m:.2g} m"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,26 +125,48 @@ def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: An
         return FogEstimate()
     read = clear & (at_stripe[:, 1] > 0)
     signal = float(np.mean(stripe.signal[row, column][read])) if read.any() else math.nan
-    return _stated(fit, sums, at_stripe[read], signal)
+    dark = _dark_offset(sweep, state.ambient, hot_flux)
+    return _stated(fit, sums, state.path_m(), dark, at_stripe[read], signal)
 
 
-def _stated(fit: _Fit, sums: Array, at_stripe: Array, signal: float) -> FogEstimate:
+def _dark_offset(sweep: Any, ambient: NDArray[np.float32], hot_flux: float) -> tuple[float, float] | None:
+    """By how much the dark frames lie above the learned ambient light, and the standard deviation; None without any."""
+    if sweep.dark_counts is None:
+        return None
+    frames = np.broadcast_to(sweep.n_dark if sweep.dark_frames is None else sweep.dark_frames, ambient.shape)
+    used = (frames > 0) & (ambient <= hot_flux)
+    exposures, ones = float(frames[used].sum()), float(sweep.dark_counts[used].sum())
+    if ones < 1.0 or ones >= exposures:
+        return None
+    level = -math.log1p(-ones / exposures)
+    return level - float(np.average(ambient[used], weights=frames[used])), level / math.sqrt(ones)
+
+
+def _stated(
+    fit: _Fit, sums: Array, path_m: Array, dark: tuple[float, float] | None, at_stripe: Array, signal: float
+) -> FogEstimate:
     haze, extinction, offset, rest = fit.value
     sd = np.sqrt(np.diag(fit.covariance))
-    extinction_sd = math.hypot(sd[1], MODEL_SHARE * extinction, REST_SHARE * max(rest, 0.0) * extinction)
     exposures = sums[..., 1].sum()
-    ambient = float(sums[..., 3].sum() / exposures + offset)
+    ambient, ambient_sd = float(sums[..., 3].sum() / exposures), float(sd[2])
+    if dark is not None:
+        # The laser's light that is there on both sides of the stripe has been scattered more than once as well.
+        level = np.average(haze * np.exp(-2.0 * extinction * (path_m - fit.at_m)), weights=sums[:, 0, :, 2].sum(0))
+        rest = max(rest, 0.0) + max(float(offset) - dark[0], 0.0) / max(float(level), FLUX_MIN)
+        offset, ambient_sd = dark[0], math.hypot(dark[1], MODEL_SHARE * (ambient + dark[0]))
+    ambient += float(offset)
+    extinction_sd = math.hypot(sd[1], MODEL_SHARE * extinction, REST_SHARE * max(rest, 0.0) * extinction)
     found: dict[str, float] = {}
     if extinction > RESOLVED_SIGMAS * extinction_sd:
-        visibility_m = VISIBILITY_CONTRAST / extinction
+        visibility_m = VISIBILITY_CONTRAST / float(extinction)
         found |= {"extinction_per_m": float(extinction), "extinction_sd_per_m": extinction_sd}
         found |= {"visibility_m": visibility_m, "visibility_sd_m": visibility_m * extinction_sd / extinction}
-    if ambient > RESOLVED_SIGMAS * sd[2]:
-        found |= {"ambient_per_exposure": ambient, "ambient_sd_per_exposure": float(sd[2])}
+    if ambient > RESOLVED_SIGMAS * ambient_sd:
+        found |= {"ambient_per_exposure": ambient, "ambient_sd_per_exposure": ambient_sd}
     if len(at_stripe):
-        path_m, gain = at_stripe.T
-        shape = gain * np.exp(-2.0 * extinction * (path_m - fit.at_m))
-        slope = np.array([shape.mean(), -2.0 * haze * np.mean((path_m - fit.at_m) * shape), 0.0, 0.0])
+        off_m, gain = at_stripe[:, 0] - fit.at_m, at_stripe[:, 1]
+        shape = gain * np.exp(-2.0 * extinction * off_m)
+        slope = np.array([shape.mean(), -2.0 * haze * np.mean(off_m * shape), 0.0, 0.0])
         veil, veil_sd = float(haze * shape.mean()), float(np.sqrt(slope @ fit.covariance @ slope))
         if veil > RESOLVED_SIGMAS * veil_sd:
             found |= {"veil_per_exposure": veil, "veil_sd_per_exposure": veil_sd}
@@ -147,8 +177,8 @@ def _stated(fit: _Fit, sums: Array, at_stripe: Array, signal: float) -> FogEstim
 def fit_fog(sums: Array, path_m: Array) -> _Fit | None:
     """Fit of block sums (blocks, 2, bins, 4) over bins of mean path; None where too little was seen before stripes.
 
-    Levenberg's steps from the likeliest of several extinctions. The covariance is the larger, number by number, of the
-    sandwich's and of the counts' own.
+    Levenberg's steps from the likeliest of several extinctions. The covariance is that of the counts, widened number
+    by number to the sandwich's.
     """
     blocks, _, bins, _ = sums.shape
     used = sums[..., 1].sum(0).ravel() > LEAST_EXPOSURES
@@ -175,12 +205,18 @@ def fit_fog(sums: Array, path_m: Array) -> _Fit | None:
         if settled:
             break
     score, information = data.slopes(value)
-    inverse = np.linalg.inv(information)
+    inverse = _inverse(information)
     seen = int(np.count_nonzero(exposures.sum(1)))
     scatter = score.T @ score * (seen / max(seen - 1, 1))
-    sandwich = inverse @ scatter @ inverse
-    wider = np.sqrt(np.maximum(np.diag(inverse) / np.diag(sandwich).clip(1e-300), 1.0))
-    return _Fit(value, sandwich * np.outer(wider, wider), at_m)
+    wider = np.sqrt(np.maximum(np.diag(inverse @ scatter @ inverse) / np.diag(inverse), 1.0))
+    return _Fit(value, inverse * np.outer(wider, wider), at_m)
+
+
+def _inverse(information: Array) -> Array:
+    """Inverse of an information whose numbers may be of any size, and may depend on each other."""
+    size = np.sqrt(np.diag(information))
+    relative = information / np.outer(size, size) + RIDGE * np.eye(len(size))
+    return np.asarray(np.linalg.inv(relative) / np.outer(size, size))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

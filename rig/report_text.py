@@ -9,7 +9,7 @@ from drivers.replay_pace import PaceReport
 from rig.effects import Effect, Flux, SceneEffects
 from rig.run import RunResult
 from rig.stages import PipelineStats
-from rig.summary import Summary, Synchronisation, Verdict
+from rig.summary import AdaptiveFigures, Summary, Synchronisation, Verdict
 
 WIDE = 300
 """Characters; wider than any line here."""
@@ -89,6 +89,13 @@ def console() -> Console:
     return Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
 
 
+def _passes(adaptive: AdaptiveFigures) -> str:
+    return (
+        f"{adaptive.passes} in all; between those of a map the rig rested for {adaptive.rest_s:.3g} s of the "
+        f"{adaptive.wall_s:.3g} s of wall time that maps took"
+    )
+
+
 def _rows(summary: Summary) -> list[tuple[str, str]]:
     frames = summary.frames
     rows = [
@@ -99,6 +106,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
             f"{summary.sensor_time_s:.3g} s of sensor, {summary.compute_time_s:.3g} s of computing "
             f"(real time x {_number(summary.realtime_factor)})",
         ),
+        *(() if summary.adaptive is None else (("passes", _passes(summary.adaptive)),)),
         *(() if summary.sync is None else (("sync", _sync(summary.sync)),)),
         *(() if summary.stages is None else (("stages", _stages(summary.stages)),)),
         *(() if summary.replay is None or not summary.replay.blocks else (("clock", _clock(summary.replay)),)),
@@ -106,13 +114,11 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
     ]
     fog = summary.fog
     if fog.extinction_per_m is not None:
-        rows.append(
-            (
-                "fog",
-                f"extinction {fog.extinction_per_m:.3g} +- {_number(fog.extinction_sd_per_m, 2)} /m, "
-                f"visibility {_number(fog.visibility_m)} m",
-            )
-        )
+        density = f"extinction {fog.extinction_per_m:.3g} +- {_number(fog.extinction_sd_per_m, 2)} /m"
+        rows.append(("fog", f"{density}, {fog.brief()}"))
+    if fog.ambient_per_exposure is not None:
+        veil = "" if fog.veil_per_exposure is None else f", veil {fog.veil_per_exposure:.3g}"
+        rows.append(("light", f"ambient {fog.ambient_per_exposure:.3g}{veil} photons per pixel and exposure"))
     if summary.truth is not None:
         stripe, depth = summary.truth.stripe_error_px, summary.truth.depth_error_m
         rows += [

@@ -13,7 +13,8 @@ import numpy as np
 
 from drivers.interfaces import SweepTruth
 from drivers.replay_pace import PaceReport
-from rig.reconstruction import FogEstimate, MapResult
+from rig.fog_meter import FogEstimate
+from rig.reconstruction import MapResult
 from rig.scoring import depth_errors, stripe_errors
 from rig.stages import PipelineStats
 
@@ -184,7 +185,7 @@ class MapTally:
             compute_time_s=compute_s,
             realtime_factor=sensor_time_s / compute_s if compute_s > 0 else None,
             valid_fraction=statistics.fmean(each.valid for each in self._maps) if self._maps else None,
-            fog=self._maps[-1].fog if self._maps else FogEstimate(None, None, None),
+            fog=self._maps[-1].fog if self._maps else FogEstimate(),
             truth=truth,
             verdict=verdict,
             stages=stages,

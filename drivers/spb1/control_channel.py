@@ -1,7 +1,7 @@
 """Commands to an SPB1 device and what it answers, over an endpoint of its own or inside the stream."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -13,7 +13,9 @@ from drivers.transports.bulk_link import BulkLink
 from drivers.transports.tap import IN, OUT, Tap
 
 _ANSWER_S = 1.0
-"""Longest wait for an acknowledgement."""
+"""Longest wait for an acknowledgement..."""
+_SLICE_S = 0.05
+"""...in pieces, after each of which `on_wait` is told."""
 _AT_ONCE = 32
 """Commands that share a transfer."""
 _ACK_READ_BYTES = 1024
@@ -43,6 +45,8 @@ class ControlChannel:
         self._stream_in = stream_in
         self._request_id = 0
         self._received: list[Ack] = []
+        self.on_wait: Callable[[float], None] | None = None
+        """Told of each piece of a wait in vain, in seconds."""
 
     @property
     def has_acks(self) -> bool:
@@ -149,7 +153,12 @@ class ControlChannel:
                     f"{self._link.label} did not acknowledge {Op(command.op).name} within {_ANSWER_S:g} s; "
                     "power-cycle it"
                 )
-            self._received += self._read_acks(left_s)
+            slice_s = min(left_s, _SLICE_S)
+            try:
+                self._received += self._read_acks(slice_s)
+            except DeviceTimeout:
+                if self.on_wait is not None:
+                    self.on_wait(slice_s)
 
     def _read_acks(self, left_s: float) -> list[Ack]:
         if self._ack_in is not None:

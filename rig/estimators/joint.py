@@ -14,12 +14,14 @@ from rig.counting import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimators.aggregation_answer import Answer, answer_settings, new_answer
 from rig.estimators.aggregation_kernels import Penalties, along_columns, along_rows
 from rig.estimators.ambient import ambient_map
-from rig.estimators.joint_confidence import confidence_of
-from rig.estimators.joint_kernels import add_quiet, read_light, read_positions
-from rig.estimators.label_grid import PER_PX, LabelGrid, label_grid
+from rig.estimators.joint_answer import stripe_table
+from rig.estimators.joint_kernels import add_quiet, read_positions
+from rig.estimators.label_grid import LabelGrid, label_grid
 from rig.estimators.label_volume import Costs, costs_of
 from rig.estimators.learning import learn_again, lines_of, next_lattice
 from rig.estimators.lessons import Lessons, Seen, Setting, first_model
+from rig.estimators.placing import new_places, place, profile_table
+from rig.estimators.placing_kernels import Places
 from rig.estimators.row_input import State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
 from rig.estimators.volume_search import nominal_exposures
@@ -42,6 +44,7 @@ class _Tables(NamedTuple):
     costs: Costs
     sweep: Sweep
     state: State
+    shares: NDArray[np.float32]
     dark: bool
 
 
@@ -51,6 +54,7 @@ class _Memory(NamedTuple):
     cost: NDArray[np.uint8]
     message: NDArray[np.uint8]
     answer: Answer
+    places: Places
 
 
 class Joint:
@@ -119,26 +123,24 @@ class Joint:
         def tie_columns(first: int, last: int) -> None:
             along_columns(memory.cost, memory.message, penalties, settings, first, last, memory.answer)
 
-        x_px, signal, haze = (np.empty((rows, columns), np.float32) for _ in range(3))
+        x_px = np.empty((rows, columns), np.float32)
 
         def read(first: int, last: int) -> None:
-            read_positions(grid.x_far, grid.side, memory.answer, first, last, x_px)
-            read_light(volume.counts, volume.n_frames, tables.sweep, tables.state, x_px, first, last, signal, haze)
+            read_positions(
+                grid.x_far, volume.n_frames, grid.side, memory.answer, first, last, x_px, memory.places.distance
+            )
 
         workers.over(rows, tie_rows)
         workers.over(columns, tie_columns)
         workers.over(rows, read)
-        confidence, sd = confidence_of(memory.answer, PER_PX)
-        nothing = np.isnan(signal)
-        for field, empty in ((x_px, np.nan), (confidence, 0.0), (sd, np.nan)):
-            field[nothing] = empty
-        return StripeTable(x_px, confidence, sd, signal, haze)
+        sd = place(volume, tables.sweep, tables.state, tables.shares, x_px, memory.places, workers)
+        return stripe_table(x_px, sd, memory.answer, memory.places, tables.state)
 
     def _room(self, rows: int, columns: int, labels: int) -> _Memory:
         memory = self._memory
         if memory is None or memory.cost.shape != (rows, columns, labels):
             cost, message = (np.zeros((rows, columns, labels), np.uint8) for _ in range(2))
-            memory = self._memory = _Memory(cost, message, new_answer(rows, columns))
+            memory = self._memory = _Memory(cost, message, new_answer(rows, columns), new_places(rows, columns))
         return memory
 
     def _seen(self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable) -> Seen:
@@ -163,4 +165,5 @@ class Joint:
 def _tables(setting: Setting, workers: RowWorkers) -> _Tables:
     grid = label_grid(setting.geometry)
     costs = costs_of(setting.model, setting.geometry, grid, setting.exposures, workers)
-    return _Tables(grid, costs, sweep_of(setting.geometry), state_of(setting.model), setting.dark)
+    shares = profile_table(setting.model.line_sigma_px)
+    return _Tables(grid, costs, sweep_of(setting.geometry), state_of(setting.model), shares, setting.dark)

@@ -1,4 +1,4 @@
-"""Compiled reading of a map's answers: positions in pixels, light around them, and what lay quietly behind them."""
+"""Compiled reading of a map's answers: positions in pixels, and what lay quietly behind them."""
 
 from typing import Final
 
@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 
 from rig.estimators.aggregation_answer import Answer
 from rig.estimators.label_grid import PER_PX
-from rig.estimators.row_input import State, Sweep, fluxes_at, line_light
+from rig.estimators.row_input import Sweep
 
-SIGNAL_REACH_PX: Final = 2
-"""The line's light is summed so far to either side."""
 QUIET_REACH_PX: Final = 8
 """Pixels so far behind a clear stripe show nothing of it."""
 QUIET: Final = 0.9
@@ -20,47 +18,20 @@ QUIET: Final = 0.9
 
 @numba.njit(cache=True, nogil=True)
 def read_positions(
-    x_far: NDArray[np.float64], side: int, answer: Answer, first_row: int, last_row: int, x_px: NDArray[np.float32]
-) -> None:
-    """x_px (rows, columns) of the answers' labels; NaN where nothing is searched."""
-    for y in range(first_row, last_row):
-        for c in range(x_far.shape[1]):
-            x_px[y, c] = x_far[y, c] - side * answer.label[y, c] / PER_PX
-
-
-@numba.njit(cache=True, nogil=True)
-def read_light(
-    counts: NDArray[np.unsignedinteger],
+    x_far: NDArray[np.float64],
     n_frames: NDArray[np.int32],
-    sweep: Sweep,
-    state: State,
-    x_px: NDArray[np.float32],
+    side: int,
+    answer: Answer,
     first_row: int,
     last_row: int,
-    signal: NDArray[np.float32],
-    haze: NDArray[np.float32],
+    x_px: NDArray[np.float32],
+    distance: NDArray[np.float32],
 ) -> None:
-    """Fill signal and haze (rows, columns), photons per exposure, where there is a position and data; else NaN."""
-    faintest, brightest = state.amplitude[0], state.amplitude[-1]
+    """x_px (rows, columns) of the answers' labels, and its distance from x_far; NaN where there are no data."""
     for y in range(first_row, last_row):
-        for c in range(x_px.shape[1]):
-            signal[y, c] = haze[y, c] = np.nan
-            if np.isnan(x_px[y, c]) or n_frames[c] == 0:
-                continue
-            frames = np.float32(n_frames[c])
-            x = min(max(int(np.rint(x_px[y, c])), sweep.x_lo[y, c]), sweep.x_hi[y, c])
-            path_p, strength = line_light(sweep, state, y, c, x)
-            before, behind, scale, _, _, _ = fluxes_at(sweep, state, y, x, sweep.plane[c], path_p, strength)
-            light = -(SIGNAL_REACH_PX + np.float32(0.5)) * (before + behind)
-            for t in range(x - SIGNAL_REACH_PX, x + SIGNAL_REACH_PX + 1):
-                at = t - sweep.x0[c]
-                if at < 0 or at >= sweep.window:
-                    light += before
-                    continue
-                n = min(np.float32(counts[c, y, at]), frames)
-                light += np.log((frames + np.float32(0.5)) / (frames - n + np.float32(0.5)))
-            signal[y, c] = min(max(light, scale * faintest), scale * brightest)
-            haze[y, c] = max(before - state.ambient[y, x], np.float32(0.0))
+        for c in range(x_far.shape[1]):
+            off = -side * answer.label[y, c] / PER_PX if n_frames[c] > 0 else np.float32(np.nan)
+            x_px[y, c], distance[y, c] = x_far[y, c] + off, off if np.isfinite(x_far[y, c]) else np.float32(np.nan)
 
 
 @numba.njit(cache=True, nogil=True)

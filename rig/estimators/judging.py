@@ -52,7 +52,7 @@ def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: 
     light, log_share = _lights(model)
     reach = max(1, int(np.count_nonzero(state.psi[1:] > TAP_SHARE)))
     bands, columns = state.ambient.shape[0], geometry.columns
-    tables = _empty_tables(columns, bands, padded_lanes(geometry.window), reach)
+    tables = _empty_tables(columns, bands, padded_lanes(geometry.window), reach, others=geometry.others is not None)
     most = min(2 * exposures + SPARE_FRAMES, COUNT_LIMIT)
     nominal = exposures / 2.0 ** halvings(exposures, most)
     largest_sum, largest = _largest(sweep, state, light, reach)
@@ -219,7 +219,7 @@ def _usual_mean(ambient: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray((np.where(usual, ambient, 0.0).sum(0) / usual.sum(0)).astype(np.float32))
 
 
-def _empty_tables(columns: int, bands: int, lanes: int, reach: int) -> Tables:
+def _empty_tables(columns: int, bands: int, lanes: int, reach: int, *, others: bool = False) -> Tables:
     pixels = lanes * STEPS
 
     def of(*shape: int, dtype: type = np.float32) -> Any:
@@ -237,6 +237,7 @@ def _empty_tables(columns: int, bands: int, lanes: int, reach: int) -> Tables:
         scale=of(pixels),
         first=of(dtype=np.int32),
         last=of(dtype=np.int32),
+        ambient=of(pixels) if others else aligned_zeros((0, bands, pixels), np.float32),
     )
 
 

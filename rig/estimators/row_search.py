@@ -101,11 +101,12 @@ def table_for(desk: Desk, search: Search, c: int, b: int, exposures: float) -> T
     if _hot_of_row(desk, x0, b * desk.band_rows) < _hot_of_row(desk, x0, band_end):
         _neutral_counts(neutral, exposures, c, desk.window, search.neutral)
     lowest = np.float32(OUTSIDE)
+    ambient = pixels * table if desk.several_lines else b * desk.ambient_px + x0
     all_right = max(read_float32(none, 0) + np.float32(START), lowest)
     return Table(
         desk.edge + pixels * table, desk.tap + 2 * SCREENS * desk.taps * pixels * table, constant,
         desk.before + 4 * pixels * table, desk.scale + 4 * pixels * table,
-        desk.ambient + 4 * (b * desk.ambient_px + x0), np.int16(all_right),
+        desk.ambient + 4 * ambient, np.int16(all_right),
         np.int16(max(read_float32(none, 1), lowest)),
         read_int32(desk.first, table) <= read_int32(desk.last, table),
     )  # fmt: skip
@@ -162,7 +163,8 @@ def judge_rows(desk: Desk, search: Search, table: Table, first: int, rows: int, 
     certainty = certainties(table, search, desk.shift)
     _answer(certainty, stripe + 4 * desk.rows, rows, search)
     _measure_light(desk, search, table, first, rows, c, exposures, stripe)
-    if exposures <= FEW_EXPOSURES:
+    # The close-up knows one level behind the stripe for all columns; other lines' haze makes it as many as there are.
+    if exposures <= FEW_EXPOSURES or desk.several_lines:
         _place_by_neighbours(desk, search, rows, c, stripe)
     else:
         _look_closely(desk, search, rows, c, exposures, stripe)

@@ -46,6 +46,7 @@ class Tables(NamedTuple):
     neutral: float32 (columns, bands, P), ones per exposure that say nothing, in pixel order.
     before, scale: float32 (columns, bands, P) as in `Row`, in pixel order.
     first, last: int32 (columns, bands), first and last position in stored pixels.
+    ambient: float32 (columns, bands, P), ambient light and other lines' haze where there are any, else no columns.
     """
 
     edge: NDArray[np.int8]
@@ -59,6 +60,7 @@ class Tables(NamedTuple):
     scale: NDArray[np.float32]
     first: NDArray[np.int32]
     last: NDArray[np.int32]
+    ambient: NDArray[np.float32]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -107,6 +109,8 @@ def fill_tables(
                 near, far = row.before[t], row.behind[t]
                 levels[FLUX_LEFT, x], levels[FLUX_RIGHT, x] = (near, far) if sweep.near_is_left else (far, near)
                 out.before[c, b, x], out.scale[c, b, x] = near, row.scale[t]
+                if out.ambient.shape[0] > 0:
+                    out.ambient[c, b, x] = state.ambient[b, x + sweep.x0[c]] + row.others[t]
                 at = cell_of(levels[FLUX_LEFT, x])
                 levels[GAIN_LEFT, x], levels[LOSS_LEFT, x] = gain[at], loss[at]
                 at = cell_of(levels[FLUX_RIGHT, x])

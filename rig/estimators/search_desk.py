@@ -106,6 +106,7 @@ class Desk(NamedTuple):
     limit_rows: int
     ambient: int
     ambient_px: int
+    several_lines: bool
     hot_start: int
     hot_at: int
     hot_place: int
@@ -137,6 +138,8 @@ class Desk(NamedTuple):
 def desk_of(judge: Judge, found: Found, memory: NDArray[np.uint8]) -> Desk:
     """Addresses of everything; the arrays must outlive it. memory: of a thread, see `search_memory`."""
     tables, closeup = judge.tables, judge.closeup
+    several_lines = tables.ambient.shape[0] > 0
+    ambient = address_of(tables.ambient) if several_lines else address_of(judge.ambient)
     return Desk(
         address_of(memory), tables.lane.shape[2], judge.x0.shape[0], judge.rows, tables.lane.shape[1],
         tables.tap.shape[4], address_of(tables.edge), address_of(tables.tap), address_of(tables.position),
@@ -144,7 +147,7 @@ def desk_of(judge: Judge, found: Found, memory: NDArray[np.uint8]) -> Desk:
         address_of(tables.before), address_of(tables.scale), address_of(tables.first), address_of(tables.last),
         address_of(closeup.weight), address_of(closeup.constant), closeup.weight.shape[3],
         address_of(closeup.label), address_of(closeup.square), address_of(judge.x0), address_of(judge.limits),
-        judge.limits.shape[2], address_of(judge.ambient), judge.ambient.shape[1], address_of(judge.hot_start),
+        judge.limits.shape[2], ambient, judge.ambient.shape[1], several_lines, address_of(judge.hot_start),
         address_of(judge.hot_at), address_of(judge.hot_place),
         address_of(judge.flux), address_of(found.stripe), address_of(found.quiet_here),
         address_of(found.quiet_exposures), address_of(found.light_here), address_of(found.quiet),

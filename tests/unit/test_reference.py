@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,10 @@ from tests.reference.genie import (
     log_expm1_table,
 )
 from tests.reference.geometry import BASELINE_M, DEPTH_RANGE_M, FOCAL_PX, Geometry, undistorted_rays
+from tests.reference.made_scenes import pane_scene, smooth_scene, thin_scene
+from tests.reference.scattering import halo_total, pedestal_share
 from tests.reference.scene import Scene, procedural_scene
-from tests.reference.working_point import CLEAR, REPORT, Light, WorkingPoint, score
+from tests.reference.working_point import CLEAR, FORWARD, HOT, REPORT, Light, WorkingPoint, at_stripe, dark_map, score
 
 ROWS, WIDTH, COLUMNS = 6, 512, 61
 
@@ -302,3 +305,93 @@ def test_score_without_any_answer_is_all_missing() -> None:
     figures = score(np.full((2, 3), np.nan), truth, np.ones((2, 3), np.bool_))
     assert figures["missing"] == 1.0
     assert math.isnan(figures["mean_abs"])
+
+
+def test_a_window_holds_the_very_counts_of_the_whole_picture() -> None:
+    p = point(light=Light(stripe=20.0, ambient=0.4), columns=11)
+    x0 = np.linspace(-0, WIDTH - 40, 11).astype(np.int32)
+    whole, part = p.counts(90, seed=3), p.counts_in(x0, 96, 90, seed=3)
+    for c in range(11):
+        inside = min(96, WIDTH - x0[c])
+        np.testing.assert_array_equal(part[c, :, :inside], whole[c, :, x0[c] : x0[c] + inside])
+        assert not part[c, :, inside:].any()
+
+
+def test_hot_pixels_are_few_constant_and_as_bright_as_stated() -> None:
+    dark = dark_map(replace(HOT, uneven=0.0), (256, WIDTH))
+    hot = dark > 2 * HOT.ambient
+    assert hot.mean() == pytest.approx(0.01, rel=0.1)
+    assert dark[hot].min() / HOT.ambient >= 10
+    assert dark[hot].max() / HOT.ambient <= 100
+    np.testing.assert_allclose(dark[~hot], HOT.ambient)
+    np.testing.assert_array_equal(dark, dark_map(HOT, (256, WIDTH)))
+
+
+def test_halo_and_pedestal_by_optical_depth_are_those_of_the_path_tracer() -> None:
+    tau = np.array([0.5, 1.0, 2.0])
+    np.testing.assert_allclose(halo_total(tau) / np.expm1(2 * tau), [0.7, 0.64, 0.5])
+    share = pedestal_share(tau)
+    assert ((share > [0.08, 0.18, 0.35]) & (share < [0.13, 0.32, 0.45])).all()
+
+
+def test_the_halo_is_added_around_the_stripe_and_a_pedestal_behind_it() -> None:
+    light = replace(FORWARD, optical_depth=0.5)
+    bare, foggy = (point(wall(4.0), replace(light, multiple_scattering=on), columns=9) for on in (False, True))
+    assert foggy.light.extinction_per_m == pytest.approx(0.5 / 4.0)
+    c, y = 5, 2
+    x_true = foggy.x_true[y, c]
+    added = (foggy.flux_of_column(c)[y] - bare.flux_of_column(c)[y]).astype(np.float64)
+    x = np.arange(WIDTH)
+    narrow, wide = (FOCAL_PX * math.tan(math.radians(a)) for a in (1.7, 6.0))
+    k = sum(np.exp(-np.abs(x - x_true) / reach) / (4 * reach) for reach in (narrow, wide))
+    halo = foggy.stripe[y, c] * 0.7 * math.expm1(2 * 0.5) * k
+    before, behind = x < x_true - 1, x > x_true + 1
+    np.testing.assert_allclose(added[before], halo[before], rtol=1e-3)
+    places = np.arange(round(x_true) - 12, round(x_true) - 4)
+    level = np.polyval(np.polyfit(places - x_true, bare.flux_of_column(c)[y][places] - light.ambient, 2), 0.0)
+    pedestal = 0.105 * level * np.exp(-(x - x_true) / wide)
+    np.testing.assert_allclose(added[behind], (halo + pedestal)[behind], rtol=0.01)
+
+
+def test_a_pane_shows_a_second_stripe_in_front_and_dims_the_first() -> None:
+    scene = pane_scene(8, WIDTH)
+    with_pane, without = point(scene), point(replace(scene, pane=None))
+    two = np.isfinite(with_pane.x_second) & np.isfinite(with_pane.x_true)
+    assert 0.2 < two.mean() < 0.9
+    assert (with_pane.x_second[two] < with_pane.x_true[two] - 5).all()
+    dimmed = with_pane.stripe[two] / without.stripe[two]
+    through = at_stripe(np.isfinite(scene.pane.depth_m), with_pane.x_true)[two]  # type: ignore[union-attr]
+    np.testing.assert_allclose(dimmed, np.where(through, 0.64, 0.8))
+    y, c = np.argwhere(two)[len(np.argwhere(two)) // 2]
+    added = (
+        with_pane.flux_of_column(c)[y].astype(np.float64)
+        - point(replace(scene, pane=None), replace(REPORT, stripe=REPORT.stripe * dimmed[0])).flux_of_column(c)[y]
+    )
+    near = np.abs(np.arange(WIDTH) - with_pane.x_second[y, c]) < 4
+    assert added[near].sum() == pytest.approx(with_pane.second[y, c], rel=1e-3)
+
+
+def test_thin_objects_are_as_wide_as_stated_and_seen() -> None:
+    scene, thin = thin_scene(64, WIDTH)
+    assert thin["pole"][30].sum() == 4
+    runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], thin["fence"][30].astype(int), [0]]))))[::2]
+    assert set(runs) == {3, 4}
+    p = point(scene, columns=500)
+    for mask in thin.values():
+        assert at_stripe(mask, p.x_true).sum() > 100
+        assert not (scene.trusted & mask).any()
+
+
+def test_sub_pixel_bound_is_met_by_a_maximum_likelihood_fit() -> None:
+    p = point(smooth_scene(96, WIDTH), replace(REPORT, stripe=2.0), columns=5)
+    exposures, c, shifts = 60, 3, np.linspace(-0.9, 0.9, 181)
+    counts = p.counts(exposures, seed=2)[c].astype(np.float64)
+    bound = p.sub_pixel_sd(exposures)[:, c]
+    truth = p.x_true[:, c].copy(), p.x_end[:, c].copy()
+    logs = []
+    for shift in shifts:
+        p.x_true[:, c], p.x_end[:, c] = truth[0] + shift, truth[1] + shift
+        flux = p.flux_of_column(c).astype(np.float64)
+        logs.append((counts * np.log(np.expm1(flux)) - exposures * flux).sum(axis=1))
+    error = shifts[np.argmax(logs, axis=0)]
+    assert np.sqrt(np.mean((error / bound) ** 2)) == pytest.approx(1.0, abs=0.2)

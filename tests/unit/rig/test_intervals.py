@@ -29,12 +29,12 @@ def test_the_blocks_of_a_map_hold_its_errors_and_leave_nan_out():
 def test_an_interval_over_blocks_holds_the_true_mean_as_often_as_it_says():
     rng = np.random.default_rng(1)
     held = 0
-    for seed in range(200):
-        numbers = rng.integers(400, 801, 200)
-        sums = numbers * rng.exponential(0.3, 200)
+    for seed in range(100):
+        numbers = rng.integers(400, 801, 100)
+        sums = numbers * rng.exponential(0.3, 100)
         low, high = blocks_interval(sums, numbers, seed)
         held += low <= 0.3 <= high
-    assert held >= 180
+    assert held >= 88
 
 
 def test_blocks_without_a_stripe_do_not_matter():

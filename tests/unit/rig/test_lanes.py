@@ -8,8 +8,10 @@ from rig import lane_shuffles, lanes
 from rig.lane_memory import (
     add_bytes,
     address_of,
+    load_block,
     load_bytes,
     load_float32,
+    load_four,
     load_int16,
     load_two_rows,
     read_float32,
@@ -17,6 +19,7 @@ from rig.lane_memory import (
     read_int32,
     store_bytes,
     store_float32,
+    store_four,
     store_int16,
     write_float32,
     write_int16,
@@ -167,6 +170,16 @@ def random_bytes(seed, n=2 * LANES):
             numba.njit(lambda a, b: lane_shuffles.second_row_pairs(a, b)),
             lambda a, b: np.stack([a[LANES:], b[LANES:]], axis=1).ravel(),
         ),
+        (
+            numba.njit(lambda a, b: lanes.add_saturated_unsigned(a, b)),
+            lambda a, b: np.minimum(wide(a) + b, 255),
+        ),
+        (
+            numba.njit(lambda a, b: lanes.sub_saturated_unsigned(a, b)),
+            lambda a, b: np.maximum(wide(a) - b, 0),
+        ),
+        (numba.njit(lambda a, b: lanes.smaller_unsigned(a, b)), np.minimum),
+        (numba.njit(lambda a, b: lanes.smaller_unsigned(a, 200)), lambda a, b: np.minimum(a, 200)),
     ],
 )
 def test_bytes_do_what_numpy_does(operation, wanted):
@@ -328,3 +341,30 @@ def test_constants():
     out = np.ones(LANES, np.int16), np.ones(LANES, np.float32), np.ones(2 * LANES, np.uint8)
     zeros(*out)
     assert not any(a.any() for a in out)
+
+
+def test_the_smallest_byte_and_where_bytes_equal_a_number():
+    @numba.njit
+    def found(a, number):
+        one, block = load_bytes(address_of(a), 0), load_block(address_of(a), 0)
+        places = lane_shuffles.equal_bytes(one, number), lane_shuffles.first_equal(block, number)
+        return *places, lanes.smallest_byte(one), lanes.smallest_byte(block)
+
+    for seed in range(20):
+        a = random_bytes(seed, 8 * LANES) | np.uint8(seed)
+        for number in (a[0], a[70], a[127], np.uint8(0)):
+            equal = np.flatnonzero(a == number)
+            mask, first, least, least_of_all = found(a, number)
+            assert mask == sum(1 << int(i) for i in equal if i < 2 * LANES)
+            assert first == (equal[0] if len(equal) else 8 * LANES)
+            assert (least, least_of_all) == (a[: 2 * LANES].min(), a.min())
+
+
+def test_four_numbers_are_scaled_and_added():
+    @numba.njit
+    def scale(a, by, out):
+        store_four(address_of(out), 1, lanes.zero_four() + load_four(address_of(a), 2) * by)
+
+    a, out = np.arange(8, dtype=np.float32), np.zeros(8, np.float32)
+    scale(a, np.float32(0.25), out)
+    np.testing.assert_array_equal(out, [0, 0.5, 0.75, 1, 1.25, 0, 0, 0])

@@ -38,7 +38,14 @@ def test_maps_are_added_up() -> None:
     assert content["compute_time_s"] == pytest.approx(0.5)
     assert content["realtime_factor"] == pytest.approx(0.2)
     assert content["valid_fraction"] == 0.75
-    assert content["fog"] == {"extinction_per_m": 0.05, "extinction_sd_per_m": 0.004, "visibility_m": 78.2}
+    fog = content["fog"]
+    assert {name: fog[name] for name in fog if fog[name] is not None} == {
+        "extinction_per_m": 0.05,
+        "extinction_sd_per_m": 0.004,
+        "visibility_m": 78.2,
+    }
+    figures = ("extinction_sd_per_m", "visibility_sd_m", "ambient_sd_per_exposure", "veil_sd_per_exposure")
+    assert {*figures, *(name.replace("_sd", "") for name in figures), "veil_to_signal"} == set(fog)
     assert content["truth"]["stripe_error_px"]["mean_abs"] == pytest.approx(1.25)
     # A missing one counts as wrong: 3 of 4 are within 1 px in the first map, none in the second.
     assert content["truth"]["stripe_error_px"]["within_1px"] == pytest.approx(0.375)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.interfaces import SweepTruth
@@ -29,22 +29,22 @@ ROW = TradeoffRow(
     mean_abs_px=0.5, within_1px=0.9, missing=0.0, depth_mm=10.0, ci95=(0.4, 0.6),
 )  # fmt: skip
 
-rows = st.lists(
-    st.builds(
-        replace,
-        st.just(ROW),
-        fog=st.sampled_from([None, "clear"]),
-        sensor_ms=st.integers(1, 6).map(float),
-        compute_ms=st.integers(1, 6).map(float),
-        mean_abs_px=st.integers(1, 6).map(float),
-        missing=st.sampled_from([0.0, 2 * MOST_MISSING]),
-    ),
-    max_size=12,
-)
+figures = st.lists(st.tuples(*[st.integers(1, 6)] * 3, st.booleans(), st.booleans()), max_size=12)
+"""Sensor time, compute time, error, whether too many answers are missing, and whether in clear air."""
 
 
-@given(rows)
-def test_a_row_is_on_the_front_where_no_other_in_its_scene_and_fog_beats_it(rows):
+def rows_of(figures):
+    return [
+        replace(ROW, exposures=1 + i, sensor_ms=float(sensor), compute_ms=float(compute), mean_abs_px=float(error),
+                missing=2 * MOST_MISSING * missing, fog="clear" if clear else None)
+        for i, (sensor, compute, error, missing, clear) in enumerate(figures)
+    ]  # fmt: skip
+
+
+@settings(max_examples=50, deadline=None)
+@given(figures)
+def test_a_row_is_on_the_front_where_no_other_in_its_scene_and_fog_beats_it(figures):
+    rows = rows_of(figures)
     marked = with_fronts(rows)
     for of in ("sensor", "compute"):
         for i, row in enumerate(marked):
@@ -64,9 +64,10 @@ def test_a_row_is_on_the_front_where_no_other_in_its_scene_and_fog_beats_it(rows
             assert on_front == (row.counts and not beaten and not twin)
 
 
-@given(rows, st.sampled_from(["sensor", "compute"]), st.integers(1, 7), st.booleans())
-def test_the_answer_is_the_best_of_those_that_fit_and_else_the_nearest(rows, of, limit, by_time):
-    rows = [replace(row, exposures=1 + i) for i, row in enumerate(rows) if row.fog is None]
+@settings(max_examples=50, deadline=None)
+@given(figures, st.sampled_from(["sensor", "compute"]), st.integers(1, 7), st.booleans())
+def test_the_answer_is_the_best_of_those_that_fit_and_else_the_nearest(figures, of, limit, by_time):
+    rows = [replace(row, fog=None) for row in rows_of(figures)]
     wish = Wish(float(limit), None, of) if by_time else Wish(None, float(limit), of)
     answer = choose(rows, wish)
     counting = [row for row in rows if row.counts]
@@ -162,9 +163,17 @@ def test_what_is_kept_of_frames_counts_as_the_frames_do():
 
 @pytest.mark.parametrize("whole", [0, 2])
 def test_an_interrupt_leaves_the_rows_that_are_whole(monkeypatch, whole):
-    config = load_config()
     trials = Trials(
-        lambda trial: config, [None], ["clear"], [1, 3, 10], [None], ["edge"], ["none"], repeat=1, seed=0, limits=False
+        lambda trial: load_config("simulated", {"scan.exposures": trial.exposures}),
+        [None],
+        ["clear"],
+        [1, 3, 10],
+        [None],
+        ["edge"],
+        ["none"],
+        repeat=1,
+        seed=0,
+        limits=False,
     )
     done = iter(range(whole))
 

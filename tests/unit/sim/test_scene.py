@@ -15,7 +15,7 @@ from drivers.errors import DeviceError
 from drivers.registry import Surroundings
 from sim_backend.effects.catalogue import CATALOGUE, Entry
 from sim_backend.optics import Line, Optics, Sensor, ambient_irradiance, detections_per_radiance
-from sim_backend.scene import SceneFile, bundled_scenes, load_scene, load_surfaces
+from sim_backend.scene import SceneFile, bundled_scenes, load_scene, load_surfaces, with_fog
 from sim_backend.scenes.prepared import load_folder
 from sim_backend.scenes.stereo import prepare
 from sim_backend.scenes.street import street
@@ -209,3 +209,23 @@ def test_a_world_without_a_light_source_is_refused(tmp_path: Path) -> None:
     save_rig_model(replace(rig(), source_m=None), tmp_path / "rig.yaml")
     with pytest.raises(DeviceError, match="source_m"):
         KIND.create(WorldConfig(geometry=str(tmp_path / "rig.yaml")), Surroundings(VirtualClock(), None, 0))
+
+
+def test_another_fog_changes_how_dense_a_medium_is_and_nothing_else():
+    scene, _ = load_scene("street")
+    thick = with_fog(scene, "20m")
+    assert thick.extinction_per_m == pytest.approx(3.912 / 20)
+    assert thick.medium.backscatter == scene.medium.backscatter
+    assert thick.medium.multiple_scattering == scene.medium.multiple_scattering
+    smoke, _ = load_scene("street-smoke")
+    assert with_fog(smoke, "20 m").extinction_per_m == pytest.approx(3.912 / 20)
+    assert with_fog(load_scene("street-clear")[0], "20 m").extinction_per_m == pytest.approx(3.912 / 20)
+    assert with_fog(thick, "clear").medium is None
+    world = KIND.create(WorldConfig(fog="20 m"), Surroundings(VirtualClock(), None, 0))
+    assert world.scene == with_fog(scene, "20 m")
+
+
+@pytest.mark.parametrize(("fog", "named"), [("20", "no unit"), ("-1 m", "more than 0 m"), ("thick", "write clear")])
+def test_a_fog_that_is_none_is_refused(fog, named):
+    with pytest.raises(ValueError, match=named):
+        WorldConfig(fog=fog)

@@ -1,0 +1,72 @@
+"""Sub-pixel places of stripes whose labels are known; see `placing_kernels`."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.counting import CountVolume
+from rig.estimators.placing_kernels import (
+    FRACTIONS,
+    REACH_PX,
+    Places,
+    measure_light,
+    pool_amplitude,
+    pool_places,
+    score_places,
+)
+from rig.estimators.row_input import State, Sweep
+from rig.estimators.row_model import pixel_shares
+from rig.row_threads import RowWorkers
+
+LIGHT_REACH = 3
+"""Rows and columns to either side that a stripe's brightness is pooled over."""
+REACHES = (2, 3, 4)
+"""The same of its place: as many as it takes to know it."""
+ENOUGH = 1 / 0.06**2
+"""Information, 1/px^2, from which a place is known well enough: surfaces bend over more neighbours."""
+BEYOND = 3.0
+"""Brightness may exceed the learned amplitudes by this factor either way."""
+SLOPE_STEP_PX = 0.05
+
+
+def profile_table(sigma_px: float) -> NDArray[np.float32]:
+    """Shares of the line and their slopes as `score_places` takes them."""
+    centre = (np.arange(FRACTIONS) + 0.5) / FRACTIONS - 0.5
+    distance = np.arange(-REACH_PX, REACH_PX + 1) - centre[:, None]
+    on, back = (pixel_shares(sigma_px, distance - step) for step in (SLOPE_STEP_PX, -SLOPE_STEP_PX))
+    slope = (on - back) / np.float32(2 * SLOPE_STEP_PX)
+    return np.ascontiguousarray(np.stack([pixel_shares(sigma_px, distance), slope], axis=1))
+
+
+def new_places(rows: int, columns: int) -> Places:
+    """Room for the places of a map."""
+    return Places(*(np.zeros((rows, columns), np.float32) for _ in Places._fields))
+
+
+def place(
+    volume: CountVolume,
+    sweep: Sweep,
+    state: State,
+    shares: NDArray[np.float32],
+    x_px: NDArray[np.float32],
+    places: Places,
+    workers: RowWorkers,
+) -> NDArray[np.float32]:
+    """Move x_px, whose distances from the far end are in `places`, to where neighbours together put it.
+
+    Returns its standard deviation in px; light and haze are left in `places`.
+    """
+    rows, columns = x_px.shape
+    side = 1 if sweep.near_is_left else -1
+    faintest, brightest = float(state.amplitude[0]) / BEYOND, float(state.amplitude[-1]) * BEYOND
+    amplitude, moved, sd = (np.empty((rows, columns), np.float32) for _ in range(3))
+    seen = volume.counts, volume.n_frames, sweep, state
+
+    def over(kernel: object, *before: object, after: tuple[object, ...]) -> None:
+        workers.over(rows, lambda first, last: kernel(*before, first, last, *after))  # type: ignore[operator]
+
+    over(measure_light, *seen, x_px, after=(places,))
+    over(pool_amplitude, places, LIGHT_REACH, faintest, brightest, after=(amplitude,))
+    over(score_places, *seen, shares, x_px, side, amplitude, after=(places,))
+    over(pool_places, places, REACHES, ENOUGH, after=(moved, sd))
+    x_px += moved
+    return sd

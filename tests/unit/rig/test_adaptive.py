@@ -1,0 +1,129 @@
+"""The choice of passes, and the counts of passes added up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rig.adaptive import EXPOSURES, Pass, Undecided, next_pass, share_of, thinned, undecided_rows
+from rig.adaptive_counts import add_pass
+from rig.config import ScanConfig
+from rig.counting import CountVolume
+
+COLUMNS = 200
+ROWS = 100
+
+
+def pass_time(columns: int, exposures: int) -> float:
+    """Frames of 10 us and 2 ms of travel."""
+    return columns * exposures * 1e-5 + 2e-3
+
+
+def undecided(now, halved, n=2) -> Undecided:
+    full = np.zeros(COLUMNS)
+    return Undecided(full + now, full + halved, np.full(COLUMNS, n, np.int32), ROWS)
+
+
+def test_where_all_columns_wait_for_photons_alike_the_next_pass_is_a_plain_sweep() -> None:
+    found = next_pass(undecided(50.0, 65.0), pass_time, 20e-3, 1)
+    assert found is not None
+    assert (found.first_column, found.columns) == (0, COLUMNS)
+
+
+def test_columns_that_decide_nothing_are_left_out() -> None:
+    now, halved = np.full(COLUMNS, 1.0), np.full(COLUMNS, 2.0)
+    now[:60], halved[:60] = 40.0, 40.0  # no light will ever decide these
+    now[120:160], halved[120:160] = 40.0, 70.0
+    found = next_pass(undecided(now, halved), pass_time, 20e-3, 3)
+    assert found is not None
+    assert 110 <= found.first_column <= 125
+    assert 155 <= found.end_column <= 170
+
+
+def test_decided_maps_and_spent_budgets_ask_for_nothing() -> None:
+    assert next_pass(undecided(0.0, 0.0), pass_time, 20e-3, 3) is None
+    assert next_pass(undecided(30.0, 30.0), pass_time, 20e-3, 3) is None
+    assert next_pass(undecided(30.0, 60.0), pass_time, 1e-3, 3) is None
+    assert next_pass(undecided(30.0, 60.0), lambda columns, exposures: None, 1.0, 3) is None
+
+
+@pytest.mark.parametrize("passes", [1, 2, 5])
+def test_a_pass_stays_within_the_budget(passes: int) -> None:
+    left_s = 7.3e-3
+    found = next_pass(undecided(50.0, 70.0), pass_time, left_s, passes)
+    assert found is not None
+    assert pass_time(found.columns, found.exposures) <= left_s
+    assert found.exposures in EXPOSURES
+
+
+def test_gain_follows_the_measured_power_law() -> None:
+    gain = undecided(40.0, 80.0).gain(2)  # halved with each doubling of the frames
+    np.testing.assert_allclose(gain, 20.0)
+    np.testing.assert_allclose(undecided(40.0, 40.0).gain(8), 0.0)
+    assert undecided(25.0, 25.0).share == 0.25
+
+
+def test_rows_that_were_not_searched_are_not_undecided() -> None:
+    confidence = np.array([[0.25, 1.0], [0.0, 0.5]], np.float32)
+    searched = np.array([[True, True], [False, True]])
+    np.testing.assert_allclose(undecided_rows(confidence, searched), [0.75, 0.5])
+
+
+def test_a_pass_has_the_commands_of_its_columns() -> None:
+    whole = ScanConfig(
+        frame_rate="100 kHz", depth_range=["1 m", "8 m"], columns=100, command_range=(-0.5, 0.5), adaptive={}
+    )
+    part = Pass(20, 10, 7).scan(whole)
+    assert (part.columns, part.exposures, part.adaptive) == (10, 7, None)
+    assert part.command_range == pytest.approx((-0.3, -0.2))
+    assert Pass(0, 100, 7).scan(whole).command_range == whole.command_range
+    np.testing.assert_array_equal(share_of([Pass(0, 4, 2), Pass(1, 2, 3)], 4), [2, 5, 5, 2])
+
+
+def volume(columns: int, n, counts, **other) -> CountVolume:
+    fields = {"dark_counts": None, "n_dark": 0, "width": 64, "x0": np.zeros(columns, np.int32)} | other
+    return CountVolume(
+        counts=np.full((columns, 2, 64), counts, np.uint8),
+        n_frames=np.full(columns, n, np.int32),
+        column=np.arange(columns, dtype=float),
+        **fields,
+    )
+
+
+def test_passes_add_up_column_by_column() -> None:
+    dark = np.ones((2, 64), np.uint32)
+    total = volume(4, 3, 1, dark_counts=dark, n_dark=2)
+    part = volume(2, 9, 5, dark_counts=2 * dark, n_dark=3, dark_frames=np.full(64, 1, np.int32))
+    part = replace(part, column=part.column + 0.5)
+    found = add_pass(total, Pass(1, 2, 9), part)
+    np.testing.assert_array_equal(found.n_frames, [3, 12, 12, 3])
+    np.testing.assert_array_equal(found.counts[:, 0, 0], [1, 6, 6, 1])
+    np.testing.assert_allclose(found.column, [0, 1 + 9 * 0.5 / 12, 2 + 9 * 0.5 / 12, 3])
+    np.testing.assert_array_equal(found.dark_counts, 3 * dark)
+    np.testing.assert_array_equal(found.dark_frames, 3)
+    assert found.n_dark == 5
+
+
+def test_counts_are_widened_before_they_overflow_and_lost_columns_stay_lost() -> None:
+    total = replace(volume(2, 0, 0), column=np.array([np.nan, np.nan]))
+    found = add_pass(add_pass(total, Pass(1, 1, 200), volume(1, 200, 200)), Pass(1, 1, 100), volume(1, 100, 100))
+    assert found.counts.dtype == np.uint16
+    np.testing.assert_array_equal(found.counts[:, 0, 0], [0, 300])
+    np.testing.assert_array_equal(found.column, [np.nan, 1.0])
+    with pytest.raises(ValueError, match="other windows"):
+        add_pass(found, Pass(0, 1, 2), volume(1, 2, 1, x0=np.full(1, 64, np.int32)))
+
+
+@pytest.mark.parametrize("n", [2, 3, 7])
+def test_thinned_counts_are_those_of_half_the_frames(n: int) -> None:
+    rng = np.random.default_rng(1)
+    rate = 0.3
+    whole = replace(volume(40, n, 0), counts=rng.binomial(n, rate, (40, 64, 64)).astype(np.uint8))
+    half = thinned(whole)
+    m = n // 2
+    np.testing.assert_array_equal(half.n_frames, m)
+    assert np.all(half.counts <= np.minimum(whole.counts, m))
+    assert np.all(half.counts >= whole.counts.astype(int) - (n - m))
+    sd = np.sqrt(m * rate * (1 - rate) / half.counts.size)
+    assert abs(half.counts.mean() - m * rate) < 4 * sd + 4e-3  # quantiles are those of 256 draws
+    assert half.counts.var() == pytest.approx(m * rate * (1 - rate), rel=0.03)
