@@ -241,6 +241,7 @@ class Acquisition:
             frames_within_s=max(usual.frames_within_s, block_s),
             busy_within_s=max(usual.busy_within_s, block_s),
             waits_within_s=max(self._silence_of_spad_s(), block_s),
+            first_wait_s=max(self._silence_of_spad_s(), block_s, usual.first_wait_s) + exposed_s,
             first_frame_s=usual.first_frame_s + exposed_s,
         )
 

@@ -1,4 +1,4 @@
-"""Which columns of a map deserve more exposures: the pass that is expected to decide most rows for its time.
+"""Which columns of a map deserve more exposures: the passes that are expected to decide most rows in the time left.
 
 A line lights all rows at once, so what can be chosen is columns, by all their rows together. A row is undecided by
 1 - confidence, its posterior probability of being wrong; of a column that share falls about as a power of the frames,
@@ -10,8 +10,11 @@ that no light will ever decide (no stripe, a shadow) leave gamma near 0 and draw
 photons alike, gamma / n is the same everywhere and the best pass is a plain one over all columns.
 """
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +29,13 @@ PassTime = Callable[[int, int], float | None]
 
 EXPOSURES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """Of a further pass; between two of them a pass is hardly better than either."""
-STEPS = 64
-"""A pass begins and ends at a multiple of a share of the columns: finer than what is learned of them."""
+BLOCKS = 64
+"""Of columns, where passes may begin and end: finer than what is learned of them."""
+PRICES = 1.0, 1e7
+"""Rows per second that are worth a plan's time, least and most; tried by halving their logarithm."""
+HALVINGS = 20
+TRAVEL_FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""The more travel counts, the fewer passes a plan has."""
 SMOOTH_COLUMNS = 15
 """Columns over which undecided rows are averaged: of one column they are known to a tenth."""
 MOST_GAMMA = 2.0
@@ -78,37 +86,95 @@ class Undecided:
         now, halved = _smooth(self.now), _smooth(self.halved)
         gamma = np.clip(np.log2(np.maximum(halved, 1e-9) / np.maximum(now, 1e-9)), 0.0, MOST_GAMMA)
         n = np.maximum(self.n_frames, 1)
-        return now * (1 - (n / (n + exposures)) ** gamma)
+        return np.asarray(now * (1 - (n / (n + exposures)) ** gamma))
 
 
 def next_pass(undecided: Undecided, pass_time: PassTime, left_s: float, passes: int) -> Pass | None:
-    """The pass that decides most rows per time, of those that leave the time that is left used up in `passes` passes.
+    """The first pass of the best plan for the time that is left, with at most so many passes; None where none gains.
 
-    None where no pass fits or none decides anything.
+    The plan gives every block of columns a further number of exposures. Neighbours that have the same make a pass, and
+    each pass costs its travel. Of its passes that comes first which decides most rows per time: behind it, columns are
+    looked at again.
     """
     columns = len(undecided.now)
-    edges = np.unique(np.linspace(0, columns, min(columns, STEPS) + 1).round().astype(int))
-    lengths = np.unique(edges[None, :] - edges[:, None])
-    best: tuple[float, Pass] | None = None
-    for exposures in EXPOSURES:
-        gained = np.concatenate([[0.0], np.cumsum(undecided.gain(exposures))])
-        for length in lengths[lengths > 0].tolist():
-            time_s = pass_time(length, exposures)
-            if time_s is None or time_s > left_s:
+    edges = np.unique(np.linspace(0, columns, min(columns, BLOCKS) + 1).round().astype(int))
+    levels = _levels(undecided, pass_time, edges)
+    best: list[tuple[Pass, float]] = []
+    for travel in TRAVEL_FACTORS:
+        low, high = PRICES
+        for _ in range(HALVINGS):
+            price = math.sqrt(low * high)
+            plan = _plan(levels, edges, price, travel)
+            times = [pass_time(one.columns, one.exposures) for one, _ in plan]
+            total_s = sum(math.inf if time_s is None else time_s for time_s in times)
+            if len(plan) > passes or total_s > left_s:
+                low = price
                 continue
-            first = edges[edges + length <= columns]
-            gain = gained[first + length] - gained[first]
-            at = int(gain.argmax())
-            enough = time_s >= left_s / passes
-            rate = float(gain[at]) / (time_s if enough else left_s / passes)
-            if gain[at] > 0 and (best is None or rate > best[0]):
-                best = rate, Pass(int(first[at]), length, exposures)
-    return None if best is None else best[1]
+            high = price
+            if sum(gain for _, gain in plan) > sum(gain for _, gain in best):
+                best = plan
+    if not best:
+        return None
+    return max(best, key=lambda each: each[1] / (pass_time(each[0].columns, each[0].exposures) or math.inf))[0]
+
+
+class _Levels(NamedTuple):
+    """Numbers of further exposures (levels,), the first 0; rows decided and time (blocks, levels); travel (levels,)."""
+
+    exposures: list[int]
+    gain: Array
+    time_s: Array
+    travel_s: Array
+
+
+def _levels(undecided: Undecided, pass_time: PassTime, edges: NDArray[np.int_]) -> _Levels:
+    """What further exposures bring to each block and cost: time goes linearly with columns, but for the travel."""
+    columns, widths = int(edges[-1]), np.diff(edges)
+    part = max(1, columns // 8)
+    exposures, gains, times, travels = [0], [np.zeros(len(widths))], [np.zeros(len(widths))], [0.0]
+    for k in EXPOSURES:
+        short_s, long_s = pass_time(part, k), pass_time(columns, k)
+        if short_s is None or long_s is None:
+            continue
+        per_column_s = (long_s - short_s) / (columns - part) if columns > part else long_s / columns
+        exposures.append(k)
+        gains.append(np.add.reduceat(undecided.gain(k), edges[:-1]))
+        times.append(widths * per_column_s)
+        travels.append(max(0.0, short_s - part * per_column_s))
+    return _Levels(exposures, np.stack(gains, axis=1), np.stack(times, axis=1), np.array(travels))
+
+
+def _plan(levels: _Levels, edges: NDArray[np.int_], price: float, travel: float) -> list[tuple[Pass, float]]:
+    """Passes, and rows they decide, with the largest sum of rows - price * time, travel counted so many times.
+
+    The best level of the blocks up to each one, by dynamic programming.
+    """
+    worth = levels.gain - price * levels.time_s
+    begin = -price * travel * levels.travel_s
+    stay = np.arange(len(levels.exposures))
+    total = worth[0] + begin
+    came_from = []
+    for block in worth[1:]:
+        other = int(total.argmax())
+        begins = total[other] + begin
+        came_from.append(np.where(begins > total, other, stay))
+        total = np.maximum(begins, total) + block
+    level = [int(total.argmax())]
+    for source in reversed(came_from):
+        level.append(int(source[level[-1]]))
+    found: list[tuple[Pass, float]] = []
+    at = 0
+    for same, blocks in groupby(reversed(level)):
+        first, at = at, at + sum(1 for _ in blocks)
+        if same:
+            one = Pass(int(edges[first]), int(edges[at] - edges[first]), levels.exposures[same])
+            found.append((one, float(levels.gain[first:at, same].sum())))
+    return found
 
 
 def undecided_rows(confidence: NDArray[np.float32], searched: NDArray[np.bool_]) -> Array:
     """Rows of each column that are expected to be wrong, (columns,), out of (rows, columns) that were searched."""
-    return np.where(searched, 1.0 - confidence.astype(np.float64), 0.0).sum(axis=0)
+    return np.asarray(np.where(searched, 1.0 - confidence.astype(np.float64), 0.0).sum(axis=0))
 
 
 def thinned(volume: CountVolume, seed: int = 0) -> CountVolume:
@@ -137,7 +203,7 @@ def _thinning(n: int) -> NDArray[np.int64]:
     """
     m = n // 2
     level = (np.arange(_DRAWS) + 0.5) / _DRAWS
-    log_factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, n + 1)))])
+    log_factorial: Array = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, n + 1)))])
     table = np.zeros((n + 1, _DRAWS), np.int64)
     for k in range(n + 1):
         j = np.arange(max(0, m - (n - k)), min(k, m) + 1)
@@ -155,11 +221,3 @@ def _smooth(values: Array) -> Array:
     """Means over neighbouring columns, fewer at the ends."""
     kernel = np.ones(min(SMOOTH_COLUMNS, len(values)))
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
-
-
-def share_of(passes: Sequence[Pass], columns: int) -> Array:
-    """Exposures that each column got in all passes, (columns,)."""
-    total = np.zeros(columns)
-    for one in passes:
-        total[one.part] += one.exposures
-    return total

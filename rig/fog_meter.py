@@ -47,7 +47,7 @@ BLOCKS: Final = 4
 LEAST_EXPOSURES: Final = 50.0
 """Of a bin that takes part."""
 MODEL_SHARE: Final = 0.02
-"""Relative error of the extinction that the model's form brings: bins, and paths of scanner and camera taken as one."""
+"""Relative error that the model's form brings: bins, gains of rows and columns, two path lengths taken as one."""
 REST_SHARE: Final = 1.0
 """Relative error of the extinction over the share of light scattered more than once. Traced: in isotropic fog the decay
 is flatter by 25 to 40 % where `rest` is 0.35 to 0.45 (Mitsuba rows, docs/fog-meter.md)."""
@@ -167,7 +167,8 @@ def _stated(
         off_m, gain = at_stripe[:, 0] - fit.at_m, at_stripe[:, 1]
         shape = gain * np.exp(-2.0 * extinction * off_m)
         slope = np.array([shape.mean(), -2.0 * haze * np.mean(off_m * shape), 0.0, 0.0])
-        veil, veil_sd = float(haze * shape.mean()), float(np.sqrt(slope @ fit.covariance @ slope))
+        veil = float(haze * shape.mean())
+        veil_sd = math.hypot(float(np.sqrt(slope @ fit.covariance @ slope)), MODEL_SHARE * veil)
         if veil > RESOLVED_SIGMAS * veil_sd:
             found |= {"veil_per_exposure": veil, "veil_sd_per_exposure": veil_sd}
             found |= {"veil_to_signal": veil / signal} if signal > 0 else {}

@@ -49,7 +49,8 @@ class LineGrid:
         """Of each column the planes (columns, 3) of those that are lit together with it: (columns, lines - 1, 3)."""
         together = self.columns_at()[self.place]
         own = together == np.arange(len(self.place))[:, None]
-        return plane[together[~own].reshape(len(self.place), self.lines - 1)]
+        result: Array = plane[together[~own].reshape(len(self.place), self.lines - 1)]
+        return result
 
     def bound_commands(self, commands: Array, column: Array) -> Array:
         """Commands at which the lines of all columns stood when the mirror bound them to `column`, both (columns,).

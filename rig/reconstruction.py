@@ -16,6 +16,7 @@ from rig.estimators import ESTIMATORS, FILTERS, Learned, create_estimator, recal
 from rig.fog_meter import FogEstimate, read_fog
 from rig.geometry import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from rig.multi_line import LineGrid
+from rig.multi_line_claims import share_claims
 from rig.multi_line_counter import LineCounter
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
@@ -97,6 +98,8 @@ class Reconstructor:
         """The map of a sweep whose stripe table the estimator gave, in `estimate_s`: filter, depth and intensity."""
         begun = time.perf_counter() - estimate_s
         geometry, fog = self._bound(sweep), self._fog(sweep, stripe)
+        if self._lines is not None:
+            stripe = share_claims(stripe, self._lines)
         if filter == "median":
             from rig.estimators.median import median_filter
 

@@ -137,7 +137,7 @@ class PhotonSource:
     def _planes(self, held: Array) -> Sequence[Array]:
         """Planes (lines, 4) at each of the mirror positions (n,)."""
         if self._of_line is None:
-            return self._planes_of(held)[:, None]
+            return list(self._planes_of(held)[:, None])
         return self._fan.planes(self._planes_of, held, self._command_range)
 
     def _draw(self, spans: list[_Span], first_frame: int, first_word: NDArray[np.int32], words: Words) -> None:

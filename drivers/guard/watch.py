@@ -35,6 +35,8 @@ class GuardLimits:
     low, for a scan marker. An application that is killed or stopped never gets this long."""
     waits_within_s: float = 0.04
     """By one at work whose source thread says that it has asked the SPAD for so long in vain."""
+    first_wait_s: float = 0.3
+    """The same before its first frame."""
     first_frame_s: float = 1.0
     """From `run` to the first one: SPAD, scanner and the scan marker come in between."""
 
@@ -89,9 +91,10 @@ class FrameWatch:
             return None
         self._silent_s += min(elapsed_s, MAX_STEP_S)
         limits = self.limits
-        if self._silent_s <= (limits.frames_within_s if self._begun else limits.first_frame_s):
+        in_vain = waited_s > (limits.waits_within_s if self._begun else limits.first_wait_s)
+        if self._silent_s <= (limits.frames_within_s if self._begun or in_vain else limits.first_frame_s):
             return None
-        if self._begun and waited_s > limits.waits_within_s:
+        if in_vain:
             return f"waited for the SPAD in vain for {self._silent_s * 1e3:.0f} ms after frame {frame}"
         if self._begun and self._silent_s <= limits.busy_within_s and busy():
             return None

@@ -226,15 +226,15 @@ def along_columns(
 ) -> None:
     """The answers of columns first_column..last_column-1, from what `along_rows` left in all rows of message.
 
-    Adds the messages from above to message. Stripes must be enough that some lie RIVAL_FROM from any.
+    Adds the messages from above to message.
     """
     rows, columns, labels = cost.shape
-    memory, papers = _path_memory(_CHUNK, labels), desk_memory(settings, _CHUNK, labels)
-    desk = desk_of(settings, out, papers, _CHUNK, labels)
+    memory, desk_bytes = _path_memory(_CHUNK, labels), desk_memory(settings, _CHUNK, labels)
+    desk = desk_of(settings, out, desk_bytes, _CHUNK, labels)
     paths, row_bytes = _paths_in(memory), columns * labels
     for column in range(first_column, last_column, _CHUNK):
         count, at = min(_CHUNK, last_column - column), column * labels
         costs, messages = address_of(cost) + at, address_of(message) + at
         _go_down(costs, messages, rows, row_bytes, labels, count, penalties, paths)
         _go_up(costs, messages, rows, row_bytes, count, penalties, paths, column, desk)
-    memory[:1] = papers[:1] = 0  # they live until here
+    memory[:1] = desk_bytes[:1] = 0  # they live until here

@@ -5,6 +5,7 @@ the neighbours along four paths (`aggregation_kernels`), and the best label of e
 light and medium is learned as by `likelihood`.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from rig.estimators.label_grid import LabelGrid, label_grid
 from rig.estimators.label_volume import Costs, costs_of
 from rig.estimators.learning import learn_again, lines_of, next_lattice
 from rig.estimators.lessons import Lessons, Seen, Setting, first_model
-from rig.estimators.placing import new_places, place, profile_table
+from rig.estimators.placing import line_width, new_places, place, profile_table
 from rig.estimators.placing_kernels import Places
 from rig.estimators.row_input import State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
@@ -33,6 +34,8 @@ BAND_ROWS = 16
 """Rows whose costs stay in the cache from one step to the next."""
 FIRST_ROUNDS = 3
 """Times that the first map's stripes teach what they are then estimated with again."""
+MOST_NONE = 0.01
+"""A row that is taken to have no stripe passes nothing on from its neighbours: there must be evidence for it."""
 QUIET_COLUMNS = 8
 """Every so manieth column teaches the ambient light where there are dark frames too."""
 
@@ -105,6 +108,8 @@ class Joint:
             stripes = self._stripes(volume, tables)
             quiet = self._quiet(volume, geometry, tables, stripes)
             ambient = ambient_map(volume, volume.intensity(), geometry, quiet)
+            width = line_width(volume, tables.sweep, tables.state, stripes, self._workers)
+            model = replace(model, line_sigma_px=width or model.line_sigma_px)
             model = learn_again(volume, geometry, model, ambient, stripes, self._workers)
         return model
 
@@ -164,6 +169,7 @@ class Joint:
 
 def _tables(setting: Setting, workers: RowWorkers) -> _Tables:
     grid = label_grid(setting.geometry)
-    costs = costs_of(setting.model, setting.geometry, grid, setting.exposures, workers)
+    model = replace(setting.model, none_weight=min(setting.model.none_weight, MOST_NONE))
+    costs = costs_of(model, setting.geometry, grid, setting.exposures, workers)
     shares = profile_table(setting.model.line_sigma_px)
     return _Tables(grid, costs, sweep_of(setting.geometry), state_of(setting.model), shares, setting.dark)

@@ -40,6 +40,8 @@ SPARE_FRAMES = 8
 """A column may have this many frames more than twice the nominal number before its counts are halved."""
 HOT_FACTOR, HOT_FLUX = 4.0, 0.02
 """A pixel is hot for the search from this many times its neighbours' ambient light, and so much more, on."""
+LEAST_VEIL = 0.1
+"""Haze of other lines, over the ambient light, from which it is more than the close-up can overlook."""
 
 
 def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: RowWorkers, *, dark: bool) -> Judge:
@@ -52,7 +54,8 @@ def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: 
     light, log_share = _lights(model)
     reach = max(1, int(np.count_nonzero(state.psi[1:] > TAP_SHARE)))
     bands, columns = state.ambient.shape[0], geometry.columns
-    tables = _empty_tables(columns, bands, padded_lanes(geometry.window), reach, others=geometry.others is not None)
+    veil = geometry.others is not None and model.profile[:, 0].max() > LEAST_VEIL * np.median(model.ambient)
+    tables = _empty_tables(columns, bands, padded_lanes(geometry.window), reach, others=bool(veil))
     most = min(2 * exposures + SPARE_FRAMES, COUNT_LIMIT)
     nominal = exposures / 2.0 ** halvings(exposures, most)
     largest_sum, largest = _largest(sweep, state, light, reach)

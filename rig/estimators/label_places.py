@@ -72,8 +72,9 @@ def _fill_places(
             place[VALID_END] = side * (start - near) + 1
             far, near = (min(hi, last), max(lo, first)) if side > 0 else (max(lo, first), min(hi, last))
             step = FRACTIONS // PHASES
-            low = max(-side * far - SLACK_PX, (-side * (last if side > 0 else first)) - 0.5)
-            high = min(-side * near + SLACK_PX, (-side * (first if side > 0 else last)) + 0.5)
+            # Of the pixels that were stored, all eighths that are nearest to them.
+            low = max(-side * far - SLACK_PX, -side * (last if side > 0 else first) - 4 / FRACTIONS)
+            high = min(-side * near + SLACK_PX, -side * (first if side > 0 else last) + 3 / FRACTIONS)
             place[LABEL] = min(max(int(np.ceil((FRACTIONS * low - at) / step)), 0), stripes)
             # The pixel of the last label is one that tables have.
             high_label = int(np.floor((FRACTIONS * high - at) / step))

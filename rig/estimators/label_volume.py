@@ -18,7 +18,8 @@ from rig.estimators.judging import HOT_FACTOR, HOT_FLUX
 from rig.estimators.label_grid import LabelGrid
 from rig.estimators.label_places import FAR_PX, FRACTIONS, PHASES, VARIANTS, label_pixels, places_of
 from rig.estimators.label_tables import LIGHTS, NONES, LabelTables, fill_tables, mark_rows, number_tables
-from rig.estimators.label_volume_kernels import Ways, fill_costs
+from rig.estimators.label_volume_buffers import Ways
+from rig.estimators.label_volume_kernels import fill_costs
 from rig.estimators.row_input import Row, State, Sweep, row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimators.row_kernels import FLUX_MAX, cell_of
 from rig.estimators.row_model import RowModel, pixel_shares

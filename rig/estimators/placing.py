@@ -8,6 +8,7 @@ from rig.estimators.placing_kernels import (
     FRACTIONS,
     REACH_PX,
     Places,
+    add_moments,
     measure_light,
     pool_amplitude,
     pool_places,
@@ -16,6 +17,7 @@ from rig.estimators.placing_kernels import (
 from rig.estimators.row_input import State, Sweep
 from rig.estimators.row_model import pixel_shares
 from rig.row_threads import RowWorkers
+from rig.stripes import StripeTable
 
 LIGHT_REACH = 3
 """Rows and columns to either side that a stripe's brightness is pooled over."""
@@ -26,6 +28,10 @@ ENOUGH = 1 / 0.06**2
 BEYOND = 3.0
 """Brightness may exceed the learned amplitudes by this factor either way."""
 SLOPE_STEP_PX = 0.05
+LEAST_PHOTONS = 100.0
+"""Photons per exposure, over all stripes, that can tell the width of the line."""
+LINE_SIGMA_PX = np.array([0.25, 2.4])
+"""Widths that are looked for."""
 
 
 def profile_table(sigma_px: float) -> NDArray[np.float32]:
@@ -70,3 +76,17 @@ def place(
     over(pool_places, places, REACHES, ENOUGH, after=(moved, sd))
     x_px += moved
     return sd
+
+
+def line_width(
+    volume: CountVolume, sweep: Sweep, state: State, stripes: StripeTable, workers: RowWorkers
+) -> float | None:
+    """Standard deviation of the line in px, from the light of clear stripes around their places; None: too little."""
+    sums = np.zeros((stripes.x_px.shape[0], 2))
+    seen = volume.counts, volume.n_frames, sweep, state, stripes.x_px, stripes.x_sd_px, stripes.confidence
+    workers.over(len(sums), lambda first, last: add_moments(*seen, first, last, sums))
+    light, moment = sums.sum(axis=0)
+    if light < LEAST_PHOTONS:
+        return None
+    pixel_variance = 1 / 12
+    return float(np.sqrt(np.clip(moment / light - pixel_variance, *LINE_SIGMA_PX**2)))

@@ -28,8 +28,11 @@ FRACTIONS: Final = 16
 SAME_PX: Final = np.float32(1.0)
 """Neighbours whose distances from the far end differ by no more lie on the same surface."""
 LEAST_FLUX: Final = np.float32(1e-5)
-LEAST_LIGHT: Final = np.float32(1e-3)
-"""Stripes are taken to be at least this part of the brightest."""
+CLEAR: Final = 0.9
+CLEAR_SD_PX: Final = 0.2
+"""Stripes this clear, and placed this well, tell the width of the line."""
+FEW_FRAMES: Final = 3.0
+"""Up to so many frames counts are taken as they are: the flux of a full pixel would be a guess."""
 
 
 class Places(NamedTuple):
@@ -196,3 +199,42 @@ def pool_places(
                 step = sums[0, c] / max(known, np.float32(1e-12)) - places.distance[y, c]
                 moved[y, c] = min(max(step, np.float32(-1.0)), np.float32(1.0)) if known > 0.0 else np.float32(0.0)
                 sd[y, c] = min(np.float32(1.0) / np.sqrt(max(known, np.float32(1e-12))), np.float32(1.0))
+
+
+@numba.njit(cache=True, nogil=True)
+def add_moments(
+    counts: NDArray[np.unsignedinteger],
+    n_frames: NDArray[np.int32],
+    sweep: Sweep,
+    state: State,
+    x_px: Float32,
+    sd_px: Float32,
+    confidence: Float32,
+    first_row: int,
+    last_row: int,
+    sums: NDArray[np.float64],
+) -> None:
+    """Add to sums (rows, 2) the light of clear stripes within REACH_PX, and that times its squared distance less sd^2.
+
+    Light above haze and ambient, photons; what is added to a row of sums comes from that row of the picture.
+    """
+    for y in range(first_row, last_row):
+        for c in range(x_px.shape[1]):
+            if not (confidence[y, c] > CLEAR and sd_px[y, c] < CLEAR_SD_PX and n_frames[c] > 0):
+                continue
+            x = int(np.rint(x_px[y, c]))
+            if x - REACH_PX < max(sweep.x0[c], 0) or x + REACH_PX >= min(sweep.x0[c] + sweep.window, sweep.u.shape[1]):
+                continue
+            path_p, strength = line_light(sweep, state, y, c, x)
+            before, behind, _, _, _, _ = fluxes_at(sweep, state, y, x, sweep.plane[c], path_p, strength)
+            side = 1 if sweep.near_is_left else -1
+            frames = np.float64(n_frames[c])
+            for t in range(x - REACH_PX, x + REACH_PX + 1):
+                away = t - np.float64(x_px[y, c])
+                lit = min(max(0.5 - side * away, 0.0), 1.0)
+                base = state.ambient[y, t] - state.ambient[y, x] + behind + lit * (before - behind)
+                n = min(np.float64(counts[c, y, t - sweep.x0[c]]), frames)
+                light = np.log((frames + 0.5) / (frames - n + 0.5)) if frames > FEW_FRAMES else n / frames
+                light -= base if frames > FEW_FRAMES else -np.expm1(-base)
+                sums[y, 0] += light
+                sums[y, 1] += light * (away * away - sd_px[y, c] * sd_px[y, c])

@@ -108,9 +108,13 @@ class SerialServer(WireServer[SerialModel]):
                     self._turn(master)
                 wait_s = _TURN_S if self._outbox else _IDLE_S
             if master is None:
-                self._ending.wait(_IDLE_S)
+                self._rest()
             else:
                 self._await_input(master, wait_s)
+
+    def _rest(self) -> None:
+        """One turn of a device that hangs or is not plugged in: what comes stays where it is."""
+        self._ending.wait(_IDLE_S)
 
     def _await_input(self, master: int, wait_s: float) -> None:
         with self._waiting:

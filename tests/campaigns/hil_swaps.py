@@ -2,8 +2,8 @@
 
 python -m tests.campaigns.hil_swaps --runs 5
 
-A scan of emulated devices with several buffers of points is recorded and replayed. The limit, 2 ms, is meant for a quiet
-machine. Passes where every run says what was said, in time.
+A scan of emulated devices with several buffers of points is recorded and replayed. The limit, 2 ms, is meant for a
+quiet machine. Passes where every run says what was said, in time.
 """
 
 import argparse

@@ -25,14 +25,14 @@ PASSED = "kernel_guest: passed"
 
 def passed(command: Sequence[str | Path], within_s: float) -> bool:
     """Run a machine whose terminal is its output. One that hangs is killed: it takes no other signal."""
-    found = False
     limited = ["timeout", "-s", "KILL", str(within_s), *command]
-    with subprocess.Popen(limited, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as process:
+    said = ""
+    with subprocess.Popen(limited, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        for line in process.stdout:
-            found = found or line.startswith(PASSED)
-            print(line, end="", flush=True)
-    return found
+        while piece := os.read(process.stdout.fileno(), 4096).decode(errors="replace"):
+            said += piece
+            print(piece, end="", flush=True)
+    return PASSED in said
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -42,7 +42,8 @@ def main(arguments: Sequence[str]) -> None:
             subprocess.run(["mount", "-t", kind, kind, place], check=True)
         os.chdir(ROOT)
         environment = {"PATH": os.defpath, "HOME": "/tmp", "PYTHONDONTWRITEBYTECODE": "1"}
-        tests = [sys.executable, "-m", "pytest", "-q", "-o", f"faulthandler_timeout={HANGS_S}", "-p", "no:cacheprovider", "--color=no", *arguments]
+        how = ["-q", "--color=no", "-p", "no:cacheprovider", "-o", f"faulthandler_timeout={HANGS_S}"]
+        tests = [sys.executable, "-m", "pytest", *how, *arguments]
         ran = subprocess.run(tests, env=environment, check=False)
         print(PASSED if ran.returncode == 0 else f"kernel_guest: pytest ended with {ran.returncode}", flush=True)
     except BaseException:

@@ -28,8 +28,7 @@ TESTS = (
     "tests/wire/test_prawndo.py",
 )
 LEFT_OUT = "not simulated and not replay and not takes_nothing"
-"""What is not on a wire; and a device that takes nothing: an adapter and its driver take some 100 kB in its place, and
-then QEMU itself stands still."""
+"""What is not on a wire; and a device that takes nothing: an adapter takes all in its place."""
 WITHIN_S = 3600.0
 
 

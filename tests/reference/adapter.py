@@ -29,8 +29,10 @@ def reconstruct(
     return reconstructor.map(volume_of(reconstructor, part, exposures))
 
 
-def reconstructor_of(point: WorkingPoint, estimator: str, filter: str = "none", threads: int = 2) -> Any:
-    """The project's Reconstructor for the rig of a working point; it has learned nothing yet."""
+def reconstructor_of(
+    point: WorkingPoint, estimator: str, filter: str = "none", threads: int = 2, lines: Any = None
+) -> Any:
+    """The project's Reconstructor for the rig of a working point; it has learned nothing yet. lines: a LineGrid."""
     from calibration.files import load_rig_model
     from rig.reconstruction import Reconstructor
 
@@ -38,8 +40,9 @@ def reconstructor_of(point: WorkingPoint, estimator: str, filter: str = "none", 
         model = load_rig_model(point.write_calibration(Path(folder)))
     commands = np.arange(point.geometry.columns, dtype=np.float64)
     return Reconstructor(
-        model, commands, DEPTH_RANGE_M, estimator=estimator, filter=filter, min_confidence=0.5, threads=threads
-    )
+        model, commands, DEPTH_RANGE_M, estimator=estimator, filter=filter, min_confidence=0.5, threads=threads,
+        lines=lines,
+    )  # fmt: skip
 
 
 def volume_of(reconstructor: Any, counts: NDArray[np.unsignedinteger], exposures: int) -> Any:

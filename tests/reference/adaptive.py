@@ -113,8 +113,8 @@ def sweep_s(columns: int, exposures: int) -> float:
 
 
 def study(
-    scene: Scene, point: str, estimator: str, *, first: int, passes: int, budget: float, fixed: Sequence[int], seed: int,
-    rows: slice,
+    scene: Scene, point: str, estimator: str, *, first: int, passes: int, budget: float, fixed: Sequence[int],
+    seed: int, rows: slice,
 ) -> Rescan:  # fmt: skip
     """Plain sweeps and passes over one scene. budget: of the sensor time of a plain sweep at K = 10."""
     from rig.adaptive import Pass, Undecided, next_pass, thinned, undecided_rows
@@ -138,7 +138,8 @@ def study(
     total = sweep_s(500, 10)
     counts, n_frames, taken, track, spent = np.uint8(0), np.zeros(it.columns, np.int32), [], [], 0.0
     while one is not None:
-        counts = counts + it.draw(scout.geometry, one.exposures, 2000 + seed + len(taken), one.first_column, one.end_column)
+        drawn = 2000 + seed + len(taken)
+        counts = counts + it.draw(scout.geometry, one.exposures, drawn, one.first_column, one.end_column)
         n_frames[one.part] += one.exposures
         spent += sweep_s(one.columns, one.exposures)
         taken.append(one)

@@ -49,22 +49,28 @@ class Lines:
     ) -> NDArray[np.unsignedinteger]:
         """Counts (columns, H, window) of the pixels from x0 on; those lit together are of the same frames."""
         g = point.geometry
-        places = g.columns // self.lines
         out = np.zeros((g.columns, g.height, window), np.uint8 if exposures <= 255 else np.uint16)
 
         def draw(place: int) -> None:
-            together = range(place, g.columns, places)
-            flux = point.ambient.copy()
-            for c in together:
-                flux += self.share * (point.flux_of_column(c) - point.ambient)
-            seen = np.random.default_rng([seed, place]).binomial(exposures, -np.expm1(-flux))
-            for c in together:
+            seen = self.counts_at(point, place, exposures, seed)
+            for c in self.together(place):
                 part = seen[:, x0[c] : x0[c] + window]
                 out[c, :, : part.shape[1]] = part
 
         with ThreadPoolExecutor(THREADS) as pool:
-            list(pool.map(draw, range(places)))
+            list(pool.map(draw, range(COLUMNS // self.lines)))
         return out
+
+    def counts_at(self, point: WorkingPoint, place: int, exposures: int, seed: int) -> NDArray[np.integer]:
+        """Counts (H, W) of the frames of a place of the mirror."""
+        flux = point.ambient.copy()
+        for c in self.together(place):
+            flux += self.share * (point.flux_of_column(c) - point.ambient)
+        return np.random.default_rng([seed, place]).binomial(exposures, -np.expm1(-flux))
+
+    def together(self, place: int) -> range:
+        """Columns that are lit there."""
+        return range(place, COLUMNS, COLUMNS // self.lines)
 
     @property
     def grid(self) -> Any:
@@ -95,12 +101,10 @@ def measure(
     """Figures of one map by estimator. told: whether it knows that there are other lines."""
     counts: NDArray[np.unsignedinteger] | None = None
     for estimator in estimators:
-        reconstructor = reconstructor_of(point, estimator)
+        reconstructor = reconstructor_of(point, estimator, lines=lines.grid if lines.lines > 1 and told else None)
         geometry = reconstructor.geometry
         if counts is None:
             counts = lines.counts(point, geometry.x0, geometry.window, exposures, seed)
-        if lines.lines > 1 and told:
-            reconstructor.geometry = replace(geometry, others=lines.grid.others(geometry.plane))
         volume = replace(volume_of(reconstructor, counts, exposures), **dark_frames(point, lines, exposures, seed))
         stripe = reconstructor.map(volume).stripe
         scored = point.trusted & np.isfinite(point.truth())

@@ -53,7 +53,7 @@ def test_sums_that_are_all_zeros_all_ones_or_nowhere() -> None:
     assert np.isfinite(fit_fog(few, PATH_M).covariance).all()
 
 
-@covers("rig.fog_meter:read_fog", "rig.fog_kernels:add_clear_rows")
+@covers("rig.fog_kernels:add_clear_rows")
 @pytest.mark.parametrize("level", [0, 1, 5])
 def test_pictures_without_any_contrast_have_no_fog(level) -> None:
     sweep = swept(Light(), 5)
@@ -64,7 +64,6 @@ def test_pictures_without_any_contrast_have_no_fog(level) -> None:
     assert fog.visibility_m is None
 
 
-@covers("rig.fog_meter:read_fog")
 def test_maps_without_an_answer_have_no_fog() -> None:
     sweep = swept(Light(), 1)
     nothing = StripeTable.empty(*sweep.point.x_true.shape)

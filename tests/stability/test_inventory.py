@@ -20,6 +20,9 @@ ELSEWHERE = {
         "tests/unit/estimators/test_search.py", "rig.estimators.best_kernels:*", "rig.estimators.row_search:*",
         "rig.estimators.screen_tables:*", "rig.estimators.search_*:*", "rig.estimators.judging:*",
     ),
+    "rows of a simulated scene, whose light test_light.py holds": (
+        "tests/unit/rig/test_scene_limits.py", "rig.scene_limits:*",
+    ),
     "labels around the best position, against the likelihood itself": (
         "tests/unit/estimators/test_closeup.py", "rig.estimators.closeup_kernels:*",
     ),

@@ -16,7 +16,7 @@ from rig.acquisition import Acquisition
 from rig.estimators import ESTIMATORS, lessons
 from tests.system.small_rig import config, write_rig
 
-MAPS, LESSON_FRAMES = 8, 1600
+MAPS, LESSON_FRAMES = 5, 1600
 """Maps of 800 lit frames, and how many there are from one lesson to the next."""
 EMULATED: dict[str, Any] = {
     "world": {"kind": "emulated", "geometry": "./rig.yaml", "scene": "street", "laser": "obis"},

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from drivers.guard import GuardLimits
 from tests.wire.guard_strikes import EMISSION_S, GONE_S, NEVER_S
 from tests.wire.scan_rig import STEP_S, Applications, ScanBench, scan_bench
 
@@ -14,6 +15,8 @@ MAPS = 40
 """Of a scan that is struck: about a second."""
 LONG_S = 1.1
 """From the first light to beyond the end of the scan."""
+FIRST_FRAME_S = GuardLimits().first_frame_s + GONE_S
+"""Light is gone after this where the SPAD fell silent before its first frame was taken."""
 OPENING_S = {"obis": 1.2, "cobolt": 7.0}
 """From the start to the first light, about."""
 FULL_BYTES = 16_384
@@ -80,7 +83,7 @@ SCAN_STRIKES = {
     "spad unplugged": ScanStrike(lambda bench: bench.world.spad_plug.unplug(), own_end=True),
     "spad falls silent": ScanStrike(_silence_spad, own_end=True, silence="40 ms"),
     "spad silent under labour": ScanStrike(
-        _silence_spad, own_end=True, silence="40 ms", labours=True, light_s=NEVER_S, emission_s=EMISSION_S + NEVER_S
+        _silence_spad, silence="40 ms", labours=True, light_s=FIRST_FRAME_S, emission_s=EMISSION_S + FIRST_FRAME_S
     ),
     "scanner unplugged": ScanStrike(lambda bench: bench.world.scanner_plug.unplug(), own_end=True),
     "gate unplugged": ScanStrike(_unplug_gate, own_end=True),

@@ -46,6 +46,12 @@ def test_work_is_no_excuse_where_the_spad_was_asked_in_vain(watch: FrameWatch) -
     assert [watch.look(TICK_S, 2, False, lambda: True, LIMITS.waits_within_s) for _ in range(20)] == [None] * 20
 
 
+def test_a_spad_that_never_sends_a_frame_has_a_little_longer(watch: FrameWatch) -> None:
+    seen = [watch.look(TICK_S, 0, False, lambda: True, tick * TICK_S) for tick in range(33)]
+    assert seen[:30] == [None] * 30
+    assert "in vain" in str(seen[32])
+
+
 def test_late_frames_are_told_to_whoever_asks_also_of_one_at_work(watch: FrameWatch) -> None:
     watch.look(TICK_S, 1, False, lambda: True)
     assert not watch.quiet

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rig.adaptive import EXPOSURES, Pass, Undecided, next_pass, share_of, thinned, undecided_rows
+from rig.adaptive import EXPOSURES, Pass, Undecided, next_pass, thinned, undecided_rows
 from rig.adaptive_counts import add_pass
 from rig.config import ScanConfig
 from rig.counting import CountVolume
@@ -77,7 +77,6 @@ def test_a_pass_has_the_commands_of_its_columns() -> None:
     assert (part.columns, part.exposures, part.adaptive) == (10, 7, None)
     assert part.command_range == pytest.approx((-0.3, -0.2))
     assert Pass(0, 100, 7).scan(whole).command_range == whole.command_range
-    np.testing.assert_array_equal(share_of([Pass(0, 4, 2), Pass(1, 2, 3)], 4), [2, 5, 5, 2])
 
 
 def volume(columns: int, n, counts, **other) -> CountVolume:

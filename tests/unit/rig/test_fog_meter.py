@@ -49,10 +49,10 @@ def read(sweep: Sweep, ambient=1.0) -> FogEstimate:
 
 @cache
 def pulls() -> dict[str, np.ndarray]:
-    """Errors over their bars in 36 maps of all sorts of fog, the ambient light known within 30 %; NaN: unresolved."""
+    """Errors over their bars in 32 maps of all sorts of fog, the ambient light known within 30 %; NaN: unresolved."""
     rng = np.random.default_rng(3)
     found = {"extinction": [], "ambient": [], "veil": []}
-    for i in range(36):
+    for i in range(32):
         haze, ambient, extinction = np.exp(rng.uniform(np.log([0.05, 0.003, 0.02]), np.log([0.4, 0.05, 0.5])))
         sweep = swept(
             Light(haze=haze, ambient=ambient, extinction_per_m=extinction), int(rng.choice([1, 2, 5, 10, 30])), i
@@ -76,7 +76,7 @@ def pulls() -> dict[str, np.ndarray]:
 def test_error_bars_cover_the_truth(figure) -> None:
     found = pulls()[figure]
     known = found[np.isfinite(found)]
-    assert len(known) >= 25
+    assert len(known) >= 22
     assert np.mean(np.abs(known) <= 1) >= 0.6
     assert np.mean(np.abs(known) <= 2) >= 0.9
     # Nor are they so wide as to say nothing.

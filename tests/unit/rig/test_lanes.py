@@ -14,6 +14,7 @@ from rig.lane_memory import (
     load_four,
     load_int16,
     load_two_rows,
+    load_widened,
     read_float32,
     read_int16,
     read_int32,
@@ -77,6 +78,9 @@ OPERATIONS = {
     "shift right": (numba.njit(lambda a, b: a >> 5), lambda a, b: a.view(np.uint16) >> 5),
     "shift left": (numba.njit(lambda a, b: a << 3), lambda a, b: wide(a) << 3),
     "with a number": (numba.njit(lambda a, b: (a & 0x55) + 7), lambda a, b: (a & 0x55) + 7),
+    "scaled": (numba.njit(lambda a, b: lanes.scaled(a, b)), lambda a, b: (wide(a) * b + (1 << 14)) >> 15),
+    "reversed": (numba.njit(lambda a, b: lane_shuffles.reversed_lanes(a)), lambda a, b: a[::-1]),
+    "the last one everywhere": (numba.njit(lambda a, b: lane_shuffles.last_everywhere(a)), lambda a, b: 0 * a + a[-1]),
     "one lane up": (numba.njit(lambda a, b: lane_shuffles.up_1(a)), lambda a, b: np.append(0, a[:-1])),
 }
 
@@ -368,3 +372,14 @@ def test_four_numbers_are_scaled_and_added():
     a, out = np.arange(8, dtype=np.float32), np.zeros(8, np.float32)
     scale(a, np.float32(0.25), out)
     np.testing.assert_array_equal(out, [0, 0.5, 0.75, 1, 1.25, 0, 0, 0])
+
+
+def test_bytes_become_wider_lanes():
+    @numba.njit
+    def kernel(a, out):
+        store_int16(address_of(out), 0, load_widened(address_of(a), 3))
+
+    a, out = np.arange(120, 152, dtype=np.uint8), np.empty(LANES, np.int16)
+    a[5] = 255
+    kernel(a, out)
+    np.testing.assert_array_equal(out, a[3 : 3 + LANES])

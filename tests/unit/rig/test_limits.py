@@ -16,7 +16,7 @@ from tests.reference.scene import Scene, load_scene
 from tests.reference.working_point import POINTS, WorkingPoint, score
 from tests.unit.small_maps import street
 
-ROWS = 32
+ROWS = 16
 EXPOSURES = (1, 3, 10, 20)
 
 
@@ -56,7 +56,7 @@ def scene(name: str) -> Scene:
 def beside_the_genie(name: str, light: str) -> tuple[list[float], list[float], list[float]]:
     """Mean errors over the exposures: limit, its standard error, genie."""
     world = scene(name)
-    g = Geometry.build(height=ROWS, width=world.shape[1], columns=120)
+    g = Geometry.build(height=ROWS, width=world.shape[1], columns=96)
     point = WorkingPoint(world, POINTS[light], g)
     places = np.argwhere(point.trusted)
     some = places[np.random.default_rng(1).permutation(len(places))[:100]]

@@ -12,12 +12,14 @@ from rig.counting import BIN_DARK, BIN_UNUSABLE, SweepCounter, SweepLayout
 from rig.errors import PlanError
 from rig.geometry import sweep_geometry
 from rig.multi_line import LineGrid, line_grid, window_overlap
+from rig.multi_line_claims import share_claims
 from rig.multi_line_counter import LineCounter
 from rig.plan import compile_plan
 from rig.recalibrated import recalibrated
 from rig.recording.plain import from_plain, to_plain
 from rig.row_threads import RowWorkers
 from rig.scan_plan import ScanPlan
+from rig.stripes import StripeTable
 from tests.unit.rig.streams import NO_LAG, SPAD, plan_of, rig_model, scan, scanner_limits, timer_clock
 from tests.unit.rig.test_counting import packed, stream
 
@@ -175,3 +177,14 @@ def test_windows_of_frames_are_refused():
         counter = LineCounter(SweepLayout(4, 2, 128, np.zeros(4, np.int32), 64, 1), grid, workers)
         with pytest.raises(ValueError, match="64 pixels a row; several lines need all 128"):
             counter.add(np.zeros((1, 2, 8), np.uint8), np.zeros(1, np.int32), np.zeros(1), np.zeros(1, np.int32))
+
+
+def test_answers_that_take_the_same_stripe_share_what_they_are_worth():
+    grid, _ = line_grid((0.0, 1.0, 2.0), 6, (0.0, 1.0))  # columns 0 2 4 and 1 3 5 are of the same frames
+    table = StripeTable.empty(1, 6)
+    table.x_px[0] = [10.0, 10.5, 11.0, 30.0, 60.0, np.nan]
+    table.confidence[0] = [0.9, 0.8, 0.3, 0.7, 0.6, 0.0]
+    shared = share_claims(table, grid)
+    np.testing.assert_allclose(shared.confidence[0], [0.9 * 0.75, 0.8, 0.3 * 0.25, 0.7, 0.6, 0.0], rtol=1e-6)
+    assert shared.x_px is table.x_px
+    assert shared.confidence.dtype == np.float32

@@ -1,0 +1,112 @@
+"""Where the compiled label costs find their tables and keep what they work on: addresses, for `rig.lane_memory`."""
+
+from typing import Final, NamedTuple
+
+import numba
+
+from rig.aligned import CACHE_LINE
+from rig.estimators.label_places import FAR_PX, PHASES, VARIANTS
+from rig.estimators.label_tables import LIGHTS, NONES
+from rig.lanes import LANES
+
+BATCH: Final = LANES
+"""Rows that go through each part of the work together: what one waits for, the others fill."""
+POSITION: Final = PHASES * LIGHTS * LANES
+"""Numbers that a vector of pixels has in a table."""
+
+
+class Ways(NamedTuple):
+    """How scores and costs are counted.
+
+    units: of scores per nat, a power of two; bits: of the largest count; most: exposures up to which counts are not
+    halved; down: power of two that scores are divided by to be costs; reach: taps on either
+    side; side, stripes, none: as in `LabelGrid`; band_rows: rows that share tables.
+    """
+
+    units: float
+    bits: int
+    most: int
+    down: int
+    reach: int
+    side: int
+    stripes: int
+    none: int
+    band_rows: int
+
+
+class At(NamedTuple):
+    """Addresses of what tables and places hold, see there, and the elements from table to table."""
+
+    edge: int
+    edge_sum: int
+    pixels: int
+    tap: int
+    taps: int
+    constant: int
+    constants: int
+    none: int
+    span: int
+    hot_start: int
+    hot_x: int
+
+
+class Buffers(NamedTuple):
+    """Addresses; of BATCH rows, int16 unless said, with the elements from row to row.
+
+    n: counts of pixels from far to near; sums: score of a change at each pixel, the first one BASE; score: of pixel
+    and phase; top, top_sum: largest ones of some lanes each, later of all; total: score of all pixels lying behind.
+    cost: bytes of labels, from that of the first pixel's phase 0 on. Of all rows: mask: bytes, EXCLUDED or 0 for each
+    label; constant: of positions, edge: of pixels, none: of 'no stripe', for each variant; through: room for sums. As
+    int32, table: of variants from -1 on, -1 where there is none; here: of each row of the batch; shown: labels that the
+    mask is for, from and up to. labels: how many there are.
+    """
+
+    n: int
+    n_row: int
+    sums: int
+    score: int
+    score_row: int
+    top: int
+    top_sum: int
+    total: int
+    cost: int
+    cost_row: int
+    mask: int
+    constant: int
+    edge: int
+    none: int
+    through: int
+    table: int
+    here: int
+    shown: int
+    labels: int
+
+
+@numba.njit(forceinline=True)
+def buffers_at(begin, pixels, vectors, labels):  # type: ignore[no-untyped-def]
+    """The buffers from an address on, and where they end."""
+    n_row = _whole(max(pixels, FAR_PX + vectors * LANES + LANES) + LANES)
+    score_row = vectors * PHASES * LANES
+    cost_row = _whole(max(labels, score_row) + 2 * 2 * LANES)
+    sums = begin + 2 * BATCH * n_row
+    score = sums + 2 * BATCH * n_row
+    top = score + 2 * BATCH * score_row
+    top_sum = top + 2 * BATCH * LANES
+    total = top_sum + 2 * BATCH * LANES
+    cost = total + 2 * LANES
+    mask = cost + BATCH * cost_row
+    constant = mask + _whole(labels)
+    edge = constant + 2 * VARIANTS * vectors * POSITION
+    none = edge + 2 * VARIANTS * pixels
+    through = none + 2 * VARIANTS * NONES
+    table = through + 2 * (pixels + 2 * LANES)
+    here = table + 4 * (VARIANTS + 1)
+    buffers = Buffers(begin, n_row, sums, score, score_row, top, top_sum, total, cost, cost_row, mask, constant, edge,
+                       none, through, table, here, here + 4 * BATCH, labels)  # fmt: skip
+    return buffers, here + 4 * (BATCH + 2)
+
+
+@numba.njit(inline="always")
+def _whole(number):  # type: ignore[no-untyped-def]
+    """The next multiple of a cache line's bytes."""
+    return -(-number // CACHE_LINE) * CACHE_LINE

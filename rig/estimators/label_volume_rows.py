@@ -1,0 +1,231 @@
+"""Compiled parts of the label costs that a batch of rows goes through: sums, scores, costs.
+
+Running sums carry the evidence of all pixels behind a label, taps that of the pixels around it; scores are saturating
+16-bit numbers. The two phases of a pixel make the low and the high byte of the same 16 bits, which is their order.
+Each part is a function of its own, not inlined: all in one, the compiler keeps a register for every address.
+"""
+
+from typing import Final
+
+import numba
+import numpy as np
+
+from rig.aligned import CACHE_LINE
+from rig.estimators.label_places import (
+    FAR_PX,
+    LABEL,
+    LABEL_END,
+    MEND,
+    ODD,
+    PHASES,
+    PLACES,
+    START,
+    VALID,
+    VALID_END,
+    VARIANT,
+)
+from rig.estimators.label_tables import BEFORE, BEHIND, CHANGE, NONES
+from rig.estimators.label_volume_buffers import POSITION, At, Buffers, Ways
+from rig.lane_memory import (
+    load_bytes,
+    load_int16,
+    load_widened,
+    prefetch,
+    read_byte,
+    read_float32,
+    read_int16,
+    read_int32,
+    store_bytes,
+    store_int16,
+    write_byte,
+    write_int16,
+    write_int32,
+)
+from rig.lane_reductions import largest_of_rows
+from rig.lane_shuffles import last_everywhere, reversed_lanes, running_sum
+from rig.lanes import LANES, add_saturated, as_bytes, larger, scaled, smaller, sub_saturated, zero_bytes, zero_int16
+
+COST_LIMIT: Final = 160
+"""Largest cost of a label that is not excluded."""
+EXCLUDED: Final = 255
+"""Cost of a label that cannot be: outside the picture, more than a pixel outside the row's search window, or none."""
+BASE: Final = np.int16(-8000)
+"""Score of 'everything is before the stripe': most of the range lies above it."""
+HIGHEST: Final = 30000
+"""Scores and their parts are cut there."""
+COUNT_BITS: Final = 15
+"""Counts are kept as fractions of 2^15 of what they can be."""
+
+
+@numba.njit(cache=True, nogil=True)
+def read_bytes(
+    counts: int, begin: int, places: int, stored: tuple[int, int, int, int], side: int, pixels: int, shift: int,
+    b: Buffers, batch: int,
+) -> None:  # fmt: skip
+    """Fill n, from far to near; what lies outside the stored pixels is of any value.
+
+    counts: address of the first of all, begin: place of the first row's. stored: first pixel, pixels of a row, all
+    counts, counts of a column. shift: power of two that counts are multiplied with.
+    """
+    x0, window, size, column = stored
+    times = np.int16(1 << shift) if shift >= 0 else np.int16(0)
+    for r in range(batch):
+        if read_int32(b.here, r) < 0:
+            continue
+        n, start = b.n + 2 * r * b.n_row, np.int64(read_int16(places, PLACES * r + START)) - x0
+        first = begin + r * window + start
+        low = first - pixels if side > 0 else first
+        if shift < 0 or low < 0 or low + pixels + LANES > size:
+            for p in range(pixels):
+                x = start - side * p
+                count = np.int64(read_byte(counts + begin + r * window, x)) if 0 <= x < window else np.int64(0)
+                write_int16(n, p, np.int16(count << shift if shift >= 0 else count >> -shift))
+            continue
+        # The next column's counts will be wanted when this one's last row has been read.
+        for line in range(0, pixels + LANES, CACHE_LINE):
+            prefetch(counts + low + column + line)
+        if side > 0:
+            for p in range(0, pixels, LANES):
+                store_int16(n, p, reversed_lanes(load_widened(counts + first - p, 1 - LANES)) * times)
+        else:
+            for p in range(0, pixels, LANES):
+                store_int16(n, p, load_widened(counts + first, p) * times)
+
+
+@numba.njit(cache=True, nogil=True)
+def mend_rows(at: At, places: int, y: int, per_nat: float, side: int, b: Buffers, batch: int) -> None:
+    """Give pixels that the table weighs, but that the row lacks, or that are hot, a count that says nothing.
+
+    y: row of the first; per_nat: units times exposures.
+    """
+    for r in range(batch):
+        i, place = np.int64(read_int32(b.here, r)), places + 2 * PLACES * r
+        if i < 0 or not read_int16(place, MEND):
+            continue
+        n, start = b.n + 2 * r * b.n_row, np.int64(read_int16(place, START))
+        begin, end = np.int64(read_int16(at.span, 2 * i)), np.int64(read_int16(at.span, 2 * i + 1))
+        for p in range(begin, end):
+            if not read_int16(place, VALID) <= p < read_int16(place, VALID_END):
+                write_int16(n, p, _neutral(at, i, p, per_nat))
+        for h in range(read_int32(at.hot_start, y + r), read_int32(at.hot_start, y + r + 1)):
+            p = side * (start - np.int64(read_int16(at.hot_x, h)))
+            if begin <= p < end:
+                write_int16(n, p, _neutral(at, i, p, per_nat))
+
+
+@numba.njit(forceinline=True)
+def _neutral(at, i, p, per_nat):  # type: ignore[no-untyped-def]
+    """The count at which a pixel is as likely before the stripe as behind it."""
+    weight = np.float32(read_int16(at.edge, i * at.pixels + p))
+    constant = read_float32(at.edge_sum, i * at.pixels + p)
+    if p > 0:
+        constant -= read_float32(at.edge_sum, i * at.pixels + p - 1)
+    if weight == 0.0:
+        return np.int16(0)
+    count = -constant * np.float32(per_nat) / weight * np.float32(1 << COUNT_BITS)
+    return np.int16(min(max(count, np.float32(0.0)), np.float32(HIGHEST)))
+
+
+@numba.njit(cache=True, nogil=True)
+def sum_edges(at: At, places: int, b: Buffers, batch: int) -> None:
+    """Fill sums, total and top_sum."""
+    pixels = at.pixels
+    for r in range(batch):
+        i = np.int64(read_int32(b.here, r))
+        if i < 0:
+            continue
+        n, sums = b.n + 2 * r * b.n_row, b.sums + 2 * r * b.n_row
+        edge, constant = (
+            at.edge + 2 * pixels * i,
+            b.edge + 2 * pixels * np.int64(read_int16(places, PLACES * r + VARIANT)),
+        )
+        carry = zero_int16() + BASE
+        top = carry
+        write_int16(sums, 0, BASE)
+        for p in range(0, pixels, LANES):
+            rise = running_sum(add_saturated(scaled(load_int16(n, p), load_int16(edge, p)), load_int16(constant, p)))
+            through = add_saturated(rise, carry)
+            store_int16(sums, p + 1, through)
+            top = larger(top, through)
+            carry = add_saturated(carry, last_everywhere(rise))
+        store_int16(b.top_sum, r * LANES, top)
+        write_int16(b.total, r, read_int16(sums, pixels))
+    store_int16(b.top_sum, 0, largest_of_rows(b.top_sum))
+
+
+@numba.njit(cache=True, nogil=True)
+def score_rows(at: At, places: int, taps: int, b: Buffers, batch: int) -> None:
+    """Fill score and top; taps: pixels around a position."""
+    vectors = b.score_row // (PHASES * LANES)
+    for r in range(batch):
+        i = np.int64(read_int32(b.here, r))
+        if i < 0:
+            continue
+        sums, score = b.sums + 2 * (r * b.n_row + FAR_PX), b.score + 2 * r * b.score_row
+        n, tap = b.n + 2 * (r * b.n_row + FAR_PX - taps // 2), at.tap + 2 * at.taps * i
+        constant = b.constant + 2 * at.constants * np.int64(read_int16(places, PLACES * r + VARIANT))
+        best = zero_int16() + np.int16(-32768)
+        for _ in range(vectors):
+            far_dim, far_bright = load_int16(constant, 0), load_int16(constant, LANES)
+            near_dim, near_bright = load_int16(constant, 2 * LANES), load_int16(constant, 3 * LANES)
+            for d in range(taps):
+                counts = load_int16(n, d)
+                far_dim = far_dim + scaled(counts, load_int16(tap, 0))
+                far_bright = far_bright + scaled(counts, load_int16(tap, LANES))
+                near_dim = near_dim + scaled(counts, load_int16(tap, 2 * LANES))
+                near_bright = near_bright + scaled(counts, load_int16(tap, 3 * LANES))
+                tap += 2 * POSITION
+            level = load_int16(sums, 0)
+            far = add_saturated(level, larger(far_dim, far_bright))
+            near = add_saturated(level, larger(near_dim, near_bright))
+            store_int16(score, 0, far)
+            store_int16(score, LANES, near)
+            best = larger(best, larger(far, near))
+            n, sums, score, constant = n + 2 * LANES, sums + 2 * LANES, score + 4 * LANES, constant + 2 * POSITION
+        store_int16(b.top, r * LANES, best)
+    store_int16(b.top, 0, largest_of_rows(b.top))
+
+
+@numba.njit(cache=True, nogil=True)
+def cost_rows(places: int, ways: Ways, b: Buffers, batch: int) -> None:
+    """Fill cost, that of 'none' included."""
+    vectors, half = b.score_row // (PHASES * LANES), np.int64((1 << ways.down) >> 1)
+    for r in range(batch):
+        cost, score = b.cost + r * b.cost_row, b.score + 2 * r * b.score_row
+        if read_int32(b.here, r) < 0:
+            for label in range(0, b.labels, 2 * LANES):
+                store_bytes(cost, label, zero_bytes())
+            continue
+        prior = b.none + 2 * NONES * np.int64(read_int16(places, PLACES * r + VARIANT))
+        behind = np.int64(read_int16(b.total, r)) + np.int64(read_int16(prior, BEHIND))
+        before = np.int64(BASE) + np.int64(read_int16(prior, BEFORE))
+        change = np.int64(read_int16(b.top_sum, r)) + np.int64(read_int16(prior, CHANGE))
+        none = min(max(behind, before, change), HIGHEST)
+        best = max(np.int64(read_int16(b.top, r)), none)
+        level = add_saturated(zero_int16() + np.int16(best), np.int16(half))
+        for v in range(vectors):
+            far = smaller(sub_saturated(level, load_int16(score, 2 * v * LANES)) >> ways.down, np.int16(COST_LIMIT))
+            near = sub_saturated(level, load_int16(score, (2 * v + 1) * LANES)) >> ways.down
+            store_bytes(cost, 2 * v * LANES, as_bytes(far | smaller(near, np.int16(COST_LIMIT)) << 8))
+        lost = min(best - none + half >> ways.down, COST_LIMIT)
+        write_byte(cost, np.int64(read_int16(places, PLACES * r + ODD)) + ways.none, np.uint8(lost))
+
+
+@numba.njit(cache=True, nogil=True)
+def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_bytes: int) -> None:
+    """Write the costs of labels to address out, rows `row_bytes` apart."""
+    for r in range(batch):
+        here, cost, to = places + 2 * PLACES * r, b.cost + r * b.cost_row, out + r * row_bytes
+        low, high = np.int64(read_int16(here, LABEL)), np.int64(read_int16(here, LABEL_END))
+        if read_int32(b.here, r) < 0:
+            low, high = np.int64(0), np.int64(ways.stripes)
+        else:
+            cost += np.int64(read_int16(here, ODD))
+        if read_int32(b.shown, 0) != low or read_int32(b.shown, 1) != high:
+            write_int32(b.shown, 0, np.int32(low))
+            write_int32(b.shown, 1, np.int32(high))
+            for label in range(b.labels):
+                inside = low <= label < high or label == ways.none
+                write_byte(b.mask, label, np.uint8(0) if inside else np.uint8(EXCLUDED))
+        for label in range(0, b.labels, 2 * LANES):
+            store_bytes(to, label, load_bytes(cost, label) | load_bytes(b.mask, label))
