@@ -1,13 +1,13 @@
 """Which columns of a map deserve more exposures: the passes that are expected to decide most rows in the time left.
 
-A line lights all rows at once, so what can be chosen is columns, by all their rows together. A row is undecided by
-1 - confidence, its posterior probability of being wrong; of a column that share falls about as a power of the frames,
+A line lights all rows at once, so what can be chosen is columns, by all their rows together. What is asked of the data
+is how many rows a column's light still moves: those whose answer from all n frames lies more than 1 px from that of
+half of them, drawn at random (`thinned`). Wrong answers fall about as 1/n, u(n) = u m / n from m frames on, so that
+moved = u(n) (n - m) / m, and e further exposures decide u(n) e / (n + e) of them. Nothing has to be known of the scene,
+nor how well a confidence is calibrated. Where all columns wait for photons alike the best pass is a plain one over all.
 
-    u(n) = u (n / n0)^-gamma,    gamma = log2(u(n0 / 2) / u(n0)),
-
-with u(n0 / 2) from the same counts thinned to half the frames (`thinned`): nothing has to be known of the scene. Rows
-that no light will ever decide (no stripe, a shadow) leave gamma near 0 and draw no exposures; where all rows wait for
-photons alike, gamma / n is the same everywhere and the best pass is a plain one over all columns.
+Tried besides, on counts of the yardstick: 1 - confidence in place of `moved`, with the power of n from half and all
+frames; both together; the pass of most gain per time, one by one, in place of a plan for all the time that is left.
 """
 
 import math
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from rig.config import ScanConfig
 from rig.counting import CountVolume
 from rig.scan_plan import column_command
+from rig.stripes import StripeTable
 
 Array = NDArray[np.float64]
 PassTime = Callable[[int, int], float | None]
@@ -37,8 +38,9 @@ HALVINGS = 20
 TRAVEL_FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """The more travel counts, the fewer passes a plan has."""
 SMOOTH_COLUMNS = 15
-"""Columns over which undecided rows are averaged: of one column they are known to a tenth."""
-MOST_GAMMA = 2.0
+"""Columns over which moved rows are averaged: of one column they are known to a tenth."""
+MOVED_PX = 1.0
+"""An answer that is further from another is another one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,37 +70,29 @@ class Pass:
 
 
 @dataclass(frozen=True, slots=True)
-class Undecided:
-    """Undecided rows of each column (columns,) float64, by all n_frames (columns,) and by half of them; of `rows`."""
+class Unsettled:
+    """Rows of each column that `moved` (columns,) from half of its n_frames (columns,) to all of them."""
 
-    now: Array
-    halved: Array
+    moved: Array
     n_frames: NDArray[np.int32]
-    rows: int
-
-    @property
-    def share(self) -> float:
-        """Of all rows and columns."""
-        return float(self.now.mean()) / self.rows
 
     def gain(self, exposures: int) -> Array:
         """Rows that so many further exposures are expected to decide in each column, (columns,)."""
-        now, halved = _smooth(self.now), _smooth(self.halved)
-        gamma = np.clip(np.log2(np.maximum(halved, 1e-9) / np.maximum(now, 1e-9)), 0.0, MOST_GAMMA)
-        n = np.maximum(self.n_frames, 1)
-        return np.asarray(now * (1 - (n / (n + exposures)) ** gamma))
+        n = np.maximum(self.n_frames, 2).astype(np.float64)
+        half = n // 2
+        return np.asarray(_smooth(self.moved) * half / (n - half) * exposures / (n + exposures))
 
 
-def next_pass(undecided: Undecided, pass_time: PassTime, left_s: float, passes: int) -> Pass | None:
+def next_pass(unsettled: Unsettled, pass_time: PassTime, left_s: float, passes: int) -> Pass | None:
     """The first pass of the best plan for the time that is left, with at most so many passes; None where none gains.
 
     The plan gives every block of columns a further number of exposures. Neighbours that have the same make a pass, and
     each pass costs its travel. Of its passes that comes first which decides most rows per time: behind it, columns are
     looked at again.
     """
-    columns = len(undecided.now)
+    columns = len(unsettled.moved)
     edges = np.unique(np.linspace(0, columns, min(columns, BLOCKS) + 1).round().astype(int))
-    levels = _levels(undecided, pass_time, edges)
+    levels = _levels(unsettled, pass_time, edges)
     best: list[tuple[Pass, float]] = []
     for travel in TRAVEL_FACTORS:
         low, high = PRICES
@@ -127,7 +121,7 @@ class _Levels(NamedTuple):
     travel_s: Array
 
 
-def _levels(undecided: Undecided, pass_time: PassTime, edges: NDArray[np.int_]) -> _Levels:
+def _levels(unsettled: Unsettled, pass_time: PassTime, edges: NDArray[np.int_]) -> _Levels:
     """What further exposures bring to each block and cost: time goes linearly with columns, but for the travel."""
     columns, widths = int(edges[-1]), np.diff(edges)
     part = max(1, columns // 8)
@@ -138,7 +132,7 @@ def _levels(undecided: Undecided, pass_time: PassTime, edges: NDArray[np.int_]) 
             continue
         per_column_s = (long_s - short_s) / (columns - part) if columns > part else long_s / columns
         exposures.append(k)
-        gains.append(np.add.reduceat(undecided.gain(k), edges[:-1]))
+        gains.append(np.add.reduceat(unsettled.gain(k), edges[:-1]))
         times.append(widths * per_column_s)
         travels.append(max(0.0, short_s - part * per_column_s))
     return _Levels(exposures, np.stack(gains, axis=1), np.stack(times, axis=1), np.array(travels))
@@ -172,9 +166,11 @@ def _plan(levels: _Levels, edges: NDArray[np.int_], price: float, travel: float)
     return found
 
 
-def undecided_rows(confidence: NDArray[np.float32], searched: NDArray[np.bool_]) -> Array:
-    """Rows of each column that are expected to be wrong, (columns,), out of (rows, columns) that were searched."""
-    return np.asarray(np.where(searched, 1.0 - confidence.astype(np.float64), 0.0).sum(axis=0))
+def moved_rows(halved: StripeTable, now: StripeTable, searched: NDArray[np.bool_]) -> Array:
+    """Rows of each column (columns,) whose answer moved, out of those that were searched (rows, columns)."""
+    with np.errstate(invalid="ignore"):
+        moved = np.abs(now.x_px - halved.x_px) > MOVED_PX
+    return np.asarray((moved & searched).sum(axis=0), np.float64)
 
 
 def thinned(volume: CountVolume, seed: int = 0) -> CountVolume:

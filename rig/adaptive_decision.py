@@ -7,7 +7,7 @@ import numpy as np
 
 from calibration.errors import CalibrationError
 from drivers.interfaces import SpadTiming
-from rig.adaptive import Pass, Undecided, next_pass, thinned, undecided_rows
+from rig.adaptive import Pass, Unsettled, moved_rows, next_pass, thinned
 from rig.config import AdaptiveConfig
 from rig.counting import CountVolume
 from rig.errors import PlanError
@@ -57,22 +57,16 @@ class DecidedPasses:
         left_s = self._budget_s - spent_s
         if taken >= self._settings.passes or left_s <= 0:
             return None
-        undecided = self._look(counts)
-        if 1 - undecided.share >= self._settings.target_share:
+        now = self._scout.estimate(counts, self._geometry)
+        if float(now.confidence[self._searched].mean()) >= self._settings.target_share:
             return None
-        return next_pass(undecided, self._pass_time, left_s, self._settings.passes - taken)
+        halved = self._scout.estimate(thinned(counts), self._geometry)
+        unsettled = Unsettled(moved_rows(halved, now, self._searched), counts.n_frames)
+        return next_pass(unsettled, self._pass_time, left_s, self._settings.passes - taken)
 
     def prepare(self, one: Pass) -> tuple[ScanPlan, SpadTiming]:
         """See `ChoosesPasses`."""
         return _prepared(self._rig, self._whole, one)
-
-    def _look(self, counts: CountVolume) -> Undecided:
-        """What is undecided, by all frames and by half of them."""
-        now, halved = (
-            undecided_rows(self._scout.estimate(seen, self._geometry).confidence, self._searched)
-            for seen in (counts, thinned(counts))
-        )
-        return Undecided(now, halved, counts.n_frames, self._geometry.rows)
 
 
 def first_pass(rig: OpenRig, whole: ScanPlan) -> Pass:

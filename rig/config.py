@@ -64,7 +64,7 @@ class AdaptiveConfig(Section):
     """A map in several passes: few exposures of all columns, then more of those that are still undecided."""
 
     first_exposures: int = Field(
-        default=3, ge=2, le=200, description="exposures of the first pass, over all columns", examples=[3]
+        default=4, ge=2, le=200, description="exposures of the first pass, over all columns", examples=[4]
     )
     passes: int = Field(default=4, ge=2, le=100, description="most passes of a map, the first included", examples=[4])
     time_budget: Annotated[Seconds, Field(gt=0)] | None = Field(
@@ -76,7 +76,7 @@ class AdaptiveConfig(Section):
         default=0.99,
         gt=0,
         lt=1,
-        description="share of rows, as the estimator's confidence tells, at which a map is good enough",
+        description="mean confidence over rows and columns at which a map is good enough",
         examples=[0.95],
     )
 

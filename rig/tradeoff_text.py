@@ -25,7 +25,7 @@ def tradeoff_table(done: Tradeoff) -> None:
                 if several_lines:
                     cells.append(str(row.lines))
                 if limits:
-                    cells.append("-" if row.times_limit is None else f"{row.times_limit:.2g}")
+                    cells.append("-" if row.times_limit is None else f"{row.times_limit:.1f}")
                 table.add_row(*cells, ("*" if row.pareto else " ") + ("+" if row.pareto_compute else ""))
         console().print(table)
         print()

@@ -58,6 +58,8 @@ class LabelTables(NamedTuple):
     constant: float32 (tables, V, PHASES, LIGHTS, LANES), nats per exposure of each position.
     none: float32 (tables, NONES), nats of 'no stripe': all behind, all before, a change somewhere.
     span: int16 (tables, 2), pixels whose weights are not 0: from and up to.
+    fitted_constant, fitted_edge, fitted_none: int16, units of constant, of each pixel's share of edge_sum, and of none,
+    for the usual number of exposures.
     """
 
     at: NDArray[np.int32]
@@ -67,6 +69,9 @@ class LabelTables(NamedTuple):
     constant: NDArray[np.float32]
     none: NDArray[np.float32]
     span: NDArray[np.int16]
+    fitted_constant: NDArray[np.int16]
+    fitted_edge: NDArray[np.int16]
+    fitted_none: NDArray[np.int16]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -168,14 +173,14 @@ def _middle_row(place: NDArray[np.int16], c: int, rows: tuple[int, int], variant
     Positions count two a pixel, from the pixel that holds label 0 on.
     """
     middle = (rows[0] + rows[1]) // 2
-    best, first, end = -1, np.int64(1 << 15), np.int64(0)
+    best, first, end = -1, 1 << 15, 0
     for y in range(rows[0], rows[1]):
         here = place[c, y]
         if here[VARIANT] == variant:
             if best < 0 or abs(y - middle) < abs(best - middle):
                 best = y
-            first = min(first, here[LABEL] + here[ODD])
-            end = max(end, here[LABEL_END] + here[ODD])
+            first = min(first, int(here[LABEL] + here[ODD]))
+            end = max(end, int(here[LABEL_END] + here[ODD]))
     return best, first, end
 
 

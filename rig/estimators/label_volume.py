@@ -19,7 +19,7 @@ from rig.estimators.label_grid import LabelGrid
 from rig.estimators.label_places import FAR_PX, FRACTIONS, PHASES, VARIANTS, label_pixels, places_of
 from rig.estimators.label_tables import LIGHTS, NONES, LabelTables, fill_tables, mark_rows, number_tables
 from rig.estimators.label_volume_buffers import Ways
-from rig.estimators.label_volume_kernels import fill_costs
+from rig.estimators.label_volume_kernels import fill_costs, fit_tables, room_for
 from rig.estimators.row_input import Row, State, Sweep, row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimators.row_kernels import FLUX_MAX, cell_of
 from rig.estimators.row_model import RowModel, pixel_shares
@@ -27,14 +27,14 @@ from rig.geometry import MARGIN_PX, SweepGeometry
 from rig.lanes import LANES
 from rig.row_threads import RowWorkers
 
-UNITS: Final = 8
-"""Units of cost per nat, up to SHARP exposures."""
-SHARP: Final = 32
-"""Exposures from which on a unit of cost is worth more: the labels beside the best one must stay within the range."""
+UNITS: Final = 8.0
+"""Units of cost per nat of very few exposures."""
+SHARP: Final = 8.0
+"""Exposures at which a nat is worth half as many: with sharp rows the labels beside the best one must still count."""
 BAND_ROWS: Final = 64
 """Rows that share tables."""
-FINEST: Final = 6
-"""Scores are of at most 2^FINEST units per nat."""
+FINEST: Final = 64.0
+"""Most units of scores per nat."""
 WEIGHT_BITS: Final = 12
 """Weights of 2^WEIGHT_BITS units per nat reach to 8 nats per count."""
 RISE_LIMIT: Final = 22000
@@ -52,8 +52,7 @@ QUARTILES: Final = (0.25, 0.75)
 class Costs:
     """Gives the costs of a sweep's counts under one model; made once per model by `costs_of`.
 
-    units_per_nat: of cost; UNITS up to SHARP nominal exposures, beyond them halved whenever those double, or less where
-    16 bits do not hold what haze says.
+    units_per_nat: of cost; UNITS / (1 + exposures / SHARP), or less where 16 bits do not hold what haze says.
     """
 
     grid: LabelGrid
@@ -71,9 +70,10 @@ class Costs:
         where it cannot be. Rows without frames, or with nothing to search, cost 0 everywhere. Best called with 16 rows
         or more at a time; threads may fill different rows at once.
         """
+        memory = room_for(self.tables, self.grid.labels)
         fill_costs(
             volume.counts, volume.n_frames, volume.x0, self.place, self.tables, self.hot_start, self.hot_x, self.ways,
-            first, last, out,
+            first, last, memory, out,
         )  # fmt: skip
 
 
@@ -111,6 +111,11 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
         )
 
     workers.over(bands, work)
+
+    def fit(first: int, last: int) -> None:
+        fit_tables(tables, ways, first, last, room_for(tables, grid.labels))
+
+    workers.over(len(tables.none), fit)
     mark_rows(place, hot, grid.side, BAND_ROWS, tables)
     y, x = np.nonzero(hot)
     hot_start = np.searchsorted(y, np.arange(geometry.rows + 1)).astype(np.int32)
@@ -123,15 +128,15 @@ def _ways(
     most = exposures + exposures // 2 + SPARE_FRAMES
     bits = most.bit_length()
     rise, gain = _largest(sweep, state, row_buffers(sweep.window, 1), light[-1])
-    largest = most * max(rise / RISE_LIMIT, gain / TAPS_LIMIT, 2.0**-FINEST / most)
-    fine = min(WEIGHT_BITS - bits, int(np.floor(-np.log2(largest))))
-    sharp = UNITS / 2.0 ** max(0, int(np.ceil(np.log2(max(exposures, 1) / SHARP))))
-    down = max(fine - int(np.log2(sharp)), 0)
+    finest = min(FINEST, 2.0 ** (WEIGHT_BITS - bits), 1.0 / (most * max(rise / RISE_LIMIT, gain / TAPS_LIMIT)))
+    wanted = UNITS / (1.0 + exposures / SHARP)
+    down = max(int(np.floor(np.log2(finest / wanted))), 0)
+    units_per_nat = min(wanted, finest)
     ways = Ways(
-        units=2.0**fine, bits=bits, most=most, down=down, reach=reach, side=grid.side, stripes=grid.stripes,
-        none=grid.none, band_rows=BAND_ROWS,
+        units=units_per_nat * 2.0**down, bits=bits, exposures=exposures, most=most, down=down, reach=reach,
+        side=grid.side, stripes=grid.stripes, none=grid.none, band_rows=BAND_ROWS,
     )  # fmt: skip
-    return ways, 2.0 ** (fine - down)
+    return ways, units_per_nat
 
 
 @numba.njit(cache=True, nogil=True)
@@ -170,6 +175,9 @@ def _empty_tables(at: NDArray[np.int32], tables: int, grid: LabelGrid, taps: int
         constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.float32),
         none=np.zeros((tables, NONES), np.float32),
         span=np.zeros((tables, 2), np.int16),
+        fitted_constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.int16),
+        fitted_edge=aligned_zeros((tables, pixels), np.int16),
+        fitted_none=np.zeros((tables, NONES), np.int16),
     )
 
 

@@ -18,13 +18,14 @@ POSITION: Final = PHASES * LIGHTS * LANES
 class Ways(NamedTuple):
     """How scores and costs are counted.
 
-    units: of scores per nat, a power of two; bits: of the largest count; most: exposures up to which counts are not
-    halved; down: power of two that scores are divided by to be costs; reach: taps on either
+    units: of scores per nat; bits: of the largest count; exposures: usual number of a column; most: exposures up to
+    which counts are not halved; down: power of two that scores are divided by to be costs; reach: taps on either
     side; side, stripes, none: as in `LabelGrid`; band_rows: rows that share tables.
     """
 
     units: float
     bits: int
+    exposures: int
     most: int
     down: int
     reach: int
@@ -50,6 +51,14 @@ class At(NamedTuple):
     hot_x: int
 
 
+class Fitted(NamedTuple):
+    """Addresses of what tables say at a number of exposures, int16: of all tables, or of a column's variants."""
+
+    constant: int
+    edge: int
+    none: int
+
+
 class Buffers(NamedTuple):
     """Addresses; of BATCH rows, int16 unless said, with the elements from row to row.
 
@@ -57,8 +66,8 @@ class Buffers(NamedTuple):
     and phase; top, top_sum: largest ones of some lanes each, later of all; total: score of all pixels lying behind.
     cost: bytes of labels, from that of the first pixel's phase 0 on. Of all rows: mask: bytes, EXCLUDED or 0 for each
     label; constant: of positions, edge: of pixels, none: of 'no stripe', for each variant; through: room for sums. As
-    int32, table: of variants from -1 on, -1 where there is none; here: of each row of the batch; shown: labels that the
-    mask is for, from and up to. labels: how many there are.
+    int32, table: of variants from -1 on, -1 where there is none; here: of each row of the batch, fitted: place of it in
+    `Fitted`; shown: labels that the mask is for, from and up to. labels: how many there are.
     """
 
     n: int
@@ -78,6 +87,7 @@ class Buffers(NamedTuple):
     through: int
     table: int
     here: int
+    fitted: int
     shown: int
     labels: int
 
@@ -102,8 +112,8 @@ def buffers_at(begin, pixels, vectors, labels):  # type: ignore[no-untyped-def]
     table = through + 2 * (pixels + 2 * LANES)
     here = table + 4 * (VARIANTS + 1)
     buffers = Buffers(begin, n_row, sums, score, score_row, top, top_sum, total, cost, cost_row, mask, constant, edge,
-                       none, through, table, here, here + 4 * BATCH, labels)  # fmt: skip
-    return buffers, here + 4 * (BATCH + 2)
+                       none, through, table, here, here + 4 * BATCH, here + 8 * BATCH, labels)  # fmt: skip
+    return buffers, here + 4 * (2 * BATCH + 2)
 
 
 @numba.njit(inline="always")

@@ -22,10 +22,9 @@ from rig.estimators.label_places import (
     START,
     VALID,
     VALID_END,
-    VARIANT,
 )
 from rig.estimators.label_tables import BEFORE, BEHIND, CHANGE, NONES
-from rig.estimators.label_volume_buffers import POSITION, At, Buffers, Ways
+from rig.estimators.label_volume_buffers import POSITION, At, Buffers, Fitted, Ways
 from rig.lane_memory import (
     load_bytes,
     load_int16,
@@ -49,7 +48,7 @@ COST_LIMIT: Final = 160
 """Largest cost of a label that is not excluded."""
 EXCLUDED: Final = 255
 """Cost of a label that cannot be: outside the picture, more than a pixel outside the row's search window, or none."""
-BASE: Final = np.int16(-8000)
+BASE: Final = -8000
 """Score of 'everything is before the stripe': most of the range lies above it."""
 HIGHEST: Final = 30000
 """Scores and their parts are cut there."""
@@ -72,7 +71,7 @@ def read_bytes(
     for r in range(batch):
         if read_int32(b.here, r) < 0:
             continue
-        n, start = b.n + 2 * r * b.n_row, np.int64(read_int16(places, PLACES * r + START)) - x0
+        n, start = b.n + 2 * r * b.n_row, read_int16(places, PLACES * r + START) - x0
         first = begin + r * window + start
         low = first - pixels if side > 0 else first
         if shift < 0 or low < 0 or low + pixels + LANES > size:
@@ -99,16 +98,16 @@ def mend_rows(at: At, places: int, y: int, per_nat: float, side: int, b: Buffers
     y: row of the first; per_nat: units times exposures.
     """
     for r in range(batch):
-        i, place = np.int64(read_int32(b.here, r)), places + 2 * PLACES * r
+        i, place = read_int32(b.here, r), places + 2 * PLACES * r
         if i < 0 or not read_int16(place, MEND):
             continue
-        n, start = b.n + 2 * r * b.n_row, np.int64(read_int16(place, START))
-        begin, end = np.int64(read_int16(at.span, 2 * i)), np.int64(read_int16(at.span, 2 * i + 1))
+        n, start = b.n + 2 * r * b.n_row, read_int16(place, START)
+        begin, end = read_int16(at.span, 2 * i), read_int16(at.span, 2 * i + 1)
         for p in range(begin, end):
             if not read_int16(place, VALID) <= p < read_int16(place, VALID_END):
                 write_int16(n, p, _neutral(at, i, p, per_nat))
         for h in range(read_int32(at.hot_start, y + r), read_int32(at.hot_start, y + r + 1)):
-            p = side * (start - np.int64(read_int16(at.hot_x, h)))
+            p = side * (start - read_int16(at.hot_x, h))
             if begin <= p < end:
                 write_int16(n, p, _neutral(at, i, p, per_nat))
 
@@ -127,21 +126,18 @@ def _neutral(at, i, p, per_nat):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def sum_edges(at: At, places: int, b: Buffers, batch: int) -> None:
+def sum_edges(at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
     """Fill sums, total and top_sum."""
     pixels = at.pixels
     for r in range(batch):
-        i = np.int64(read_int32(b.here, r))
+        i = read_int32(b.here, r)
         if i < 0:
             continue
         n, sums = b.n + 2 * r * b.n_row, b.sums + 2 * r * b.n_row
-        edge, constant = (
-            at.edge + 2 * pixels * i,
-            b.edge + 2 * pixels * np.int64(read_int16(places, PLACES * r + VARIANT)),
-        )
-        carry = zero_int16() + BASE
+        edge, constant = at.edge + 2 * pixels * i, fitted.edge + 2 * pixels * read_int32(b.fitted, r)
+        carry = zero_int16() + np.int16(BASE)
         top = carry
-        write_int16(sums, 0, BASE)
+        write_int16(sums, 0, np.int16(BASE))
         for p in range(0, pixels, LANES):
             rise = running_sum(add_saturated(scaled(load_int16(n, p), load_int16(edge, p)), load_int16(constant, p)))
             through = add_saturated(rise, carry)
@@ -154,16 +150,16 @@ def sum_edges(at: At, places: int, b: Buffers, batch: int) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def score_rows(at: At, places: int, taps: int, b: Buffers, batch: int) -> None:
+def score_rows(at: At, fitted: Fitted, taps: int, b: Buffers, batch: int) -> None:
     """Fill score and top; taps: pixels around a position."""
     vectors = b.score_row // (PHASES * LANES)
     for r in range(batch):
-        i = np.int64(read_int32(b.here, r))
+        i = read_int32(b.here, r)
         if i < 0:
             continue
         sums, score = b.sums + 2 * (r * b.n_row + FAR_PX), b.score + 2 * r * b.score_row
         n, tap = b.n + 2 * (r * b.n_row + FAR_PX - taps // 2), at.tap + 2 * at.taps * i
-        constant = b.constant + 2 * at.constants * np.int64(read_int16(places, PLACES * r + VARIANT))
+        constant = fitted.constant + 2 * at.constants * read_int32(b.fitted, r)
         best = zero_int16() + np.int16(-32768)
         for _ in range(vectors):
             far_dim, far_bright = load_int16(constant, 0), load_int16(constant, LANES)
@@ -187,28 +183,28 @@ def score_rows(at: At, places: int, taps: int, b: Buffers, batch: int) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def cost_rows(places: int, ways: Ways, b: Buffers, batch: int) -> None:
+def cost_rows(fitted: Fitted, places: int, ways: Ways, b: Buffers, batch: int) -> None:
     """Fill cost, that of 'none' included."""
-    vectors, half = b.score_row // (PHASES * LANES), np.int64((1 << ways.down) >> 1)
+    vectors, half = b.score_row // (PHASES * LANES), (1 << ways.down) >> 1
     for r in range(batch):
         cost, score = b.cost + r * b.cost_row, b.score + 2 * r * b.score_row
         if read_int32(b.here, r) < 0:
             for label in range(0, b.labels, 2 * LANES):
                 store_bytes(cost, label, zero_bytes())
             continue
-        prior = b.none + 2 * NONES * np.int64(read_int16(places, PLACES * r + VARIANT))
-        behind = np.int64(read_int16(b.total, r)) + np.int64(read_int16(prior, BEHIND))
-        before = np.int64(BASE) + np.int64(read_int16(prior, BEFORE))
-        change = np.int64(read_int16(b.top_sum, r)) + np.int64(read_int16(prior, CHANGE))
+        prior = fitted.none + 2 * NONES * read_int32(b.fitted, r)
+        behind = read_int16(b.total, r) + read_int16(prior, BEHIND)
+        before = BASE + read_int16(prior, BEFORE)
+        change = read_int16(b.top_sum, r) + read_int16(prior, CHANGE)
         none = min(max(behind, before, change), HIGHEST)
-        best = max(np.int64(read_int16(b.top, r)), none)
+        best = max(read_int16(b.top, r), none)
         level = add_saturated(zero_int16() + np.int16(best), np.int16(half))
         for v in range(vectors):
             far = smaller(sub_saturated(level, load_int16(score, 2 * v * LANES)) >> ways.down, np.int16(COST_LIMIT))
             near = sub_saturated(level, load_int16(score, (2 * v + 1) * LANES)) >> ways.down
             store_bytes(cost, 2 * v * LANES, as_bytes(far | smaller(near, np.int16(COST_LIMIT)) << 8))
         lost = min(best - none + half >> ways.down, COST_LIMIT)
-        write_byte(cost, np.int64(read_int16(places, PLACES * r + ODD)) + ways.none, np.uint8(lost))
+        write_byte(cost, read_int16(places, PLACES * r + ODD) + ways.none, np.uint8(lost))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -216,11 +212,11 @@ def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_by
     """Write the costs of labels to address out, rows `row_bytes` apart."""
     for r in range(batch):
         here, cost, to = places + 2 * PLACES * r, b.cost + r * b.cost_row, out + r * row_bytes
-        low, high = np.int64(read_int16(here, LABEL)), np.int64(read_int16(here, LABEL_END))
+        low, high = read_int16(here, LABEL), read_int16(here, LABEL_END)
         if read_int32(b.here, r) < 0:
-            low, high = np.int64(0), np.int64(ways.stripes)
+            low, high = 0, ways.stripes
         else:
-            cost += np.int64(read_int16(here, ODD))
+            cost += read_int16(here, ODD)
         if read_int32(b.shown, 0) != low or read_int32(b.shown, 1) != high:
             write_int32(b.shown, 0, np.int32(low))
             write_int32(b.shown, 1, np.int32(high))

@@ -71,7 +71,7 @@ def measure_light(
             frames = np.float32(n_frames[c])
             x = min(max(int(np.rint(x_px[y, c])), sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, x)
-            before, behind, scale, _, _, _ = fluxes_at(sweep, state, y, x, sweep.plane[c], path_p, strength)
+            before, behind, scale, _, _, _, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)
             own = state.ambient[y, x]
             # A pixel that the picture does not have counts as one of just the expected light.
             light = -(LIGHT_PX + half) * (before + behind - own - own)
@@ -117,7 +117,7 @@ def score_places(
             profile = shares[min(int(part * FRACTIONS), FRACTIONS - 1)]
             near = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, near)
-            before, behind, scale, _, _, _ = fluxes_at(sweep, state, y, near, sweep.plane[c], path_p, strength)
+            before, behind, scale, _, _, _, _ = fluxes_at(sweep, state, y, near, c, path_p, strength)
             before -= state.ambient[y, near]
             behind -= state.ambient[y, near]
             light = amplitude[y, c] * scale
@@ -226,7 +226,7 @@ def add_moments(
             if x - REACH_PX < max(sweep.x0[c], 0) or x + REACH_PX >= min(sweep.x0[c] + sweep.window, sweep.u.shape[1]):
                 continue
             path_p, strength = line_light(sweep, state, y, c, x)
-            before, behind, _, _, _, _ = fluxes_at(sweep, state, y, x, sweep.plane[c], path_p, strength)
+            before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)
             side = 1 if sweep.near_is_left else -1
             frames = np.float64(n_frames[c])
             for t in range(x - REACH_PX, x + REACH_PX + 1):

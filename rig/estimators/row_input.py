@@ -141,9 +141,35 @@ def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def fluxes_at(sweep, state, y, x, plane, path_p, strength):  # type: ignore[no-untyped-def]
-    """Flux before and behind the stripe, its scale, geometry factor, inverse depth and profile bin of one pixel."""
-    profile = state.profile
+def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
+    """Haze of the lines that are lit together with column c, at one pixel, whichever side of c's stripe it lies on.
+
+    Where their own stripes lie is not known: their haze has not ended with the share of the depth range that lies
+    behind the pixel's point on their plane, surely where that is nearer than the range begins.
+    """
+    profile, light = state.profile, 0.0
+    ux, vx = np.float64(sweep.u[y, x]), np.float64(sweep.v[y, x])
+    path_c = np.sqrt(1.0 + ux * ux + vx * vx)
+    for other in range(sweep.others.shape[1]):
+        plane = sweep.others[c, other]
+        path_u = -(plane[1] * vx + plane[2]) / plane[0]
+        path_p = np.sqrt(1.0 + path_u * path_u + vx * vx)
+        w = plane[0] * ux + plane[1] * vx + plane[2]
+        there = min(max((w - sweep.w_far) / (sweep.w_near - sweep.w_far), 0.0), 1.0)
+        b = min(max((w * 2.0 / (path_p + path_c) - state.w_lo) * state.per_w, 0.0), profile.shape[0] - 1.001)
+        i = int(b)
+        haze = profile[i, 0] + (b - i) * (profile[i + 1, 0] - profile[i, 0])
+        rest = profile[i, 1] + (b - i) * (profile[i + 1, 1] - profile[i, 1])
+        light += path_p * (there * haze + (1.0 - there) * rest)
+    return np.float32(state.row_gain[y] * path_c * light)
+
+
+@numba.njit(inline="always")
+def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyped-def]
+    """Flux before and behind the stripe of column c, the stripe's scale, geometry factor, inverse depth and profile bin
+    of one pixel, and what other lines' haze brings to both fluxes.
+    """
+    plane, profile = sweep.plane[c], state.profile
     ux, vx = sweep.u[y, x], sweep.v[y, x]
     path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
     w = plane[0] * ux + plane[1] * vx + plane[2]
@@ -156,7 +182,11 @@ def fluxes_at(sweep, state, y, x, plane, path_p, strength):  # type: ignore[no-u
     ambient = state.ambient[y, x]
     before = min(max(ambient + haze, FLUX_MIN), FLUX_MAX)
     behind = min(max(ambient + rest, FLUX_MIN), FLUX_MAX)
-    return before, behind, profile[i, 2] + f * (profile[i + 1, 2] - profile[i, 2]), gain, w, int(b + 0.5)
+    others = np.float32(0.0)
+    if sweep.others.shape[1] > 0:
+        others = others_at(sweep, state, y, c, x)
+        before, behind = min(before + others, FLUX_MAX), min(behind + others, FLUX_MAX)
+    return before, behind, profile[i, 2] + f * (profile[i + 1, 2] - profile[i, 2]), gain, w, int(b + 0.5), others
 
 
 @numba.njit(cache=True, nogil=True)
@@ -169,7 +199,7 @@ def row_fluxes(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[in
     lo, hi, x0 = sweep.x_lo[y, c], sweep.x_hi[y, c], sweep.x0[c]
     if lo > hi:
         return 0, 0, -1, 0
-    plane, u, profile = sweep.plane[c], sweep.u, state.profile
+    u, profile = sweep.u, state.profile
     first = max(lo - MARGIN_PX, x0, 0)
     last = min(hi + MARGIN_PX, x0 + sweep.window - 1, u.shape[1] - 1)
     while first < last and np.isnan(u[y, first]):
@@ -185,48 +215,17 @@ def row_fluxes(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[in
         return 0, 0, -1, 0
     path_p, strength = line_light(sweep, state, y, c, (first + last) // 2)
     for t in range(length):
-        before, behind, scale, gain, w, cell = fluxes_at(sweep, state, y, start + step * t, plane, path_p, strength)
+        x = start + step * t
+        before, behind, scale, gain, w, cell, others = fluxes_at(sweep, state, y, x, c, path_p, strength)
         row.before[t] = before
         row.behind[t] = behind
         row.scale[t] = scale
         row.cell[t] = cell
         row.gain[t] = gain
-        row.others[t] = 0.0
+        row.others[t] = others
         row.w[t] = w
         row.log_prior[t] = profile[cell, 3]
-    if sweep.others.shape[1] > 0:
-        _add_others(sweep, state, row, y, c, length, start, step)
     return length, begin, end, start
-
-
-@numba.njit(cache=True, nogil=True)
-def _add_others(sweep: Sweep, state: State, row: Row, y: int, c: int, length: int, start: int, step: int) -> None:
-    """Add the haze of lines that are lit together with column c to both sides of its stripe.
-
-    Where their own stripes lie is not known: their haze has not ended at a pixel with the share of the depth range that
-    lies behind it there, all of it where the pixel shows it nearer than the range begins.
-    """
-    profile = state.profile
-    vy = sweep.v[y, start + step * (length // 2)]
-    for other in range(sweep.others.shape[1]):
-        plane = sweep.others[c, other]
-        path_u = -(plane[1] * vy + plane[2]) / plane[0]
-        path_p = np.sqrt(1.0 + path_u * path_u + vy * vy)
-        for t in range(length):
-            x = start + step * t
-            ux, vx = sweep.u[y, x], sweep.v[y, x]
-            path_c = np.sqrt(1.0 + ux * ux + vx * vx)
-            w = plane[0] * ux + plane[1] * vx + plane[2]
-            there = min(max((w - sweep.w_far) / (sweep.w_near - sweep.w_far), 0.0), 1.0)
-            b = min(max((w * 2.0 / (path_p + path_c) - state.w_lo) * state.per_w, 0.0), profile.shape[0] - 1.001)
-            i = int(b)
-            f = b - i
-            haze = profile[i, 0] + f * (profile[i + 1, 0] - profile[i, 0])
-            rest = profile[i, 1] + f * (profile[i + 1, 1] - profile[i, 1])
-            light = state.row_gain[y] * path_p * path_c * (there * haze + (1.0 - there) * rest)
-            row.others[t] += light
-            row.before[t] = min(row.before[t] + light, FLUX_MAX)
-            row.behind[t] = min(row.behind[t] + light, FLUX_MAX)
 
 
 @numba.njit(cache=True, nogil=True)

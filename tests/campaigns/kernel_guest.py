@@ -1,6 +1,6 @@
 """Tests as the only process of a virtual machine: the guest's half of `kernel_usb` and `kernel_serial`.
 
-    python -m tests.campaigns.kernel_guest PYTEST_ARGUMENT...     as process 1
+    python -m tests.campaigns.kernel_guest PYTEST_ARGUMENT... end     as process 1
 
 and `passed`, the host's half: starts the machine, shows what it says and tells whether its tests passed.
 """
@@ -21,6 +21,8 @@ POWER_OFF = 0x4321FEDC
 HANGS_S = 120
 """A test that takes longer says where it is."""
 PASSED = "kernel_guest: passed"
+END = "end"
+"""Behind the last argument: a user-mode kernel adds some of its own."""
 
 
 def passed(command: Sequence[str | Path], within_s: float) -> bool:
@@ -53,4 +55,4 @@ def main(arguments: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(sys.argv[1 : sys.argv.index(END)])

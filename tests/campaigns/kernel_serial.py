@@ -40,9 +40,10 @@ def main() -> int:
     options = parser.parse_args()
     if subprocess.run(["sh", FETCH, options.kernel], check=False).returncode:
         return 2
-    arguments = ["-m", kernel_guest.__name__, "-p", "tests.wire.kernel_serial_ports", "-k", f'"{LEFT_OUT}"']
+    plugin = ["-m", kernel_guest.__name__, "-p", "tests.wire.kernel_serial_ports", "-k", f'"{LEFT_OUT}"']
+    arguments = [*plugin, *options.tests, kernel_guest.END]
     with tempfile.TemporaryDirectory(prefix="spadrig-qemu-") as sockets:
-        return int(not kernel_guest.passed(machine(options.kernel, sockets, [*arguments, *options.tests]), WITHIN_S))
+        return int(not kernel_guest.passed(machine(options.kernel, sockets, arguments), WITHIN_S))
 
 
 def machine(kernel: Path, sockets: str, arguments: list[str]) -> list[str | Path]:

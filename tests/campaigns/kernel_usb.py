@@ -29,7 +29,8 @@ def main() -> int:
         return 2
     boot = [options.kernel / "linux", f"mem={MEMORY}", "rootfstype=hostfs", "rw", "quiet", "con=null", "con0=fd:0,fd:1"]
     guest = [f"init={sys.executable}", f"PYTHONPATH={kernel_guest.ROOT}", "PYTHONDONTWRITEBYTECODE=1"]
-    return int(not kernel_guest.passed([*boot, *guest, "--", "-m", kernel_guest.__name__, TESTS], WITHIN_S))
+    arguments = ["-m", kernel_guest.__name__, TESTS, kernel_guest.END]
+    return int(not kernel_guest.passed([*boot, *guest, "--", *arguments], WITHIN_S))
 
 
 if __name__ == "__main__":

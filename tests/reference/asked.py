@@ -142,19 +142,17 @@ def _calibration(estimator: str, groups: Groups) -> Iterator[Finding]:
     for (point, k), group in sorted(groups.items()):
         answers = pooled([one.answers for one in group.values()])
         everything.append(answers)
-        yield _ece(f"{point}: calibration error", str(k), estimator, answers)
+        yield from _calibration_errors(point, str(k), estimator, answers)
     if everything:
-        yield _ece("all points: calibration error", "", estimator, pooled(everything))
+        yield from _calibration_errors("all points", "", estimator, pooled(everything))
 
 
-def _ece(what: str, k: str, estimator: str, answers: Answers) -> Finding:
-    """Beside it, in the place of the worst: with answers where there is no stripe counted as wrong."""
-    value = calibration_error(*answers.claims())
-    harder = calibration_error(*answers.claims(empty=True))
-    return _finding(
-        what, k, estimator, f"below {CALIBRATION}", value, f"{harder:.4f} (rows without stripe counted as wrong)",
-        value < CALIBRATION,
-    )  # fmt: skip
+def _calibration_errors(what: str, k: str, estimator: str, answers: Answers) -> Iterator[Finding]:
+    """Over the scored stripes, and with answers where there is no stripe counted as wrong."""
+    for empty, name in ((False, "stripes"), (True, "stripes and rows without")):
+        value = calibration_error(*answers.claims(empty=empty))
+        holds = value < CALIBRATION
+        yield _finding(f"{what}: calibration error, {name}", k, estimator, f"below {CALIBRATION}", value, "", holds)
 
 
 def _by_scene(group: Group, figure: Callable[[Answers], float]) -> dict[str, float]:

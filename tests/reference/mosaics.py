@@ -27,7 +27,7 @@ class Mosaic:
     title: str
     depth_m: NDArray[np.floating]
     limits: tuple[float, float]
-    cells: int = 82
+    cells: int = 73
 
     @property
     def legend(self) -> Sequence[Series]:

@@ -35,6 +35,7 @@ EXPOSURES = (1, 3, 5, 10, 20)
 SEED = 1
 CLAIMS = (Mark((10, 1.0), "report: < 1 px"), Mark((20, 0.1), "report: about 0.1 px"))
 """Mean error of the report by exposures, on truth rounded to whole pixels."""
+SHARE = "within_1px"
 ROW = 250
 """Image row of figures 3 and 4."""
 
@@ -144,16 +145,19 @@ def figure_6(scene: Scene) -> str:
 
 
 def figure_of_exposures(figures: Sequence[Figure], filter: str) -> str:
-    """Error over exposures, a panel for each working point, with the report's claims (figures 7 and 8)."""
+    """Error over exposures, a panel for each working point, and the share within 1 px (figures 7 and 8)."""
     panels = []
     for point, light in POINTS.items():
         here = [figure for figure in figures if figure.point == point and figure.filter == filter]
         if here:
             title = f"{point}: extinction {light.extinction_per_m:g} /m"
             marks = CLAIMS if point == "report" else ()
-            panels.append(Panel(title, "exposures of a column", "mean error, px", list(_curves(here)), marks=marks))
+            panels += [
+                Panel(title, "exposures of a column", "mean error, px", list(_curves(here)), marks=marks),
+                Panel(title, "exposures of a column", "share within 1 px", list(_curves(here, SHARE)), y_log=False),
+            ]
     filtered = "without filter" if filter == "none" else "with the 5 x 5 median"
-    return chart_svg(panels, title=f"Error over exposures, {filtered}", across=3, notes=_notes(figures))
+    return chart_svg(panels, title=f"Error over exposures, {filtered}", notes=_notes(figures))
 
 
 def figure_9(figures: Sequence[Figure]) -> str:
@@ -174,7 +178,7 @@ def figure_9(figures: Sequence[Figure]) -> str:
     label = "maps a second of 500 columns at 100 kHz"
     panels = [
         Panel("error", label, "mean error, px", curves("mean_px"), marks=marks),
-        Panel("answers within 1 px", label, "share", curves("within_1px"), y_log=False),
+        Panel("answers within 1 px", label, "share", curves(SHARE), y_log=False),
     ]
     notes = [
         *_notes(figures),

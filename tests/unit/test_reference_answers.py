@@ -67,4 +67,4 @@ def test_what_is_asked_stands_beside_what_came_out() -> None:
     assert rows["report: within 1 px"].verdict == "pass"
     assert rows["hot pixels 1 %: error over that without"].mean == "1.0000"
     assert rows["halo: bias, px"].verdict == "short"
-    assert rows["all points: calibration error"].verdict == "short"
+    assert rows["all points: calibration error, stripes"].verdict == "short"

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rig.adaptive import EXPOSURES, Pass, Undecided, next_pass, thinned, undecided_rows
+from rig.adaptive import EXPOSURES, Pass, Unsettled, moved_rows, next_pass, thinned
 from rig.adaptive_counts import add_pass
 from rig.config import ScanConfig
 from rig.counting import CountVolume
+from rig.stripes import StripeTable
 
 COLUMNS = 200
-ROWS = 100
 
 
 def pass_time(columns: int, exposures: int) -> float:
@@ -19,54 +19,52 @@ def pass_time(columns: int, exposures: int) -> float:
     return columns * exposures * 1e-5 + 2e-3
 
 
-def undecided(now, halved, n=2) -> Undecided:
-    full = np.zeros(COLUMNS)
-    return Undecided(full + now, full + halved, np.full(COLUMNS, n, np.int32), ROWS)
+def unsettled(moved, n=2) -> Unsettled:
+    return Unsettled(np.zeros(COLUMNS) + moved, np.full(COLUMNS, n, np.int32))
 
 
 def test_where_all_columns_wait_for_photons_alike_the_next_pass_is_a_plain_sweep() -> None:
-    found = next_pass(undecided(50.0, 65.0), pass_time, 20e-3, 1)
+    found = next_pass(unsettled(15.0), pass_time, 20e-3, 1)
     assert found is not None
     assert (found.first_column, found.columns) == (0, COLUMNS)
 
 
 def test_columns_that_decide_nothing_are_left_out() -> None:
-    now, halved = np.full(COLUMNS, 1.0), np.full(COLUMNS, 2.0)
-    now[:60], halved[:60] = 40.0, 40.0  # no light will ever decide these
-    now[120:160], halved[120:160] = 40.0, 70.0
-    found = next_pass(undecided(now, halved), pass_time, 20e-3, 3)
+    moved = np.full(COLUMNS, 0.5)
+    moved[120:160] = 30.0
+    found = next_pass(unsettled(moved), pass_time, 20e-3, 3)
     assert found is not None
     assert 110 <= found.first_column <= 125
     assert 155 <= found.end_column <= 170
 
 
 def test_decided_maps_and_spent_budgets_ask_for_nothing() -> None:
-    assert next_pass(undecided(0.0, 0.0), pass_time, 20e-3, 3) is None
-    assert next_pass(undecided(30.0, 30.0), pass_time, 20e-3, 3) is None
-    assert next_pass(undecided(30.0, 60.0), pass_time, 1e-3, 3) is None
-    assert next_pass(undecided(30.0, 60.0), lambda columns, exposures: None, 1.0, 3) is None
+    assert next_pass(unsettled(0.0), pass_time, 20e-3, 3) is None
+    assert next_pass(unsettled(30.0), pass_time, 1e-3, 3) is None
+    assert next_pass(unsettled(30.0), lambda columns, exposures: None, 1.0, 3) is None
 
 
 @pytest.mark.parametrize("passes", [1, 2, 5])
 def test_a_pass_stays_within_the_budget(passes: int) -> None:
     left_s = 7.3e-3
-    found = next_pass(undecided(50.0, 70.0), pass_time, left_s, passes)
+    found = next_pass(unsettled(20.0), pass_time, left_s, passes)
     assert found is not None
     assert pass_time(found.columns, found.exposures) <= left_s
     assert found.exposures in EXPOSURES
 
 
-def test_gain_follows_the_measured_power_law() -> None:
-    gain = undecided(40.0, 80.0).gain(2)  # halved with each doubling of the frames
-    np.testing.assert_allclose(gain, 20.0)
-    np.testing.assert_allclose(undecided(40.0, 40.0).gain(8), 0.0)
-    assert undecided(25.0, 25.0).share == 0.25
+def test_gain_is_that_of_errors_that_fall_as_one_over_the_frames() -> None:
+    for n, half in ((2, 1), (3, 1), (8, 4)):
+        wrong = 120.0 / n
+        np.testing.assert_allclose(unsettled(120.0 / half - wrong, n).gain(6), wrong - 120.0 / (n + 6))
 
 
-def test_rows_that_were_not_searched_are_not_undecided() -> None:
-    confidence = np.array([[0.25, 1.0], [0.0, 0.5]], np.float32)
-    searched = np.array([[True, True], [False, True]])
-    np.testing.assert_allclose(undecided_rows(confidence, searched), [0.75, 0.5])
+def test_rows_that_were_not_searched_do_not_move() -> None:
+    here, there = StripeTable.empty(2, 3), StripeTable.empty(2, 3)
+    here.x_px[:] = [[5, 5, 5], [9, np.nan, 9]]
+    there.x_px[:] = [[6, 6.5, 9], [1, 9, 9]]
+    searched = np.array([[True, True, False], [True, True, True]])
+    np.testing.assert_array_equal(moved_rows(here, there, searched), [1, 1, 0])
 
 
 def test_a_pass_has_the_commands_of_its_columns() -> None:
