@@ -188,7 +188,7 @@ class ScanPlan:
         return float(leg.path.lit_start / self.point_rate_hz) + leg.lag_s
 
     def column(self, tau_s: Array, leg: Leg) -> Array:
-        """Fractional column, of several lines place, of the mirror `tau_s` after the scan marker of a sweep of this leg.
+        """Fractional column (of several lines: place) of the mirror `tau_s` after the scan marker of a sweep of a leg.
 
         Continued linearly outside the lit part (below -0.5, above places - 0.5), where the mirror is on no column.
         """

@@ -16,7 +16,7 @@ from rig.acquisition import SILENCE_S, Acquisition, ScanProgress
 from rig.adaptive_decision import ChoosesPasses, DecidedPasses
 from rig.adaptive_recording import PassNotes, RecordedPasses
 from rig.adaptive_scan import AdaptiveAcquisition
-from rig.config import RigConfig
+from rig.config import RigConfig, ScanConfig
 from rig.errors import RigError
 from rig.estimators import LEARNING, Learned
 from rig.geometry import SweepGeometry
@@ -156,6 +156,12 @@ def _passes(
     return None if rig.config.scan.adaptive is None else DecidedPasses(rig, plan, geometry, threads)
 
 
+def _plain_sweeps(scan: ScanConfig, plan: ScanPlan, maps: int) -> int:
+    """Sweeps of the plan that take as long as the maps may."""
+    budget_s = scan.adaptive.time_budget if scan.adaptive is not None else None
+    return maps if budget_s is None else math.ceil(maps * budget_s / float(plan.sweep_s))
+
+
 def _recording(
     rig: OpenRig, run: Run, plan: ScanPlan, timing: SpadTiming, maps: int, manifest: dict[str, Any]
 ) -> Recording:
@@ -164,7 +170,7 @@ def _recording(
         maps,
         manifest,
         lambda folder: write_inputs(folder, plan, rig.model),
-        recording_bytes(plan, spad_request(rig.config.scan, plan), timing, maps),
+        recording_bytes(plan, spad_request(rig.config.scan, plan), timing, _plain_sweeps(rig.config.scan, plan, maps)),
         map_bytes(plan),
     )
 

@@ -136,7 +136,7 @@ def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRo
     """The rows of one trial after the other."""
     configs = trials.configs()
     bar = _Bar(progress, trials.repeat * sum(map(_frames_of, configs.values())))
-    limits = SceneLimits(max(trials.exposures))
+    limits = SceneLimits(trials.exposures)
     for trial, config in configs.items():
         scores: dict[Method, list[MapScore]] = {}
         for seed in range(trials.seed, trials.seed + trials.repeat):

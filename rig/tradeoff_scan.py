@@ -19,6 +19,7 @@ from rig.acquisition import Acquisition
 from rig.config import RigConfig
 from rig.counting import Counter, FrameTally, SweepLayout, SweepTally
 from rig.errors import UsageError
+from rig.estimators import LEARNING
 from rig.geometry import WORD_PX
 from rig.reconstruction import MapResult, Reconstructor
 from rig.scan_plan import ScanPlan
@@ -32,6 +33,8 @@ MAPS = 2
 """The first one is learned from, the last one is scored."""
 TIMED_PASSES = 3
 """How often the last map is made, for the median of its time."""
+LONG_S = 1.0
+"""Passes that take longer than that together are enough."""
 MOST_KEPT_BYTES = 2_000_000_000
 """Of frames of one sweep in memory."""
 
@@ -111,13 +114,25 @@ class ManyMakers:
         """The first map is learned from, the last one made by all; gives back one of them."""
         assert isinstance(sweep, KeptSweep), "made by the counter above"
         self._maps += 1
-        for name in self._makers:
-            passes = [self._all_filters(name, sweep) for _ in range(1 if self._maps < MAPS else TIMED_PASSES)]
-            for filter, result in passes[0].items():
-                seconds = statistics.median(each[filter].compute_s for each in passes)
-                self.results[name, filter] = result, seconds
+        last = self._maps == MAPS
+        names = list(self._makers)
+        if not last:  # there is nothing to learn for the others
+            names = [name for name in names if name in LEARNING] or names[:1]
+        for name in names:
+            made = self._timed(name, sweep, TIMED_PASSES if last else 1)
+            self.results |= {(name, filter): each for filter, each in made.items()} if last else {}
         sweep.blocks.clear()  # the next sweep's frames need the room
-        return result
+        return next(iter(made.values()))[0]
+
+    def _timed(self, name: str, sweep: KeptSweep, passes: int) -> dict[str, tuple[MapResult, float]]:
+        """What the first of some passes gave, and the median of their seconds."""
+        begun = time.perf_counter()
+        made = [self._all_filters(name, sweep)]
+        while len(made) < passes and time.perf_counter() - begun < LONG_S:
+            made.append(self._all_filters(name, sweep))
+        return {
+            filter: (made[0][filter], statistics.median(each[filter].compute_s for each in made)) for filter in made[0]
+        }
 
     def _all_filters(self, name: str, sweep: KeptSweep) -> dict[str, MapResult]:
         stripe, counted, estimate_s = self._estimate(name, sweep)

@@ -21,7 +21,7 @@ from rig.estimators.label_grid import LabelGrid, label_grid
 from rig.estimators.label_volume import Costs, costs_of
 from rig.estimators.learning import learn_again, lines_of, next_lattice
 from rig.estimators.lessons import Lessons, Seen, Setting, first_model
-from rig.estimators.placing import line_width, new_places, place, profile_table
+from rig.estimators.placing import amplitudes_of, line_width, new_places, place, profile_table
 from rig.estimators.placing_kernels import Places
 from rig.estimators.row_input import State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
@@ -34,7 +34,7 @@ BAND_ROWS = 16
 """Rows whose costs stay in the cache from one step to the next."""
 FIRST_ROUNDS = 3
 """Times that the first map's stripes teach what they are then estimated with again."""
-MOST_NONE = 0.01
+MOST_NONE = 1e-12
 """A row that is taken to have no stripe passes nothing on from its neighbours: there must be evidence for it."""
 QUIET_COLUMNS = 8
 """Every so manieth column teaches the ambient light where there are dark frames too."""
@@ -111,6 +111,9 @@ class Joint:
             width = line_width(volume, tables.sweep, tables.state, stripes, self._workers)
             model = replace(model, line_sigma_px=width or model.line_sigma_px)
             model = learn_again(volume, geometry, model, ambient, stripes, self._workers)
+            assert self._memory is not None, "a map has been estimated"
+            amplitude, weight = amplitudes_of(self._memory.places)
+            model = replace(model, amplitude=amplitude, weight=weight)
         return model
 
     def _stripes(self, volume: CountVolume, tables: _Tables) -> StripeTable:
@@ -123,6 +126,7 @@ class Joint:
             for band in range(first, last, BAND_ROWS):
                 end = min(band + BAND_ROWS, last)
                 tables.costs.fill(volume, band, end, memory.cost)
+                memory.cost[band:end, :, grid.none] = 255
                 along_rows(memory.cost, memory.message, penalties, band, end)
 
         def tie_columns(first: int, last: int) -> None:

@@ -1,5 +1,7 @@
 """Sub-pixel places of stripes whose labels are known; see `placing_kernels`."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,20 +61,20 @@ def place(
 ) -> NDArray[np.float32]:
     """Move x_px, whose distances from the far end are in `places`, to where neighbours together put it.
 
-    Returns its standard deviation in px; light and haze are left in `places`.
+    Returns its standard deviation in px; light and haze are left in `places`, with all that was found on the way.
     """
     rows, columns = x_px.shape
     side = 1 if sweep.near_is_left else -1
     faintest, brightest = float(state.amplitude[0]) / BEYOND, float(state.amplitude[-1]) * BEYOND
-    amplitude, moved, sd = (np.empty((rows, columns), np.float32) for _ in range(3))
+    moved, sd = (np.empty((rows, columns), np.float32) for _ in range(2))
     seen = volume.counts, volume.n_frames, sweep, state
 
     def over(kernel: object, *before: object, after: tuple[object, ...]) -> None:
         workers.over(rows, lambda first, last: kernel(*before, first, last, *after))  # type: ignore[operator]
 
     over(measure_light, *seen, x_px, after=(places,))
-    over(pool_amplitude, places, LIGHT_REACH, faintest, brightest, after=(amplitude,))
-    over(score_places, *seen, shares, x_px, side, amplitude, after=(places,))
+    over(pool_amplitude, LIGHT_REACH, faintest, brightest, after=(places,))
+    over(score_places, *seen, shares, x_px, side, after=(places,))
     over(pool_places, places, REACHES, ENOUGH, after=(moved, sd))
     x_px += moved
     return sd
@@ -90,3 +92,13 @@ def line_width(
         return None
     pixel_variance = 1 / 12
     return float(np.sqrt(np.clip(moment / light - pixel_variance, *LINE_SIGMA_PX**2)))
+
+
+def amplitudes_of(places: Places) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Four amplitudes that stand for those of a map's stripes, pooled over neighbours, and their shares."""
+    found = places.amplitude[places.scale > 0]
+    edges, shares = (0.0, 0.2, 0.5, 0.8, 1.0), np.array([0.2, 0.3, 0.3, 0.2])
+    if len(found) == 0:
+        return np.ones(4, np.float32), shares
+    middle = [0.5 * (a + b) for a, b in pairwise(edges)]
+    return np.quantile(found, middle).astype(np.float32), shares

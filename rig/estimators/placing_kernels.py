@@ -45,6 +45,7 @@ class Places(NamedTuple):
     distance: Float32
     light: Float32
     scale: Float32
+    amplitude: Float32
     haze: Float32
     score: Float32
     known: Float32
@@ -95,12 +96,11 @@ def score_places(
     shares: Float32,
     x_px: Float32,
     side: int,
-    amplitude: Float32,
     first_row: int,
     last_row: int,
     out: Places,
 ) -> None:
-    """Fill score and known of rows first_row..last_row-1 for stripes of `amplitude` (rows, columns) at x_px.
+    """Fill score and known of rows first_row..last_row-1 for stripes at x_px.
 
     shares: (FRACTIONS, 2, 2 REACH_PX + 1), share of the line in each pixel around the one that holds its centre, and
     by how much that grows with every pixel that the centre moves on.
@@ -120,7 +120,7 @@ def score_places(
             before, behind, scale, _, _, _, _ = fluxes_at(sweep, state, y, near, c, path_p, strength)
             before -= state.ambient[y, near]
             behind -= state.ambient[y, near]
-            light = amplitude[y, c] * scale
+            light = out.amplitude[y, c] * scale
             score, known = np.float32(0.0), np.float32(0.0)
             for d in range(-REACH_PX, REACH_PX + 1):
                 t = x + d
@@ -160,9 +160,10 @@ def pool_row(distance: Float32, first: Float32, second: Float32, y: int, reach: 
 
 @numba.njit(cache=True, nogil=True)
 def pool_amplitude(
-    places: Places, reach: int, faintest: float, brightest: float, first_row: int, last_row: int, amplitude: Float32
+    reach: int, faintest: float, brightest: float, first_row: int, last_row: int, places: Places
 ) -> None:
-    """Brightness of each stripe over that of its scale, pooled over neighbours, between two limits."""
+    """Fill amplitude: brightness of each stripe over that of its scale, pooled over neighbours, between two limits."""
+    amplitude = places.amplitude
     sums = np.empty((2, amplitude.shape[1]), np.float32)
     for y in range(first_row, last_row):
         pool_row(places.distance, places.light, places.scale, y, reach, sums)
