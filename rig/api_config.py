@@ -23,6 +23,7 @@ def configure(
     estimator: Estimator | None = None,
     filter: Filter | None = None,
     min_confidence: float | None = None,
+    temporal_prior: bool | None = None,
     adaptive: Mapping[str, object] | None = None,
 ) -> RigConfig:
     """The validated config that `scan` would use; options that are None stay as the config says.
@@ -37,6 +38,7 @@ def configure(
         "estimate.estimator": estimator,
         "estimate.filter": filter,
         "estimate.min_confidence": min_confidence,
+        "estimate.temporal_prior": temporal_prior,
     }
     loaded = config if isinstance(config, RigConfig) else load_config(os.fspath(config))
     for name, asked in (("scene", scene), ("fog", fog)):
@@ -48,7 +50,12 @@ def configure(
     given = {key: value for key, value in options.items() if value is not None}
     if not given:
         return loaded
-    return load_config(os.fspath(config), given) if not isinstance(config, RigConfig) else _changed(config, given)
+    changed = _changed(config, given) if isinstance(config, RigConfig) else load_config(os.fspath(config), given)
+    if temporal_prior and changed.estimate.estimator != "joint":
+        raise UsageError(
+            f"--temporal-prior is for the estimator joint, this is {changed.estimate.estimator}; add --estimator joint"
+        )
+    return changed
 
 
 def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:

@@ -31,6 +31,7 @@ def scan(
     estimator: Estimator | None = None,
     filter: Filter | None = None,
     min_confidence: float | None = None,
+    temporal_prior: bool | None = None,
     adaptive: Mapping[str, object] | None = None,
     seed: int = 0,
     save: str = "all",
@@ -62,6 +63,7 @@ def scan(
         estimator=estimator,
         filter=filter,
         min_confidence=min_confidence,
+        temporal_prior=temporal_prior,
         adaptive=adaptive,
     )
     policy, overload = _checked_policies(maps, seed, save, on_overload, _problems(settings, arm, out, record))

@@ -45,6 +45,14 @@ def scan_command(
     estimator: EstimatorOption = None,
     filter: FilterOption = None,
     min_confidence: ConfidenceOption = None,
+    temporal_prior: Annotated[
+        bool | None,
+        typer.Option(
+            "--temporal-prior/--no-temporal-prior",
+            help="joint: hold each map to the last one a little",
+            show_default=False,
+        ),
+    ] = None,
     adaptive: Annotated[
         bool, typer.Option("--adaptive", help="maps in passes: more exposures where rows are still undecided")
     ] = False,
@@ -72,6 +80,7 @@ def scan_command(
         "estimator": estimator,
         "filter": filter,
         "min_confidence": min_confidence,
+        "temporal_prior": temporal_prior,
         "adaptive": _passes(adaptive, time_budget),
     }
     if dry_run:

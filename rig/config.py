@@ -149,6 +149,11 @@ class EstimateConfig(Section):
     min_confidence: float = Field(
         default=0.5, ge=0, le=1, description="answers below this confidence do not enter the depth map", examples=[0.5]
     )
+    temporal_prior: bool = Field(
+        default=False,
+        description="hold each map to the last one a little, for scenes that mostly stand still; `joint` only",
+        examples=["true"],
+    )
     threads: int | None = Field(
         default=None,
         ge=1,

@@ -43,6 +43,7 @@ FLAGS: Mapping[Key, str] = {
     ("estimate", "estimator"): "--estimator",
     ("estimate", "filter"): "--filter",
     ("estimate", "min_confidence"): "--min-confidence",
+    ("estimate", "temporal_prior"): "--temporal-prior",
 }
 """Keys that the command line has an option for."""
 _READS_ON = ("is ", "has ", "runs ", "begins ")

@@ -42,7 +42,7 @@ class Reconstructor:
 
     model: rig model, None for an uncalibrated rig (stripes only). column_commands: (columns,) mirror command of each
     column's centre. estimator, filter: of ESTIMATORS and FILTERS. lines: which line lights which column where there are
-    several. Raises UsageError for what does not fit.
+    several. temporal_prior: of `joint`, see `EstimateConfig`. Raises UsageError for what does not fit.
     """
 
     def __init__(
@@ -58,6 +58,7 @@ class Reconstructor:
         threads: int = 2,
         learned: Sequence[Learned] = (),
         lines: LineGrid | None = None,
+        temporal_prior: bool = False,
     ) -> None:
         if estimator not in ESTIMATORS:
             raise UsageError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
@@ -69,7 +70,10 @@ class Reconstructor:
         self._filter = filter
         self._lines = lines
         self._workers = RowWorkers(threads)
-        self.estimator = recalling(estimator, learned, threads) if learned else create_estimator(estimator, threads)
+        if learned:
+            self.estimator = recalling(estimator, learned, threads, temporal_prior=temporal_prior)
+        else:
+            self.estimator = create_estimator(estimator, threads, temporal_prior=temporal_prior)
         if model is not None:
             self.geometry = sweep_geometry(model, model.planes(self._commands), depth_range_m)
             if lines is not None:

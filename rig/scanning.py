@@ -245,6 +245,7 @@ def make_reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequ
         threads=threads,
         learned=learned,
         lines=plan.lines,
+        temporal_prior=estimate.temporal_prior,
     )
 
 

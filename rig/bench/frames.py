@@ -74,7 +74,7 @@ def window_frames(window: int, workers: RowWorkers, n_bytes: int = FRAMES_BYTES)
     def draw(first: int, last: int) -> None:
         for i in range(first, last):
             frames = bits[i * PLACE_FRAMES : (i + 1) * PLACE_FRAMES]
-            draw_frames(_thresholds(window, place[i], photons[i]), (window << 32) + (i << 16), frames)
+            draw_frames(thresholds(window, place[i], photons[i]), (window << 32) + (i << 16), frames)
 
     workers.over(distinct, draw)
     for first in range(distinct * PLACE_FRAMES, len(bits), distinct * PLACE_FRAMES):
@@ -93,22 +93,22 @@ def full_frames(narrow: BenchFrames, n_bytes: int = FRAMES_BYTES) -> BenchFrames
     return BenchFrames(narrow.window, bits, narrow.truth_px[:places], narrow.geometry)
 
 
-def bench_geometry(window: int) -> SweepGeometry:
+def bench_geometry(window: int, rows: int = ROWS, columns: int = COLUMNS) -> SweepGeometry:
     """Columns whose planes all cross the depth range over just `window` pixels, which begin at a multiple of it."""
     x0 = min(window, WIDTH - window)
-    u = np.broadcast_to(np.linspace(-0.5, 0.5, WIDTH, dtype=np.float32), (ROWS, WIDTH)).copy()
+    u = np.broadcast_to(np.linspace(-0.5, 0.5, WIDTH, dtype=np.float32), (rows, WIDTH)).copy()
     tangents_per_px = 1.0 / (WIDTH - 1)
     w_per_px = (NEAR_W - FAR_W) / (window - 1)
     plane = np.array([-w_per_px / tangents_per_px, 0.0, NEAR_W + w_per_px * x0 - 0.5 * w_per_px / tangents_per_px])
-    planes = np.tile(np.append(plane, 1.0), (COLUMNS, 1))
-    low = np.full((ROWS, COLUMNS), x0, np.int32)
+    planes = np.tile(np.append(plane, 1.0), (columns, 1))
+    low = np.full((rows, columns), x0, np.int32)
     return SweepGeometry(
         u, np.zeros_like(u), planes[:, :3].copy(), planes, low, low + np.int32(window - 1),
-        np.full(COLUMNS, x0, np.int32), window, True, (1 / NEAR_W, 1 / FAR_W), np.zeros((ROWS, WIDTH), np.bool_),
+        np.full(columns, x0, np.int32), window, True, (1 / NEAR_W, 1 / FAR_W), np.zeros((rows, WIDTH), np.bool_),
     )  # fmt: skip
 
 
-def _thresholds(window: int, place: NDArray[np.float32], photons: NDArray[np.float32]) -> NDArray[np.uint32]:
+def thresholds(window: int, place: NDArray[np.float32], photons: NDArray[np.float32]) -> NDArray[np.uint32]:
     """Detection probability of each pixel, (rows, window), in units of 2 ** -BITS_OF_CHANCE."""
     x = np.arange(window)
     depth_m = 1.0 / (NEAR_W - (NEAR_W - FAR_W) / (window - 1) * x)

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.bench.bench_kernels import read_all
-from rig.bench.frames import FRAMES_BYTES, PLACE_FRAMES, BenchFrames, full_frames, window_frames
+from rig.bench.frames import COLUMNS, FRAMES_BYTES, PLACE_FRAMES, ROWS, BenchFrames, full_frames, window_frames
 from rig.bench.latency import SECONDS, Latency, measure_latency
 from rig.bench.machine import machine
+from rig.bench.map_stages import joint_stage, joint_sweep_stage, learn_joint, sgbm_stage
 from rig.bench.recorded import recording_of
 from rig.bench.stages import (
     Measured,
@@ -32,6 +33,7 @@ from rig.bench.stages import (
     parse_stage,
     search_stage,
 )
+from rig.bench.surface import bench_surface, count_surface
 from rig.counting import SweepCounter
 from rig.estimators.likelihood import Likelihood
 from rig.row_threads import RowWorkers
@@ -58,7 +60,8 @@ class Extent:
     """How much is measured.
 
     moment_s, count_moment_s: of each row in each of the `rounds`, those of `count` being fast. latency_s: of the stream
-    for the latency. frames_bytes, read_bytes: memory of the frames of each window, and for the plain read.
+    for the latency. frames_bytes, read_bytes: memory of the frames of each window, and for the plain read. map_rows,
+    map_columns: of the maps that are made as a whole.
     """
 
     windows: tuple[int, ...] = WINDOWS
@@ -69,23 +72,29 @@ class Extent:
     latency_s: float = SECONDS
     frames_bytes: int = FRAMES_BYTES
     read_bytes: int = READ_BYTES
+    map_rows: int = ROWS
+    map_columns: int = COLUMNS
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One figure. exposures: None where columns play no part; None as well where a quotient means nothing."""
+    """One figure. exposures: None where columns play no part; None as well where a speed or quotient means nothing.
+
+    ms_per_map: of stages that make whole maps.
+    """
 
     stage: str
     window: int
     exposures: int | None
     threads: int
-    frames_per_s: float
-    times_real_time: float
+    frames_per_s: float | None
+    times_real_time: float | None
     of_memory_bandwidth: float | None
     times_numpy: float | None
     error_px: float | None
     median_error_px: float | None
     missing: float | None
+    ms_per_map: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +138,7 @@ def measure_speed(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="spadrig-bench-")))
         frames = {window: window_frames(window, workers[most], extent.frames_bytes) for window in extent.windows}
         learned = {window: learn(these, most) for window, these in frames.items()}
-        cases = _cases(frames, learned, workers, extent, folder)
+        cases = _cases(frames, learned, workers, extent, folder) + _map_cases(workers, extent)
         memory, measured = _in_turn(cases, frames[extent.windows[-1]], extent, progress)
         window = _usual_window(extent)
         latency = measure_latency(frames[window], LEARN_EXPOSURES, workers[most], learned[window], extent.latency_s)
@@ -246,6 +255,19 @@ def _recorded_cases(
     return cases
 
 
+def _map_cases(workers: dict[int, RowWorkers], extent: Extent) -> list[_Case]:
+    surface = bench_surface(extent.map_rows, extent.map_columns)
+    most, window = max(workers), WINDOWS[0]
+    model = learn_joint(surface, LEARN_EXPOSURES, most)
+    cases = [_Case("sgbm", window, None, n, None, sgbm_stage(surface, n)) for n in workers]
+    for k in FEW_EXPOSURES:
+        bits = surface.frames(k, workers[most])
+        volume = count_surface(surface, bits, k, workers[most])
+        cases += [_Case("joint", window, k, n, None, joint_stage(surface, volume, n, model)) for n in workers]
+    stages = {n: joint_sweep_stage(surface, bits, k, n, model) for n in workers}
+    return cases + [_Case("joint-sweep", window, k, n, None, stage) for n, stage in stages.items()]
+
+
 def _in_turn(
     cases: list[_Case], frames: BenchFrames, extent: Extent, progress: Callable[[int, int], None] | None
 ) -> tuple[list[float], list[list[Measured]]]:
@@ -279,7 +301,7 @@ def _read_bytes_per_s(words: NDArray[np.uint64]) -> float:
 
 
 def _rows(cases: list[_Case], measured: list[list[Measured]], read: float) -> tuple[Row, ...]:
-    speeds = [float(np.median([each.frames / each.seconds for each in these])) for these in measured]
+    speeds = [float(np.median([each.frames / each.seconds for each in these])) or None for these in measured]
     naive = {
         (case.window, case.exposures): speed for case, speed in zip(cases, speeds, strict=True) if case.stage == "numpy"
     }
@@ -293,15 +315,21 @@ def _rows(cases: list[_Case], measured: list[list[Measured]], read: float) -> tu
             exposures=case.exposures,
             threads=case.threads,
             frames_per_s=speed,
-            times_real_time=speed / REAL_TIME_HZ,
-            of_memory_bandwidth=None if case.frame_bytes is None else speed * case.frame_bytes / read,
-            times_numpy=None if slow is None else speed / slow,
+            times_real_time=None if speed is None else speed / REAL_TIME_HZ,
+            of_memory_bandwidth=None if speed is None or case.frame_bytes is None else speed * case.frame_bytes / read,
+            times_numpy=None if speed is None or slow is None else speed / slow,
             error_px=error.mean_abs_px,
             median_error_px=error.median_abs_px,
             missing=error.missing,
+            ms_per_map=_ms_per_map(these),
         )
         rows.append(row if these[0].error else replace(row, error_px=None, median_error_px=None, missing=None))
     return tuple(rows)
+
+
+def _ms_per_map(measured: list[Measured]) -> float | None:
+    times = [1e3 * each.seconds / each.maps for each in measured if each.maps]
+    return float(np.median(times)) if times else None
 
 
 def _usual_window(extent: Extent) -> int:

@@ -45,11 +45,12 @@ class StripeError:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Work of one moment; error where it estimates."""
+    """Work of one moment; error where it estimates, maps where it makes whole ones."""
 
     frames: int
     seconds: float
     error: StripeError | None = None
+    maps: int | None = None
 
 
 Stage = Callable[[float], Measured]
@@ -111,7 +112,7 @@ def numpy_stage(frames: BenchFrames, walk: Walk, exposures: int) -> Stage:
             spent += time.perf_counter() - begun
             done += len(bits)
             errors.append((brightest + x0 - frames.truth_px[place]).astype(np.float32))
-        return Measured(done, spent, _error(np.concatenate(errors)))
+        return Measured(done, spent, stripe_error(np.concatenate(errors)))
 
     return measure
 
@@ -230,10 +231,11 @@ def _sweep_frames(
 def _search_error(sweep: SearchedSweep, frames: BenchFrames, places: list[int], exposures: int) -> StripeError:
     columns = len(places) * PLACE_FRAMES // exposures
     place = np.repeat(np.array(places), PLACE_FRAMES // exposures)
-    return _error(sweep.stripe.x_px[:, :columns] - frames.truth_px[place].T)
+    return stripe_error(sweep.stripe.x_px[:, :columns] - frames.truth_px[place].T)
 
 
-def _error(difference: NDArray[np.float32]) -> StripeError:
+def stripe_error(difference: NDArray[np.float32]) -> StripeError:
+    """Of differences from the truth, NaN where there is no estimate."""
     found = np.abs(difference[np.isfinite(difference)])
     if not len(found):
         return StripeError(float("nan"), float("nan"), 1.0)

@@ -20,6 +20,9 @@ _TITLES = {
     "likelihood-sweep": "the same with what is done once a sweep",
     "count-full": "counting alone, whole frames",
     "likelihood-full": "counting + likelihood in a window of whole frames",
+    "joint": "joint from counts, whole maps of 512 x 500",
+    "joint-sweep": "counting + joint, one after the other",
+    "sgbm": "OpenCV's StereoSGBM, MODE_HH4, as many disparities and pixels, two pictures",
     "disk": "counting + likelihood from a recording (page cache), header checksums",
     "disk-crc": "the same, payload checksums too",
     "parse": "reading SPB1 blocks in memory, header checksums",
@@ -133,7 +136,7 @@ def _print_machine(console: Console, found: dict[str, object]) -> None:
 def _table(rows: Iterable[Row]) -> Table:
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for name in (
-        "window", "K", "threads", "kframes/s", "real time", "of memory", "x numpy", "error px", "median px",
+        "window", "K", "threads", "kframes/s", "real time", "of memory", "x numpy", "error px", "median px", "ms/map",
     ):  # fmt: skip
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
@@ -141,12 +144,13 @@ def _table(rows: Iterable[Row]) -> Table:
             str(row.window),
             "-" if row.exposures is None else str(row.exposures),
             str(row.threads),
-            f"{row.frames_per_s / 1e3:.4g}",
-            f"{row.times_real_time:.2f}",
+            "-" if row.frames_per_s is None else f"{row.frames_per_s / 1e3:.4g}",
+            "-" if row.times_real_time is None else f"{row.times_real_time:.2f}",
             _number(row.of_memory_bandwidth, 2),
             _number(row.times_numpy),
             _number(row.error_px),
             _number(row.median_error_px),
+            _number(row.ms_per_map),
         )
     return table
 

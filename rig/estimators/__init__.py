@@ -58,30 +58,33 @@ class LearnsFromStream(Estimator, Protocol):
     """The state that the next map will be estimated with, None before a map that taught."""
 
 
-def recalling(name: str, learned: Sequence[Learned], threads: int = 2) -> Estimator:
+def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
     """The estimator of a name in LEARNING that learned these states, to estimate the map of each again as with it.
 
     It learns nothing.
     """
     from rig.estimators.recalled import Recalled
 
-    return Recalled(_learning(name, threads, learns=False), learned)
+    return Recalled(_learning(name, threads, learns=False, temporal_prior=temporal_prior), learned)
 
 
-def create_estimator(name: str, threads: int = 2) -> Estimator:
-    """Estimator of a name out of ESTIMATORS, fresh, for up to `threads` threads; KeyError for any other name."""
+def create_estimator(name: str, threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
+    """Estimator of a name out of ESTIMATORS, fresh, for up to `threads` threads; KeyError for any other name.
+
+    temporal_prior: whether `joint` holds each map to the last one a little; the others estimate every map by itself.
+    """
     if name in LEARNING:
-        return _learning(name, threads, learns=True)
+        return _learning(name, threads, learns=True, temporal_prior=temporal_prior)
     from rig.estimators.peaks import Peaks
 
     return {"argmax": Peaks(False, threads), "edge": Peaks(True, threads)}[name]
 
 
-def _learning(name: str, threads: int, *, learns: bool) -> LearnsFromStream:
+def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool) -> LearnsFromStream:
     if name == "likelihood":
         from rig.estimators.likelihood import Likelihood
 
         return Likelihood(threads, learns=learns)
     from rig.estimators.joint import Joint
 
-    return Joint(threads, learns=learns)
+    return Joint(threads, learns=learns, temporal_prior=temporal_prior)

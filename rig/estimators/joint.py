@@ -15,6 +15,8 @@ from rig.counting import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimators.aggregation_answer import Answer, answer_settings, new_answer
 from rig.estimators.aggregation_kernels import Penalties, along_columns, along_rows
 from rig.estimators.ambient import ambient_map
+from rig.estimators.halo import halo_shares
+from rig.estimators.halo_learning import learn_halo
 from rig.estimators.joint_answer import stripe_table
 from rig.estimators.joint_kernels import add_quiet, read_positions
 from rig.estimators.label_grid import LabelGrid, label_grid
@@ -25,6 +27,7 @@ from rig.estimators.placing import amplitudes_of, line_width, new_places, place,
 from rig.estimators.placing_kernels import Places
 from rig.estimators.row_input import State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
+from rig.estimators.temporal import TemporalPrior
 from rig.estimators.volume_search import nominal_exposures
 from rig.geometry import SweepGeometry
 from rig.row_threads import RowWorkers
@@ -48,6 +51,7 @@ class _Tables(NamedTuple):
     sweep: Sweep
     state: State
     shares: NDArray[np.float32]
+    halo: NDArray[np.float32]
     dark: bool
 
 
@@ -64,24 +68,31 @@ class Joint:
     """The row likelihood tied to the neighbours', with the state it has learned so far.
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
-    learns: whether later maps change that state.
+    learns: whether later maps change that state. temporal_prior: whether each map is held to the last one a little.
     """
 
-    def __init__(self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True) -> None:
+    def __init__(
+        self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True, temporal_prior: bool = False
+    ) -> None:
         self._workers = RowWorkers(threads)
-        self._lessons = Lessons(_tables, model, learns=learns)
+        self._lessons = Lessons(_tables, None, learns=learns)
+        self._prior = TemporalPrior(temporal_prior)
         self._memory: _Memory | None = None
         self.used: RowModel | None = None
         """The state that the last map was estimated with."""
+        if model is not None:
+            self.model = model
 
     @property
     def model(self) -> RowModel | None:
         """The state that the next map will be estimated with."""
-        return self._lessons.model
+        model, before = self._lessons.model, self._prior.before
+        return model if model is None or before is None else replace(model, before=before)
 
     @model.setter
     def model(self, model: RowModel) -> None:
-        self._lessons.model = model
+        self._prior.recall(model.before)
+        self._lessons.model = model if model.before is None else replace(model, before=None)
 
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
         """A counter whose sweeps `estimate` takes; geometry: nominal, as of every sweep."""
@@ -92,8 +103,10 @@ class Joint:
         model = self._lessons.model_for(lambda: self._first_model(sweep, geometry))
         setting = Setting(model, geometry, nominal_exposures(sweep), sweep.dark_counts is not None)
         tables = self._lessons.tables(setting, self._workers)
+        self._prior.begin(geometry, tables.grid)
+        self.used = model if self._prior.before is None else replace(model, before=self._prior.before)
         stripes = self._stripes(sweep, tables)
-        self.used = model
+        self._prior.leave(stripes, tables.grid, self._workers)
         self._lessons.attend(
             stripes, model, int(sweep.n_frames.sum()), lambda: self._seen(sweep, geometry, tables, stripes)
         )
@@ -101,6 +114,7 @@ class Joint:
 
     def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
         """Learn from the first sweep: row by row, then from stripes that all rows together show far better."""
+        self._prior.recall(None)  # of maps that taught nothing
         model = first_model(volume, geometry, self._workers)
         exposures, dark = nominal_exposures(volume), volume.dark_counts is not None
         for _ in range(FIRST_ROUNDS):
@@ -112,8 +126,10 @@ class Joint:
             model = replace(model, line_sigma_px=width or model.line_sigma_px)
             model = learn_again(volume, geometry, model, ambient, stripes, self._workers)
             assert self._memory is not None, "a map has been estimated"
-            amplitude, weight = amplitudes_of(self._memory.places)
+            places = self._memory.places
+            amplitude, weight = amplitudes_of(places)
             model = replace(model, amplitude=amplitude, weight=weight)
+            model = learn_halo(volume, geometry, model, ambient, stripes, places, self._workers)
         return model
 
     def _stripes(self, volume: CountVolume, tables: _Tables) -> StripeTable:
@@ -126,6 +142,7 @@ class Joint:
             for band in range(first, last, BAND_ROWS):
                 end = min(band + BAND_ROWS, last)
                 tables.costs.fill(volume, band, end, memory.cost)
+                self._prior.add(volume, band, end, memory.cost)
                 memory.cost[band:end, :, grid.none] = 255
                 along_rows(memory.cost, memory.message, penalties, band, end)
 
@@ -143,7 +160,7 @@ class Joint:
         workers.over(columns, tie_columns)
         workers.over(rows, read)
         sd = place(volume, tables.sweep, tables.state, tables.shares, x_px, memory.places, workers)
-        return stripe_table(x_px, sd, memory.answer, memory.places, tables.state)
+        return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, tables.state, workers)
 
     def _room(self, rows: int, columns: int, labels: int) -> _Memory:
         memory = self._memory
@@ -163,8 +180,8 @@ class Joint:
 
         def work(first: int, last: int) -> None:
             add_quiet(
-                volume.counts, volume.n_frames, tables.sweep, stripes.x_px, stripes.confidence,
-                QUIET_COLUMNS if tables.dark else 1, first, last, quiet,
+                volume.counts, volume.n_frames, tables.sweep, tables.state, tables.halo, stripes.x_px, stripes.signal,
+                stripes.confidence, QUIET_COLUMNS if tables.dark else 1, first, last, quiet,
             )  # fmt: skip
 
         self._workers.over(geometry.rows, work)
@@ -176,4 +193,5 @@ def _tables(setting: Setting, workers: RowWorkers) -> _Tables:
     model = replace(setting.model, none_weight=min(setting.model.none_weight, MOST_NONE))
     costs = costs_of(model, setting.geometry, grid, setting.exposures, workers)
     shares = profile_table(setting.model.line_sigma_px)
-    return _Tables(grid, costs, sweep_of(setting.geometry), state_of(setting.model), shares, setting.dark)
+    halo = halo_shares(model, setting.geometry.width if model.halo.any() else 0)
+    return _Tables(grid, costs, sweep_of(setting.geometry), state_of(setting.model), shares, halo, setting.dark)

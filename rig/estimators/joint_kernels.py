@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rig.estimators.aggregation_answer import Answer
 from rig.estimators.label_grid import PER_PX
-from rig.estimators.row_input import Sweep
+from rig.estimators.row_input import State, Sweep, fluxes_at, line_light
 
 QUIET_REACH_PX: Final = 8
 """Pixels so far behind a clear stripe show nothing of it."""
@@ -39,14 +39,21 @@ def add_quiet(
     counts: NDArray[np.unsignedinteger],
     n_frames: NDArray[np.int32],
     sweep: Sweep,
+    state: State,
+    halo: NDArray[np.float32],
     x_px: NDArray[np.float32],
+    signal: NDArray[np.float32],
     confidence: NDArray[np.float32],
     column_step: int,
     first_row: int,
     last_row: int,
     quiet: NDArray[np.float64],
 ) -> None:
-    """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, of some columns."""
+    """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, of some columns.
+
+    halo: (BINS, pixels) of `halo_shares`, without pixels where there is none: with one it is not dark behind a stripe
+    of `signal` photons, and what is expected of halo and pedestal is taken off.
+    """
     width = sweep.u.shape[1]
     for y in range(first_row, last_row):
         for c in range(0, x_px.shape[1], column_step):
@@ -61,3 +68,13 @@ def add_quiet(
             for t in range(begin, end):
                 quiet[0, y, t] += counts[c, y, t - x0]
                 quiet[1, y, t] += n_frames[c]
+            if halo.shape[1] == 0 or begin >= end:
+                continue
+            at = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
+            path_p, strength = line_light(sweep, state, y, c, at)
+            _, _, _, _, _, cell, _ = fluxes_at(sweep, state, y, at, c, path_p, strength)
+            for t in range(begin, end):
+                _, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, t, c, path_p, strength)
+                ambient = state.ambient[y, t]
+                total = behind + signal[y, c] * halo[cell, min(abs(t - x), halo.shape[1] - 1)]
+                quiet[0, y, t] -= n_frames[c] * (np.exp(-ambient) - np.exp(-total))

@@ -113,15 +113,16 @@ def fill_tables(
     """
     side = 1 if sweep.near_is_left else -1
     pixels = out.edge.shape[1]
-    row = row_buffers(sweep.window, 1)
+    row, middle_light = row_buffers(sweep.window, 1), np.sqrt(light[0] * light[-1])
     mean, number = np.empty(pixels, np.float32), np.empty(pixels, np.int32)
     flux, level = np.empty((2, pixels), np.float32), np.empty((4, pixels), np.float32)
+    glow = np.empty(pixels, np.float32)
     for b in range(first_band, last_band):
         rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
         for c in range(place.shape[0]):
             if out.at[b, c].max() < 0:
                 continue
-            _mean_ambient(place, ambient, hot, side, c, rows, mean, number)
+            mean_ambient(place, ambient, hot, side, c, rows, mean, number)
             for variant in range(VARIANTS):
                 i = out.at[b, c, variant]
                 if i < 0:
@@ -133,14 +134,17 @@ def fill_tables(
                 span = max(to_t - length + 1, 0), min(to_t + 1, pixels)
                 out.span[i, 0], out.span[i, 1] = span
                 for p in range(span[0], span[1]):
+                    # Around its middle the halo is level; `halo_tables` tell what it is elsewhere.
+                    glow[p] = state.glow[row.cell[to_t - p]]
                     for near in (_NEAR, _FAR):
                         light_there = row.before[to_t - p] if near == _NEAR else row.behind[to_t - p]
+                        light_there += middle_light * row.scale[to_t - p] * glow[p]
                         flux[near, p] = min(max(light_there + mean[p], FLUX_MIN), FLUX_MAX)
                         cell = cell_of(flux[near, p])
                         level[near, p], level[2 + near, p] = state.table[0, cell], state.table[1, cell]
                 _fill_edges(level, span, per_nat, out.edge[i], out.edge_sum[i])
                 _fill_taps(
-                    state.table, row.scale, to_t, span, flux, level, light, shares, variant, per_nat, most,
+                    state.table, row.scale, glow, to_t, span, flux, level, light, shares, variant, per_nat, most,
                     (label, label_end), out.tap[i], out.constant[i],
                 )  # fmt: skip
                 behind, before, change = none_prior(
@@ -185,7 +189,7 @@ def _middle_row(place: NDArray[np.int16], c: int, rows: tuple[int, int], variant
 
 
 @numba.njit(cache=True, nogil=True)
-def _mean_ambient(
+def mean_ambient(
     place: NDArray[np.int16], ambient: NDArray[np.float32], hot: NDArray[np.bool_], side: int, c: int,
     rows: tuple[int, int], mean: NDArray[np.float32], number: NDArray[np.int32],
 ) -> None:  # fmt: skip
@@ -224,13 +228,13 @@ def _fill_edges(
 
 @numba.njit(cache=True, nogil=True)
 def _fill_taps(
-    table: NDArray[np.float32], scale: NDArray[np.float32], to_t: int, span: tuple[int, int],
+    table: NDArray[np.float32], scale: NDArray[np.float32], glow: NDArray[np.float32], to_t: int, span: tuple[int, int],
     flux: NDArray[np.float32], level: NDArray[np.float32], light: NDArray[np.float32], shares: NDArray[np.float32],
     variant: int, per_nat: float, most: float, labels: tuple[int, int], tap: NDArray[np.int16],
     constant: NDArray[np.float32],
 ) -> None:  # fmt: skip
     reach = shares.shape[1] // 2
-    half = np.float32(0.5)
+    half, middle_light = np.float32(0.5), np.sqrt(light[0] * light[-1])
     for q in range(LANES * tap.shape[0]):
         p, vector, lane = FAR_PX + q, q // LANES, q % LANES
         for phase in range(PHASES):
@@ -243,6 +247,7 @@ def _fill_taps(
                 constant[vector, phase, m, lane] = IMPOSSIBLE
                 if not inside:
                     continue
+                halo = (light[m] - middle_light) * scale[to_t - p] * glow[p]
                 for d in range(max(-reach, span[0] - p), min(reach + 1, span[1] - p)):
                     at = p + d
                     # Relative to what the running sum takes the pixel for: behind up to here, before from here on.
@@ -251,8 +256,8 @@ def _fill_taps(
                     if d == 0:
                         nearer = half - np.float32(off) / np.float32(FRACTIONS)
                         base = flux[_FAR, at] + nearer * (flux[_NEAR, at] - flux[_FAR, at])
-                    extra = light[m] * scale[to_t - p] * shares[off + VARIANTS, d + reach]
-                    cell = cell_of(min(base + extra, FLUX_MAX))
+                    extra = light[m] * scale[to_t - p] * shares[off + VARIANTS, d + reach] + halo
+                    cell = cell_of(min(max(base + extra, FLUX_MIN), FLUX_MAX))
                     weight = _weight((table[0, cell] - level[own, at]) * per_nat)
                     tap[vector, d + reach, phase, m, lane] = weight
                     largest += abs(weight)

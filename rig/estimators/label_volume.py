@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from rig.aligned import aligned_zeros
 from rig.counting import CountVolume
+from rig.estimators.halo import halo_shares
+from rig.estimators.halo_tables import HaloTables, fill_halo, halo_tables
 from rig.estimators.judging import HOT_FACTOR, HOT_FLUX
 from rig.estimators.label_grid import LabelGrid
 from rig.estimators.label_places import FAR_PX, FRACTIONS, PHASES, VARIANTS, label_pixels, places_of
@@ -57,6 +59,7 @@ class Costs:
 
     grid: LabelGrid
     tables: LabelTables
+    halo: HaloTables
     place: NDArray[np.int16]
     hot_start: NDArray[np.int32]
     hot_x: NDArray[np.int16]
@@ -70,10 +73,10 @@ class Costs:
         where it cannot be. Rows without frames, or with nothing to search, cost 0 everywhere. Best called with 16 rows
         or more at a time; threads may fill different rows at once.
         """
-        memory = room_for(self.tables, self.grid.labels)
+        memory = room_for(self.tables, self.halo, self.grid.labels)
         fill_costs(
-            volume.counts, volume.n_frames, volume.x0, self.place, self.tables, self.hot_start, self.hot_x, self.ways,
-            first, last, memory, out,
+            volume.counts, volume.n_frames, volume.x0, self.place, self.tables, self.halo, self.hot_start, self.hot_x,
+            self.ways, first, last, memory, out,
         )  # fmt: skip
 
 
@@ -111,15 +114,26 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
         )
 
     workers.over(bands, work)
+    halo = halo_tables(tables, bool(model.halo.any()))
+
+    def around(first: int, last: int) -> None:
+        fill_halo(
+            sweep, dark, shares_of_halo, place, ambient, hot, light, ways.units * scale, BAND_ROWS, first, last, tables,
+            halo,
+        )  # fmt: skip
+
+    if halo.weight.size > 0:
+        shares_of_halo = halo_shares(model, tables.edge.shape[1] + FAR_PX)
+        workers.over(bands, around)
 
     def fit(first: int, last: int) -> None:
-        fit_tables(tables, ways, first, last, room_for(tables, grid.labels))
+        fit_tables(tables, ways, first, last, room_for(tables, halo, grid.labels))
 
     workers.over(len(tables.none), fit)
     mark_rows(place, hot, grid.side, BAND_ROWS, tables)
     y, x = np.nonzero(hot)
     hot_start = np.searchsorted(y, np.arange(geometry.rows + 1)).astype(np.int32)
-    return Costs(grid, tables, place, hot_start, x.astype(np.int16), ways, units_per_nat)
+    return Costs(grid, tables, halo, place, hot_start, x.astype(np.int16), ways, units_per_nat)
 
 
 def _ways(

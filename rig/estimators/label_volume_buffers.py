@@ -3,10 +3,12 @@
 from typing import Final, NamedTuple
 
 import numba
+import numpy as np
 
 from rig.aligned import CACHE_LINE
 from rig.estimators.label_places import FAR_PX, PHASES, VARIANTS
 from rig.estimators.label_tables import LIGHTS, NONES
+from rig.lane_memory import address_of
 from rig.lanes import LANES
 
 BATCH: Final = LANES
@@ -114,6 +116,12 @@ def buffers_at(begin, pixels, vectors, labels):  # type: ignore[no-untyped-def]
     buffers = Buffers(begin, n_row, sums, score, score_row, top, top_sum, total, cost, cost_row, mask, constant, edge,
                        none, through, table, here, here + 4 * BATCH, here + 8 * BATCH, labels)  # fmt: skip
     return buffers, here + 4 * (2 * BATCH + 2)
+
+
+@numba.njit(forceinline=True)
+def signed_address(array):  # type: ignore[no-untyped-def]
+    """Address of an array's first element, signed: sums of both kinds would be floats."""
+    return np.int64(address_of(array))
 
 
 @numba.njit(inline="always")

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.aligned import CACHE_LINE
+from rig.estimators.halo_rows import fit_halo, halo_at, halo_rows
+from rig.estimators.halo_tables import HaloTables
 from rig.estimators.label_places import (
     PLACES,
     START,
@@ -19,7 +21,7 @@ from rig.estimators.label_places import (
     VARIANTS,
 )
 from rig.estimators.label_tables import NONES, LabelTables
-from rig.estimators.label_volume_buffers import BATCH, At, Buffers, Fitted, Ways, buffers_at
+from rig.estimators.label_volume_buffers import BATCH, At, Buffers, Fitted, Ways, buffers_at, signed_address
 from rig.estimators.label_volume_rows import (
     COUNT_BITS,
     HIGHEST,
@@ -31,7 +33,6 @@ from rig.estimators.label_volume_rows import (
     write_rows,
 )
 from rig.lane_memory import (
-    address_of,
     load_float32,
     load_int16,
     prefetch,
@@ -54,9 +55,11 @@ _TO_UNSIGNED: Final = np.float32(32768.5)
 
 
 @numba.njit(cache=True, nogil=True)
-def room_for(tables: LabelTables, labels: int) -> NDArray[np.uint8]:
+def room_for(tables: LabelTables, halo: HaloTables, labels: int) -> NDArray[np.uint8]:
     """Memory that `fill_costs` and `fit_tables` work in."""
     _, size = buffers_at(0, tables.edge.shape[1], tables.tap.shape[1], labels)
+    if halo.weight.size > 0:
+        _, size = halo_at(halo, size, tables.constant[:1].size)
     return np.zeros(size + CACHE_LINE, np.uint8)
 
 
@@ -67,6 +70,7 @@ def fill_costs(
     x0: NDArray[np.int32],
     place: NDArray[np.int16],
     tables: LabelTables,
+    halo: HaloTables,
     hot_start: NDArray[np.int32],
     hot_x: NDArray[np.int16],
     ways: Ways,
@@ -81,13 +85,14 @@ def fill_costs(
     since what is known by its address alone would be freed in here.
     """
     pixels, vectors, labels = tables.edge.shape[1], tables.tap.shape[1], out.shape[2]
-    begin = _place(memory)
-    b, _ = buffers_at(begin + -begin % CACHE_LINE, pixels, vectors, labels)
+    begin = signed_address(memory)
+    b, end_of_buffers = buffers_at(begin + -begin % CACHE_LINE, pixels, vectors, labels)
+    around, _ = halo_at(halo, end_of_buffers, tables.constant[:1].size)
     rows, columns, band_rows = out.shape[0], out.shape[1], ways.band_rows
     at = _at(tables, hot_start, hot_x)
-    usually = Fitted(_place(tables.fitted_constant), _place(tables.fitted_edge), _place(tables.fitted_none))
+    usually = _usually(tables)
     room = Fitted(b.constant, b.edge, b.none)
-    place_at, out_at, counts_at = _place(place), _place(out), _place(counts)
+    place_at, out_at, counts_at = signed_address(place), signed_address(out), signed_address(counts)
     window, in_bytes = counts.shape[2], counts.itemsize == 1
     write_int32(b.table, 0, np.int32(-1))
     write_int32(b.shown, 0, np.int32(-1))
@@ -109,6 +114,9 @@ def fill_costs(
                     _fit_table(at, i, variant, ways.units, per_nat, fitted, b.through)
                 if c + 1 < columns and tables.at[band, c + 1, variant] >= 0:
                     _fetch_table(at, int(tables.at[band, c + 1, variant]), usually)
+            column = band * columns + c
+            if halo.weight.size > 0:
+                fit_halo(around, column, per_nat)
             for y in range(top, end, BATCH):
                 batch = min(BATCH, end - y)
                 places = place_at + 2 * PLACES * (c * rows + y)
@@ -123,15 +131,13 @@ def fill_costs(
                     _read_any(counts, c, y, places, stored[0], ways.side, pixels, shift, b, batch)
                 mend_rows(at, places, y, per_nat, ways.side, b, batch)
                 sum_edges(at, fitted, b, batch)
-                score_rows(at, fitted, 2 * ways.reach + 1, b, batch)
+                if halo.weight.size > 0:
+                    halo_rows(around, column, at, fitted, b, batch)
+                    score_rows(at, around.constant, around.which, 2 * ways.reach + 1, b, batch)
+                else:
+                    score_rows(at, fitted.constant, b.fitted, 2 * ways.reach + 1, b, batch)
                 cost_rows(fitted, places, ways, b, batch)
                 write_rows(places, ways, b, batch, out_at + (y * columns + c) * labels, columns * labels)
-
-
-@numba.njit(forceinline=True)
-def _place(array):  # type: ignore[no-untyped-def]
-    """Address of an array's first element, signed: sums of both kinds would be floats."""
-    return np.int64(address_of(array))
 
 
 @numba.njit(forceinline=True)
@@ -154,13 +160,15 @@ def fit_tables(tables: LabelTables, ways: Ways, first: int, last: int, memory: N
     at = _at(tables, tables.span, tables.span)
     fitted = _usually(tables)
     for i in range(first, last):
-        _fit_table(at, i, i, ways.units, ways.units * ways.exposures, fitted, _place(memory))
+        _fit_table(at, i, i, ways.units, ways.units * ways.exposures, fitted, signed_address(memory))
 
 
 @numba.njit(forceinline=True)
 def _usually(tables):  # type: ignore[no-untyped-def]
     """What the tables say at the usual number of exposures."""
-    return Fitted(_place(tables.fitted_constant), _place(tables.fitted_edge), _place(tables.fitted_none))
+    return Fitted(
+        signed_address(tables.fitted_constant), signed_address(tables.fitted_edge), signed_address(tables.fitted_none)
+    )
 
 
 @numba.njit(cache=True, nogil=True)
@@ -184,9 +192,9 @@ def _fit_table(at: At, i: int, j: int, units: float, per_nat: float, to: Fitted,
 @numba.njit(forceinline=True)
 def _at(tables, hot_start, hot_x):  # type: ignore[no-untyped-def]
     return At(
-        _place(tables.edge), _place(tables.edge_sum), tables.edge.shape[1], _place(tables.tap),
-        tables.tap[:1].size, _place(tables.constant), tables.constant[:1].size, _place(tables.none),
-        _place(tables.span), _place(hot_start), _place(hot_x),
+        signed_address(tables.edge), signed_address(tables.edge_sum), tables.edge.shape[1], signed_address(tables.tap),
+        tables.tap[:1].size, signed_address(tables.constant), tables.constant[:1].size, signed_address(tables.none),
+        signed_address(tables.span), signed_address(hot_start), signed_address(hot_x),
     )  # fmt: skip
 
 

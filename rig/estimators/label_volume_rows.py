@@ -150,8 +150,11 @@ def sum_edges(at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def score_rows(at: At, fitted: Fitted, taps: int, b: Buffers, batch: int) -> None:
-    """Fill score and top; taps: pixels around a position."""
+def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch: int) -> None:
+    """Fill score and top; constants: address of those of positions, which: of what each row's number there is.
+
+    taps: pixels around a position.
+    """
     vectors = b.score_row // (PHASES * LANES)
     for r in range(batch):
         i = read_int32(b.here, r)
@@ -159,7 +162,7 @@ def score_rows(at: At, fitted: Fitted, taps: int, b: Buffers, batch: int) -> Non
             continue
         sums, score = b.sums + 2 * (r * b.n_row + FAR_PX), b.score + 2 * r * b.score_row
         n, tap = b.n + 2 * (r * b.n_row + FAR_PX - taps // 2), at.tap + 2 * at.taps * i
-        constant = fitted.constant + 2 * at.constants * read_int32(b.fitted, r)
+        constant = constants + 2 * at.constants * read_int32(which, r)
         best = zero_int16() + np.int16(-32768)
         for _ in range(vectors):
             far_dim, far_bright = load_int16(constant, 0), load_int16(constant, LANES)

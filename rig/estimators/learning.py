@@ -264,6 +264,10 @@ def maximise(
     spread: the amplitude grid may move; free_ambient: the level of ambient light was guessed and is learned as well;
     gains: the strength of the haze per row and column is learned, which must not go on from map to map (it drifts).
     """
+    if model.halo.any():
+        # Row by row a halo is taken for haze: `halo_learning` tells one from the other.
+        profile = np.column_stack([model.profile[:, :3], _position_prior(seen.levels)]).astype(np.float32)
+        return replace(model, profile=profile, none_weight=_amplitudes(model, seen.amplitude_mass, False)[2])
     path_m = model.path_m()
     typical = float(np.median(model.ambient))
     haze, haze_variance = _level(seen.levels[:, 0:4])

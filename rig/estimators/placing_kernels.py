@@ -31,6 +31,8 @@ LEAST_FLUX: Final = np.float32(1e-5)
 CLEAR: Final = 0.9
 CLEAR_SD_PX: Final = 0.2
 """Stripes this clear, and placed this well, tell the width of the line."""
+BESIDE_PX: Final = 5, 6
+"""Pixels to either side, from and to, that show how much of a halo is under a line, and nothing of the line."""
 FEW_FRAMES: Final = 3.0
 """Up to so many frames counts are taken as they are: the flux of a full pixel would be a guess."""
 
@@ -72,7 +74,7 @@ def measure_light(
             frames = np.float32(n_frames[c])
             x = min(max(int(np.rint(x_px[y, c])), sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, x)
-            before, behind, scale, _, _, _, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)
+            before, behind, scale, _, _, cell, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)
             own = state.ambient[y, x]
             # A pixel that the picture does not have counts as one of just the expected light.
             light = -(LIGHT_PX + half) * (before + behind - own - own)
@@ -83,6 +85,8 @@ def measure_light(
                     light += np.log((frames + half) / (frames - n + half)) - state.ambient[y, t]
                 else:
                     light += half * (before + behind) - own
+            # What the halo adds to the light of the line grows with it.
+            light /= np.float32(1.0) + np.float32(2 * LIGHT_PX + 1) * state.glow[cell]
             out.light[y, c], out.scale[y, c] = light, scale
             out.haze[y, c] = max(before - own, np.float32(0.0))
 
@@ -117,10 +121,11 @@ def score_places(
             profile = shares[min(int(part * FRACTIONS), FRACTIONS - 1)]
             near = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, near)
-            before, behind, scale, _, _, _, _ = fluxes_at(sweep, state, y, near, c, path_p, strength)
-            before -= state.ambient[y, near]
-            behind -= state.ambient[y, near]
+            before, behind, scale, _, _, cell, _ = fluxes_at(sweep, state, y, near, c, path_p, strength)
             light = out.amplitude[y, c] * scale
+            # Around its middle the halo is level.
+            before += light * state.glow[cell] - state.ambient[y, near]
+            behind += light * state.glow[cell] - state.ambient[y, near]
             score, known = np.float32(0.0), np.float32(0.0)
             for d in range(-REACH_PX, REACH_PX + 1):
                 t = x + d
@@ -217,25 +222,37 @@ def add_moments(
 ) -> None:
     """Add to sums (rows, 2) the light of clear stripes within REACH_PX, and that times its squared distance less sd^2.
 
-    Light above haze and ambient, photons; what is added to a row of sums comes from that row of the picture.
+    Light above haze, halo and ambient, photons; what is added to a row of sums comes from that row of the picture.
     """
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
             if not (confidence[y, c] > CLEAR and sd_px[y, c] < CLEAR_SD_PX and n_frames[c] > 0):
                 continue
             x = int(np.rint(x_px[y, c]))
-            if x - REACH_PX < max(sweep.x0[c], 0) or x + REACH_PX >= min(sweep.x0[c] + sweep.window, sweep.u.shape[1]):
-                continue
             path_p, strength = line_light(sweep, state, y, c, x)
-            before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)
+            before, behind, _, _, _, cell, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)
+            reach = BESIDE_PX[1] if state.glow[cell] > 0.0 else REACH_PX
+            if x - reach < max(sweep.x0[c], 0) or x + reach >= min(sweep.x0[c] + sweep.window, sweep.u.shape[1]):
+                continue
             side = 1 if sweep.near_is_left else -1
             frames = np.float64(n_frames[c])
-            for t in range(x - REACH_PX, x + REACH_PX + 1):
+            halo, level, wide = 0.0, 0.0, 0.0
+            for t in range(x - reach, x + reach + 1):
+                if REACH_PX < abs(t - x) < BESIDE_PX[0]:
+                    continue
                 away = t - np.float64(x_px[y, c])
                 lit = min(max(0.5 - side * away, 0.0), 1.0)
                 base = state.ambient[y, t] - state.ambient[y, x] + behind + lit * (before - behind)
                 n = min(np.float64(counts[c, y, t - sweep.x0[c]]), frames)
                 light = np.log((frames + 0.5) / (frames - n + 0.5)) if frames > FEW_FRAMES else n / frames
                 light -= base if frames > FEW_FRAMES else -np.expm1(-base)
+                if abs(t - x) > REACH_PX:
+                    halo += light / (2 * (BESIDE_PX[1] - BESIDE_PX[0] + 1))
+                    continue
+                spread = away * away - sd_px[y, c] * sd_px[y, c]
                 sums[y, 0] += light
-                sums[y, 1] += light * (away * away - sd_px[y, c] * sd_px[y, c])
+                sums[y, 1] += light * spread
+                level += 1.0
+                wide += spread
+            sums[y, 0] -= halo * level
+            sums[y, 1] -= halo * wide

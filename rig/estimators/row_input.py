@@ -6,6 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.estimators.halo import halo_shares
 from rig.estimators.row_kernels import (
     FLUX_MAX,
     FLUX_MIN,
@@ -54,7 +55,10 @@ class Lines(NamedTuple):
 
 
 class State(NamedTuple):
-    """A RowModel as the kernels read it: log weights instead of weights, the line's profiles instead of its width."""
+    """A RowModel as the kernels read it: log weights instead of weights, the line's profiles instead of its width.
+
+    glow: (BINS,) of the halo at the stripe itself, photons per pixel over those of the stripe.
+    """
 
     profile: Float32
     w_lo: float
@@ -68,6 +72,7 @@ class State(NamedTuple):
     psi: Float32
     fine: Float32
     table: Float32
+    glow: Float32
 
 
 class Row(NamedTuple):
@@ -110,7 +115,7 @@ def state_of(model: RowModel) -> State:
     return State(
         model.profile, model.w_lo, model.per_w, model.row_gain, model.column_gain, model.ambient, model.amplitude,
         np.log(np.maximum(model.weight, 1e-6)).astype(np.float32), model.none_weight, line_profile(model.line_sigma_px),
-        fine_profiles(model.line_sigma_px), TABLE,
+        fine_profiles(model.line_sigma_px), TABLE, halo_shares(model, 1)[:, 0].copy(),
     )  # fmt: skip
 
 

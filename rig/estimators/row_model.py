@@ -7,7 +7,8 @@ the stripe at inverse depth w carries q S(w) photons, S = w^2 exp(-2 extinction 
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
+from dataclasses import field as field_of
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,9 @@ from rig.estimators.row_kernels import LABEL_PX, LABELS
 BINS = 64
 AMPLITUDES = 4
 EXTINCTION_MAX_PER_M = 5.0
+HALO_NODES = 12
+HALO_REACHES_PX = (8.0, 16.0, 32.0, 64.0, 128.0)
+"""Reaches of the exponentials that make up a halo: no line is as wide, and the last one is even over most windows."""
 OPTICAL_DEPTH_MAX = 50.0
 """Most extinction times path at which haze is looked for: e^-100 of it would come back."""
 
@@ -31,7 +35,9 @@ class RowModel:
     positions. row_gain: (rows,) and column_gain: (columns,) float32, strength of the haze on each. ambient: (rows,
     width) float32, photons per exposure of ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at
     S = 1 and their probability. none_weight: probability of a row without stripe. line_sigma_px: width of the line.
-    extinction_per_m and its standard deviation: NaN where the haze does not resolve it.
+    extinction_per_m and its standard deviation: NaN where the haze does not resolve it. halo: (HALO_NODES, reaches)
+    float32, light of the stripe's halo over its own (`halo`), zeros where there is none. before: what the map before
+    left to this one (`temporal`), None where that is nothing.
     """
 
     profile: NDArray[np.float32]
@@ -46,15 +52,24 @@ class RowModel:
     line_sigma_px: float
     extinction_per_m: float
     extinction_sd_per_m: float
+    halo: NDArray[np.float32] = field_of(
+        default_factory=lambda: np.zeros((HALO_NODES, len(HALO_REACHES_PX)), np.float32)
+    )
+    before: NDArray[np.uint16] | None = None
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Every field as an array, to be kept with the map."""
-        return {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+        """Every field that there is as an array, to be kept with the map."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "RowModel":
-        """The state that `arrays` gave, bit for bit. KeyError where one is missing."""
-        kept = {field.name: arrays[field.name] for field in fields(cls)}
+        """The state that `arrays` gave, bit for bit. KeyError where one is missing that was always there."""
+        kept = {
+            field.name: arrays[field.name]
+            for field in fields(cls)
+            if field.name in arrays or (field.default is MISSING and field.default_factory is MISSING)
+        }
         values: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in kept.items()}
         return cls(**values)
 

@@ -30,7 +30,13 @@ def reconstruct(
 
 
 def reconstructor_of(
-    point: WorkingPoint, estimator: str, filter: str = "none", threads: int = 2, lines: Any = None
+    point: WorkingPoint,
+    estimator: str,
+    filter: str = "none",
+    threads: int = 2,
+    lines: Any = None,
+    *,
+    temporal_prior: bool = False,
 ) -> Any:
     """The project's Reconstructor for the rig of a working point; it has learned nothing yet. lines: a LineGrid."""
     from calibration.files import load_rig_model
@@ -41,7 +47,7 @@ def reconstructor_of(
     commands = np.arange(point.geometry.columns, dtype=np.float64)
     return Reconstructor(
         model, commands, DEPTH_RANGE_M, estimator=estimator, filter=filter, min_confidence=0.5, threads=threads,
-        lines=lines,
+        lines=lines, temporal_prior=temporal_prior,
     )  # fmt: skip
 
 

@@ -68,7 +68,7 @@ def reconstruct(rig: Rig, wall: Path, *more: object, cube: str = "cube.npy", pla
     return rig("reconstruct", wall / cube, *given)
 
 
-@pytest.mark.parametrize("estimator", ["argmax", "likelihood"])
+@pytest.mark.parametrize("estimator", ["argmax", "likelihood", "joint"])
 def test_a_foreign_cube_gives_its_wall(rig: Rig, wall: Path, estimator: str) -> None:
     ran = reconstruct(rig, wall, "--estimator", estimator, "--json")
     summary = json.loads(ran.out)

@@ -37,7 +37,7 @@ def summary(folder: Path) -> dict[str, Any]:
     return content
 
 
-@pytest.mark.parametrize("estimator", ["likelihood", "argmax"])
+@pytest.mark.parametrize("estimator", ["likelihood", "joint", "argmax"])
 def test_a_recording_gives_the_depth_of_its_scan_to_the_bit_alone(rig: Rig, small: Path, estimator: str) -> None:
     taken = rig("scan", small, "--estimator", estimator, *OPTIONS, "--record", "--out", "lab/run")
     assert taken.code == 0, taken.err

@@ -48,7 +48,7 @@ def test_parts_and_compressed_recordings_are_recordings(rig: Rig, run: Path, tmp
     assert "start 0: frames " in rig("info", tmp_path / "part").out
 
 
-@pytest.mark.parametrize("estimator", ["argmax", "likelihood"])
+@pytest.mark.parametrize("estimator", ["argmax", "likelihood", "joint"])
 def test_the_maps_of_a_part_come_out_as_in_the_whole(rig: Rig, tmp_path: Path, estimator: str) -> None:
     content = config()
     content["scan"] |= {"bidirectional": True}

@@ -19,6 +19,7 @@ from rig.estimators.search_buffers import BATCH, search_in, search_memory
 from rig.estimators.search_desk import desk_of
 from rig.estimators.search_kernels import START, score_rows
 from rig.estimators.stream_kernels import search_counts
+from rig.estimators.volume_search import search_volume
 from rig.lane_memory import read_int16
 from rig.lane_order import STEPS, padded_lanes, read_counts
 from rig.row_threads import RowWorkers
@@ -382,5 +383,6 @@ def test_halved_counts_keep_their_light(exposures):
     sweep = simulated("report", exposures, rows=64, columns=128)
     estimator = Likelihood(1)
     estimator.estimate(sweep.volume, sweep.geometry)
-    ones, lit = estimator._search(sweep.volume, sweep.geometry, estimator.used)[1]
+    judge = judge_of(estimator.used, sweep.geometry, exposures, WORKERS, dark=False)
+    ones, lit = search_volume(sweep.volume, sweep.geometry, judge, WORKERS)[1]
     assert ones.sum() / lit.sum() == pytest.approx(-np.expm1(-sweep.point.light.ambient), rel=0.006)

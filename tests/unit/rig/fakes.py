@@ -179,7 +179,7 @@ def fake_rig(plan, streams, failing=None, power=None, **spad):
     """A rig of fakes and the list of what they are told."""
     failing = failing or {}
     log: list[str] = []
-    config = dataclasses.make_dataclass("Config", ["scan"])(scan(power=power))
+    config = dataclasses.make_dataclass("Config", ["scan", "spad"])(scan(power=power), spad=None)
     rig = OpenRig(
         config=config,
         clock=VirtualClock(),

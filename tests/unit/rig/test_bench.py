@@ -5,6 +5,7 @@ import json
 import math
 from fractions import Fraction
 
+import cv2
 import numpy as np
 import pytest
 
@@ -19,10 +20,12 @@ from rig.bench import looped_spad, speed, stages
 from rig.bench.bench_kernels import count_columns, draw_frames, read_all
 from rig.bench.frames import BLOCK_FRAMES, COLUMNS, EDGE_PX, PLACE_FRAMES, ROWS, WIDTH, full_frames, window_frames
 from rig.bench.looped_spad import LEAD_FRAMES, Loop, LoopedSpad
+from rig.bench.map_stages import sgbm_stage
 from rig.bench.recorded import recording_of
 from rig.bench.soak import SoakOptions, soak
 from rig.bench.speed import Extent, measure_speed
 from rig.bench.stages import Walk, search_stage
+from rig.bench.surface import WINDOW, bench_surface, count_surface
 from rig.counting import SweepCounter, SweepLayout
 from rig.counting_kernels import CHUNK, new_planes, planes_for
 from rig.errors import UsageError
@@ -33,11 +36,11 @@ from tests.unit.rig.streams import SPAD, plan_of, scan, stream_of
 
 SMALL = Extent(
     windows=(64, 128), exposures=(1, 10), rounds=2, moment_s=1e-3, count_moment_s=1e-3, latency_s=0.02,
-    frames_bytes=2**22, read_bytes=2**20,
+    frames_bytes=2**22, read_bytes=2**20, map_rows=64, map_columns=128,
 )  # fmt: skip
 KEYS = {
     "stage", "window", "exposures", "threads", "frames_per_s", "times_real_time", "of_memory_bandwidth", "times_numpy",
-    "error_px", "median_error_px", "missing",
+    "error_px", "median_error_px", "missing", "ms_per_map",
 }  # fmt: skip
 
 
@@ -102,6 +105,20 @@ def test_every_column_of_the_geometry_spans_its_window_and_the_depth_range(frame
     for x, depth_m in ((x0, near_m), (x0 + 63, far_m)):
         ray = np.array([geometry.u[0, x], geometry.v[0, x], 1.0])
         assert 1.0 / float(geometry.plane[0] @ ray) == pytest.approx(depth_m, rel=1e-3)
+
+
+def test_the_frames_and_the_pictures_of_the_surface_show_the_same_disparities():
+    surface = bench_surface(64, 128)
+    with RowWorkers(2) as workers:
+        counts = count_surface(surface, surface.frames(50, workers), 50, workers).counts
+    assert counts.shape == (128, 64, WINDOW)
+    assert np.median(np.abs(counts.argmax(axis=2) - surface.place_px)) < 0.5
+    left, right = surface.pictures()
+    y, x = np.indices(left.shape)
+    at = x - np.rint(surface.place_px.T).astype(int)
+    seen = at >= 0
+    shown, expected = left[seen].astype(float), right[y[seen], at[seen]].astype(float)
+    assert np.corrcoef(shown, expected)[0, 1] > 0.7  # of noise shifted by whole pixels instead of parts
 
 
 # Stages
@@ -182,9 +199,10 @@ def test_the_report_has_a_row_for_every_stage_window_exposures_and_threads(repor
     for window, k, threads in itertools.product((64, 128), (1, 10), (1, 2)):
         assert {("count", window, k, threads), ("likelihood", window, k, threads)} <= rows
         assert ("numpy", window, k, 1) in rows
+        assert {("joint", 64, k, threads), ("joint-sweep", 64, 10, threads), ("sgbm", 64, None, threads)} <= rows
     assert {row[0] for row in rows} == {
         "count", "count-full", "likelihood", "likelihood-full", "likelihood-sweep", "disk", "disk-crc", "parse",
-        "parse-crc", "numpy",
+        "parse-crc", "numpy", "joint", "joint-sweep", "sgbm",
     }  # fmt: skip
 
 
@@ -207,6 +225,29 @@ def test_estimating_rows_tell_their_error_and_others_none(report):
         assert row.error_px < 1
         assert row.error_px < rows["numpy", 128, 10, 1].error_px
         assert row.missing == 0
+
+
+def test_rows_of_whole_maps_tell_the_time_of_one(report):
+    rows = {(row.stage, row.window, row.exposures, row.threads): row for row in report.rows}
+    for (stage, k), threads in itertools.product([("joint", 1), ("joint", 10), ("joint-sweep", 10)], (1, 2)):
+        row = rows[stage, 64, k, threads]
+        # Each is a median over rounds of its own: their product is that of one round where all are alike, else more.
+        assert 0.99 < row.ms_per_map * row.frames_per_s / (1e3 * SMALL.map_columns * k) < 10
+        assert row.error_px < 1
+        assert row.missing == 0
+    for threads in (1, 2):
+        row = rows["sgbm", 64, None, threads]
+        assert row.ms_per_map > 0
+        assert row.median_error_px < 1
+        assert row.missing >= WINDOW / SMALL.map_columns
+        assert (row.frames_per_s, row.times_real_time, row.times_numpy, row.of_memory_bandwidth) == (None,) * 4
+    assert all((row.ms_per_map is None) == (not row.stage.startswith(("joint", "sgbm"))) for row in report.rows)
+
+
+def test_opencv_keeps_the_threads_it_had():
+    before = cv2.getNumThreads()
+    sgbm_stage(bench_surface(64, 128), before + 1)(0.0)
+    assert cv2.getNumThreads() == before
 
 
 def test_latency_counts_every_column(report):

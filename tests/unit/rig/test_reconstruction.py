@@ -53,7 +53,7 @@ def test_without_a_model_the_sensor_size_is_asked_for():
         Reconstructor(None, np.arange(5), DEPTH_RANGE_M)
 
 
-@pytest.mark.parametrize("estimator", ["argmax", "edge", "likelihood"])
+@pytest.mark.parametrize("estimator", ["argmax", "edge", "likelihood", "joint"])
 def test_a_map_has_the_shapes_that_its_files_promise(estimator):
     sweep, result = simulated(), mapped(estimator=estimator)
     rows, columns = 32, 96

@@ -1,0 +1,107 @@
+"""The stages that make a whole map at a time, for so many threads each.
+
+joint: the estimate alone, from counts that were made before. joint-sweep: counting in blocks as in a scan, then the
+estimate. sgbm: OpenCV's StereoSGBM (MODE_HH4, which aggregates along four paths too) on a pair of pictures of the same
+surface, as many disparities as the window has pixels; OpenCV leaves out as many columns at the left edge. Nothing learns
+meanwhile: `joint` goes by what it learned from the first sweep. Each begins with a map that is not timed.
+"""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.bench.frames import BLOCK_FRAMES
+from rig.bench.stages import Measured, Stage, StripeError, stripe_error
+from rig.bench.surface import WINDOW, BenchSurface, count_surface, sweep_frames
+from rig.counting import CountVolume
+from rig.estimators.joint import Joint
+from rig.estimators.row_model import RowModel
+from rig.row_threads import RowWorkers
+
+SGBM_BLOCK_PX = 3
+"""OpenCV's own default; its penalties follow from it as its documentation advises."""
+SGBM_STEPS = 16
+"""Of OpenCV's disparities to the pixel."""
+
+
+def learn_joint(surface: BenchSurface, exposures: int, threads: int) -> RowModel:
+    """What `joint` learns from a first sweep of the surface, as in a scan."""
+    joint = Joint(threads)
+    with RowWorkers(threads) as workers:
+        volume = count_surface(surface, surface.frames(exposures, workers), exposures, workers)
+    joint.estimate(volume, surface.geometry)
+    assert joint.used is not None, "a map has been estimated"
+    return joint.used
+
+
+def joint_stage(surface: BenchSurface, volume: CountVolume, threads: int, model: RowModel) -> Stage:
+    """`joint` from counts."""
+
+    def measure(seconds: float) -> Measured:
+        # Made anew: kept beyond this moment, the memory of all threads' and exposures' would be too much.
+        joint = Joint(threads, model, learns=False)
+
+        def make() -> NDArray[np.float32]:
+            return joint.estimate(volume, surface.geometry).x_px
+
+        return _timed(make, seconds, int(volume.n_frames.sum()), stripe_error(make() - surface.truth_px()))
+
+    return measure
+
+
+def joint_sweep_stage(
+    surface: BenchSurface, bits: NDArray[np.uint8], exposures: int, threads: int, model: RowModel
+) -> Stage:
+    """Counting and `joint`, one after the other."""
+    bins, column, x0 = sweep_frames(surface, exposures)
+
+    def measure(seconds: float) -> Measured:
+        joint = Joint(threads, model, learns=False)
+        counter = joint.counter(surface.layout(exposures), surface.geometry)
+
+        def make() -> NDArray[np.float32]:
+            counter.reset()
+            for first in range(0, len(bits), BLOCK_FRAMES):
+                block = slice(first, first + BLOCK_FRAMES)
+                counter.add(bits[block], bins[block], column[block], x0[block])
+            return joint.estimate(counter.finish(), surface.geometry).x_px
+
+        return _timed(make, seconds, len(bits), stripe_error(make() - surface.truth_px()))
+
+    return measure
+
+
+def sgbm_stage(surface: BenchSurface, threads: int) -> Stage:
+    """OpenCV's StereoSGBM."""
+    import cv2
+
+    left, right = surface.pictures()
+    area = SGBM_BLOCK_PX**2
+    mode = cv2.STEREO_SGBM_MODE_HH4
+    matcher = cv2.StereoSGBM.create(0, WINDOW, SGBM_BLOCK_PX, P1=8 * area, P2=32 * area, mode=mode)
+
+    def measure(seconds: float) -> Measured:
+        before = cv2.getNumThreads()
+        cv2.setNumThreads(threads)
+        try:
+            found = matcher.compute(left, right)
+            disparity = np.where(found < 0, np.float32(np.nan), found / np.float32(SGBM_STEPS))
+            error = stripe_error(disparity - surface.place_px.T)
+            return _timed(lambda: matcher.compute(left, right), seconds, 0, error)
+        finally:
+            cv2.setNumThreads(before)
+
+    return measure
+
+
+def _timed(make: Callable[[], object], seconds: float, frames: int, error: StripeError) -> Measured:
+    """Make maps of so many frames each for a moment."""
+    maps, spent = 0, 0.0
+    while spent < seconds or not maps:
+        begun = time.perf_counter()
+        make()
+        spent += time.perf_counter() - begun
+        maps += 1
+    return Measured(maps * frames, spent, error, maps)

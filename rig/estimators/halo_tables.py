@@ -1,0 +1,134 @@
+"""What the halo adds to the label costs: tables over blocks of pixels, per column and band of rows.
+
+The tables of `label_tables` take the halo for as bright everywhere as it is where the stripe stands: right where the
+stripe's place is decided. What it is less beyond varies slowly with the stripe's place and from pixel to pixel. So it
+is told for stripes BLOCK_PX apart, in between by straight lines, from the mean counts of as many pixels.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.aligned import aligned_zeros
+from rig.estimators.label_places import FAR_PX, START, VARIANT, VARIANTS
+from rig.estimators.label_tables import LIGHTS, WEIGHT_LIMIT, LabelTables, mean_ambient
+from rig.estimators.row_input import Float32, State, Sweep, row_buffers, row_fluxes
+from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, cell_of
+from rig.lanes import LANES
+
+BLOCK_PX: Final = 8
+FIRST_PX: Final = FAR_PX % BLOCK_PX
+"""Pixel that the first block begins at: the first label's pixel begins a block."""
+AHEAD: Final = FAR_PX // BLOCK_PX
+"""Blocks behind a stripe at place 0."""
+_FULL: Final = 32768.0
+
+
+class HaloTables(NamedTuple):
+    """Blocks of pixels are counted from FIRST_PX on; places of the stripe from the far end of the first label's pixel.
+
+    weight: int16 (bands, columns, blocks, LIGHTS, places), of the mean count of a block. constant: float32 (bands,
+    columns, LIGHTS, places), nats per exposure. ramp: int16 (phases, 3, LANES), parts that the three places around a
+    vector of labels have in each, of 2^15. Without a halo all are empty.
+    """
+
+    weight: NDArray[np.int16]
+    constant: NDArray[np.float32]
+    ramp: NDArray[np.int16]
+
+
+def halo_tables(tables: LabelTables, there: bool) -> HaloTables:
+    """Room for the tables of a halo, if there is one."""
+    bands, columns, _ = tables.at.shape
+    blocks = (tables.edge.shape[1] - FIRST_PX) // BLOCK_PX
+    places = -(-(LANES // BLOCK_PX * tables.tap.shape[1] + 1) // LANES) * LANES
+    if not there:
+        bands = blocks = places = 0
+    weight = aligned_zeros((bands, columns, blocks, LIGHTS, places), np.int16)
+    return HaloTables(weight, aligned_zeros((bands, columns, LIGHTS, places), np.float32), _ramps())
+
+
+def _ramps() -> NDArray[np.int16]:
+    pixel = np.arange(LANES) + 0.5
+    # A pixel's labels lie about a quarter of it to either side of its middle.
+    at = (pixel + np.array([-0.25, 0.25])[:, None]) / BLOCK_PX
+    parts = np.maximum(1.0 - np.abs(at[:, None] - np.arange(3)[:, None]), 0.0)
+    return np.asarray(np.minimum(np.rint(_FULL * parts), _FULL - 1), np.int16)
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_halo(
+    sweep: Sweep,
+    state: State,
+    halo: Float32,
+    place: NDArray[np.int16],
+    ambient: Float32,
+    hot: NDArray[np.bool_],
+    light: Float32,
+    per_nat: float,
+    band_rows: int,
+    first_band: int,
+    last_band: int,
+    tables: LabelTables,
+    out: HaloTables,
+) -> None:
+    """Tables of bands first_band..last_band-1, as `label_tables.fill_tables`; halo: (BINS, pixels) of `halo_shares`."""
+    side = 1 if sweep.near_is_left else -1
+    pixels = tables.edge.shape[1]
+    row, middle_light = row_buffers(sweep.window, 1), np.sqrt(light[0] * light[-1])
+    mean, number = np.empty(pixels, np.float32), np.empty(pixels, np.int32)
+    # Of the blocks: flux before and behind the stripe, and of the halo as the tables of labels have it.
+    level = np.empty((3, out.weight.shape[2]), np.float32)
+    for b in range(first_band, last_band):
+        rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
+        for c in range(place.shape[0]):
+            y = _middle(place, c, rows)
+            if y < 0:
+                continue
+            mean_ambient(place, ambient, hot, side, c, rows, mean, number)
+            length, _, _, start = row_fluxes(sweep, state, row, y, c)
+            to_t = side * (place[c, y, START] - start)
+            first_px, end_px = max(0, to_t - length + 1), min(pixels, to_t + 1)
+            for variant in range(VARIANTS):
+                i = tables.at[b, c, variant]
+                if i >= 0:
+                    first_px = max(first_px, int(tables.span[i, 0]))
+                    end_px = min(end_px, int(tables.span[i, 1]))
+            for k in range(level.shape[1]):
+                level[:, k] = 0.0
+                for p in range(FIRST_PX + BLOCK_PX * k, FIRST_PX + BLOCK_PX * (k + 1)):
+                    t = min(max(to_t - p, 0), length - 1)
+                    level[0, k] += (row.before[t] + mean[p]) / BLOCK_PX
+                    level[1, k] += (row.behind[t] + mean[p]) / BLOCK_PX
+                    level[2, k] += middle_light * row.scale[t] * state.glow[row.cell[t]] / BLOCK_PX
+            out.weight[b, c] = 0
+            out.constant[b, c] = 0.0
+            for j in range(out.weight.shape[4]):
+                t = min(max(to_t - FAR_PX - BLOCK_PX * j, 0), length - 1)
+                for m in range(LIGHTS):
+                    s = light[m] * row.scale[t]
+                    for k in range(level.shape[1]):
+                        begin = FIRST_PX + BLOCK_PX * k
+                        if begin < first_px or begin + BLOCK_PX > end_px:
+                            continue
+                        # The middle of a block is half a block from its ends.
+                        away = abs(BLOCK_PX * (k - j - AHEAD) + BLOCK_PX // 2)
+                        base = level[1 if k < j + AHEAD else 0, k]
+                        told = min(max(base + level[2, k], FLUX_MIN), FLUX_MAX)
+                        flux = min(max(base + s * halo[row.cell[t], away], FLUX_MIN), FLUX_MAX)
+                        other, own = cell_of(told), cell_of(flux)
+                        weight = BLOCK_PX * per_nat * (state.table[0, own] - state.table[0, other])
+                        out.weight[b, c, k, m, j] = round(min(max(weight, -WEIGHT_LIMIT), WEIGHT_LIMIT))
+                        out.constant[b, c, m, j] += BLOCK_PX * (state.table[1, own] - state.table[1, other])
+
+
+@numba.njit(cache=True, nogil=True)
+def _middle(place: NDArray[np.int16], c: int, rows: tuple[int, int]) -> int:
+    """The row nearest the band's middle that has labels; -1: none."""
+    best, middle = -1, (rows[0] + rows[1]) // 2
+    for y in range(rows[0], rows[1]):
+        if place[c, y, VARIANT] >= 0 and (best < 0 or abs(y - middle) < abs(best - middle)):
+            best = y
+    return best

@@ -1,0 +1,70 @@
+"""Second returns: where the counts themselves show another line beside the stripe, and how probably so.
+
+In haze a row cannot answer with both: the light behind the nearer one excludes that it ends there, so that the best
+rival of an answer is hardly ever the second surface. `second_return_kernels` looks for its light instead.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.counting import CountVolume
+from rig.estimators.label_grid import PER_PX, LabelGrid
+from rig.estimators.row_input import State, Sweep
+from rig.estimators.second_return_kernels import (
+    APART_PX,
+    BLOCK,
+    LINE_SIGMAS,
+    Blocks,
+    Seconds,
+    find_candidates,
+    judge_seconds,
+    measure_seconds,
+    move_seconds,
+    sum_blocks,
+)
+from rig.row_threads import RowWorkers
+
+LIGHT_SIGMAS = 1.5
+"""Widths of the line to either side that its light is looked for in."""
+HALF_SURE, PER_SD = 5.0, 1.5
+"""Light that stands out by HALF_SURE standard deviations is a second return in half of the cases."""
+
+
+def second_returns(
+    volume: CountVolume,
+    grid: LabelGrid,
+    sweep: Sweep,
+    state: State,
+    line_sigma_px: float,
+    x_px: NDArray[np.float32],
+    workers: RowWorkers,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """x2_px and confidence2 (rows, columns) beside stripes at x_px: NaN and 0 where nothing stands out."""
+    rows, columns = x_px.shape
+    shape = -(-rows // BLOCK), -(-columns // BLOCK)
+    apart, reach = APART_PX + LINE_SIGMAS * line_sigma_px, max(int(np.rint(LIGHT_SIGMAS * line_sigma_px)), 1)
+    sums = (np.empty((*shape, -(-grid.stripes // PER_PX)), np.float32) for _ in Blocks._fields)
+    blocks = Blocks(*sums)
+    distance, haze = (np.empty(shape, np.float32) for _ in range(2))
+    seen = volume.counts, volume.n_frames, sweep, state, grid.x_far, grid.side, apart
+
+    workers.over(shape[0], lambda first, last: sum_blocks(*seen, x_px, first, last, blocks))
+    workers.over(shape[0], lambda first, last: find_candidates(blocks, reach, grid.side, first, last, distance, haze))
+    sure = np.zeros((rows, columns), np.float32)
+    if np.isnan(distance).all():
+        return np.full((rows, columns), np.nan, np.float32), sure
+    each = np.repeat(np.repeat(distance, BLOCK, 0)[:rows], BLOCK, 1)[:, :columns]
+    seconds = Seconds(np.ascontiguousarray(each), *(np.zeros((rows, columns), np.float32) for _ in range(4)))
+
+    def measure(first: int, last: int) -> None:
+        measure_seconds(*seen, reach, x_px, haze, first, last, seconds)
+
+    moved = np.empty((rows, columns), np.float32)
+    workers.over(rows, measure)
+    workers.over(rows, lambda first, last: move_seconds(reach, first, last, seconds, moved))
+    seconds = seconds._replace(distance=moved)
+    workers.over(rows, measure)
+    workers.over(rows, lambda first, last: judge_seconds(first, last, seconds, sure))
+    x2_px = np.where(sure > 0, grid.x_far + moved, np.nan).astype(np.float32)
+    confidence = 1 / (1 + np.exp(PER_SD * (HALF_SURE - sure)))
+    return x2_px, np.where(np.isnan(x2_px), 0.0, confidence).astype(np.float32)

@@ -1,0 +1,222 @@
+"""Compiled search for light of a second surface beside each stripe: a pane before a wall, a twig, a flake of snow.
+
+Such light stands off the haze by too little for a row alone, and rows that see both surfaces answer with one of them.
+So light is summed over blocks of rows and columns at equal distances from the far end first, pixel by pixel of
+distance, and compared with what haze and ambient light bring; then each row is asked itself, with its neighbours.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimators.placing_kernels import Float32, pool_row
+from rig.estimators.row_input import State, Sweep, fluxes_at, line_light
+
+BLOCK: Final = 4
+"""Rows, and columns, whose light is summed at once; a block is judged together with its eight neighbours."""
+RING_PX: Final = 4
+"""Pixels to either side of where light is looked for that tell whether haze is as strong as was learned."""
+GAP_PX: Final = 1
+"""Pixels between the two."""
+APART_PX: Final = 2.0
+"""Light so far from a stripe, and further by LINE_SIGMAS widths of the line, is not its own."""
+LINE_SIGMAS: Final = 2.5
+CANDIDATE: Final = 3.0
+"""Standard deviations from which a block's light is looked at more closely."""
+REACH: Final = 3
+"""Rows and columns to either side that light is pooled over in the end."""
+
+
+class Blocks(NamedTuple):
+    """Sums per block: float32 (block rows, block columns, pixels of distance): ones, and those that were expected."""
+
+    ones: Float32
+    expected: Float32
+
+
+class Seconds(NamedTuple):
+    """What is known of second returns, float32 (rows, columns) each.
+
+    distance: from the far end in px, NaN where there is no candidate; ones, expected: within the line's reach of it;
+    light, moment: ones above those expected, and that times the distance in px.
+    """
+
+    distance: Float32
+    ones: Float32
+    expected: Float32
+    light: Float32
+    moment: Float32
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def sum_blocks(
+    counts: NDArray[np.unsignedinteger],
+    n_frames: NDArray[np.int32],
+    sweep: Sweep,
+    state: State,
+    x_far: NDArray[np.float64],
+    side: int,
+    apart: float,
+    x_px: Float32,
+    first_block: int,
+    last_block: int,
+    out: Blocks,
+) -> None:
+    """Fill the sums of rows of blocks first_block..last_block-1, without what lies within `apart` px of stripes x_px.
+
+    Haze is taken from the middle of each block: it changes slowly.
+    """
+    rows, columns = x_px.shape
+    width, pixels = sweep.u.shape[1], out.ones.shape[2]
+    before, behind = np.zeros(pixels, np.float32), np.zeros(pixels, np.float32)
+    for by in range(first_block, last_block):
+        out.ones[by] = 0.0
+        out.expected[by] = 0.0
+        for bx in range(out.ones.shape[1]):
+            my, mc = min(by * BLOCK + BLOCK // 2, rows - 1), min(bx * BLOCK + BLOCK // 2, columns - 1)
+            if np.isnan(x_far[my, mc]):
+                continue
+            middle = int(np.rint(x_far[my, mc]))
+            path_p, strength = line_light(sweep, state, my, mc, min(max(middle, 0), width - 1))
+            for i in range(pixels):
+                t = middle - side * i
+                before[i] = behind[i] = 0.0
+                if 0 <= t < width:
+                    here, there, _, _, _, _, _ = fluxes_at(sweep, state, my, t, mc, path_p, strength)
+                    before[i] = -np.expm1(state.ambient[my, t] - here)
+                    behind[i] = -np.expm1(state.ambient[my, t] - there)
+            ones, expected = out.ones[by, bx], out.expected[by, bx]
+            for y in range(by * BLOCK, min(by * BLOCK + BLOCK, rows)):
+                for c in range(bx * BLOCK, min(bx * BLOCK + BLOCK, columns)):
+                    if np.isnan(x_px[y, c]) or np.isnan(x_far[y, c]):
+                        continue
+                    far, x0, frames = int(np.rint(x_far[y, c])), sweep.x0[c], np.float32(n_frames[c])
+                    # Pixels far - side * i that are searched, counted and in the picture; those near the stripe are not.
+                    lo, hi = max(sweep.x_lo[y, c], x0, 0), min(sweep.x_hi[y, c], x0 + sweep.window - 1, width - 1)
+                    begin, end = (far - hi, far - lo + 1) if side > 0 else (lo - far, hi - far + 1)
+                    begin, end = max(begin, 0), min(end, pixels)
+                    near = (far - x_px[y, c]) * side
+                    cut = min(max(int(np.ceil(near - apart)), begin), end)
+                    on = max(min(int(np.floor(near + apart)) + 1, end), begin)
+                    line, ambient = counts[c, y], state.ambient[y]
+                    # Near pixels lie before the stripe, far ones (small i) behind it.
+                    for i in range(begin, cut):
+                        t = far - side * i
+                        ones[i] += np.float32(line[t - x0])
+                        expected[i] += frames * (behind[i] + (np.float32(1.0) - behind[i]) * ambient[t])
+                    for i in range(on, end):
+                        t = far - side * i
+                        ones[i] += np.float32(line[t - x0])
+                        expected[i] += frames * (before[i] + (np.float32(1.0) - before[i]) * ambient[t])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def find_candidates(
+    blocks: Blocks, reach: int, side: int, first_block: int, last_block: int, distance: Float32, haze: Float32
+) -> None:
+    """Where the light of each block and its neighbours stands out most: distance from the far end, NaN if nowhere.
+
+    Rows of blocks first_block..last_block-1. reach: of the line, px. haze: how much stronger it is there than was
+    learned, at least 1.
+    """
+    rows, columns, pixels = blocks.ones.shape
+    span = reach + GAP_PX + RING_PX
+    ones, expected = np.zeros(pixels + 2 * span + 1), np.zeros(pixels + 2 * span + 1)
+    for by in range(first_block, last_block):
+        for bx in range(columns):
+            ones[:] = 0.0
+            expected[:] = 0.0
+            for y in range(max(by - 1, 0), min(by + 2, rows)):
+                for x in range(max(bx - 1, 0), min(bx + 2, columns)):
+                    for i in range(pixels):
+                        ones[span + 1 + i] += blocks.ones[y, x, i]
+                        expected[span + 1 + i] += blocks.expected[y, x, i]
+            for i in range(1, len(ones)):
+                ones[i] += ones[i - 1]
+                expected[i] += expected[i - 1]
+            best, distance[by, bx], haze[by, bx] = CANDIDATE, np.nan, 1.0
+            for i in range(pixels):
+                a, b = span + i - reach, span + i + reach + 1
+                n, e = ones[b] - ones[a], expected[b] - expected[a]
+                if n - e < best * np.sqrt(e + 1.0):
+                    continue
+                ring = ones[b + GAP_PX + RING_PX] - ones[b + GAP_PX] + ones[a - GAP_PX] - ones[a - GAP_PX - RING_PX]
+                asked = expected[b + GAP_PX + RING_PX] - expected[b + GAP_PX]
+                asked += expected[a - GAP_PX] - expected[a - GAP_PX - RING_PX]
+                more = max((ring + 1.0) / (asked + 1.0), 1.0)
+                sure = (n - e * more) / np.sqrt(e * more + 1.0)
+                if sure > best:
+                    best, distance[by, bx], haze[by, bx] = sure, -side * i, more
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def measure_seconds(
+    counts: NDArray[np.unsignedinteger],
+    n_frames: NDArray[np.int32],
+    sweep: Sweep,
+    state: State,
+    x_far: NDArray[np.float64],
+    side: int,
+    apart: float,
+    reach: int,
+    x_px: Float32,
+    haze: Float32,
+    first_row: int,
+    last_row: int,
+    out: Seconds,
+) -> None:
+    """Fill all but distance of rows first_row..last_row-1; zeros where there is no candidate or a stripe is near.
+
+    haze: of blocks, as `find_candidates` gives it.
+    """
+    width = sweep.u.shape[1]
+    for y in range(first_row, last_row):
+        for c in range(x_px.shape[1]):
+            out.ones[y, c] = out.expected[y, c] = out.light[y, c] = out.moment[y, c] = 0.0
+            place = np.float32(x_far[y, c]) + out.distance[y, c]
+            if np.isnan(place) or np.isnan(x_px[y, c]) or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
+                continue
+            lo, hi = max(sweep.x0[c], 0), min(sweep.x0[c] + sweep.window, width) - 1
+            x, frames = int(np.rint(place)), np.float32(n_frames[c])
+            at = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
+            path_p, strength = line_light(sweep, state, y, c, at)
+            before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, at, c, path_p, strength)
+            more = haze[y // BLOCK, c // BLOCK]
+            for t in range(max(x - reach, lo), min(x + reach, hi) + 1):
+                if abs(t - x_px[y, c]) < apart:
+                    continue
+                flux = (before if (t - x_px[y, c]) * side < 0 else behind) - state.ambient[y, at]
+                n = np.float32(counts[c, y, t - sweep.x0[c]])
+                e = -np.expm1(-more * flux - state.ambient[y, t]) * frames
+                out.ones[y, c] += n
+                out.expected[y, c] += e
+                out.light[y, c] += n - e
+                out.moment[y, c] += (n - e) * (t - place)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds, moved: Float32) -> None:
+    """Distance of each candidate, moved to the middle of the light around it, pooled over neighbours."""
+    sums = np.empty((2, moved.shape[1]), np.float32)
+    for y in range(first_row, last_row):
+        pool_row(seconds.distance, seconds.moment, seconds.light, y, REACH, sums)
+        for c in range(moved.shape[1]):
+            step = sums[0, c] / sums[1, c] if sums[1, c] > 0.0 else np.float32(0.0)
+            moved[y, c] = seconds.distance[y, c] + min(max(step, np.float32(-reach)), np.float32(reach))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def judge_seconds(first_row: int, last_row: int, seconds: Seconds, sure: Float32) -> None:
+    """Standard deviations by which each candidate's light stands out, pooled over neighbours; 0 without candidate.
+
+    That is the signed root of twice the gain in log-likelihood of Poisson counts: right for few photons, too.
+    """
+    sums = np.empty((2, sure.shape[1]), np.float32)
+    for y in range(first_row, last_row):
+        pool_row(seconds.distance, seconds.ones, seconds.expected, y, REACH, sums)
+        for c in range(sure.shape[1]):
+            n, e = sums[0, c], max(sums[1, c], np.float32(1e-3))
+            gain = n * np.log(n / e) - (n - e) if n > e else np.float32(0.0)
+            sure[y, c] = np.sqrt(max(np.float32(2.0) * gain, np.float32(0.0)))

@@ -1,0 +1,119 @@
+"""The halo of forward-peaked fog: what it adds to label costs, and that it is found where it is and only there."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rig.estimators.halo import halo_shares, over_bins
+from rig.estimators.halo_kernels import solve
+from rig.estimators.joint import Joint
+from rig.estimators.label_grid import PER_PX, label_grid
+from rig.estimators.label_volume import _lights, costs_of
+from rig.estimators.label_volume_rows import EXCLUDED
+from rig.estimators.row_input import row_buffers, row_fluxes, state_of, sweep_of
+from rig.estimators.row_kernels import FLOOR
+from rig.estimators.row_model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, pixel_shares
+from rig.row_threads import RowWorkers
+from tests.unit.estimators.test_label_volume import known_model
+from tests.unit.small_maps import simulated
+
+WORKERS = RowWorkers(1)
+HALO = np.tile(np.array([0.0, 1.0, 0.0, 1.5, 0.0], np.float32), (HALO_NODES, 1))
+
+
+def flux_of(label, model, geometry, row, y, c, light):
+    """Flux of each pixel of a row's buffers for a stripe at a label, written out."""
+    length, _, _, start = row
+    side, state = 1 if geometry.near_is_left else -1, state_of(model)
+    buffers = row_buffers(geometry.window, 1)
+    row_fluxes(sweep_of(geometry), state, buffers, y, c)
+    t = side * (label_grid(geometry).x_far[y, c] - start) - label / PER_PX
+    pixels = np.arange(length)
+    at = int(np.floor(t + 0.5))
+    lit = np.clip(t + 0.5 - pixels, 0.0, 1.0)
+    s = light * buffers.scale[at]
+    base = buffers.behind[:length] + lit * (buffers.before[:length] - buffers.behind[:length])
+    halo = halo_shares(model, geometry.width)[buffers.cell[at]]
+    around = np.interp(np.abs(pixels - t), np.arange(geometry.width), halo)
+    return base + s * (pixel_shares(model.line_sigma_px, pixels - t) + around)
+
+
+def test_costs_are_those_of_a_stripe_with_its_halo():
+    swept, y = simulated("halo", 10, rows=20, columns=48), 7
+    model, geometry, volume = replace(known_model(swept.geometry), halo=HALO), swept.geometry, swept.volume
+    costs = costs_of(model, geometry, label_grid(geometry), 10, WORKERS)
+    out = np.zeros((geometry.rows, geometry.columns, costs.grid.labels), np.uint8)
+    costs.fill(volume, 0, geometry.rows, out)
+    off = []
+    for c in range(4, 44, 5):
+        row = row_fluxes(sweep_of(geometry), state_of(model), row_buffers(geometry.window, 1), y, c)
+        side = 1 if geometry.near_is_left else -1
+        n = volume.counts[c, y, row[3] + side * np.arange(row[0]) - geometry.x0[c]].astype(float)
+        given = out[y, c, : costs.grid.stripes].astype(float)
+        labels = np.flatnonzero(given != EXCLUDED)
+        labels = labels[(labels > 4) & (labels < labels[-1] - 4)]
+        scores = np.full((len(labels), 2), -np.inf)
+        for i, label in enumerate(labels):
+            for m, light in enumerate(_lights(model).astype(float)):
+                p = (1 - FLOOR) * -np.expm1(-flux_of(label, model, geometry, row, y, c, light)) + FLOOR / 2
+                scores[i, m] = (n * np.log(p) + (10 - n) * np.log1p(-p)).sum()
+        nats = given[labels] / costs.units_per_nat
+        wanted = scores.max(axis=1).max() - scores.max(axis=1)
+        near = np.minimum(wanted, nats) < 10
+        # Both against the same label: in the volume the best one may be 'none'.
+        best = int(np.argmin(nats))
+        off.append((nats - nats[best] - wanted + wanted[best])[near])
+    # Counts enter by blocks of 8 px, where the halo differs from what it is at the stripe.
+    assert np.sqrt(np.mean(np.concatenate(off) ** 2)) < 1.0
+    plain = costs_of(replace(model, halo=0 * HALO), geometry, costs.grid, 10, WORKERS)
+    assert plain.halo.weight.size == 0, "without a halo there are no tables of one"
+
+
+@pytest.mark.parametrize("light", ["halo", "halo-less"])
+def test_a_halo_is_found_where_there_is_one(light):
+    swept = simulated(light, 5, rows=48, columns=240)
+
+    joint = Joint(2, learns=False)
+    stripes = joint.estimate(swept.volume, swept.geometry)
+    model = joint.used
+    assert bool(model.halo.any()) is (light == "halo")
+    assert model.extinction_per_m == pytest.approx(swept.point.light.extinction_per_m, rel=0.3)
+    errors = swept.errors(stripes.x_px)
+    assert np.nanmean(errors) < 1.0
+    assert np.isfinite(errors).mean() > 0.95
+
+
+def test_shares_add_up_to_the_halos_light():
+    model = replace(known_model(simulated(rows=20, columns=48).geometry), halo=HALO)
+    shares = halo_shares(model, 2000)
+    assert 2 * shares.sum(axis=1) - shares[:, 0] == pytest.approx(np.full(BINS, 2.5), rel=1e-2)
+    assert over_bins(np.arange(HALO_NODES)[:, None] * 1.0, BINS)[[0, -1], 0] == pytest.approx([0, HALO_NODES - 1])
+    assert len(HALO_REACHES_PX) == HALO.shape[1]
+
+
+def test_the_fit_keeps_numbers_from_falling_below_zero():
+    rng = np.random.default_rng(1)
+    shapes = rng.random((40, 4))
+    right = shapes @ np.array([1.0, 0.0, 2.0, -0.5])
+    matrix, product = shapes.T @ shapes, shapes.T @ right
+    assert solve(matrix, product, 3) == pytest.approx([1.0, 0.0, 2.0, -0.5], abs=1e-2)
+    bounded = solve(matrix, product, -1)
+    assert bounded.min() == 0.0
+    slope = matrix @ bounded - product
+    assert np.abs(slope[bounded > 0]).max() < 0.02
+    assert slope[bounded == 0].min() > -0.02
+
+
+def test_states_kept_before_there_was_a_halo_still_load():
+    model = known_model(simulated(rows=20, columns=48).geometry)
+    room = io.BytesIO()
+    np.savez(room, **{name: array for name, array in model.arrays().items() if name != "halo"})
+    room.seek(0)
+    with np.load(room) as kept:
+        assert not RowModel.from_arrays(dict(kept)).halo.any()
+    with_halo = RowModel.from_arrays(replace(model, halo=HALO).arrays())
+    assert with_halo.halo.tobytes() == HALO.tobytes()
+    with pytest.raises(KeyError):
+        RowModel.from_arrays({name: array for name, array in model.arrays().items() if name != "ambient"})
