@@ -1,0 +1,100 @@
+"""When a map teaches, and from which map on that is heeded."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rig.estimators import lessons
+from rig.estimators.lessons import LAG_FRAMES, LEAST_SURE, TEACH_FRAMES, Lessons, Setting
+from rig.row_threads import RowWorkers
+from rig.stripes import StripeTable
+from tests.unit.estimators.test_label_volume import known_model
+from tests.unit.small_maps import simulated
+
+WORKERS = RowWorkers(1)
+GEOMETRY = simulated().geometry
+MODEL = known_model(GEOMETRY)
+
+
+def stripes(sure=1.0) -> StripeTable:
+    """A map of which such a share is confident."""
+    table = StripeTable.empty(10, 100)
+    table.confidence.flat[: round(sure * table.confidence.size)] = 0.9
+    return table
+
+
+@pytest.fixture
+def taught(monkeypatch):
+    """What lessons were given: (first map or None before it, expectation of the one before) of each."""
+    found = []
+
+    def learn_next(lines, geometry, model, before, workers):
+        found.append((lines, before))
+        return replace(model, none_weight=model.none_weight + 0.01), f"seen {lines}"
+
+    monkeypatch.setattr(lessons, "learn_next", learn_next)
+    monkeypatch.setattr(lessons, "ambient_map", lambda tally, *rest: MODEL.ambient)
+    return found
+
+
+def run(frames, maps, learns=True, model=MODEL):
+    """The `none_weight` that each of so many maps of so many frames is estimated with, in hundredths above MODEL's."""
+    school = Lessons(lambda setting, workers: setting.model.none_weight, model, learns=learns)
+    used = []
+    for index in range(maps):
+        now = school.model_for(lambda: MODEL)
+        # Tables that were made beside the stream are those of the model they came with.
+        assert school.tables(Setting(now, GEOMETRY, 10, False), WORKERS) == now.none_weight
+        used.append(round(100 * (now.none_weight - MODEL.none_weight)))
+        seen = SimpleNamespace(tally=SimpleNamespace(intensity=lambda: None), quiet=None, lines=index)
+        school.attend(stripes(), now, frames, lambda seen=seen: seen)
+    return used
+
+
+def test_a_map_teaches_every_so_many_frames_and_is_heeded_a_fixed_number_later(taught):
+    each = LAG_FRAMES // 5
+    first, heeded = TEACH_FRAMES // each, LAG_FRAMES // each
+    used = run(each, first + heeded + 1)
+    assert used == [0] * (first + heeded) + [1]
+    assert taught == [(first - 1, None)]
+
+
+def test_lessons_carry_on_what_was_seen_before(taught):
+    assert run(TEACH_FRAMES, 5) == [0, 0, 1, 1, 2]
+    assert taught == [(0, None), (2, "seen 0"), (4, "seen 2")][: len(taught)]
+    assert len(taught) >= 2
+
+
+def test_an_estimator_that_learns_nothing_keeps_its_model(taught):
+    assert run(TEACH_FRAMES, 5, learns=False) == [0] * 5
+    assert not taught
+
+
+@pytest.mark.parametrize(("sure", "kept"), [(0.0, False), (0.5 * LEAST_SURE, False), (2 * LEAST_SURE, True)])
+def test_maps_without_confident_answers_teach_nothing_and_leave_no_model(taught, sure, kept):
+    school = Lessons(lambda setting, workers: None, None, learns=True)
+    for _ in range(3):
+        school.attend(stripes(sure), MODEL, 0, pytest.fail)
+        assert school.model is (MODEL if kept else None)
+    if not kept:
+        school.attend(stripes(sure), MODEL, TEACH_FRAMES, pytest.fail)
+
+
+def test_the_first_model_is_asked_for_until_a_map_has_taught():
+    school = Lessons(lambda setting, workers: None, None, learns=True)
+    assert school.model_for(lambda: MODEL) is MODEL
+    assert school.model is None
+    school.model = MODEL
+    assert school.model_for(pytest.fail) is MODEL
+
+
+def test_tables_are_made_anew_for_another_setting_alone():
+    made = []
+    school = Lessons(lambda setting, workers: made.append(setting), MODEL, learns=True)
+    setting = Setting(MODEL, GEOMETRY, 10, False)
+    others = [replace(setting, exposures=11), replace(setting, dark=True), replace(setting, model=replace(MODEL))]
+    for each in (setting, replace(setting), *others):
+        school.tables(each, WORKERS)
+    assert made == [setting, *others]
