@@ -3,7 +3,6 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from rig.estimators import lessons
@@ -27,7 +26,7 @@ def stripes(sure=1.0) -> StripeTable:
 
 @pytest.fixture
 def taught(monkeypatch):
-    """What lessons were given: (first map or None before it, expectation of the one before) of each."""
+    """The map of each lesson, and what it was told of the lesson before."""
     found = []
 
     def learn_next(lines, geometry, model, before, workers):
@@ -62,9 +61,8 @@ def test_a_map_teaches_every_so_many_frames_and_is_heeded_a_fixed_number_later(t
 
 
 def test_lessons_carry_on_what_was_seen_before(taught):
-    assert run(TEACH_FRAMES, 5) == [0, 0, 1, 1, 2]
-    assert taught == [(0, None), (2, "seen 0"), (4, "seen 2")][: len(taught)]
-    assert len(taught) >= 2
+    assert run(TEACH_FRAMES, 4) == [0, 0, 1, 1]
+    assert taught == [(0, None), (2, "seen 0")]
 
 
 def test_an_estimator_that_learns_nothing_keeps_its_model(taught):
