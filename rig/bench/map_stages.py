@@ -2,8 +2,8 @@
 
 joint: the estimate alone, from counts that were made before. joint-sweep: counting in blocks as in a scan, then the
 estimate. sgbm: OpenCV's StereoSGBM (MODE_HH4, which aggregates along four paths too) on a pair of pictures of the same
-surface, as many disparities as the window has pixels; OpenCV leaves out as many columns at the left edge. Nothing learns
-meanwhile: `joint` goes by what it learned from the first sweep. Each begins with a map that is not timed.
+surface, as many disparities as the window has pixels; OpenCV leaves out as many columns at the left edge. Nothing is
+learned meanwhile: `joint` goes by what it learned from the first sweep. Each begins with a map that is not timed.
 """
 
 import time

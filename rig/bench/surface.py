@@ -51,7 +51,7 @@ class BenchSurface:
         return bits
 
     def pictures(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Left and right picture (rows, columns) of a random texture; what left shows at x, right shows at x - place."""
+        """Left and right picture (rows, columns) of a texture; what left shows at x is at x - place in right."""
         import cv2
 
         disparity = np.ascontiguousarray(self.place_px.T)

@@ -25,7 +25,7 @@ UNITS_PER_NAT: Final = 8
 
 
 class AnswerSettings(NamedTuple):
-    """Which labels there are: stripes at 0..stripes-1, 'no stripe' at `none` behind them; tables of `answer_settings`.
+    """Which labels there are, stripes at 0..stripes-1, and tables of `answer_settings`.
 
     weights: float32 (256,), of a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), for each
     reach those of the taps within it. reach: uint8 (2^TAPS,), how far labels reach to both sides where the taps of the
@@ -34,7 +34,6 @@ class AnswerSettings(NamedTuple):
     """
 
     stripes: int
-    none: int
     weights: NDArray[np.float32]
     powers: NDArray[np.float32]
     reach: NDArray[np.uint8]
@@ -46,9 +45,9 @@ class Answer(NamedTuple):
     """Per (row, column). Labels are counted in labels, costs in eighths of a nat.
 
     label, spread: float32, mean and standard deviation of the labels around the winner, the stripe of the least total
-    (ties: the smaller label). margin: uint8, the least total at least MARGIN_FROM labels away less the winner's. none:
-    int16, total of 'no stripe' less the winner's. data: uint8, the winner's own cost. rival: float32, the best label at
-    least RIVAL_FROM labels away, NaN where all of those have total 255; rival_data: its own cost.
+    (ties: the smaller label). margin: uint8, the least total at least MARGIN_FROM labels away less the winner's. data:
+    uint8, the winner's own cost. rival: float32, the best label at least RIVAL_FROM labels away, NaN where all of those
+    have total 255; rival_data: its own cost.
     Means are taken only as far as both sides have labels: one side alone would draw every answer to it. spread is 0
     where that is the winner alone.
     """
@@ -56,7 +55,6 @@ class Answer(NamedTuple):
     label: NDArray[np.float32]
     spread: NDArray[np.float32]
     margin: NDArray[np.uint8]
-    none: NDArray[np.int16]
     data: NDArray[np.uint8]
     rival: NDArray[np.float32]
     rival_data: NDArray[np.uint8]
@@ -65,10 +63,10 @@ class Answer(NamedTuple):
 def new_answer(rows: int, columns: int) -> Answer:
     """Room for the answers of a map."""
     real, byte = np.float32, np.uint8
-    return Answer(*(np.zeros((rows, columns), dtype) for dtype in (real, real, byte, np.int16, byte, real, byte)))
+    return Answer(*(np.zeros((rows, columns), dtype) for dtype in (real, real, byte, byte, real, byte)))
 
 
-def answer_settings(stripes: int, none: int, beta: float = 0.5) -> AnswerSettings:
+def answer_settings(stripes: int, beta: float = 0.5) -> AnswerSettings:
     """Settings for so many stripe labels; a label weighs exp(-beta * excess of its total in nats)."""
     weights = np.exp(-beta / UNITS_PER_NAT * np.arange(LARGEST + 1)).astype(np.float32)
     distance = np.arange(-REACH, REACH + 1)
@@ -81,4 +79,4 @@ def answer_settings(stripes: int, none: int, beta: float = 0.5) -> AnswerSetting
     away = np.abs(np.arange(VECTOR) - MIDDLE)
     near = np.where(away < RIVAL_FROM, LARGEST, 0).astype(np.uint8)
     off_ring = np.where((away >= MARGIN_FROM) & (away < RIVAL_FROM), 0, LARGEST).astype(np.uint8)
-    return AnswerSettings(stripes, none, weights, powers, reach_of, off_ring, near)
+    return AnswerSettings(stripes, weights, powers, reach_of, off_ring, near)

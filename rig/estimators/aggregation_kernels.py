@@ -198,18 +198,15 @@ def _go_up(
     desk: Desk,
 ) -> None:  # fmt: skip
     """Totals of some columns and their answers, from the last row on; pixel: place of the first among the answers."""
-    labels, size = desk.labels, desk.labels + 2 * _SIDE
+    labels = desk.labels
     width = row_bytes // labels
-    before, after = paths, paths + _CHUNK * size
+    before, after = paths, paths + _CHUNK * (labels + 2 * _SIDE)
     _begin(paths, _CHUNK, labels)
     for row in range(rows - 1, -1, -1):
         costs, messages, here = cost + row * row_bytes, message + row * row_bytes, pixel + row * width
         fetch_answers(here - _AHEAD * width, columns, desk)
         _step_up(before, after, costs, messages, labels, columns, -_AHEAD * row_bytes, penalties, desk.totals,
                  desk.size, desk.hidden)  # fmt: skip
-        for c in range(columns):
-            none = np.int64(read_byte(messages, c * labels + desk.none)) + read_byte(after, c * size + desk.none)
-            write_byte(desk.none_total, c, np.uint8(min(none, LARGEST)))
         answer_columns(costs, here, columns, desk)
         before, after = after, before
 

@@ -34,7 +34,6 @@ from rig.lane_memory import (
     store_four,
     write_byte,
     write_float32,
-    write_int16,
     write_int32,
 )
 from rig.lane_shuffles import equal_bytes, first_equal
@@ -49,7 +48,6 @@ class Fields(NamedTuple):
     label: int
     spread: int
     margin: int
-    none: int
     data: int
     rival: int
     rival_data: int
@@ -64,17 +62,16 @@ class Found(NamedTuple):
 
 
 class Desk(NamedTuple):
-    """What columns are answered with: numbers (labels, end, none, size) and addresses.
+    """What columns are answered with: numbers (labels, end, size) and addresses.
 
     totals: uint8, `size` bytes from column to column, at least a vector of LARGEST before and behind each. end: labels
-    up to the end of the last block with stripes. none_total, ring: uint8 of each column, total of 'no stripe', and the
-    least one of labels that count for the margin, but may be no rival. hidden: uint8 (labels,), LARGEST where
-    there is no stripe. The tables are those of `AnswerSettings`.
+    up to the end of the last block with stripes. ring: uint8 of each column, the least total of labels that count for
+    the margin, but may be no rival. hidden: uint8 (labels,), LARGEST where there is no stripe. The tables are those of
+    `AnswerSettings`.
     """
 
     labels: int
     end: int
-    none: int
     size: int
     totals: int
     hidden: int
@@ -85,7 +82,6 @@ class Desk(NamedTuple):
     near: int
     winner: Found
     rival: Found
-    none_total: int
     ring: int
     answer: Fields
 
@@ -107,16 +103,16 @@ def desk_of(settings: AnswerSettings, out: Answer, memory: NDArray[np.uint8], co
     moments = totals + columns * size - VECTOR
     rest = moments + 2 * 4 * POWERS * columns
     answer = Fields(
-        address_of(out.label), address_of(out.spread), address_of(out.margin), address_of(out.none),
+        address_of(out.label), address_of(out.spread), address_of(out.margin),
         address_of(out.data), address_of(out.rival), address_of(out.rival_data),
     )  # fmt: skip
     return Desk(
-        labels, -(-settings.stripes // _BLOCK) * _BLOCK, settings.none, size, totals, hidden,
+        labels, -(-settings.stripes // _BLOCK) * _BLOCK, size, totals, hidden,
         address_of(settings.weights), address_of(settings.powers), address_of(settings.reach),
         address_of(settings.off_ring), address_of(settings.near),
         Found(rest, rest + 8 * columns, moments),
         Found(rest + 4 * columns, rest + 9 * columns, moments + 4 * POWERS * columns),
-        rest + 10 * columns, rest + 11 * columns, answer,
+        rest + 10 * columns, answer,
     )  # fmt: skip
 
 
@@ -167,13 +163,12 @@ def _hide_winners(columns, desk):  # type: ignore[no-untyped-def]
 def _answer_winners(cost, pixel, columns, desk):  # type: ignore[no-untyped-def]
     answer, found = desk.answer, desk.winner
     for c in range(columns):
-        label, total = read_int32(found.label, c), read_byte(found.total, c)
+        label = read_int32(found.label, c)
         share = np.float32(1.0) / read_float32(found.moments, POWERS * c)
         mean = read_float32(found.moments, POWERS * c + 1) * share
         square = read_float32(found.moments, POWERS * c + 2) * share
         write_float32(answer.label, pixel + c, np.float32(label) + mean)
         write_float32(answer.spread, pixel + c, np.sqrt(max(square - mean * mean, np.float32(0.0))))
-        write_int16(answer.none, pixel + c, np.int16(np.int16(read_byte(desk.none_total, c)) - np.int16(total)))
         write_byte(answer.data, pixel + c, read_byte(cost, c * desk.labels + label))
 
 
@@ -214,7 +209,6 @@ def fetch_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
         prefetch(answer.label + 4 * at)
         prefetch(answer.spread + 4 * at)
         prefetch(answer.margin + at)
-        prefetch(answer.none + 2 * at)
         prefetch(answer.data + at)
         prefetch(answer.rival + 4 * at)
         prefetch(answer.rival_data + at)

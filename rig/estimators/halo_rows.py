@@ -79,12 +79,13 @@ def halo_rows(halo: HaloAt, column: int, at: At, fitted: Fitted, b: Buffers, bat
     vectors = b.score_row // (PHASES * LANES)
     weights = halo.weight + 2 * column * halo.per_column
     for r in range(batch):
-        if read_int32(b.here, r) < 0:
+        i = read_int32(b.here, r)
+        if i < 0:
             continue
-        n = b.n + 2 * (r * b.n_row + FIRST_PX)
+        n, first, end = b.n + 2 * r * b.n_row, read_int16(at.span, 2 * i), read_int16(at.span, 2 * i + 1)
         for k in range(halo.blocks):
-            total = 0
-            for p in range(BLOCK_PX * k, BLOCK_PX * (k + 1)):
+            begin, total = FIRST_PX + BLOCK_PX * k, 0
+            for p in range(max(begin, first), min(begin + BLOCK_PX, end)):
                 total += read_int16(n, p)
             write_int16(halo.mean, k, np.int16(total // BLOCK_PX))
         for j in range(0, LIGHTS * halo.places, LANES):

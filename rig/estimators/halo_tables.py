@@ -19,9 +19,9 @@ from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, cell_of
 from rig.lanes import LANES
 
 BLOCK_PX: Final = 8
-FIRST_PX: Final = FAR_PX % BLOCK_PX
-"""Pixel that the first block begins at: the first label's pixel begins a block."""
-AHEAD: Final = FAR_PX // BLOCK_PX
+FIRST_PX: Final = FAR_PX % BLOCK_PX - BLOCK_PX
+"""Pixel that the first block begins at, before the row: the first label's pixel begins a block."""
+AHEAD: Final = (FAR_PX - FIRST_PX) // BLOCK_PX
 """Blocks behind a stripe at place 0."""
 _FULL: Final = 32768.0
 
@@ -29,9 +29,9 @@ _FULL: Final = 32768.0
 class HaloTables(NamedTuple):
     """Blocks of pixels are counted from FIRST_PX on; places of the stripe from the far end of the first label's pixel.
 
-    weight: int16 (bands, columns, blocks, LIGHTS, places), of the mean count of a block. constant: float32 (bands,
-    columns, LIGHTS, places), nats per exposure. ramp: int16 (phases, 3, LANES), parts that the three places around a
-    vector of labels have in each, of 2^15. Without a halo all are empty.
+    weight: int16 (bands, columns, blocks, LIGHTS, places), of the counts of a block over BLOCK_PX. constant: float32
+    (bands, columns, LIGHTS, places), nats per exposure. ramp: int16 (phases, 3, LANES), parts that the three places
+    around a vector of labels have in each, of 2^15. Without a halo all but `ramp` are empty.
     """
 
     weight: NDArray[np.int16]
@@ -42,7 +42,7 @@ class HaloTables(NamedTuple):
 def halo_tables(tables: LabelTables, there: bool) -> HaloTables:
     """Room for the tables of a halo, if there is one."""
     bands, columns, _ = tables.at.shape
-    blocks = (tables.edge.shape[1] - FIRST_PX) // BLOCK_PX
+    blocks = -(-(tables.edge.shape[1] - FIRST_PX) // BLOCK_PX)
     places = -(-(LANES // BLOCK_PX * tables.tap.shape[1] + 1) // LANES) * LANES
     if not there:
         bands = blocks = places = 0
@@ -80,7 +80,7 @@ def fill_halo(
     row, middle_light = row_buffers(sweep.window, 1), np.sqrt(light[0] * light[-1])
     mean, number = np.empty(pixels, np.float32), np.empty(pixels, np.int32)
     # Of the blocks: flux before and behind the stripe, and of the halo as the tables of labels have it.
-    level = np.empty((3, out.weight.shape[2]), np.float32)
+    level, size = np.empty((3, out.weight.shape[2]), np.float32), np.empty(out.weight.shape[2], np.int64)
     for b in range(first_band, last_band):
         rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
         for c in range(place.shape[0]):
@@ -98,11 +98,13 @@ def fill_halo(
                     end_px = min(end_px, int(tables.span[i, 1]))
             for k in range(level.shape[1]):
                 level[:, k] = 0.0
-                for p in range(FIRST_PX + BLOCK_PX * k, FIRST_PX + BLOCK_PX * (k + 1)):
-                    t = min(max(to_t - p, 0), length - 1)
-                    level[0, k] += (row.before[t] + mean[p]) / BLOCK_PX
-                    level[1, k] += (row.behind[t] + mean[p]) / BLOCK_PX
-                    level[2, k] += middle_light * row.scale[t] * state.glow[row.cell[t]] / BLOCK_PX
+                begin = max(FIRST_PX + BLOCK_PX * k, first_px)
+                size[k] = max(min(FIRST_PX + BLOCK_PX * (k + 1), end_px) - begin, 0)
+                for p in range(begin, begin + size[k]):
+                    t = to_t - p
+                    level[0, k] += (row.before[t] + mean[p]) / size[k]
+                    level[1, k] += (row.behind[t] + mean[p]) / size[k]
+                    level[2, k] += middle_light * row.scale[t] * state.glow[row.cell[t]] / size[k]
             out.weight[b, c] = 0
             out.constant[b, c] = 0.0
             for j in range(out.weight.shape[4]):
@@ -110,8 +112,7 @@ def fill_halo(
                 for m in range(LIGHTS):
                     s = light[m] * row.scale[t]
                     for k in range(level.shape[1]):
-                        begin = FIRST_PX + BLOCK_PX * k
-                        if begin < first_px or begin + BLOCK_PX > end_px:
+                        if size[k] == 0:
                             continue
                         # The middle of a block is half a block from its ends.
                         away = abs(BLOCK_PX * (k - j - AHEAD) + BLOCK_PX // 2)
@@ -121,7 +122,7 @@ def fill_halo(
                         other, own = cell_of(told), cell_of(flux)
                         weight = BLOCK_PX * per_nat * (state.table[0, own] - state.table[0, other])
                         out.weight[b, c, k, m, j] = round(min(max(weight, -WEIGHT_LIMIT), WEIGHT_LIMIT))
-                        out.constant[b, c, m, j] += BLOCK_PX * (state.table[1, own] - state.table[1, other])
+                        out.constant[b, c, m, j] += size[k] * (state.table[1, own] - state.table[1, other])
 
 
 @numba.njit(cache=True, nogil=True)

@@ -37,8 +37,6 @@ BAND_ROWS = 16
 """Rows whose costs stay in the cache from one step to the next."""
 FIRST_ROUNDS = 3
 """Times that the first map's stripes teach what they are then estimated with again."""
-MOST_NONE = 1e-12
-"""A row that is taken to have no stripe passes nothing on from its neighbours: there must be evidence for it."""
 QUIET_COLUMNS = 8
 """Every so manieth column teaches the ambient light where there are dark frames too."""
 
@@ -136,14 +134,13 @@ class Joint:
         grid, workers = tables.grid, self._workers
         rows, columns = grid.x_far.shape
         memory = self._room(rows, columns, grid.labels)
-        settings, penalties = answer_settings(grid.stripes, grid.none), Penalties()
+        settings, penalties = answer_settings(grid.stripes), Penalties()
 
         def tie_rows(first: int, last: int) -> None:
             for band in range(first, last, BAND_ROWS):
                 end = min(band + BAND_ROWS, last)
                 tables.costs.fill(volume, band, end, memory.cost)
                 self._prior.add(volume, band, end, memory.cost)
-                memory.cost[band:end, :, grid.none] = 255
                 along_rows(memory.cost, memory.message, penalties, band, end)
 
         def tie_columns(first: int, last: int) -> None:
@@ -190,8 +187,7 @@ class Joint:
 
 def _tables(setting: Setting, workers: RowWorkers) -> _Tables:
     grid = label_grid(setting.geometry)
-    model = replace(setting.model, none_weight=min(setting.model.none_weight, MOST_NONE))
-    costs = costs_of(model, setting.geometry, grid, setting.exposures, workers)
+    costs = costs_of(setting.model, setting.geometry, grid, setting.exposures, workers)
     shares = profile_table(setting.model.line_sigma_px)
-    halo = halo_shares(model, setting.geometry.width if model.halo.any() else 0)
+    halo = halo_shares(setting.model, setting.geometry.width if setting.model.halo.any() else 0)
     return _Tables(grid, costs, sweep_of(setting.geometry), state_of(setting.model), shares, halo, setting.dark)

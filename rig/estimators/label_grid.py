@@ -17,23 +17,20 @@ PER_PX: Final = 2
 """Labels a pixel: at whole pixels the stripe's place between two of them costs 0.05 px of error at 10 exposures."""
 SPARE: Final = 2
 """Labels beyond the searched pixels at either end, for the mean of a peak there."""
-GAP: Final = 4
-"""Labels without meaning between the last stripe and 'none': no small step leads from one to the other."""
 VECTOR: Final = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelGrid:
-    """Label l of a row and column is at x_far - side * l / PER_PX, for l from 0 to stripes - 1; `none` is 'no stripe'.
+    """Label l of a row and column is at x_far - side * l / PER_PX, for l from 0 to stripes - 1.
 
     x_far: float64 (rows, columns), NaN where nothing is searched; x may lie outside the picture there. side: 1 where
-    near is left, else -1. labels: a multiple of VECTOR; those that are no stripe and not `none` mean nothing.
+    near is left, else -1. labels: a multiple of VECTOR; those from stripes on mean nothing.
     """
 
     x_far: NDArray[np.float64]
     side: int
     stripes: int
-    none: int
     labels: int
 
 
@@ -47,8 +44,7 @@ def label_grid(geometry: SweepGeometry) -> LabelGrid:
     seen = np.isfinite(x_far)
     span = (side * (x_far - nearest))[seen].max(initial=1.0)
     stripes = int(np.ceil(PER_PX * span)) + 1 + SPARE
-    none = stripes + GAP
-    return LabelGrid(x_far, side, stripes, none, -(-(none + 1) // VECTOR) * VECTOR)
+    return LabelGrid(x_far, side, stripes, -(-stripes // VECTOR) * VECTOR)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -32,7 +32,7 @@ from rig.estimators.label_places import (
     VARIANTS,
 )
 from rig.estimators.row_input import State, Sweep, row_buffers, row_fluxes
-from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, cell_of, none_prior
+from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, cell_of
 from rig.lanes import LANES
 
 LIGHTS: Final = 2
@@ -41,10 +41,6 @@ WEIGHT_LIMIT: Final = 32767
 """Weights are cut there: a count that would say more says this much."""
 IMPOSSIBLE: Final = np.float32(-1e9)
 """Constant of a position where no row of the band has a label."""
-CHANGE_PX: Final = 8
-"""Positions of a change without a stripe that count as one with the likeliest."""
-BEHIND, BEFORE, CHANGE = range(3)
-NONES: Final = 3
 _NEAR, _FAR = 0, 1
 
 
@@ -56,10 +52,9 @@ class LabelTables(NamedTuple):
     the pixels up to and including each lying behind.
     tap: int16 (tables, V, taps, PHASES, LIGHTS, LANES), weight of the counts of the pixels around each position.
     constant: float32 (tables, V, PHASES, LIGHTS, LANES), nats per exposure of each position.
-    none: float32 (tables, NONES), nats of 'no stripe': all behind, all before, a change somewhere.
     span: int16 (tables, 2), pixels whose weights are not 0: from and up to.
-    fitted_constant, fitted_edge, fitted_none: int16, units of constant, of each pixel's share of edge_sum, and of none,
-    for the usual number of exposures.
+    fitted_constant, fitted_edge: int16, units of constant and of each pixel's share of edge_sum, for the usual number
+    of exposures.
     """
 
     at: NDArray[np.int32]
@@ -67,11 +62,9 @@ class LabelTables(NamedTuple):
     edge_sum: NDArray[np.float32]
     tap: NDArray[np.int16]
     constant: NDArray[np.float32]
-    none: NDArray[np.float32]
     span: NDArray[np.int16]
     fitted_constant: NDArray[np.int16]
     fitted_edge: NDArray[np.int16]
-    fitted_none: NDArray[np.int16]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -129,7 +122,7 @@ def fill_tables(
                     continue
                 y, label, label_end = _middle_row(place, c, rows, variant)
                 here = place[c, y]
-                length, first, last, start = row_fluxes(sweep, state, row, y, c)
+                length, _, _, start = row_fluxes(sweep, state, row, y, c)
                 to_t = side * (here[START] - start)
                 span = max(to_t - length + 1, 0), min(to_t + 1, pixels)
                 out.span[i, 0], out.span[i, 1] = span
@@ -147,12 +140,6 @@ def fill_tables(
                     state.table, row.scale, glow, to_t, span, flux, level, light, shares, variant, per_nat, most,
                     (label, label_end), out.tap[i], out.constant[i],
                 )  # fmt: skip
-                behind, before, change = none_prior(
-                    sweep.w_near, sweep.w_far, row.w[first], row.w[last], state.none_weight
-                )
-                share = np.log((1.0 - behind - before - change) / (last - first + 1))
-                out.none[i, BEHIND], out.none[i, BEFORE] = np.log(behind) - share, np.log(before) - share
-                out.none[i, CHANGE] = np.log(change * CHANGE_PX / (length + 1)) - share
 
 
 @numba.njit(cache=True, nogil=True)

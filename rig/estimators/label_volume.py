@@ -1,8 +1,9 @@
-"""Cost of every label on every row of every column: how much less likely than the best answer its counts make it.
+"""Cost of every label on every row of every column: how much less likely than the best one its counts make it.
 
-A label is a position of the stripe half a pixel nearer than the one before (`label_grid`); behind the positions stands
-'none', a row without stripe. The likelihood is that of `row_kernels`, with the line's profile at the label's own
-fraction of a pixel, from tables that the rows of a band share (`label_tables`).
+A label is a position of the stripe half a pixel nearer than the one before (`label_grid`); that there is none is not
+among the answers, since a row that is taken for empty would pass nothing on from its neighbours. The likelihood is that
+of `row_kernels`, with the line's profile at the label's own fraction of a pixel, from tables that the rows of a band
+share (`label_tables`).
 """
 
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from rig.estimators.halo_tables import HaloTables, fill_halo, halo_tables
 from rig.estimators.judging import HOT_FACTOR, HOT_FLUX
 from rig.estimators.label_grid import LabelGrid
 from rig.estimators.label_places import FAR_PX, FRACTIONS, PHASES, VARIANTS, label_pixels, places_of
-from rig.estimators.label_tables import LIGHTS, NONES, LabelTables, fill_tables, mark_rows, number_tables
+from rig.estimators.label_tables import LIGHTS, LabelTables, fill_tables, mark_rows, number_tables
 from rig.estimators.label_volume_buffers import Ways
 from rig.estimators.label_volume_kernels import fill_costs, fit_tables, room_for
 from rig.estimators.row_input import Row, State, Sweep, row_buffers, row_fluxes, state_of, sweep_of
@@ -69,9 +70,9 @@ class Costs:
     def fill(self, volume: CountVolume, first: int, last: int, out: NDArray[np.uint8]) -> None:
         """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows.
 
-        Cost: by how much a label is less likely than the best one of that row and column, at most COST_LIMIT; EXCLUDED
-        where it cannot be. Rows without frames, or with nothing to search, cost 0 everywhere. Best called with 16 rows
-        or more at a time; threads may fill different rows at once.
+        Cost: by how much a label is less likely than the best one of that row and column (of all that the band has), at
+        most COST_LIMIT; EXCLUDED where it cannot be. Rows without frames, or with nothing to search, cost 0 everywhere.
+        Best called with 16 rows or more at a time; threads may fill different rows at once.
         """
         memory = room_for(self.tables, self.halo, self.grid.labels)
         fill_costs(
@@ -129,7 +130,7 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
     def fit(first: int, last: int) -> None:
         fit_tables(tables, ways, first, last, room_for(tables, halo, grid.labels))
 
-    workers.over(len(tables.none), fit)
+    workers.over(len(tables.span), fit)
     mark_rows(place, hot, grid.side, BAND_ROWS, tables)
     y, x = np.nonzero(hot)
     hot_start = np.searchsorted(y, np.arange(geometry.rows + 1)).astype(np.int32)
@@ -148,7 +149,7 @@ def _ways(
     units_per_nat = min(wanted, finest)
     ways = Ways(
         units=units_per_nat * 2.0**down, bits=bits, exposures=exposures, most=most, down=down, reach=reach,
-        side=grid.side, stripes=grid.stripes, none=grid.none, band_rows=BAND_ROWS,
+        side=grid.side, stripes=grid.stripes, band_rows=BAND_ROWS,
     )  # fmt: skip
     return ways, units_per_nat
 
@@ -187,11 +188,9 @@ def _empty_tables(at: NDArray[np.int32], tables: int, grid: LabelGrid, taps: int
         edge_sum=aligned_zeros((tables, pixels), np.float32),
         tap=aligned_zeros((tables, vectors, taps, PHASES, LIGHTS, LANES), np.int16),
         constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.float32),
-        none=np.zeros((tables, NONES), np.float32),
         span=np.zeros((tables, 2), np.int16),
         fitted_constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.int16),
         fitted_edge=aligned_zeros((tables, pixels), np.int16),
-        fitted_none=np.zeros((tables, NONES), np.int16),
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from rig.aligned import CACHE_LINE
 from rig.estimators.label_places import FAR_PX, PHASES, VARIANTS
-from rig.estimators.label_tables import LIGHTS, NONES
+from rig.estimators.label_tables import LIGHTS
 from rig.lane_memory import address_of
 from rig.lanes import LANES
 
@@ -22,7 +22,7 @@ class Ways(NamedTuple):
 
     units: of scores per nat; bits: of the largest count; exposures: usual number of a column; most: exposures up to
     which counts are not halved; down: power of two that scores are divided by to be costs; reach: taps on either
-    side; side, stripes, none: as in `LabelGrid`; band_rows: rows that share tables.
+    side; side, stripes: as in `LabelGrid`; band_rows: rows that share tables.
     """
 
     units: float
@@ -33,7 +33,6 @@ class Ways(NamedTuple):
     reach: int
     side: int
     stripes: int
-    none: int
     band_rows: int
 
 
@@ -47,7 +46,6 @@ class At(NamedTuple):
     taps: int
     constant: int
     constants: int
-    none: int
     span: int
     hot_start: int
     hot_x: int
@@ -58,16 +56,15 @@ class Fitted(NamedTuple):
 
     constant: int
     edge: int
-    none: int
 
 
 class Buffers(NamedTuple):
     """Addresses; of BATCH rows, int16 unless said, with the elements from row to row.
 
     n: counts of pixels from far to near; sums: score of a change at each pixel, the first one BASE; score: of pixel
-    and phase; top, top_sum: largest ones of some lanes each, later of all; total: score of all pixels lying behind.
+    and phase; top: largest ones of some lanes each, later of all.
     cost: bytes of labels, from that of the first pixel's phase 0 on. Of all rows: mask: bytes, EXCLUDED or 0 for each
-    label; constant: of positions, edge: of pixels, none: of 'no stripe', for each variant; through: room for sums. As
+    label; constant: of positions, edge: of pixels, for each variant; through: room for sums. As
     int32, table: of variants from -1 on, -1 where there is none; here: of each row of the batch, fitted: place of it in
     `Fitted`; shown: labels that the mask is for, from and up to. labels: how many there are.
     """
@@ -78,14 +75,11 @@ class Buffers(NamedTuple):
     score: int
     score_row: int
     top: int
-    top_sum: int
-    total: int
     cost: int
     cost_row: int
     mask: int
     constant: int
     edge: int
-    none: int
     through: int
     table: int
     here: int
@@ -103,18 +97,15 @@ def buffers_at(begin, pixels, vectors, labels):  # type: ignore[no-untyped-def]
     sums = begin + 2 * BATCH * n_row
     score = sums + 2 * BATCH * n_row
     top = score + 2 * BATCH * score_row
-    top_sum = top + 2 * BATCH * LANES
-    total = top_sum + 2 * BATCH * LANES
-    cost = total + 2 * LANES
+    cost = top + 2 * BATCH * LANES
     mask = cost + BATCH * cost_row
     constant = mask + _whole(labels)
     edge = constant + 2 * VARIANTS * vectors * POSITION
-    none = edge + 2 * VARIANTS * pixels
-    through = none + 2 * VARIANTS * NONES
+    through = edge + 2 * VARIANTS * pixels
     table = through + 2 * (pixels + 2 * LANES)
     here = table + 4 * (VARIANTS + 1)
-    buffers = Buffers(begin, n_row, sums, score, score_row, top, top_sum, total, cost, cost_row, mask, constant, edge,
-                       none, through, table, here, here + 4 * BATCH, here + 8 * BATCH, labels)  # fmt: skip
+    buffers = Buffers(begin, n_row, sums, score, score_row, top, cost, cost_row, mask, constant, edge,
+                       through, table, here, here + 4 * BATCH, here + 8 * BATCH, labels)  # fmt: skip
     return buffers, here + 4 * (2 * BATCH + 2)
 
 

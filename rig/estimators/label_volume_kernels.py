@@ -20,7 +20,7 @@ from rig.estimators.label_places import (
     VARIANT,
     VARIANTS,
 )
-from rig.estimators.label_tables import NONES, LabelTables
+from rig.estimators.label_tables import LabelTables
 from rig.estimators.label_volume_buffers import BATCH, At, Buffers, Fitted, Ways, buffers_at, signed_address
 from rig.estimators.label_volume_rows import (
     COUNT_BITS,
@@ -36,7 +36,6 @@ from rig.lane_memory import (
     load_float32,
     load_int16,
     prefetch,
-    read_float32,
     read_int16,
     read_int32,
     store_int16,
@@ -91,7 +90,7 @@ def fill_costs(
     rows, columns, band_rows = out.shape[0], out.shape[1], ways.band_rows
     at = _at(tables, hot_start, hot_x)
     usually = _usually(tables)
-    room = Fitted(b.constant, b.edge, b.none)
+    room = Fitted(b.constant, b.edge)
     place_at, out_at, counts_at = signed_address(place), signed_address(out), signed_address(counts)
     window, in_bytes = counts.shape[2], counts.itemsize == 1
     write_int32(b.table, 0, np.int32(-1))
@@ -111,7 +110,7 @@ def fill_costs(
                 i = int(tables.at[band, c, variant]) if exposures > 0 else -1
                 write_int32(b.table, 1 + variant, np.int32(i))
                 if i >= 0 and not usual:
-                    _fit_table(at, i, variant, ways.units, per_nat, fitted, b.through)
+                    _fit_table(at, i, variant, per_nat, fitted, b.through)
                 if c + 1 < columns and tables.at[band, c + 1, variant] >= 0:
                     _fetch_table(at, int(tables.at[band, c + 1, variant]), usually)
             column = band * columns + c
@@ -136,7 +135,7 @@ def fill_costs(
                     score_rows(at, around.constant, around.which, 2 * ways.reach + 1, b, batch)
                 else:
                     score_rows(at, fitted.constant, b.fitted, 2 * ways.reach + 1, b, batch)
-                cost_rows(fitted, places, ways, b, batch)
+                cost_rows(ways, b, batch)
                 write_rows(places, ways, b, batch, out_at + (y * columns + c) * labels, columns * labels)
 
 
@@ -160,26 +159,21 @@ def fit_tables(tables: LabelTables, ways: Ways, first: int, last: int, memory: N
     at = _at(tables, tables.span, tables.span)
     fitted = _usually(tables)
     for i in range(first, last):
-        _fit_table(at, i, i, ways.units, ways.units * ways.exposures, fitted, signed_address(memory))
+        _fit_table(at, i, i, ways.units * ways.exposures, fitted, signed_address(memory))
 
 
 @numba.njit(forceinline=True)
 def _usually(tables):  # type: ignore[no-untyped-def]
     """What the tables say at the usual number of exposures."""
-    return Fitted(
-        signed_address(tables.fitted_constant), signed_address(tables.fitted_edge), signed_address(tables.fitted_none)
-    )
+    return Fitted(signed_address(tables.fitted_constant), signed_address(tables.fitted_edge))
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_table(at: At, i: int, j: int, units: float, per_nat: float, to: Fitted, through: int) -> None:
+def _fit_table(at: At, i: int, j: int, per_nat: float, to: Fitted, through: int) -> None:
     """Constants of table i for a number of exposures, as number j; per_nat: units times exposures."""
     source, constant = at.constant + 4 * i * at.constants, to.constant + 2 * j * at.constants
     for k in range(0, at.constants, LANES):
         store_int16(constant, k, _rounded(load_float32(source, k) * np.float32(per_nat)))
-    for k in range(NONES):
-        prior = min(max(np.float32(units) * read_float32(at.none, NONES * i + k), -_LIMIT), _LIMIT)
-        write_int16(to.none, NONES * j + k, np.int16(prior))
     source, edge = at.edge_sum + 4 * i * at.pixels, to.edge + 2 * j * at.pixels
     # Differences of rounded sums: rounding each pixel would drift along the row.
     write_int16(through, LANES - 1, np.int16(0))
@@ -193,7 +187,7 @@ def _fit_table(at: At, i: int, j: int, units: float, per_nat: float, to: Fitted,
 def _at(tables, hot_start, hot_x):  # type: ignore[no-untyped-def]
     return At(
         signed_address(tables.edge), signed_address(tables.edge_sum), tables.edge.shape[1], signed_address(tables.tap),
-        tables.tap[:1].size, signed_address(tables.constant), tables.constant[:1].size, signed_address(tables.none),
+        tables.tap[:1].size, signed_address(tables.constant), tables.constant[:1].size,
         signed_address(tables.span), signed_address(hot_start), signed_address(hot_x),
     )  # fmt: skip
 

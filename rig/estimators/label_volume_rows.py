@@ -23,7 +23,6 @@ from rig.estimators.label_places import (
     VALID,
     VALID_END,
 )
-from rig.estimators.label_tables import BEFORE, BEHIND, CHANGE, NONES
 from rig.estimators.label_volume_buffers import POSITION, At, Buffers, Fitted, Ways
 from rig.lane_memory import (
     load_bytes,
@@ -47,7 +46,7 @@ from rig.lanes import LANES, add_saturated, as_bytes, larger, scaled, smaller, s
 COST_LIMIT: Final = 160
 """Largest cost of a label that is not excluded."""
 EXCLUDED: Final = 255
-"""Cost of a label that cannot be: outside the picture, more than a pixel outside the row's search window, or none."""
+"""Cost of a label that cannot be: outside the picture, more than a pixel outside the row's search window."""
 BASE: Final = -8000
 """Score of 'everything is before the stripe': most of the range lies above it."""
 HIGHEST: Final = 30000
@@ -127,7 +126,7 @@ def _neutral(at, i, p, per_nat):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def sum_edges(at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
-    """Fill sums, total and top_sum."""
+    """Fill sums."""
     pixels = at.pixels
     for r in range(batch):
         i = read_int32(b.here, r)
@@ -136,17 +135,11 @@ def sum_edges(at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
         n, sums = b.n + 2 * r * b.n_row, b.sums + 2 * r * b.n_row
         edge, constant = at.edge + 2 * pixels * i, fitted.edge + 2 * pixels * read_int32(b.fitted, r)
         carry = zero_int16() + np.int16(BASE)
-        top = carry
         write_int16(sums, 0, np.int16(BASE))
         for p in range(0, pixels, LANES):
             rise = running_sum(add_saturated(scaled(load_int16(n, p), load_int16(edge, p)), load_int16(constant, p)))
-            through = add_saturated(rise, carry)
-            store_int16(sums, p + 1, through)
-            top = larger(top, through)
+            store_int16(sums, p + 1, add_saturated(rise, carry))
             carry = add_saturated(carry, last_everywhere(rise))
-        store_int16(b.top_sum, r * LANES, top)
-        write_int16(b.total, r, read_int16(sums, pixels))
-    store_int16(b.top_sum, 0, largest_of_rows(b.top_sum))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -186,8 +179,8 @@ def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch:
 
 
 @numba.njit(cache=True, nogil=True)
-def cost_rows(fitted: Fitted, places: int, ways: Ways, b: Buffers, batch: int) -> None:
-    """Fill cost, that of 'none' included."""
+def cost_rows(ways: Ways, b: Buffers, batch: int) -> None:
+    """Fill cost."""
     vectors, half = b.score_row // (PHASES * LANES), (1 << ways.down) >> 1
     for r in range(batch):
         cost, score = b.cost + r * b.cost_row, b.score + 2 * r * b.score_row
@@ -195,19 +188,11 @@ def cost_rows(fitted: Fitted, places: int, ways: Ways, b: Buffers, batch: int) -
             for label in range(0, b.labels, 2 * LANES):
                 store_bytes(cost, label, zero_bytes())
             continue
-        prior = fitted.none + 2 * NONES * read_int32(b.fitted, r)
-        behind = read_int16(b.total, r) + read_int16(prior, BEHIND)
-        before = BASE + read_int16(prior, BEFORE)
-        change = read_int16(b.top_sum, r) + read_int16(prior, CHANGE)
-        none = min(max(behind, before, change), HIGHEST)
-        best = max(read_int16(b.top, r), none)
-        level = add_saturated(zero_int16() + np.int16(best), np.int16(half))
+        level = add_saturated(zero_int16() + read_int16(b.top, r), np.int16(half))
         for v in range(vectors):
             far = smaller(sub_saturated(level, load_int16(score, 2 * v * LANES)) >> ways.down, np.int16(COST_LIMIT))
             near = sub_saturated(level, load_int16(score, (2 * v + 1) * LANES)) >> ways.down
             store_bytes(cost, 2 * v * LANES, as_bytes(far | smaller(near, np.int16(COST_LIMIT)) << 8))
-        lost = min(best - none + half >> ways.down, COST_LIMIT)
-        write_byte(cost, read_int16(places, PLACES * r + ODD) + ways.none, np.uint8(lost))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -224,7 +209,6 @@ def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_by
             write_int32(b.shown, 0, np.int32(low))
             write_int32(b.shown, 1, np.int32(high))
             for label in range(b.labels):
-                inside = low <= label < high or label == ways.none
-                write_byte(b.mask, label, np.uint8(0) if inside else np.uint8(EXCLUDED))
+                write_byte(b.mask, label, np.uint8(0) if low <= label < high else np.uint8(EXCLUDED))
         for label in range(0, b.labels, 2 * LANES):
             store_bytes(to, label, load_bytes(cost, label) | load_bytes(b.mask, label))

@@ -15,6 +15,7 @@ from rig.estimators.second_return_kernels import (
     BLOCK,
     LINE_SIGMAS,
     Blocks,
+    Candidates,
     Seconds,
     find_candidates,
     judge_seconds,
@@ -26,8 +27,10 @@ from rig.row_threads import RowWorkers
 
 LIGHT_SIGMAS = 1.5
 """Widths of the line to either side that its light is looked for in."""
-HALF_SURE, PER_SD = 5.0, 1.5
-"""Light that stands out by HALF_SURE standard deviations is a second return in half of the cases."""
+LOG_ODDS = -12.2, 0.4, 2.3
+"""Log odds that a candidate is right: these times 1 and the standard deviations of a row's own light and its block's.
+
+Fitted to maps with and without a pane (docs/results.md)."""
 
 
 def second_returns(
@@ -43,21 +46,19 @@ def second_returns(
     rows, columns = x_px.shape
     shape = -(-rows // BLOCK), -(-columns // BLOCK)
     apart, reach = APART_PX + LINE_SIGMAS * line_sigma_px, max(int(np.rint(LIGHT_SIGMAS * line_sigma_px)), 1)
-    sums = (np.empty((*shape, -(-grid.stripes // PER_PX)), np.float32) for _ in Blocks._fields)
-    blocks = Blocks(*sums)
-    distance, haze = (np.empty(shape, np.float32) for _ in range(2))
+    blocks = Blocks(*(np.empty((*shape, -(-grid.stripes // PER_PX)), np.float32) for _ in Blocks._fields))
+    candidates = Candidates(*(np.empty(shape, np.float32) for _ in Candidates._fields))
     seen = volume.counts, volume.n_frames, sweep, state, grid.x_far, grid.side, apart
 
     workers.over(shape[0], lambda first, last: sum_blocks(*seen, x_px, first, last, blocks))
-    workers.over(shape[0], lambda first, last: find_candidates(blocks, reach, grid.side, first, last, distance, haze))
+    workers.over(shape[0], lambda first, last: find_candidates(blocks, reach, grid.side, first, last, candidates))
     sure = np.zeros((rows, columns), np.float32)
-    if np.isnan(distance).all():
+    if np.isnan(candidates.distance).all():
         return np.full((rows, columns), np.nan, np.float32), sure
-    each = np.repeat(np.repeat(distance, BLOCK, 0)[:rows], BLOCK, 1)[:, :columns]
-    seconds = Seconds(np.ascontiguousarray(each), *(np.zeros((rows, columns), np.float32) for _ in range(4)))
+    seconds = Seconds(_each(candidates.distance, rows, columns), *(np.zeros((rows, columns), np.float32) for _ in range(4)))
 
     def measure(first: int, last: int) -> None:
-        measure_seconds(*seen, reach, x_px, haze, first, last, seconds)
+        measure_seconds(*seen, reach, x_px, candidates.haze, first, last, seconds)
 
     moved = np.empty((rows, columns), np.float32)
     workers.over(rows, measure)
@@ -66,5 +67,15 @@ def second_returns(
     workers.over(rows, measure)
     workers.over(rows, lambda first, last: judge_seconds(first, last, seconds, sure))
     x2_px = np.where(sure > 0, grid.x_far + moved, np.nan).astype(np.float32)
-    confidence = 1 / (1 + np.exp(PER_SD * (HALF_SURE - sure)))
-    return x2_px, np.where(np.isnan(x2_px), 0.0, confidence).astype(np.float32)
+    return x2_px, _confidence(sure, _each(candidates.sure, rows, columns))
+
+
+def _each(of_blocks: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
+    """What each row and column has of its block."""
+    wide = np.repeat(np.repeat(of_blocks, BLOCK, axis=0)[:rows], BLOCK, axis=1)
+    return np.ascontiguousarray(wide[:, :columns])
+
+
+def _confidence(own: NDArray[np.float32], of_block: NDArray[np.float32]) -> NDArray[np.float32]:
+    odds = LOG_ODDS[0] + LOG_ODDS[1] * own + LOG_ODDS[2] * of_block
+    return np.where(own > 0, 1 / (1 + np.exp(-odds)), 0.0).astype(np.float32)

@@ -16,6 +16,8 @@ from rig.estimators.row_input import State, Sweep, fluxes_at, line_light
 
 BLOCK: Final = 4
 """Rows, and columns, whose light is summed at once; a block is judged together with its eight neighbours."""
+HAZE_STEP: Final = 8
+"""Pixels from one place where haze is worked out to the next."""
 RING_PX: Final = 4
 """Pixels to either side of where light is looked for that tell whether haze is as strong as was learned."""
 GAP_PX: Final = 1
@@ -23,6 +25,10 @@ GAP_PX: Final = 1
 APART_PX: Final = 2.0
 """Light so far from a stripe, and further by LINE_SIGMAS widths of the line, is not its own."""
 LINE_SIGMAS: Final = 2.5
+LEAST_RING: Final = 0.25
+"""Share of those pixels that must be seen on each side."""
+STEEPER: Final = 1.5
+"""Haze that the ring shows beyond the learned one may be this much more between its two sides: it is not straight."""
 CANDIDATE: Final = 3.0
 """Standard deviations from which a block's light is looked at more closely."""
 REACH: Final = 3
@@ -34,6 +40,18 @@ class Blocks(NamedTuple):
 
     ones: Float32
     expected: Float32
+
+
+class Candidates(NamedTuple):
+    """What stands out most in each block and its neighbours, float32 (block rows, block columns) each.
+
+    distance: from the far end in px, NaN where nothing does; sure: standard deviations by which its light does; haze:
+    how much stronger haze is there than was learned, at least 1.
+    """
+
+    distance: Float32
+    sure: Float32
+    haze: Float32
 
 
 class Seconds(NamedTuple):
@@ -70,7 +88,8 @@ def sum_blocks(
     """
     rows, columns = x_px.shape
     width, pixels = sweep.u.shape[1], out.ones.shape[2]
-    before, behind = np.zeros(pixels, np.float32), np.zeros(pixels, np.float32)
+    knots = -(-pixels // HAZE_STEP) * HAZE_STEP + 1
+    left, right = np.zeros(knots, np.float32), np.zeros(knots, np.float32)
     for by in range(first_block, last_block):
         out.ones[by] = 0.0
         out.expected[by] = 0.0
@@ -78,49 +97,74 @@ def sum_blocks(
             my, mc = min(by * BLOCK + BLOCK // 2, rows - 1), min(bx * BLOCK + BLOCK // 2, columns - 1)
             if np.isnan(x_far[my, mc]):
                 continue
-            middle = int(np.rint(x_far[my, mc]))
-            path_p, strength = line_light(sweep, state, my, mc, min(max(middle, 0), width - 1))
-            for i in range(pixels):
-                t = middle - side * i
-                before[i] = behind[i] = 0.0
-                if 0 <= t < width:
-                    here, there, _, _, _, _, _ = fluxes_at(sweep, state, my, t, mc, path_p, strength)
-                    before[i] = -np.expm1(state.ambient[my, t] - here)
-                    behind[i] = -np.expm1(state.ambient[my, t] - there)
+            _haze_beside(sweep, state, my, mc, leftmost(x_far[my, mc], side, pixels), side, left, right)
             ones, expected = out.ones[by, bx], out.expected[by, bx]
             for y in range(by * BLOCK, min(by * BLOCK + BLOCK, rows)):
                 for c in range(bx * BLOCK, min(bx * BLOCK + BLOCK, columns)):
                     if np.isnan(x_px[y, c]) or np.isnan(x_far[y, c]):
                         continue
-                    far, x0, frames = int(np.rint(x_far[y, c])), sweep.x0[c], np.float32(n_frames[c])
-                    # Pixels far - side * i that are searched, counted and in the picture; those near the stripe are not.
-                    lo, hi = max(sweep.x_lo[y, c], x0, 0), min(sweep.x_hi[y, c], x0 + sweep.window - 1, width - 1)
-                    begin, end = (far - hi, far - lo + 1) if side > 0 else (lo - far, hi - far + 1)
-                    begin, end = max(begin, 0), min(end, pixels)
-                    near = (far - x_px[y, c]) * side
-                    cut = min(max(int(np.ceil(near - apart)), begin), end)
-                    on = max(min(int(np.floor(near + apart)) + 1, end), begin)
-                    line, ambient = counts[c, y], state.ambient[y]
-                    # Near pixels lie before the stripe, far ones (small i) behind it.
-                    for i in range(begin, cut):
-                        t = far - side * i
-                        ones[i] += np.float32(line[t - x0])
-                        expected[i] += frames * (behind[i] + (np.float32(1.0) - behind[i]) * ambient[t])
-                    for i in range(on, end):
-                        t = far - side * i
-                        ones[i] += np.float32(line[t - x0])
-                        expected[i] += frames * (before[i] + (np.float32(1.0) - before[i]) * ambient[t])
+                    start, x0 = leftmost(x_far[y, c], side, pixels), sweep.x0[c]
+                    begin = max(sweep.x_lo[y, c], x0, 0, start)
+                    end = max(min(sweep.x_hi[y, c], x0 + sweep.window - 1, width - 1, start + pixels - 1) + 1, begin)
+                    stop = min(max(int(np.ceil(x_px[y, c] - apart)), begin), end)
+                    on = max(min(int(np.floor(x_px[y, c] + apart)) + 1, end), begin)
+                    line, dark, frames = counts[c, y], state.ambient[y], np.float32(n_frames[c])
+                    for first, last, haze in ((begin, stop, left), (on, end, right)):
+                        _add_line(
+                            line[first - x0 : last - x0], dark[first:last], frames, haze[first - start : last - start],
+                            ones[first - start : last - start], expected[first - start : last - start],
+                        )  # fmt: skip
+
+
+@numba.njit(inline="always")
+def leftmost(x_far, side, pixels):  # type: ignore[no-untyped-def]
+    """Pixel that the first of so many pixels of distance is at: they run from left to right."""
+    return int(np.rint(x_far)) - (pixels - 1 if side > 0 else 0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _haze_beside(
+    sweep: Sweep, state: State, y: int, c: int, start: int, side: int, left: Float32, right: Float32
+) -> None:
+    """Probability of a one by haze, without ambient light, left and right of a stripe, in pixels from `start` on.
+
+    Straight lines between every HAZE_STEP pixels; both as long as a multiple of that, and one more.
+    """
+    end = sweep.u.shape[1] - 1
+    path_p, strength = line_light(sweep, state, y, c, min(max(start, 0), end))
+    for i in range(0, len(left), HAZE_STEP):
+        x = min(max(start + i, 0), end)
+        left[i] = right[i] = 0.0
+        if not np.isnan(sweep.u[y, x]):
+            before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)
+            if side < 0:
+                before, behind = behind, before
+            left[i], right[i] = -np.expm1(state.ambient[y, x] - before), -np.expm1(state.ambient[y, x] - behind)
+        for k in range(max(i - HAZE_STEP + 1, 0), i):
+            part = np.float32((i - k) / HAZE_STEP)
+            left[k] = left[i] + part * (left[i - HAZE_STEP] - left[i])
+            right[k] = right[i] + part * (right[i - HAZE_STEP] - right[i])
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_line(
+    line: NDArray[np.unsignedinteger],
+    ambient: Float32,
+    frames: np.float32,
+    haze: Float32,
+    ones: Float32,
+    expected: Float32,
+) -> None:
+    for i in range(len(line)):
+        ones[i] += np.float32(line[i])
+        expected[i] += frames * (haze[i] + (np.float32(1.0) - haze[i]) * ambient[i])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def find_candidates(
-    blocks: Blocks, reach: int, side: int, first_block: int, last_block: int, distance: Float32, haze: Float32
+    blocks: Blocks, reach: int, side: int, first_block: int, last_block: int, out: Candidates
 ) -> None:
-    """Where the light of each block and its neighbours stands out most: distance from the far end, NaN if nowhere.
-
-    Rows of blocks first_block..last_block-1. reach: of the line, px. haze: how much stronger it is there than was
-    learned, at least 1.
-    """
+    """Fill rows of blocks first_block..last_block-1. reach: of the line's light, px."""
     rows, columns, pixels = blocks.ones.shape
     span = reach + GAP_PX + RING_PX
     ones, expected = np.zeros(pixels + 2 * span + 1), np.zeros(pixels + 2 * span + 1)
@@ -136,19 +180,25 @@ def find_candidates(
             for i in range(1, len(ones)):
                 ones[i] += ones[i - 1]
                 expected[i] += expected[i - 1]
-            best, distance[by, bx], haze[by, bx] = CANDIDATE, np.nan, 1.0
+            out.distance[by, bx], out.sure[by, bx], out.haze[by, bx] = np.nan, CANDIDATE, 1.0
             for i in range(pixels):
                 a, b = span + i - reach, span + i + reach + 1
                 n, e = ones[b] - ones[a], expected[b] - expected[a]
-                if n - e < best * np.sqrt(e + 1.0):
+                if n - e < out.sure[by, bx] * np.sqrt(e + 1.0):
                     continue
-                ring = ones[b + GAP_PX + RING_PX] - ones[b + GAP_PX] + ones[a - GAP_PX] - ones[a - GAP_PX - RING_PX]
-                asked = expected[b + GAP_PX + RING_PX] - expected[b + GAP_PX]
-                asked += expected[a - GAP_PX] - expected[a - GAP_PX - RING_PX]
-                more = max((ring + 1.0) / (asked + 1.0), 1.0)
+                more = 1.0
+                # Light that only falls off to one side is a halo of the stripe or haze that was learned too weak.
+                for start in (a - GAP_PX - RING_PX, b + GAP_PX):
+                    ring, asked = ones[start + RING_PX] - ones[start], expected[start + RING_PX] - expected[start]
+                    seen = asked > LEAST_RING * e * RING_PX / (b - a)
+                    more = max(more, (ring + 1.0) / (asked + 1.0)) if seen else np.inf
+                if np.isinf(more):
+                    continue
+                more = 1.0 + STEEPER * (more - 1.0)
                 sure = (n - e * more) / np.sqrt(e * more + 1.0)
-                if sure > best:
-                    best, distance[by, bx], haze[by, bx] = sure, -side * i, more
+                if sure > out.sure[by, bx]:
+                    out.distance[by, bx] = i - (pixels - 1 if side > 0 else 0)
+                    out.sure[by, bx], out.haze[by, bx] = sure, more
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -169,7 +219,7 @@ def measure_seconds(
 ) -> None:
     """Fill all but distance of rows first_row..last_row-1; zeros where there is no candidate or a stripe is near.
 
-    haze: of blocks, as `find_candidates` gives it.
+    haze: of `Candidates`.
     """
     width = sweep.u.shape[1]
     for y in range(first_row, last_row):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import CountVolume
-from rig.estimators.aggregation_answer import UNITS_PER_NAT, VECTOR
+from rig.estimators.aggregation_answer import VECTOR
 from rig.estimators.label_grid import PER_PX, LabelGrid
 from rig.geometry import SweepGeometry
 from rig.lane_memory import address_of, load_bytes, store_bytes
@@ -18,8 +18,8 @@ from rig.lanes import add_saturated_unsigned
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
-MOST = round(0.75 * UNITS_PER_NAT)
-"""Most that a label costs more, units of the costs."""
+MOST = 3
+"""Most that a label costs more, units of the costs (eighths of a nat). From 6 on dark things that move are held back."""
 SLOPE = 2
 """Units for each label farther off."""
 FREE = 1

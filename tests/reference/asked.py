@@ -124,17 +124,18 @@ def _hot(estimator: str, groups: Groups) -> Iterator[Finding]:
 def _extras(estimator: str, groups: Groups) -> Iterator[Finding]:
     for (point, k), group in sorted(groups.items()):
         for one in group.values():
+            of = f"{point}, {one.scene}" if one.scene != point else point
             for name, value in one.extras.items():
                 if "times the bound" in name:
                     yield _finding(
-                        f"{point}: {name}", k, estimator, f"at most {BOUND_TIMES}", value, "", value <= BOUND_TIMES
+                        f"{of}: {name}", k, estimator, f"at most {BOUND_TIMES}", value, "", value <= BOUND_TIMES
                     )
                 elif name.startswith(("pole", "fence")):
                     yield _finding(
-                        f"{point}: {name}", k, estimator, f"at least {THIN_WITHIN}", value, "", value >= THIN_WITHIN
+                        f"{of}: {name}", k, estimator, f"at least {THIN_WITHIN}", value, "", value >= THIN_WITHIN
                     )
                 else:
-                    yield _finding(f"{point}: {name}", k, estimator, "", value, "", None)
+                    yield _finding(f"{of}: {name}", k, estimator, "", value, "", None)
 
 
 def _calibration(estimator: str, groups: Groups) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Figures that only a made scene can tell: sub-pixel place over its bound, thin objects, a second return."""
+"""Figures that a mean over stripes does not tell: sub-pixel place over its bound, thin objects, second return, fog."""
 
 from __future__ import annotations
 
@@ -7,22 +7,35 @@ from typing import Any
 
 import numpy as np
 
-from tests.reference.answers import OUTLIER_PX, WITHIN_PX, averaged_pixels
+from tests.reference.answers import MISSING_PX, OUTLIER_PX, WITHIN_PX, averaged_pixels
 from tests.reference.made_scenes import thin_scene
 from tests.reference.working_point import WorkingPoint, at_stripe
 
 LAGS = 24
 """Pixels over which errors of neighbouring answers are looked at for being averages of the same light."""
 SURE = 0.5
+MUCH_FOG = 1.25
+"""Optical depth; halo and stripe of the point `halo` are made for 1 at the scene's median depth."""
 
 
 def figures_of(point: str, world: WorkingPoint, stripes: Sequence[Any], exposures: int) -> dict[str, float]:
-    """Figures by name of the StripeTables of two maps or more; none for a point on prepared scenes."""
+    """Figures by name of the StripeTables of one map, or two where noise is asked for; none for most points."""
     if point == "smooth":
         return _bound(world, stripes, exposures)
     if point == "thin":
         return _thin(world, stripes[0])
+    if point == "halo":
+        return _through_fog(world, stripes[0])
     return _second(world, stripes[0]) if point == "pane" else {}
+
+
+def _through_fog(world: WorkingPoint, stripe: Any) -> dict[str, float]:
+    """Mean error of trusted stripes behind little and behind much fog."""
+    error = np.abs(stripe.x_px - world.x_true)
+    error = np.where(np.isfinite(error), error, MISSING_PX)
+    thin = world.optical_depth <= MUCH_FOG
+    parts = {f"mean error to optical depth {MUCH_FOG:g}": thin, f"mean error beyond {MUCH_FOG:g}": ~thin}
+    return {name: float(error[world.trusted & part].mean()) for name, part in parts.items()}
 
 
 def _bound(world: WorkingPoint, stripes: Sequence[Any], exposures: int) -> dict[str, float]:
@@ -60,10 +73,10 @@ def _thin(world: WorkingPoint, stripe: Any) -> dict[str, float]:
 def _second(world: WorkingPoint, stripe: Any) -> dict[str, float]:
     """How often both surfaces are found where there are two, and how often a second one is where there is none."""
     x = np.stack([stripe.x_px, getattr(stripe, "x2_px", np.full_like(stripe.x_px, np.nan))])
-    two = np.isfinite(world.x_second) & np.isfinite(world.x_true)
+    two = np.asarray(np.isfinite(world.x_second) & np.isfinite(world.x_true))
     one = np.isfinite(world.x_true) & ~two & world.trusted
-    near = (np.abs(x - world.x_second) <= WITHIN_PX).any(axis=0)
-    far = (np.abs(x - world.x_true) <= WITHIN_PX).any(axis=0)
+    near = np.asarray((np.abs(x - world.x_second) <= WITHIN_PX).any(axis=0))
+    far = np.asarray((np.abs(x - world.x_true) <= WITHIN_PX).any(axis=0))
     sure = np.isfinite(x[1]) & (getattr(stripe, "confidence2", np.zeros_like(x[0])) > SURE)
     return {
         "a return within 1 px of either": float((near | far)[two].mean()),

@@ -48,9 +48,12 @@ def halo_and_pedestal(
     x_true: NDArray[np.float64],
     x_end: NDArray[np.float64],
     stripe: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Photons per exposure (H, columns): the halo's total, and the pedestal per pixel just behind the sheet's end."""
-    halo, pedestal = np.zeros_like(stripe), np.zeros_like(stripe)
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Photons per exposure (H, columns): the halo's total, and the pedestal per pixel just behind the sheet's end.
+
+    Third: the optical depth of that end, 0 where it is outside the picture.
+    """
+    halo, pedestal, depth = np.zeros_like(stripe), np.zeros_like(stripe), np.zeros_like(stripe)
     places = np.arange(geometry.width)
     for y in range(geometry.height):
         inside = (x_end[y] >= 0) & (x_end[y] <= geometry.width - 1)
@@ -60,8 +63,8 @@ def halo_and_pedestal(
         inverse_z = (n0 * u + n1 * v + n2) / d
         inside &= inverse_z > 0
         tau = np.where(inside, extinction_per_m / np.where(inside, inverse_z, 1.0), 0.0)
-        halo[y] = stripe[y] * halo_total(tau)
+        depth[y], halo[y] = tau, stripe[y] * halo_total(tau)
         for c in np.flatnonzero(inside):
             before = kernels.haze_at(u[c], v[c], inverse_z[c], geometry.scanner_m, extinction_per_m)
             pedestal[y, c] = haze_scale * before * pedestal_share(tau[c])
-    return halo, pedestal
+    return halo, pedestal, depth

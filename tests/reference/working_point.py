@@ -102,9 +102,9 @@ class WorkingPoint:
         self.stripe *= self.stripe_scale
         self.haze_scale = light.haze / mean_free_haze(g, light.extinction_per_m) if light.haze > 0 else 0.0
         self.x_second, self.second = self._second()
-        self.halo, self.pedestal = np.zeros_like(self.stripe), np.zeros_like(self.stripe)
+        self.halo, self.pedestal, self.optical_depth = (np.zeros_like(self.stripe) for _ in range(3))
         if light.multiple_scattering:
-            self.halo, self.pedestal = scattering.halo_and_pedestal(
+            self.halo, self.pedestal, self.optical_depth = scattering.halo_and_pedestal(
                 g, light.extinction_per_m, self.haze_scale, self.x_true, self.x_end, self.stripe
             )
         self.ambient = dark_map(light, scene.shape)

@@ -61,12 +61,13 @@ def test_costs_are_those_of_a_stripe_with_its_halo():
                 scores[i, m] = (n * np.log(p) + (10 - n) * np.log1p(-p)).sum()
         nats = given[labels] / costs.units_per_nat
         wanted = scores.max(axis=1).max() - scores.max(axis=1)
-        near = np.minimum(wanted, nats) < 10
         # Both against the same label: in the volume the best one may be 'none'.
         best = int(np.argmin(nats))
-        off.append((nats - nats[best] - wanted + wanted[best])[near])
-    # Counts enter by blocks of 8 px, where the halo differs from what it is at the stripe.
-    assert np.sqrt(np.mean(np.concatenate(off) ** 2)) < 1.0
+        near = np.abs(labels - labels[best]) < 8 * PER_PX
+        off.append((nats - nats[best] - wanted + wanted[best])[near & (np.minimum(wanted, nats) < 10)])
+    # Counts enter by blocks of 8 px, and places by straight lines between blocks: within a nat or two.
+    assert np.sqrt(np.mean(np.concatenate(off) ** 2)) < 2.0
+    assert abs(np.mean(np.concatenate(off))) < 1.0
     plain = costs_of(replace(model, halo=0 * HALO), geometry, costs.grid, 10, WORKERS)
     assert plain.halo.weight.size == 0, "without a halo there are no tables of one"
 

@@ -12,7 +12,7 @@ from rig.estimators.label_grid import PER_PX, label_grid
 from rig.estimators.label_volume import QUARTILES, SHARP, UNITS, _lights, costs_of
 from rig.estimators.label_volume_rows import COST_LIMIT, EXCLUDED
 from rig.estimators.row_input import row_buffers, row_fluxes, state_of, sweep_of
-from rig.estimators.row_kernels import FLOOR, none_prior
+from rig.estimators.row_kernels import FLOOR
 from rig.estimators.row_model import BINS, RowModel, pixel_shares, stripe_scale
 from rig.row_threads import RowWorkers
 from tests.unit.small_maps import simulated, volume_of
@@ -61,7 +61,7 @@ def log_likelihood(n, k, flux):
 
 
 def exact(model, geometry, volume, y, c):
-    """Log-likelihoods of the labels of a row, NaN of those that cannot be, and that of 'none'."""
+    """Log-likelihoods of the labels of a row, NaN of those that cannot be."""
     grid, swept, state = label_grid(geometry), sweep_of(geometry), state_of(model)
     row = row_buffers(geometry.window, 1)
     length, first, last, start = row_fluxes(swept, state, row, y, c)
@@ -86,10 +86,7 @@ def exact(model, geometry, volume, y, c):
             (log_likelihood(n[around], k, base + light * scale[i] * share) - dark[around]).sum()
             for light in _lights(model).astype(float)
         )
-    all_behind, all_before, change = none_prior(swept.w_near, swept.w_far, row.w[first], row.w[last], model.none_weight)
-    share = np.log((1 - all_behind - all_before - change) / (last - first + 1))
-    none = max(np.log(all_behind), np.log(all_before) + edge[-1], np.log(change * 8 / (length + 1)) + edge.max())
-    return scores, none - share
+    return scores
 
 
 def differences(model, geometry, volume, exposures, columns=(0, 3, 17, 30, 47), rows=(0, 7, 19)):
@@ -100,18 +97,18 @@ def differences(model, geometry, volume, exposures, columns=(0, 3, 17, 30, 47), 
         for c in columns:
             if geometry.x_lo[y, c] > geometry.x_hi[y, c]:
                 continue
-            scores, none = exact(model, geometry, volume, y, c)
-            wanted = costs.units_per_nat * (max(np.nanmax(scores, initial=-np.inf), none) - np.append(scores, none))
-            given = np.append(out[y, c, : grid.stripes], out[y, c, grid.none]).astype(float)
+            scores = exact(model, geometry, volume, y, c)
+            wanted = costs.units_per_nat * (np.nanmax(scores, initial=-np.inf) - scores)
+            given = out[y, c, : grid.stripes].astype(float)
             alone += int((np.isnan(wanted) != (given == EXCLUDED)).sum())
             both = np.isfinite(wanted) & (given != EXCLUDED)
+            # The best one may be a label that only other rows of the band have.
+            given[both] -= given[both].min(initial=COST_LIMIT)
             compared = both & (np.minimum(wanted, given) < SEEN)
             limited = np.minimum(wanted, COST_LIMIT)[compared]
             found.append(np.maximum(np.abs(given[compared] - limited) - 0.1 * limited, 0.0))
             assert given[both].max(initial=0) <= COST_LIMIT
-            assert given[both].min(initial=0) == 0
-            others = np.delete(out[y, c], [*range(grid.stripes), grid.none])
-            assert (others == EXCLUDED).all()
+            assert (out[y, c, grid.stripes :] == EXCLUDED).all()
     return np.concatenate(found), alone
 
 
@@ -166,8 +163,7 @@ def test_columns_of_other_lengths_and_without_frames():
     out, costs = filled(known_model(s.geometry), s.geometry, volume, 10)
     grid = costs.grid
     assert not out[:, 30, : grid.stripes].any()
-    assert not out[:, 30, grid.none].any()
-    assert (out[:, 30, grid.stripes : grid.none] == EXCLUDED).all()
+    assert (out[:, 30, grid.stripes :] == EXCLUDED).all()
 
 
 def test_a_column_with_many_more_frames_than_usual():

@@ -13,6 +13,8 @@ from rig.estimators.row_model import RowModel
 from rig.estimators.temporal import FREE, MOST, SLOPE, TemporalPrior
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
+from tests.reference.moving import Disc, measure
+from tests.reference.scene import procedural_scene
 from tests.unit.small_maps import simulated
 
 WORKERS = RowWorkers(2)
@@ -142,3 +144,10 @@ def test_what_stands_still_is_found_better_from_one_exposure():
         errors = [simulated(exposures=1, seed=seed).errors(tables[seed - 1].x_px) for seed in range(2, 6)]
         means[on] = np.mean([np.minimum(error, 10).mean() for error in errors])
     assert means[True] < means[False]
+
+
+def test_what_moves_is_not_held_back():
+    without, prior = measure(procedural_scene(64, 512), Disc(albedo=0.1, radius_m=0.1), exposures=1, maps=3)
+    for part, more_px in (("disc", 0.01), ("uncovered", 0.03), ("all", 0.0)):
+        assert without.parts[part].sum() > 100
+        assert prior.mean_px(part) <= without.mean_px(part) + more_px, part
