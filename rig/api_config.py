@@ -29,7 +29,8 @@ def configure(
     """The validated config that `scan` would use; options that are None stay as the config says.
 
     config: a bundled rig's name, a file or a RigConfig. fog: in place of the scene's, a visibility such as '20 m', or
-    'clear'. adaptive: maps in passes, with these settings laid over those of scan.adaptive. Raises UsageError with one line per problem.
+    'clear'. temporal_prior: `joint` holds each map to the last one a little. adaptive: maps in passes, with these
+    settings laid over those of scan.adaptive. Raises UsageError with one line per problem.
     """
     options: dict[str, object | None] = {
         "world.scene": scene,

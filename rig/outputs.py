@@ -74,11 +74,9 @@ class RunFolder:
         Where one cannot be written (disk full), the map's other files go too and UsageError says why.
         """
         name = f"{index:06d}"
-        stripe = result.stripe
-        table = {key: getattr(stripe, key) for key in ("x_px", "confidence", "x_sd_px", "signal", "haze")}
         files = {
             f"intensity/{name}.png": png_bytes(intensity_picture(result.intensity)),
-            f"stripe/{name}.npz": _npz_bytes(table),
+            f"stripe/{name}.npz": _npz_bytes(result.stripe.arrays()),
         }
         if result.learned is not None:
             files[f"learned/{name}.npz"] = _npz_bytes(result.learned.arrays())

@@ -27,6 +27,7 @@ from rig.estimators.placing import amplitudes_of, line_width, new_places, place,
 from rig.estimators.placing_kernels import Places
 from rig.estimators.row_input import State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
+from rig.estimators.second_return import second_returns
 from rig.estimators.temporal import TemporalPrior
 from rig.estimators.volume_search import nominal_exposures
 from rig.geometry import SweepGeometry
@@ -50,6 +51,7 @@ class _Tables(NamedTuple):
     state: State
     shares: NDArray[np.float32]
     halo: NDArray[np.float32]
+    line_sigma_px: float
     dark: bool
 
 
@@ -103,7 +105,7 @@ class Joint:
         tables = self._lessons.tables(setting, self._workers)
         self._prior.begin(geometry, tables.grid)
         self.used = model if self._prior.before is None else replace(model, before=self._prior.before)
-        stripes = self._stripes(sweep, tables)
+        stripes = self._with_seconds(sweep, tables, self._stripes(sweep, tables))
         self._prior.leave(stripes, tables.grid, self._workers)
         self._lessons.attend(
             stripes, model, int(sweep.n_frames.sum()), lambda: self._seen(sweep, geometry, tables, stripes)
@@ -159,6 +161,12 @@ class Joint:
         sd = place(volume, tables.sweep, tables.state, tables.shares, x_px, memory.places, workers)
         return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, tables.state, workers)
 
+    def _with_seconds(self, volume: CountVolume, tables: _Tables, stripes: StripeTable) -> StripeTable:
+        x2_px, confidence2 = second_returns(
+            volume, tables.grid, tables.sweep, tables.state, tables.line_sigma_px, stripes.x_px, self._workers
+        )
+        return replace(stripes, x2_px=x2_px, confidence2=confidence2)
+
     def _room(self, rows: int, columns: int, labels: int) -> _Memory:
         memory = self._memory
         if memory is None or memory.cost.shape != (rows, columns, labels):
@@ -188,6 +196,9 @@ class Joint:
 def _tables(setting: Setting, workers: RowWorkers) -> _Tables:
     grid = label_grid(setting.geometry)
     costs = costs_of(setting.model, setting.geometry, grid, setting.exposures, workers)
-    shares = profile_table(setting.model.line_sigma_px)
+    sigma_px = setting.model.line_sigma_px
+    shares = profile_table(sigma_px)
     halo = halo_shares(setting.model, setting.geometry.width if setting.model.halo.any() else 0)
-    return _Tables(grid, costs, sweep_of(setting.geometry), state_of(setting.model), shares, halo, setting.dark)
+    return _Tables(
+        grid, costs, sweep_of(setting.geometry), state_of(setting.model), shares, halo, sigma_px, setting.dark
+    )

@@ -143,7 +143,9 @@ def _ways(
     most = exposures + exposures // 2 + SPARE_FRAMES
     bits = most.bit_length()
     rise, gain = _largest(sweep, state, row_buffers(sweep.window, 1), light[-1])
-    finest = min(FINEST, 2.0 ** (WEIGHT_BITS - bits), 1.0 / (most * max(rise / RISE_LIMIT, gain / TAPS_LIMIT)))
+    # Where pixels say nothing at all, any unit will do.
+    largest = max(rise / RISE_LIMIT, gain / TAPS_LIMIT, 1e-9)
+    finest = min(FINEST, 2.0 ** (WEIGHT_BITS - bits), 1.0 / (most * largest))
     wanted = UNITS / (1.0 + exposures / SHARP)
     down = max(int(np.floor(np.log2(finest / wanted))), 0)
     units_per_nat = min(wanted, finest)

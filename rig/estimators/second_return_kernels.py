@@ -29,7 +29,7 @@ LEAST_RING: Final = 0.25
 """Share of those pixels that must be seen on each side."""
 STEEPER: Final = 1.5
 """Haze that the ring shows beyond the learned one may be this much more between its two sides: it is not straight."""
-CANDIDATE: Final = 3.0
+CANDIDATE: Final = 4.0
 """Standard deviations from which a block's light is looked at more closely."""
 REACH: Final = 3
 """Rows and columns to either side that light is pooled over in the end."""
@@ -161,9 +161,7 @@ def _add_line(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def find_candidates(
-    blocks: Blocks, reach: int, side: int, first_block: int, last_block: int, out: Candidates
-) -> None:
+def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, last_block: int, out: Candidates) -> None:
     """Fill rows of blocks first_block..last_block-1. reach: of the line's light, px."""
     rows, columns, pixels = blocks.ones.shape
     span = reach + GAP_PX + RING_PX
@@ -232,12 +230,18 @@ def measure_seconds(
             x, frames = int(np.rint(place)), np.float32(n_frames[c])
             at = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, at)
-            before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, at, c, path_p, strength)
+            # Of both sides: what the lesson of the haze took for haze may be light of the second surface itself.
+            near, far = max(at - HAZE_STEP // 2, lo), min(at + HAZE_STEP // 2, hi)
+            before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, near, c, path_p, strength)
+            before_too, behind_too, _, _, _, _, _ = fluxes_at(sweep, state, y, far, c, path_p, strength)
+            own = np.float32(0.5) * (state.ambient[y, near] + state.ambient[y, far])
+            before = np.float32(0.5) * (before + before_too) - own
+            behind = np.float32(0.5) * (behind + behind_too) - own
             more = haze[y // BLOCK, c // BLOCK]
             for t in range(max(x - reach, lo), min(x + reach, hi) + 1):
                 if abs(t - x_px[y, c]) < apart:
                     continue
-                flux = (before if (t - x_px[y, c]) * side < 0 else behind) - state.ambient[y, at]
+                flux = before if (t - x_px[y, c]) * side < 0 else behind
                 n = np.float32(counts[c, y, t - sweep.x0[c]])
                 e = -np.expm1(-more * flux - state.ambient[y, t]) * frames
                 out.ones[y, c] += n
@@ -251,6 +255,9 @@ def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds, mo
     """Distance of each candidate, moved to the middle of the light around it, pooled over neighbours."""
     sums = np.empty((2, moved.shape[1]), np.float32)
     for y in range(first_row, last_row):
+        if np.isnan(seconds.distance[y]).all():
+            moved[y] = np.nan
+            continue
         pool_row(seconds.distance, seconds.moment, seconds.light, y, REACH, sums)
         for c in range(moved.shape[1]):
             step = sums[0, c] / sums[1, c] if sums[1, c] > 0.0 else np.float32(0.0)
@@ -265,6 +272,9 @@ def judge_seconds(first_row: int, last_row: int, seconds: Seconds, sure: Float32
     """
     sums = np.empty((2, sure.shape[1]), np.float32)
     for y in range(first_row, last_row):
+        sure[y] = 0.0
+        if np.isnan(seconds.distance[y]).all():
+            continue
         pool_row(seconds.distance, seconds.ones, seconds.expected, y, REACH, sums)
         for c in range(sure.shape[1]):
             n, e = sums[0, c], max(sums[1, c], np.float32(1e-3))

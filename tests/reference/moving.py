@@ -117,7 +117,12 @@ def _worlds(scene: Scene, disc: Disc | None, maps: int) -> Iterator[tuple[Scene,
         yield (scene, np.zeros(scene.shape, np.bool_)) if disc is None else disc.into(scene, index)
 
 
-DISCS = {"nothing": None, "disc": Disc(), "dark disc": Disc(albedo=0.04), "slow disc": Disc(aside_m=0.01, nearer_m=0.02)}
+DISCS = {
+    "nothing": None,
+    "disc": Disc(),
+    "dark disc": Disc(albedo=0.04),
+    "slow disc": Disc(aside_m=0.01, nearer_m=0.02),
+}
 TITLES = ("scene", "moves", "K", *(f"{part}: without, with" for part in PARTS), "within 1 px", "calibration")
 
 
@@ -153,7 +158,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scene = scene if options.rows is None else scene.crop(options.rows, scene.shape[1])
         for moves in options.moves.split(","):
             for exposures in map(int, options.exposures.split(",")):
-                row = row_of(name, moves, exposures, measure(scene, DISCS[moves], exposures, options.maps, options.point))
+                row = row_of(
+                    name, moves, exposures, measure(scene, DISCS[moves], exposures, options.maps, options.point)
+                )
                 text += row
                 print(row, end="", flush=True)
     if options.markdown:

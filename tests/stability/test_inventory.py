@@ -19,6 +19,7 @@ ELSEWHERE = {
     "whole-number tables and lanes of the compiled search; its answers for any counts in test_estimators.py": (
         "tests/unit/estimators/test_search.py", "rig.estimators.best_kernels:*", "rig.estimators.row_search:*",
         "rig.estimators.screen_tables:*", "rig.estimators.search_*:*", "rig.estimators.judging:*",
+        "rig.estimators.volume_search:*",
     ),
     "rows of a simulated scene, whose light test_light.py holds": (
         "tests/unit/rig/test_scene_limits.py", "rig.scene_limits:*",
@@ -26,6 +27,27 @@ ELSEWHERE = {
     "labels around the best position, against the likelihood itself": (
         "tests/unit/estimators/test_closeup.py", "rig.estimators.closeup_kernels:*",
     ),
+    "bytes that stop at 255, against whole numbers": (
+        "tests/unit/estimators/test_aggregation.py", "rig.estimators.aggregation_*:*",
+    ),
+    "costs of labels against log-likelihoods; any rays and windows in test_estimators.py": (
+        "tests/unit/estimators/test_label_volume.py", "rig.estimators.label_places:*", "rig.estimators.label_tables:*",
+        "rig.estimators.label_volume*:*",
+    ),
+    "light around the stripe, against costs written out": (
+        "tests/unit/estimators/test_halo.py", "rig.estimators.halo*:*",
+    ),
+    "answers of whole maps; those to any counts in test_estimators.py": (
+        "tests/unit/estimators/test_joint.py", "rig.estimators.joint_*:*",
+    ),
+    "which maps teach": ("tests/unit/estimators/test_lessons.py", "rig.estimators.lessons:*"),
+    "what the last map says": ("tests/unit/estimators/test_temporal.py", "rig.estimators.temporal:*"),
+    "columns of several lines, counted as of each alone": (
+        "tests/unit/rig/test_multi_line.py", "rig.multi_line:*", "rig.multi_line_counter:*", "rig.multi_line_kernels:*",
+    ),
+    "lines by the number, as the config says": ("tests/unit/rig/test_multi_line_config.py", "rig.multi_line_config:*"),
+    "intervals against drawn repeats": ("tests/unit/rig/test_intervals.py", "rig.intervals:*"),
+    "a missing answer's charge": ("tests/unit/rig/test_tradeoff.py", "rig.tradeoff_rows:*"),
     "powers of two off the bits of a number": ("tests/unit/estimators/test_powers.py", "rig.estimators.powers:*"),
     "the search, column by column: the same bits": (
         "tests/unit/estimators/test_stream.py", "rig.estimators.stream*:*", "rig.estimators.likelihood:*",
@@ -36,6 +58,7 @@ ELSEWHERE = {
     ),
     "rows as the kernels read them; any rays and windows in test_estimators.py": (
         "tests/stability/test_estimators.py", "rig.estimators.row_input:*", "rig.estimators:*",
+        "rig.estimators.second_return*:*",
     ),
     "against 50 digits, for kernels only": ("tests/stability/test_photon_bits.py", "sim_backend.exponential:*"),
     "statistics of the bits": (

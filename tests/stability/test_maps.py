@@ -75,7 +75,7 @@ def test_without_a_model_the_whole_row_is_searched(rows, width, columns) -> None
 @covers(
     "rig.depth:depth_map",
     "rig.depth_kernels:fill_rows",
-    "rig.stripes:StripeTable.empty",
+    "rig.stripes:StripeTable.*",
     "rig.estimators.median:median_filter",
 )
 @EXAMPLES
@@ -126,7 +126,7 @@ def test_scores_are_numbers_or_none(x, true) -> None:
 
 @covers(
     "rig.counting:SweepCounter.*", "rig.counting:SweepTally.*", "rig.counting:SweepLayout.*",
-    "rig.counting:FrameTally.*", "rig.counting:CountVolume.*",
+    "rig.counting:FrameTally.*", "rig.counting:CountVolume.*", "rig.counting:with_room",
 )  # fmt: skip
 def test_a_million_exposures_are_counted_to_the_last_one(worst) -> None:
     layout = SweepLayout(columns=2, rows=1, width=64, x0=np.zeros(2, np.int32), window=64, exposures=10**6)

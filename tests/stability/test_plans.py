@@ -121,6 +121,8 @@ def plans(draw):
     "rig.scan_plan:column_command",
     "rig.path_search:PathDemand.*",
     "rig.path_search:find_path",
+    "rig.plan:compile_plan",
+    "rig.plan:path_demand",
     "rig.windows:window_widths",
 )
 @EXAMPLES

@@ -41,7 +41,8 @@ def main(folder: Path) -> None:
     _say_late("", write_rig(folder / "emulated", emulated), maps=3, estimator="likelihood", filter="median")
     lessons.TEACH_FRAMES = lessons.LAG_FRAMES = LESSON_FRAMES
     for estimator in ESTIMATORS:
-        _say_late("rig.", write_rig(folder / estimator), maps=MAPS, estimator=estimator, filter="median")
+        options = {"estimator": estimator, "filter": "median", "temporal_prior": estimator == "joint"}
+        _say_late("rig.", write_rig(folder / estimator), maps=MAPS, **options)
 
 
 def _say_late(of: str, file: Path, **options: Any) -> None:

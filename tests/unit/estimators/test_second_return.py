@@ -1,0 +1,92 @@
+"""Second returns of a pane before a wall, on both sides of the answer, and none where there is one surface only."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rig.estimators.label_grid import label_grid
+from rig.estimators.row_input import state_of, sweep_of
+from rig.estimators.second_return import second_returns
+from rig.row_threads import RowWorkers
+from tests.reference.geometry import Geometry
+from tests.reference.made_scenes import pane_scene
+from tests.reference.working_point import POINTS, WorkingPoint
+from tests.unit.estimators.test_label_volume import known_model
+from tests.unit.small_maps import RIGS, Sweep, geometry_of, simulated
+
+WORKERS = RowWorkers(1)
+ROWS, COLUMNS = 24, 96
+SURE = 0.5
+REACH = 5
+
+
+@cache
+def pane(light="report", rig="left", exposures=10) -> Sweep:
+    g = Geometry.build(width=512, height=ROWS, columns=COLUMNS, **RIGS[rig])
+    point = WorkingPoint(pane_scene(ROWS), POINTS[light], g)
+    return Sweep(point, geometry_of(g), point.counts(exposures, 1), exposures)
+
+
+def seconds_of(sweep: Sweep, x_px, haze=0.14, threads=WORKERS):
+    model = known_model(sweep.geometry, haze=haze)
+    grid = label_grid(sweep.geometry)
+    x_px = x_px.astype(np.float32)
+    return second_returns(sweep.volume, grid, sweep_of(sweep.geometry), state_of(model), 0.6, x_px, threads)
+
+
+@pytest.mark.parametrize("rig", ["left", "right"])
+def test_a_pane_before_the_wall_is_found_in_haze(rig) -> None:
+    sweep = pane(rig=rig)
+    x2_px, confidence2 = seconds_of(sweep, sweep.point.x_true)
+    two = np.isfinite(sweep.point.x_second) & np.isfinite(sweep.point.x_true)
+    error = x2_px[two] - sweep.point.x_second[two]
+    assert (np.abs(error) <= 1).mean() > 0.98
+    assert abs(np.nanmedian(error)) < 0.1
+    assert (confidence2[two] > SURE).mean() > 0.98
+    # Light is looked for together with that of blocks around: the pane's reaches a little beyond it.
+    near = np.lib.stride_tricks.sliding_window_view(np.pad(two, REACH), (2 * REACH + 1, 2 * REACH + 1)).any((2, 3))
+    assert (confidence2[~near] > SURE).mean() < 0.005
+
+
+def test_the_wall_behind_an_answer_is_found_in_clear_air() -> None:
+    sweep = pane("clear")
+    two = np.isfinite(sweep.point.x_second) & np.isfinite(sweep.point.x_true)
+    x_px = np.where(two, sweep.point.x_second, sweep.point.x_true)
+    x2_px, confidence2 = seconds_of(sweep, x_px, haze=1e-4)
+    right = (np.abs(x2_px - sweep.point.x_true) <= 1) & (confidence2 > SURE)
+    assert right[two].mean() > 0.98
+
+
+@pytest.mark.parametrize("light", ["report", "clear"])
+def test_one_surface_has_no_second_return(light) -> None:
+    sweep = simulated(light, 10, rows=ROWS)
+    haze = 0.14 if light == "report" else 1e-4
+    x2_px, confidence2 = seconds_of(sweep, sweep.point.x_true, haze)
+    assert (confidence2[sweep.point.trusted] > SURE).mean() < 0.005
+    assert (confidence2[np.isnan(x2_px)] == 0).all()
+
+
+def test_rows_without_data_have_none_and_threads_do_not_matter() -> None:
+    sweep = pane()
+    x_px = sweep.point.x_true.copy()
+    x_px[:, 40:60] = np.nan
+    x2_px, confidence2 = seconds_of(sweep, x_px)
+    assert np.isnan(x2_px[:, 40:60]).all()
+    assert (confidence2[:, 40:60] == 0).all()
+    with RowWorkers(3) as workers:
+        for one, other in zip((x2_px, confidence2), seconds_of(sweep, x_px, threads=workers), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_columns_without_exposures_are_left_alone() -> None:
+    sweep = pane()
+    volume = sweep.volume
+    volume.n_frames[::7] = 0
+    model = known_model(sweep.geometry)
+    grid = label_grid(sweep.geometry)
+    x_px = np.where(volume.n_frames > 0, sweep.point.x_true, np.nan).astype(np.float32)
+    x2_px, _ = second_returns(volume, grid, sweep_of(sweep.geometry), state_of(model), 0.6, x_px, WORKERS)
+    assert np.isnan(x2_px[:, ::7]).all()
+    two = np.isfinite(sweep.point.x_second) & np.isfinite(x_px)
+    assert (np.abs(x2_px - sweep.point.x_second)[two] <= 1).mean() > 0.95
