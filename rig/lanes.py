@@ -268,6 +268,18 @@ def smallest_byte(typing: Any, a: Any) -> VectorCode:
 
 
 @intrinsic_of
+def where_small(typing: Any, values: Any, sizes: Any, limit: Any) -> VectorCode:
+    """where_small(values, sizes, limit): float32 lanes, 0 where the size is more than `limit` either way, or NaN."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        size = called(builder, f"llvm.fabs.{vector_name(FLOAT32.llvm)}", FLOAT32.llvm, args[1])
+        small = builder.fcmp_ordered("<=", size, splat(context, builder, FLOAT32, signature.args[2], args[2]))
+        return builder.select(small, args[0], ir.Constant(FLOAT32.llvm, [0.0] * LANES))
+
+    return FLOAT32(FLOAT32, FLOAT32, limit), code
+
+
+@intrinsic_of
 def scaled(typing: Any, a: Any, weights: Any) -> VectorCode:
     """scaled(a, weights): a * weights / 2^15 rounded to the nearest, of signed 16-bit lanes; not both -32768."""
     one_instruction = _has_avx2()

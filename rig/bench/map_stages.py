@@ -66,7 +66,9 @@ def joint_sweep_stage(
             for first in range(0, len(bits), BLOCK_FRAMES):
                 block = slice(first, first + BLOCK_FRAMES)
                 counter.add(bits[block], bins[block], column[block], x0[block])
-            return joint.estimate(counter.finish(), surface.geometry).x_px
+            volume = counter.finish()
+            assert isinstance(volume, CountVolume), "joint needs the counts of whole sweeps"
+            return joint.estimate(volume, surface.geometry).x_px
 
         return _timed(make, seconds, len(bits), stripe_error(make() - surface.truth_px()))
 

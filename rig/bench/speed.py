@@ -264,8 +264,8 @@ def _map_cases(workers: dict[int, RowWorkers], extent: Extent) -> list[_Case]:
         bits = surface.frames(k, workers[most])
         volume = count_surface(surface, bits, k, workers[most])
         cases += [_Case("joint", window, k, n, None, joint_stage(surface, volume, n, model)) for n in workers]
-    stages = {n: joint_sweep_stage(surface, bits, k, n, model) for n in workers}
-    return cases + [_Case("joint-sweep", window, k, n, None, stage) for n, stage in stages.items()]
+    cases.append(_Case("joint-sweep", window, k, most, None, joint_sweep_stage(surface, bits, k, most, model)))
+    return cases
 
 
 def _in_turn(

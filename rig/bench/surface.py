@@ -56,8 +56,8 @@ class BenchSurface:
 
         disparity = np.ascontiguousarray(self.place_px.T)
         right = np.random.default_rng(1).integers(0, 256, disparity.shape, np.uint8)
-        y, x = np.indices(disparity.shape, np.float32)
-        left = cv2.remap(right, x - disparity, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        at: NDArray[np.float32] = np.indices(disparity.shape).astype(np.float32)
+        left = cv2.remap(right, at[1] - disparity, at[0], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         return np.asarray(left, np.uint8), right
 
 

@@ -26,7 +26,7 @@ def ambient_map(
     """Photons per exposure (rows, width) float32 from dark frames, `quiet` (2, rows, width) counts and hot pixels.
 
     intensity: (rows, width), ones of each pixel within the windows. quiet: ones and exposures of each pixel while
-    clearly behind the stripe; None before any stripe is known.
+    clearly behind the stripe; None before any stripe is known. Ones less the light of a halo may lie below 0.
     """
     ones = np.zeros((geometry.rows, geometry.width))
     exposures = np.zeros_like(ones)
@@ -79,7 +79,7 @@ def _shrunk(ones: NDArray[np.float64], exposures: NDArray[np.float64]) -> NDArra
             for a in (ones, exposures)
         )
         # Neighbourhoods without data take the picture's level.
-        mean = (local_ones + overall) / (local_exposures + 1.0)
+        mean = np.maximum(local_ones + overall, 0.0) / (local_exposures + 1.0)
     expected = mean * exposures
     outlier = ones > expected + 4.0 * np.sqrt(expected) + 4.0
     usual = ~outlier & (exposures > 0)

@@ -1,8 +1,10 @@
 """Estimator `joint`: the row likelihood tied across rows and columns, for a whole map at a time.
 
-Each label of a row and column (`label_grid`) gets a cost from the counts (`label_volume`), costs are tied to those of
-the neighbours along four paths (`aggregation_kernels`), and the best label of each is the answer. What the rows know of
-light and medium is learned as by `likelihood`.
+Each label of a row and column (`label_grid`) gets a cost from the counts (`label_volume`), with the halo where there is
+one (`halo_tables`) and the map before where that is asked for (`temporal`). Costs are tied to those of the neighbours
+along four paths (`aggregation_kernels`); the best label of each is placed between labels by what neighbours on its
+surface know (`placing`), judged (`joint_confidence`) and searched for a second line (`second_return`). What the rows
+know of light and medium is learned as by `likelihood`, then from the map's own stripes.
 """
 
 from dataclasses import replace
@@ -17,13 +19,14 @@ from rig.estimators.aggregation_kernels import Penalties, along_columns, along_r
 from rig.estimators.ambient import ambient_map
 from rig.estimators.halo import halo_shares
 from rig.estimators.halo_learning import learn_halo
-from rig.estimators.joint_answer import stripe_table
+from rig.estimators.joint_answer import brightness_of, stripe_table
+from rig.estimators.joint_confidence import Brightness
 from rig.estimators.joint_kernels import add_quiet, read_positions
 from rig.estimators.label_grid import LabelGrid, label_grid
 from rig.estimators.label_volume import Costs, costs_of
 from rig.estimators.learning import learn_again, lines_of, next_lattice
 from rig.estimators.lessons import Lessons, Seen, Setting, first_model
-from rig.estimators.placing import amplitudes_of, line_width, new_places, place, profile_table
+from rig.estimators.placing import amplitudes_of, line_width, new_places, place, profile_table, weigh_light
 from rig.estimators.placing_kernels import Places
 from rig.estimators.row_input import State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
@@ -52,6 +55,7 @@ class _Tables(NamedTuple):
     shares: NDArray[np.float32]
     halo: NDArray[np.float32]
     line_sigma_px: float
+    bright: Brightness
     dark: bool
 
 
@@ -127,9 +131,11 @@ class Joint:
             model = learn_again(volume, geometry, model, ambient, stripes, self._workers)
             assert self._memory is not None, "a map has been estimated"
             places = self._memory.places
+            model = learn_halo(volume, geometry, model, ambient, stripes, places, self._workers)
+            # Amplitudes are relative to the scale of the model that they are written into.
+            weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
             amplitude, weight = amplitudes_of(places)
             model = replace(model, amplitude=amplitude, weight=weight)
-            model = learn_halo(volume, geometry, model, ambient, stripes, places, self._workers)
         return model
 
     def _stripes(self, volume: CountVolume, tables: _Tables) -> StripeTable:
@@ -159,7 +165,7 @@ class Joint:
         workers.over(columns, tie_columns)
         workers.over(rows, read)
         sd = place(volume, tables.sweep, tables.state, tables.shares, x_px, memory.places, workers)
-        return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, tables.state, workers)
+        return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, tables.bright, workers)
 
     def _with_seconds(self, volume: CountVolume, tables: _Tables, stripes: StripeTable) -> StripeTable:
         x2_px, confidence2 = second_returns(
@@ -176,7 +182,7 @@ class Joint:
 
     def _seen(self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable) -> Seen:
         quiet = self._quiet(volume, geometry, tables, stripes)
-        return Seen(volume, quiet, lines_of(volume, next_lattice(geometry), stripes))
+        return Seen(volume, volume.intensity(), quiet, lines_of(volume, next_lattice(geometry), stripes))
 
     def _quiet(
         self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable
@@ -200,5 +206,6 @@ def _tables(setting: Setting, workers: RowWorkers) -> _Tables:
     shares = profile_table(sigma_px)
     halo = halo_shares(setting.model, setting.geometry.width if setting.model.halo.any() else 0)
     return _Tables(
-        grid, costs, sweep_of(setting.geometry), state_of(setting.model), shares, halo, sigma_px, setting.dark
-    )
+        grid, costs, sweep_of(setting.geometry), state_of(setting.model), shares, halo, sigma_px,
+        brightness_of(setting.model), setting.dark,
+    )  # fmt: skip

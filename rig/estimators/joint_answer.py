@@ -6,9 +6,14 @@ from numpy.typing import NDArray
 from rig.estimators.aggregation_answer import Answer
 from rig.estimators.joint_confidence import Brightness, confidences
 from rig.estimators.placing_kernels import Places
-from rig.estimators.row_input import State
+from rig.estimators.row_model import RowModel
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
+
+
+def brightness_of(model: RowModel) -> Brightness:
+    """What `stripe_table` takes of a learned state."""
+    return Brightness(float(model.amplitude[0]), float(model.amplitude[-1]), float(np.median(model.ambient)))
 
 
 def stripe_table(
@@ -17,12 +22,11 @@ def stripe_table(
     n_frames: NDArray[np.int32],
     answer: Answer,
     places: Places,
-    state: State,
+    bright: Brightness,
     workers: RowWorkers,
 ) -> StripeTable:
     """The table of a map; arrays float32 (rows, columns), x_px NaN where there are no data."""
     confidence, signal, haze = (np.empty_like(x_px) for _ in range(3))
-    bright = Brightness(float(state.amplitude[0]), float(state.amplitude[-1]), float(np.median(state.ambient)))
 
     def work(first: int, last: int) -> None:
         confidences(x_px, sd_px, n_frames, answer, places, bright, first, last, confidence, signal, haze)

@@ -31,8 +31,10 @@ D: Final = 1.891
 UNITS: Final = 8.0
 """Cost units of a margin of 1."""
 POOLED: Final = 25.0
-"""Answers whose light counts as one."""
+"""Answers whose light counts as one: about half of the neighbours that it is pooled over lie on the same surface."""
 LEAST_Z: Final = 0.05
+SURE: Final = 4.0
+"""From here on erf is 1 as a float32."""
 
 
 class Brightness(NamedTuple):
@@ -43,7 +45,7 @@ class Brightness(NamedTuple):
     ambient: float
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def confidences(
     x_px: Float32,
     sd_px: Float32,
@@ -63,20 +65,25 @@ def confidences(
     """
     nothing = np.float32(np.nan)
     half_width = LIGHT_PX + 0.5
+    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
+    scales, lights, amplitudes, hazes = places.scale, places.light, places.amplitude, places.haze
+    margins = answer.margin
+    faintest, brightest, ambient = bright.faintest, bright.brightest, bright.ambient
+    rivals = np.exp(np.minimum(A - B * np.arange(256) / UNITS, 30.0))
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
             if np.isnan(x_px[y, c]):
                 confidence[y, c] = 0.0
                 signal[y, c] = haze[y, c] = sd_px[y, c] = nothing
                 continue
-            scale = places.scale[y, c]
-            signal[y, c] = min(max(places.light[y, c], bright.faintest * scale), bright.brightest * scale)
-            haze[y, c] = places.haze[y, c]
-            light = max(places.amplitude[y, c] * scale, np.float32(0.0))
+            scale = scales[y, c]
+            signal[y, c] = min(max(lights[y, c], faintest * scale), brightest * scale)
+            haze[y, c] = hazes[y, c]
+            light = max(amplitudes[y, c] * scale, np.float32(0.0))
             exposures = POOLED * n_frames[c]
-            base = half_width * places.haze[y, c] + 2.0 * half_width * bright.ambient
-            z = light * math.sqrt(exposures / (light + base + 1.0 / exposures))
-            rival = math.exp(min(A - B * answer.margin[y, c] / UNITS, 30.0))
-            dark = C * max(z, LEAST_Z) ** -D
-            within = math.erf(1.0 / (math.sqrt(2.0) * WIDER * max(sd_px[y, c], 1e-3)))
-            confidence[y, c] = within / ((1.0 + rival) * (1.0 + dark))
+            base = half_width * hazes[y, c] + 2.0 * half_width * ambient
+            z = np.float32(light * math.sqrt(exposures / (light + base + 1.0 / exposures)))
+            dark = np.float32(C) * max(z, np.float32(LEAST_Z)) ** np.float32(-D)
+            sizes = 1.0 / (math.sqrt(2.0) * WIDER * max(sd_px[y, c], np.float32(1e-3)))
+            within = math.erf(sizes) if sizes < SURE else 1.0
+            confidence[y, c] = within / ((1.0 + rivals[margins[y, c]]) * (1.0 + dark))

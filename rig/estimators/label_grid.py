@@ -15,7 +15,7 @@ from rig.geometry import SweepGeometry
 
 PER_PX: Final = 2
 """Labels a pixel: at whole pixels the stripe's place between two of them costs 0.05 px of error at 10 exposures."""
-SPARE: Final = 2
+SPARE: Final = 1
 """Labels beyond the searched pixels at either end, for the mean of a peak there."""
 VECTOR: Final = 32
 

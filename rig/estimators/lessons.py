@@ -26,7 +26,8 @@ from rig.stripes import StripeTable
 LEAST_SURE = 0.02
 """Share of confident answers below which a map teaches nothing: a closed shutter must not spoil the maps after it."""
 TEACH_FRAMES = 100_000
-"""Lit frames from one map that teaches to the next: a second at 100 kHz. Learning costs some 0.2 s of one core."""
+"""Lit frames from one map that teaches to the next: a second at 100 kHz. Learning costs some 0.2 s of one core, with
+the tables of `joint` twice that."""
 LAG_FRAMES = 50_000
 """Lit frames from a map that teaches to the first one that heeds it: time to learn beside the stream."""
 
@@ -51,9 +52,13 @@ class Setting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What a sweep can teach: its tally, ones and exposures of pixels behind clear stripes, some lines of counts."""
+    """What a sweep can teach: its tally, ones and exposures of pixels behind clear stripes, some lines of counts.
+
+    intensity: of the tally, taken at once: counts may grow by another pass while the lesson is learned.
+    """
 
     tally: FrameTally
+    intensity: NDArray[np.uint32]
     quiet: NDArray[np.float64]
     lines: Lines
 
@@ -104,7 +109,7 @@ class Lessons(Generic[Tables]):
 
     def _teach(self, setting: Setting, seen: Seen, before: Expectation | None) -> tuple[Setting, Expectation, Tables]:
         """The setting carried on by one sweep, and the tables that follow from it, on one thread beside the stream."""
-        ambient = ambient_map(seen.tally, seen.tally.intensity(), setting.geometry, seen.quiet)
+        ambient = ambient_map(seen.tally, seen.intensity, setting.geometry, seen.quiet)
         with RowWorkers(1) as workers:
             model, taught = learn_next(
                 seen.lines, setting.geometry, replace(setting.model, ambient=ambient), before, workers

@@ -53,14 +53,16 @@ class Likelihood:
         if isinstance(sweep, SearchedSweep):
             assert self.model is not None, "a sweep is judged under a model"
             used, stripes = self.model, sweep.stripe
-            seen = Seen(sweep, sweep.quiet, sweep.lines)
+            quiet, lines = sweep.quiet, sweep.lines
         else:
             used = self._lessons.model_for(lambda: first_model(sweep, geometry, self._workers))
             setting = Setting(used, geometry, nominal_exposures(sweep), sweep.dark_counts is not None)
             stripes, quiet = search_volume(sweep, geometry, self._lessons.tables(setting, self._workers), self._workers)
-            seen = Seen(sweep, quiet, lines_of(sweep, next_lattice(geometry)))
+            lines = lines_of(sweep, next_lattice(geometry))
         self.used = used
-        self._lessons.attend(stripes, used, int(sweep.n_frames.sum()), lambda: seen)
+        self._lessons.attend(
+            stripes, used, int(sweep.n_frames.sum()), lambda: Seen(sweep, sweep.intensity(), quiet, lines)
+        )
         return stripes
 
     def judge(self, geometry: SweepGeometry, exposures: int, *, dark: bool) -> Judge:

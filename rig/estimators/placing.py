@@ -6,16 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import CountVolume
-from rig.estimators.placing_kernels import (
-    FRACTIONS,
-    REACH_PX,
-    Places,
-    add_moments,
-    measure_light,
-    pool_amplitude,
-    pool_places,
-    score_places,
-)
+from rig.estimators.placing_kernels import REACH_PX, Places, add_moments, measure_light
+from rig.estimators.placing_pools import pool_amplitude, pool_places
+from rig.estimators.placing_scores import FRACTIONS, score_places
 from rig.estimators.row_input import State, Sweep
 from rig.estimators.row_model import pixel_shares
 from rig.row_threads import RowWorkers
@@ -63,21 +56,24 @@ def place(
 
     Returns its standard deviation in px; light and haze are left in `places`, with all that was found on the way.
     """
-    rows, columns = x_px.shape
-    side = 1 if sweep.near_is_left else -1
-    faintest, brightest = float(state.amplitude[0]) / BEYOND, float(state.amplitude[-1]) * BEYOND
-    moved, sd = (np.empty((rows, columns), np.float32) for _ in range(2))
+    moved, sd = (np.empty_like(x_px) for _ in range(2))
     seen = volume.counts, volume.n_frames, sweep, state
-
-    def over(kernel: object, *before: object, after: tuple[object, ...]) -> None:
-        workers.over(rows, lambda first, last: kernel(*before, first, last, *after))  # type: ignore[operator]
-
-    over(measure_light, *seen, x_px, after=(places,))
-    over(pool_amplitude, LIGHT_REACH, faintest, brightest, after=(places,))
-    over(score_places, *seen, shares, x_px, side, after=(places,))
-    over(pool_places, places, REACHES, ENOUGH, after=(moved, sd))
+    weigh_light(volume, sweep, state, x_px, places, workers)
+    workers.over(len(x_px), lambda first, last: score_places(*seen, shares, x_px, first, last, places))
+    workers.over(len(x_px), lambda first, last: pool_places(places, REACHES, ENOUGH, first, last, moved, sd))
     x_px += moved
     return sd
+
+
+def weigh_light(
+    volume: CountVolume, sweep: Sweep, state: State, x_px: NDArray[np.float32], places: Places, workers: RowWorkers
+) -> None:
+    """Fill light, scale, haze and amplitude of `places` for stripes at x_px, as `state` sees them."""
+    faintest, brightest = float(state.amplitude[0]) / BEYOND, float(state.amplitude[-1]) * BEYOND
+    logs = np.log(np.arange(int(volume.n_frames.max(initial=0)) + 1) + 0.5)
+    seen = volume.counts, volume.n_frames, sweep, state, logs, x_px
+    workers.over(len(x_px), lambda first, last: measure_light(*seen, first, last, places))
+    workers.over(len(x_px), lambda first, last: pool_amplitude(LIGHT_REACH, faintest, brightest, first, last, places))
 
 
 def line_width(

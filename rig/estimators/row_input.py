@@ -133,15 +133,37 @@ def row_buffers(window: int, amplitudes: int) -> Row:
 
 
 @numba.njit(inline="always")
+def path_to_plane(px, py, pz, vy):  # type: ignore[no-untyped-def]
+    """Length of the light's path to a plane's points on a row of tangent vy, per unit of depth."""
+    # Tangent at which this row meets the plane infinitely far away: the direction of the light in the row.
+    path_u = -(py * vy + pz) / px
+    return np.sqrt(1.0 + path_u * path_u + vy * vy)
+
+
+@numba.njit(inline="always")
+def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignore[no-untyped-def]
+    """Path from the camera to a plane's point in a pixel's direction, per unit of depth; its inverse depth; its place
+    among the profile's bins.
+    """
+    path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
+    w = px * ux + py * vx + pz
+    return path_c, w, min(max((w * 2.0 / (path_p + path_c) - w_lo) * per_w, 0.0), bins - 1.001)
+
+
+@numba.njit(inline="always")
+def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-def]
+    """Ambient light, and what the profile brings that is `one` in a bin and `other` in the next."""
+    return min(max(ambient + gain * (one + part * (other - one)), FLUX_MIN), FLUX_MAX)
+
+
+@numba.njit(inline="always")
 def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
     """Length of the light's path to the plane's points on row y per unit of depth, and the strength of the haze there.
 
     middle: pixel of the row that its v is taken from.
     """
-    plane, vy = sweep.plane[c], sweep.v[y, middle]
-    # Tangent at which this row meets the plane infinitely far away: the direction of the light in the row.
-    path_u = -(plane[1] * vy + plane[2]) / plane[0]
-    path_p = np.sqrt(1.0 + path_u * path_u + vy * vy)
+    plane = sweep.plane[c]
+    path_p = path_to_plane(plane[0], plane[1], plane[2], sweep.v[y, middle])
     return path_p, state.row_gain[y] * state.column_gain[c] * path_p
 
 
@@ -175,18 +197,15 @@ def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyp
     of one pixel, and what other lines' haze brings to both fluxes.
     """
     plane, profile = sweep.plane[c], state.profile
-    ux, vx = sweep.u[y, x], sweep.v[y, x]
-    path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
-    w = plane[0] * ux + plane[1] * vx + plane[2]
-    b = min(max((w * 2.0 / (path_p + path_c) - state.w_lo) * state.per_w, 0.0), profile.shape[0] - 1.001)
+    path_c, w, b = profile_place(
+        plane[0], plane[1], plane[2], sweep.u[y, x], sweep.v[y, x], path_p, state.w_lo, state.per_w, profile.shape[0]
+    )
     i = int(b)
     f = np.float32(b - i)
     gain = strength * path_c
-    haze = gain * (profile[i, 0] + f * (profile[i + 1, 0] - profile[i, 0]))
-    rest = gain * (profile[i, 1] + f * (profile[i + 1, 1] - profile[i, 1]))
     ambient = state.ambient[y, x]
-    before = min(max(ambient + haze, FLUX_MIN), FLUX_MAX)
-    behind = min(max(ambient + rest, FLUX_MIN), FLUX_MAX)
+    before = flux_between(ambient, gain, profile[i, 0], profile[i + 1, 0], f)
+    behind = flux_between(ambient, gain, profile[i, 1], profile[i + 1, 1], f)
     others = np.float32(0.0)
     if sweep.others.shape[1] > 0:
         others = others_at(sweep, state, y, c, x)

@@ -68,6 +68,7 @@ def second_returns(
     seconds = seconds._replace(distance=moved)
     workers.over(rows, measure)
     workers.over(rows, lambda first, last: judge_seconds(first, last, seconds, sure))
+    sure[np.isnan(x_px)] = 0.0
     x2_px = np.where(sure > 0, grid.x_far + moved, np.nan).astype(np.float32)
     return x2_px, _confidence(sure, _each(candidates.sure, rows, columns))
 

@@ -11,7 +11,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.placing_kernels import Float32, pool_row
+from rig.estimators.placing_kernels import Float32
+from rig.estimators.placing_pools import pool_row
 from rig.estimators.row_input import State, Sweep, fluxes_at, line_light
 
 BLOCK: Final = 4

@@ -80,7 +80,7 @@ def _ramps(labels: int) -> NDArray[np.uint8]:
     """(MOST + 1, 2 labels): what the label i - labels beyond the last one costs more, for each most that it may be."""
     away = np.abs(np.arange(2 * labels) - labels)
     ramp = SLOPE * np.maximum(away - FREE, 0)
-    return np.minimum(ramp, np.arange(MOST + 1)[:, None]).astype(np.uint8)
+    return np.asarray(np.minimum(ramp, np.arange(MOST + 1)[:, None]), np.uint8)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -25,7 +25,7 @@ SCOPE = (
     *(f"rig/{name}.py" for name in ("mirror_path", "path_search", "plan", "scan_plan", "scoring", "stripes", "sweeps")),
     "rig/windows.py",
     *(f"rig/{name}.py" for name in ("error_bounds", "fog_kernels", "fog_meter", "limits", "row_light", "scene_limits")),
-    *(f"rig/{name}.py" for name in ("adaptive", "adaptive_counts", "intervals", "multi_line*", "tradeoff_rows")),
+    *(f"rig/{name}.py" for name in ("adaptive", "intervals", "multi_line*", "tradeoff_rows")),
     "rig/estimators/*.py",
     *(
         f"sim_backend/{name}.py"

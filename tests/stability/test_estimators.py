@@ -28,6 +28,10 @@ def check(table, volume, geometry):
     assert not table.confidence[~asked].any()
     for values in (table.x_sd_px, table.signal, table.haze):
         np.testing.assert_array_equal(np.isfinite(values), asked)
+    if table.x2_px is not None:
+        found = np.isfinite(table.x2_px)
+        assert not found[~asked].any()
+        assert np.all((table.confidence2 >= 0) & (table.confidence2 <= found))
     assert np.all(table.x_sd_px[asked] > 0)
     assert np.all(table.signal[asked] >= 0)
     assert np.all(table.haze[asked] >= 0)

@@ -40,6 +40,9 @@ ELSEWHERE = {
     "answers of whole maps; those to any counts in test_estimators.py": (
         "tests/unit/estimators/test_joint.py", "rig.estimators.joint_*:*",
     ),
+    "places pooled over walls and neighbours; those of any counts in test_estimators.py": (
+        "tests/unit/estimators/test_placing.py", "rig.estimators.placing*:*",
+    ),
     "which maps teach": ("tests/unit/estimators/test_lessons.py", "rig.estimators.lessons:*"),
     "what the last map says": ("tests/unit/estimators/test_temporal.py", "rig.estimators.temporal:*"),
     "columns of several lines, counted as of each alone": (

@@ -16,7 +16,7 @@ def stripes(run: Path) -> list[dict[str, np.ndarray]]:
 
 def test_a_part_gives_the_maps_of_the_whole_bit_for_bit(tmp_path: Path) -> None:
     rig = write_rig(tmp_path / "rig")
-    options = {"maps": 3, "seed": 5, "estimator": "joint", "exposures": 1}
+    options = {"maps": 3, "seed": 5, "estimator": "joint", "exposures": 2}
     api.scan(rig, out=tmp_path / "whole", record=True, temporal_prior=True, **options)
     api.scan(rig, out=tmp_path / "without", **options)
     api.cut(tmp_path / "whole", tmp_path / "part", maps="1:3")

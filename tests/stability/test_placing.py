@@ -1,0 +1,149 @@
+"""Labels and pooled places at the ends of their ranges, and the choice of passes for any counts so far."""
+
+from dataclasses import replace
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.adaptive import EXPOSURES, Pass, Unsettled, moved_rows, next_pass, thinned
+from rig.adaptive_counts import add_pass
+from rig.errors import UsageError
+from rig.estimators.label_grid import far_ends, label_grid
+from rig.estimators.placing import amplitudes_of, line_width, new_places, place, profile_table
+from rig.estimators.row_input import state_of, sweep_of
+from rig.estimators.row_model import pixel_shares
+from rig.row_threads import RowWorkers
+from rig.stripes import StripeTable
+from tests.reference.geometry import Geometry
+from tests.stability.inventory import EXAMPLES, covers
+from tests.unit.estimators.test_label_volume import known_model
+from tests.unit.small_maps import RIGS, geometry_of, volume_of
+
+ROWS, COLUMNS, WIDTH = 6, 10, 256
+GEOMETRIES = {rig: geometry_of(Geometry.build(width=WIDTH, height=ROWS, columns=COLUMNS, **RIGS[rig])) for rig in RIGS}
+WORKERS = RowWorkers(1)
+
+
+@covers("rig.estimators.row_model:pixel_shares", "rig.estimators.placing:profile_table")
+def test_shares_of_a_line_are_those_of_a_gaussian_however_narrow_or_wide(worst) -> None:
+    distance = np.array([-60.0, -3.0, -0.5, 0.0, 0.25, 0.5, 1.0, 7.0])
+    with mpmath.workdps(50):
+        for sigma_px in (1e-3, 0.25, 0.6, 2.4, 100.0):
+            exact = [
+                float(mpmath.ncdf((mpmath.mpf(d) + 0.5) / sigma_px) - mpmath.ncdf((mpmath.mpf(d) - 0.5) / sigma_px))
+                for d in distance
+            ]
+            worst("share of a line in float32", "mpmath, 50 digits", pixel_shares(sigma_px, distance) - exact, 1e-7)
+            table = profile_table(sigma_px)
+            assert np.isfinite(table).all()
+            assert np.all((table[:, 0] >= 0) & (table[:, 0].sum(axis=1, keepdims=True) <= 1 + 1e-6))
+
+
+@covers("rig.estimators.label_grid:far_ends")
+@EXAMPLES
+@given(
+    rig=st.sampled_from(list(RIGS)), near=st.floats(1e-3, 1e3), ratio=st.floats(1.001, 1e6),
+    k1=st.sampled_from([-0.3, 0.0, 0.5]),
+)  # fmt: skip
+def test_far_ends_are_numbers_where_anything_is_searched_and_nowhere_else(rig, near, ratio, k1) -> None:
+    g = Geometry.build(width=WIDTH, height=ROWS, columns=COLUMNS, **{**RIGS[rig], "k1": k1})
+    try:
+        geometry = geometry_of(g, (near, near * ratio))
+    except UsageError:
+        return
+    asked = geometry.x_lo <= geometry.x_hi
+    found = far_ends(geometry.u, geometry.v, geometry.plane, geometry.x_lo, geometry.x_hi, 1 / (near * ratio))
+    np.testing.assert_array_equal(np.isfinite(found), asked)
+    grid = label_grid(geometry)
+    assert grid.labels % 32 == 0
+    assert 0 < grid.stripes <= grid.labels
+    nearest = geometry.x_lo if geometry.near_is_left else geometry.x_hi
+    assert np.all((grid.side * (grid.x_far - nearest))[asked] * 2 < grid.stripes)
+
+
+@covers("rig.estimators.placing*:*")
+@EXAMPLES
+@given(
+    rig=st.sampled_from(list(RIGS)), exposures=st.sampled_from([1, 10, 255, 10**6]),
+    rate=st.sampled_from([0.0, 1e-4, 0.5, 1.0]), haze=st.sampled_from([1e-9, 0.14, 50.0]),
+    ambient=st.sampled_from([1e-6, 0.005, 20.0]), light=st.sampled_from([1e-6, 1.0, 1e6]),
+    sigma_px=st.sampled_from([0.25, 0.6, 2.4]), seed=st.integers(0, 99),
+)  # fmt: skip
+def test_places_of_any_counts_move_a_pixel_at_most(rig, exposures, rate, haze, ambient, light, sigma_px, seed) -> None:
+    geometry, rng = GEOMETRIES[rig], np.random.default_rng(seed)
+    model = known_model(geometry, haze=haze, ambient=ambient, sigma_px=sigma_px)
+    model = replace(model, amplitude=np.float32(light) * model.amplitude)
+    sweep, state, grid = sweep_of(geometry), state_of(model), label_grid(geometry)
+    frames = np.where(rng.random(COLUMNS) < 0.2, 0, exposures).astype(np.int32)
+    counts = rng.binomial(frames[:, None, None], rate, (COLUMNS, ROWS, WIDTH)).astype(np.uint32)
+    volume = volume_of(counts, geometry, frames)
+    x_px = rng.uniform(geometry.x_lo - 2, np.maximum(geometry.x_hi, geometry.x_lo) + 2).astype(np.float32)
+    x_px[(geometry.x_lo > geometry.x_hi) | (frames == 0)] = np.nan
+    before, places = x_px.copy(), new_places(ROWS, COLUMNS)
+    places.distance[:] = x_px - grid.x_far
+    sd = place(volume, sweep, state, profile_table(sigma_px), x_px, places, WORKERS)
+    there = np.isfinite(before)
+    np.testing.assert_array_equal(np.isfinite(x_px), there)
+    assert np.all(np.abs(x_px - before)[there] <= 1 + 1e-4)
+    assert np.all((sd[there] > 0) & (sd[there] <= 1))
+    for values in (places.light, places.scale, places.amplitude, places.haze, places.known):
+        assert np.isfinite(values[there]).all()
+    assert np.all(places.haze[there] >= 0)
+    amplitude, weight = amplitudes_of(places)
+    assert np.all(amplitude > 0)
+    assert weight.sum() == pytest.approx(1)
+    table = StripeTable.empty(ROWS, COLUMNS)
+    table.x_px[:], table.x_sd_px[:], table.confidence[:] = x_px, sd, there
+    width = line_width(volume, sweep, state, table, WORKERS)
+    assert width is None or 0.2 < width < 2.5
+
+
+PASS_TIMES = {
+    "free": lambda columns, exposures: 0.0,
+    "plain": lambda columns, exposures: columns * exposures * 1e-5 + 2e-3,
+    "endless": lambda columns, exposures: 1e12,
+    "some": lambda columns, exposures: None if exposures > 3 or columns < 4 else 1e-9 * columns,
+}
+
+
+@covers("rig.adaptive:Pass.*", "rig.adaptive:Unsettled.*", "rig.adaptive:next_pass", "rig.adaptive:moved_rows")
+@EXAMPLES
+@given(
+    columns=st.sampled_from([1, 2, 7, 63, 64, 500]), moved=st.sampled_from([0.0, 1e-300, 1.0, 512.0]),
+    frames=st.sampled_from([0, 1, 2, 10**9]), passes=st.sampled_from([1, 8]), left_s=st.sampled_from([1e-9, 0.1, 1e9]),
+    time=st.sampled_from(list(PASS_TIMES)), seed=st.integers(0, 99),
+)  # fmt: skip
+def test_passes_lie_within_their_map_and_its_time(columns, moved, frames, passes, left_s, time, seed) -> None:
+    rng = np.random.default_rng(seed)
+    unsettled = Unsettled(moved * rng.random(columns), rng.integers(0, frames + 1, columns).astype(np.int32))
+    for exposures in (1, 10**6):
+        gain = unsettled.gain(exposures)
+        assert np.isfinite(gain).all()
+        assert np.all(gain >= 0)
+    found = next_pass(unsettled, PASS_TIMES[time], left_s, passes)
+    if found is not None:
+        assert 0 <= found.first_column < found.end_column <= columns
+        assert found.exposures in EXPOSURES
+        assert PASS_TIMES[time](found.columns, found.exposures) <= left_s
+    nothing = StripeTable.empty(3, columns)
+    assert not moved_rows(nothing, nothing, np.ones((3, columns), bool)).any()
+
+
+@covers("rig.adaptive:thinned")
+@pytest.mark.parametrize("level", [0, 1])
+def test_counts_without_contrast_are_halved_and_added_exactly(level) -> None:
+    geometry = GEOMETRIES["left"]
+    frames = np.array([0, 1, 2, 3, 10, 255, 400, 400, 7, 7], np.int32)
+    volume = volume_of(np.full((COLUMNS, ROWS, WIDTH), level) * frames[:, None, None], geometry, frames)
+    volume = replace(volume, counts=volume.counts.astype(np.uint16))
+    half = thinned(volume)
+    np.testing.assert_array_equal(half.counts, np.broadcast_to(level * (frames // 2)[:, None, None], half.counts.shape))
+    few = replace(half, counts=half.counts.astype(np.uint8), n_frames=half.n_frames)
+    total = few
+    for _ in range(400):
+        total = add_pass(total, Pass(0, COLUMNS, 1), few)
+    np.testing.assert_array_equal(total.counts, 401 * half.counts.astype(np.uint32))
+    np.testing.assert_array_equal(np.isfinite(total.column), total.n_frames > 0)
