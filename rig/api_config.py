@@ -51,12 +51,7 @@ def configure(
     given = {key: value for key, value in options.items() if value is not None}
     if not given:
         return loaded
-    changed = _changed(config, given) if isinstance(config, RigConfig) else load_config(os.fspath(config), given)
-    if temporal_prior and changed.estimate.estimator != "joint":
-        raise UsageError(
-            f"--temporal-prior is for the estimator joint, this is {changed.estimate.estimator}; add --estimator joint"
-        )
-    return changed
+    return _changed(config, given) if isinstance(config, RigConfig) else load_config(os.fspath(config), given)
 
 
 def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:

@@ -50,10 +50,16 @@ def tradeoff(
     from rig.tradeoff_choice import wish_of
     from rig.tradeoff_files import write_files
 
-    problems = _of_rig(configure(config))
+    loaded = configure(config)
+    problems = _of_rig(loaded)
     estimators = estimators or [name for name in ESTIMATORS if name != "argmax"]
     filters = filters or FILTERS
     problems += require_methods(estimators, filters)
+    if loaded.estimate.temporal_prior and set(estimators) != {"joint"}:
+        problems.append(
+            f"{loaded.name} has estimate.temporal_prior, which is for joint alone; leave it out of the config or try "
+            "--estimators joint"
+        )
     if repeat < 1:
         problems.append(f"repeat is {repeat}; it must be at least 1")
     if not 0 <= seed <= MAX_SEED - repeat:

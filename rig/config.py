@@ -15,6 +15,7 @@ from pydantic import (
     Field,
     SerializeAsAny,
     ValidationInfo,
+    field_validator,
     model_validator,
 )
 
@@ -161,6 +162,16 @@ class EstimateConfig(Section):
         description="threads that count and estimate, null for one a core; results do not depend on it",
         examples=[2],
     )
+
+    @field_validator("temporal_prior")
+    @classmethod
+    def _prior_is_of_joint(cls, value: bool, info: ValidationInfo) -> bool:
+        estimator = info.data.get("estimator", "joint")  # absent where it is itself a problem
+        if value and estimator != "joint":
+            raise ValueError(
+                f"is for the estimator joint, this is {estimator}; choose estimator joint or leave the prior off"
+            )
+        return value
 
 
 def _of_slot(slot: str) -> BeforeValidator:

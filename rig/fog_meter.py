@@ -13,7 +13,8 @@ map, and the same whenever the map is estimated again.
 Error bars are those of the sandwich, H^-1 (sum of g g^T) H^-1, g the likelihood's slope from each of 16 blocks of rows
 and columns: what the model leaves out shows as scatter between them, as in a jackknife, of which this is the first
 order. Light scattered more than once flattens the decay all over the picture, which no scatter shows; REST_SHARE of
-`rest` is therefore added to the extinction's relative error. 5 ms a map.
+`rest` is therefore added to the extinction's relative error. Where the fog lays a halo around the stripes (`halo`), its
+light falls off on both sides of them as haze would, and neither extinction nor veil is stated. 5 ms a map.
 """
 
 import math
@@ -123,9 +124,11 @@ def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: An
     fit = fit_fog(sums, state.path_m())
     if fit is None:
         return FogEstimate()
+    dark = _dark_offset(sweep, state.ambient, hot_flux)
+    if state.halo.any():
+        return _under_halo(sums, dark)
     read = clear & (at_stripe[:, 1] > 0)
     signal = float(np.mean(stripe.signal[row, column][read])) if read.any() else math.nan
-    dark = _dark_offset(sweep, state.ambient, hot_flux)
     return _stated(fit, sums, state.path_m(), dark, at_stripe[read], signal)
 
 
@@ -140,6 +143,18 @@ def _dark_offset(sweep: Any, ambient: NDArray[np.float32], hot_flux: float) -> t
         return None
     level = -math.log1p(-ones / exposures)
     return level - float(np.average(ambient[used], weights=frames[used])), level / math.sqrt(ones)
+
+
+def _under_halo(sums: Array, dark: tuple[float, float] | None) -> FogEstimate:
+    """What is stated where the stripes' halo lies on all that is read: the ambient light, if dark frames tell of it."""
+    if dark is None:
+        return FogEstimate()
+    level = float(sums[..., 3].sum() / sums[..., 1].sum()) + dark[0]
+    return FogEstimate(**_ambient(level, math.hypot(dark[1], MODEL_SHARE * level)))
+
+
+def _ambient(level: float, sd: float) -> dict[str, float]:
+    return {"ambient_per_exposure": level, "ambient_sd_per_exposure": sd} if level > RESOLVED_SIGMAS * sd else {}
 
 
 def _stated(
@@ -161,8 +176,7 @@ def _stated(
         visibility_m = VISIBILITY_CONTRAST / float(extinction)
         found |= {"extinction_per_m": float(extinction), "extinction_sd_per_m": extinction_sd}
         found |= {"visibility_m": visibility_m, "visibility_sd_m": visibility_m * extinction_sd / extinction}
-    if ambient > RESOLVED_SIGMAS * ambient_sd:
-        found |= {"ambient_per_exposure": ambient, "ambient_sd_per_exposure": ambient_sd}
+    found |= _ambient(ambient, ambient_sd)
     if len(at_stripe):
         off_m, gain = at_stripe[:, 0] - fit.at_m, at_stripe[:, 1]
         shape = gain * np.exp(-2.0 * extinction * off_m)

@@ -117,6 +117,8 @@ def replay_config(
         "scan": scan,
         "estimate": {**(recorded.get("estimate") or {}), **{k: v for k, v in estimate.items() if v is not None}},
     }
+    if content["estimate"].get("estimator") != "joint":  # another estimator than that of the scan, which had a prior
+        content["estimate"].pop("temporal_prior", None)
     if others is not None:
         content |= {slot: part for slot, part in others.model_dump(mode="json").items() if slot in (*RECORDED, "world")}
     elif against_recording:

@@ -21,7 +21,8 @@ POWERS: Final = 4
 VECTOR: Final = 32
 """Labels that are worked on at once."""
 MIDDLE: Final = VECTOR // 2
-UNITS_PER_NAT: Final = 8
+UNITS: Final = 8.0
+"""Units of cost per nat of very few exposures; of K exposures UNITS / (1 + K / SHARP), see `label_volume`."""
 
 
 class AnswerSettings(NamedTuple):
@@ -42,7 +43,7 @@ class AnswerSettings(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """Per (row, column). Labels are counted in labels, costs in eighths of a nat.
+    """Per (row, column). Labels are counted in labels, costs in units (`UNITS`).
 
     label, spread: float32, mean and standard deviation of the labels around the winner, the stripe of the least total
     (ties: the smaller label). margin: uint8, the least total at least MARGIN_FROM labels away less the winner's. data:
@@ -67,8 +68,8 @@ def new_answer(rows: int, columns: int) -> Answer:
 
 
 def answer_settings(stripes: int, beta: float = 0.5) -> AnswerSettings:
-    """Settings for so many stripe labels; a label weighs exp(-beta * excess of its total in nats)."""
-    weights = np.exp(-beta / UNITS_PER_NAT * np.arange(LARGEST + 1)).astype(np.float32)
+    """Settings for so many stripe labels; a label weighs exp(-beta * excess of its total / UNITS)."""
+    weights = np.exp(-beta / UNITS * np.arange(LARGEST + 1)).astype(np.float32)
     distance = np.arange(-REACH, REACH + 1)
     powers = np.zeros((REACH + 1, TAPS, POWERS), np.float32)
     for reach in range(REACH + 1):

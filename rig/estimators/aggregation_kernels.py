@@ -36,7 +36,10 @@ _SET, _ADD, _TOTAL = 0, 1, 2
 
 
 class Penalties(NamedTuple):
-    """What a change of label between neighbours costs, eighths of a nat: a step of 1, 2 or 3 labels, or any other."""
+    """What a change of label between neighbours costs, in units: a step of 1, 2 or 3 labels, or any other.
+
+    Units of `label_volume`, 8 / (1 + K / 8) to a nat of K exposures: in nats a change costs more the more there are.
+    """
 
     one: int = 16
     two: int = 24

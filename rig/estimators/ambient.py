@@ -35,7 +35,8 @@ def ambient_map(
         exposures += tally.n_dark if tally.dark_frames is None else tally.dark_frames
     # Behind its stripe a pixel is not dark where other lines are lit together with it.
     if quiet is not None and geometry.others is None:
-        ones += quiet[0]
+        # What a halo is expected to add has been taken off: chance may leave less than nothing.
+        ones += np.maximum(quiet[0], 0.0)
         exposures += quiet[1]
     totals = np.stack([intensity, np.broadcast_to(_window_exposures(tally, geometry), intensity.shape)])
     if exposures.sum() < ones.size:

@@ -107,7 +107,8 @@ def fill_halo(
                     level[2, k] += middle_light * row.scale[t] * state.glow[row.cell[t]] / size[k]
             out.weight[b, c] = 0
             out.constant[b, c] = 0.0
-            for j in range(out.weight.shape[4]):
+            # No label lies around the places behind these, which fill up a vector: `halo` need not reach so far.
+            for j in range(LANES // BLOCK_PX * tables.tap.shape[1] + 1):
                 t = min(max(to_t - FAR_PX - BLOCK_PX * j, 0), length - 1)
                 for m in range(LIGHTS):
                     s = light[m] * row.scale[t]

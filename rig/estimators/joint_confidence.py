@@ -4,7 +4,7 @@
                / (1 + exp(A - B margin))             another position is the right one
                / (1 + C z^-D)                        there is no stripe: haze ends, but nothing shines
 
-margin: by how much the next best place is worse, in eighths of units of cost; z: light of the stripe over its noise,
+margin: by how much the next best place is worse, over UNITS of cost; z: light of the stripe over its noise,
 both pooled over neighbours. The five numbers are fitted (maximum likelihood) to 10 maps of a second simulator, `cones`
 and `art` in clear air, thin and dense fog at 1 to 10 exposures, all answers counted, also those where there is no
 stripe; on 8 other maps (`moebius`, `motorcycle`, `aloe`) the calibration error was 0.017.
@@ -17,7 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.aggregation_answer import Answer
+from rig.estimators.aggregation_answer import UNITS, Answer
 from rig.estimators.placing_kernels import LIGHT_PX, Places
 
 Float32 = NDArray[np.float32]
@@ -28,8 +28,6 @@ A: Final = 2.445
 B: Final = 0.603
 C: Final = math.exp(-3.272)
 D: Final = 1.891
-UNITS: Final = 8.0
-"""Cost units of a margin of 1."""
 POOLED: Final = 25.0
 """Answers whose light counts as one: about half of the neighbours that it is pooled over lie on the same surface."""
 LEAST_Z: Final = 0.05

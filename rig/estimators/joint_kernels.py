@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rig.estimators.aggregation_answer import Answer
 from rig.estimators.label_grid import PER_PX
-from rig.estimators.row_input import State, Sweep, fluxes_at, line_light
+from rig.estimators.row_input import State, Sweep, fluxes_at, line_light, with_rays
 
 QUIET_REACH_PX: Final = 8
 """Pixels so far behind a clear stripe show nothing of it."""
@@ -51,8 +51,8 @@ def add_quiet(
 ) -> None:
     """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, of some columns.
 
-    halo: (BINS, pixels) of `halo_shares`, without pixels where there is none: with one it is not dark behind a stripe
-    of `signal` photons, and what is expected of halo and pedestal is taken off.
+    Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels where there is none: with
+    one it is not dark behind a stripe of `signal` photons, and what is expected of halo and pedestal is taken off.
     """
     width = sweep.u.shape[1]
     for y in range(first_row, last_row):
@@ -65,10 +65,14 @@ def add_quiet(
                 begin = max(begin, x + QUIET_REACH_PX + 1)
             else:
                 end = min(end, x - QUIET_REACH_PX)
+            if begin >= end:
+                continue
+            begin, last = with_rays(sweep.u, y, begin, end - 1)
+            end = last + 1 if not np.isnan(sweep.u[y, last]) else begin
             for t in range(begin, end):
                 quiet[0, y, t] += counts[c, y, t - x0]
                 quiet[1, y, t] += n_frames[c]
-            if halo.shape[1] == 0 or begin >= end:
+            if halo.shape[1] == 0 or begin == end:
                 continue
             at = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, at)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.label_grid import LabelGrid
-from rig.estimators.row_input import Sweep
+from rig.estimators.row_input import Sweep, with_rays
 from rig.geometry import MARGIN_PX
 
 FRACTIONS: Final = 8
@@ -53,11 +53,9 @@ def _fill_places(
             place = out[c, y]
             place[VARIANT] = -1
             lo, hi, x0 = sweep.x_lo[y, c], sweep.x_hi[y, c], sweep.x0[c]
-            first, last = max(lo - MARGIN_PX, x0, 0), min(hi + MARGIN_PX, x0 + sweep.window - 1, width - 1)
-            while first < last and np.isnan(sweep.u[y, first]):
-                first += 1
-            while last > first and np.isnan(sweep.u[y, last]):
-                last -= 1
+            first, last = with_rays(
+                sweep.u, y, max(lo - MARGIN_PX, x0, 0), min(hi + MARGIN_PX, x0 + sweep.window - 1, width - 1)
+            )
             if lo > hi or max(lo, first) > min(hi, last):
                 continue
             # In eighths of a pixel towards near: label 0, and from there to the pixel that holds it.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rig.aligned import aligned_zeros
 from rig.counting import CountVolume
+from rig.estimators.aggregation_answer import UNITS
 from rig.estimators.halo import halo_shares
 from rig.estimators.halo_tables import HaloTables, fill_halo, halo_tables
 from rig.estimators.judging import HOT_FACTOR, HOT_FLUX
@@ -30,8 +31,6 @@ from rig.geometry import MARGIN_PX, SweepGeometry
 from rig.lanes import LANES
 from rig.row_threads import RowWorkers
 
-UNITS: Final = 8.0
-"""Units of cost per nat of very few exposures."""
 SHARP: Final = 8.0
 """Exposures at which a nat is worth half as many: with sharp rows the labels beside the best one must still count."""
 BAND_ROWS: Final = 64
@@ -91,7 +90,7 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
     bands = -(-geometry.rows // BAND_ROWS)
     at = np.empty((bands, geometry.columns, VARIANTS), np.int32)
     tables = _empty_tables(at, number_tables(place, BAND_ROWS, at), grid, 2 * reach + 1)
-    ambient, hot = model.ambient, _hot(model.ambient)
+    ambient, hot = model.ambient, hot_in_bands(model.ambient)
     distance = np.arange(-reach, reach + 1) - (np.arange(FRACTIONS)[:, None] - FRACTIONS // 2) / FRACTIONS
     shares = pixel_shares(model.line_sigma_px, distance)
     dark = state._replace(ambient=np.zeros_like(ambient), row_gain=_band_means(state.row_gain))
@@ -203,7 +202,7 @@ def _lights(model: RowModel) -> NDArray[np.float32]:
     return np.exp(np.interp(QUARTILES, middle, np.log(model.amplitude.astype(np.float64)))).astype(np.float32)
 
 
-def _hot(ambient: NDArray[np.float32]) -> NDArray[np.bool_]:
+def hot_in_bands(ambient: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Pixels (rows, width) that are far brighter than those of their column in the band."""
     bands = np.arange(BAND_ROWS, ambient.shape[0], BAND_ROWS)
     return np.concatenate([part > HOT_FACTOR * np.median(part, axis=0) + HOT_FLUX for part in np.split(ambient, bands)])

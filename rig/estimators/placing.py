@@ -22,6 +22,8 @@ ENOUGH = 1 / 0.06**2
 """Information, 1/px^2, from which a place is known well enough: surfaces bend over more neighbours."""
 BEYOND = 3.0
 """Brightness may exceed the learned amplitudes by this factor either way."""
+DARKEST = 300.0
+"""Stripes are taken to be no darker than the bright ones by this factor."""
 SLOPE_STEP_PX = 0.05
 LEAST_PHOTONS = 100.0
 """Photons per exposure, over all stripes, that can tell the width of the line."""
@@ -97,4 +99,5 @@ def amplitudes_of(places: Places) -> tuple[NDArray[np.float32], NDArray[np.float
     if len(found) == 0:
         return np.ones(4, np.float32), shares
     middle = [0.5 * (a + b) for a, b in pairwise(edges)]
-    return np.quantile(found, middle).astype(np.float32), shares
+    amplitude = np.quantile(found, middle)
+    return np.maximum(amplitude, amplitude[-1] / DARKEST).astype(np.float32), shares

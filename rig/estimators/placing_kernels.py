@@ -140,11 +140,15 @@ def add_moments(
             if not (confidence[y, c] > CLEAR and sd_px[y, c] < CLEAR_SD_PX and n_frames[c] > 0):
                 continue
             x = int(np.rint(x_px[y, c]))
+            begin, end = x - BESIDE_PX[1], x + BESIDE_PX[1]
+            if begin < max(sweep.x0[c], 0) or end >= min(sweep.x0[c] + sweep.window, sweep.u.shape[1]):
+                continue
+            # Pixels without a ray lie at the ends of a row.
+            if np.isnan(sweep.u[y, begin]) or np.isnan(sweep.u[y, end]):
+                continue
             path_p, strength = line_light(sweep, state, y, c, x)
             before, behind, _, _, _, cell, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)
             reach = BESIDE_PX[1] if state.glow[cell] > 0.0 else REACH_PX
-            if x - reach < max(sweep.x0[c], 0) or x + reach >= min(sweep.x0[c] + sweep.window, sweep.u.shape[1]):
-                continue
             side = 1 if sweep.near_is_left else -1
             frames = np.float64(n_frames[c])
             halo, level, wide = 0.0, 0.0, 0.0

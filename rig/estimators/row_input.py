@@ -157,6 +157,16 @@ def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-de
 
 
 @numba.njit(inline="always")
+def with_rays(u, y, first, last):  # type: ignore[no-untyped-def]
+    """First and last of those pixels of a row, without the ones at its ends that have no ray; one is always left."""
+    while first < last and np.isnan(u[y, first]):
+        first += 1
+    while last > first and np.isnan(u[y, last]):
+        last -= 1
+    return first, last
+
+
+@numba.njit(inline="always")
 def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
     """Length of the light's path to the plane's points on row y per unit of depth, and the strength of the haze there.
 
@@ -224,12 +234,9 @@ def row_fluxes(sweep: Sweep, state: State, row: Row, y: int, c: int) -> tuple[in
     if lo > hi:
         return 0, 0, -1, 0
     u, profile = sweep.u, state.profile
-    first = max(lo - MARGIN_PX, x0, 0)
-    last = min(hi + MARGIN_PX, x0 + sweep.window - 1, u.shape[1] - 1)
-    while first < last and np.isnan(u[y, first]):
-        first += 1
-    while last > first and np.isnan(u[y, last]):
-        last -= 1
+    first, last = with_rays(
+        u, y, max(lo - MARGIN_PX, x0, 0), min(hi + MARGIN_PX, x0 + sweep.window - 1, u.shape[1] - 1)
+    )
     length = last - first + 1
     start, step = (first, 1) if sweep.near_is_left else (last, -1)
     begin = lo - first if sweep.near_is_left else last - hi

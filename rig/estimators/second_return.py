@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rig.counting import CountVolume
 from rig.estimators.label_grid import PER_PX, LabelGrid
+from rig.estimators.label_volume import hot_in_bands
 from rig.estimators.row_input import State, Sweep
 from rig.estimators.second_return_kernels import (
     APART_PX,
@@ -48,7 +49,10 @@ def second_returns(
     apart, reach = APART_PX + LINE_SIGMAS * line_sigma_px, max(int(np.rint(LIGHT_SIGMAS * line_sigma_px)), 1)
     blocks = Blocks(*(np.empty((*shape, -(-grid.stripes // PER_PX)), np.float32) for _ in Blocks._fields))
     candidates = Candidates(*(np.empty(shape, np.float32) for _ in Candidates._fields))
-    seen = volume.counts, volume.n_frames, sweep, state, grid.x_far, grid.side, apart
+    # Pixels that nearly always fire, and those not to be used, show nothing of haze or stripes.
+    dark = np.where(hot_in_bands(state.ambient), np.float32(np.nan), -np.expm1(-state.ambient))
+    haze_only = state._replace(ambient=np.zeros_like(state.ambient))
+    seen = volume.counts, volume.n_frames, sweep, haze_only, dark, grid.x_far, grid.side, apart
 
     workers.over(shape[0], lambda first, last: sum_blocks(*seen, x_px, first, last, blocks))
     workers.over(shape[0], lambda first, last: find_candidates(blocks, reach, grid.side, first, last, candidates))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rig.estimators.placing_kernels import Float32
 from rig.estimators.placing_pools import pool_row
-from rig.estimators.row_input import State, Sweep, fluxes_at, line_light
+from rig.estimators.row_input import State, Sweep, fluxes_at, line_light, with_rays
 
 BLOCK: Final = 4
 """Rows, and columns, whose light is summed at once; a block is judged together with its eight neighbours."""
@@ -75,6 +75,7 @@ def sum_blocks(
     n_frames: NDArray[np.int32],
     sweep: Sweep,
     state: State,
+    dark: Float32,
     x_far: NDArray[np.float64],
     side: int,
     apart: float,
@@ -85,7 +86,8 @@ def sum_blocks(
 ) -> None:
     """Fill the sums of rows of blocks first_block..last_block-1, without what lies within `apart` px of stripes x_px.
 
-    Haze is taken from the middle of each block: it changes slowly.
+    Haze is taken from the middle of each block: it changes slowly. state: without ambient light; dark: (rows, width),
+    probability of a one by that alone, NaN for pixels that are left out.
     """
     rows, columns = x_px.shape
     width, pixels = sweep.u.shape[1], out.ones.shape[2]
@@ -109,10 +111,10 @@ def sum_blocks(
                     end = max(min(sweep.x_hi[y, c], x0 + sweep.window - 1, width - 1, start + pixels - 1) + 1, begin)
                     stop = min(max(int(np.ceil(x_px[y, c] - apart)), begin), end)
                     on = max(min(int(np.floor(x_px[y, c] + apart)) + 1, end), begin)
-                    line, dark, frames = counts[c, y], state.ambient[y], np.float32(n_frames[c])
+                    line, alone, frames = counts[c, y], dark[y], np.float32(n_frames[c])
                     for first, last, haze in ((begin, stop, left), (on, end, right)):
                         _add_line(
-                            line[first - x0 : last - x0], dark[first:last], frames, haze[first - start : last - start],
+                            line[first - x0 : last - x0], alone[first:last], frames, haze[first - start : last - start],
                             ones[first - start : last - start], expected[first - start : last - start],
                         )  # fmt: skip
 
@@ -127,20 +129,20 @@ def leftmost(x_far, side, pixels):  # type: ignore[no-untyped-def]
 def _haze_beside(
     sweep: Sweep, state: State, y: int, c: int, start: int, side: int, left: Float32, right: Float32
 ) -> None:
-    """Probability of a one by haze, without ambient light, left and right of a stripe, in pixels from `start` on.
+    """Probability of a one by haze left and right of a stripe, in pixels from `start` on.
 
-    Straight lines between every HAZE_STEP pixels; both as long as a multiple of that, and one more.
+    Straight lines between every HAZE_STEP pixels; both as long as a multiple of that, and one more. Pixels without a
+    ray have that of the nearest one with a ray.
     """
-    end = sweep.u.shape[1] - 1
-    path_p, strength = line_light(sweep, state, y, c, min(max(start, 0), end))
+    first, last = with_rays(sweep.u, y, 0, sweep.u.shape[1] - 1)
+    path_p, strength = line_light(sweep, state, y, c, min(max(start, sweep.x_lo[y, c]), sweep.x_hi[y, c]))
     for i in range(0, len(left), HAZE_STEP):
-        x = min(max(start + i, 0), end)
-        left[i] = right[i] = 0.0
-        if not np.isnan(sweep.u[y, x]):
-            before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)
-            if side < 0:
-                before, behind = behind, before
-            left[i], right[i] = -np.expm1(state.ambient[y, x] - before), -np.expm1(state.ambient[y, x] - behind)
+        before, behind, _, _, _, _, _ = fluxes_at(
+            sweep, state, y, min(max(start + i, first), last), c, path_p, strength
+        )
+        if side < 0:
+            before, behind = behind, before
+        left[i], right[i] = -np.expm1(-before), -np.expm1(-behind)
         for k in range(max(i - HAZE_STEP + 1, 0), i):
             part = np.float32((i - k) / HAZE_STEP)
             left[k] = left[i] + part * (left[i - HAZE_STEP] - left[i])
@@ -150,15 +152,16 @@ def _haze_beside(
 @numba.njit(cache=True, nogil=True)
 def _add_line(
     line: NDArray[np.unsignedinteger],
-    ambient: Float32,
+    dark: Float32,
     frames: np.float32,
     haze: Float32,
     ones: Float32,
     expected: Float32,
 ) -> None:
     for i in range(len(line)):
-        ones[i] += np.float32(line[i])
-        expected[i] += frames * (haze[i] + (np.float32(1.0) - haze[i]) * ambient[i])
+        out = np.isnan(dark[i])
+        ones[i] += np.float32(0.0) if out else np.float32(line[i])
+        expected[i] += np.float32(0.0) if out else frames * (haze[i] + (np.float32(1.0) - haze[i]) * dark[i])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -206,6 +209,7 @@ def measure_seconds(
     n_frames: NDArray[np.int32],
     sweep: Sweep,
     state: State,
+    dark: Float32,
     x_far: NDArray[np.float64],
     side: int,
     apart: float,
@@ -218,7 +222,7 @@ def measure_seconds(
 ) -> None:
     """Fill all but distance of rows first_row..last_row-1; zeros where there is no candidate or a stripe is near.
 
-    haze: of `Candidates`.
+    state, dark: as `sum_blocks`; haze: of `Candidates`.
     """
     width = sweep.u.shape[1]
     for y in range(first_row, last_row):
@@ -227,7 +231,7 @@ def measure_seconds(
             place = np.float32(x_far[y, c]) + out.distance[y, c]
             if np.isnan(place) or np.isnan(x_px[y, c]) or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
                 continue
-            lo, hi = max(sweep.x0[c], 0), min(sweep.x0[c] + sweep.window, width) - 1
+            lo, hi = with_rays(sweep.u, y, max(sweep.x0[c], 0), min(sweep.x0[c] + sweep.window, width) - 1)
             x, frames = int(np.rint(place)), np.float32(n_frames[c])
             at = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, at)
@@ -235,16 +239,15 @@ def measure_seconds(
             near, far = max(at - HAZE_STEP // 2, lo), min(at + HAZE_STEP // 2, hi)
             before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, near, c, path_p, strength)
             before_too, behind_too, _, _, _, _, _ = fluxes_at(sweep, state, y, far, c, path_p, strength)
-            own = np.float32(0.5) * (state.ambient[y, near] + state.ambient[y, far])
-            before = np.float32(0.5) * (before + before_too) - own
-            behind = np.float32(0.5) * (behind + behind_too) - own
             more = haze[y // BLOCK, c // BLOCK]
+            before = -np.expm1(np.float32(-0.5) * more * (before + before_too))
+            behind = -np.expm1(np.float32(-0.5) * more * (behind + behind_too))
             for t in range(max(x - reach, lo), min(x + reach, hi) + 1):
-                if abs(t - x_px[y, c]) < apart:
+                if abs(t - x_px[y, c]) < apart or np.isnan(dark[y, t]):
                     continue
-                flux = before if (t - x_px[y, c]) * side < 0 else behind
+                veil = before if (t - x_px[y, c]) * side < 0 else behind
                 n = np.float32(counts[c, y, t - sweep.x0[c]])
-                e = -np.expm1(-more * flux - state.ambient[y, t]) * frames
+                e = (veil + (np.float32(1.0) - veil) * dark[y, t]) * frames
                 out.ones[y, c] += n
                 out.expected[y, c] += e
                 out.light[y, c] += n - e

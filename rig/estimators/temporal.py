@@ -19,7 +19,7 @@ from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
 MOST = 3
-"""Most that a label costs more, eighths of a nat as all costs. With 6, dark things that move are held back."""
+"""Most that a label costs more, in units as all costs (`UNITS`). With 6, dark things that move are held back."""
 SLOPE = 2
 """Units for each label farther off."""
 FREE = 1

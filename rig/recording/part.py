@@ -37,8 +37,8 @@ def part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None)
     manifest: dict[str, Any] = (read_manifest(folder) or {}) if folder.is_dir() else {}
     before = (manifest.get("config") or {}).get("estimate") or {}
     same = before.get("estimator") == estimate.estimator and estimate.estimator in LEARNING
-    # Recordings from before there was a prior have none.
-    same = same and before.get("temporal_prior", False) == estimate.temporal_prior
+    if estimate.estimator == "joint":  # recordings from before there was a prior have none
+        same = same and before.get("temporal_prior", False) == estimate.temporal_prior
     calibration = (manifest.get("calibration") or {}).get("id")
     if "cut" not in manifest or not same or model is None or calibration != model.fingerprint():
         return []

@@ -29,6 +29,7 @@ def test_a_part_gives_the_maps_of_the_whole_bit_for_bit(tmp_path: Path) -> None:
         for one, other in zip(found, scanned[first:], strict=True):
             for name, values in other.items():
                 np.testing.assert_array_equal(one[name], values, err_msg=f"{again} {name}")
+    api.reconstruct(tmp_path / "part", estimator="likelihood")  # knows no prior, and is not asked for one
     learned = [set(np.load(tmp_path / "whole" / "learned" / f"{i:06d}.npz")) for i in range(3)]
     assert ["before" in names for names in learned] == [False, True, True]
     assert not np.array_equal(stripes(tmp_path / "without")[1]["x_px"], scanned[1]["x_px"], equal_nan=True)
@@ -37,3 +38,8 @@ def test_a_part_gives_the_maps_of_the_whole_bit_for_bit(tmp_path: Path) -> None:
 def test_it_is_for_joint(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--temporal-prior is for the estimator joint, this is argmax"):
         api.configure(write_rig(tmp_path), temporal_prior=True)
+    with_prior = api.configure(write_rig(tmp_path), estimator="joint", temporal_prior=True)
+    with pytest.raises(UsageError, match=r"estimate.temporal_prior is for the estimator joint, this is likelihood"):
+        api.configure(with_prior, estimator="likelihood")
+    with pytest.raises(UsageError, match=r"has estimate.temporal_prior, which is for joint alone"):
+        api.tradeoff(with_prior)

@@ -8,13 +8,16 @@ import pytest
 
 from rig.estimators.halo import halo_shares, over_bins
 from rig.estimators.halo_kernels import solve
+from rig.estimators.halo_tables import BLOCK_PX
 from rig.estimators.joint import Joint
+from rig.estimators.joint_kernels import add_quiet
 from rig.estimators.label_grid import PER_PX, label_grid
 from rig.estimators.label_volume import _lights, costs_of
 from rig.estimators.label_volume_rows import EXCLUDED
 from rig.estimators.row_input import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimators.row_kernels import FLOOR
 from rig.estimators.row_model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, pixel_shares
+from rig.lanes import LANES
 from rig.row_threads import RowWorkers
 from tests.unit.estimators.test_label_volume import known_model
 from tests.unit.small_maps import simulated
@@ -68,6 +71,9 @@ def test_costs_are_those_of_a_stripe_with_its_halo():
     # Counts enter by blocks of 8 px, and places by straight lines between blocks: within a nat or two.
     assert np.sqrt(np.mean(np.concatenate(off) ** 2)) < 2.0
     assert abs(np.mean(np.concatenate(off))) < 1.0
+    places = LANES // BLOCK_PX * costs.tables.tap.shape[1] + 1
+    assert costs.halo.weight[..., :places].any()
+    assert not costs.halo.weight[..., places:].any(), "no label lies there, and shares of the halo end before"
     plain = costs_of(replace(model, halo=0 * HALO), geometry, costs.grid, 10, WORKERS)
     assert plain.halo.weight.size == 0, "without a halo there are no tables of one"
 
@@ -84,6 +90,31 @@ def test_a_halo_is_found_where_there_is_one(light):
     errors = swept.errors(stripes.x_px)
     assert np.nanmean(errors) < 1.0
     assert np.isfinite(errors).mean() > 0.95
+
+
+def test_pixels_without_a_ray_are_not_quiet():
+    swept = simulated("halo", 10, rows=20, columns=48)
+    g, volume = swept.geometry, swept.volume
+    cut = int(np.median(swept.point.x_true[np.isfinite(swept.point.x_true)])) + 40
+    u = g.u.copy()
+    u[:, cut:] = np.nan
+    g = replace(g, u=u, v=np.where(np.isnan(u), u, g.v), x_hi=np.minimum(g.x_hi, cut - 1))
+    model = replace(known_model(g), halo=HALO)
+    x_px = swept.point.x_true.astype(np.float32)
+    there = np.isfinite(x_px) & (x_px < cut)
+    signal, confidence = np.where(there, 0.3, 0).astype(np.float32), there.astype(np.float32)
+    shares = halo_shares(model, g.width)
+    found = {}
+    for name, halo in (("halo", shares), ("none", shares[:, :0])):
+        quiet = found[name] = np.zeros((2, g.rows, g.width))
+        add_quiet(
+            volume.counts, volume.n_frames, sweep_of(g), state_of(model), halo, x_px, signal, confidence, 1, 0, g.rows,
+            quiet,
+        )  # fmt: skip
+        assert not quiet[:, :, cut:].any()
+        assert quiet[1, :, :cut].any()
+    assert np.isfinite(found["halo"]).all()
+    np.testing.assert_array_equal(found["halo"][1], found["none"][1])
 
 
 def test_shares_add_up_to_the_halos_light():

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from rig.counting import CountVolume
+from rig.estimators.aggregation_answer import UNITS
 from rig.estimators.label_grid import PER_PX, label_grid
-from rig.estimators.label_volume import QUARTILES, SHARP, UNITS, _lights, costs_of
+from rig.estimators.label_volume import QUARTILES, SHARP, _lights, costs_of
 from rig.estimators.label_volume_rows import COST_LIMIT, EXCLUDED
 from rig.estimators.row_input import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimators.row_kernels import FLOOR

@@ -8,7 +8,7 @@ import pytest
 
 from rig.estimators.label_grid import label_grid
 from rig.estimators.placing import amplitudes_of, line_width, new_places, place, profile_table
-from rig.estimators.placing_kernels import REACH_PX
+from rig.estimators.placing_kernels import BESIDE_PX, REACH_PX
 from rig.estimators.row_input import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimators.row_model import pixel_shares
 from rig.row_threads import RowWorkers
@@ -102,6 +102,22 @@ def test_the_width_of_the_line_is_found_whatever_was_thought_before(sigma_px, ex
     nearly = known_model(geometry, haze=0.01, sigma_px=0.7)
     found = line_width(volume, sweep_of(geometry), state_of(nearly), stripes_at(x_px), WORKERS)
     assert found == pytest.approx(sigma_px, rel=0.12)
+
+
+def test_stripes_at_the_end_of_a_row_do_not_tell_the_width():
+    volume, geometry, x_px = wall("left", 20, 0.6, 8.0, 0.01)
+    state = state_of(known_model(geometry, haze=0.01, sigma_px=0.7))
+    cut = int(np.nanquantile(x_px, 0.7))
+    u = geometry.u.copy()
+    u[:, cut:] = np.nan
+    cut_off = replace(geometry, u=u, v=np.where(np.isnan(u), u, geometry.v))
+    inside = np.where(np.rint(x_px) + BESIDE_PX[1] < cut, x_px, np.nan)
+    found = line_width(volume, sweep_of(cut_off), state, stripes_at(x_px), WORKERS)
+    assert found == line_width(volume, sweep_of(geometry), state, stripes_at(inside), WORKERS)
+    outside = inside.copy()
+    for at, x in zip(np.argwhere(np.isnan(inside)), (-3.0, 1.0, geometry.width + 2.0, 1e6), strict=False):
+        outside[tuple(at)] = x
+    assert found == line_width(volume, sweep_of(geometry), state, stripes_at(outside), WORKERS)
 
 
 def test_too_little_light_tells_no_width():

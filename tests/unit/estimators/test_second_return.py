@@ -1,5 +1,6 @@
 """Second returns of a pane before a wall, on both sides of the answer, and none where there is one surface only."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -7,7 +8,9 @@ import pytest
 
 from rig.estimators.label_grid import label_grid
 from rig.estimators.row_input import state_of, sweep_of
+from rig.estimators.row_kernels import FLUX_MAX
 from rig.estimators.second_return import second_returns
+from rig.estimators.second_return_kernels import _add_line
 from rig.row_threads import RowWorkers
 from tests.reference.geometry import Geometry
 from tests.reference.made_scenes import pane_scene
@@ -90,3 +93,51 @@ def test_columns_without_exposures_are_left_alone() -> None:
     assert np.isnan(x2_px[:, ::7]).all()
     two = np.isfinite(sweep.point.x_second) & np.isfinite(x_px)
     assert (np.abs(x2_px - sweep.point.x_second)[two] <= 1).mean() > 0.95
+
+
+@pytest.mark.parametrize("rig", ["left", "right"])
+def test_rows_that_end_before_the_picture_does_are_as_good(rig) -> None:
+    sweep = pane(rig=rig)
+    g, point = sweep.geometry, sweep.point
+    seen = np.isfinite(point.x_true)
+    low, high = (int(q) for q in np.quantile(point.x_true[seen], (0.2, 0.8)))
+    u = g.u.copy()
+    u[:, :low] = u[:, high + 1 :] = np.nan
+    x_lo, x_hi = np.maximum(g.x_lo, low), np.minimum(g.x_hi, high)
+    empty = (g.x_lo > g.x_hi) | (x_lo > x_hi)
+    x_lo[empty], x_hi[empty] = 0, -1
+    g = replace(g, u=u, v=np.where(np.isnan(u), u, g.v), x_lo=x_lo, x_hi=x_hi)
+    inside = [(x > low + REACH) & (x < high - REACH) for x in (point.x_true, point.x_second)]
+    x_px = np.where(inside[0], point.x_true, np.nan)
+    x2_px, confidence2 = seconds_of(replace(sweep, geometry=g), x_px)
+    two = inside[0] & inside[1]
+    assert two.mean() > 0.05
+    assert ((np.abs(x2_px - point.x_second) <= 1) & (confidence2 > SURE))[two].mean() > 0.9
+    assert (confidence2[np.isnan(point.x_second)] > SURE).mean() < 0.01
+
+
+def test_pixels_not_to_be_used_neither_show_nor_hide_a_second_return() -> None:
+    sweep = pane()
+    volume, model = sweep.volume, known_model(sweep.geometry)
+    bad = np.random.default_rng(1).random(model.ambient.shape) < 0.03
+    model.ambient[bad] = FLUX_MAX
+    counts = volume.counts.copy()
+    first = sweep.geometry.x0
+    for c in range(COLUMNS):
+        counts[c][bad[:, first[c] : first[c] + counts.shape[2]]] = 10 * (c % 2)
+    grid, x_px = label_grid(sweep.geometry), sweep.point.x_true.astype(np.float32)
+    x2_px, confidence2 = second_returns(
+        replace(volume, counts=counts), grid, sweep_of(sweep.geometry), state_of(model), 0.6, x_px, WORKERS
+    )
+    two = np.isfinite(sweep.point.x_second) & np.isfinite(x_px)
+    assert ((np.abs(x2_px - sweep.point.x_second) <= 1) & (confidence2 > SURE))[two].mean() > 0.95
+    near = np.lib.stride_tricks.sliding_window_view(np.pad(two, REACH), (2 * REACH + 1, 2 * REACH + 1)).any((2, 3))
+    assert (confidence2[~near] > SURE).mean() < 0.005
+
+
+def test_strong_ambient_light_is_expected_as_ones_not_as_photons() -> None:
+    ones, expected = np.zeros(3, np.float32), np.zeros(3, np.float32)
+    dark, haze = -np.expm1(-np.array([0.0, 2.0, np.nan], np.float32)), np.full(3, 0.5, np.float32)
+    _add_line(np.array([4, 5, 6], np.uint16), dark, np.float32(10), haze, ones, expected)
+    np.testing.assert_allclose(expected, [5, 10 * (1 - 0.5 * np.exp(-2)), 0], rtol=1e-6)
+    np.testing.assert_array_equal(ones, [4, 5, 0])

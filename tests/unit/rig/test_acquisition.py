@@ -118,7 +118,7 @@ def test_trouble_while_stopping_is_noted_on_the_error_that_led_there():
 def test_a_guard_that_took_the_light_ends_a_scan_whose_spad_is_silent():
     rig, log = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)])
     failure = DeviceTimeout("the guard took the light")
-    guard = SimpleNamespace(failure=None, beat=lambda frame: None, expect=lambda limits: None)
+    guard = SimpleNamespace(failure=None, beat=lambda frame: None, expect=lambda limits: None, wait=lambda: None)
     rig = dataclasses.replace(rig, guard=guard)
     one_map = int(PLAN.frames_for(1)) // rig.spad.size + 2
 
