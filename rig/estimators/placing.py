@@ -16,7 +16,7 @@ from rig.stripes import StripeTable
 
 LIGHT_REACH = 3
 """Rows and columns to either side that a stripe's brightness is pooled over."""
-REACHES = (2, 3, 4)
+REACHES = (1, 2, 3, 4)
 """The same of its place: as many as it takes to know it."""
 ENOUGH = 1 / 0.06**2
 """Information, 1/px^2, from which a place is known well enough: surfaces bend over more neighbours."""
