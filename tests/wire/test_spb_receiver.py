@@ -173,6 +173,13 @@ def test_a_truncated_block_counts_for_its_whole_frames() -> None:
 
 @pytest.mark.parametrize("slots", [1, 2, 3, 8, 40])
 def test_a_reader_that_keeps_up_loses_nothing_however_short_the_ring(slots: int) -> None:
+    wanted = list(range(320 if slots >= 3 else 16))
+    # On a busy machine the reader's thread may be starved: then it did not keep up.
+    assert any(_read_in_time(slots, len(wanted)) == wanted for _ in range(4))
+
+
+def _read_in_time(slots: int, frames: int) -> list[int]:
+    """Numbers of the frames that a reader on a thread of its own got."""
     with opened(model(paced=True, fifo_frames=1_000_000)) as spad:
         timing = spad.configure(REQUEST)
         ring = BlockRing(slots, timing.stride, on_full=OnFull.DROP)
@@ -187,13 +194,12 @@ def test_a_reader_that_keeps_up_loses_nothing_however_short_the_ring(slots: int)
 
         thread = threading.Thread(target=read)
         thread.start()
-        spad.start(320 if slots >= 3 else 16)
+        spad.start(frames)
         while spad.fill(ring, 1.0):
             time.sleep(0.002)
         ring.finish()
         thread.join()
-        assert numbers == list(range(len(numbers)))
-        assert len(numbers) == (320 if slots >= 3 else 16)
+    return numbers
 
 
 def test_a_full_ring_drops_counted_blocks_and_the_device_does_not_starve() -> None:
