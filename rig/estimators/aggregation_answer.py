@@ -7,17 +7,13 @@ from numpy.typing import NDArray
 
 REACH: Final = 4
 """Labels to each side of the winner that its sub-label position is the mean of."""
-RIVAL_REACH: Final = 2
-"""The same of the rival."""
 MARGIN_FROM: Final = 3
 """Labels from the winner at which the margin's rivals begin: 1.5 pixels."""
-RIVAL_FROM: Final = 6
-"""Labels from the winner at which a second return may lie."""
 LARGEST: Final = 255
 """Largest cost and total: of a label that is excluded."""
 TAPS: Final = 2 * REACH + 1
 POWERS: Final = 4
-"""Numbers that are summed at once: powers 0, 1 and 2 of the distance, and nothing."""
+"""Numbers that are summed at once: powers 0 and 1 of the distance, and nothing."""
 VECTOR: Final = 32
 """Labels that are worked on at once."""
 MIDDLE: Final = VECTOR // 2
@@ -30,41 +26,32 @@ class AnswerSettings(NamedTuple):
 
     weights: float32 (256,), of a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), for each
     reach those of the taps within it. reach: uint8 (2^TAPS,), how far labels reach to both sides where the taps of the
-    set bits are excluded. off_ring, near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST at labels that do not
-    count for the margin, or may be rivals; and at those which are too near for a rival.
+    set bits are excluded. near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST at labels that do not count for the
+    margin.
     """
 
     stripes: int
     weights: NDArray[np.float32]
     powers: NDArray[np.float32]
     reach: NDArray[np.uint8]
-    off_ring: NDArray[np.uint8]
     near: NDArray[np.uint8]
 
 
 class Answer(NamedTuple):
     """Per (row, column). Labels are counted in labels, costs in units (`UNITS`).
 
-    label, spread: float32, mean and standard deviation of the labels around the winner, the stripe of the least total
-    (ties: the smaller label). margin: uint8, the least total at least MARGIN_FROM labels away less the winner's. data:
-    uint8, the winner's own cost. rival: float32, the best label at least RIVAL_FROM labels away, NaN where all of those
-    have total 255; rival_data: its own cost.
-    Means are taken only as far as both sides have labels: one side alone would draw every answer to it. spread is 0
-    where that is the winner alone.
+    label: float32, mean of the labels around the winner, the stripe of the least total (ties: the smaller label), only
+    as far as both sides have labels: one side alone would draw every answer to it. margin: uint8, the least total at
+    least MARGIN_FROM labels away less the winner's.
     """
 
     label: NDArray[np.float32]
-    spread: NDArray[np.float32]
     margin: NDArray[np.uint8]
-    data: NDArray[np.uint8]
-    rival: NDArray[np.float32]
-    rival_data: NDArray[np.uint8]
 
 
 def new_answer(rows: int, columns: int) -> Answer:
     """Room for the answers of a map."""
-    real, byte = np.float32, np.uint8
-    return Answer(*(np.zeros((rows, columns), dtype) for dtype in (real, real, byte, byte, real, byte)))
+    return Answer(np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.uint8))
 
 
 def answer_settings(stripes: int, beta: float = 0.5) -> AnswerSettings:
@@ -73,11 +60,10 @@ def answer_settings(stripes: int, beta: float = 0.5) -> AnswerSettings:
     distance = np.arange(-REACH, REACH + 1)
     powers = np.zeros((REACH + 1, TAPS, POWERS), np.float32)
     for reach in range(REACH + 1):
-        powers[reach, :, :3] = (np.abs(distance) <= reach)[:, None] * distance[:, None] ** np.arange(3.0)
+        powers[reach, :, :2] = (np.abs(distance) <= reach)[:, None] * distance[:, None] ** np.arange(2.0)
     excluded = np.arange(1 << TAPS)[:, None] >> np.arange(TAPS) & 1
     pairs = excluded[:, REACH + 1 :] | excluded[:, REACH - 1 :: -1]
     reach_of = np.where(pairs.any(axis=1), pairs.argmax(axis=1), REACH).astype(np.uint8)
     away = np.abs(np.arange(VECTOR) - MIDDLE)
-    near = np.where(away < RIVAL_FROM, LARGEST, 0).astype(np.uint8)
-    off_ring = np.where((away >= MARGIN_FROM) & (away < RIVAL_FROM), 0, LARGEST).astype(np.uint8)
-    return AnswerSettings(stripes, weights, powers, reach_of, off_ring, near)
+    near = np.where(away < MARGIN_FROM, LARGEST, 0).astype(np.uint8)
+    return AnswerSettings(stripes, weights, powers, reach_of, near)

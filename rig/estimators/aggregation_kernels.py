@@ -210,7 +210,7 @@ def _go_up(
         fetch_answers(here - _AHEAD * width, columns, desk)
         _step_up(before, after, costs, messages, labels, columns, -_AHEAD * row_bytes, penalties, desk.totals,
                  desk.size, desk.hidden)  # fmt: skip
-        answer_columns(costs, here, columns, desk)
+        answer_columns(here, columns, desk)
         before, after = after, before
 
 

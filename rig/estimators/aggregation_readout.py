@@ -15,7 +15,6 @@ from rig.estimators.aggregation_answer import (
     MIDDLE,
     POWERS,
     REACH,
-    RIVAL_REACH,
     TAPS,
     VECTOR,
     Answer,
@@ -46,11 +45,7 @@ class Fields(NamedTuple):
     """Addresses of what `Answer` has."""
 
     label: int
-    spread: int
     margin: int
-    data: int
-    rival: int
-    rival_data: int
 
 
 class Found(NamedTuple):
@@ -78,11 +73,8 @@ class Desk(NamedTuple):
     weights: int
     powers: int
     reach: int
-    off_ring: int
     near: int
     winner: Found
-    rival: Found
-    ring: int
     answer: Fields
 
 
@@ -101,48 +93,49 @@ def desk_of(settings: AnswerSettings, out: Answer, memory: NDArray[np.uint8], co
     totals = -(-(hidden + labels) // VECTOR) * VECTOR + VECTOR
     size = -(-labels // _BLOCK) * _BLOCK + 2 * VECTOR
     moments = totals + columns * size - VECTOR
-    rest = moments + 2 * 4 * POWERS * columns
-    answer = Fields(
-        address_of(out.label), address_of(out.spread), address_of(out.margin),
-        address_of(out.data), address_of(out.rival), address_of(out.rival_data),
-    )  # fmt: skip
+    rest = moments + 4 * POWERS * columns
     return Desk(
         labels, -(-settings.stripes // _BLOCK) * _BLOCK, size, totals, hidden,
         address_of(settings.weights), address_of(settings.powers), address_of(settings.reach),
-        address_of(settings.off_ring), address_of(settings.near),
-        Found(rest, rest + 8 * columns, moments),
-        Found(rest + 4 * columns, rest + 9 * columns, moments + 4 * POWERS * columns),
-        rest + 10 * columns, answer,
+        address_of(settings.near), Found(rest, rest + 4 * columns, moments),
+        Fields(address_of(out.label), address_of(out.margin)),
     )  # fmt: skip
 
 
 @numba.njit(forceinline=True)
-def _find_least(columns, desk, found):  # type: ignore[no-untyped-def]
-    """The least total of each column and its label, the smallest such one."""
-    for c in range(columns):
-        totals = desk.totals + c * desk.size
-        low = load_block(totals, 0)
-        for block in range(_BLOCK, desk.end, _BLOCK):
-            low = smaller_unsigned(low, load_block(totals, block))
-        least, label = smallest_byte(low), 0
-        for block in range(desk.end - _BLOCK, -1, -_BLOCK):
-            place = first_equal(load_block(totals, block), least)
-            label = block + place if place < _BLOCK else label
-        write_int32(found.label, c, np.int32(label))
-        write_byte(found.total, c, least)
+def _least_of(totals, desk):  # type: ignore[no-untyped-def]
+    """The least total of a column."""
+    low = load_block(totals, 0)
+    for block in range(_BLOCK, desk.end, _BLOCK):
+        low = smaller_unsigned(low, load_block(totals, block))
+    return smallest_byte(low)
 
 
 @numba.njit(forceinline=True)
-def _weigh(columns, desk, found, farthest):  # type: ignore[no-untyped-def]
-    """Sums of weight times each power over the labels around those found, as far as both sides have some."""
+def _find_winners(columns, desk):  # type: ignore[no-untyped-def]
+    """The least total of each column and its label, the smallest such one."""
+    for c in range(columns):
+        totals = desk.totals + c * desk.size
+        least, label = _least_of(totals, desk), 0
+        for block in range(desk.end - _BLOCK, -1, -_BLOCK):
+            place = first_equal(load_block(totals, block), least)
+            label = block + place if place < _BLOCK else label
+        write_int32(desk.winner.label, c, np.int32(label))
+        write_byte(desk.winner.total, c, least)
+
+
+@numba.njit(forceinline=True)
+def _weigh(columns, desk):  # type: ignore[no-untyped-def]
+    """Sums of weight times each power over the labels around the winners, as far as both sides have some."""
+    found = desk.winner
     for c in range(columns):
         around = desk.totals + c * desk.size + read_int32(found.label, c)
         excluded = np.int64(equal_bytes(load_bytes(around, -MIDDLE), LARGEST)) >> (MIDDLE - REACH)
-        reach = min(np.int64(read_byte(desk.reach, excluded & ((1 << TAPS) - 1))), farthest)
+        reach = np.int64(read_byte(desk.reach, excluded & ((1 << TAPS) - 1)))
         powers = desk.powers + 4 * POWERS * (TAPS * reach + REACH)
         weights = desk.weights - 4 * np.int64(read_byte(found.total, c))
         below, above = load_four(powers, 0) * read_float32(weights, np.int64(read_byte(around, 0))), zero_four()
-        for k in range(1, farthest + 1):
+        for k in range(1, REACH + 1):
             below = below + load_four(powers, -POWERS * k) * read_float32(weights, np.int64(read_byte(around, -k)))
             above = above + load_four(powers, POWERS * k) * read_float32(weights, np.int64(read_byte(around, k)))
         store_four(found.moments, POWERS * c, below + above)
@@ -150,55 +143,30 @@ def _weigh(columns, desk, found, farthest):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _hide_winners(columns, desk):  # type: ignore[no-untyped-def]
-    """Take the winners, and what is too near for a rival, out of the totals."""
-    off_ring, near = load_bytes(desk.off_ring, 0), load_bytes(desk.near, 0)
+    """Take the winners, and what does not count for the margin, out of the totals."""
+    near = load_bytes(desk.near, 0)
     for c in range(columns):
         around = desk.totals + c * desk.size + read_int32(desk.winner.label, c)
-        window = load_bytes(around, -MIDDLE)
-        write_byte(desk.ring, c, smallest_byte(window | off_ring))
-        store_bytes(around, -MIDDLE, window | near)
+        store_bytes(around, -MIDDLE, load_bytes(around, -MIDDLE) | near)
 
 
 @numba.njit(forceinline=True)
-def _answer_winners(cost, pixel, columns, desk):  # type: ignore[no-untyped-def]
+def _write_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
     answer, found = desk.answer, desk.winner
     for c in range(columns):
-        label = read_int32(found.label, c)
-        share = np.float32(1.0) / read_float32(found.moments, POWERS * c)
-        mean = read_float32(found.moments, POWERS * c + 1) * share
-        square = read_float32(found.moments, POWERS * c + 2) * share
-        write_float32(answer.label, pixel + c, np.float32(label) + mean)
-        write_float32(answer.spread, pixel + c, np.sqrt(max(square - mean * mean, np.float32(0.0))))
-        write_byte(answer.data, pixel + c, read_byte(cost, c * desk.labels + label))
-
-
-@numba.njit(forceinline=True)
-def _answer_rivals(cost, pixel, columns, desk):  # type: ignore[no-untyped-def]
-    answer, found = desk.answer, desk.rival
-    for c in range(columns):
-        label, total = read_int32(found.label, c), read_byte(found.total, c)
         mean = read_float32(found.moments, POWERS * c + 1) / read_float32(found.moments, POWERS * c)
-        own = read_byte(cost, c * desk.labels + label)
-        margin = np.uint8(min(total, read_byte(desk.ring, c)) - read_byte(desk.winner.total, c))
-        there = total < LARGEST
-        write_float32(answer.rival, pixel + c, np.float32(label) + mean if there else np.float32(np.nan))
-        write_byte(answer.rival_data, pixel + c, own if there else np.uint8(LARGEST))
-        write_byte(answer.margin, pixel + c, margin)
+        write_float32(answer.label, pixel + c, np.float32(read_int32(found.label, c)) + mean)
+        rival = _least_of(desk.totals + c * desk.size, desk)
+        write_byte(answer.margin, pixel + c, np.uint8(rival - read_byte(found.total, c)))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def answer_columns(cost: int, pixel: int, columns: int, desk: Desk) -> None:
-    """Answer columns from the desk's totals, which are not the same afterwards.
-
-    cost: address of the first one's costs; pixel: its place among the answers.
-    """
-    _find_least(columns, desk, desk.winner)
-    _weigh(columns, desk, desk.winner, REACH)
+def answer_columns(pixel: int, columns: int, desk: Desk) -> None:
+    """Answer columns from the desk's totals, which are not the same afterwards; pixel: the first one's answer."""
+    _find_winners(columns, desk)
+    _weigh(columns, desk)
     _hide_winners(columns, desk)
-    _find_least(columns, desk, desk.rival)
-    _weigh(columns, desk, desk.rival, RIVAL_REACH)
-    _answer_winners(cost, pixel, columns, desk)
-    _answer_rivals(cost, pixel, columns, desk)
+    _write_answers(pixel, columns, desk)
 
 
 @numba.njit(forceinline=True)
@@ -207,8 +175,4 @@ def fetch_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
     answer = desk.answer
     for at in (pixel, pixel + columns - 1):
         prefetch(answer.label + 4 * at)
-        prefetch(answer.spread + 4 * at)
         prefetch(answer.margin + at)
-        prefetch(answer.data + at)
-        prefetch(answer.rival + 4 * at)
-        prefetch(answer.rival_data + at)
