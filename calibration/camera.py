@@ -53,6 +53,11 @@ class Camera:
         object.__setattr__(self, "distortion", distortion)
         object.__setattr__(self, "_lens", lens)
 
+    @property
+    def lens(self) -> LensModel:
+        """The distortion, on tangents."""
+        return self._lens
+
     def tangents(self) -> tuple[Array, Array]:
         """(u, v) of every raw pixel, each (height, width) float64; NaN where the lens model has no inverse."""
         y, x = np.mgrid[0 : self.height, 0 : self.width]

@@ -1,4 +1,4 @@
-"""The one error of this package."""
+"""The errors of this package."""
 
 
 class CalibrationError(ValueError):
@@ -6,3 +6,12 @@ class CalibrationError(ValueError):
 
     The message is one line that names the thing, the value, the limit and the next step.
     """
+
+
+class Degenerate(CalibrationError):  # noqa: N818, the input is, not the program
+    """Input from which no model follows. `reason` is for machines: one of the words of the verdict, as 'one-pose'."""
+
+    def __init__(self, reason: str, message: str) -> None:
+        """Take the reason, and the message: what is wrong, its value and limit, the condition number, the next step."""
+        super().__init__(message)
+        self.reason = reason

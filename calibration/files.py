@@ -8,93 +8,34 @@
 or, instead of `planes`, a scanner with commands of its own:
 
     scanner: {table: {command: [...], planes: rows or path}}
-    scanner: {pivot: {axis_point_m, axis_direction, zero_normal, angle_rad: [a0, a1, ...], command_range: [-1, 1]}}
+    scanner: {pivot: {axis_point_m, axis_direction, zero_normal, angle_rad: [a0, a1, ...], command_range: [-1, 1],
+                      offset_m: [b0, b1, ...], cone_rad, bow_per_rad}}        # the last three: none
 
-Optional: source_m, lag_s: {forward, backward}, speed_range_per_s: [low, high], defects: a bool .npy, provenance: any
-mapping. Paths are relative to the file's folder.
+Optional: source_m, lag_s: {forward, backward}, speed_range_per_s: [low, high], row_delay_s, gate_delay_s,
+colour_skew_s, marker_rising, defects: a bool .npy, dark_rate: a float .npy, covariance: {names, file}, identity,
+provenance: any mapping. Paths are relative to the file's folder; docs/calibration-file.md says it all.
 """
 
 import os
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ValidationError
 
 from calibration.camera import Camera
+from calibration.covariance import Covariance
 from calibration.errors import CalibrationError
-from calibration.model import Lag, RigModel
+from calibration.file_sections import FORMAT, VERSION, CalibrationFile, PlaneRows, explain
+from calibration.model import Identity, Lag, RigModel
+from calibration.parameters import with_parameters
 from calibration.scanner import PivotScanner, PlaneTable, Scanner
 
-FORMAT = "spadrig-calibration"
-VERSION = 1
-
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
-Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
-Row = Annotated[list[Number], Field(min_length=4, max_length=4)]
-PlaneRows = str | list[Row]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class _CameraSection(_Section):
-    width: int
-    height: int
-    matrix: list[Triple]
-    distortion: list[Number] = []
-
-
-class _TableSection(_Section):
-    command: list[Number]
-    planes: PlaneRows
-
-
-class _PivotSection(_Section):
-    axis_point_m: Triple
-    axis_direction: Triple
-    zero_normal: Triple
-    angle_rad: list[Number]
-    command_range: Pair = [-1.0, 1.0]
-
-
-class _ScannerSection(_Section):
-    table: _TableSection | None = None
-    pivot: _PivotSection | None = None
-
-    @model_validator(mode="after")
-    def _one(self) -> "_ScannerSection":
-        if (self.table is None) == (self.pivot is None):
-            raise ValueError("give exactly one of 'table' and 'pivot'")
-        return self
-
-
-class _LagSection(_Section):
-    forward: Number = 0.0
-    backward: Number = 0.0
-
-
-class _File(_Section):
-    format: Literal["spadrig-calibration"]
-    version: Literal[1]
-    camera: _CameraSection
-    planes: PlaneRows | None = None
-    scanner: _ScannerSection | None = None
-    source_m: Triple | None = None
-    lag_s: _LagSection = _LagSection()
-    speed_range_per_s: Pair | None = None
-    defects: str | None = None
-    provenance: dict[str, Any] = {}
-
-    @model_validator(mode="after")
-    def _one_scanner(self) -> "_File":
-        if (self.planes is None) == (self.scanner is None):
-            raise ValueError("give exactly one of 'planes' and 'scanner'")
-        return self
+_PLAIN = {"row_delay_s": 0.0, "gate_delay_s": 0.0, "colour_skew_s": 0.0, "marker_rising": True}
+"""Values of a model that its file has under the same name, and what they are where it does not."""
 
 
 def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
@@ -119,9 +60,9 @@ def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
     if content.get("version") != VERSION:
         raise CalibrationError(f"{file} has version {content.get('version')!r}; this program reads version {VERSION}")
     try:
-        parsed = _File.model_validate(content)
+        parsed = CalibrationFile.model_validate(content)
     except ValidationError as error:
-        raise CalibrationError(f"{file}: {_explain(error)}") from error
+        raise CalibrationError(f"{file}: {explain(error)}") from error
     try:
         return _build(parsed, file.parent)
     except CalibrationError as error:
@@ -129,9 +70,9 @@ def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
 
 
 def save_rig_model(model: RigModel, path: str | os.PathLike[str]) -> None:
-    """Write a model so that `load_rig_model` gives the same numbers back; a defect map becomes a .npy beside it.
+    """Write a model so that `load_rig_model` gives the same numbers back; maps and covariance become .npy beside it.
 
-    The file appears whole or not at all. Raises OSError where the folder cannot be written.
+    Each file appears whole or not at all, the YAML last. Raises OSError where the folder cannot be written.
     """
     file = Path(path)
     camera = model.camera
@@ -151,21 +92,34 @@ def save_rig_model(model: RigModel, path: str | os.PathLike[str]) -> None:
         content["source_m"] = np.asarray(model.source_m).tolist()
     if model.speed_range_per_s is not None:
         content["speed_range_per_s"] = list(model.speed_range_per_s)
+    content |= {name: getattr(model, name) for name in _PLAIN if getattr(model, name) != _PLAIN[name]}
     if model.provenance:
         content["provenance"] = dict(model.provenance)
+    if model.identity is not None:
+        content["identity"] = _identity_content(model.identity)
     if model.defects is not None:
-        beside = file.with_name(f"{file.stem}-defects.npy")
-        content["defects"] = beside.name
-        scratch = beside.with_name(f".{beside.name}.part")
-        with scratch.open("wb") as stream:
-            np.save(stream, model.defects, allow_pickle=False)
-        scratch.replace(beside)
+        content["defects"] = _save_beside(file, "defects", model.defects)
+    if model.dark_rate_per_s is not None:
+        content["dark_rate"] = _save_beside(file, "dark-rate", model.dark_rate_per_s)
+    if model.covariance is not None:
+        beside = _save_beside(file, "covariance", model.covariance.matrix)
+        content["covariance"] = {"names": list(model.covariance.names), "file": beside}
     scratch = file.with_name(f".{file.name}.part")
     scratch.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120), encoding="utf-8")
     scratch.replace(file)
 
 
-def _build(parsed: _File, folder: Path) -> RigModel:
+def _save_beside(file: Path, what: str, array: NDArray[Any]) -> str:
+    """Write an array to `FILE-what.npy` and say its name."""
+    beside = file.with_name(f"{file.stem}-{what}.npy")
+    scratch = beside.with_name(f".{beside.name}.part")
+    with scratch.open("wb") as stream:
+        np.save(stream, array, allow_pickle=False)
+    scratch.replace(beside)
+    return beside.name
+
+
+def _build(parsed: CalibrationFile, folder: Path) -> RigModel:
     camera = Camera(
         width=parsed.camera.width,
         height=parsed.camera.height,
@@ -177,8 +131,15 @@ def _build(parsed: _File, folder: Path) -> RigModel:
         defects = _load_array(folder / parsed.defects, "defects")
         if defects.dtype != np.bool_:
             raise CalibrationError(f"defects {parsed.defects} holds {defects.dtype}; it must be bool, True = unusable")
+    dark_rate = None
+    if parsed.dark_rate is not None:
+        dark_rate = _load_array(folder / parsed.dark_rate, "dark_rate")
+        if dark_rate.dtype.kind != "f":
+            raise CalibrationError(
+                f"dark_rate {parsed.dark_rate} holds {dark_rate.dtype}; it must be float32, counts/s"
+            )
     speed = parsed.speed_range_per_s
-    return RigModel(
+    model = RigModel(
         camera=camera,
         scanner=_build_scanner(parsed, folder),
         lag_s=Lag(parsed.lag_s.forward, parsed.lag_s.backward),
@@ -186,25 +147,58 @@ def _build(parsed: _File, folder: Path) -> RigModel:
         source_m=None if parsed.source_m is None else np.array(parsed.source_m, dtype=np.float64),
         defects=defects,
         provenance=parsed.provenance,
+        dark_rate_per_s=dark_rate,
+        covariance=_build_covariance(parsed, folder),
+        identity=_build_identity(parsed),
+        **{name: getattr(parsed, name) for name in _PLAIN},
     )
+    if model.covariance is not None:
+        _check_names(model, model.covariance)
+    return model
 
 
-def _build_scanner(parsed: _File, folder: Path) -> Scanner:
+def _check_names(model: RigModel, covariance: Covariance) -> None:
+    """A fit may have tried more terms than the model kept: their uncertainty counts."""
+    try:
+        with_parameters(model, covariance.names, np.zeros(len(covariance.names)))
+    except CalibrationError as error:
+        raise CalibrationError(f"covariance.names: {error}") from error
+
+
+def _build_covariance(parsed: CalibrationFile, folder: Path) -> Covariance | None:
+    section = parsed.covariance
+    if section is None:
+        return None
+    matrix = _load_array(folder / section.file, "covariance.file")
+    if matrix.dtype.kind not in "fiu":
+        raise CalibrationError(f"covariance {section.file} holds {matrix.dtype}; it must be float64 (names, names)")
+    return Covariance(tuple(section.names), matrix)
+
+
+def _build_identity(parsed: CalibrationFile) -> Identity | None:
+    section = parsed.identity
+    return None if section is None else Identity(**section.model_dump() | {"reasons": tuple(section.reasons)})
+
+
+def _build_scanner(parsed: CalibrationFile, folder: Path) -> Scanner:
     if parsed.planes is not None:
         rows = _plane_rows(parsed.planes, folder)
         return PlaneTable(command=np.arange(len(rows), dtype=np.float64), rows=rows)
-    assert parsed.scanner is not None  # _File admits exactly one of the two
+    assert parsed.scanner is not None  # CalibrationFile admits exactly one of the two
     if parsed.scanner.table is not None:
         table = parsed.scanner.table
         return PlaneTable(command=np.array(table.command, dtype=np.float64), rows=_plane_rows(table.planes, folder))
     pivot = parsed.scanner.pivot
-    assert pivot is not None  # _ScannerSection admits exactly one of the two
+    assert pivot is not None  # ScannerSection admits exactly one of the two
     return PivotScanner(
         axis_point_m=np.array(pivot.axis_point_m),
         axis_direction=np.array(pivot.axis_direction),
         zero_normal=np.array(pivot.zero_normal),
         angle_rad=np.array(pivot.angle_rad),
         command_range=(pivot.command_range[0], pivot.command_range[1]),
+        offset_m=np.array(pivot.offset_m, dtype=np.float64),
+        cone_rad=pivot.cone_rad,
+        bow_per_rad=pivot.bow_per_rad,
     )
 
 
@@ -237,34 +231,20 @@ def _scanner_content(scanner: Scanner) -> dict[str, Any]:
     if isinstance(scanner, PlaneTable):
         return {"table": {"command": scanner.command.tolist(), "planes": scanner.rows.tolist()}}
     if isinstance(scanner, PivotScanner):
-        return {
-            "pivot": {
-                "axis_point_m": scanner.axis_point_m.tolist(),
-                "axis_direction": scanner.axis_direction.tolist(),
-                "zero_normal": scanner.zero_normal.tolist(),
-                "angle_rad": scanner.angle_rad.tolist(),
-                "command_range": list(scanner.command_range),
-            }
+        pivot: dict[str, Any] = {
+            "axis_point_m": scanner.axis_point_m.tolist(),
+            "axis_direction": scanner.axis_direction.tolist(),
+            "zero_normal": scanner.zero_normal.tolist(),
+            "angle_rad": scanner.angle_rad.tolist(),
+            "command_range": list(scanner.command_range),
         }
+        if scanner.offset_m.size:
+            pivot["offset_m"] = scanner.offset_m.tolist()
+        pivot |= {name: float(getattr(scanner, name)) for name in ("cone_rad", "bow_per_rad") if getattr(scanner, name)}
+        return {"pivot": pivot}
     raise CalibrationError(f"a scanner of type {type(scanner).__name__} has no form in a calibration file")
 
 
-def _explain(error: ValidationError) -> str:
-    """The validation errors on one line, the offending key first."""
-    said = []
-    for problem in error.errors():
-        # A union reports once per member, with the member's name in the path; the key is what people need.
-        key = ".".join(str(part) for part in problem["loc"] if not str(part).startswith(("list[", "str")))
-        if problem["type"] == "extra_forbidden":
-            text = f"unknown key '{key}'; remove it or correct its spelling"
-        elif problem["type"] == "missing":
-            text = f"'{key}' is missing"
-        elif problem["type"] == "value_error":
-            text = f"{key + ': ' if key else ''}{problem['ctx']['error']}"
-        else:
-            value = repr(problem["input"])
-            shown = value if len(value) < 60 else value[:57] + "..."
-            text = f"{key} is {shown}: {problem['msg'][0].lower()}{problem['msg'][1:]}"
-        if text not in said:
-            said.append(text)
-    return "; ".join(said[:5]) + (f"; and {len(said) - 5} more" if len(said) > 5 else "")
+def _identity_content(identity: Identity) -> dict[str, Any]:
+    said = asdict(identity)
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in said.items() if value}

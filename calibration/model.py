@@ -3,13 +3,15 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.camera import Camera
+from calibration.covariance import Covariance
 from calibration.errors import CalibrationError
+from calibration.light_sheet import LightSheets, fan_origin, light_sheets
 from calibration.scanner import Scanner
 
 Array = NDArray[np.float64]
@@ -22,6 +24,24 @@ class Lag(NamedTuple):
     backward: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Of which rig this is the calibration, from when, and what became of it; compared before a model is used.
+
+    rig: hash over what matters of the rig's config. name: the rig's name. created: date and time, ISO 8601. kinds,
+    serials: of the devices by slot (spad, scanner, ...), those that were known. verdict, reasons: of the calibration
+    and of the last check of it; None where there was none.
+    """
+
+    rig: str
+    created: str
+    name: str = ""
+    kinds: Mapping[str, str] = field(default_factory=dict)
+    serials: Mapping[str, str] = field(default_factory=dict)
+    verdict: Literal["passed", "failed"] | None = None
+    reasons: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class RigModel:
     """Camera, scanner, lag, defects and provenance of one rig.
@@ -29,6 +49,11 @@ class RigModel:
     speed_range_per_s: command speeds the lag was measured at, None where it was not measured.
     source_m: (3,) where the light leaves the mirror, camera frame; None where unknown.
     defects: (height, width) bool, True = pixel not to be used; None where unknown.
+    dark_rate_per_s: (height, width) float32 counts a second in the dark; None where unknown.
+    row_delay_s: by which every row is exposed later than the row above it. gate_delay_s: from the gate's edge until
+    the light follows. colour_skew_s: by which the scanner's gate output runs ahead of its mirror. marker_rising:
+    whether the edge of a scan marker that counts is the rising one.
+    covariance: of the parameters that were estimated, see `parameters`. identity: None where nobody wrote it down.
     Raises CalibrationError for planes within 45 degrees of the search axis: along the row they give no position.
     """
 
@@ -39,14 +64,25 @@ class RigModel:
     source_m: Array | None = None
     defects: NDArray[np.bool_] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    dark_rate_per_s: NDArray[np.float32] | None = None
+    row_delay_s: float = 0.0
+    gate_delay_s: float = 0.0
+    colour_skew_s: float = 0.0
+    marker_rising: bool = True
+    covariance: Covariance | None = None
+    identity: Identity | None = None
 
     def __post_init__(self) -> None:
         """Check that the parts fit each other."""
         if not all(np.isfinite(lag) and lag >= 0 for lag in self.lag_s):
             raise CalibrationError(f"lag_s is {tuple(self.lag_s)}; a mirror follows its command by 0 s or more")
+        for name in ("row_delay_s", "gate_delay_s", "colour_skew_s"):
+            if not np.isfinite(getattr(self, name)):
+                raise CalibrationError(f"{name} is {getattr(self, name)}; it must be a finite number of seconds")
         size = (self.camera.height, self.camera.width)
-        if self.defects is not None and self.defects.shape != size:
-            raise CalibrationError(f"defect map is {_size(self.defects.shape)} pixels, the camera {_size(size)}")
+        for what, pixels in (("defect", self.defects), ("dark rate", self.dark_rate_per_s)):
+            if pixels is not None and pixels.shape != size:
+                raise CalibrationError(f"{what} map is {_size(pixels.shape)} pixels, the camera {_size(size)}")
         low, high = self.scanner.command_range
         commands = getattr(self.scanner, "command", np.linspace(low, high, 33))
         planes = self.scanner.planes(commands)
@@ -62,6 +98,22 @@ class RigModel:
     def planes(self, commands: ArrayLike) -> Array:
         """Light planes (..., 4) = nx, ny, nz, d (metres) for mirror commands (...)."""
         return self.scanner.planes(commands)
+
+    def sheets(self, commands: ArrayLike) -> LightSheets:
+        """The light at mirror commands (...): `planes`, and how they bow."""
+        return light_sheets(self.scanner, self.source_m, commands)
+
+    def mirror_command(self, commands: ArrayLike, y_px: ArrayLike, velocity_per_s: ArrayLike) -> Array:
+        """Where the mirror stands when row y sees the light, on the command's scale, for what is commanded then.
+
+        velocity_per_s: of the command, positive where it rises; the lag is that of its direction. All broadcast.
+        """
+        velocity = np.asarray(velocity_per_s, np.float64)
+        lag_s = np.where(velocity < 0, self.lag_s.backward, self.lag_s.forward)
+        result: Array = np.asarray(commands, np.float64) - velocity * (
+            lag_s + self.row_delay_s * np.asarray(y_px, np.float64)
+        )
+        return result
 
     def check_sensor(self, width: int, height: int) -> None:
         """Raise CalibrationError unless the model was made for a sensor of this size."""
@@ -94,6 +146,11 @@ class RigModel:
             self.scanner.planes(getattr(self.scanner, "command", np.linspace(low, high, 33))),
             [] if self.defects is None else np.flatnonzero(self.defects),
         )
+        bow_per_rad = getattr(self.scanner, "bow_per_rad", 0.0)
+        if bow_per_rad:
+            parts += ([bow_per_rad, *fan_origin(self.scanner, self.source_m)],)
+        if self.row_delay_s:
+            parts += ([self.row_delay_s],)
         for part in parts:
             values = np.ascontiguousarray(part, dtype="<f8")
             digest.update(str(values.shape).encode() + values.tobytes())

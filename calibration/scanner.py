@@ -4,7 +4,7 @@ The command is what the calibration was made with: a galvo's normalised drive (-
 (n, d) and (-n, -d) are the same plane; results come with n_x > 0 wherever the plane crosses the rows.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -18,6 +18,12 @@ _ROUNDING = 1e-15
 """A few units in the last place of 1.0."""
 _MOST_ANGLE_RAD = 1e3
 """Sines of larger angles lose digits; no mirror turns that far."""
+_MOST_OFFSET_M = 10.0
+"""Metres by which light could pass the axis of any mirror."""
+_MOST_CONE_RAD = 0.5
+"""A mirror that tilts the light more than this towards its axis is mounted wrongly."""
+_MOST_BOW_PER_RAD = 0.5
+"""Light at right angles to the fan's middle would otherwise leave it backwards; laser lines bow by some 0.01."""
 
 
 class Scanner(Protocol):
@@ -88,10 +94,15 @@ class PlaneTable:
 
 @dataclass(frozen=True, eq=False)
 class PivotScanner:
-    """A line turned about a fixed axis: n(a) = n0 cos a + (axis x n0) sin a, d = n . axis_point.
+    """A line turned about a fixed axis, with what a real mirror and lens add to that.
 
-    axis_point_m, axis_direction, zero_normal: (3,) float64. angle_rad: (terms,) float64, the optical angle as a
+        n(a) = cos(cone) (n0 cos a + (axis x n0) sin a) + sin(cone) axis,    d(a) = n . axis_point + offset(a)
+
+    axis_point_m, axis_direction, zero_normal: (3,) float64. angle_rad: (terms,) float64, the optical angle a as a
     polynomial in the command, constant term first. The part of zero_normal along the axis is dropped.
+    offset_m: (terms,) float64, how far the light passes the axis, a polynomial in the optical angle, constant first.
+    cone_rad: constant tilt of the normal towards the axis: the planes then touch a cone whose tip is axis_point_m.
+    bow_per_rad: a sheet that bends out of its plane by bow x (angle within the fan)^2, along n(a); see `light_sheet`.
     """
 
     axis_point_m: Array
@@ -99,6 +110,9 @@ class PivotScanner:
     zero_normal: Array
     angle_rad: Array
     command_range: tuple[float, float] = (-1.0, 1.0)
+    offset_m: Array = field(default_factory=lambda: np.zeros(0))
+    cone_rad: float = 0.0
+    bow_per_rad: float = 0.0
 
     def __post_init__(self) -> None:
         """Check and normalise."""
@@ -120,7 +134,20 @@ class PivotScanner:
                 f"pivot scanner's angle_rad reaches {reach:.3g} rad over command_range [{low:g}, {high:g}], more than "
                 f"{_MOST_ANGLE_RAD:g}; give the optical angle in radians as a polynomial in the command"
             )
-        parts = {"axis_point_m": point, "axis_direction": axis, "zero_normal": normal, "angle_rad": angle}
+        offset = np.array(self.offset_m, dtype=np.float64)
+        if offset.ndim != 1 or not np.all(np.isfinite(offset)):
+            raise CalibrationError("pivot scanner's offset_m must be finite polynomial terms in metres, constant first")
+        with np.errstate(over="ignore", invalid="ignore"):
+            passes = float(np.polynomial.polynomial.polyval(reach, np.abs(offset))) if offset.size else 0.0
+        for what, size, most in (
+            ("offset_m over the whole turn", passes, _MOST_OFFSET_M),
+            ("cone_rad", self.cone_rad, _MOST_CONE_RAD),
+            ("bow_per_rad", self.bow_per_rad, _MOST_BOW_PER_RAD),
+        ):
+            if not abs(size) <= most:
+                raise CalibrationError(f"pivot scanner's {what} is {size:g}; it must lie within -{most:g} and {most:g}")
+        parts = {"axis_point_m": point, "axis_direction": axis, "zero_normal": normal}
+        parts |= {"angle_rad": angle, "offset_m": offset}
         for name, value in parts.items():
             value.flags.writeable = False
             object.__setattr__(self, name, value)
@@ -128,11 +155,21 @@ class PivotScanner:
 
     def planes(self, commands: ArrayLike) -> Array:
         """Planes (..., 4) for commands (...). Raises CalibrationError outside command_range."""
+        planes = self.turned(commands)
+        result: Array = np.where(planes[..., :1] < 0, -planes, planes)
+        return result
+
+    def turned(self, commands: ArrayLike) -> Array:
+        """The same planes with the sign of n(a), along which offset_m, cone_rad and bow_per_rad count."""
         at = _inside(commands, self.command_range)
         angle = np.polynomial.polynomial.polyval(at, self.angle_rad)[..., None]
         normal = self.zero_normal * np.cos(angle) + np.cross(self.axis_direction, self.zero_normal) * np.sin(angle)
-        planes = np.concatenate([normal, np.sum(normal * self.axis_point_m, axis=-1, keepdims=True)], axis=-1)
-        result: Array = np.where(planes[..., :1] < 0, -planes, planes)
+        if self.cone_rad != 0:
+            normal = np.cos(self.cone_rad) * normal + np.sin(self.cone_rad) * self.axis_direction
+        distance = np.sum(normal * self.axis_point_m, axis=-1, keepdims=True)
+        if self.offset_m.size:
+            distance = distance + np.polynomial.polynomial.polyval(angle, self.offset_m)
+        result: Array = np.concatenate([normal, distance], axis=-1)
         return result
 
 

@@ -3,6 +3,7 @@
 Ray r = (u, v, 1), plane n.X = d:  z = d / (n.r). Along an image row dz/dx = -(z^2 / d) (n . dr/dx), whose sign says on
 which side of the stripe the near points lie. Everything broadcasts; NaN is 'no depth', never inf, never a warning.
 n.r cancels where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps 1e-9 of z at the least.
+Light that bows out of its plane is in `light_sheet`.
 """
 
 from typing import Final

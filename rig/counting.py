@@ -73,6 +73,7 @@ class FrameTally:
     dark_counts: (rows, width) uint32 over n_dark frames with the gate low, None where there are none.
     width: sensor width in pixels.
     dark_frames: (width,) int32, those of the n_dark frames in which a pixel was used; None: all of them.
+    velocity_per_s: of the mirror command over the columns, negative where it fell, 0 where nobody says.
     """
 
     n_frames: NDArray[np.int32]
@@ -81,6 +82,7 @@ class FrameTally:
     n_dark: int
     width: int
     dark_frames: NDArray[np.int32] | None = None
+    velocity_per_s: float = 0.0
 
     def intensity(self) -> NDArray[np.uint32]:
         """Counts summed over the columns, (rows, width) uint32."""

@@ -3,7 +3,7 @@
 import os
 import time
 
-from calibration.model import RigModel
+from rig.calibration_identity import CalibrationUse, accepted_by
 from rig.config import EstimateConfig
 from rig.counting import SweepLayout
 from rig.cube import Cube, column_commands, count_map
@@ -14,10 +14,10 @@ from rig.warm_up import warm_up
 
 
 def reconstruct_cube(
-    cube: Cube, model: RigModel, estimate: EstimateConfig, out: OutFolder, progress: Progress | None = None
+    cube: Cube, calibration: CalibrationUse, estimate: EstimateConfig, out: OutFolder, progress: Progress | None = None
 ) -> RunResult:
     """All maps of a checked cube. An interrupt ends the run after its last whole map, with verdict 'aborted'."""
-    plan = cube.plan
+    plan, model = cube.plan, calibration.model
     threads = estimate.threads or os.cpu_count() or 1
     reconstructor = Reconstructor(
         model,
@@ -37,7 +37,7 @@ def reconstruct_cube(
         )
     )
     with Run(out, tally) as run:
-        run.rays = geometry.u, geometry.v
+        run.rays = geometry.rays
         verdict = Verdict.COMPLETE
         try:
             for index in range(cube.maps):
@@ -55,8 +55,11 @@ def reconstruct_cube(
             "command": "reconstruct",
             "cube": cube.path.absolute(),
             "plan": plan.model_dump(mode="json"),
-            "calibration": {"id": model.fingerprint(), "provenance": dict(model.provenance)},
+            "calibration": calibration.content(),
             "estimate": estimate.model_dump(mode="json"),
             "gaps": [],
         }
-        return run.finish(RunFrames(n, n, 0, None, n), n / float(plan.frame_rate), verdict, manifest)
+        frames = RunFrames(n, n, 0, None, n)
+        return run.finish(
+            frames, n / float(plan.frame_rate), verdict, manifest, accepted_calibration=accepted_by(calibration)
+        )

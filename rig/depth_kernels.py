@@ -23,8 +23,12 @@ def fill_rows(
     v: NDArray[np.float32],
     inverse_depth: NDArray[np.float32],
     depth_confidence: NDArray[np.float32],
+    commands: NDArray[np.float64],
+    command: NDArray[np.float64],
 ) -> None:
     """Write inverse depth and its confidence (rows, width) for pixels between stripes of neighbouring columns.
+
+    And the mirror's command there, from the columns' `commands`, where `command` has room for any.
 
     Two stripes of one row lie on one surface when their columns are at most MAX_COLUMN_GAP apart and their spacing is
     that of equal depth within 1 px + 3 sd. Between them the column is linear in x. The more confident pair wins.
@@ -63,4 +67,6 @@ def fill_rows(
                     if w > 1e-6:
                         inverse_depth[y, x] = w
                         depth_confidence[y, x] = sure
+                        if command.size:
+                            command[y, x] = (1.0 - f) * commands[c] + f * commands[other]
                 break

@@ -5,7 +5,7 @@ so the depth range becomes one interval of pixels. No rectification is assumed; 
 the interval simply moves from row to row.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calibration.model import RigModel
 from calibration.triangulation import LEAST_OFFSET_M, near_side
+from rig.bent_light import BentLight, bent_light, bent_u, beside_px, is_bent
 from rig.errors import UsageError
 
 WORD_PX: Final = 64
@@ -25,7 +26,8 @@ MARGIN_PX = 10
 class SweepGeometry:
     """Rays, planes and search windows of one sweep.
 
-    u, v: float32 (rows, width) ray tangents of every raw pixel, NaN where the camera model is not invertible.
+    u, v: float32 (rows, width) ray tangents of every raw pixel, NaN where the camera model is not invertible; where the
+    light is bent those that meet the planes nearly where the true rays meet the light.
     plane: float64 (columns, 3), the plane as p.X = 1 (p = n/d), so that inverse depth is p.(u, v, 1).
     planes: float64 (columns, 4) as (n, d), |n| = 1.
     x_lo, x_hi: int32 (rows, columns), first and last pixel of the search window; empty where x_lo > x_hi.
@@ -33,7 +35,7 @@ class SweepGeometry:
     near_is_left: True where near points lie at smaller x than far ones (scanner on the left).
     depth_range_m: nearest and farthest depth. defects: bool (rows, width), True where a pixel is not to be used.
     others: float64 (columns, lines - 1, 3), `plane` of the columns that other lines light together with each; None: a
-    line is alone.
+    line is alone. light: what is to be put right in depths from planes; None: nothing.
     """
 
     u: NDArray[np.float32]
@@ -48,6 +50,18 @@ class SweepGeometry:
     depth_range_m: tuple[float, float]
     defects: NDArray[np.bool_]
     others: NDArray[np.float64] | None = None
+    light: BentLight | None = None
+
+    @property
+    def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """True rays (u, v), each (rows, width)."""
+        return (self.u, self.v) if self.light is None else (self.light.u, self.light.v)
+
+    def bound_to(self, model: RigModel, commands: NDArray[np.float64], velocity_per_s: float) -> "SweepGeometry":
+        """The same windows with the light of a sweep whose columns were bound to `commands`, at this velocity."""
+        planes = model.planes(commands)
+        light = None if self.light is None else replace(self.light, commands=commands, velocity_per_s=velocity_per_s)
+        return replace(self, planes=planes, plane=planes[:, :3] / planes[:, 3:], light=light)
 
     @property
     def rows(self) -> int:
@@ -83,8 +97,8 @@ class SweepGeometry:
         return np.asarray(left + px_per_tangent * (u - u_left))
 
 
-def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: tuple[float, float]) -> SweepGeometry:
-    """Search windows of `planes` (columns, 4) for a camera and a depth range in metres.
+def sweep_geometry(model: RigModel, commands: NDArray[np.float64], depth_range_m: tuple[float, float]) -> SweepGeometry:
+    """Search windows of the light at mirror commands (columns,), for a camera and a depth range in metres.
 
     Raises UsageError where a plane passes through the camera (its depth is not determined) or where no column can be
     seen at all within the depth range.
@@ -93,7 +107,7 @@ def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: 
 
     u64, v64 = model.camera.tangents()
     u, v = np.ascontiguousarray(u64, dtype=np.float32), np.ascontiguousarray(v64, dtype=np.float32)
-    planes = np.ascontiguousarray(planes, dtype=np.float64)
+    planes = np.ascontiguousarray(model.planes(commands))
     offset = planes[:, 3]
     if np.any(np.abs(offset) < LEAST_OFFSET_M):
         worst = int(np.argmin(np.abs(offset)))
@@ -104,6 +118,12 @@ def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: 
     plane = planes[:, :3] / offset[:, None]
     near_is_left = bool(near_side(0.0, 0.0, planes[len(planes) // 2], model.camera) < 0)
     near_m, far_m = depth_range_m
+    light, beside = None, 0
+    if is_bent(model):
+        light = bent_light(model, u, v, commands)
+        bent = bent_u(model, u64, v64, 2.0 / (1.0 / near_m + 1.0 / far_m))
+        beside = beside_px(model, (u64, v64), bent, commands, depth_range_m)
+        u = bent.astype(np.float32)
     x_lo, x_hi = row_windows(u, v, plane, 1.0 / far_m, 1.0 / near_m)
     seen = x_lo <= x_hi
     if not seen.any():
@@ -112,6 +132,9 @@ def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: 
             "widen depth_range or check the calibration"
         )
     width = u.shape[1]
+    if beside:
+        x_lo = np.where(seen, np.maximum(x_lo - np.int32(beside), 0), x_lo)
+        x_hi = np.where(seen, np.minimum(x_hi + np.int32(beside), width - 1), x_hi)
     padded = -(-width // WORD_PX) * WORD_PX
     big = np.int32(padded)
     first = np.where(seen, x_lo, big).min(axis=0) - MARGIN_PX
@@ -125,7 +148,9 @@ def sweep_geometry(model: RigModel, planes: NDArray[np.float64], depth_range_m: 
     nearest = some[np.searchsorted(some, np.arange(x_lo.shape[1])).clip(max=len(some) - 1)]
     x0 = np.minimum(first, padded - window).astype(np.int32)[nearest]
     defects = np.zeros(u.shape, np.bool_) if model.defects is None else model.defects
-    return SweepGeometry(u, v, plane, planes, x_lo, x_hi, x0, window, near_is_left, (near_m, far_m), defects)
+    return SweepGeometry(
+        u, v, plane, planes, x_lo, x_hi, x0, window, near_is_left, (near_m, far_m), defects, light=light
+    )
 
 
 def uncalibrated_geometry(rows: int, width: int, columns: int) -> SweepGeometry:

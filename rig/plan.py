@@ -349,7 +349,7 @@ def _windows(
     from rig.geometry import sweep_geometry
 
     try:
-        geometry = sweep_geometry(model, model.planes(commands), scan.depth_range)
+        geometry = sweep_geometry(model, commands, scan.depth_range)
     except UsageError as error:
         raise PlanError(f"scan.depth_range: {error}") from error
     if lines is not None:

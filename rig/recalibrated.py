@@ -7,9 +7,15 @@ import numpy as np
 from calibration.errors import CalibrationError
 from calibration.model import RigModel
 from rig.errors import UsageError
-from rig.geometry import sweep_geometry
+from rig.geometry import WORD_PX, sweep_geometry
 from rig.multi_line import window_overlap
 from rig.scan_plan import ScanPlan
+
+
+def whole_rows(plan: ScanPlan) -> ScanPlan:
+    """The plan of whole frames, where nothing is known of the rig any more: every pixel can be anybody's."""
+    padded = -(-plan.width // WORD_PX) * WORD_PX
+    return replace(plan, x0=np.zeros_like(plan.x0), window=padded, windows=None)
 
 
 def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
@@ -22,7 +28,7 @@ def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
         model.check_sensor(plan.width, plan.rows)
         model.check_speed(plan.speed_per_s)
         model.planes(np.array(plan.command_range))
-        geometry = sweep_geometry(model, model.planes(plan.commands), plan.depth_range_m)
+        geometry = sweep_geometry(model, plan.commands, plan.depth_range_m)
     except CalibrationError as error:
         raise UsageError(f"calibration: {error}") from error
     lags = {1: model.lag_s.forward, -1: model.lag_s.backward}

@@ -75,7 +75,7 @@ class Reconstructor:
         else:
             self.estimator = create_estimator(estimator, threads, temporal_prior=temporal_prior)
         if model is not None:
-            self.geometry = sweep_geometry(model, model.planes(self._commands), depth_range_m)
+            self.geometry = sweep_geometry(model, self._commands, depth_range_m)
             if lines is not None:
                 self.geometry = replace(self.geometry, others=lines.others(self.geometry.plane))
         elif sensor is not None:
@@ -124,8 +124,7 @@ class Reconstructor:
             commands = np.interp(column, np.arange(len(self._commands)), self._commands)
         else:
             commands = self._lines.bound_commands(self._commands, column)
-        planes = self._model.planes(commands)
-        return replace(self.geometry, planes=planes, plane=planes[:, :3] / planes[:, 3:])
+        return self.geometry.bound_to(self._model, commands, sweep.velocity_per_s)
 
     def _fog(self, sweep: FrameTally, stripe: StripeTable) -> FogEstimate:
         """What the map says of the medium; nothing where its estimator learns none, or without a geometry."""

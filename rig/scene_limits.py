@@ -67,7 +67,7 @@ def _lights(
     power_w: float, exposure_s: float, rng: np.random.Generator,
 ) -> list[RowLight]:  # fmt: skip
     """One row of each column that has a stripe there."""
-    geometry = sweep_geometry(model, model.planes(commands), depth_range_m)
+    geometry = sweep_geometry(model, commands, depth_range_m)
     found = []
     for column, command in enumerate(commands):
         seen = np.flatnonzero(geometry.x_lo[:, column] <= geometry.x_hi[:, column])

@@ -5,7 +5,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -162,11 +162,12 @@ class SweepAssembler:
         ]
         self._gaps = [gap for gap in self._gaps if gap[1] >= clock.end_frame]
         begun = time.perf_counter()
-        volume = self._counter.finish()
+        direction = self._plan.leg(clock.sweep).direction
+        volume = replace(self._counter.finish(), velocity_per_s=direction * self._plan.speed_per_s)
         self._count_s += time.perf_counter() - begun
         data = SweepData(
             index=self._first_index + clock.sweep - self._start.sweep,
-            direction=self._plan.leg(clock.sweep).direction,
+            direction=direction,
             volume=volume,
             residual_columns=clock.residual_columns,
             clock_error=clock.clock_error,

@@ -23,6 +23,7 @@ SCOPE = (
         for name in ("binding*", "blanking*", "counting*", "cube", "depth*", "geometry*", "marker_line")
     ),
     *(f"rig/{name}.py" for name in ("mirror_path", "path_search", "plan", "scan_plan", "scoring", "stripes", "sweeps")),
+    "rig/bent_light*.py",
     "rig/windows.py",
     *(f"rig/{name}.py" for name in ("error_bounds", "fog_kernels", "fog_meter", "limits", "row_light", "scene_limits")),
     *(f"rig/{name}.py" for name in ("adaptive", "intervals", "multi_line*", "tradeoff_rows")),

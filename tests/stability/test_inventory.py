@@ -49,6 +49,9 @@ ELSEWHERE = {
         "tests/unit/rig/test_multi_line.py", "rig.multi_line:*", "rig.multi_line_counter:*", "rig.multi_line_kernels:*",
     ),
     "lines by the number, as the config says": ("tests/unit/rig/test_multi_line_config.py", "rig.multi_line_config:*"),
+    "sheets, in one kernel; those of any numbers in test_calibration_model.py": (
+        "tests/unit/rig/test_bent_light.py", "rig.bent_light:*", "rig.bent_light_kernels:*",
+    ),
     "intervals against drawn repeats": ("tests/unit/rig/test_intervals.py", "rig.intervals:*"),
     "a missing answer's charge": ("tests/unit/rig/test_tradeoff.py", "rig.tradeoff_rows:*"),
     "powers of two off the bits of a number": ("tests/unit/estimators/test_powers.py", "rig.estimators.powers:*"),

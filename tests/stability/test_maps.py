@@ -44,7 +44,7 @@ def test_windows_hold_what_lies_in_the_depth_range_and_nothing_else(
     commands = np.arange(len(rows), dtype=float)
     try:
         model = RigModel(camera, PlaneTable(commands, rows))
-        geometry = sweep_geometry(model, model.planes(commands), (near, near * ratio))
+        geometry = sweep_geometry(model, commands, (near, near * ratio))
     except (CalibrationError, UsageError):
         return
     assert (geometry.rows, geometry.width, geometry.columns) == (5, width, len(rows))

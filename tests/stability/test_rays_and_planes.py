@@ -206,4 +206,4 @@ def test_a_model_of_no_baseline_is_refused_where_depth_is_asked_for() -> None:
     with pytest.raises(CalibrationError):
         model.check_speed(np.nan)
     with pytest.raises(UsageError, match="baseline"):
-        sweep_geometry(model, model.planes(np.arange(2.0)), (1.0, 8.0))
+        sweep_geometry(model, np.arange(2.0), (1.0, 8.0))

@@ -26,7 +26,7 @@ def rig_model(g: Geometry) -> RigModel:
 
 
 def geometry_of(g: Geometry, depth_range_m=DEPTH_RANGE_M) -> SweepGeometry:
-    return sweep_geometry(rig_model(g), g.planes, depth_range_m)
+    return sweep_geometry(rig_model(g), np.arange(float(g.columns)), depth_range_m)
 
 
 def volume_of(counts, geometry: SweepGeometry, exposures, **other) -> CountVolume:

@@ -1,13 +1,17 @@
 """The calibration file: what is written is read back, and what is wrong is said in one line."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from calibration import (
     CalibrationError,
     Camera,
+    Covariance,
+    Identity,
     Lag,
     PivotScanner,
     PlaneTable,
@@ -84,6 +88,43 @@ def test_what_is_saved_is_read_back(
     assert not list(tmp_path.glob(".*"))
 
 
+def test_what_a_calibration_finds_out_is_saved_and_read_back(tmp_path: Path) -> None:
+    scanner = replace(pivot(), offset_m=np.array([1e-3, 1 / 3]), cone_rad=0.01, bow_per_rad=-0.02)
+    identity = Identity(
+        "0f3a", "2026-11-22T10:00:00+00:00", "bench", {"spad": "spb-usb"}, {"spad": "7"}, "failed", ("no-tilt",)
+    )
+    model = RigModel(
+        camera([-0.1, 0, 0, 0]),
+        scanner,
+        dark_rate_per_s=np.full((512, 512), 1 / 3, np.float32),
+        row_delay_s=1e-8,
+        gate_delay_s=2e-6,
+        colour_skew_s=-1e-6,
+        marker_rising=False,
+        covariance=Covariance(("fx", "axis_shift_1"), np.array([[0.04, 1e-5], [1e-5, 1e-8]])),
+        identity=identity,
+    )
+    save_rig_model(model, tmp_path / "rig.yaml")
+    again = load_rig_model(tmp_path / "rig.yaml")
+    assert again.fingerprint() == model.fingerprint()
+    assert np.array_equal(again.scanner.turned([-1, 0.3]), scanner.turned([-1, 0.3]))
+    assert again.identity == identity
+    for name in ("row_delay_s", "gate_delay_s", "colour_skew_s", "marker_rising"):
+        assert getattr(again, name) == getattr(model, name)
+    assert np.array_equal(again.dark_rate_per_s, model.dark_rate_per_s)
+    assert again.covariance.names == ("fx", "axis_shift_1")
+    assert np.array_equal(again.covariance.matrix, model.covariance.matrix)
+
+
+def test_files_and_fingerprints_of_models_without_all_that_are_what_they_were(tmp_path: Path) -> None:
+    model = load_rig_model(BUNDLED)
+    assert model.fingerprint() == "3dadb6d2d7bf9dff"
+    save_rig_model(model, tmp_path / "rig.yaml")
+    kept = yaml.safe_load((tmp_path / "rig.yaml").read_text())
+    assert list(kept) == ["format", "version", "camera", "scanner", "lag_s", "source_m", "provenance"]
+    assert list(kept["scanner"]["pivot"])[-1] == "command_range"
+
+
 def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
     base = RigModel(camera([]), table())
     others = [
@@ -91,8 +132,14 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
         RigModel(camera([]), pivot()),
         RigModel(camera([]), table(), lag_s=Lag(1e-6, 0)),
         RigModel(Camera(512, 511, MATRIX, np.zeros(0)), table()),
+        RigModel(camera([]), table(), row_delay_s=1e-9),
+        *(
+            RigModel(camera([]), replace(pivot(), bow_per_rad=0.01), source_m=at)
+            for at in (None, np.array([0, 1e-3, 0]))
+        ),
     ]
-    assert len({model.fingerprint() for model in [base, *others]}) == 5
+    assert len({model.fingerprint() for model in [base, *others]}) == 8
+    assert RigModel(camera([]), table(), gate_delay_s=1e-6).fingerprint() == base.fingerprint()
     assert RigModel(camera([]), table()).fingerprint() == base.fingerprint()
 
 
@@ -117,10 +164,19 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
         (HEAD + CAMERA + "scanner: {}\n", "exactly one of 'table' and 'pivot'"),
         (HEAD + CAMERA + ROWS + "defects: planes.npy\n", "it must be bool"),
         (HEAD + CAMERA + ROWS + "lag_s: {forward: -1.0}\n", "lag_s is"),
+        (HEAD + CAMERA + ROWS + "row_delay_s: .inf\n", "row_delay_s is inf"),
+        (HEAD + CAMERA + ROWS + "dark_rate: planes.npy\n", "dark rate map is 4 x 3 pixels"),
+        (HEAD + CAMERA + ROWS + "covariance: {names: [fx], file: planes.npy}\n", "shape (3, 4) for 1 names"),
+        (
+            HEAD + CAMERA + ROWS + "covariance: {names: [bow], file: one.npy}\n",
+            "the model has no parameter bow; it has fx",
+        ),
+        (HEAD + CAMERA + ROWS + "identity: {rig: a, created: b, verdict: fine}\n", "identity.verdict is 'fine'"),
     ],
 )
 def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path: Path, text: str, said: str) -> None:
     np.save(tmp_path / "planes.npy", np.zeros((3, 4)))
+    np.save(tmp_path / "one.npy", np.ones((1, 1)))
     file = write(tmp_path, text)
     with pytest.raises(CalibrationError) as caught:
         load_rig_model(file)

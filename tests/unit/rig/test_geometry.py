@@ -102,7 +102,7 @@ def test_stored_windows_hold_every_search_interval_with_its_margin(rig, width, h
 def test_the_margin_is_kept_on_both_sides_of_every_single_column(rig):
     g = Geometry.build(width=512, height=3, columns=120, **RIGS[rig])
     for c in range(20, 100):
-        geometry = sweep_geometry(rig_model(g), g.planes[c : c + 1], (1.0, 8.0))
+        geometry = sweep_geometry(rig_model(g), np.array([float(c)]), (1.0, 8.0))
         first, last = geometry.x_lo.min(), geometry.x_hi.max()
         assert geometry.x0[0] <= max(first - MARGIN_PX, 0) < geometry.x0[0] + 64
         assert geometry.x0[0] + geometry.window > min(last + MARGIN_PX, 511)
@@ -118,7 +118,7 @@ def test_a_lens_that_does_not_reach_the_corners_leaves_them_out():
     matrix = np.array([[60.0, 0, 79.5], [0, 60.0, 29.5], [0, 0, 1]])
     camera = Camera(160, 60, matrix, np.array([-0.3, 0.0, 0.0, 0.0]))
     planes = Geometry.build(columns=40).planes
-    geometry = sweep_geometry(RigModel(camera, PlaneTable(np.arange(40.0), planes)), planes, (0.3, 50.0))
+    geometry = sweep_geometry(RigModel(camera, PlaneTable(np.arange(40.0), planes)), np.arange(40.0), (0.3, 50.0))
     blind = np.isnan(geometry.u)
     assert 0.05 < blind.mean() < 0.95
     y, c = np.nonzero(geometry.x_lo <= geometry.x_hi)
@@ -130,8 +130,9 @@ def test_a_plane_through_the_camera_is_refused_with_its_column():
     g = Geometry.build(width=100, height=4, columns=9)
     planes = g.planes.copy()
     planes[5, 3] = 3e-8
+    model = RigModel(rig_model(g).camera, PlaneTable(np.arange(9.0), planes))
     with pytest.raises(UsageError, match=r"column 5 passes 3\.0e-08 m") as error:
-        sweep_geometry(rig_model(g), planes, (1.0, 8.0))
+        sweep_geometry(model, np.arange(9.0), (1.0, 8.0))
     assert "\n" not in str(error.value)
 
 

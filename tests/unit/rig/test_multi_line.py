@@ -119,7 +119,7 @@ def test_a_plan_with_lines_is_kept_and_read_back_and_one_without_is_written_as_b
 def test_the_overlap_is_the_share_of_a_window_that_other_windows_cover():
     grid, commands = line_grid(OFFSETS, 40, (-0.1, 0.1))
     model = rig_model()
-    geometry = sweep_geometry(model, model.planes(commands), (1.0, 8.0))
+    geometry = sweep_geometry(model, commands, (1.0, 8.0))
     shares = []
     for c in range(40):
         others = [o for o in grid.columns_at()[grid.place[c]] if o != c]

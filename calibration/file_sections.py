@@ -1,0 +1,135 @@
+"""What a calibration file may say, section by section, and what is said of a file that says something else."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+FORMAT = "spadrig-calibration"
+VERSION = 1
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Row = Annotated[list[Number], Field(min_length=4, max_length=4)]
+PlaneRows = str | list[Row]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CameraSection(_Section):
+    """The camera, in pixels."""
+
+    width: int
+    height: int
+    matrix: list[Triple]
+    distortion: list[Number] = []
+
+
+class TableSection(_Section):
+    """Planes at commands."""
+
+    command: list[Number]
+    planes: PlaneRows
+
+
+class PivotSection(_Section):
+    """A mirror that turns about an axis, as `PivotScanner` has it."""
+
+    axis_point_m: Triple
+    axis_direction: Triple
+    zero_normal: Triple
+    angle_rad: list[Number]
+    command_range: Pair = [-1.0, 1.0]
+    offset_m: list[Number] = []
+    cone_rad: Number = 0.0
+    bow_per_rad: Number = 0.0
+
+
+class ScannerSection(_Section):
+    """One of the two forms."""
+
+    table: TableSection | None = None
+    pivot: PivotSection | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> "ScannerSection":
+        if (self.table is None) == (self.pivot is None):
+            raise ValueError("give exactly one of 'table' and 'pivot'")
+        return self
+
+
+class LagSection(_Section):
+    """By how much the mirror follows a rising and a falling command."""
+
+    forward: Number = 0.0
+    backward: Number = 0.0
+
+
+class CovarianceSection(_Section):
+    """Names of the parameters, and the file of their matrix."""
+
+    names: list[str]
+    file: str
+
+
+class IdentitySection(_Section):
+    """Of which rig, as `Identity` has it."""
+
+    rig: str
+    created: str
+    name: str = ""
+    kinds: dict[str, str] = {}
+    serials: dict[str, str] = {}
+    verdict: Literal["passed", "failed"] | None = None
+    reasons: list[str] = []
+
+
+class CalibrationFile(_Section):
+    """The whole file."""
+
+    format: Literal["spadrig-calibration"]
+    version: Literal[1]
+    camera: CameraSection
+    planes: PlaneRows | None = None
+    scanner: ScannerSection | None = None
+    source_m: Triple | None = None
+    lag_s: LagSection = LagSection()
+    speed_range_per_s: Pair | None = None
+    row_delay_s: Number = 0.0
+    gate_delay_s: Number = 0.0
+    colour_skew_s: Number = 0.0
+    marker_rising: bool = True
+    defects: str | None = None
+    dark_rate: str | None = None
+    covariance: CovarianceSection | None = None
+    identity: IdentitySection | None = None
+    provenance: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _one_scanner(self) -> "CalibrationFile":
+        if (self.planes is None) == (self.scanner is None):
+            raise ValueError("give exactly one of 'planes' and 'scanner'")
+        return self
+
+
+def explain(error: ValidationError) -> str:
+    """The validation errors on one line, the offending key first."""
+    said = []
+    for problem in error.errors():
+        # A union reports once per member, with the member's name in the path; the key is what people need.
+        key = ".".join(str(part) for part in problem["loc"] if not str(part).startswith(("list[", "str")))
+        if problem["type"] == "extra_forbidden":
+            text = f"unknown key '{key}'; remove it or correct its spelling"
+        elif problem["type"] == "missing":
+            text = f"'{key}' is missing"
+        elif problem["type"] == "value_error":
+            text = f"{key + ': ' if key else ''}{problem['ctx']['error']}"
+        else:
+            value = repr(problem["input"])
+            shown = value if len(value) < 60 else value[:57] + "..."
+            text = f"{key} is {shown}: {problem['msg'][0].lower()}{problem['msg'][1:]}"
+        if text not in said:
+            said.append(text)
+    return "; ".join(said[:5]) + (f"; and {len(said) - 5} more" if len(said) > 5 else "")
