@@ -1,0 +1,70 @@
+"""One view of a calibration board held still: where its corners lie, and when the line passed over each pixel.
+
+A pixel's passage is the mirror command at which the line's centre crosses it. Its albedo is the same in every column,
+so the board's print does not pull at the passage, as it would at a stripe sought along a row.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corners:
+    """Corners of a board in a picture.
+
+    ids: (n,) int32, the board's numbers. px: (n, 2) float64 raw pixels, centres at integers. sd_px: (n,) float64, of
+    either coordinate, as the picture's noise makes it; None where nobody knows.
+    """
+
+    ids: NDArray[np.int32]
+    px: Array
+    sd_px: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Passages:
+    """When the line's centre crossed the pixels of one sweep.
+
+    x_px, y_px: (m,) float64. command: (m,) float64, as commanded at that instant, without any lag. sd: (m,) float64 in
+    command units. direction: +1 while the command rises, else -1. speed_per_s: how fast it does, above 0.
+    """
+
+    x_px: Array
+    y_px: Array
+    command: Array
+    sd: Array
+    direction: int
+    speed_per_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What is known of one pose of the board. picture: (height, width) float32, photons per pixel and exposure."""
+
+    name: str
+    corners: Corners | None
+    passages: tuple[Passages, ...] = ()
+    picture: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardPose:
+    """X_camera = R X_board + position. rotation: (3,) float64 Rodrigues vector in rad; position_m: (3,) float64."""
+
+    rotation: Array
+    position_m: Array
+
+    def to_camera(self, points_m: ArrayLike) -> Array:
+        """Points (..., 3) of the board in the camera's frame, metres."""
+        moved: Array = np.asarray(points_m, np.float64) @ self.matrix.T + self.position_m
+        return moved
+
+    @property
+    def matrix(self) -> Array:
+        """(3, 3) float64 rotation; its columns are the board's x, y and normal in the camera's frame."""
+        return np.asarray(cv2.Rodrigues(np.asarray(self.rotation, np.float64))[0], np.float64)

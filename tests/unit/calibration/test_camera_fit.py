@@ -1,0 +1,147 @@
+"""The camera from corners: as good as it says, with what does not fit named, and nothing from too little."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.camera_fit import fit_camera
+from calibration.errors import CalibrationError, Degenerate
+from calibration.views import Corners, View
+from tests.reference.board_pictures import CHARUCO, DISTORTION, SIZE, corners_px, pose
+from tests.reference.chessboards import FOLDER, pairs
+
+TRUE = dict(zip(("fx", "fy", "cx", "cy"), (380.0, 379.0, 162.0, 117.0), strict=True))
+SD_PX = 0.05
+
+
+def shown(seed: int, count: int = 10, noise_px: float = SD_PX) -> list[View]:
+    """Boards as a person shows them, corners with noise, those outside the picture missing."""
+    rng = np.random.default_rng(seed)
+    return [seen(i, rng, noise_px, turn=rng.uniform(-0.6, 0.6, 3) * [1, 1, 0.4]) for i in range(count)]
+
+
+def seen(number: int, rng: np.random.Generator, noise_px: float, turn, distance_m: float | None = None) -> View:
+    away = rng.uniform(0.8, 1.6) if distance_m is None else distance_m
+    px = corners_px(CHARUCO, pose(CHARUCO, away, tuple(rng.uniform(-0.15, 0.15, 2)), tuple(turn)))
+    px += rng.normal(0, noise_px, px.shape)
+    inside = ((px >= 2) & (px <= np.array(SIZE) - 3)).all(axis=1)
+    return View(f"{number:03d}", Corners(np.flatnonzero(inside).astype(np.int32), px[inside]))
+
+
+def test_the_true_camera_lies_where_the_covariance_says():
+    scaled = []
+    for seed in range(12):
+        fit = fit_camera(shown(seed), CHARUCO, SIZE)
+        truth = np.array([*TRUE.values(), *DISTORTION])
+        found = np.concatenate([fit.camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], fit.camera.distortion])
+        scaled.append(np.linalg.solve(np.linalg.cholesky(fit.covariance.matrix), found - truth))
+        assert fit.outliers == ()
+        assert fit.rms_px == pytest.approx(SD_PX * np.sqrt(2), rel=0.15)
+        assert fit.sd["fx"] < 3
+    assert 0.8 < np.std(scaled) < 1.2
+    assert fit.covariance.names[:5] == ("fx", "fy", "cx", "cy", "k1")
+    assert 0.5 < fit.coverage.share <= 1
+    assert fit.coverage.distance_m.min() > 0.7
+    assert fit.condition < 1e6
+
+
+@pytest.mark.parametrize("terms", [0, 4])
+def test_other_lens_models_have_their_own_number_of_terms(terms):
+    fit = fit_camera(shown(1, 12), CHARUCO, SIZE, distortion_terms=terms)
+    assert len(fit.camera.distortion) == terms
+    assert len(fit.covariance.names) == 4 + terms
+
+
+def test_more_terms_than_the_views_determine_are_refused():
+    with pytest.raises(Degenerate, match="8 terms of distortion are more than these views determine"):
+        fit_camera(shown(1, 12), CHARUCO, SIZE, distortion_terms=8)
+
+
+def shifted_corners(px, rng):
+    px[rng.choice(len(px), 4, replace=False)] += rng.choice([-2, 2], (4, 2))
+    return px
+
+
+def another_order(px, rng):
+    return px[::-1] if len(px) < 48 else px.reshape(6, 8, 2)[:, ::-1].reshape(-1, 2)
+
+
+def moved_corners(px, rng):
+    return px + rng.normal(0, 1.0, px.shape)
+
+
+def bent_board(px, rng):
+    return px + 4e-4 * (px - px.mean(axis=0)) * np.abs(px - px.mean(axis=0))
+
+
+@pytest.mark.parametrize("corrupt", [shifted_corners, another_order, moved_corners, bent_board])
+def test_bad_views_are_named(corrupt):
+    named = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        views = shown(seed + 100)
+        at = int(rng.integers(len(views)))
+        corners = views[at].corners
+        views[at] = View(views[at].name, Corners(corners.ids, corrupt(corners.px.copy(), rng)))
+        fit = fit_camera(views, CHARUCO, SIZE)
+        named += fit.outliers == (views[at].name,)
+        assert abs(fit.camera.matrix[0, 0] - TRUE["fx"]) < 6 * fit.sd["fx"]
+    assert named >= 9
+
+
+def test_one_view_is_one_pose():
+    with pytest.raises(Degenerate, match="condition number") as refused:
+        fit_camera(shown(1, 1), CHARUCO, SIZE)
+    assert refused.value.reason == "one-pose"
+
+
+def test_the_same_pose_again_and_again_is_one_pose():
+    rng = np.random.default_rng(1)
+    here = pose(CHARUCO, 1.0, (0, 0), (0.3, 0.2, 0))
+    every = np.arange(48, dtype=np.int32)
+    px = corners_px(CHARUCO, here)
+    views = [View(str(i), Corners(every, px + rng.normal(0, SD_PX, px.shape))) for i in range(8)]
+    with pytest.raises(Degenerate, match="one pose") as refused:
+        fit_camera(views, CHARUCO, SIZE)
+    assert refused.value.reason == "one-pose"
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.02, 0.2])
+@pytest.mark.parametrize("distance_m", [None, 1.2])
+def test_boards_that_are_all_parallel_to_the_picture_are_refused(noise_px, distance_m):
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        views = [seen(i, rng, noise_px, (0, 0, rng.uniform(-0.3, 0.3)), distance_m) for i in range(8)]
+        with pytest.raises(Degenerate, match="condition number") as refused:
+            fit_camera(views, CHARUCO, SIZE, distortion_terms=4)
+        assert refused.value.reason == "coplanar"
+
+
+def test_no_board_and_a_mirrored_board_are_refused():
+    with pytest.raises(Degenerate) as refused:
+        fit_camera([View("000", None)], CHARUCO, SIZE)
+    assert refused.value.reason == "no-board"
+    mirrored = [View(v.name, Corners(v.corners.ids, [SIZE[0] - 1, 0] + v.corners.px * [-1, 1])) for v in shown(1)]
+    with pytest.raises(Degenerate) as refused:
+        fit_camera(mirrored, CHARUCO, SIZE)
+    assert refused.value.reason == "mirrored"
+
+
+def test_a_number_of_terms_that_opencv_has_not_is_refused():
+    with pytest.raises(CalibrationError, match="6 terms"):
+        fit_camera(shown(1), CHARUCO, SIZE, distortion_terms=6)
+
+
+@pytest.mark.skipif(not Path(FOLDER).is_dir(), reason="the chessboard pictures are not here")
+def test_real_pictures_fit_no_worse_than_opencv_on_the_same_corners():
+    board, views, size = pairs("left", every=2)
+    fit = fit_camera(views, board, size)
+    kept = [(v.corners, used) for v, used in zip(views, fit.used, strict=True) if used.any()]
+    points = [board.corners_m[c.ids][used].astype(np.float32) for c, used in kept]
+    px = [c.px[used].astype(np.float32) for c, used in kept]
+    rms, *_ = cv2.calibrateCamera(points, px, size, None, None)
+    assert fit.rms_px <= rms + 1e-4
+    assert fit.rms_px < 0.25
+    assert fit.camera.matrix[0, 0] == pytest.approx(535, rel=0.01)

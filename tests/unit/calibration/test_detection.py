@@ -1,0 +1,115 @@
+"""Corners from pictures of few photons, and pictures that are refused."""
+
+import numpy as np
+import pytest
+
+from calibration.board import Board
+from calibration.detection import find_corners
+from calibration.errors import Degenerate
+from calibration.hot_pixels import repaired
+from tests.reference.board_pictures import CHARUCO, CHESSBOARD, SIZE, albedo, corners_px, exposed, pose
+
+TURNED = pose(CHARUCO, 0.9, (0.03, -0.02), (0.35, -0.3, 0.1))
+FRAMES = 5000
+
+
+@pytest.fixture(scope="module")
+def light():
+    return albedo(CHARUCO, TURNED)
+
+
+@pytest.mark.parametrize(("white_flux", "sd_px"), [(0.05, 0.02), (0.004, 0.05)])
+def test_corners_of_few_photons_are_good_to_hundredths_of_a_pixel(light, white_flux, sd_px):
+    truth = corners_px(CHARUCO, TURNED)
+    off = []
+    for seed in range(3):
+        found = find_corners(exposed(light, white_flux, FRAMES, seed), CHARUCO)
+        assert len(found.ids) > 0.9 * len(truth)
+        off.append((found.px - truth[found.ids]) / found.sd_px[:, None])
+        assert np.sqrt(np.mean((found.px - truth[found.ids]) ** 2)) < sd_px
+        assert np.abs(np.mean(found.px - truth[found.ids], axis=0)).max() < 0.02
+    assert 0.6 < np.std(np.concatenate(off)) < 1.5
+
+
+def test_hot_pixels_that_are_listed_do_no_harm(light):
+    picture = exposed(light, 0.02, FRAMES, 1)
+    hot = np.random.default_rng(2).random(picture.shape) < 0.01
+    picture[hot] = 5.0
+    found = find_corners(picture, CHARUCO, hot)
+    off = found.px - corners_px(CHARUCO, TURNED)[found.ids]
+    assert len(found.ids) > 40
+    assert np.abs(off).max() < 0.15
+
+
+def test_hot_pixels_become_their_neighbours_median():
+    picture = np.arange(25, dtype=np.float32).reshape(5, 5)
+    bad = np.zeros((5, 5), np.bool_)
+    bad[2, 2] = bad[0, 0] = True
+    picture[0, 0] = picture[2, 2] = np.nan
+    fixed = repaired(picture, bad)
+    assert fixed[2, 2] == 12
+    assert fixed[0, 0] == 5
+    assert repaired(np.full((3, 3), np.nan)).tolist() == np.zeros((3, 3)).tolist()
+
+
+def test_a_picture_without_a_board_is_refused():
+    with pytest.raises(Degenerate, match="0 of 31 markers") as refused:
+        find_corners(exposed(np.full(SIZE[::-1], 0.4), 0.01, FRAMES, 1), CHARUCO)
+    assert refused.value.reason == "no-board"
+
+
+def test_a_mirror_image_is_refused(light):
+    with pytest.raises(Degenerate, match="mirror") as refused:
+        find_corners(exposed(light[:, ::-1], 0.05, FRAMES, 1), CHARUCO)
+    assert refused.value.reason == "mirrored"
+
+
+def test_a_board_half_out_is_refused_and_the_border_named():
+    beyond = pose(CHARUCO, 0.9, (-0.48, 0.0), (0.1, 0.2, 0))
+    with pytest.raises(Degenerate, match=r"of 48 corners.*left border") as refused:
+        find_corners(exposed(albedo(CHARUCO, beyond), 0.05, FRAMES, 1), CHARUCO)
+    assert refused.value.reason == "board-half-out"
+
+
+def test_two_boards_alike_are_refused():
+    two = [pose(CHARUCO, 1.7, (x, 0.05), (0.1, x, 0)) for x in (-0.2, 0.2)]
+    with pytest.raises(Degenerate, match="two boards") as refused:
+        find_corners(exposed(albedo(CHARUCO, *two), 0.05, FRAMES, 1), CHARUCO)
+    assert refused.value.reason == "two-boards"
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+def test_a_chessboard_is_numbered_from_its_own_top_left(upside_down):
+    # With an odd and an even side a half turn swaps the colours, so that it can be told.
+    stands = pose(CHESSBOARD, 0.9, (0, 0), (0, 0.2, np.pi if upside_down else 0.1))
+    found = find_corners(exposed(albedo(CHESSBOARD, stands), 0.02, FRAMES, 1), CHESSBOARD)
+    assert np.abs(found.px - corners_px(CHESSBOARD, stands)[found.ids]).max() < 0.15
+    assert len(found.ids) == 40
+
+
+def test_two_chessboards_are_refused():
+    two = [pose(CHESSBOARD, 1.6, (x, 0.0), (0.1, x, 0)) for x in (-0.2, 0.2)]
+    with pytest.raises(Degenerate) as refused:
+        find_corners(exposed(albedo(CHESSBOARD, *two), 0.05, FRAMES, 1), CHESSBOARD)
+    assert refused.value.reason == "two-boards"
+
+
+def test_a_chessboard_half_out_is_refused():
+    beyond = pose(CHESSBOARD, 0.9, (-0.45, 0.0), (0, 0, 0))
+    with pytest.raises(Degenerate, match="of the chessboard's 8 x 5") as refused:
+        find_corners(exposed(albedo(CHESSBOARD, beyond), 0.05, FRAMES, 1), CHESSBOARD)
+    assert refused.value.reason == "board-half-out"
+
+
+def test_a_chessboard_with_two_even_sides_shows_that_it_is_mirrored():
+    board = Board("chessboard", (8, 6), 0.06)
+    seen = exposed(albedo(board, pose(board, 0.9, (0, 0), (0, 0.2, 0.1))), 0.05, FRAMES, 1)
+    assert len(find_corners(seen, board).ids) == 35
+    with pytest.raises(Degenerate) as refused:
+        find_corners(seen[:, ::-1], board)
+    assert refused.value.reason == "mirrored"
+
+
+def test_an_eight_bit_picture_is_searched_too(light):
+    found = find_corners((light * 255).astype(np.uint8), CHARUCO)
+    assert np.abs(found.px - corners_px(CHARUCO, TURNED)[found.ids]).max() < 0.1

@@ -1,0 +1,96 @@
+"""Lags and row delay from passages of one unmoved scene: right, with honest intervals, and refused where untellable."""
+
+import numpy as np
+import pytest
+
+from calibration.errors import Degenerate
+from calibration.sync_fit import NAMES, fit_sync
+from calibration.views import Passages
+
+LAG_S = {1: 2.1e-4, -1: 1.6e-4}
+SD = 6e-4
+
+
+def _sweeps(rng, speeds, ways=(1, -1), *, lag_s=LAG_S, row_s=0.0, pixels=1500, jitter=0.0, slope=0.0):
+    """Passages of pixels whose line stands somewhere, each sweep seeing most of them. slope: of the lag over speed."""
+    x, y = rng.integers(0, 512, (2, pixels)).astype(float)
+    stands = -0.8 + 1.6 * x / 512 + 0.02 * y / 512 + rng.normal(0, 0.05, pixels)
+    sweeps = []
+    for speed in speeds:
+        for way in ways:
+            there = rng.random(pixels) < 0.9
+            lag = lag_s[way] * (1 + slope * (speed / speeds[0] - 1)) + row_s * y
+            trembles = jitter * rng.normal(size=400)[((stands + 1) * 200).astype(int)]
+            sd = SD * rng.uniform(0.5, 2, pixels)
+            command = stands + way * speed * lag + trembles + rng.normal(0, sd)
+            parts = (part[there] for part in (x, y, command, sd))
+            sweeps.append(Passages(*parts, way, speed))
+    return sweeps
+
+
+def test_both_lags_and_their_intervals_hold_at_two_speeds():
+    rng = np.random.default_rng(1)
+    off = []
+    for _ in range(60):
+        fit = fit_sync(_sweeps(rng, (35.0, 90.0), jitter=3e-4))
+        off.append((np.array(fit.lag_s) - [LAG_S[1], LAG_S[-1]]) / fit.sd_s[:2])
+        assert not fit.common
+        assert fit.row_delay_s == 0
+        assert fit.speed_range_per_s == pytest.approx((35 * 0.95, 90 * 1.05))
+    assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.1  # the 0.3 us that every sweep may be off are not there
+    assert max(fit.sd_s[:2]) < 1e-6
+
+
+def test_row_delay_is_found_where_there_is_one():
+    fit = fit_sync(_sweeps(np.random.default_rng(2), (35.0, 90.0), row_s=2e-8))
+    assert abs(fit.row_delay_s - 2e-8) < 4 * fit.sd_s[2]
+    assert abs(fit.lag_s.forward - LAG_S[1]) < 4 * fit.sd_s[0]
+    assert NAMES[2] == "row_delay"
+
+
+def test_one_speed_both_ways_gives_the_mean_of_the_lags():
+    fit = fit_sync(_sweeps(np.random.default_rng(3), (35.0,)))
+    assert fit.common
+    assert fit.lag_s.forward == fit.lag_s.backward == pytest.approx(np.mean(list(LAG_S.values())), abs=1e-6)
+    assert fit.speed_range_per_s == pytest.approx((33.25, 36.75))
+
+
+def test_one_way_at_two_speeds_gives_its_lag_alone():
+    fit = fit_sync(_sweeps(np.random.default_rng(4), (35.0, 90.0), ways=(1,)))
+    assert fit.told == (1,)
+    assert fit.lag_s.forward == pytest.approx(LAG_S[1], abs=2e-6)
+    assert np.isnan(fit.sd_s[1])
+
+
+def test_a_lag_that_depends_on_speed_is_seen():
+    rng = np.random.default_rng(5)
+    assert fit_sync(_sweeps(rng, (35.0, 60.0, 90.0))).steady
+    assert not fit_sync(_sweeps(rng, (35.0, 60.0, 90.0), slope=0.2)).steady
+
+
+def test_passages_of_something_else_do_not_count():
+    rng = np.random.default_rng(6)
+    sweeps = _sweeps(rng, (35.0, 90.0))
+    for sweep in sweeps:
+        wrong = rng.random(len(sweep.command)) < 0.05
+        sweep.command[wrong] += rng.uniform(-0.5, 0.5, wrong.sum())
+    assert np.abs(np.array(fit_sync(sweeps).lag_s) - [LAG_S[1], LAG_S[-1]]).max() < 2e-6
+
+
+@pytest.mark.parametrize(
+    ("sweeps", "reason"),
+    [
+        (lambda rng: _sweeps(rng, (35.0,), ways=(1,)), "one-speed"),
+        (lambda rng: _sweeps(rng, (35.0, 90.0), pixels=40), "too-few-pixels"),
+        (lambda rng: _sweeps(rng, (35.0, 90.0), lag_s={1: -5e-5, -1: 1e-4}), "negative-lag"),
+        (lambda rng: [_reversed(s) if s.direction < 0 else s for s in _sweeps(rng, (35.0, 90.0))], "marker-polarity"),
+    ],
+)
+def test_what_cannot_be_told_is_refused(sweeps, reason):
+    with pytest.raises(Degenerate) as refused:
+        fit_sync(sweeps(np.random.default_rng(7)))
+    assert refused.value.reason == reason
+
+
+def _reversed(sweep):
+    return Passages(sweep.x_px, sweep.y_px, -sweep.command, sweep.sd, sweep.direction, sweep.speed_per_s)

@@ -1,0 +1,152 @@
+"""Each mistake is named as the first reason, and a sound calibration passes."""
+
+from dataclasses import replace
+from math import nan, radians
+
+import numpy as np
+import pytest
+
+from calibration.board import Board
+from calibration.errors import Degenerate
+from calibration.evidence import PoseEvidence, ViewEvidence, pose_evidence, view_evidence
+from calibration.sweep_waves import SweepResidual, sweep_waves
+from calibration.verdict import Asked, FitEvidence, judge, judge_refusal
+from calibration.view_shifts import ViewShift, common_shift, last_before_move
+from calibration.views import BoardPose, Corners, View
+
+ASKED = Asked(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)
+VIEWS = ViewEvidence(shown=12, with_board=12, coverage=0.8, board_share=0.06, room_flux=0.2)
+FIT = FitEvidence(
+    PoseEvidence(tilt_rad=radians(60), distance_m=1.6, board_rad=0.35),
+    expected_m=0.004,
+    worst_m=0.012,
+    wave_m=0.002,
+    shift_m=0.001,
+    baseline_m=0.3004,
+    baseline_sd_m=2e-4,
+)
+IMPRECISE = replace(FIT, expected_m=0.03, worst_m=0.2)
+
+
+def test_a_sound_calibration_passes() -> None:
+    verdict = judge(VIEWS, FIT, ASKED)
+    assert verdict.passed
+    assert verdict.codes == ()
+
+
+@pytest.mark.parametrize(
+    ("code", "views", "fit"),
+    [
+        ("exposure-not-locked", VIEWS, replace(IMPRECISE, wave_m=0.2, shift_m=0.05)),
+        ("moved-rig", VIEWS, replace(IMPRECISE, wave_m=0.002, shift_m=0.1)),
+        ("moved-rig", VIEWS, replace(FIT, wave_m=0.02, shift_m=0.3)),
+        ("wrong-square-size", VIEWS, replace(FIT, baseline_m=0.309)),
+        ("room-light", replace(VIEWS, room_flux=8.0), IMPRECISE),
+        ("room-light", replace(VIEWS, room_flux=8.0), FIT),
+        ("room-light", replace(VIEWS, room_flux=1.5), IMPRECISE),
+        ("too-few-poses", replace(VIEWS, shown=3, coverage=0.3), IMPRECISE),
+        ("too-few-poses", replace(VIEWS, shown=3), FIT),
+        ("no-tilt", VIEWS, replace(IMPRECISE, poses=replace(FIT.poses, tilt_rad=radians(3)))),
+        ("board-too-far", VIEWS, replace(IMPRECISE, poses=replace(FIT.poses, board_rad=0.08))),
+        ("poor-coverage", replace(VIEWS, coverage=0.2), IMPRECISE),
+        ("too-few-poses", VIEWS, IMPRECISE),  # nothing wrong with the data but their number
+    ],
+)
+def test_each_mistake_is_the_first_reason(code: str, views: ViewEvidence, fit: FitEvidence) -> None:
+    verdict = judge(views, fit, ASKED)
+    assert not verdict.passed
+    assert verdict.codes[0] == code
+    first = verdict.reasons[0]
+    assert str(first).startswith(f"{code}: ")
+    assert first.next_step
+
+
+def test_what_the_data_lack_counts_more_where_depth_suffers() -> None:
+    assert judge(replace(VIEWS, coverage=0.4), FIT, ASKED).passed
+    assert judge(replace(VIEWS, coverage=0.4), IMPRECISE, ASKED).codes == ("poor-coverage",)
+    assert judge(replace(VIEWS, coverage=0.2), FIT, ASKED).codes == ("poor-coverage",)
+    parallel = replace(FIT, poses=replace(FIT.poses, tilt_rad=radians(3)))
+    assert judge(VIEWS, parallel, ASKED).codes == ("no-tilt",)
+
+
+def test_a_baseline_that_is_badly_known_contradicts_nothing() -> None:
+    fit = replace(FIT, baseline_m=0.309, baseline_sd_m=0.004)
+    assert judge(VIEWS, fit, ASKED).passed
+    assert judge(VIEWS, replace(fit, baseline_m=nan), ASKED).passed
+
+
+def test_unknown_errors_do_not_pass() -> None:
+    assert not judge(VIEWS, replace(FIT, expected_m=nan), ASKED).passed
+
+
+@pytest.mark.parametrize(
+    ("reason", "room_flux", "code"),
+    [("coplanar", 0.2, "no-tilt"), ("one-pose", 0.2, "too-few-poses"), ("no-board", 7.0, "room-light")],
+)
+def test_a_refusal_names_the_cause(reason: str, room_flux: float, code: str) -> None:
+    shown = 1 if reason == "one-pose" else 10
+    views = replace(VIEWS, shown=shown, with_board=min(shown, 4), room_flux=room_flux)
+    verdict = judge_refusal(Degenerate(reason, "all boards lie in one plane"), views)
+    assert not verdict.passed
+    assert verdict.codes[0] == code
+
+
+def test_views_tell_coverage_and_room_light() -> None:
+    board = Board("chessboard", (5, 4), 0.05)
+    px = 100 + 40 * board.corners_m[:, :2] / 0.05
+    picture = np.full((300, 400), 0.01, np.float32)
+    picture[130:230, 130:270] = 2.0
+    seen = View("a", Corners(np.arange(len(px), dtype=np.int32), px), picture=picture)
+    unseen = View("b", None, picture=np.full((300, 400), 2.0, np.float32))
+    evidence = view_evidence([seen, unseen], (400, 300))
+    assert (evidence.shown, evidence.with_board) == (2, 1)
+    assert evidence.coverage == pytest.approx(120 * 80 / (400 * 300))
+    assert evidence.room_flux == pytest.approx(2.0)
+
+
+def test_poses_tell_tilt_and_distance() -> None:
+    board = Board("chessboard", (5, 4), 0.1)
+    poses = [BoardPose(np.array([0, angle, 0]), np.array([-0.25, -0.2, 2.0])) for angle in (-0.3, 0.4)]
+    evidence = pose_evidence(poses, board)
+    assert evidence.tilt_rad == pytest.approx(0.7)
+    assert evidence.distance_m == pytest.approx(2.0, abs=0.05)
+    assert evidence.board_rad == pytest.approx(0.25, abs=0.01)
+
+
+def _sweeps(rng: np.random.Generator, *, wave: float, lag: float = 0.0, views: int = 10) -> list[SweepResidual]:
+    """Each board is lit in a third of the range. What all sweeps share is bent; the directions differ by a lag."""
+    sweeps = []
+    for view in range(views):
+        low = rng.uniform(-0.8, 0.3)
+        for direction in (1, -1):
+            command = rng.uniform(low, low + 0.5, 2000)
+            residual = 3e-4 * rng.standard_normal(2000) + direction * lag + 1e-3 * np.cos(5 * command)
+            residual += wave * np.sqrt(2) * np.sin(2 * np.pi * command / 0.2 + rng.uniform(0, 2 * np.pi))
+            sweeps.append(SweepResidual(str(view), direction, command, residual))
+    return sweeps
+
+
+@pytest.mark.parametrize("wave", [0.0, 1e-4, 1e-3])
+def test_waves_are_what_tells_sweeps_of_a_view_apart(wave: float) -> None:
+    waves = sweep_waves(_sweeps(np.random.default_rng(3), wave=wave, lag=5e-4))
+    assert waves.rms == pytest.approx(wave, rel=0.25, abs=3e-5)
+
+
+def test_single_sweeps_show_their_waves_too() -> None:
+    sweeps = _sweeps(np.random.default_rng(4), wave=2e-3)[::2]
+    assert sweep_waves(sweeps).rms == pytest.approx(2e-3, rel=0.25)
+
+
+def test_without_sweeps_nothing_is_told() -> None:
+    assert np.isnan(sweep_waves([]).rms)
+
+
+def test_one_move_between_views_is_found() -> None:
+    shifts = tuple(ViewShift(str(i), 1e-3 if i < 4 else -2e-3, 1e-4) for i in range(9))
+    assert last_before_move(shifts) == "3"
+    assert common_shift(shifts, 0.0, 2) == pytest.approx(1.63e-3, rel=0.01)
+    rng = np.random.default_rng(5)
+    calm = tuple(ViewShift(str(i), 1e-4 * rng.standard_normal(), 1e-4) for i in range(12))
+    assert last_before_move(calm) is None
+    assert common_shift(calm, 0.0, 2) < 1e-4
+    assert np.isnan(common_shift(calm[:1], 0.0, 2))
