@@ -1,7 +1,9 @@
 """What a scene file says: surfaces, medium, weather, ambient light, motion. Unknown keys are refused, quantities carry
 units.
 
-surfaces: street              # the built-in street, or a folder with world.npz or with disparity.npy and left.png
+surfaces: street              # the built-in street, board, or a folder with world.npz or disparity.npy and left.png
+board: {rotation: [20 deg, 0 deg, 0 deg], position: [-30 cm, -20 cm, 1.5 m]}    # of `surfaces: board`; or a list
+wall: 4 m                                                     # behind the board
 medium: {fog: {visibility: 30 m}, backscatter: 0.05 /sr}      # or smoke, `sim_backend.medium`; none: clear air
 rain: {rate: 20 mm/h}                                         # or snow: {rate: 2 mm/h}, `sim_backend.weather`
 ambient: {illuminance: 100 lux}                               # none: darkness
@@ -10,13 +12,13 @@ seed: 1                                                       # where the drops 
 """
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from drivers.errors import DeviceError
-from drivers.units import Lux, MetresPerSecond
+from drivers.units import Lux, Metres, MetresPerSecond, Radians
 from sim_backend.medium import Fog, Medium, Section
 from sim_backend.scenes.prepared import load_folder
 from sim_backend.scenes.surfaces import Surfaces
@@ -42,10 +44,32 @@ class Motion(Section):
     """Along x (right), y (down), z (away from the camera)."""
 
 
+class BoardPlace(Section):
+    """Where a calibration board is held, as `calibration.views.BoardPose` has it."""
+
+    rotation: tuple[Radians, Radians, Radians]
+    """Rotation vector; all 0: square to the camera's axis."""
+    position: tuple[Metres, Metres, Metres]
+    """Of the top left corner of the board's squares: x right, y down, z away from the camera."""
+
+
+class BoardShown(BoardPlace):
+    """A calibration board in the scene."""
+
+    file: str | None = None
+    """What is printed on it, a board file; the bundled one by default."""
+    mirrored: bool = False
+    """Printed the wrong way round."""
+
+
 class SceneFile(Section):
     """A whole scene file."""
 
     surfaces: str = "street"
+    board: BoardShown | tuple[BoardShown, ...] = ()
+    """What stands in front of the wall where `surfaces` is `board`."""
+    wall: Annotated[Metres, Field(gt=0)] = 4.0
+    """How far behind the camera's plane the wall is that boards stand in front of."""
     medium: Medium | None = None
     rain: Rain | None = None
     snow: Snow | None = None
@@ -53,6 +77,17 @@ class SceneFile(Section):
     motion: Motion | None = None
     seed: int = Field(default=1, ge=0, lt=2**63)
     """Which drops and flakes there are, where, and which speckle."""
+
+    @model_validator(mode="after")
+    def _boards_on_board_scenes(self) -> Self:
+        if (self.surfaces == "board") != bool(self.boards):
+            raise ValueError("write both or neither of 'surfaces: board' and 'board: {rotation: ..., position: ...}'")
+        return self
+
+    @property
+    def boards(self) -> tuple[BoardShown, ...]:
+        """All boards of the scene."""
+        return (self.board,) if isinstance(self.board, BoardShown) else self.board
 
     @property
     def illuminance_lux(self) -> float:
@@ -114,15 +149,29 @@ def with_fog(scene: SceneFile, visibility: str) -> SceneFile:
     return scene.model_copy(update={"medium": medium})
 
 
+def with_board_at(scene: SceneFile, place: BoardPlace) -> SceneFile:
+    """The scene with its board, the first where there are several, held elsewhere. DeviceError where there is none."""
+    if not scene.boards:
+        raise DeviceError(
+            "board_pose moves the board of a scene, this one has none; choose a scene with 'surfaces: board'"
+        )
+    moved = scene.boards[0].model_copy(update={"rotation": place.rotation, "position": place.position})
+    return scene.model_copy(update={"board": (moved, *scene.boards[1:])})
+
+
 def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surfaces:
     """The scene's surfaces for the rays (u, v), each (rows, width); relative folders start at `folder`."""
     if scene.surfaces == "street":
         from sim_backend.scenes.street import street
 
         return street(u, v)
+    if scene.surfaces == "board":
+        from sim_backend.scenes.board import board_scene, load_boards
+
+        return board_scene(u, v, load_boards(scene.boards, folder), scene.wall)
     path = folder / Path(scene.surfaces).expanduser()
     if not path.is_dir():
         raise DeviceError(
-            f"surfaces {scene.surfaces!r}: {path} is no folder; name 'street' or a folder with a scene in it"
+            f"surfaces {scene.surfaces!r}: {path} is no folder; name 'street', 'board' or a folder with a scene in it"
         )
     return load_folder(path, (u.shape[0], u.shape[1]))

@@ -94,10 +94,14 @@ class View:
         )
 
 
-def make_view(model: RigModel, surfaces: Surfaces, motion: Moves | None = None) -> View:
-    """View of the surfaces through the model's camera. The model must know where its light comes from (`source_m`)."""
+def make_view(
+    model: RigModel, surfaces: Surfaces, motion: Moves | None = None, rays: tuple[Array, Array] | None = None
+) -> View:
+    """View of the surfaces through the model's camera. The model must know where its light comes from (`source_m`).
+
+    rays: the camera's tangents (u, v), where they are known already."""
     assert model.source_m is not None, "checked by the world"
-    u, v = model.camera.tangents()
+    u, v = model.camera.tangents() if rays is None else rays
     u_x, v_x = _slope(u, 1), _slope(v, 1)
     u_y, v_y = _slope(u, 0), _slope(v, 0)
     surface = 1.0 / surfaces.depth_m.astype(np.float64)

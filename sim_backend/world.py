@@ -26,7 +26,7 @@ from sim_backend.line_fan import ONE_LINE, LineFan, line_fan
 from sim_backend.line_width import line_width
 from sim_backend.optics import Line, Optics, Sensor, detections_per_radiance
 from sim_backend.photons import PhotonSource
-from sim_backend.scene import CLEAR, load_scene, load_surfaces, with_fog
+from sim_backend.scene import CLEAR, BoardPlace, load_scene, load_surfaces, with_board_at, with_fog
 from sim_backend.view import make_view
 
 if TYPE_CHECKING:
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+DARK_EFFECTS = ("dark counts",)
+"""Steady detections that need no light."""
 DEFAULT_GEOMETRY = Path(__file__).parent.parent / "config" / "simulated-rig.yaml"
 
 
@@ -79,6 +81,8 @@ class WorldConfig(KindConfig):
     """A bundled scene's name, a scene file, or a folder of surfaces."""
     fog: Annotated[str | None, AfterValidator(_known_fog)] = None
     """How far one sees in the scene's air, in place of what the scene says: a visibility such as `20 m`, or `clear`."""
+    board_pose: BoardPlace | None = None
+    """Where the scene's calibration board is held, in place of where the scene has it."""
     optics: Optics = Field(default_factory=Optics)
     sensor: Sensor = Field(default_factory=Sensor)
     line: Line = Field(default_factory=Line)
@@ -101,6 +105,8 @@ class SimulatedWorld:
         self.scene, folder = load_scene(config.scene)
         if config.fog is not None:
             self.scene = with_fog(self.scene, config.fog)
+        if config.board_pose is not None:
+            self.scene = with_board_at(self.scene, config.board_pose)
         u, v = camera.tangents()
         self.surfaces = load_surfaces(self.scene, folder, u, v)
         """Depth, albedo and where they are trusted; the truth behind `truth`."""
@@ -110,7 +116,7 @@ class SimulatedWorld:
             from sim_backend.effects.motion import MovingSurfaces
 
             motion = MovingSurfaces(self.scene.motion.velocity)
-        view = make_view(self.model, self.surfaces, motion)
+        view = make_view(self.model, self.surfaces, motion, (u, v))
         line_width(view, config.optics, config.sensor, config.line)  # refuses a focus within the lens, before any plan
         self.setting = Setting(view, self.scene, config.optics, config.sensor, config.line, gain)
         self._planned_for = MOST
@@ -176,11 +182,24 @@ class SimulatedWorld:
         """
         self.grid = column_grid(commands, self.model.scanner.command_range)
 
+    def cover_lens(self) -> None:
+        """Let no more light in: what is left is the sensor's own, none of it left out however little it would matter.
+
+        To be called before the SPAD is configured; for good.
+        """
+        kept = [entry for entry in CATALOGUE if entry.name in DARK_EFFECTS or entry.kind == "bits"]
+        wanted = [e for e in kept if e.called(self.setting)[0] and is_wanted(e.name, self.config.effects)]
+        self._planned = self._plan()[0], FluxModel(self.setting, wanted)
+
     def held(self, happening: Happening) -> Array:
         """Mirror positions (n,) whose light n frames see, NaN past the ends of the grid: those of the columns, with the
         mirror's jitter."""
         low, high = self.model.scanner.command_range
         return np.clip(self.grid.hold(happening.mirror) + happening.jitter, low, high)
+
+    def true_model(self) -> RigModel:
+        """The rig as it really is: what a calibration should find."""
+        return self.model
 
     def truth(self, commands: Array, time_s: float = 0.0) -> SweepTruth:
         """Where the stripe of each column (commands (columns,)) truly is, and the depth of every pixel.

@@ -40,6 +40,8 @@ class SimulatedScannerConfig(KindConfig):
     """From `start` to the first point; no whole number of frames."""
     jitter: float = Field(default=0.0, ge=0, le=0.1)
     """Standard deviation of the mirror's random error, in units of the drive; a column of the bundled rig is 3.5e-3."""
+    serial: str = Field(default="SIM-MIRROR-0001", min_length=1)
+    """What it says of itself; another one is another scanner, which needs a calibration of its own."""
 
 
 class SimulatedScanner(BeamScanner):
@@ -55,6 +57,11 @@ class SimulatedScanner(BeamScanner):
     def limits(self) -> ScannerLimits:
         """Limits of the simulated galvo."""
         return LIMITS
+
+    @property
+    def serial(self) -> str:
+        """The config's."""
+        return self._config.serial
 
     def _do_status(self) -> ScannerStatus:
         return ScannerStatus(moving=self._bench.moving(), fault=None, position=self._bench.mirror())

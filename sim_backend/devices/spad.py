@@ -59,6 +59,8 @@ class SimulatedSpadConfig(KindConfig):
     """Relative error of the crystal."""
     clock_wander: Annotated[Ppm, Field(ge=0, le=1e-3)] = 0.0
     """What a second adds to that error at random, as a standard deviation; it grows with the root of time."""
+    serial: str = Field(default="SIM-0001", min_length=1)
+    """What it says of itself; another one is another sensor, which needs a calibration of its own."""
 
 
 class SimulatedSpad(SpadArray):
@@ -86,7 +88,7 @@ class SimulatedSpad(SpadArray):
         rows, width = world.size
         self._info = SpadInfo(
             model="simulated",
-            serial="SIM-0001",
+            serial=config.serial,
             width=width,
             height=rows,
             rotation_deg=0,

@@ -1,0 +1,80 @@
+"""The light of a pixel that the laser line passes over, how likely counts are with it, and the derivatives of both.
+
+Of n frames in column t, y have a 1: y ~ Binomial(n, 1 - exp(-flux)), and around the passage c
+
+    flux(t) = before + (after - before) Phi(z) + area phi(z) / sigma,   z = (t - c) / sigma
+
+with phi and Phi the normal density and its integral: the level of the haze before the line and behind it, and the line.
+Line, pixel and the line's travel within a column all blur the passage symmetrically; sigma stands for them together,
+and `box`, the width of the latter two in widths of the line, for how flat that makes it.
+
+theta: (pixels, 5): BEFORE, AFTER, AREA, CENTRE and the logarithm of SIGMA.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_NODES = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(3), strict=True))
+LEAST_FLUX = 1e-7
+LEVEL_COUNTS = 0.5
+"""What a level is held up by, in counts: one without a single 1 is then half a count over all its frames, not 0."""
+BEFORE, AFTER, AREA, CENTRE, SIGMA = range(5)
+
+
+def light(theta: Array, at: Array, box: float) -> tuple[Array, Array]:
+    """Flux (pixels, columns), and its derivatives (pixels, 5, columns), by the logarithm of sigma the last one."""
+    before, after, area, centre, log_sigma = (theta[:, i, None] for i in range(5))
+    sigma = np.exp(log_sigma)
+    narrow = sigma / np.sqrt(1 + box * box / 12)
+    line, slope = np.zeros(at.shape), np.zeros(at.shape)
+    for node, weight in _NODES if box else ((0.0, 1.0),):
+        z = (at - centre) / narrow - node * box
+        part = weight * np.exp(-0.5 * z * z) / (np.sqrt(2 * np.pi) * narrow)
+        line += part
+        slope += part * z / narrow
+    passed = _normal_integral((at - centre) / sigma)  # its shape hardly matters
+    flux = np.maximum(before + (after - before) * passed + area * line, LEAST_FLUX)
+    moves = area * slope - (after - before) * line
+    # Both line and edge are functions of (at - centre) / sigma, the line with 1 / sigma before it.
+    widens = moves * (at - centre) - area * line
+    slopes = np.stack([1 - passed, passed, line, moves, widens], axis=1)
+    return flux, slopes
+
+
+def _normal_integral(z: Array) -> Array:
+    """Of the normal density up to z, to 2e-4 (E. Page, Applied Statistics 26, 1977)."""
+    result: Array = 0.5 * (1 + np.tanh(np.sqrt(2 / np.pi) * (z + 0.044715 * z**3)))
+    return result
+
+
+def score_of(ones: Array, frames: Array, flux: Array, slopes: Array, theta: Array) -> tuple[Array, Array]:
+    """Gradient (pixels, 5) of the log-likelihood and its expected information (pixels, 5, 5)."""
+    residual, weight = residual_of(ones, frames, flux)
+    score = (slopes @ residual[:, :, None])[:, :, 0]
+    information = (slopes * weight[:, None, :]) @ slopes.transpose(0, 2, 1)
+    for level in (BEFORE, AFTER):
+        score[:, level] += LEVEL_COUNTS / theta[:, level]
+        information[:, level, level] += LEVEL_COUNTS / theta[:, level] ** 2
+    return score, information
+
+
+def residual_of(ones: Array, frames: Array, flux: Array) -> tuple[Array, Array]:
+    """Derivative of the log-likelihood by the flux, and its expected square; (pixels, columns)."""
+    lit = -np.expm1(-flux)
+    return ones / lit - frames, frames * (1 - lit) / lit
+
+
+def regular(information: Array) -> Array:
+    """The same with a diagonal that is never quite singular, whatever the units."""
+    size = information.shape[1]
+    diagonal = np.einsum("pii->pi", information)
+    regular: Array = information + (1e-9 * diagonal + 1e-12)[:, :, None] * np.eye(size)
+    return regular
+
+
+def log_likelihood(ones: Array, frames: Array, flux: Array) -> Array:
+    """Of each pixel's counts (pixels,), without the part that no flux changes."""
+    result: Array = (ones * np.log(-np.expm1(-flux)) - (frames - ones) * flux).sum(axis=1)
+    return result

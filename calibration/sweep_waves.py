@@ -1,0 +1,115 @@
+"""By how much the planes of one sweep wave against those of another: exposures that are not locked to the mirror.
+
+While the sweeps of a view were taken nothing moved, so their residuals, binned over the mirror's command, may differ by
+noise and by one constant for each direction (what is left of the lag). The rest are waves that each sweep has on its
+own. A view with a single sweep shows them against its own straight line. Medians in bins keep bad passages out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+BINS = 24
+"""Of the command range: wide enough for tens of passages each, narrow enough for a wave of several turns."""
+_FEWEST_IN_BIN = 5
+_FEWEST_BINS = 4
+MAD_TO_SD = 1.4826
+"""Of a normal distribution."""
+_MEDIAN_VARIANCE = np.pi / 2
+"""Of a median in units of the mean's variance, normal distribution."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepResidual:
+    """Residuals of one sweep of a view. command, residual: (m,) float64, both in command units."""
+
+    view: str
+    direction: int
+    command: Array
+    residual: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepWaves:
+    """rms: of the waves in command units, noise taken off; NaN where there are too few passages to tell.
+
+    command: (BINS,) middles of bins; sweeps: (sweeps, BINS) medians, NaN where there are too few passages.
+    """
+
+    rms: float
+    command: Array
+    sweeps: Array
+
+
+def sweep_waves(sweeps: Sequence[SweepResidual]) -> SweepWaves:
+    """Compare the sweeps of each view."""
+    edges = _edges(sweeps)
+    middle, variance = _binned(sweeps, edges)
+    left = middle.copy()
+    for direction in (-1, 1):
+        mine = np.array([sweep.direction == direction for sweep in sweeps], dtype=bool)
+        if np.isfinite(middle[mine]).any():
+            left[mine] -= np.nanmedian(middle[mine])
+    views = [
+        [i for i, sweep in enumerate(sweeps) if sweep.view == name]
+        for name in dict.fromkeys(sweep.view for sweep in sweeps)
+    ]
+    square = _between(left, variance, views)
+    if np.isnan(square):
+        square = _off_lines(left, variance)
+    return SweepWaves(
+        rms=float(np.sqrt(max(square, 0.0))) if np.isfinite(square) else np.nan,
+        command=(edges[1:] + edges[:-1]) / 2,
+        sweeps=middle,
+    )
+
+
+def _edges(sweeps: Sequence[SweepResidual]) -> Array:
+    commands = [sweep.command for sweep in sweeps if sweep.command.size]
+    low, high = (min(map(np.min, commands)), max(map(np.max, commands))) if commands else (-1.0, 1.0)
+    return np.linspace(low, high if high > low else low + 1, BINS + 1)
+
+
+def _binned(sweeps: Sequence[SweepResidual], edges: Array) -> tuple[Array, Array]:
+    """Medians of the residuals (sweeps, BINS) and their variances."""
+    middle, variance = np.full((len(sweeps), BINS), np.nan), np.full((len(sweeps), BINS), np.nan)
+    for i, sweep in enumerate(sweeps):
+        at = np.clip(np.searchsorted(edges, sweep.command, side="right") - 1, 0, BINS - 1)
+        for k in np.flatnonzero(np.bincount(at, minlength=BINS) >= _FEWEST_IN_BIN):
+            inside = sweep.residual[at == k]
+            middle[i, k] = np.median(inside)
+            sd = MAD_TO_SD * np.median(np.abs(inside - middle[i, k]))
+            variance[i, k] = _MEDIAN_VARIANCE * sd**2 / inside.size
+    return middle, variance
+
+
+def _between(left: Array, variance: Array, views: Sequence[Sequence[int]]) -> float:
+    """Mean square of what tells the sweeps of a view apart; NaN where no view has two."""
+    found, weight = [], []
+    for rows in views:
+        if len(rows) > 1:
+            spread = np.var(left[rows], axis=0, ddof=1) - np.mean(variance[rows], axis=0)
+            known = spread[np.isfinite(spread)]
+            found.append(float(known.sum()) * (len(rows) - 1))
+            weight.append(known.size * (len(rows) - 1))
+    return sum(found) / sum(weight) if sum(weight) else np.nan
+
+
+def _off_lines(left: Array, variance: Array) -> float:
+    """Mean square of single sweeps off their straight lines; NaN where none is long enough."""
+    found, weight = 0.0, 0.0
+    bins = np.arange(BINS)
+    for values, noise in zip(left, variance, strict=True):
+        known = np.isfinite(values)
+        count = int(np.count_nonzero(known))
+        if count < _FEWEST_BINS:
+            continue
+        line = np.polynomial.Polynomial.fit(bins[known], values[known], 1)
+        free = count - 2
+        found += float(np.sum((values[known] - line(bins[known])) ** 2)) - free * float(noise[known].mean())
+        weight += free
+    return found / weight if weight else np.nan

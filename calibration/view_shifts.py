@@ -1,0 +1,125 @@
+"""Which views contradict the others: their passages as seen from the pose that their corners alone give.
+
+A fit of everything may move a board by a millimetre to please the light. With every pose from the corners alone, and
+camera and mirror as fitted, passages lie off the light by what the views disagree: nothing but the noise of the poses
+where one rig saw them all, a shift of each view where camera or mirror moved in between.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model import RigModel
+from calibration.rig_fit import RigFit
+from calibration.sweep_fit import SweepFit
+from calibration.sweep_waves import MAD_TO_SD
+from calibration.views import BoardPose, View
+
+Array = NDArray[np.float64]
+
+_STEP = 1e-6
+"""Of the command range, and of a pose in rad and m, for differences."""
+_FEWEST_CORNERS = 6
+_FEWEST_TO_SPLIT = 4
+MOST_UNEXPLAINED = 0.35
+"""Share of the shifts' variance that a single move may leave."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewShift:
+    """Of one view, in command units: median of its passages off the light, and the sd that the pose's noise gives."""
+
+    name: str
+    shift: float
+    sd: float
+
+
+def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
+    """Of all views of a fit that have passages; views by name."""
+    model = fit.model
+    posed = []
+    for name, pose, sweeps in zip(fit.views, fit.poses, fit.sweeps, strict=True):
+        found = _corner_pose(model, fit, views[name], pose)
+        if found is not None and sweeps:
+            posed.append((name, *found, sweeps))
+    if not posed:
+        return ()
+    left = np.concatenate([residual for _, _, residual, _, _ in posed])
+    corner_sd = MAD_TO_SD * float(np.median(np.abs(left)))
+    return tuple(_shift(model, name, pose, corner_sd**2 * inverse, sweeps) for name, pose, _, inverse, sweeps in posed)
+
+
+def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> float:
+    """Root mean square of views against each other, without the noise of poses and of waves (rms `wave`, in command
+    units, each of `sweeps` sweeps of a view on its own); NaN for fewer than two views.
+    """
+    if len(shifts) < 2:
+        return np.nan
+    square = float(np.mean([one.shift**2 - one.sd**2 for one in shifts]))
+    square -= wave**2 / max(sweeps, 1) if np.isfinite(wave) else 0.0
+    return math.sqrt(max(square, 0.0))
+
+
+def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...]) -> tuple[ViewShift, ...]:
+    """Those that have to agree: all, but for a single outlier, which had no say in the fit, unless it is the last."""
+    if len(outliers) != 1 or not shifts or shifts[-1].name in outliers:
+        return shifts
+    return tuple(one for one in shifts if one.name not in outliers)
+
+
+def last_before_move(shifts: tuple[ViewShift, ...]) -> str | None:
+    """The view after which the rig moved, where one move between two views explains most of the shifts; else None."""
+    values = np.array([one.shift for one in shifts])
+    if len(values) < _FEWEST_TO_SPLIT:
+        return None
+    spread = float(np.sum((values - values.mean()) ** 2))
+    parts = [values[:at].var() * at + values[at:].var() * (len(values) - at) for at in range(1, len(values))]
+    best = int(np.argmin(parts))
+    return shifts[best].name if parts[best] < MOST_UNEXPLAINED * spread else None
+
+
+def _corner_pose(model: RigModel, fit: RigFit, view: View, start: BoardPose) -> tuple[BoardPose, Array, Array] | None:
+    """Pose by the corners alone, what it leaves of them (2n,), and the inverse of its equations (6, 6)."""
+    if view.corners is None:
+        return None
+    px = np.asarray(view.corners.px, np.float64)
+    known = np.isfinite(px).all(axis=1)
+    if np.count_nonzero(known) < _FEWEST_CORNERS:
+        return None
+    points, px, camera = fit.board.corners_m[view.corners.ids[known]], px[known], model.camera
+    first = np.asarray(start.rotation, np.float64).reshape(3, 1), np.asarray(start.position_m).reshape(3, 1)
+    turn, shift = cv2.solvePnPRefineLM(points, px, camera.matrix, camera.distortion, first[0].copy(), first[1].copy())
+    seen, slopes = cv2.projectPoints(points, turn, shift, camera.matrix, camera.distortion)
+    slopes = slopes[:, :6]
+    pose = BoardPose(np.asarray(turn, np.float64).ravel(), np.asarray(shift, np.float64).ravel())
+    return pose, (seen.reshape(-1, 2) - px).ravel(), np.linalg.pinv(slopes.T @ slopes)
+
+
+def _shift(model: RigModel, name: str, pose: BoardPose, covariance: Array, sweeps: tuple[SweepFit, ...]) -> ViewShift:
+    residuals = [_residual(model, pose, sweep) for sweep in sweeps]
+    slope = np.zeros(6)
+    for i in range(6):
+        step = np.zeros(6)
+        step[i] = _STEP
+        moved = BoardPose(pose.rotation + step[:3], pose.position_m + step[3:])
+        change = [_residual(model, moved, sweep) - at for sweep, at in zip(sweeps, residuals, strict=True)]
+        slope[i] = float(np.median(np.concatenate(change))) / _STEP
+    return ViewShift(name, float(np.median(np.concatenate(residuals))), float(np.sqrt(slope @ covariance @ slope)))
+
+
+def _residual(model: RigModel, pose: BoardPose, sweep: SweepFit) -> Array:
+    """(m,) by how much the mirror's command is above the one whose light goes through the board's point."""
+    u, v = model.camera.tangents_at(sweep.x_px, sweep.y_px)
+    ray = np.stack([u, v, np.ones_like(u)], axis=-1)
+    normal = pose.matrix[:, 2]
+    points = ray * ((normal @ pose.position_m) / (ray @ normal))[:, None]
+    low, high = model.scanner.command_range
+    step = _STEP * (high - low)
+    at = np.clip(sweep.command, low + step, high - step)
+    off = model.sheets(at).distance_m(points)
+    by_command = (model.sheets(at + step).distance_m(points) - model.sheets(at - step).distance_m(points)) / (2 * step)
+    residual: Array = off / by_command
+    return residual
