@@ -23,6 +23,8 @@ class Dac(Protocol):
     name: str
     identity: str
     """See `Device.identity`."""
+    serial: str | None
+    """See `Device.serial`."""
     highest_rate_hz: float
     closes_at: float | None
     """Drive that giving the board back jumps to; None: it holds."""
@@ -64,6 +66,11 @@ class DacScanner(BeamScanner):
     def identity(self) -> str:
         """What the board says of itself."""
         return self._dac.identity
+
+    @property
+    def serial(self) -> str | None:
+        """Of the board: which mirror hangs on it nobody can ask."""
+        return self._dac.serial
 
     @property
     def limits(self) -> ScannerLimits:

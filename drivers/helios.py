@@ -53,6 +53,7 @@ class HeliosDac:
     def __init__(self, config: HeliosConfig, link: HeliosLink, clock: Clock) -> None:
         self.name = link.name
         self.identity = f"{link.name}, {link.stored_name!r}, firmware {link.firmware}"
+        self.serial = link.stored_name or None
         self.highest_rate_hz = config.max_point_rate
         self._config = config
         self._link = link

@@ -44,6 +44,7 @@ class LaserCubeDac:
     def __init__(self, config: LaserCubeConfig, link: LaserCubeLink) -> None:
         self.name = link.name
         self.identity = f"{link.name}, firmware {link.firmware[0]}.{link.firmware[1]}"
+        self.serial = link.serial
         self.highest_rate_hz = min(config.max_point_rate, float(link.highest_rate_hz))
         self._config = config
         self._link = link

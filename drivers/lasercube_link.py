@@ -46,6 +46,7 @@ class LaserCubeLink:
     def __init__(self, link: UsbDevice, clock: Clock) -> None:
         """Output off, ring empty, and what the device says of itself."""
         self.name = link.label
+        self.serial = link.listing.serial
         self.clock = clock
         self._link = link
         self._lock = threading.RLock()

@@ -50,6 +50,7 @@ _ALL = (
         },
         "10 us",
     ),
+    Dimension("age", {"d": Fraction(86400), "h": Fraction(3600), "s": Fraction(1)}, "90 d"),
     Dimension(
         "frequency",
         {"Hz": Fraction(1), "kHz": Fraction(10**3), "MHz": Fraction(10**6), "GHz": Fraction(10**9)},
@@ -192,6 +193,8 @@ class _Text:
 
 
 Seconds = Annotated[float, _Text("time")]
+Age = Annotated[float, _Text("age")]
+"""In seconds in code: "90 d" is 7776000."""
 Hertz = Annotated[float, _Text("frequency")]
 ExactHertz = Annotated[Fraction, _Text("frequency", exact=True)]
 Metres = Annotated[float, _Text("length")]

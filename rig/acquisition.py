@@ -28,7 +28,7 @@ from rig.recording.writer import Recording
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig
 from rig.stages import PipelineStats
-from rig.sweeps import SweepAssembler, SweepStart
+from rig.sweeps import SweepAssembler, SweepData, SweepStart
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +63,8 @@ class Acquisition:
     Iterate once over `run()`. maker: makes the maps, on the counting thread. first_alone: take the first map with a
     start of its own, so that a SPAD that cannot wait stands still while it is learned from. groups: sweeps of each
     start, where that is not for the scan to choose; starts: with which sweep each begins. recording, watch: what
-    recorder and monitor work for, None for none. on_progress is called on the caller's thread.
+    recorder and monitor work for, None for none. on_progress is called on the caller's thread, on_sweep as `Mapping`
+    says.
     Raises UsageError where the SPAD cannot do what `policy` asks.
     """
 
@@ -82,6 +83,7 @@ class Acquisition:
         recording: Recording | None = None,
         watch: Watch | None = None,
         on_progress: Callable[[ScanProgress], None] | None = None,
+        on_sweep: Callable[[SweepData], None] | None = None,
         silence_s: float = SILENCE_S,
     ) -> None:
         if maps < 1:
@@ -101,6 +103,7 @@ class Acquisition:
         self._recording = recording
         self._watch = watch
         self._on_progress = on_progress
+        self._on_sweep = on_sweep
         self._silence_s = silence_s
         self._pipeline: Pipeline | None = None
         self._stats_before = PipelineStats()
@@ -188,6 +191,7 @@ class Acquisition:
             recording=self._recording,
             watch=self._watch,
             on_frame=None if rig.guard is None else rig.guard.beat,
+            on_sweep=self._on_sweep,
         )
         if rig.guard is not None:
             rig.guard.expect(self._guard_limits(sweeps))

@@ -5,6 +5,7 @@ result = scan(exposures=4, seed=1)
 result.last.depth_m, result.summary.truth
 """
 
+from rig.api_calibrate import calibrate_camera, calibrate_check, calibrate_pixels, calibrate_planes, calibrate_sync
 from rig.api_config import SIMULATED, Config, PathLike, configure
 from rig.api_reconstruct import reconstruct
 from rig.api_recordings import compress, cut, export_run, import_frames, recording_info, repair, verify
@@ -22,6 +23,11 @@ __all__ = [
     "bench",
     "bench_disk",
     "bench_simulator",
+    "calibrate_camera",
+    "calibrate_check",
+    "calibrate_pixels",
+    "calibrate_planes",
+    "calibrate_sync",
     "compress",
     "configure",
     "cut",

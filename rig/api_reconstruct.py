@@ -22,6 +22,7 @@ def reconstruct(
     estimator: Estimator | None = None,
     filter: Filter | None = None,
     min_confidence: float | None = None,
+    accept_calibration: bool = False,
     out: OutFolder = None,
     progress: Progress | None = None,
 ) -> RunResult:
@@ -29,10 +30,10 @@ def reconstruct(
 
     source: folder of a run taken with `record`, or uint8 (maps x columns x exposures, height, ceil(width/8)). plan,
     calibration: a cube needs both; a recording has its own, but may be given a calibration file that was made since.
-    Settings that are None are those of the recording; of a cube likelihood, none and 0.5.
-    out: a folder to write, None to write nothing. progress: called with frames or maps done and all. Raises UsageError,
-    a line per problem, for files that do not fit together. An interrupt ends the run after its last whole map, with
-    verdict 'aborted'.
+    Settings that are None are those of the recording; of a cube likelihood, none and 0.5. accept_calibration: as of
+    `scan`. out: a folder to write, None to write nothing. progress: called with frames or maps done and all. Raises
+    UsageError, a line per problem, for files that do not fit together. An interrupt ends the run after its last whole
+    map, with verdict 'aborted'.
     """
     if Path(source).is_dir():
         if plan is not None:
@@ -46,9 +47,11 @@ def reconstruct(
             estimator=estimator,
             filter=filter,
             min_confidence=min_confidence,
+            accept_calibration=accept_calibration,
             out=out,
             progress=progress,
         )
+    from rig.calibration_identity import cube_calibration_use
     from rig.cube import open_cube
     from rig.cube_depth import reconstruct_cube
 
@@ -62,7 +65,9 @@ def reconstruct(
     )
     cube_plan = plan if isinstance(plan, CubePlan) else load_cube_plan(Path(plan))
     model = calibration if isinstance(calibration, RigModel) else _load_calibration(calibration)
-    return reconstruct_cube(open_cube(source, cube_plan, model), model, estimate, out, progress)
+    file = None if isinstance(calibration, RigModel) else Path(calibration)
+    use = cube_calibration_use(model, file, accept=accept_calibration)
+    return reconstruct_cube(open_cube(source, cube_plan, model), use, estimate, out, progress)
 
 
 def _load_calibration(path: PathLike) -> RigModel:

@@ -36,6 +36,7 @@ def scan(
     seed: int = 0,
     save: str = "all",
     arm: bool = False,
+    accept_calibration: bool = False,
     out: OutFolder = None,
     record: bool = False,
     on_overload: str = "abort",
@@ -46,10 +47,12 @@ def scan(
     """Acquire and reconstruct `maps` depth maps (`rig scan`).
 
     config and options: as `configure`. save: 'all', 'last' or 'every N' maps. arm: must be True where laser or gate are
-    real. out: a folder to write, None to write nothing. record: write the frames into it too. on_overload: 'abort',
-    'drop' or 'block', what to do with frames that come too fast. progress: called with frames done and planned; live:
-    with a `ScanProgress`, the figures of every stage in it; both several times a second. monitor: called with the
-    newest frames as a `MonitorView`, at most ten times a second, on a thread of its own; the run never waits for it.
+    real. accept_calibration: use a calibration that is of another rig, has failed or is too old all the same (else it
+    is refused); what speaks against it is in manifest and summary. out: a folder to write, None to write nothing.
+    record: write the frames into it too. on_overload: 'abort', 'drop' or 'block', what to do with frames that come too
+    fast. progress: called with frames done and planned; live: with a `ScanProgress`, the figures of every stage in it;
+    both several times a second. monitor: called with the newest frames as a `MonitorView`, at most ten times a second,
+    on a thread of its own; the run never waits for it.
     Raises UsageError for what cannot be, DeviceError or DevicesError where devices fail; maps that were whole by then
     are in `out`. An interrupt ends the scan after its last whole map, with verdict 'aborted'.
     """
@@ -67,7 +70,7 @@ def scan(
         adaptive=adaptive,
     )
     policy, overload = _checked_policies(maps, seed, save, on_overload, _problems(settings, arm, out, record))
-    options = ScanOptions(overload, record, monitor, _both(progress, live))
+    options = ScanOptions(overload, record, monitor, _both(progress, live), accept_calibration=accept_calibration)
     with _new_run(settings, out, policy, record) as run:
         tap = run.start_tap() if record else None
         with open_rig(settings, seed=seed, tap=tap) as rig:
@@ -81,17 +84,20 @@ def plan_scan(
     seed: int = 0,
     save: str = "all",
     on_overload: str = "abort",
+    accept_calibration: bool = False,
     **options: Any,
 ) -> "ScanPlan":
     """The compiled plan of a scan, checked against its devices' limits (`rig scan --dry-run`).
 
-    maps, seed, save, on_overload: checked as `scan` would; the plan does not depend on them. options: as `configure`.
+    maps, seed, save, on_overload, accept_calibration: checked as `scan` would; the plan does not depend on them.
+    options: as `configure`.
 
     Devices are opened, asked for their limits and closed again: nothing moves and nothing shines, so that no `arm` is
     needed. Raises DevicesError, a line per device, where real ones are not there.
     """
     from rig.adaptive_decision import first_pass
     from rig.burst import require_memory
+    from rig.calibration_identity import calibration_use
     from rig.overload import require_policy
     from rig.session import open_rig, prepare
 
@@ -99,6 +105,7 @@ def plan_scan(
     _, overload = _checked_policies(maps, seed, save, on_overload)
     with open_rig(settings) as rig:
         require_policy(overload, rig.spad.info)
+        calibration_use(rig, accept=accept_calibration)
         plan, _ = prepare(rig)
         require_memory(rig, plan)
         if settings.scan.adaptive is not None:
@@ -122,6 +129,7 @@ def replay(
     block_frames: int | None = None,
     save: str = "all",
     arm: bool = False,
+    accept_calibration: bool = False,
     out: OutFolder = None,
     record: bool = False,
     on_overload: str = "abort",
@@ -152,7 +160,7 @@ def replay(
         settings = settings.model_copy(update={"calibration": Path(calibration)})
     problems = _problems(settings, arm, out, record)
     policy, overload = _checked_policies(1 if maps is None else maps, 0, save, on_overload, problems)
-    options = ScanOptions(overload, record, monitor, _both(progress, live))
+    options = ScanOptions(overload, record, monitor, _both(progress, live), accept_calibration=accept_calibration)
     with _new_run(settings, out, policy, record) as writer:
         return play(settings, Path(run), writer, maps, options, steps)
 

@@ -16,7 +16,17 @@ from typing import Annotated
 
 import typer
 
-from rig import cli_bench, cli_config, cli_devices, cli_exchange, cli_recordings, cli_replay, cli_scan, cli_tradeoff
+from rig import (
+    cli_bench,
+    cli_calibrate,
+    cli_config,
+    cli_devices,
+    cli_exchange,
+    cli_recordings,
+    cli_replay,
+    cli_scan,
+    cli_tradeoff,
+)
 from rig.cli_command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, say
 from rig.kernel_cache import ensure_kernel_cache
 
@@ -28,7 +38,17 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 # In the order in which '--help' lists them; groups come last.
-for _commands in (cli_config, cli_recordings, cli_exchange, cli_replay, cli_scan, cli_tradeoff, cli_devices, cli_bench):
+for _commands in (
+    cli_config,
+    cli_recordings,
+    cli_exchange,
+    cli_replay,
+    cli_scan,
+    cli_tradeoff,
+    cli_calibrate,
+    cli_devices,
+    cli_bench,
+):
     _commands.register(app)
 
 

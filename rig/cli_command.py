@@ -42,6 +42,9 @@ OutOption = Annotated[
 ]
 RecordOption = Annotated[bool, typer.Option("--record", help="write the frames into the folder too")]
 ArmOption = Annotated[bool, typer.Option("--arm", help="let a real laser shine: the beam path is clear")]
+AcceptOption = Annotated[
+    bool, typer.Option("--accept-calibration", help="use a calibration of another rig, failed or too old, all the same")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout")]
 
 
@@ -52,8 +55,10 @@ def command(function: Callable[P, int | None]) -> Callable[P, None]:
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
             code = function(*args, **kwargs)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as interrupt:
             say("aborted")
+            for note in getattr(interrupt, "__notes__", []):
+                say(note)
             code = EXIT_ABORTED
         except Exception as error:
             code = _code_of(error)
@@ -133,6 +138,23 @@ def live_progress() -> Iterator["Callable[[ScanProgress], None] | None"]:
             bar(done.frames, done.frames_planned, done.lost, "" if done.fog is None else done.fog.brief())
 
         yield None if bar is None else tell
+
+
+def split_option(given: list[str] | None) -> list[str]:
+    """The parts of an option that may be given several times and with commas."""
+    parts = (part.strip() for value in given or () for part in value.split(","))
+    return list(dict.fromkeys(part for part in parts if part))
+
+
+def whole_numbers(option: str, given: list[str] | None) -> list[int]:
+    """The same of an option that takes whole numbers."""
+    from rig.errors import UsageError
+
+    parts = split_option(given)
+    wrong = [part for part in parts if not part.isdecimal()]
+    if wrong:
+        raise UsageError(f"{option} has {wrong[0]!r}, which is no whole number; write e.g. {option} 1,3,10")
+    return [int(part) for part in parts]
 
 
 def default_out() -> Path:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli_command import (
+    AcceptOption,
     ArmOption,
     ConfidenceOption,
     EstimatorOption,
@@ -74,6 +75,7 @@ def replay_command(
         str, typer.Option("--on-overload", help="frames come too fast: abort and block wait, drop counts them")
     ] = "abort",
     arm: ArmOption = False,
+    accept_calibration: AcceptOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Play a recording through the live stack, at any clock."""
@@ -92,6 +94,7 @@ def replay_command(
             block_frames=block_frames,
             save=save or ("last" if loop else "all"),
             arm=arm,
+            accept_calibration=accept_calibration,
             out=default_out() if out is None else out,
             record=record,
             on_overload=on_overload,

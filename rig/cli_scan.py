@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli_command import (
+    AcceptOption,
     ArmOption,
     ConfidenceOption,
     ConfigArgument,
@@ -68,6 +69,7 @@ def scan_command(
         str, typer.Option("--on-overload", help="frames come too fast: abort, drop (and count) or block (wait)")
     ] = "abort",
     arm: ArmOption = False,
+    accept_calibration: AcceptOption = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="compile and print the plan; nothing moves")] = False,
     as_json: JsonOption = False,
 ) -> int:
@@ -82,6 +84,7 @@ def scan_command(
         "min_confidence": min_confidence,
         "temporal_prior": temporal_prior,
         "adaptive": _passes(adaptive, time_budget),
+        "accept_calibration": accept_calibration,
     }
     if dry_run:
         plan = api.plan_scan(config, maps=maps, seed=seed, save=save, on_overload=on_overload, **options)
@@ -135,6 +138,7 @@ def reconstruct_command(
     estimator: EstimatorOption = None,
     filter: FilterOption = None,
     min_confidence: ConfidenceOption = None,
+    accept_calibration: AcceptOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Depth from a recording or from a packed .npy cube of frames."""
@@ -142,6 +146,7 @@ def reconstruct_command(
 
     # Names that are none are refused by the call, which knows which there are.
     options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
+    options["accept_calibration"] = accept_calibration
     with progress("done") as bar:
         result = api.reconstruct(source, plan, calibration, out=out, progress=bar, **options)
     return report(result, as_json)

@@ -1,6 +1,6 @@
 """What accuracy costs in time, and which setting to use: `rig tradeoff`."""
 
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import typer
 
@@ -14,10 +14,11 @@ from rig.cli_command import (
     print_json,
     progress,
     say,
+    split_option,
+    whole_numbers,
 )
 
 Some = list[str] | None
-Value = TypeVar("Value")
 
 
 def register(app: typer.Typer) -> None:
@@ -58,12 +59,12 @@ def tradeoff_command(
     with progress("frames") as bar:
         done = api.tradeoff(
             config,
-            scenes=_split(scene),
-            fogs=_split(fog),
-            exposures=_numbers("--exposures", exposures),
-            lines=_numbers("--lines", lines),
-            estimators=_split(estimators),
-            filters=_split(filters),
+            scenes=split_option(scene),
+            fogs=split_option(fog),
+            exposures=whole_numbers("--exposures", exposures),
+            lines=whole_numbers("--lines", lines),
+            estimators=split_option(estimators),
+            filters=split_option(filters),
             repeat=repeat,
             seed=seed,
             limits=limits,
@@ -89,19 +90,3 @@ def tradeoff_command(
             "raise --exposures")  # fmt: skip
         return 1
     return 0 if done.answer.fits else 1
-
-
-def _split(given: Some) -> list[str]:
-    """The parts of an option that may be given several times and with commas."""
-    parts = (part.strip() for value in given or () for part in value.split(","))
-    return list(dict.fromkeys(part for part in parts if part))
-
-
-def _numbers(option: str, given: Some) -> list[int]:
-    from rig.errors import UsageError
-
-    parts = _split(given)
-    wrong = [part for part in parts if not part.isdecimal()]
-    if wrong:
-        raise UsageError(f"{option} has {wrong[0]!r}, which is no whole number; write e.g. {option} 1,3,10")
-    return [int(part) for part in parts]

@@ -21,7 +21,7 @@ from pydantic import (
 
 from drivers.errors import UnknownKind
 from drivers.registry import KindConfig, kinds, lookup
-from drivers.units import ExactHertz, Metres, Seconds, Watts
+from drivers.units import Age, ExactHertz, Metres, Seconds, Watts
 from rig.multi_line_config import LineOffsets, LinePower, line_problems
 
 MIN_DARK_FRACTION = 0.05
@@ -208,6 +208,11 @@ class RigConfig(Section):
     name: str = Field(min_length=1, description="name of the rig, for people", examples=["lab"])
     calibration: Annotated[Path | None, AfterValidator(_beside_config)] = Field(
         default=None, description="calibration file, relative to this file; without one there is no depth"
+    )
+    calibration_max_age: Annotated[Age, Field(gt=0)] | None = Field(
+        default=None,
+        description="age from which on a calibration that says when it was made is refused; null for any age",
+        examples=["90 d"],
     )
     world: Annotated[SerializeAsAny[KindConfig], _of_slot("world")] | None = Field(
         default=None, description="what simulated devices look at; real rigs have none"

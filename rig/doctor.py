@@ -13,6 +13,7 @@ from typing import Any
 
 from drivers.errors import DeviceError
 from rig.burst import require_memory
+from rig.calibration_identity import NEXT, identity_of, refusals
 from rig.config import RigConfig
 from rig.dark_look import DarkLook, look
 from rig.errors import DevicesError, RigError
@@ -45,7 +46,7 @@ def examine(config: RigConfig, folder: Path) -> list[Finding]:
     findings: list[Finding] = []
     try:
         with open_rig(config) as rig:
-            findings += _devices(rig)
+            findings += [*_devices(rig), _calibration(rig)]
             plan, timing = prepare(rig)
             require_memory(rig, plan)
             rig.sync.program(*plan.sync_program(plan.sweeps_per_period))
@@ -97,6 +98,19 @@ def _laser(rig: OpenRig) -> Finding:
     warm = "" if status.temperature_c is None else f", {status.temperature_c:.1f} C"
     most = f", up to {rig.laser.limits.max_power_w * 1e3:g} mW"
     return Finding("laser", not trouble, f"{rig.laser.identity}: {state}{warm}{most}")
+
+
+def _calibration(rig: OpenRig) -> Finding:
+    """A rig without one can scan: there are stripes then, and no depth."""
+    file, model = rig.config.calibration, rig.model
+    if model is None:
+        return Finding("calibration", True, "none: a scan gives stripes but no depth")
+    against = refusals(model, file, identity_of(rig), rig.config.calibration_max_age)
+    if against:
+        return Finding("calibration", False, f"{file}: {'; '.join(each.text for each in against)}; {NEXT}")
+    made = model.identity
+    said = "does not say of which rig it is: unchecked" if made is None else f"of this rig, made {made.created}"
+    return Finding("calibration", True, f"{file}: {said}")
 
 
 def _plan(plan: ScanPlan) -> Finding:

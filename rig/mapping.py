@@ -31,8 +31,8 @@ class Mapping:
     """Counts the blocks of one start of the SPAD and estimates each sweep where it ends, before any frame behind it.
 
     on_complete: called on this thread as soon as the marker that closes the last sweep is counted; the last map is
-    estimated after that. sweeps: how many it is to be. Maps go to `queue`, which ends with this thread; `error` says
-    why, where it was too early.
+    estimated after that. on_sweep: shown each counted sweep before its map is made, on this thread too. sweeps: how
+    many it is to be. Maps go to `queue`, which ends with this thread; `error` says why, where it was too early.
     """
 
     def __init__(
@@ -45,6 +45,7 @@ class Mapping:
         source: Source,
         silence_s: float,
         on_complete: Callable[[], None],
+        on_sweep: Callable[[SweepData], None] | None = None,
     ) -> None:
         self._reader = reader
         self._assembler = assembler
@@ -54,6 +55,7 @@ class Mapping:
         self._source = source
         self._silence_s = silence_s
         self._on_complete = on_complete
+        self._on_sweep = on_sweep
         self._thread = StageThread(self._run, "counting")
         self.counting_s = 0.0
         self.estimation_s = 0.0
@@ -113,6 +115,8 @@ class Mapping:
 
     def _estimate(self, sweep: SweepData) -> None:
         begun = time.perf_counter()
+        if self._on_sweep is not None:
+            self._on_sweep(sweep)
         result = self._maker.map(sweep.volume)
         column = sweep.volume.bound_column()
         found = AcquiredMap(sweep.account(), column, result, sweep.count_s + result.compute_s)

@@ -22,8 +22,13 @@ def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
     return low - spare, high + spare
 
 
-def depth_picture(depth_m: NDArray[np.float32], limits: tuple[float, float] | None) -> NDArray[np.uint8]:
-    """Colours near (red) to far (blue), black where there is no depth, with a scale in metres at the right; BGR."""
+def depth_picture(
+    depth_m: NDArray[np.float32], limits: tuple[float, float] | None, unit: str = "m"
+) -> NDArray[np.uint8]:
+    """Colours near (red) to far (blue), black where there is no depth, with a scale at the right; BGR.
+
+    limits: of red and of blue, whichever is larger.
+    """
     import cv2
 
     rows, width = depth_m.shape
@@ -38,11 +43,11 @@ def depth_picture(depth_m: NDArray[np.float32], limits: tuple[float, float] | No
     bar = np.linspace(low, high, bottom - top)
     left = width + 8
     picture[top:bottom, left : left + _BAR_PX] = _colours(bar, limits)[:, None]
-    for value in round_values(low, high, min(_LABELS, max(1, rows // 40))):
+    for value in round_values(min(limits), max(limits), min(_LABELS, max(1, rows // 40))):
         y = top + round((value - low) / (high - low) * (bottom - top - 1))
         cv2.line(picture, (left + _BAR_PX, y), (left + _BAR_PX + 3, y), (255, 255, 255), 1)
         at = (left + _BAR_PX + 6, min(max(y + _TEXT_HEIGHT_PX // 2, _TEXT_HEIGHT_PX), rows - 2))
-        cv2.putText(picture, f"{value:.4g} m", at, cv2.FONT_HERSHEY_SIMPLEX, 0.38, (255, 255, 255), 1, cv2.LINE_AA)
+        cv2.putText(picture, f"{value:.4g} {unit}", at, cv2.FONT_HERSHEY_SIMPLEX, 0.38, (255, 255, 255), 1, cv2.LINE_AA)
     return picture
 
 

@@ -17,7 +17,7 @@ from rig.recording.recorder import Recorder
 from rig.recording.writer import WRITERS, Recording
 from rig.source import Source
 from rig.stages import PipelineStats
-from rig.sweeps import MOST_UNDER_WAY, SweepAssembler
+from rig.sweeps import MOST_UNDER_WAY, SweepAssembler, SweepData
 
 MAPS_AHEAD = 2
 """Maps that may wait for the caller before counting waits too."""
@@ -35,7 +35,7 @@ class Pipeline:
     """source -> ring -> {counting + estimation, recorder, monitor} -> maps, for one start of the SPAD.
 
     assembler: takes `sweeps` sweeps; maker: makes their maps, on the counting thread. recording, watch: None for no
-    recorder and no monitor.
+    recorder and no monitor. on_sweep: as of `Mapping`.
     """
 
     def __init__(
@@ -50,6 +50,7 @@ class Pipeline:
         recording: Recording | None = None,
         watch: Watch | None = None,
         on_frame: Callable[[int], None] | None = None,
+        on_sweep: Callable[[SweepData], None] | None = None,
     ) -> None:
         self._ring = ring
         self._queue = MapQueue(MAPS_AHEAD)
@@ -63,6 +64,7 @@ class Pipeline:
             self._source,
             silence_s,
             on_complete=self._complete,
+            on_sweep=on_sweep,
         )
         self._recorder: Recorder | None = None
         if recording is not None:

@@ -105,6 +105,7 @@ def replay_config(
     content: dict[str, Any] = {
         "name": f"replay of {recorded.get('name') or run.name}",
         "calibration": str(calibration.absolute()) if calibration.exists() else None,
+        "calibration_max_age": recorded.get("calibration_max_age"),
         "world": None,
         "spad": {
             "kind": "replay",
@@ -135,6 +136,10 @@ def replay_plan(
         from rig.recalibrated import recalibrated
 
         plan = recalibrated(plan, model)
+    elif not plan.windowed:
+        from rig.recalibrated import whole_rows
+
+        plan = whole_rows(plan)
     first = plan
     if (recording.path / pass_plan(0)).exists():  # taken in passes: the SPAD begins with the first of them
         first = read_plan(recording.path, pass_plan(0))

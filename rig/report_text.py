@@ -110,6 +110,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         *(() if summary.sync is None else (("sync", _sync(summary.sync)),)),
         *(() if summary.stages is None else (("stages", _stages(summary.stages)),)),
         *(() if summary.replay is None or not summary.replay.blocks else (("clock", _clock(summary.replay)),)),
+        *(("calibration", f"accepted in spite of {reason}") for reason in summary.accepted_calibration),
         ("filled", f"{_percent(summary.valid_fraction)} of the pixels have a depth"),
     ]
     fog = summary.fog

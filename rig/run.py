@@ -4,7 +4,7 @@ import os
 import platform
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
@@ -175,9 +175,11 @@ class Run:
         sync: Synchronisation | None = None,
         replay: PaceReport | None = None,
         adaptive: AdaptiveFigures | None = None,
+        accepted_calibration: tuple[str, ...] = (),
     ) -> RunResult:
         """Write manifest and summary and make the folder appear; one without a map or a recorded block leaves none."""
         summary = self.tally.summary(frames, sensor_time_s, verdict, stages, sync, replay, adaptive)
+        summary = replace(summary, accepted_calibration=accepted_calibration)
         index, result, truth = self._last or (None, None, None)
         folder = None
         if self._folder is not None and self.worth_keeping:

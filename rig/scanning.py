@@ -16,6 +16,7 @@ from rig.acquisition import SILENCE_S, Acquisition, ScanProgress
 from rig.adaptive_decision import ChoosesPasses, DecidedPasses
 from rig.adaptive_recording import PassNotes, RecordedPasses
 from rig.adaptive_scan import AdaptiveAcquisition
+from rig.calibration_identity import accepted_by, calibration_use, identity_of, rig_content
 from rig.config import RigConfig, ScanConfig
 from rig.errors import RigError
 from rig.estimators import LEARNING, Learned
@@ -33,7 +34,7 @@ from rig.run import Run, RunResult
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, prepare
 from rig.summary import RunFrames, Synchronisation, Verdict
-from rig.sweeps import SweepAccount
+from rig.sweeps import SweepAccount, SweepData
 from rig.warm_up import warm_binding, warm_up
 
 
@@ -42,13 +43,16 @@ class ScanOptions:
     """How a scan is run, apart from its config. record: keep the frames; needs a run with a folder.
 
     watch: a monitor's callback, on a thread of its own. live: told of the progress several times a second, on the
-    caller's thread.
+    caller's thread. sweeps: shown each counted sweep before its map is made, on the counting thread; not those of maps
+    that are made in passes. accept_calibration: use a foreign or stale calibration too, see `calibration_identity`.
     """
 
     policy: Overload = Overload.ABORT
     record: bool = False
     watch: Watch | None = None
     live: Callable[[ScanProgress], None] | None = None
+    sweeps: Callable[[SweepData], None] | None = None
+    accept_calibration: bool = False
 
 
 def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanOptions | None = None) -> RunResult:
@@ -61,6 +65,8 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
     """
     options = options or ScanOptions()
     require_policy(options.policy, rig.spad.info)
+    here = identity_of(rig)
+    calibration = calibration_use(rig, accept=options.accept_calibration, here=here)
     plan, timing = prepare(rig)
     replayed = Replayed.of(rig.spad, plan, maps)
     maps = maps or 1 if replayed is None else replayed.maps
@@ -70,7 +76,7 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
     )
     geometry = reconstructor.geometry
     passes = _passes(rig, plan, timing, geometry, threads, replayed)
-    run.rays = (geometry.u, geometry.v) if rig.model is not None else None
+    run.rays = geometry.rays if rig.model is not None else None
 
     estimate = rig.config.estimate
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)
@@ -79,7 +85,8 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         "command": "scan" if replayed is None else "replay",
         "config": rig.config.model_dump(mode="json"),
         "plan": plan_content(plan),
-        "calibration": calibration_content(rig.model),
+        "calibration": None if calibration is None else calibration.content(),
+        "rig": rig_content(here),
         "devices": devices_content(rig, plan, timing),
         "seed": seed,
         "maps": maps,
@@ -107,6 +114,7 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
             # Learning takes a second or more, and a live stream cannot stand still meanwhile.
             first_alone=estimate.estimator in LEARNING and not rig.spad.info.can_wait,
             groups=None if replayed is None else replayed.groups(),
+            on_sweep=options.sweeps,
             **settings,
         )
     of_maps: list[tuple[SweepAccount, ...]] = []
@@ -134,6 +142,7 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         _synchronisation(sweeps),
         None if replayed is None else replayed.report,
         acquisition.figures(frames.lit) if isinstance(acquisition, AdaptiveAcquisition) else None,
+        accepted_by(calibration),
     )
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:
@@ -224,11 +233,6 @@ def plan_content(plan: ScanPlan) -> dict[str, Any]:
             for leg in plan.legs
         ],
     }
-
-
-def calibration_content(model: RigModel | None) -> dict[str, Any] | None:
-    """Which calibration a run used, for the manifest."""
-    return None if model is None else {"id": model.fingerprint(), "provenance": dict(model.provenance)}
 
 
 def make_reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned] = ()) -> Reconstructor:

@@ -109,6 +109,8 @@ class Summary:
     sync: Synchronisation | None = None
     replay: PaceReport | None = None
     adaptive: AdaptiveFigures | None = None
+    accepted_calibration: tuple[str, ...] = ()
+    """What speaks against the calibration that the run was told to use all the same."""
 
     def as_json(self) -> dict[str, Any]:
         """The summary as plain values; `truth` only where it is known, others only of a scan or of a replay."""
@@ -124,6 +126,8 @@ class Summary:
             del content["replay"]
         if self.adaptive is None:
             del content["adaptive"]
+        if not self.accepted_calibration:
+            del content["accepted_calibration"]
         return content
 
 

@@ -145,7 +145,7 @@ class ManyMakers:
         counter.reset()
         for block in sweep.blocks:
             counter.add(*block)
-        counted = counter.finish()
+        counted = replace(counter.finish(), velocity_per_s=sweep.velocity_per_s)
         stripe = maker.estimator.estimate(counted, maker.geometry)
         return stripe, counted, time.perf_counter() - begun
 

@@ -57,6 +57,11 @@ class Device(ABC):
         return self._name
 
     @property
+    def serial(self) -> str | None:
+        """Its serial number, or the lasting name of one that has none; None: it tells neither."""
+        return None
+
+    @property
     def state(self) -> DeviceState:
         """Where the device stands, as far as its verbs tell."""
         return self._state

@@ -130,6 +130,11 @@ class SpadArray(Device):
         return " ".join(part for part in (f"{self._name}:", self.info.model, self.info.serial) if part)
 
     @property
+    def serial(self) -> str | None:
+        """As in `info`."""
+        return self.info.serial or None
+
+    @property
     def counters(self) -> SpadCounters:
         """Counts of the present run, or of the last one; also after `close`. Any thread."""
         return self._do_counters()

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.row_input import Float32, State, Sweep, row_buffers, row_fluxes
+from rig.estimators.row_input import Float32, Lines, State, Sweep, row_buffers, row_fluxes
 
 LEAST_FLUX: Final = 2e-3
 """Flux that a pixel is taken to have at least where its counts are weighed."""
@@ -18,26 +18,24 @@ MOST_SWEEPS: Final = 3000
 
 @numba.njit(cache=True, nogil=True)
 def add_equations(
-    counts: NDArray[np.unsignedinteger],
-    n_frames: NDArray[np.int32],
+    lines: Lines,
+    light: Float32,
     sweep: Sweep,
     state: State,
     halo: Float32,
     reaches: NDArray[np.float64],
     nodes: int,
     hot_flux: float,
-    rows: NDArray[np.int32],
-    columns: NDArray[np.int32],
-    x_px: Float32,
-    light: Float32,
+    first_line: int,
+    last_line: int,
     matrix: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> None:
-    """Add the normal equations of stripes on some rows of some columns, weighted as the present state expects counts.
+    """Add the normal equations of lines first_line..last_line-1, weighted as the present state expects counts.
 
     Unknown: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; ambient
-    light that the state has too little of. halo: (BINS, pixels) of `halo_shares`; x_px, light: of each row and column,
-    photons. Only one half of the matrix is filled, rows from columns on.
+    light that the state has too little of. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its
+    x_px, photons. Only one half of the matrix is filled, rows from columns on.
     """
     bins, number = state.profile.shape[0], len(reaches)
     first_share, first_halo, last = bins, bins + nodes, matrix.shape[0] - 1
@@ -45,13 +43,13 @@ def add_equations(
     index, value = np.empty(terms + 1, np.int64), np.empty(terms + 1)
     row, side = row_buffers(sweep.window, 1), 1 if sweep.near_is_left else -1
     per_bin = (nodes - 1) / (bins - 1)
-    for i in range(rows.shape[0]):
-        y, c = rows[i], columns[i]
+    for i in range(first_line, last_line):
+        y, c = lines.row[i], lines.column[i]
         length, _, _, start = row_fluxes(sweep, state, row, y, c)
-        if length == 0 or n_frames[c] == 0:
+        if length == 0 or lines.exposures[i] == 0:
             continue
-        frames, s = np.float64(n_frames[c]), np.float64(light[y, c])
-        place = side * (np.float64(x_px[y, c]) - start)
+        frames, s = np.float64(lines.exposures[i]), np.float64(light[i])
+        place = side * (np.float64(lines.x_px[i]) - start)
         own = row.cell[min(max(int(np.rint(place)), 0), length - 1)]
         low = min(int(own * per_bin), nodes - 2)
         part = own * per_bin - low
@@ -64,7 +62,7 @@ def add_equations(
             expected = (row.before[t] if before else row.behind[t]) + s * halo[own, min(int(away), halo.shape[1] - 1)]
             dark = np.exp(-max(expected, LEAST_FLUX))
             weight = frames * dark / (1.0 - dark)
-            n = np.float64(counts[c, y, start + side * t - sweep.x0[c]])
+            n = np.float64(lines.counts[i, start + side * t - sweep.x0[c]])
             # The flux that would make these counts the expected ones, near the present state.
             flux = (n / frames - 1.0 + dark) / dark - np.log(dark) - ambient - row.others[t]
             if before:

@@ -2,10 +2,11 @@
 
 What is counted beside a stripe is haze, pedestal, halo and ambient light: each of them a sum of known shapes, so that
 one linear fit tells them apart where averages behind and before the stripe cannot: the halo follows the brightness of
-each stripe, haze does not. On its own a row cannot tell a stripe's brightness: neighbours' is used (`placing`).
+each stripe, haze does not. On its own a row cannot tell a stripe's brightness: neighbours' is used (`placing`). Later
+maps are asked whether there still is a halo, or one now.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 from rig.counting import CountVolume
 from rig.estimators.halo import halo_shares, over_bins
 from rig.estimators.halo_kernels import add_equations, solve
-from rig.estimators.learning import LATTICE_LINES, PIECES, lattice
+from rig.estimators.learning import LATTICE_LINES, PIECES, lattice, lines_of
+from rig.estimators.lessons import Setting
 from rig.estimators.placing_kernels import Places
-from rig.estimators.row_input import state_of, sweep_of
+from rig.estimators.row_input import Lines, state_of, sweep_of
 from rig.estimators.row_model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, fit_haze
 from rig.geometry import SweepGeometry
 from rig.row_threads import RowWorkers
@@ -25,7 +27,8 @@ from rig.stripes import StripeTable
 CLEAR: Final = np.float32(0.5)
 """Confidence of stripes that teach."""
 FIRST_LINES: Final = LATTICE_LINES // 4
-"""Rows x columns that tell whether there is a halo at all; once there is, twice LATTICE_LINES measure it."""
+"""Rows x columns that tell whether there is a halo at all, and of later maps; once there is one in the first map, twice
+LATTICE_LINES measure it."""
 LEAST_EVIDENCE: Final = 50.0
 """By how much a halo must better the fit, in chi squared: without one it does by 2 to 10, in fog of optical depth 1 by
 4000 to 30000."""
@@ -36,7 +39,26 @@ _SHARE, _HALO = BINS, BINS + HALO_NODES
 _SIZE = _HALO + HALO_NODES * len(HALO_REACHES_PX) + 1
 
 
-def learn_halo(
+@dataclass(frozen=True, slots=True, eq=False)
+class BrightLines:
+    """Lines with a clear stripe, and the light of each, photons: what can teach of a halo."""
+
+    lines: Lines
+    light: NDArray[np.float32]
+
+
+def bright_lines(
+    volume: CountVolume, geometry: SweepGeometry, stripes: StripeTable, places: Places, number: int = FIRST_LINES
+) -> BrightLines:
+    """The clear ones of about so many lines of a map; places: of its stripes."""
+    rows, columns = lattice(geometry, number)
+    clear = stripes.confidence[rows, columns] > CLEAR
+    rows, columns = rows[clear], columns[clear]
+    light = places.amplitude[rows, columns] * places.scale[rows, columns]
+    return BrightLines(lines_of(volume, (rows, columns), stripes), light)
+
+
+def learn_first_halo(
     volume: CountVolume,
     geometry: SweepGeometry,
     model: RowModel,
@@ -45,13 +67,41 @@ def learn_halo(
     places: Places,
     workers: RowWorkers,
 ) -> RowModel:
+    """What `learn_halo` gives for the first map; to be called again with the map that is made under it."""
+    number = 2 * LATTICE_LINES if model.halo.any() else FIRST_LINES
+    seen, dark = bright_lines(volume, geometry, stripes, places, number), volume.dark_counts is not None
+    return learn_halo(seen, geometry, model, ambient, workers, dark=dark)
+
+
+def learn_next_halo(setting: Setting, seen: BrightLines, workers: RowWorkers) -> RowModel:
+    """The model of a later lesson: with a halo where the map begins to show one, without where it does not any more.
+
+    One that stays is left as it was found. Told again from so few lines, lesson after lesson, halo, haze and the rest
+    behind stripes shift among each other: over eight maps in steady fog errors grew by 10 to 25 %.
+    """
+    model = setting.model
+    if not model.halo.any() and np.isnan(model.extinction_per_m):
+        return model
+    found = learn_halo(seen, setting.geometry, model, model.ambient, workers, dark=setting.dark)
+    return model if found.halo.any() == model.halo.any() else found
+
+
+def learn_halo(
+    seen: BrightLines,
+    geometry: SweepGeometry,
+    model: RowModel,
+    ambient: NDArray[np.float32],
+    workers: RowWorkers,
+    *,
+    dark: bool,
+) -> RowModel:
     """The model with the halo that these stripes have, and the haze under it; as it is where they have none.
 
-    ambient: of each pixel, (rows, width). The scale of stripes stays that of the model, which `places` goes by.
+    The scale of stripes stays that of the model, which their light goes by. ambient: of each pixel, (rows, width), that
+    the fit begins with. dark: whether there are dark frames.
     """
-    seen = replace(model, ambient=ambient)
-    matrix, right = _equations(volume, geometry, seen, stripes, places, workers)
-    free = _SIZE - 1 if volume.dark_counts is None else -1
+    matrix, right = _equations(seen, geometry, replace(model, ambient=ambient), workers)
+    free = -1 if dark else _SIZE - 1
     if free < 0:
         # Dark frames have measured the ambient light.
         matrix[-1], matrix[:, -1], right[-1] = 0.0, 0.0, 0.0
@@ -78,25 +128,20 @@ def learn_halo(
 
 
 def _equations(
-    volume: CountVolume, geometry: SweepGeometry, model: RowModel, stripes: StripeTable, places: Places,
-    workers: RowWorkers,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
-    rows, columns = lattice(geometry, 2 * LATTICE_LINES if model.halo.any() else FIRST_LINES)
-    clear = stripes.confidence[rows, columns] > CLEAR
-    rows, columns = rows[clear], columns[clear]
-    sweep, state, light = sweep_of(geometry), state_of(model), places.amplitude * places.scale
+    seen: BrightLines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    sweep, state = sweep_of(geometry), state_of(model)
     shares, reaches = halo_shares(model, geometry.width), np.array(HALO_REACHES_PX)
     hot_flux = 5.0 * float(np.median(model.ambient)) + 1e-3
     # Fixed pieces, added in order: the sums do not depend on the number of threads.
-    edges = np.linspace(0, len(rows), PIECES + 1).astype(int)
+    edges = np.linspace(0, len(seen.light), PIECES + 1).astype(int)
     matrices, rights = np.zeros((PIECES, _SIZE, _SIZE)), np.zeros((PIECES, _SIZE))
 
     def work(first: int, last: int) -> None:
         for i in range(first, last):
-            part = slice(edges[i], edges[i + 1])
             add_equations(
-                volume.counts, volume.n_frames, sweep, state, shares, reaches, HALO_NODES, hot_flux, rows[part],
-                columns[part], stripes.x_px, light, matrices[i], rights[i],
+                seen.lines, seen.light, sweep, state, shares, reaches, HALO_NODES, hot_flux, edges[i], edges[i + 1],
+                matrices[i], rights[i],
             )  # fmt: skip
 
     workers.over(PIECES, work)

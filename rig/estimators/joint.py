@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import Counter, CountVolume, SweepCounter, SweepLayout
+from rig.errors import UsageError
 from rig.estimators.aggregation_answer import Answer, answer_settings, new_answer
 from rig.estimators.aggregation_kernels import Penalties, along_columns, along_rows
 from rig.estimators.ambient import ambient_map
 from rig.estimators.halo import halo_shares
-from rig.estimators.halo_learning import learn_halo
+from rig.estimators.halo_learning import bright_lines, learn_first_halo, learn_next_halo
 from rig.estimators.joint_answer import brightness_of, stripe_table
 from rig.estimators.joint_confidence import Brightness
 from rig.estimators.joint_kernels import add_quiet, read_positions
@@ -30,7 +31,7 @@ from rig.estimators.placing import amplitudes_of, line_width, new_places, place,
 from rig.estimators.placing_kernels import Places
 from rig.estimators.row_input import State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
-from rig.estimators.second_return import second_returns
+from rig.estimators.second_return import SecondLight, second_light, second_returns
 from rig.estimators.temporal import TemporalPrior
 from rig.estimators.volume_search import nominal_exposures
 from rig.geometry import SweepGeometry
@@ -41,6 +42,8 @@ BAND_ROWS = 16
 """Rows whose costs stay in the cache from one step to the next."""
 FIRST_ROUNDS = 3
 """Times that the first map's stripes teach what they are then estimated with again."""
+MOST_BYTES = 4 << 30
+"""Costs and messages of a map may take so much: room for 1000 columns, each searched over all of 1024 x 1024 pixels."""
 QUIET_COLUMNS = 8
 """Every so manieth column teaches the ambient light where there are dark frames too."""
 
@@ -54,7 +57,7 @@ class _Tables(NamedTuple):
     state: State
     shares: NDArray[np.float32]
     halo: NDArray[np.float32]
-    line_sigma_px: float
+    light: SecondLight
     bright: Brightness
     dark: bool
 
@@ -79,7 +82,7 @@ class Joint:
         self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True, temporal_prior: bool = False
     ) -> None:
         self._workers = RowWorkers(threads)
-        self._lessons = Lessons(_tables, None, learns=learns)
+        self._lessons = Lessons(_tables, None, learns=learns, learn_more=learn_next_halo)
         self._prior = TemporalPrior(temporal_prior)
         self._memory: _Memory | None = None
         self.used: RowModel | None = None
@@ -99,7 +102,11 @@ class Joint:
         self._lessons.model = model if model.before is None else replace(model, before=None)
 
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
-        """A counter whose sweeps `estimate` takes; geometry: nominal, as of every sweep."""
+        """A counter whose sweeps `estimate` takes; geometry: nominal, as of every sweep.
+
+        UsageError where its maps would take too much memory: before any light is let out.
+        """
+        _grid(geometry)
         return SweepCounter(layout, self._workers)
 
     def estimate(self, sweep: CountVolume, geometry: SweepGeometry) -> StripeTable:
@@ -131,7 +138,7 @@ class Joint:
             model = learn_again(volume, geometry, model, ambient, stripes, self._workers)
             assert self._memory is not None, "a map has been estimated"
             places = self._memory.places
-            model = learn_halo(volume, geometry, model, ambient, stripes, places, self._workers)
+            model = learn_first_halo(volume, geometry, model, ambient, stripes, places, self._workers)
             # Amplitudes are relative to the scale of the model that they are written into.
             weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
             amplitude, weight = amplitudes_of(places)
@@ -169,7 +176,7 @@ class Joint:
 
     def _with_seconds(self, volume: CountVolume, tables: _Tables, stripes: StripeTable) -> StripeTable:
         x2_px, confidence2 = second_returns(
-            volume, tables.grid, tables.sweep, tables.state, tables.line_sigma_px, stripes.x_px, self._workers
+            volume, tables.grid, tables.sweep, tables.light, stripes.x_px, self._workers
         )
         return replace(stripes, x2_px=x2_px, confidence2=confidence2)
 
@@ -181,8 +188,11 @@ class Joint:
         return memory
 
     def _seen(self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable) -> Seen:
+        assert self._memory is not None, "a map has been estimated"
         quiet = self._quiet(volume, geometry, tables, stripes)
-        return Seen(volume, volume.intensity(), quiet, lines_of(volume, next_lattice(geometry), stripes))
+        lines = lines_of(volume, next_lattice(geometry), stripes)
+        bright = bright_lines(volume, geometry, stripes, self._memory.places)
+        return Seen(volume, volume.intensity(), quiet, lines, bright)
 
     def _quiet(
         self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable
@@ -199,13 +209,24 @@ class Joint:
         return quiet
 
 
+def _grid(geometry: SweepGeometry) -> LabelGrid:
+    grid = label_grid(geometry)
+    rows, columns = grid.x_far.shape
+    if (needed := 2 * rows * columns * grid.labels) > MOST_BYTES:
+        raise UsageError(
+            f"joint weighs {grid.labels} places on each of {rows} rows of {columns} columns, which takes "
+            f"{needed / 2**30:.1f} GiB; it may take {MOST_BYTES / 2**30:.3g}: narrow depth_range, or use the estimator "
+            "likelihood"
+        )
+    return grid
+
+
 def _tables(setting: Setting, workers: RowWorkers) -> _Tables:
-    grid = label_grid(setting.geometry)
+    grid = _grid(setting.geometry)
     costs = costs_of(setting.model, setting.geometry, grid, setting.exposures, workers)
-    sigma_px = setting.model.line_sigma_px
-    shares = profile_table(sigma_px)
+    state, sigma_px = state_of(setting.model), setting.model.line_sigma_px
     halo = halo_shares(setting.model, setting.geometry.width if setting.model.halo.any() else 0)
     return _Tables(
-        grid, costs, sweep_of(setting.geometry), state_of(setting.model), shares, halo, sigma_px,
+        grid, costs, sweep_of(setting.geometry), state, profile_table(sigma_px), halo, second_light(state, sigma_px),
         brightness_of(setting.model), setting.dark,
     )  # fmt: skip

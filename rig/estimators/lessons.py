@@ -7,12 +7,13 @@ and is heeded a fixed number of frames later, so that a live scan never waits an
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import CountVolume, FrameTally
+from rig.errors import UsageError
 from rig.estimators.ambient import ambient_map
 from rig.estimators.judging import judge_of
 from rig.estimators.learning import Expectation, learn_first, learn_next, lines_of, next_lattice
@@ -30,6 +31,8 @@ TEACH_FRAMES = 100_000
 the tables of `joint` twice that."""
 LAG_FRAMES = 50_000
 """Lit frames from a map that teaches to the first one that heeds it: time to learn beside the stream."""
+KEPT = 2
+"""Tables that are kept under one model: passes of a map are looked at with all of their counts and half of them."""
 
 Tables = TypeVar("Tables")
 """What an estimator makes ready under a model, for sweeps of one geometry."""
@@ -37,43 +40,76 @@ Tables = TypeVar("Tables")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """What tables are made for. exposures: of most columns; dark: whether sweeps have dark frames."""
+    """What tables are made for. exposures: of most columns; dark: whether sweeps have dark frames.
+
+    UsageError where the model was learned from a sweep of another size.
+    """
 
     model: RowModel
     geometry: SweepGeometry
     exposures: int
     dark: bool
 
+    def __post_init__(self) -> None:
+        """Kernels look nothing up twice: what the model has too little of would be read beyond its end."""
+        model, geometry = self.model, self.geometry
+        learned = *model.ambient.shape, len(model.column_gain)
+        here = geometry.rows, geometry.width, geometry.columns
+        if learned != here or len(model.row_gain) != geometry.rows:
+            raise UsageError(
+                f"the learned state is of {_size(*learned)}, the sweep of {_size(*here)}; estimate it with a state of "
+                "its own, or with none, to learn one from it"
+            )
+
     def same(self, other: "Setting") -> bool:
         """Whether the other's tables would be the same ones."""
-        made = self.model is other.model and self.geometry is other.geometry
-        return made and (self.exposures, self.dark) == (other.exposures, other.dark)
+        return self.akin(other) and (self.exposures, self.dark) == (other.exposures, other.dark)
+
+    def akin(self, other: "Setting") -> bool:
+        """Whether the other is of the same model and geometry."""
+        return self.model is other.model and self.geometry is other.geometry
+
+
+def _size(rows: int, pixels: int, columns: int) -> str:
+    return f"{rows} rows of {pixels} pixels and {columns} columns"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
     """What a sweep can teach: its tally, ones and exposures of pixels behind clear stripes, some lines of counts.
 
-    intensity: of the tally, taken at once: counts may grow by another pass while the lesson is learned.
+    intensity: of the tally, taken at once: counts may grow by another pass while the lesson is learned. more: what the
+    estimator itself learns from, see `Lessons`.
     """
 
     tally: FrameTally
     intensity: NDArray[np.uint32]
     quiet: NDArray[np.float64]
     lines: Lines
+    more: Any = None
 
 
 class Lessons(Generic[Tables]):
     """The model that an estimator goes by, `None` before a map that taught, and the tables it made under it.
 
-    make: makes tables; called on the thread beside the stream too. learns: whether later maps change the model.
+    make: makes tables; called on the thread beside the stream too, as is learn_more: it learns from what `Seen` has for
+    it in `more`, on top of what every estimator does. learns: whether later maps change the model.
     """
 
-    def __init__(self, make: Callable[[Setting, RowWorkers], Tables], model: RowModel | None, *, learns: bool) -> None:
+    def __init__(
+        self,
+        make: Callable[[Setting, RowWorkers], Tables],
+        model: RowModel | None,
+        *,
+        learns: bool,
+        learn_more: Callable[[Setting, Any, RowWorkers], RowModel] | None = None,
+    ) -> None:
         self._make = make
+        self._learn_more = learn_more
         self._learns = learns
         self.model = model
-        self._made: tuple[Setting, Tables] | None = None
+        self._made: list[tuple[Setting, Tables]] = []
+        """Those of one model and geometry, the last used last."""
         self._taught: Expectation | None = None
         self._lesson: Future[tuple[Setting, Expectation, Tables]] | None = None
         self._tutor = ThreadPoolExecutor(1, thread_name_prefix="learning", initializer=yield_to_others)
@@ -85,10 +121,12 @@ class Lessons(Generic[Tables]):
         return self.model if self.model is not None else first()
 
     def tables(self, setting: Setting, workers: RowWorkers) -> Tables:
-        """Tables for a setting; made once while it stays the same."""
-        if self._made is None or not self._made[0].same(setting):
-            self._made = setting, self._make(setting, workers)
-        return self._made[1]
+        """Tables for a setting; made once while it, and at most one other that it takes turns with, stay the same."""
+        kept = [made for made in self._made if made[0].akin(setting)]
+        found = next((made for made in kept if made[0].same(setting)), None)
+        self._made = [made for made in kept if made is not found][1 - KEPT :]  # the rest may go before more is made
+        self._made.append(found or (setting, self._make(setting, workers)))
+        return self._made[-1][1]
 
     def attend(self, stripes: StripeTable, used: RowModel, frames: int, see: Callable[[], Seen]) -> None:
         """After a map of so many lit frames, estimated with `used`; see: called where the map is to teach."""
@@ -99,12 +137,12 @@ class Lessons(Generic[Tables]):
         if self._lesson is None:
             if self._learns and sure and self._frames_since >= TEACH_FRAMES:
                 self._frames_since = 0
-                assert self._made is not None, "a map has been estimated"
-                self._lesson = self._tutor.submit(self._teach, self._made[0], see(), self._taught)
+                assert self._made, "a map has been estimated"
+                self._lesson = self._tutor.submit(self._teach, self._made[-1][0], see(), self._taught)
         elif self._frames_since >= LAG_FRAMES:
             # Waits where the lesson is not over: which map is estimated with what never depends on speed.
             setting, self._taught, tables = self._lesson.result()
-            self.model, self._made = setting.model, (setting, tables)
+            self.model, self._made = setting.model, [(setting, tables)]
             self._lesson = None
 
     def _teach(self, setting: Setting, seen: Seen, before: Expectation | None) -> tuple[Setting, Expectation, Tables]:
@@ -115,6 +153,8 @@ class Lessons(Generic[Tables]):
                 seen.lines, setting.geometry, replace(setting.model, ambient=ambient), before, workers
             )
             setting = replace(setting, model=model)
+            if self._learn_more is not None:
+                setting = replace(setting, model=self._learn_more(setting, seen.more, workers))
             return setting, taught, self._make(setting, workers)
 
 

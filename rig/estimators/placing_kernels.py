@@ -38,6 +38,8 @@ CLEAR_SD_PX: Final = 0.2
 """Stripes this clear, and placed this well, tell the width of the line."""
 BESIDE_PX: Final = 5, 6
 """Pixels to either side, from and to, that show how much of a halo is under a line, and nothing of the line."""
+BLIND_FLUX: Final = np.float32(3.0)
+"""A pixel with so much ambient light fires in 95 % of all frames and shows no more; so does one not to be used."""
 FEW_FRAMES: Final = 3.0
 """Up to so many frames counts are taken as they are: the flux of a full pixel would be a guess."""
 
@@ -90,7 +92,8 @@ def measure_light(
                 continue
             frames = int(n_frames[c])
             x = min(max(int(np.floor(x_px[y, c] + half)), int(x_lo[y, c])), int(x_hi[y, c]))
-            px, py, pz, own = plane[c, 0], plane[c, 1], plane[c, 2], ambient[y, x]
+            px, py, pz = plane[c, 0], plane[c, 1], plane[c, 2]
+            own = ambient[y, x] if ambient[y, x] < BLIND_FLUX else np.float32(0.0)
             path_p = path_to_plane(px, py, pz, v[y, x])
             path_c, _, b = profile_place(px, py, pz, u[y, x], v[y, x], path_p, w_lo, per_w, profile.shape[0])
             i = int(b)
@@ -100,16 +103,18 @@ def measure_light(
             if several:
                 others = others_at(sweep, state, y, c, x)
                 before, behind = min(before + others, FLUX_MAX), min(behind + others, FLUX_MAX)
-            # A pixel that the picture does not have counts as one of just the expected light.
+            # A pixel that the picture does not have, or that is blind, counts as one of just the expected light.
             light = -(LIGHT_PX + half) * (before + behind - own - own)
             stored = int(x0[c])
             first, last = max(stored, 0), min(stored + window, width) - 1
             unseen = max(first - x + LIGHT_PX, 0) + max(x + LIGHT_PX - last, 0)
-            light += min(unseen, 2 * LIGHT_PX + 1) * (half * (before + behind) - own)
+            usual = half * (before + behind) - own
+            light += min(unseen, 2 * LIGHT_PX + 1) * usual
             begin, end = max(x - LIGHT_PX, first), min(x + LIGHT_PX, last) + 1
             for t in range(np.uint64(begin), np.uint64(max(end, begin))):
                 dark = np.uint64(max(frames - int(counts[c, y, t - np.uint64(stored)]), 0))
-                light += np.float32(logs[frames] - logs[dark]) - ambient[y, t]
+                seen = np.float32(logs[frames] - logs[dark]) - ambient[y, t]
+                light += seen if ambient[y, t] < BLIND_FLUX else usual
             halo = glow[int(b + 0.5)]
             # What the halo adds to the light of the line grows with it.
             to_light[y, c] = light / (np.float32(1.0) + np.float32(2 * LIGHT_PX + 1) * halo)
@@ -145,6 +150,8 @@ def add_moments(
                 continue
             # Pixels without a ray lie at the ends of a row.
             if np.isnan(sweep.u[y, begin]) or np.isnan(sweep.u[y, end]):
+                continue
+            if state.ambient[y, begin : end + 1].max() >= BLIND_FLUX:
                 continue
             path_p, strength = line_light(sweep, state, y, c, x)
             before, behind, _, _, _, cell, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)

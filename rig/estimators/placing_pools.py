@@ -44,7 +44,8 @@ def widen_row(
             _widen_block(at, to, columns, y, rows, c, inner, reach)
     for c in range(columns if blocks == 0 else columns - blocks * LANES):
         here = c if c < reach or blocks == 0 else c + blocks * LANES
-        _widen_one(distance, first, second, y, rows, here, inner, reach, sums)
+        if sums[1, here] < enough:
+            _widen_one(distance, first, second, y, rows, here, inner, reach, sums)
 
 
 @numba.njit(cache=True, nogil=True)

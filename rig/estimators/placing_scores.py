@@ -1,8 +1,8 @@
 """Compiled score and information of stripes' places, see `placing_kernels`, sixteen stripes to a vector.
 
 Of each row, first what the pixels around every stripe counted and should have counted is laid out pixel by pixel from
-the stripe, stripe beside stripe; the arithmetic then goes along the row. A pixel that the row does not have is given
-light in which nothing can be seen.
+the stripe, stripe beside stripe; the arithmetic then goes along the row. A pixel that the row does not have, or that is
+not to be used, is given light in which nothing can be seen.
 """
 
 from typing import Final
@@ -94,8 +94,9 @@ def _lay_out(
         for d in range(TAPS):
             around[d, _SHARE, c], around[d, _GROWTH, c] = shares[profile, 0, d], shares[profile, 1, d]
             if inside or (0 <= first + d - x0[c] < window and 0 <= first + d < picture):
-                around[d, _SEEN, c] = counts[c, y, at + np.uint64(d)]
-                around[d, _AMBIENT, c] = ambient[y, t + np.uint64(d)]
+                own = ambient[y, t + np.uint64(d)]
+                around[d, _SEEN, c] = np.float32(counts[c, y, at + np.uint64(d)]) if own < MOST_FLUX else frames
+                around[d, _AMBIENT, c] = own
             else:
                 around[d, _SEEN, c], around[d, _AMBIENT, c] = frames, MOST_FLUX
 

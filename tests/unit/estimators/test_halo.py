@@ -2,18 +2,21 @@
 
 import io
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
 from rig.estimators.halo import halo_shares, over_bins
 from rig.estimators.halo_kernels import solve
+from rig.estimators.halo_learning import bright_lines, learn_next_halo
 from rig.estimators.halo_tables import BLOCK_PX
 from rig.estimators.joint import Joint
 from rig.estimators.joint_kernels import add_quiet
 from rig.estimators.label_grid import PER_PX, label_grid
 from rig.estimators.label_volume import _lights, costs_of
 from rig.estimators.label_volume_rows import EXCLUDED
+from rig.estimators.lessons import Setting
 from rig.estimators.row_input import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimators.row_kernels import FLOOR
 from rig.estimators.row_model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, pixel_shares
@@ -78,18 +81,34 @@ def test_costs_are_those_of_a_stripe_with_its_halo():
     assert plain.halo.weight.size == 0, "without a halo there are no tables of one"
 
 
+@cache
+def first_map(light):
+    """A sweep, the estimator that has made its map, and that map."""
+    swept, joint = simulated(light, 5, rows=48, columns=240), Joint(2, learns=False)
+    return swept, joint, joint.estimate(swept.volume, swept.geometry)
+
+
 @pytest.mark.parametrize("light", ["halo", "halo-less"])
 def test_a_halo_is_found_where_there_is_one(light):
-    swept = simulated(light, 5, rows=48, columns=240)
-
-    joint = Joint(2, learns=False)
-    stripes = joint.estimate(swept.volume, swept.geometry)
+    swept, joint, stripes = first_map(light)
     model = joint.used
     assert bool(model.halo.any()) is (light == "halo")
     assert model.extinction_per_m == pytest.approx(swept.point.light.extinction_per_m, rel=0.3)
     errors = swept.errors(stripes.x_px)
     assert np.nanmean(errors) < 1.0
     assert np.isfinite(errors).mean() > 0.95
+
+
+@pytest.mark.parametrize(("light", "other"), [("halo", "halo-less"), ("halo-less", "halo")])
+def test_later_maps_tell_whether_there_is_a_halo(light, other):
+    swept, joint, stripes = first_map(light)
+    seen = bright_lines(swept.volume, swept.geometry, stripes, joint._memory.places)
+    setting = Setting(joint.used, swept.geometry, 5, False)
+    assert learn_next_halo(setting, seen, WORKERS) is joint.used
+    wrong = first_map(other)[1].used
+    assert learn_next_halo(replace(setting, model=wrong), seen, WORKERS).halo.any() == (light == "halo")
+    clear = replace(first_map("halo-less")[1].used, extinction_per_m=np.nan)
+    assert learn_next_halo(replace(setting, model=clear), seen, WORKERS) is clear, "without haze there is no halo"
 
 
 def test_pixels_without_a_ray_are_not_quiet():

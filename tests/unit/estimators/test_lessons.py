@@ -5,8 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from rig.estimators import lessons
+from rig.errors import UsageError
+from rig.estimators import joint, lessons
+from rig.estimators.joint import Joint
 from rig.estimators.lessons import LAG_FRAMES, LEAST_SURE, TEACH_FRAMES, Lessons, Setting
+from rig.estimators.likelihood import Likelihood
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 from tests.unit.estimators.test_label_volume import known_model
@@ -96,3 +99,30 @@ def test_tables_are_made_anew_for_another_setting_alone():
     for each in (setting, replace(setting), *others):
         school.tables(each, WORKERS)
     assert made == [setting, *others]
+
+
+def test_two_settings_under_one_model_may_take_turns():
+    made = []
+    school = Lessons(lambda setting, workers: made.append(setting) or len(made), MODEL, learns=True)
+    whole, half = Setting(MODEL, GEOMETRY, 10, False), Setting(MODEL, GEOMETRY, 5, False)
+    assert [school.tables(each, WORKERS) for each in (whole, half, whole, half)] == [1, 2, 1, 2]
+    # A third takes the place of what was used before the last one, another model that of all.
+    assert [school.tables(replace(whole, exposures=k), WORKERS) for k in (7, 5, 10)] == [3, 2, 4]
+    other = replace(whole, model=replace(MODEL))
+    assert [school.tables(each, WORKERS) for each in (other, whole)] == [5, 6]
+
+
+@pytest.mark.parametrize("lacking", ["column_gain", "row_gain", "ambient"])
+def test_a_state_of_another_sweeps_size_is_refused(lacking):
+    less = replace(MODEL, **{lacking: getattr(MODEL, lacking)[:-1]})
+    for estimator in (Joint(1, less), Likelihood(1, less)):
+        with pytest.raises(UsageError, match=f"sweep of {GEOMETRY.rows} rows of {GEOMETRY.width} pixels and"):
+            estimator.estimate(simulated().volume, GEOMETRY)
+
+
+def test_a_map_that_would_not_fit_the_memory_is_refused_before_the_scan(monkeypatch):
+    monkeypatch.setattr(joint, "MOST_BYTES", 2 * GEOMETRY.rows * GEOMETRY.columns)
+    with pytest.raises(UsageError, match=r"places on each of 32 rows of 96 columns.*narrow depth_range"):
+        Joint(1).counter(None, GEOMETRY)
+    with pytest.raises(UsageError, match="narrow depth_range"):
+        Joint(1, MODEL).estimate(simulated().volume, GEOMETRY)

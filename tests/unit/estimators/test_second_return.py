@@ -9,8 +9,9 @@ import pytest
 from rig.estimators.label_grid import label_grid
 from rig.estimators.row_input import state_of, sweep_of
 from rig.estimators.row_kernels import FLUX_MAX
-from rig.estimators.second_return import second_returns
-from rig.estimators.second_return_kernels import _add_line
+from rig.estimators.second_return import second_light, second_returns
+from rig.estimators.second_return_sums import BLOCK, Blocks, sum_blocks
+from rig.lanes import LANES
 from rig.row_threads import RowWorkers
 from tests.reference.geometry import Geometry
 from tests.reference.made_scenes import pane_scene
@@ -35,7 +36,8 @@ def seconds_of(sweep: Sweep, x_px, haze=0.14, threads=WORKERS):
     model = known_model(sweep.geometry, haze=haze)
     grid = label_grid(sweep.geometry)
     x_px = x_px.astype(np.float32)
-    return second_returns(sweep.volume, grid, sweep_of(sweep.geometry), state_of(model), 0.6, x_px, threads)
+    light = second_light(state_of(model), 0.6)
+    return second_returns(sweep.volume, grid, sweep_of(sweep.geometry), light, x_px, threads)
 
 
 @pytest.mark.parametrize("rig", ["left", "right"])
@@ -89,7 +91,8 @@ def test_columns_without_exposures_are_left_alone() -> None:
     model = known_model(sweep.geometry)
     grid = label_grid(sweep.geometry)
     x_px = np.where(volume.n_frames > 0, sweep.point.x_true, np.nan).astype(np.float32)
-    x2_px, _ = second_returns(volume, grid, sweep_of(sweep.geometry), state_of(model), 0.6, x_px, WORKERS)
+    light = second_light(state_of(model), 0.6)
+    x2_px, _ = second_returns(volume, grid, sweep_of(sweep.geometry), light, x_px, WORKERS)
     assert np.isnan(x2_px[:, ::7]).all()
     two = np.isfinite(sweep.point.x_second) & np.isfinite(x_px)
     assert (np.abs(x2_px - sweep.point.x_second)[two] <= 1).mean() > 0.95
@@ -127,7 +130,12 @@ def test_pixels_not_to_be_used_neither_show_nor_hide_a_second_return() -> None:
         counts[c][bad[:, first[c] : first[c] + counts.shape[2]]] = 10 * (c % 2)
     grid, x_px = label_grid(sweep.geometry), sweep.point.x_true.astype(np.float32)
     x2_px, confidence2 = second_returns(
-        replace(volume, counts=counts), grid, sweep_of(sweep.geometry), state_of(model), 0.6, x_px, WORKERS
+        replace(volume, counts=counts),
+        grid,
+        sweep_of(sweep.geometry),
+        second_light(state_of(model), 0.6),
+        x_px,
+        WORKERS,
     )
     two = np.isfinite(sweep.point.x_second) & np.isfinite(x_px)
     assert ((np.abs(x2_px - sweep.point.x_second) <= 1) & (confidence2 > SURE))[two].mean() > 0.95
@@ -136,8 +144,21 @@ def test_pixels_not_to_be_used_neither_show_nor_hide_a_second_return() -> None:
 
 
 def test_strong_ambient_light_is_expected_as_ones_not_as_photons() -> None:
-    ones, expected = np.zeros(3, np.float32), np.zeros(3, np.float32)
-    dark, haze = -np.expm1(-np.array([0.0, 2.0, np.nan], np.float32)), np.full(3, 0.5, np.float32)
-    _add_line(np.array([4, 5, 6], np.uint16), dark, np.float32(10), haze, ones, expected)
-    np.testing.assert_allclose(expected, [5, 10 * (1 - 0.5 * np.exp(-2)), 0], rtol=1e-6)
-    np.testing.assert_array_equal(ones, [4, 5, 0])
+    sweep = pane()
+    geometry, model, grid = sweep.geometry, known_model(sweep.geometry, haze=1e-9), label_grid(sweep.geometry)
+    model.ambient[:] = 2.0
+    model.ambient[::3, 200] = FLUX_MAX
+    light, x_px = second_light(state_of(model), 0.6), sweep.point.x_true.astype(np.float32)
+    pixels = -(-grid.stripes // (2 * LANES)) * LANES
+    for counts in (np.uint8, np.uint16):
+        blocks = Blocks(*(np.empty((ROWS // BLOCK, COLUMNS // BLOCK, pixels), np.float32) for _ in range(2)))
+        once = np.ones_like(sweep.volume.counts, counts)
+        sum_blocks(
+            once, sweep.volume.n_frames, sweep_of(geometry), light.state, light.still, grid.x_far, grid.side,
+            light.apart, x_px, 0, ROWS // BLOCK, blocks,
+        )  # fmt: skip
+        np.testing.assert_allclose(blocks.expected, blocks.ones * 10 * -np.expm1(-2), rtol=1e-4)
+        y, x = np.arange(ROWS)[:, None, None], np.arange(geometry.width)
+        seen = (x >= geometry.x_lo[..., None]) & (x <= geometry.x_hi[..., None]) & ((x != 200) | (y % 3 != 0))
+        seen &= np.abs(x - x_px[..., None]) > light.apart
+        assert blocks.ones.sum() == seen.sum()

@@ -1,13 +1,21 @@
 """The account of a sweep's frames, beside what test_acquisition.py and test_windows.py pin."""
 
 import itertools
+from dataclasses import dataclass
 
 import numpy as np
 
 from drivers.recorded.reader import block_part
-from rig.counting import BIN_DARK, BIN_UNUSABLE
+from rig.counting import BIN_DARK, BIN_UNUSABLE, FrameTally
 from rig.sweeps import SweepAssembler, SweepStart
 from tests.unit.rig.streams import plan_of, scan, stand_still, stream_of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noted(FrameTally):
+    """The bins of a sweep's frames."""
+
+    bins: list[int]
 
 
 class Noting:
@@ -26,7 +34,10 @@ class Noting:
         self.settled = under_way
 
     def finish(self):
-        return list(self.bins)
+        nothing = np.zeros(0)
+        return Noted(
+            n_frames=nothing.astype(np.int32), column=nothing, dark_counts=None, n_dark=0, width=0, bins=list(self.bins)
+        )
 
 
 def test_frames_beyond_what_a_column_may_use_are_received_but_not_lit():
@@ -35,7 +46,7 @@ def test_frames_beyond_what_a_column_may_use_are_received_but_not_lit():
     stand_still(stream, 700)
     assembler = SweepAssembler(plan, Noting(), maps=1)
     (sweep,) = [found for block in stream.blocks(itertools.repeat(100)) for found in assembler.add(block)]
-    bins = np.array(sweep.volume)
+    bins = np.array(sweep.volume.bins)
     assert np.bincount(bins[bins >= 0]).max() == 255
     assert sweep.frames.lit == np.count_nonzero(bins >= 0)
     assert sweep.frames.dark == np.count_nonzero(bins == BIN_DARK)
@@ -91,7 +102,7 @@ def test_maps_of_a_part_begin_with_the_sweep_that_is_whole():
     kept = [block_part(block, first, 10**6) for block in blocks if block.header.first_frame + block.n_frames > first]
     found = [sweep for block in kept for sweep in part.add(block)]
     assert [sweep.index for sweep in found] == [0, 1]
-    assert [sweep.volume for sweep in found] == [sweep.volume for sweep in sweeps[1:]]
+    assert [sweep.volume.bins for sweep in found] == [sweep.volume.bins for sweep in sweeps[1:]]
     assert part.complete
 
 
@@ -106,11 +117,23 @@ def test_a_frame_that_comes_twice_is_lost_where_it_comes_again_whatever_the_bloc
         (sweep,) = sweeps(plan, doubled.blocks(itertools.repeat(size)))
         assert sweep.frames == missed.frames
         assert [gap for first, last in sweep.gaps for gap in range(first, last + 1)] == twice
-        bins = np.array(sweep.volume)
-        assert bins[bins != BIN_UNUSABLE].tolist() == [found for found in missed.volume if found != BIN_UNUSABLE]
+        bins = np.array(sweep.volume.bins)
+        assert bins[bins != BIN_UNUSABLE].tolist() == [found for found in missed.volume.bins if found != BIN_UNUSABLE]
 
 
 def sweeps(plan, blocks):
     """Of one map."""
     assembler = SweepAssembler(plan, Noting(), maps=1)
     return [found for block in blocks for found in assembler.add(block)]
+
+
+def test_sweeps_know_how_fast_and_which_way_the_command_ran():
+    plan = plan_of(scan(columns=30, bidirectional=True))
+    stream = stream_of(plan, 3)
+    assembler = SweepAssembler(plan, Noting(), maps=3)
+    found = [sweep for block in stream.blocks(itertools.repeat(100)) for sweep in assembler.add(block)]
+    first, last = plan.command_range
+    lit_s = 30 * float(plan.column_s)
+    assert [sweep.direction for sweep in found] == [1, -1, 1]
+    for sweep in found:
+        assert np.isclose(sweep.volume.velocity_per_s, sweep.direction * abs(last - first) / lit_s)

@@ -1,0 +1,248 @@
+"""The calls that calibrate: `calibrate_planes`, `camera`, `pixels`, `sync` and `check`.
+
+Sources are a rig (a config, a bundled one's name or its file), folders of runs taken with `record`, folders of earlier
+calibrations (for their views), and for the camera pictures; none: the bundled simulated rig, whose world moves the
+board. All raise CalibrationError (Degenerate, with `.reason`) where the views make no calibration, UsageError for what
+cannot be, DeviceError or DevicesError where devices fail; views that were taken by then are in `out`.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drivers.units import parse_quantity
+from rig.api_config import SIMULATED, Config, PathLike
+from rig.api_scan import MAX_SEED
+from rig.config import RigConfig
+from rig.errors import UsageError
+from rig.run import OutFolder, Progress
+
+if TYPE_CHECKING:
+    from calibration.board import Board
+    from calibration.model import RigModel
+    from rig.calibrating.pixel_result import PixelResult
+    from rig.calibrating.result import CalibrationResult
+    from rig.calibrating.showing import Ask, Tell
+
+SourcesLike = Config | Sequence[Config]
+
+
+def calibrate_planes(
+    sources: SourcesLike = (),
+    *,
+    board: PathLike | None = None,
+    poses: int | None = None,
+    guided: bool = False,
+    calibration: PathLike | None = None,
+    stated_baseline: str | None = None,
+    accuracy: str | None = None,
+    at: str | None = None,
+    scene: str | None = None,
+    exposures: Sequence[int] = (),
+    seed: int = 0,
+    arm: bool = False,
+    out: OutFolder = None,
+    ask: "Ask | None" = None,
+    tell: "Tell | None" = None,
+) -> "CalibrationResult":
+    """Calibrate camera, light planes and lag together from views of a board (`rig calibrate planes`).
+
+    board: a board's file; None: the bundled one. poses: to show to a live rig, the most where guided. guided: after
+    each view the pose that helps most is asked for, until the accuracy is reached. calibration: one to start from,
+    whose defects are kept. stated_baseline: of mirror and camera as measured, such as '300 mm'. accuracy: sd of the
+    depth that is good enough, such as '10 mm', at the distance `at`, such as '5 m'; None: what a tenth of a pixel costs
+    there. scene: of a simulated rig. exposures: per column, by turns. arm: must be True where laser or gate are real.
+    ask: has the board of a real rig moved and returns once it is. tell: takes a line for each view. out: a folder to
+    write, None: nothing.
+    """
+    from calibration.judging import AT_M
+    from rig.calibrating.planes_run import POSES, PlanesAsked, run_planes
+
+    problems = _problems(poses, seed)
+    accuracy_m = _length(problems, "accuracy", accuracy)
+    at_m = _length(problems, "at", at)
+    baseline_m = _length(problems, "stated_baseline", stated_baseline)
+    if problems:
+        raise UsageError.of(problems)
+    asked = PlanesAsked(
+        poses=poses or POSES,
+        guided=guided,
+        accuracy_m=accuracy_m,
+        at_m=at_m or AT_M,
+        stated_baseline_m=baseline_m,
+        exposures=tuple(exposures),
+        seed=seed,
+        arm=arm,
+    )
+    from rig.calibrating.sources import sort_sources
+
+    found = sort_sources(_listed(sources), scene=scene)
+    return run_planes(found, _board(board), asked, base=_base(calibration), out=out, ask=ask, tell=tell)
+
+
+def calibrate_camera(
+    sources: SourcesLike = (),
+    *,
+    board: PathLike | None = None,
+    poses: int | None = None,
+    terms: int = 5,
+    scene: str | None = None,
+    seed: int = 0,
+    arm: bool = False,
+    out: OutFolder = None,
+    ask: "Ask | None" = None,
+    tell: "Tell | None" = None,
+) -> "CalibrationResult":
+    """Calibrate the camera alone (`rig calibrate camera`). sources: pictures and folders of pictures too.
+
+    terms: of the lens model: 0, 4, 5, 8, 12 or 14, as OpenCV counts them. All else as `calibrate_planes`.
+    """
+    from rig.calibrating.camera_run import CameraAsked, run_camera
+    from rig.calibrating.planes_run import POSES
+    from rig.calibrating.sources import sort_sources
+
+    if problems := _problems(poses, seed):
+        raise UsageError.of(problems)
+    asked = CameraAsked(poses or POSES, terms, seed, arm)
+    found = sort_sources(_listed(sources), pictures=True, scene=scene)
+    return run_camera(found, _board(board), asked, out=out, ask=ask, tell=tell)
+
+
+def calibrate_pixels(
+    source: Config = SIMULATED,
+    *,
+    frames: int | None = None,
+    lit: PathLike | None = None,
+    light: bool = False,
+    against: PathLike | None = None,
+    seed: int = 0,
+    arm: bool = False,
+    out: PathLike | None = None,
+    covered: "Callable[[], None] | None" = None,
+    progress: Progress | None = None,
+) -> "PixelResult":
+    """Map hot, dead and noisy pixels and the dark rate from dark frames (`rig calibrate pixels`).
+
+    source: a rig, or the folder of a recorded run. frames: dark ones, None: as many as the limit of hot pixels needs.
+    lit: a recorded run whose lit frames tell dead pixels; light: take such now. against: an older map; None: the one
+    beside the rig's calibration. covered: called where a person has to cover the lens, returns once it is.
+    """
+    from rig.calibrating.pixel_run import run_pixels
+
+    return run_pixels(
+        source, frames=frames, lit=lit, light=light, arm=arm, against=against, seed=seed, out=out, progress=progress,
+        covered=covered,
+    )  # fmt: skip
+
+
+def calibrate_sync(
+    sources: SourcesLike = (),
+    *,
+    calibration: PathLike | None = None,
+    exposures: Sequence[int] = (),
+    accuracy: str | None = None,
+    at: str | None = None,
+    scene: str | None = None,
+    seed: int = 0,
+    arm: bool = False,
+    out: OutFolder = None,
+    tell: "Tell | None" = None,
+) -> "CalibrationResult":
+    """Measure the mirror's lag each way and the rows' delay from one unmoved scene (`rig calibrate sync`).
+
+    calibration: the model they go into; None: that of the live rig. exposures: per column, a speed each. All else as
+    `calibrate_planes`.
+    """
+    from calibration.judging import AT_M
+    from rig.calibrating.sources import sort_sources
+    from rig.calibrating.sync_run import SyncAsked, run_sync
+
+    problems = _problems(None, seed)
+    accuracy_m = _length(problems, "accuracy", accuracy)
+    at_m = _length(problems, "at", at)
+    if problems:
+        raise UsageError.of(problems)
+    asked = SyncAsked(tuple(exposures), accuracy_m, at_m or AT_M, seed, arm)
+    found = sort_sources(_listed(sources), scene=scene)
+    return run_sync(found, asked, base=_base(calibration), out=out, tell=tell)
+
+
+def calibrate_check(
+    sources: SourcesLike = (),
+    *,
+    board: PathLike | None = None,
+    poses: int | None = None,
+    calibration: PathLike | None = None,
+    angle: str | None = None,
+    accuracy: str | None = None,
+    at: str | None = None,
+    scene: str | None = None,
+    seed: int = 0,
+    arm: bool = False,
+    out: OutFolder = None,
+    ask: "Ask | None" = None,
+    tell: "Tell | None" = None,
+) -> "CalibrationResult":
+    """Judge a calibration by a flat board that it was not made with (`rig calibrate check`).
+
+    calibration: a file; None: that of the live rig. angle: between the boards of the first two views, such as '30 deg'.
+    All else as `calibrate_planes`.
+    """
+    from calibration.judging import AT_M
+    from rig.calibrating.check_run import CheckAsked, run_check
+    from rig.calibrating.sources import sort_sources
+
+    problems = _problems(poses, seed)
+    accuracy_m = _length(problems, "accuracy", accuracy)
+    at_m = _length(problems, "at", at)
+    angle_rad = _quantity(problems, "angle", angle, "angle")
+    if problems:
+        raise UsageError.of(problems)
+    asked = CheckAsked(poses or 1, accuracy_m, at_m or AT_M, angle_rad, seed, arm)
+    file = None if calibration is None else Path(calibration)
+    found = sort_sources(_listed(sources), scene=scene)
+    return run_check(found, _board(board), file, asked, out=out, ask=ask, tell=tell)
+
+
+def _listed(sources: SourcesLike) -> Sequence[Config]:
+    return [sources] if isinstance(sources, RigConfig | str | os.PathLike) else list(sources)
+
+
+def _board(file: PathLike | None) -> "Board":
+    from calibration.board import BUNDLED_BOARD, load_board
+
+    return load_board(BUNDLED_BOARD if file is None else file)
+
+
+def _base(file: PathLike | None) -> "RigModel | None":
+    from calibration.files import load_rig_model
+
+    return None if file is None else load_rig_model(file)
+
+
+def _problems(poses: int | None, seed: int) -> list[str]:
+    problems = []
+    if poses is not None and poses < 1:
+        problems.append(f"poses is {poses}; it must be at least 1")
+    if not 0 <= seed <= MAX_SEED:
+        problems.append(f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})")
+    return problems
+
+
+def _length(problems: list[str], name: str, text: str | None) -> float | None:
+    return _quantity(problems, name, text, "length")
+
+
+def _quantity(problems: list[str], name: str, text: str | None, dimension: str) -> float | None:
+    """The number that a text means, above 0; what is wrong with it goes to the problems."""
+    if text is None:
+        return None
+    try:
+        value = parse_quantity(text, dimension)
+    except ValueError as error:
+        problems.append(f"{name}: {error}")
+        return None
+    if not value > 0:
+        problems.append(f"{name} is {text}; it must be above 0")
+    return value

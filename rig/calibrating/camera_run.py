@@ -1,0 +1,114 @@
+"""`rig calibrate camera`: the camera alone, from views of a board or from picture files."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import yaml
+
+from calibration.board import Board
+from calibration.camera_fit import CameraFit, fit_camera
+from calibration.camera_judging import ACCURACY_PX, JudgedCamera, judge_camera
+from calibration.errors import Degenerate
+from calibration.judging import AT_M, judge_refused
+from rig.calibrating.planes_run import POSES
+from rig.calibrating.refusing import refusal
+from rig.calibrating.report import camera_report
+from rig.calibrating.result import CalibrationResult, named
+from rig.calibrating.session import Session
+from rig.calibrating.showing import Ask, Tell, require_live
+from rig.calibrating.sources import Sources
+from rig.calibrating.taking import Live, Taken, good_poses, take_kept, take_live
+from rig.run import OutFolder, versions
+
+CAMERA_FILE = "camera.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class CameraAsked:
+    """poses: of a live rig. terms: of the lens model, as OpenCV counts them."""
+
+    poses: int = POSES
+    terms: int = 5
+    seed: int = 0
+    arm: bool = False
+
+
+def run_camera(
+    sources: Sources,
+    board: Board,
+    asked: CameraAsked,
+    *,
+    out: OutFolder = None,
+    ask: Ask | None = None,
+    tell: Tell | None = None,
+) -> CalibrationResult:
+    """Calibrate the camera; camera.yaml is the `camera` section of a calibration file, with its standard deviations.
+
+    Raises Degenerate where the views make no camera; its notes say why, root cause first.
+    """
+    live = sources.live
+    require_live(live, ask, asked.arm)
+    with Session(out) as session:
+        taken = Taken(session, tell)
+        take_kept(taken, sources, board)
+        if live is not None:
+            choose = good_poses(live, board, asked.poses, AT_M, asked.seed)
+            take_live(taken, Live(live, asked.poses, choose, ask, seed=asked.seed, arm=asked.arm), board)
+        try:
+            fit = fit_camera(taken.views, board, taken.size, distortion_terms=asked.terms)
+        except Degenerate as refused:
+            raise refusal(refused, judge_refused(refused, taken.views, board, taken.size), taken) from refused
+        judged = judge_camera(fit, taken.views, board, photons=not sources.pictures)
+        summary = {"command": "camera", **_summary(fit, judged, taken), "versions": versions()}
+        figures = tuple(_figures(fit, judged))
+        used = [view for view in taken.views if view.name in fit.views]
+        report = camera_report(fit, used, judged, board, figures)
+        session.write_text(CAMERA_FILE, yaml.safe_dump({"camera": _camera(fit), "sd": fit.sd}, sort_keys=False))
+        session.finish(summary, report, None)
+        return CalibrationResult(judged.verdict, judged.line(), figures, summary, None, session.path)
+
+
+def _camera(fit: CameraFit) -> dict[str, Any]:
+    camera = fit.camera
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "matrix": camera.matrix.tolist(),
+        "distortion": camera.distortion.tolist(),
+    }
+
+
+def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, Any]:
+    return {
+        "verdict": judged.verdict.as_json(),
+        "views": {
+            "shown": len(taken.views),
+            "used": len(fit.views) - len(fit.outliers),
+            "outliers": list(fit.outliers),
+            "refused": {name: str(why) for name, why in taken.refused.items()},
+            "rms_px": dict(zip(fit.views, fit.view_rms_px.tolist(), strict=True)),
+        },
+        "camera": _camera(fit),
+        "sd": fit.sd,
+        "rms_px": fit.rms_px,
+        "ray_sd_px": {"median": judged.sd_px, "worst": judged.worst_px, "asked": ACCURACY_PX, "line": judged.line()},
+        "coverage": fit.coverage.share,
+        "condition": fit.condition,
+    }
+
+
+def _figures(fit: CameraFit, judged: JudgedCamera) -> list[tuple[str, str]]:
+    matrix, sd = fit.camera.matrix, fit.sd
+    terms = ", ".join(f"{term:.4g}" for term in fit.camera.distortion) or "none"
+    return [
+        ("views", f"{len(fit.views) - len(fit.outliers)} used, {named(fit.outliers)} outliers"),
+        ("rays", f"{judged.sd_px:.2g} px, at the worst 5 % of the picture {judged.worst_px:.2g} px"),
+        ("focal length", f"{matrix[0, 0]:.2f}, {matrix[1, 1]:.2f} px, sd {sd['fx']:.2g}, {sd['fy']:.2g}"),
+        ("centre", f"{matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px, sd {sd['cx']:.2g}, {sd['cy']:.2g}"),
+        ("distortion", terms),
+        ("residuals", f"{fit.rms_px:.3f} px rms"),
+        ("coverage", f"{fit.coverage.share:.0%} of the picture's cells, boards up to "
+                     f"{np.degrees(fit.coverage.spread_rad):.0f} degrees apart"),
+        ("condition", f"{fit.condition:.3g}"),
+    ]  # fmt: skip

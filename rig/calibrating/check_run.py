@@ -1,0 +1,150 @@
+"""`rig calibrate check`: a calibration judged by scans of a flat board that it was not made with."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.board import Board
+from calibration.check_fit import CheckedAngle, CheckedBoard, check_angle, check_boards
+from calibration.check_verdict import judge_check
+from calibration.errors import Degenerate
+from calibration.files import load_rig_model
+from calibration.judging import ACCURACY_PX, AT_M
+from calibration.sensitivity import sensitivity
+from calibration.uncertainty import DepthUncertainty, depth_uncertainty
+from calibration.verdict import Asked, Verdict
+from rig.calibrating.planes_run import true_errors, truth_content
+from rig.calibrating.report import check_report
+from rig.calibrating.result import CalibrationResult
+from rig.calibrating.session import Session
+from rig.calibrating.showing import Ask, Tell, require_live
+from rig.calibrating.sources import Sources
+from rig.calibrating.taking import Live, Taken, good_poses, take_kept, take_live
+from rig.calibration_identity import note_check
+from rig.errors import UsageError
+from rig.run import OutFolder, versions
+
+NO_COVARIANCE = "the calibration has no covariance: nothing tells what depth error to expect"
+
+
+@dataclass(frozen=True, slots=True)
+class CheckAsked:
+    """What is to be checked. poses: of a live rig. angle_rad: between the boards of the first two views, as stated."""
+
+    poses: int = 1
+    accuracy_m: float | None = None
+    at_m: float = AT_M
+    angle_rad: float | None = None
+    seed: int = 0
+    arm: bool = False
+
+
+def run_check(
+    sources: Sources,
+    board: Board,
+    calibration: Path | None,
+    asked: CheckAsked,
+    *,
+    out: OutFolder = None,
+    ask: Ask | None = None,
+    tell: Tell | None = None,
+) -> CalibrationResult:
+    """Check a calibration, by default that of the live rig; how it ended is noted beside its file, if it is of a rig.
+
+    Raises Degenerate where the board was not scanned, UsageError where there is no calibration.
+    """
+    live = sources.live
+    file = calibration or (None if live is None else live.calibration)
+    if file is None:
+        raise UsageError("there is no calibration to check; name one with --calibration")
+    model = load_rig_model(file)
+    poses = max(asked.poses, 2 if asked.angle_rad is not None else 1)
+    require_live(live, ask, asked.arm)
+    with Session(out) as session:
+        taken = Taken(session, tell)
+        take_kept(taken, sources, board, model.defects)
+        if live is not None:
+            choose = good_poses(live, board, poses, asked.at_m, asked.seed)
+            take_live(taken, Live(live, poses, choose, ask, (), asked.seed, asked.arm, model.defects), board)
+        views = [view for view in taken.views if view.name not in taken.refused]
+        if not views:
+            raise Degenerate("no-board", "; ".join(f"view {name}: {why}" for name, why in taken.refused.items()))
+        model.check_sensor(*taken.size)
+        boards = check_boards(model, views, board)
+        angle = check_angle(model, views[0], views[1], board) if asked.angle_rad is not None and views[1:] else None
+        worth = sensitivity(model, asked.at_m)
+        goal = Asked(ACCURACY_PX * worth.per_pixel_m if asked.accuracy_m is None else asked.accuracy_m, asked.at_m)
+        verdict = judge_check(boards, goal, board.size_m[0], angle, asked.angle_rad)
+        uncertainty = None if model.covariance is None else depth_uncertainty(model, asked.at_m)
+        line = NO_COVARIANCE if uncertainty is None else uncertainty.line()
+        truth = None if live is None else true_errors(model, live, asked.at_m)
+        summary = {
+            "command": "check",
+            **_summary(verdict, boards, angle, asked, goal, uncertainty, file),
+            "truth": None if truth is None else truth_content(truth),
+            "versions": versions(),
+        }
+        figures = tuple(_figures(boards, angle))
+        session.finish(summary, check_report(boards, uncertainty, verdict, line, figures), None)
+        if model.identity is not None:
+            note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
+        return CalibrationResult(verdict, line, figures, summary, model, session.path)
+
+
+def _summary(
+    verdict: Verdict,
+    boards: Sequence[CheckedBoard],
+    angle: CheckedAngle | None,
+    asked: CheckAsked,
+    goal: Asked,
+    uncertainty: DepthUncertainty | None,
+    file: Path,
+) -> dict[str, Any]:
+    return {
+        "verdict": verdict.as_json(),
+        "calibration": str(file),
+        "boards": [
+            {
+                "view": board.name,
+                "distance_m": board.distance_m,
+                "flatness_rms_m": board.flatness_rms_m,
+                "flatness_peak_m": board.flatness_peak_m,
+                "expected_m": board.expected_m,
+                "chi2": board.chi2,
+                "freedom": board.freedom,
+                "scale": board.scale,
+                "scale_sd": board.scale_sd,
+                "point_rms_m": board.point_rms_m,
+            }
+            for board in boards
+        ],
+        "angle": None
+        if angle is None
+        else {"rad": angle.angle_rad, "sd_rad": angle.sd_rad, "stated_rad": asked.angle_rad},
+        "depth_error": {
+            "at_m": goal.at_m,
+            "asked_m": goal.accuracy_m,
+            "median_m": None if uncertainty is None else float(np.nanmedian(uncertainty.sd_m)),
+            "line": None if uncertainty is None else uncertainty.line(),
+        },
+    }
+
+
+def _figures(boards: Sequence[CheckedBoard], angle: CheckedAngle | None) -> list[tuple[str, str]]:
+    rows = []
+    for board in boards:
+        rows.append(
+            (
+                f"view {board.name}",
+                f"{board.distance_m:.2f} m away, flat to {board.flatness_rms_m * 1e3:.2g} mm rms "
+                f"({board.expected_m * 1e3:.2g} expected), {board.flatness_peak_m * 1e3:.2g} mm peak, scale "
+                f"{board.scale - 1:+.3%} (sd {board.scale_sd:.2%})",
+            )
+        )
+    if angle is not None:
+        rows.append(("angle", f"{math.degrees(angle.angle_rad):.3f} degrees, sd {math.degrees(angle.sd_rad):.2g}"))
+    return rows

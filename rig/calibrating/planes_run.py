@@ -1,0 +1,213 @@
+"""`rig calibrate planes`: the whole rig, camera and mirror and lag together, from views of a board."""
+
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from calibration.against_truth import DepthErrors, depth_errors
+from calibration.board import Board
+from calibration.errors import CalibrationError, Degenerate
+from calibration.judging import AT_M, Judged, judge_fit, judge_refused
+from calibration.model import Identity, RigModel
+from calibration.rig_fit import RigFit, fit_rig
+from rig.calibrating.guided import Guide
+from rig.calibrating.refusing import refusal
+from rig.calibrating.report import planes_report
+from rig.calibrating.result import CalibrationResult, KnowsRig, named
+from rig.calibrating.session import Session
+from rig.calibrating.showing import Ask, Tell, require_live
+from rig.calibrating.sources import Sources
+from rig.calibrating.taking import Live, Taken, good_poses, take_kept, take_live
+from rig.config import RigConfig
+from rig.run import OutFolder, versions
+from rig.session import open_rig
+
+POSES = 12
+SPEEDS = (1.0, 0.3, 2.0)
+"""Exposures per column by turns, in units of the config's: the lags of both directions need several speeds, and hold
+between the lowest and the highest of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanesAsked:
+    """What a calibration of planes is to be. poses: of a live rig, the most where guided.
+
+    accuracy_m: sd of depth at `at_m` that is good enough, None: what a tenth of a pixel costs there. stated_baseline_m:
+    as somebody measured it, None: nobody has. exposures: per column, by turns; none: SPEEDS times the config's.
+    """
+
+    poses: int = POSES
+    guided: bool = False
+    accuracy_m: float | None = None
+    at_m: float = AT_M
+    stated_baseline_m: float | None = None
+    exposures: tuple[int, ...] = ()
+    seed: int = 0
+    arm: bool = False
+
+
+def run_planes(
+    sources: Sources,
+    board: Board,
+    asked: PlanesAsked,
+    *,
+    base: RigModel | None = None,
+    out: OutFolder = None,
+    ask: Ask | None = None,
+    tell: Tell | None = None,
+) -> CalibrationResult:
+    """Calibrate. base: a model to start from, whose defects are kept. ask: gets a person to move the board; tell: is
+    told of each view.
+
+    Raises Degenerate where the views make no calibration; its notes say why, root cause first.
+    """
+    live = sources.live
+    require_live(live, ask, asked.arm)
+    with Session(out) as session:
+        taken = Taken(session, tell)
+        defects = None if base is None else base.defects
+        take_kept(taken, sources, board, defects)
+        if live is not None:
+            start = good_poses(live, board, asked.poses, asked.at_m, asked.seed)
+            guide = Guide(start, board, live, asked.at_m, asked.accuracy_m, taken, tell)
+            exposures = asked.exposures or speeds_of(live)
+            choose = guide if asked.guided else start
+            take_live(taken, Live(live, asked.poses, choose, ask, exposures, asked.seed, asked.arm, defects), board)
+        fit = _fitted(taken, board, base)
+        judged = judge_fit(
+            fit, taken.views, at_m=asked.at_m, accuracy_m=asked.accuracy_m, stated_baseline_m=asked.stated_baseline_m
+        )
+        model = _signed(fit, judged, taken.identity)
+        truth = None if live is None else true_errors(model, live, asked.at_m)
+        line = judged.uncertainty.line()
+        summary = {
+            "command": "planes",
+            **_summary(fit, judged, taken),
+            "truth": None if truth is None else truth_content(truth),
+            "versions": versions(),
+        }
+        figures = tuple(_figures(fit, judged, truth))
+        report = planes_report(fit, taken.views, judged, line, figures)
+        calibration = session.finish(summary, report, model)
+        return CalibrationResult(judged.verdict, line, figures, summary, model, session.path, calibration)
+
+
+def speeds_of(live: RigConfig) -> tuple[int, ...]:
+    """Exposures per column at which a rig is looked at by turns."""
+    return tuple(dict.fromkeys(max(1, round(times * live.scan.exposures)) for times in SPEEDS))
+
+
+def _fitted(taken: Taken, board: Board, base: RigModel | None) -> RigFit:
+    try:
+        return fit_rig(taken.views, board, taken.size, start=base)
+    except CalibrationError as error:
+        refused = error if isinstance(error, Degenerate) else Degenerate("no-model", str(error))
+        raise refusal(refused, judge_refused(refused, taken.views, board, taken.size), taken) from refused
+
+
+def _signed(fit: RigFit, judged: Judged, identity: Identity | None) -> RigModel:
+    """The model with its verdict, and of which rig it is."""
+    verdict = judged.verdict
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    if identity is not None:
+        word = "passed" if verdict.passed else "failed"
+        identity = replace(identity, created=created, verdict=word, reasons=verdict.codes)  # type: ignore[arg-type]
+    provenance = {
+        "by": "rig calibrate planes",
+        "created": created,
+        "views": len(fit.views),
+        "corner_rms_px": fit.corner_rms_px,
+        "depth_sd_m": judged.evidence.expected_m,
+        "at_m": judged.asked.at_m,
+        "asked_m": judged.asked.accuracy_m,
+        "verdict": "passed" if verdict.passed else "failed",
+        "reasons": [str(reason) for reason in verdict.reasons],
+    }
+    return replace(fit.model, identity=identity, provenance=provenance)
+
+
+def true_model(live: RigConfig) -> RigModel | None:
+    """The rig as its world knows it; asked after everything was estimated."""
+    if live.world is None:
+        return None
+    with open_rig(live.model_copy(update={"calibration": None})) as rig:
+        return rig.world.true_model() if isinstance(rig.world, KnowsRig) else None
+
+
+def true_errors(model: RigModel, live: RigConfig, at_m: float) -> DepthErrors | None:
+    """How far depths are off, where the rig's world knows."""
+    truth = true_model(live)
+    if truth is None:
+        return None
+    speed = 0.0 if model.speed_range_per_s is None else float(np.mean(model.speed_range_per_s))
+    return depth_errors(model, truth, at_m, speed)
+
+
+def truth_content(errors: DepthErrors) -> dict[str, Any]:
+    """For programs."""
+    return {
+        "at_m": errors.depth_m,
+        "median_m": errors.median_m,
+        "worst_m": errors.worst_m,
+        "ratio_to_sd": errors.ratio,
+    }
+
+
+def _summary(fit: RigFit, judged: Judged, taken: Taken) -> dict[str, Any]:
+    evidence, uncertainty = judged.evidence, judged.uncertainty
+    return {
+        "verdict": judged.verdict.as_json(),
+        "views": {
+            "shown": len(taken.views),
+            "used": len(fit.views) - len(fit.outliers),
+            "without_board": list(fit.left_out),
+            "outliers": list(fit.outliers),
+            "refused": {name: str(why) for name, why in taken.refused.items()},
+        },
+        "depth_error": {
+            "at_m": judged.asked.at_m,
+            "asked_m": judged.asked.accuracy_m,
+            "median_m": evidence.expected_m,
+            "worst_m": evidence.worst_m,
+            "parts_m": {name: float(np.nanmedian(part)) for name, part in uncertainty.part_m.items()},
+            "line": uncertainty.line(),
+        },
+        "corner_rms_px": fit.corner_rms_px,
+        "passages": sum(len(sweep.residual) for sweeps in fit.sweeps for sweep in sweeps),
+        "passage_factor": fit.noise.passage_factor,
+        "jitter_sd": fit.noise.jitter_sd,
+        "misfit": fit.misfit,
+        "condition": fit.condition,
+        "wave_m": evidence.wave_m,
+        "shift_m": evidence.shift_m,
+        "baseline_m": evidence.baseline_m,
+        "baseline_sd_m": evidence.baseline_sd_m,
+        "lag_s": fit.model.lag_s._asdict(),
+        "row_delay_s": fit.model.row_delay_s,
+        "speed_range_per_s": fit.model.speed_range_per_s,
+        "decisions": [asdict(decision) for decision in fit.decisions],
+    }
+
+
+def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None) -> list[tuple[str, str]]:
+    evidence, matrix = judged.evidence, fit.model.camera.matrix
+    lag = fit.model.lag_s
+    asked = judged.asked
+    rows = [
+        ("views", f"{len(fit.views) - len(fit.outliers)} used, {named(fit.outliers)} outliers, "
+                  f"{named(fit.left_out)} without board"),
+        ("depth error", f"{evidence.expected_m * 1e3:.3g} mm at {asked.at_m:g} m (95 % of the picture: "
+                        f"{evidence.worst_m * 1e3:.3g} mm), asked {asked.accuracy_m * 1e3:.3g} mm"),
+        ("camera", f"f {matrix[0, 0]:.2f}, {matrix[1, 1]:.2f} px, centre {matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px"),
+        ("baseline", f"{evidence.baseline_m * 1e3:.2f} mm, sd {evidence.baseline_sd_m * 1e3:.2g} mm"),
+        ("lag", f"{lag.forward * 1e6:.1f} us forward, {lag.backward * 1e6:.1f} us backward"),
+        ("residuals", f"corners {fit.corner_rms_px:.3f} px, planes wave by {evidence.wave_m * 1e3:.2g} mm and views "
+                      f"differ by {evidence.shift_m * 1e3:.2g} mm at {asked.at_m:g} m"),
+        ("condition", f"{fit.condition:.3g}"),
+    ]  # fmt: skip
+    if truth is not None:
+        rows.append(("truth", f"median {truth.median_m * 1e3:.3g} mm, worst {truth.worst_m * 1e3:.3g} mm at "
+                              f"{truth.depth_m:g} m, {truth.ratio:.2f} of the expected sd"))  # fmt: skip
+    return rows

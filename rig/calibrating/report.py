@@ -1,0 +1,166 @@
+"""Reports of `rig calibrate`, one HTML file each: verdict and reasons first, then the pictures."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board import Board
+from calibration.camera import Camera
+from calibration.camera_fit import CameraFit
+from calibration.camera_judging import JudgedCamera
+from calibration.check_fit import CheckedBoard
+from calibration.judging import Judged
+from calibration.rig_fit import RigFit
+from calibration.sync_fit import SyncFit
+from calibration.uncertainty import DepthUncertainty
+from calibration.verdict import Verdict
+from calibration.views import BoardPose, View
+from rig.calibrating.report_charts import plane_residuals
+from rig.calibrating.report_page import Section, page, paragraph, picture, table
+from rig.calibrating.report_pictures import cells_picture, coverage_picture, error_picture, residual_picture
+
+Array = NDArray[np.float64]
+Figures = Sequence[tuple[str, str]]
+
+
+def planes_report(fit: RigFit, views: Sequence[View], judged: Judged, line: str, figures: Figures) -> str:
+    """Of a whole rig."""
+    by_name = {view.name: view for view in views}
+    used = [by_name[name] for name in fit.views]
+    sections = [
+        *camera_sections(fit.model.camera, used, fit.corner_residual_px),
+        planes_section(judged),
+        uncertainty_section(judged.uncertainty),
+        _views_section(fit, judged),
+        _decisions_section(fit),
+    ]
+    return page("Calibration of camera and planes", judged.verdict, line, figures, sections)
+
+
+def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequence[Array]) -> list[Section]:
+    """Where corners were seen and how far the model's are from them."""
+    size = (camera.width, camera.height)
+    seen = [corners_px(view) for view in views]
+    arrows, times = residual_picture(seen, residuals_px, size)
+    return [
+        Section("Coverage", picture(coverage_picture(seen, size), "Corners of all views, a colour for each view.")),
+        Section("Residuals of the corners", picture(arrows, f"Drawn {times} times longer than they are.")),
+    ]
+
+
+def planes_section(judged: Judged) -> Section:
+    """What is left of the planes."""
+    chart = plane_residuals(judged.waves, judged.residuals, judged.sensitivity.per_command_m, judged.asked.at_m)
+    return Section("Residuals of the planes", chart)
+
+
+def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
+    """The expected depth error as a map."""
+    if not np.isfinite(uncertainty.sd_m).any():
+        return Section("Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m."))
+    caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
+    rows = [(name, f"{np.nanmedian(part) * 1e3:.3g} mm") for name, part in uncertainty.part_m.items()]
+    said = paragraph("Its parts, each the median over the picture:") + table(("from", "mm"), rows)
+    return Section("Expected depth error", picture(error_picture(uncertainty), caption) + said)
+
+
+def camera_report(fit: CameraFit, views: Sequence[View], judged: JudgedCamera, board: Board, figures: Figures) -> str:
+    """Of a camera alone; views: those of the fit."""
+    seen = [corners_px(view) for view in views]
+    rows = [
+        (
+            name + (" (outlier)" if name in fit.outliers else ""),
+            *pose_words(pose, board),
+            f"{np.count_nonzero(used)} of {len(used)}",
+            f"{rms:.3f}",
+        )
+        for name, pose, used, rms in zip(fit.views, fit.poses, fit.used, fit.view_rms_px, strict=True)
+    ]
+    head = ("view", "distance, m", "tilt, degrees", "corners used", "rms, px")
+    shown = [view for view, px in zip(views, seen, strict=True) if len(px)]
+    sections = [*camera_sections(fit.camera, shown, fit.residual_px), Section("Views", table(head, rows))]
+    return page("Calibration of the camera", judged.verdict, judged.line(), figures, sections)
+
+
+def check_report(
+    boards: Sequence[CheckedBoard], uncertainty: DepthUncertainty | None, verdict: Verdict, line: str, figures: Figures
+) -> str:
+    """Of a check."""
+    sections = []
+    for board in boards:
+        caption = "How far the board's squares lie off their plane; black: not scanned."
+        rows = [
+            ("flatness", f"rms {board.flatness_rms_m * 1e3:.3g} mm, expected {board.expected_m * 1e3:.3g} mm; peak "
+                         f"{board.flatness_peak_m * 1e3:.3g} mm"),
+            ("chi2", f"{board.chi2:.1f} of {board.freedom}"),
+            ("scale", f"{board.scale:.5f}, sd {board.scale_sd:.2g}"),
+            ("distance", f"{board.distance_m:.3f} m"),
+        ]  # fmt: skip
+        shown = picture(cells_picture(board.cells_m), caption)
+        sections.append(Section(f"View {board.name}", table(("", ""), rows) + shown))
+    if uncertainty is not None:
+        sections.append(uncertainty_section(uncertainty))
+    return page("Check of a calibration", verdict, line, figures, sections)
+
+
+def sync_report(fit: SyncFit, verdict: Verdict, line: str, figures: Figures) -> str:
+    """Of lags and delays."""
+    rows = [
+        (
+            "up" if sweep.direction > 0 else "down",
+            f"{sweep.speed_per_s:.4g}",
+            f"{sweep.lag_s * 1e6:.2f}",
+            f"{sweep.sd_s * 1e6:.2g}",
+            str(sweep.passages),
+        )
+        for sweep in fit.sweeps
+    ]
+    head = ("sweep", "speed, 1/s", "lag, us", "sd, us", "passages")
+    return page("Calibration of lag and delays", verdict, line, figures, [Section("Sweeps", table(head, rows))])
+
+
+def corners_px(view: View) -> Array:
+    """The corners that were seen and used, (n, 2)."""
+    if view.corners is None:
+        return np.zeros((0, 2))
+    px = np.asarray(view.corners.px, np.float64)
+    known: Array = px[np.isfinite(px).all(axis=1)]
+    return known
+
+
+def pose_words(pose: BoardPose, board: Board) -> tuple[str, str]:
+    """Distance of a board's middle, and how far it is tilted from facing the camera."""
+    middle = pose.to_camera([board.size_m[0] / 2, board.size_m[1] / 2, 0.0])
+    tilt = np.degrees(np.arccos(np.clip(pose.matrix[2, 2], -1, 1)))
+    return f"{middle[2]:.2f}", f"{tilt:.0f}"
+
+
+def _views_section(fit: RigFit, judged: Judged) -> Section:
+    rows = []
+    worth = judged.sensitivity.per_command_m
+    shifts = {one.name: one.shift for one in judged.shifts}
+    for name, pose, residual, sweeps in zip(fit.views, fit.poses, fit.corner_residual_px, fit.sweeps, strict=True):
+        rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))) if len(residual) else np.nan
+        shift = shifts.get(name, np.nan) * worth * 1e3
+        rows.append(
+            (
+                name + (" (outlier)" if name in fit.outliers else ""),
+                *pose_words(pose, fit.board),
+                str(len(residual)),
+                f"{rms:.3f}",
+                str(sum(len(sweep.residual) for sweep in sweeps)),
+                f"{shift:+.2g}" if np.isfinite(shift) else "-",
+            )
+        )
+    head = ("view", "distance, m", "tilt, degrees", "corners", "rms, px", "passages", "shift, mm")
+    left_out = paragraph(f"Without a board: {', '.join(fit.left_out)}.", small=True) if fit.left_out else ""
+    return Section("Views", table(head, rows) + left_out)
+
+
+def _decisions_section(fit: RigFit) -> Section:
+    rows = [
+        (one.name, "kept" if one.kept else "left out", f"{one.value:.3g}", f"{one.sd:.2g}", one.reason)
+        for one in fit.decisions
+    ]
+    return Section("Terms of the model", table(("term", "", "value", "sd", "why"), rows))

@@ -1,0 +1,96 @@
+"""The folder of a calibration: its views are written as they come and stay, whatever becomes of the rest.
+
+    views/000.npz ...  rig.json (whose they are)  calibration.yaml (+ .npy)  report.html  summary.json
+
+A session that was interrupted, or whose views made no calibration, leaves its views, which are a source for the next.
+"""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from calibration.files import save_rig_model
+from calibration.model import Identity, RigModel
+from calibration.views import View
+from rig.calibrating.sources import VIEWS
+from rig.calibrating.view_files import save_view
+from rig.errors import UsageError
+from rig.outputs import RunFolder
+from rig.run import OutFolder
+
+CALIBRATION_FILE = "calibration.yaml"
+RIG_FILE = "rig.json"
+
+
+def session_rig(folder: Path) -> Identity | None:
+    """Which rig the views of a session are of; None where it does not say."""
+    try:
+        content = json.loads((folder / RIG_FILE).read_text(encoding="utf-8"))
+        return Identity(**{**content, "reasons": tuple(content["reasons"])})
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise UsageError(f"{folder / RIG_FILE} does not say which rig it is of ({error}); remove it") from error
+
+
+class Session:
+    """Takes views one by one, then what was made of them. out: None to write nothing."""
+
+    def __init__(self, out: OutFolder) -> None:
+        """Claim the folder. UsageError where it cannot be."""
+        self._folder = None if out is None else RunFolder(out, in_place=True)
+        self._views = 0
+
+    @property
+    def path(self) -> Path | None:
+        """The folder."""
+        return None if self._folder is None else self._folder.path
+
+    def __enter__(self) -> Self:
+        """The session itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Keep what was written if there is a view among it, and say so where something went wrong."""
+        if self._folder is None:
+            return
+        if self._views:
+            self._folder.keep()
+            if error is not None:
+                error.add_note(f"{self._views} views are in {self._folder.path}, which can be given as a source")
+        self._folder.discard()
+
+    def note_rig(self, identity: Identity) -> None:
+        """Write which rig the views are of."""
+        if self._folder is not None:
+            self._folder.write_json(RIG_FILE, asdict(identity))
+
+    def add(self, view: View) -> None:
+        """Write a view."""
+        if self._folder is not None:
+            folder = self._folder.place(VIEWS)
+            folder.mkdir(exist_ok=True)
+            save_view(view, folder / f"{self._views:03d}.npz")
+            self._views += 1
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a file of text."""
+        if self._folder is not None:
+            self._folder.write_text(name, text)
+
+    def finish(self, summary: dict[str, Any], report: str, model: RigModel | None) -> Path | None:
+        """Write what was made of the views; the calibration's file, None where there is none."""
+        if self._folder is None:
+            return None
+        file = None
+        if model is not None:
+            file = self._folder.place(CALIBRATION_FILE)
+            save_rig_model(model, file)
+        self._folder.write_text("report.html", report)
+        self._folder.write_json("summary.json", summary)
+        self._folder.publish()
+        return None if file is None else self._folder.path / CALIBRATION_FILE

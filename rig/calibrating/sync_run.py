@@ -1,0 +1,162 @@
+"""`rig calibrate sync`: lag of the mirror each way and delay of the rows, from one unmoved scene at several speeds."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from calibration.covariance import Covariance
+from calibration.errors import CalibrationError
+from calibration.files import load_rig_model
+from calibration.judging import ACCURACY_PX, AT_M
+from calibration.model import RigModel
+from calibration.sensitivity import sensitivity
+from calibration.sync_fit import NAMES, SyncFit, fit_sync
+from calibration.sync_verdict import judge_sync
+from calibration.verdict import Asked, Verdict
+from rig.calibrating.capture import capture_view
+from rig.calibrating.planes_run import speeds_of, true_model
+from rig.calibrating.report import sync_report
+from rig.calibrating.result import CalibrationResult
+from rig.calibrating.session import Session
+from rig.calibrating.showing import Tell
+from rig.calibrating.sources import Sources
+from rig.calibrating.taking import Taken, take_kept
+from rig.config import RigConfig
+from rig.run import OutFolder, versions
+
+
+@dataclass(frozen=True, slots=True)
+class SyncAsked:
+    """exposures: per column, a speed each; none: those of `speeds_of`. accuracy_m: as for planes."""
+
+    exposures: tuple[int, ...] = ()
+    accuracy_m: float | None = None
+    at_m: float = AT_M
+    seed: int = 0
+    arm: bool = False
+
+
+def run_sync(
+    sources: Sources,
+    asked: SyncAsked,
+    *,
+    base: RigModel | None = None,
+    out: OutFolder = None,
+    tell: Tell | None = None,
+) -> CalibrationResult:
+    """Measure the lags. base: the model they go into, by default that of the live rig; without one nothing but the
+    figures is written. Raises Degenerate where the sweeps cannot tell.
+    """
+    live = sources.live
+    base = base or _own(live)
+    with Session(out) as session:
+        taken = Taken(session, tell)
+        take_kept(taken, sources, None)
+        if live is not None:
+            for at, exposures in enumerate(asked.exposures or speeds_of(live)):
+                name, seed = f"{exposures} exposures", asked.seed + at
+                taken.add_capture(capture_view(live, name, None, seed=seed, exposures=exposures, arm=asked.arm))
+        fit = fit_sync([sweep for view in taken.views for sweep in view.passages])
+        goal = None if base is None else _goal(base, asked)
+        verdict = judge_sync(fit, base, goal)
+        model = None if base is None else _with_sync(base, fit, verdict)
+        truth = None if live is None else true_model(live)
+        line = _line(fit)
+        summary = {"command": "sync", **_summary(fit, verdict, truth), "versions": versions()}
+        figures = tuple(_figures(fit, truth))
+        calibration = session.finish(summary, sync_report(fit, verdict, line, figures), model)
+        return CalibrationResult(verdict, line, figures, summary, model, session.path, calibration)
+
+
+def _own(live: RigConfig | None) -> RigModel | None:
+    if live is None or live.calibration is None:
+        return None
+    try:
+        return load_rig_model(live.calibration)
+    except CalibrationError:
+        return None  # what is wrong with it says the command that needs it
+
+
+def _goal(model: RigModel, asked: SyncAsked) -> Asked:
+    if asked.accuracy_m is not None:
+        return Asked(asked.accuracy_m, asked.at_m)
+    return Asked(ACCURACY_PX * sensitivity(model, asked.at_m).per_pixel_m, asked.at_m)
+
+
+def _with_sync(base: RigModel, fit: SyncFit, verdict: Verdict) -> RigModel:
+    """The model with the lags found; what it knew of its own ones is forgotten."""
+    provenance = {
+        **base.provenance,
+        "sync": {
+            "by": "rig calibrate sync",
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+            "verdict": "passed" if verdict.passed else "failed",
+        },
+    }
+    return replace(
+        base,
+        lag_s=fit.lag_s,
+        row_delay_s=fit.row_delay_s,
+        speed_range_per_s=fit.speed_range_per_s,
+        covariance=None if base.covariance is None else _joined(base.covariance, fit),
+        provenance=provenance,
+    )
+
+
+def _joined(known: Covariance, fit: SyncFit) -> Covariance:
+    kept = [name for name in known.names if name not in NAMES]
+    told = [i for i in range(len(NAMES)) if np.isfinite(fit.covariance[i, i]) and fit.covariance[i, i] > 0]
+    names = (*kept, *(NAMES[i] for i in told))
+    matrix = np.zeros((len(names), len(names)))
+    matrix[: len(kept), : len(kept)] = known.of(kept)
+    matrix[len(kept) :, len(kept) :] = np.nan_to_num(fit.covariance[np.ix_(told, told)])
+    return Covariance(names, matrix)
+
+
+def _line(fit: SyncFit) -> str:
+    up, down = (f"{lag * 1e6:.1f} us (sd {sd * 1e6:.1g})" for lag, sd in zip(fit.lag_s, fit.sd_s[:2], strict=True))
+    return f"lag up {up}, down {down}"
+
+
+def _summary(fit: SyncFit, verdict: Verdict, truth: RigModel | None) -> dict[str, Any]:
+    sd = fit.sd_s
+    return {
+        "verdict": verdict.as_json(),
+        "lag_s": fit.lag_s._asdict(),
+        "lag_sd_s": {"forward": sd[0], "backward": sd[1]},
+        "row_delay_s": fit.row_delay_s,
+        "row_delay_sd_s": sd[2],
+        "speed_range_per_s": fit.speed_range_per_s,
+        "common": fit.common,
+        "chi2": fit.chi2,
+        "freedom": fit.dof,
+        "noise": fit.noise,
+        "sweeps": [
+            {
+                "direction": sweep.direction,
+                "speed_per_s": sweep.speed_per_s,
+                "lag_s": sweep.lag_s,
+                "sd_s": sweep.sd_s,
+                "passages": sweep.passages,
+            }
+            for sweep in fit.sweeps
+        ],
+        "truth": None if truth is None else {"lag_s": truth.lag_s._asdict(), "row_delay_s": truth.row_delay_s},
+    }
+
+
+def _figures(fit: SyncFit, truth: RigModel | None) -> Sequence[tuple[str, str]]:
+    low, high = fit.speed_range_per_s
+    rows = [
+        ("lags", _line(fit) + (": their mean" if fit.common else "")),
+        ("row delay", f"{fit.row_delay_s * 1e9:.3g} ns a row, sd {fit.sd_s[2] * 1e9:.2g}"),
+        ("speeds", f"{low:.3g} to {high:.3g} per second"),
+        ("sweeps", f"{len(fit.sweeps)}, chi2 {fit.chi2:.1f} of {fit.dof}"),
+    ]
+    if truth is not None:
+        lag = truth.lag_s
+        rows.append(("truth", f"lag {lag.forward * 1e6:.1f} us up, {lag.backward * 1e6:.1f} us down"))
+    return rows

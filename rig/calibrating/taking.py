@@ -1,0 +1,214 @@
+"""Views from all sources of a calibration: those kept earlier, recorded runs, then the live rig, pose by pose."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board import Board
+from calibration.camera import Camera
+from calibration.detection import find_corners
+from calibration.errors import CalibrationError, Degenerate
+from calibration.files import load_rig_model
+from calibration.guide import Advice, candidates, rough_camera, sequence
+from calibration.model import Identity
+from calibration.views import View
+from rig.calibrating.capture import Capture, capture_recorded, capture_view
+from rig.calibrating.session import Session, session_rig
+from rig.calibrating.showing import Ask, Tell, shown
+from rig.calibrating.sources import VIEWS, Sources
+from rig.calibrating.view_files import load_views
+from rig.config import RigConfig
+from rig.errors import PlanError, UsageError
+from rig.session import open_rig
+
+MISSED_SHARE = 0.5
+"""So many more poses than asked for are shown where the board is not found in some."""
+
+Defects = NDArray[np.bool_] | None
+"""(rows, width), pixels not to be used."""
+
+
+class ChoosesPoses(Protocol):
+    """Says which pose to show next."""
+
+    def next(self, views: Sequence[View]) -> Advice | None:
+        """After these views; None: no more are needed."""
+        ...
+
+
+class Taken:
+    """What was taken. views: all of them. refused: why some have no corners, by the view's name. identity: of the rig,
+    None: not known.
+    """
+
+    def __init__(self, session: Session, tell: Tell | None = None) -> None:
+        """session: where views are kept; tell: is told of each."""
+        self.views: list[View] = []
+        self.refused: dict[str, Degenerate] = {}
+        self.identity: Identity | None = None
+        self._session = session
+        self.tell = tell
+
+    def add(self, view: View, refused: Degenerate | None = None, identity: Identity | None = None) -> None:
+        """One more; a name that there is already gets a number."""
+        if view.name in [known.name for known in self.views]:
+            view = replace(view, name=f"{view.name}-{len(self.views)}")
+        self.views.append(view)
+        if refused is not None:
+            self.refused[view.name] = refused
+        self._of_rig(identity)
+        self._session.add(view)
+        if self.tell is not None:
+            self.tell(_told(view, refused))
+
+    def _of_rig(self, identity: Identity | None) -> None:
+        if identity is None:
+            return
+        if self.identity is None:
+            self._session.note_rig(identity)
+        elif (self.identity.rig, self.identity.serials) != (identity.rig, identity.serials):
+            raise UsageError(
+                f"views are of two rigs: {self.identity.name} ({_devices(self.identity)}) and {identity.name} "
+                f"({_devices(identity)}); calibrate each with its own"
+            )
+        self.identity = identity
+
+    def add_capture(self, capture: Capture) -> None:
+        """The view of a scan."""
+        self.add(capture.view, capture.refused, capture.identity)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the pictures. UsageError where views are of different sizes."""
+        sizes = {view.picture.shape[::-1] for view in self.views if view.picture is not None}
+        if len(sizes) != 1:
+            named = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)) or "none"
+            raise UsageError(f"pictures of the views have sizes {named}; views of one sensor make a calibration")
+        width, height = sizes.pop()
+        return width, height
+
+
+@dataclass(frozen=True, slots=True)
+class FixedPoses:
+    """Poses of a sequence that was chosen before."""
+
+    poses: Sequence[Advice]
+
+    def next(self, views: Sequence[View]) -> Advice | None:
+        """The one that follows."""
+        return self.poses[len(views)] if len(views) < len(self.poses) else None
+
+
+def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int) -> FixedPoses:
+    """Poses that tell most about any rig, and a few more for those in which the board is missed."""
+    choices = candidates(first_camera(config), board, config.scan.depth_range)
+    if not choices:
+        raise UsageError(f"no pose of a board of {board.size_m[0]:g} x {board.size_m[1]:g} m fits the picture within "
+                         f"scan.depth_range; use a smaller board or widen the range")  # fmt: skip
+    chosen = sequence(choices, poses + math.ceil(MISSED_SHARE * poses), seed)
+    return FixedPoses([Advice(candidate, at_m) for candidate in chosen])
+
+
+def first_camera(config: RigConfig) -> Camera:
+    """A camera to place boards with: that of the config's calibration, else a rough one of the sensor's size."""
+    if config.calibration is not None:
+        try:
+            return load_rig_model(config.calibration).camera
+        except CalibrationError:
+            pass  # it is about to be replaced
+    with open_rig(config.model_copy(update={"calibration": None})) as rig:
+        return rough_camera((rig.spad.info.width, rig.spad.info.height))
+
+
+def take_kept(taken: Taken, sources: Sources, board: Board | None, defects: Defects = None) -> None:
+    """Take the views that need no live rig. board: None where none is to be looked for in recordings."""
+    for folder in sources.sessions:
+        identity = session_rig(folder)
+        for view in load_views(folder / VIEWS):
+            taken.add(view, None, identity)
+    for run in sources.recorded:
+        taken.add_capture(capture_recorded(run, run.name, board, defects=defects))
+    for file in sources.pictures:
+        taken.add(*_pictured(file, board))
+
+
+@dataclass(frozen=True, slots=True)
+class Live:
+    """How a live rig takes views. poses: good ones wanted; choose: which. ask: gets a person to move the board.
+
+    exposures: per column, by turns, so that the mirror is seen at several speeds; those that it cannot do are left out;
+    none: as the config says. seed: of everything simulated.
+    """
+
+    config: RigConfig
+    poses: int
+    choose: ChoosesPoses
+    ask: Ask | None = None
+    exposures: Sequence[int] = ()
+    seed: int = 0
+    arm: bool = False
+    defects: Defects = None
+
+
+def take_live(taken: Taken, live: Live, board: Board) -> None:
+    """Take views of a board that is moved from pose to pose."""
+    good, seen = 0, list[View]()
+    speeds = list(live.exposures)
+    while good < live.poses and len(seen) < live.poses + math.ceil(MISSED_SHARE * live.poses):
+        advice = live.choose.next(seen)
+        if advice is None:
+            return
+        config = shown(
+            live.config, f"pose {good + 1} of {live.poses}: {advice}", advice.candidate, live.ask, taken.tell
+        )
+        capture = _captured(taken, live, config, board, good, speeds)
+        taken.add_capture(capture)
+        seen.append(capture.view)
+        good += capture.refused is None
+
+
+def _captured(taken: Taken, live: Live, config: RigConfig, board: Board, good: int, speeds: list[int]) -> Capture:
+    """One view, at the speed whose turn it is; speeds that the rig cannot do are taken out of the list."""
+    at = len(taken.views)
+    while True:
+        exposures = speeds[good % len(speeds)] if speeds else None
+        try:
+            return capture_view(
+                config, f"{at:03d}", board, seed=live.seed + at, exposures=exposures, arm=live.arm, defects=live.defects
+            )
+        except PlanError:
+            if exposures is None or len(speeds) < 2:
+                raise
+            speeds.remove(exposures)
+
+
+def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]:
+    """A picture of the board, taken with anything."""
+    pixels = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if pixels is None:
+        raise UsageError(f"{file} cannot be read as a picture; convert it to PNG")
+    picture = np.asarray(pixels, np.float32)
+    try:
+        corners = None if board is None else find_corners(np.asarray(pixels), board)
+        return View(file.name, corners, (), picture), None
+    except Degenerate as error:
+        return View(file.name, None, (), picture), error
+
+
+def _devices(identity: Identity) -> str:
+    return ", ".join([*identity.kinds.values(), *identity.serials.values()])
+
+
+def _told(view: View, refused: Degenerate | None) -> str:
+    if refused is not None:
+        return f"view {view.name}: {refused}"
+    parts = [] if view.corners is None else [f"{len(view.corners.ids)} corners"]
+    if view.passages:
+        parts.append(f"{', '.join(str(len(sweep.command)) for sweep in view.passages)} passages of the line")
+    return f"view {view.name}: {', '.join(parts) or 'nothing'}"

@@ -1,0 +1,228 @@
+"""Random rigs calibrated from boards shown to them: is the depth as good as the calibration says it is?
+
+    python -m tests.campaigns.calibration_rigs --rigs 500 --processes 2
+
+Every rig is its own (`tests.reference.random_rigs`), is shown 10 to 16 poses, and swept both ways at K = 10 (every
+fourth pose at K = 3 too, which tells the lags apart). Frames come from the simulator's photons, are counted as in a
+scan, and go the way of `rig calibrate planes`: picture, corners, passages, fit. The fitted model's depth is then
+compared with the true model's, for the same pixels and commands, at points 5 m away spread over the picture. Per rig:
+median and worst error, error over the stated standard deviation, whether the true depth lies in the stated 95 %
+interval, and what the model adds to a scan's error in pixels at K = 10, 1 and 20, both ways. Rigs that were refused
+are listed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board import Board
+from calibration.detection import find_corners
+from calibration.errors import CalibrationError, Degenerate
+from calibration.even_albedo import board_pixels, even_pixels
+from calibration.even_pixels import evenly
+from calibration.model import RigModel
+from calibration.passages import SweepCounts, find_passages
+from calibration.rig_fit import RigFit, fit_rig
+from calibration.triangulation import depth_slope
+from calibration.uncertainty import command_at, depth_sd_m
+from calibration.views import Passages, View
+from sim_backend.scenes.board import ShownBoard
+from tests.campaigns.board_capture import FRAME_S, HOT_PER_S, Stand, SweepAsked, SweepTaken, set_up, speed, take_sweeps
+from tests.reference.random_rigs import BOARD, random_poses, random_rig
+
+Array = NDArray[np.float64]
+
+FAR_M = 5.0
+GRID = 12
+"""Points along each side of the picture."""
+PIXELS = 500
+"""Of a sweep that are looked at for passages."""
+CALIBRATED, SCANNED = 10, (10, 1, 20)
+SLOW_EVERY, OTHER_SPEED = 4, 3
+OFF_LINE = 8
+"""Columns on either side of the line that do not count for the picture."""
+SURE = 1.959964
+"""Standard deviations of a 95 % interval."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """A fitted model against the truth, at points (n,) of the picture. error_m, sd_m: at FAR_M. added_px: by exposures
+    and direction, root mean square over the picture of what the model adds to a scan's error.
+    """
+
+    error_m: Array
+    sd_m: Array
+    added_px: dict[tuple[int, int], float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What became of a rig. trouble: why there is no model, '' where there is one."""
+
+    seed: int
+    seconds: float
+    trouble: str
+    poses: int = 0
+    compared: Compared | None = None
+    fit: RigFit | None = None
+
+
+def view_of(name: str, stand: Stand, taken: Sequence[SweepTaken], board: Board) -> View:
+    """The view that a capture makes of these sweeps; without corners where no board is found."""
+    defects = stand.dark_per_s > HOT_PER_S
+    picture = room_picture(stand, taken)
+    try:
+        corners = find_corners(picture, board, defects)
+    except Degenerate:
+        return View(name, None, (), picture)
+    usable = even_pixels(picture) & board_pixels(corners, board, picture.shape) & ~defects
+    return View(name, corners, tuple(_passages(sweep, usable) for sweep in taken), picture)
+
+
+def room_picture(stand: Stand, taken: Sequence[SweepTaken]) -> NDArray[np.float32]:
+    """What the room's light shows (rows, width), photons per exposure, as `calibration.flux_picture` has it but for its
+    care of windows that move; NaN outside the window."""
+    ones, frames = np.zeros(taken[0].volume.counts.shape[1:], np.int64), 0
+    for sweep in taken:
+        counts, n = sweep.volume.counts, sweep.asked.exposures
+        most, at = np.zeros_like(counts[0]), np.zeros(counts[0].shape, np.int64)
+        for column, here in enumerate(counts):
+            ones += here
+            at[here > most] = column
+            np.maximum(most, here, out=most)
+        frames += n * (len(counts) - 2 * OFF_LINE - 1)
+        for shift in range(-OFF_LINE, OFF_LINE + 1):
+            ones -= np.take_along_axis(counts, np.clip(at + shift, 0, len(counts) - 1)[None], axis=0)[0]
+    picture = np.full(stand.rays[0].shape, np.nan, np.float32)
+    x0, window = int(taken[0].volume.x0[0]), taken[0].volume.counts.shape[2]
+    inside = np.s_[:, x0 : x0 + window]
+    room = -np.log1p(-np.clip(ones, 0, frames - 0.5) / frames)
+    picture[inside] = room[:, : picture[inside].shape[1]]
+    return (picture - FRAME_S * stand.dark_per_s).astype(np.float32)
+
+
+def views_of(stand: Stand, board: Board, poses: int, rng: np.random.Generator) -> list[View]:
+    """The board at so many random poses, all swept."""
+    views = []
+    for i, pose in enumerate(random_poses(rng, stand.rig.model.camera, board, poses)):
+        speeds = [CALIBRATED, OTHER_SPEED] if i % SLOW_EVERY == 0 else [CALIBRATED]
+        sweeps = [SweepAsked(exposures, direction) for exposures in speeds for direction in (1, -1)]
+        views.append(view_of(f"{i:03d}", stand, take_sweeps(stand, [ShownBoard(board, pose)], sweeps, rng), board))
+    return views
+
+
+def compare(fitted: RigModel, true: RigModel) -> Compared:
+    """The fitted model's depth against the true one's, for the same pixels and commands."""
+    camera = true.camera
+    x, y = np.meshgrid(*((np.arange(GRID) + 0.5) / GRID * size - 0.5 for size in (camera.width, camera.height)))
+    mirror = command_at(true, x, y, FAR_M)
+    there = np.isfinite(mirror)
+    x, y, mirror = x[there], y[there], mirror[there]
+    slope = np.abs(depth_slope(*camera.tangents_at(x, y), true.planes(mirror), camera))
+    added, error, sd = {}, np.empty(0), np.empty(0)
+    for exposures in SCANNED:
+        for direction in (1, -1):
+            velocity = direction * speed(exposures)
+            lag_s = true.lag_s.forward if direction > 0 else true.lag_s.backward
+            stands = fitted.mirror_command(mirror + velocity * lag_s, y, velocity)
+            stands = np.clip(stands, *fitted.scanner.command_range)
+            off = fitted.sheets(stands).depth(*fitted.camera.tangents_at(x, y)) - FAR_M
+            added[exposures, direction] = float(np.sqrt(np.nanmean((off / slope) ** 2)))
+            if exposures == CALIBRATED:
+                error = np.concatenate([error, off])
+                sd = np.concatenate([sd, depth_sd_m(fitted, x, y, stands, velocity)])
+    return Compared(error, sd, added)
+
+
+def calibrated(seed: int) -> Outcome:
+    """Make a rig, calibrate it, compare."""
+    begun = time.perf_counter()
+    rng = np.random.default_rng(seed)
+    stand = set_up(random_rig(rng))
+    poses = int(rng.integers(10, 17))
+    camera = stand.rig.model.camera
+    try:
+        fit = fit_rig(views_of(stand, BOARD, poses, rng), BOARD, (camera.width, camera.height))
+        compared = compare(fit.model, stand.rig.model)
+    except CalibrationError as error:
+        return Outcome(seed, time.perf_counter() - begun, f"{getattr(error, 'reason', 'error')}: {error}")
+    return Outcome(seed, time.perf_counter() - begun, "", poses, compared, fit)
+
+
+def summary(outcomes: Iterable[Outcome]) -> str:
+    """The figures over all rigs."""
+    done = list(outcomes)
+    good = [(o, o.compared) for o in done if o.compared is not None]
+    said = [f"{len(done)} rigs, {len(good)} calibrated, median {np.median([o.seconds for o in done]):.1f} s a rig"]
+    said += [f"  refused, seed {o.seed}: {o.trouble}" for o in done if o.compared is None]
+    if not good:
+        return "\n".join(said)
+    z = np.concatenate([c.error_m / c.sd_m for _, c in good])
+    medians = np.array([np.median(np.abs(c.error_m)) for _, c in good])
+    worst = np.array([np.max(np.abs(c.error_m)) for _, c in good])
+    inside = np.array([np.mean(np.abs(c.error_m) < SURE * c.sd_m) for _, c in good])
+    spread = np.array([np.sqrt(np.mean((c.error_m / c.sd_m) ** 2)) for _, c in good])
+    said += [
+        f"depth error at {FAR_M:g} m, mm: median of the rigs' medians {1e3 * np.median(medians):.2f}, of their worst "
+        f"{1e3 * np.median(worst):.2f}; worst of all {1e3 * worst.max():.1f}",
+        f"error over stated sd: median {np.median(np.abs(z)) / 0.67449:.3f}, rms {np.sqrt(np.mean(z**2)):.3f}, a rig's "
+        f"rms {np.median(spread):.3f} (median), {np.percentile(spread, 95):.2f} (95 %), {spread.max():.2f} (worst)",
+        f"true depth in the stated 95 % interval: {np.mean(np.abs(z) < SURE):.1%} of points; a rig's share "
+        f"{np.percentile(inside, 5):.0%} (5 %)",
+    ]
+    for exposures in SCANNED:
+        added = np.array([[c.added_px[exposures, direction] for direction in (1, -1)] for _, c in good]).ravel()
+        said.append(
+            f"added to a scan at K = {exposures}, px: median {np.median(added):.4f}, 95 % "
+            f"{np.percentile(added, 95):.4f}, worst {added.max():.4f}, above 0.1 px {np.mean(added > 0.1):.1%}"
+        )
+    odd = Counter(name for o, _ in good if o.fit is not None for name in o.fit.outliers)
+    said.append(f"views called outliers: {sum(odd.values())} of {sum(o.poses for o, _ in good)}")
+    return "\n".join(said)
+
+
+def _passages(taken: SweepTaken, usable: NDArray[np.bool_]) -> Passages:
+    volume, asked = taken.volume, taken.asked
+    counts = SweepCounts(volume.counts, volume.n_frames, taken.command, volume.x0, volume.width)
+    thinned = np.zeros_like(usable)
+    thinned[tuple(evenly(usable)[:PIXELS].T)] = True
+    return find_passages(counts, asked.direction, asked.speed_per_s, thinned)
+
+
+def main() -> None:
+    """Run the campaign."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rigs", type=int, default=500)
+    parser.add_argument("--first", type=int, default=1, help="seed of the first rig")
+    parser.add_argument("--processes", type=int, default=2)
+    asked = parser.parse_args()
+    outcomes = []
+    with ProcessPoolExecutor(asked.processes) as pool:
+        for outcome in pool.map(calibrated, range(asked.first, asked.first + asked.rigs)):
+            outcomes.append(outcome)
+            print(_line(outcome), flush=True)
+    print(summary(outcomes))
+
+
+def _line(outcome: Outcome) -> str:
+    if outcome.compared is None:
+        return f"{outcome.seed}: {outcome.trouble} ({outcome.seconds:.1f} s)"
+    c = outcome.compared
+    z = np.sqrt(np.mean((c.error_m / c.sd_m) ** 2))
+    return (
+        f"{outcome.seed}: error {1e3 * np.median(np.abs(c.error_m)):.2f} mm, sd {1e3 * np.median(c.sd_m):.2f} mm, "
+        f"ratio {z:.2f} ({outcome.seconds:.1f} s)"
+    )
+
+
+if __name__ == "__main__":
+    main()
