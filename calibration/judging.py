@@ -59,7 +59,7 @@ def judge_fit(
     )
     waves = sweep_waves(residuals)
     shifts = view_shifts(fit, {view.name: view for view in views})
-    agreeing = counted(shifts, fit.outliers)
+    agreeing = counted(shifts, fit.outliers, fit.misfit)
     sweeps = max((len(of_view) for of_view in fit.sweeps), default=1)
     uncertainty = depth_uncertainty(model, at_m)
     baseline, baseline_sd = _baseline(model)
@@ -72,6 +72,7 @@ def judge_fit(
         shift_m=common_shift(agreeing, waves.rms, sweeps) * worth.per_command_m,
         moved_after=last_before_move(agreeing),
         outliers=fit.outliers,
+        misfit=fit.misfit,
         baseline_m=baseline,
         baseline_sd_m=baseline_sd,
     )

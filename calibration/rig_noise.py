@@ -125,8 +125,8 @@ def tail_weight(normalised: Array) -> Array:
 
 
 def _robust_smooth(command: Array, y_px: Array, residual: Array, weight: Array) -> Array:
-    part = smooth_part(command, y_px, residual, weight)
-    for _ in range(2):
+    part = np.full_like(residual, np.median(residual))  # an outlier at the end of a sweep would bend any other start
+    for _ in range(4):
         left = np.abs(residual - part) * np.sqrt(weight)
         scale = float(np.median(left)) / 0.6745
         if scale == 0:

@@ -19,6 +19,8 @@ from typing import Any, Final
 from calibration.errors import Degenerate
 from calibration.evidence import PoseEvidence, ViewEvidence
 
+_FEWEST_TO_JUDGE = 3
+"""Of fewer poses neither tilt nor coverage can be asked."""
 FEWEST_POSES: Final = 6
 """With fewer, a single bad view bends the fit to it, so that nothing shows that it was bad."""
 
@@ -68,8 +70,9 @@ class FitEvidence:
 
     expected_m, worst_m: predicted sd of the depth at the distance asked, median and 95 % of the picture. wave_m: error
     of one sweep against another of the same view there; shift_m: of a view against the others; moved_after: the view
-    after which they changed, where one move explains them. outliers: views that do not fit. baseline_m, baseline_sd_m:
-    distance of camera and mirror axis.
+    after which they changed, where one move explains them. outliers: views that do not fit. misfit: by which the
+    expected variances grew because the data contradict each other. baseline_m, baseline_sd_m: distance of camera and
+    mirror axis.
     """
 
     poses: PoseEvidence
@@ -79,6 +82,7 @@ class FitEvidence:
     shift_m: float = math.nan
     moved_after: str | None = None
     outliers: tuple[str, ...] = ()
+    misfit: float = 1.0
     baseline_m: float = math.nan
     baseline_sd_m: float = math.nan
 
@@ -118,7 +122,7 @@ class Verdict:
 def judge(views: ViewEvidence, fit: FitEvidence, asked: Asked) -> Verdict:
     """The verdict on a fitted rig model."""
     imprecise = not (fit.expected_m <= asked.accuracy_m and fit.worst_m <= WORST_TIMES * asked.accuracy_m)
-    reasons = [*_contradictions(fit, asked)]
+    reasons = [*_contradictions(fit, asked, imprecise)]
     poverty = data_lack(views, fit.poses, imprecise=imprecise)
     scale = _scale(fit, asked)
     # A baseline is only as good as the fit it comes from.
@@ -162,9 +166,15 @@ def _reason(code: str, text: str, value: float, limit: float) -> Reason:
     return Reason(code, text, value, limit, _NEXT_STEP[code])
 
 
-def _contradictions(fit: FitEvidence, asked: Asked) -> list[Reason]:
-    """What no one rig can have made. Sweeps of one view that differ tell waves from a rig that moved in between."""
+def _contradictions(fit: FitEvidence, asked: Asked, imprecise: bool) -> list[Reason]:
+    """What no one rig can have made. Sweeps of one view that differ tell waves from a rig that moved in between.
+
+    Where the result would be precise but for the misfit, less than the accuracy asked is the cause already.
+    """
     limit = asked.accuracy_m
+    grown = math.sqrt(max(fit.misfit, 1.0))
+    if imprecise and fit.expected_m <= limit * grown and fit.worst_m <= WORST_TIMES * limit * grown:
+        limit /= grown
     waves = fit.wave_m > limit
     moved = fit.shift_m > max(limit, fit.wave_m if waves else 0.0)
     found = []
@@ -212,8 +222,11 @@ def data_lack(
     if views.room_flux > max(bright, MOST_ROOM_FLUX.always):
         found.append(_room_light(views.room_flux, bright))
     if views.shown < FEWEST_POSES:
-        text = f"{views.shown} poses were shown, {FEWEST_POSES} are the fewest that can be checked against each other"
+        were = "pose was" if views.shown == 1 else "poses were"
+        text = f"{views.shown} {were} shown, {FEWEST_POSES} are the fewest that can be checked against each other"
         found.append(_reason("too-few-poses", text, views.shown, FEWEST_POSES))
+    if views.shown < _FEWEST_TO_JUDGE:
+        return found
     if poses is not None:
         found += _poses_lack(poses, imprecise)
     least = LEAST_COVERAGE.at(imprecise)

@@ -24,6 +24,8 @@ _STEP = 1e-6
 """Of the command range, and of a pose in rad and m, for differences."""
 _FEWEST_CORNERS = 6
 _FEWEST_TO_SPLIT = 4
+MOST_MISFIT = 3.0
+"""Factor on the variances up to which the views are taken to agree."""
 MOST_UNEXPLAINED = 0.35
 """Share of the shifts' variance that a single move may leave."""
 
@@ -63,9 +65,12 @@ def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> flo
     return math.sqrt(max(square, 0.0))
 
 
-def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...]) -> tuple[ViewShift, ...]:
-    """Those that have to agree: all, but for a single outlier, which had no say in the fit, unless it is the last."""
-    if len(outliers) != 1 or not shifts or shifts[-1].name in outliers:
+def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...], misfit: float = 1.0) -> tuple[ViewShift, ...]:
+    """Those that have to agree: all, but for a single outlier, which had no say in the fit.
+
+    Unless it is the last one, since the rig may be another since then, or the others do not fit either.
+    """
+    if len(outliers) != 1 or not shifts or shifts[-1].name in outliers or misfit > MOST_MISFIT:
         return shifts
     return tuple(one for one in shifts if one.name not in outliers)
 

@@ -61,7 +61,8 @@ class Session:
         if self._views:
             self._folder.keep()
             if error is not None:
-                error.add_note(f"{self._views} views are in {self._folder.path}, which can be given as a source")
+                kept = "1 view is" if self._views == 1 else f"{self._views} views are"
+                error.add_note(f"{kept} in {self._folder.path}, which can be given as a source")
         self._folder.discard()
 
     def note_rig(self, identity: Identity) -> None:

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from calibration.sync_fit import NAMES, SyncFit, fit_sync
 from calibration.sync_verdict import judge_sync
 from calibration.verdict import Asked, Verdict
 from rig.calibrating.capture import capture_view
+from rig.calibrating.gate_times import GateDelay, gate_delay
 from rig.calibrating.planes_run import speeds_of, true_model
 from rig.calibrating.report import sync_report
 from rig.calibrating.result import CalibrationResult
@@ -55,20 +58,33 @@ def run_sync(
     with Session(out) as session:
         taken = Taken(session, tell)
         take_kept(taken, sources, None)
+        gates = [gate_delay(run) for run in sources.recorded]
         if live is not None:
-            for at, exposures in enumerate(asked.exposures or speeds_of(live)):
-                name, seed = f"{exposures} exposures", asked.seed + at
-                taken.add_capture(capture_view(live, name, None, seed=seed, exposures=exposures, arm=asked.arm))
+            gates.append(_scanned(live, asked, taken))
+        gate = min((one for one in gates if one is not None and one.sd_s > 0), key=lambda one: one.sd_s, default=None)
         fit = fit_sync([sweep for view in taken.views for sweep in view.passages])
         goal = None if base is None else _goal(base, asked)
         verdict = judge_sync(fit, base, goal)
-        model = None if base is None else _with_sync(base, fit, verdict)
+        model = None if base is None else _with_sync(base, fit, gate, verdict)
         truth = None if live is None else true_model(live)
         line = _line(fit)
-        summary = {"command": "sync", **_summary(fit, verdict, truth), "versions": versions()}
-        figures = tuple(_figures(fit, truth))
+        summary = {"command": "sync", **_summary(fit, gate, verdict, truth), "versions": versions()}
+        figures = tuple(_figures(fit, gate, truth))
         calibration = session.finish(summary, sync_report(fit, verdict, line, figures), model)
         return CalibrationResult(verdict, line, figures, summary, model, session.path, calibration)
+
+
+def _scanned(live: RigConfig, asked: SyncAsked, taken: Taken) -> GateDelay | None:
+    """Scan at every speed; the gate's delay comes from the fastest sweeps, which are recorded for it."""
+    speeds = asked.exposures or speeds_of(live)
+    gate = None
+    with TemporaryDirectory() as scratch:
+        for at, exposures in enumerate(speeds):
+            run = Path(scratch) / "run" if exposures == min(speeds) else None
+            name, seed = f"{exposures} exposures", asked.seed + at
+            taken.add_capture(capture_view(live, name, None, seed=seed, exposures=exposures, arm=asked.arm, out=run))
+            gate = gate if run is None else gate_delay(run)
+    return gate
 
 
 def _own(live: RigConfig | None) -> RigModel | None:
@@ -86,7 +102,7 @@ def _goal(model: RigModel, asked: SyncAsked) -> Asked:
     return Asked(ACCURACY_PX * sensitivity(model, asked.at_m).per_pixel_m, asked.at_m)
 
 
-def _with_sync(base: RigModel, fit: SyncFit, verdict: Verdict) -> RigModel:
+def _with_sync(base: RigModel, fit: SyncFit, gate: GateDelay | None, verdict: Verdict) -> RigModel:
     """The model with the lags found; what it knew of its own ones is forgotten."""
     provenance = {
         **base.provenance,
@@ -100,6 +116,7 @@ def _with_sync(base: RigModel, fit: SyncFit, verdict: Verdict) -> RigModel:
         base,
         lag_s=fit.lag_s,
         row_delay_s=fit.row_delay_s,
+        gate_delay_s=base.gate_delay_s if gate is None else gate.delay_s,
         speed_range_per_s=fit.speed_range_per_s,
         covariance=None if base.covariance is None else _joined(base.covariance, fit),
         provenance=provenance,
@@ -121,7 +138,7 @@ def _line(fit: SyncFit) -> str:
     return f"lag up {up}, down {down}"
 
 
-def _summary(fit: SyncFit, verdict: Verdict, truth: RigModel | None) -> dict[str, Any]:
+def _summary(fit: SyncFit, gate: GateDelay | None, verdict: Verdict, truth: RigModel | None) -> dict[str, Any]:
     sd = fit.sd_s
     return {
         "verdict": verdict.as_json(),
@@ -129,6 +146,8 @@ def _summary(fit: SyncFit, verdict: Verdict, truth: RigModel | None) -> dict[str
         "lag_sd_s": {"forward": sd[0], "backward": sd[1]},
         "row_delay_s": fit.row_delay_s,
         "row_delay_sd_s": sd[2],
+        "gate_delay_s": None if gate is None else gate.delay_s,
+        "gate_delay_sd_s": None if gate is None else gate.sd_s,
         "speed_range_per_s": fit.speed_range_per_s,
         "common": fit.common,
         "chi2": fit.chi2,
@@ -148,7 +167,7 @@ def _summary(fit: SyncFit, verdict: Verdict, truth: RigModel | None) -> dict[str
     }
 
 
-def _figures(fit: SyncFit, truth: RigModel | None) -> Sequence[tuple[str, str]]:
+def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Sequence[tuple[str, str]]:
     low, high = fit.speed_range_per_s
     rows = [
         ("lags", _line(fit) + (": their mean" if fit.common else "")),
@@ -156,6 +175,8 @@ def _figures(fit: SyncFit, truth: RigModel | None) -> Sequence[tuple[str, str]]:
         ("speeds", f"{low:.3g} to {high:.3g} per second"),
         ("sweeps", f"{len(fit.sweeps)}, chi2 {fit.chi2:.1f} of {fit.dof}"),
     ]
+    if gate is not None:
+        rows.append(("gate", f"light follows it by {gate.delay_s * 1e6:.2f} us, sd {gate.sd_s * 1e6:.2g}"))
     if truth is not None:
         lag = truth.lag_s
         rows.append(("truth", f"lag {lag.forward * 1e6:.1f} us up, {lag.backward * 1e6:.1f} us down"))

@@ -92,7 +92,7 @@ def test_an_interrupt_keeps_the_views_so_far(calibrated: Path, tmp_path: Path) -
             calibrated / "board-rig.yaml", board=calibrated / "board.yaml", scene=str(calibrated / "scene.yaml"),
             exposures=(3,), out=tmp_path / "kept", tell=tell,
         )  # fmt: skip
-    assert "1 views are in" in ended.value.__notes__[0]
+    assert "1 view is in" in ended.value.__notes__[0]
     assert len(list((tmp_path / "kept" / "views").glob("*.npz"))) == 1
     assert not (tmp_path / "kept" / "calibration.yaml").exists()
 

@@ -11,7 +11,7 @@ from calibration.errors import Degenerate
 from calibration.evidence import PoseEvidence, ViewEvidence, pose_evidence, view_evidence
 from calibration.sweep_waves import SweepResidual, sweep_waves
 from calibration.verdict import Asked, FitEvidence, judge, judge_refusal
-from calibration.view_shifts import ViewShift, common_shift, last_before_move
+from calibration.view_shifts import ViewShift, common_shift, counted, last_before_move
 from calibration.views import BoardPose, Corners, View
 
 ASKED = Asked(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)
@@ -40,6 +40,7 @@ def test_a_sound_calibration_passes() -> None:
         ("exposure-not-locked", VIEWS, replace(IMPRECISE, wave_m=0.2, shift_m=0.05)),
         ("moved-rig", VIEWS, replace(IMPRECISE, wave_m=0.002, shift_m=0.1)),
         ("moved-rig", VIEWS, replace(FIT, wave_m=0.02, shift_m=0.3)),
+        ("moved-rig", VIEWS, replace(FIT, expected_m=0.02, misfit=21.0, shift_m=0.005)),
         ("wrong-square-size", VIEWS, replace(FIT, baseline_m=0.309)),
         ("room-light", replace(VIEWS, room_flux=8.0), IMPRECISE),
         ("room-light", replace(VIEWS, room_flux=8.0), FIT),
@@ -144,6 +145,8 @@ def test_without_sweeps_nothing_is_told() -> None:
 def test_one_move_between_views_is_found() -> None:
     shifts = tuple(ViewShift(str(i), 1e-3 if i < 4 else -2e-3, 1e-4) for i in range(9))
     assert last_before_move(shifts) == "3"
+    assert counted(shifts, ("2",)) == (*shifts[:2], *shifts[3:])
+    assert counted(shifts, ("8",)) == counted(shifts, ("2",), 9.0) == counted(shifts, ("2", "3")) == shifts
     assert common_shift(shifts, 0.0, 2) == pytest.approx(1.63e-3, rel=0.01)
     rng = np.random.default_rng(5)
     calm = tuple(ViewShift(str(i), 1e-4 * rng.standard_normal(), 1e-4) for i in range(12))
