@@ -155,7 +155,8 @@ def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[flo
     if not ties:
         return 0.0, 0.0
     middle = float(np.mean([np.median(angle) for _, angle in curves]))
-    commands = [polynomial.polyval(middle, polynomial.polyfit(angle, command, 2)) for command, angle in curves]
+    # Full: angles of too few poses may all be the same, which is no reason to warn.
+    commands = [polynomial.polyfit(angle - middle, command, 2, full=True)[0][0] for command, angle in curves]
     design = np.array(
         [
             [1.0] + [v if ("lag_forward" if v > 0 else "lag_backward") in tie else 0.0 for tie in ties]

@@ -5,34 +5,40 @@ from collections.abc import Sequence
 from calibration.sweep_waves import SweepResidual, SweepWaves
 from rig.svg_chart import Panel, Series, chart_svg
 
-_COLOURS = {1: "#0072b2", -1: "#d55e00"}
-_NAMES = {1: "rising command", -1: "falling command"}
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Of Okabe and Ito, by turns for the views."""
+_WAYS = {1: "rising command", -1: "falling command"}
 
 
 def plane_residuals(waves: SweepWaves, sweeps: Sequence[SweepResidual], metres_per_command: float, at_m: float) -> str:
-    """SVG: medians of each sweep's residuals over the command, in millimetres of depth at `at_m`."""
-    series = [
-        Series(
-            label=_NAMES[sweep.direction],
-            colour=_COLOURS[sweep.direction],
-            points=[
-                (float(command), float(value) * metres_per_command * 1e3)
-                for command, value in zip(waves.command, values, strict=True)
+    """SVG: medians of each sweep's residuals over the command, in millimetres of depth at `at_m`; a panel each way."""
+    views = list(dict.fromkeys(sweep.view for sweep in sweeps))
+    panels = [
+        Panel(
+            title=title,
+            x_label="mirror command",
+            y_label=f"depth at {at_m:g} m, mm",
+            series=[
+                Series(
+                    label="",
+                    colour=_COLOURS[views.index(sweep.view) % len(_COLOURS)],
+                    points=[
+                        (float(command), float(value) * metres_per_command * 1e3)
+                        for command, value in zip(waves.command, values, strict=True)
+                    ],
+                    marker=False,
+                )
+                for sweep, values in zip(sweeps, waves.sweeps, strict=True)
+                if sweep.direction == way
             ],
-            marker=False,
+            x_log=False,
+            y_log=False,
         )
-        for sweep, values in zip(sweeps, waves.sweeps, strict=True)
+        for way, title in _WAYS.items()
+        if any(sweep.direction == way for sweep in sweeps)
     ]
-    panel = Panel(
-        title="a curve for each sweep",
-        x_label="mirror command",
-        y_label=f"depth at {at_m:g} m, mm",
-        series=series,
-        x_log=False,
-        y_log=False,
-    )
     notes = [
-        "Curves that agree: the scanner model's misfit. One direction against the other: the lag.",
-        "Waves that differ from sweep to sweep: exposures not locked to the scan. Whole views apart: a rig that moved.",
+        "A curve for each sweep, a colour for each view. What all curves share is the scanner model's misfit;",
+        "waves that differ from sweep to sweep come from exposures that are not locked to the scan.",
     ]
-    return chart_svg([panel], title="Plane residuals", notes=notes, panel_px=(720, 290))
+    return chart_svg(panels, title="Plane residuals", notes=notes) if panels else ""
