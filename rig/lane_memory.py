@@ -13,7 +13,7 @@ from numba import types
 
 from rig.lanes import BLOCK, BYTES, FLOAT32, FOUR, INT16, LANES, VectorCode, called, intrinsic_of, place_list
 
-_I8, _I16, _I32, _F32 = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.FloatType()
+_I8, _I16, _I32, _I64, _F32 = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.IntType(64), ir.FloatType()
 
 
 @numba.njit(inline="always")
@@ -74,11 +74,13 @@ store_four = _writer(FOUR, _F32, FOUR.llvm, 4)
 read_byte = _reader(types.uint8, _I8, _I8, 1)
 read_int16 = _reader(types.int16, _I16, _I16, 2)
 read_int32 = _reader(types.int32, _I32, _I32, 4)
+read_int64 = _reader(types.int64, _I64, _I64, 1)
 read_float32 = _reader(types.float32, _F32, _F32, 4)
 """read_...(address, index): one number."""
 write_byte = _writer(types.uint8, _I8, _I8, 1)
 write_int16 = _writer(types.int16, _I16, _I16, 2)
 write_int32 = _writer(types.int32, _I32, _I32, 4)
+write_int64 = _writer(types.int64, _I64, _I64, 1)
 write_float32 = _writer(types.float32, _F32, _F32, 4)
 """write_...(address, index, number): one number."""
 

@@ -63,66 +63,6 @@ class Places(NamedTuple):
     known: Float32
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def measure_light(
-    counts: NDArray[np.unsignedinteger],
-    n_frames: NDArray[np.int32],
-    sweep: Sweep,
-    state: State,
-    logs: NDArray[np.float64],
-    x_px: Float32,
-    first_row: int,
-    last_row: int,
-    out: Places,
-) -> None:
-    """Fill light, scale, haze, rest and glow of rows first_row..last_row-1 for stripes at x_px; zeros where none is.
-
-    logs: of 0.5, 1.5 and so on, up to the most frames of a column.
-    """
-    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
-    u, v, plane, profile, ambient = sweep.u, sweep.v, sweep.plane, state.profile, state.ambient
-    to_light, to_scale, to_haze, to_rest, to_glow = out.light, out.scale, out.haze, out.rest, out.glow
-    x_lo, x_hi, x0, glow = sweep.x_lo, sweep.x_hi, sweep.x0, state.glow
-    row_gain, column_gain, w_lo, per_w = state.row_gain, state.column_gain, state.w_lo, state.per_w
-    half, window, width, several = np.float32(0.5), sweep.window, u.shape[1], sweep.others.shape[1] > 0
-    for y in range(first_row, last_row):
-        for c in range(x_px.shape[1]):
-            to_light[y, c] = to_scale[y, c] = to_haze[y, c] = to_rest[y, c] = to_glow[y, c] = 0.0
-            if np.isnan(x_px[y, c]) or n_frames[c] == 0:
-                continue
-            frames = int(n_frames[c])
-            x = min(max(int(np.floor(x_px[y, c] + half)), int(x_lo[y, c])), int(x_hi[y, c]))
-            px, py, pz = plane[c, 0], plane[c, 1], plane[c, 2]
-            own = ambient[y, x] if ambient[y, x] < BLIND_FLUX else np.float32(0.0)
-            path_p = path_to_plane(px, py, pz, v[y, x])
-            path_c, _, b = profile_place(px, py, pz, u[y, x], v[y, x], path_p, w_lo, per_w, profile.shape[0])
-            i = int(b)
-            part, gain = np.float32(b - i), row_gain[y] * column_gain[c] * path_p * path_c
-            before = flux_between(own, gain, profile[i, 0], profile[i + 1, 0], part)
-            behind = flux_between(own, gain, profile[i, 1], profile[i + 1, 1], part)
-            if several:
-                others = others_at(sweep, state, y, c, x)
-                before, behind = min(before + others, FLUX_MAX), min(behind + others, FLUX_MAX)
-            # A pixel that the picture does not have, or that is blind, counts as one of just the expected light.
-            light = -(LIGHT_PX + half) * (before + behind - own - own)
-            stored = int(x0[c])
-            first, last = max(stored, 0), min(stored + window, width) - 1
-            unseen = max(first - x + LIGHT_PX, 0) + max(x + LIGHT_PX - last, 0)
-            usual = half * (before + behind) - own
-            light += min(unseen, 2 * LIGHT_PX + 1) * usual
-            begin, end = max(x - LIGHT_PX, first), min(x + LIGHT_PX, last) + 1
-            for t in range(np.uint64(begin), np.uint64(max(end, begin))):
-                dark = np.uint64(max(frames - int(counts[c, y, t - np.uint64(stored)]), 0))
-                seen = np.float32(logs[frames] - logs[dark]) - ambient[y, t]
-                light += seen if ambient[y, t] < BLIND_FLUX else usual
-            halo = glow[int(b + 0.5)]
-            # What the halo adds to the light of the line grows with it.
-            to_light[y, c] = light / (np.float32(1.0) + np.float32(2 * LIGHT_PX + 1) * halo)
-            to_scale[y, c] = profile[i, 2] + part * (profile[i + 1, 2] - profile[i, 2])
-            to_haze[y, c], to_rest[y, c] = max(before - own, np.float32(0.0)), max(behind - own, np.float32(0.0))
-            to_glow[y, c] = halo
-
-
 @numba.njit(cache=True, nogil=True)
 def add_moments(
     counts: NDArray[np.unsignedinteger],
