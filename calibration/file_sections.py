@@ -14,11 +14,13 @@ Row = Annotated[list[Number], Field(min_length=4, max_length=4)]
 PlaneRows = str | list[Row]
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """A part of a file: what it does not know is refused."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class CameraSection(_Section):
+class CameraSection(Section):
     """The camera, in pixels."""
 
     width: int
@@ -27,14 +29,14 @@ class CameraSection(_Section):
     distortion: list[Number] = []
 
 
-class TableSection(_Section):
+class TableSection(Section):
     """Planes at commands."""
 
     command: list[Number]
     planes: PlaneRows
 
 
-class PivotSection(_Section):
+class PivotSection(Section):
     """A mirror that turns about an axis, as `PivotScanner` has it."""
 
     axis_point_m: Triple
@@ -47,7 +49,7 @@ class PivotSection(_Section):
     bow_per_rad: Number = 0.0
 
 
-class ScannerSection(_Section):
+class ScannerSection(Section):
     """One of the two forms."""
 
     table: TableSection | None = None
@@ -60,21 +62,21 @@ class ScannerSection(_Section):
         return self
 
 
-class LagSection(_Section):
+class LagSection(Section):
     """By how much the mirror follows a rising and a falling command."""
 
     forward: Number = 0.0
     backward: Number = 0.0
 
 
-class CovarianceSection(_Section):
+class CovarianceSection(Section):
     """Names of the parameters, and the file of their matrix."""
 
     names: list[str]
     file: str
 
 
-class IdentitySection(_Section):
+class IdentitySection(Section):
     """Of which rig, as `Identity` has it."""
 
     rig: str
@@ -86,7 +88,7 @@ class IdentitySection(_Section):
     reasons: list[str] = []
 
 
-class CalibrationFile(_Section):
+class CalibrationFile(Section):
     """The whole file."""
 
     format: Literal["spadrig-calibration"]

@@ -24,15 +24,15 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from calibration.camera import Camera
+from calibration.camera_files import build_camera, camera_content
 from calibration.covariance import Covariance
 from calibration.errors import CalibrationError
-from calibration.file_sections import FORMAT, VERSION, CalibrationFile, PlaneRows, explain
+from calibration.file_sections import FORMAT, VERSION, CalibrationFile, PlaneRows
 from calibration.model import Identity, Lag, RigModel
 from calibration.parameters import with_parameters
 from calibration.scanner import PivotScanner, PlaneTable, Scanner
+from calibration.yaml_file import read_yaml_file
 
 _PLAIN = {"row_delay_s": 0.0, "gate_delay_s": 0.0, "colour_skew_s": 0.0, "marker_rising": True}
 """Values of a model that its file has under the same name, and what they are where it does not."""
@@ -44,25 +44,7 @@ def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
     Raises CalibrationError, one line: the file, the key, what is wrong and what would be right.
     """
     file = Path(path)
-    try:
-        content = yaml.load(file.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except OSError as error:
-        raise CalibrationError(f"cannot read calibration {file}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise CalibrationError(f"{file} is not text; a calibration is a YAML file with 'format: {FORMAT}'") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" line {mark.line + 1}" if mark is not None else ""
-        problem = getattr(error, "problem", None) or "unreadable"
-        raise CalibrationError(f"{file}{where} is not YAML: {problem}") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise CalibrationError(f"{file} is not a calibration: its first entry must be 'format: {FORMAT}'")
-    if content.get("version") != VERSION:
-        raise CalibrationError(f"{file} has version {content.get('version')!r}; this program reads version {VERSION}")
-    try:
-        parsed = CalibrationFile.model_validate(content)
-    except ValidationError as error:
-        raise CalibrationError(f"{file}: {explain(error)}") from error
+    parsed = read_yaml_file(file, "a calibration", FORMAT, VERSION, CalibrationFile)
     try:
         return _build(parsed, file.parent)
     except CalibrationError as error:
@@ -75,16 +57,10 @@ def save_rig_model(model: RigModel, path: str | os.PathLike[str]) -> None:
     Each file appears whole or not at all, the YAML last. Raises OSError where the folder cannot be written.
     """
     file = Path(path)
-    camera = model.camera
     content: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
-        "camera": {
-            "width": camera.width,
-            "height": camera.height,
-            "matrix": camera.matrix.tolist(),
-            "distortion": camera.distortion.tolist(),
-        },
+        "camera": camera_content(model.camera),
         "scanner": _scanner_content(model.scanner),
         "lag_s": model.lag_s._asdict(),
     }
@@ -120,12 +96,6 @@ def _save_beside(file: Path, what: str, array: NDArray[Any]) -> str:
 
 
 def _build(parsed: CalibrationFile, folder: Path) -> RigModel:
-    camera = Camera(
-        width=parsed.camera.width,
-        height=parsed.camera.height,
-        matrix=np.array(parsed.camera.matrix, dtype=np.float64),
-        distortion=np.array(parsed.camera.distortion, dtype=np.float64),
-    )
     defects = None
     if parsed.defects is not None:
         defects = _load_array(folder / parsed.defects, "defects")
@@ -140,7 +110,7 @@ def _build(parsed: CalibrationFile, folder: Path) -> RigModel:
             )
     speed = parsed.speed_range_per_s
     model = RigModel(
-        camera=camera,
+        camera=build_camera(parsed.camera),
         scanner=_build_scanner(parsed, folder),
         lag_s=Lag(parsed.lag_s.forward, parsed.lag_s.backward),
         speed_range_per_s=None if speed is None else (speed[0], speed[1]),

@@ -35,6 +35,7 @@ def calibrate_planes(
     poses: int | None = None,
     guided: bool = False,
     calibration: PathLike | None = None,
+    camera: PathLike | None = None,
     stated_baseline: str | None = None,
     accuracy: str | None = None,
     at: str | None = None,
@@ -50,12 +51,13 @@ def calibrate_planes(
 
     board: a board's file; None: the bundled one. poses: to show to a live rig, the most where guided. guided: after
     each view the pose that helps most is asked for, until the accuracy is reached. calibration: one to start from,
-    whose defects are kept. stated_baseline: of mirror and camera as measured, such as '300 mm'. accuracy: sd of the
-    depth that is good enough, such as '10 mm', at the distance `at`, such as '5 m'; None: what a tenth of a pixel costs
-    there. scene: of a simulated rig. exposures: per column, by turns. arm: must be True where laser or gate are real.
-    ask: has the board of a real rig moved and returns once it is. tell: takes a line for each view. out: a folder to
-    write, None: nothing.
+    whose defects are kept. camera: the camera.yaml of `calibrate_camera`, made of other views. stated_baseline: of
+    mirror and camera as measured, such as '300 mm'. accuracy: sd of the depth that is good enough, such as '10 mm', at
+    the distance `at`, such as '5 m'; None: what a tenth of a pixel costs there. scene: of a simulated rig. exposures:
+    per column, by turns. arm: must be True where laser or gate are real. ask: has the board of a real rig moved and
+    returns once it is. tell: takes a line for each view. out: a folder to write, None: nothing.
     """
+    from calibration.camera_files import load_camera
     from calibration.judging import AT_M
     from rig.calibrating.planes_run import POSES, PlanesAsked, run_planes
 
@@ -78,7 +80,8 @@ def calibrate_planes(
     from rig.calibrating.sources import sort_sources
 
     found = sort_sources(_listed(sources), scene=scene)
-    return run_planes(found, _board(board), asked, base=_base(calibration), out=out, ask=ask, tell=tell)
+    known = None if camera is None else load_camera(Path(camera))
+    return run_planes(found, _board(board), asked, base=_base(calibration), camera=known, out=out, ask=ask, tell=tell)
 
 
 def calibrate_camera(

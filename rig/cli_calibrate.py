@@ -155,6 +155,10 @@ def planes_command(
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="one to start from; its defects are kept", show_default=False)
     ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option("--camera", help="camera.yaml of `calibrate camera`, made of other views", show_default=False),
+    ] = None,
     stated_baseline: Annotated[
         str | None,
         typer.Option("--stated-baseline", help="camera to mirror as measured: '300 mm'", show_default=False),
@@ -177,6 +181,7 @@ def planes_command(
         poses=poses,
         guided=guided,
         calibration=calibration,
+        camera=camera,
         stated_baseline=stated_baseline,
         accuracy=accuracy,
         at=at,

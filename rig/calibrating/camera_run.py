@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import yaml
 
 from calibration.board import Board
+from calibration.camera_files import camera_content, camera_file_text, corners_digest
 from calibration.camera_fit import CameraFit, fit_camera
 from calibration.camera_judging import ACCURACY_PX, JudgedCamera, judge_camera
 from calibration.errors import Degenerate
@@ -43,7 +43,7 @@ def run_camera(
     ask: Ask | None = None,
     tell: Tell | None = None,
 ) -> CalibrationResult:
-    """Calibrate the camera; camera.yaml is the `camera` section of a calibration file, with its standard deviations.
+    """Calibrate the camera; camera.yaml (`calibration.camera_files`) can be given to a calibration of the planes.
 
     Raises Degenerate where the views make no camera; its notes say why, root cause first.
     """
@@ -64,19 +64,10 @@ def run_camera(
         figures = tuple(_figures(fit, judged))
         used = [view for view in taken.views if view.name in fit.views]
         report = camera_report(fit, used, judged, board, figures)
-        session.write_text(CAMERA_FILE, yaml.safe_dump({"camera": _camera(fit), "sd": fit.sd}, sort_keys=False))
+        digests = [corners_digest(view) for view in used if view.name not in fit.outliers]
+        session.write_text(CAMERA_FILE, camera_file_text(fit.camera, fit.covariance, digests))
         session.finish(summary, report, None)
         return CalibrationResult(judged.verdict, judged.line(), figures, summary, None, session.path)
-
-
-def _camera(fit: CameraFit) -> dict[str, Any]:
-    camera = fit.camera
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "matrix": camera.matrix.tolist(),
-        "distortion": camera.distortion.tolist(),
-    }
 
 
 def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, Any]:
@@ -89,7 +80,7 @@ def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, An
             "refused": {name: str(why) for name, why in taken.refused.items()},
             "rms_px": dict(zip(fit.views, fit.view_rms_px.tolist(), strict=True)),
         },
-        "camera": _camera(fit),
+        "camera": camera_content(fit.camera),
         "sd": fit.sd,
         "rms_px": fit.rms_px,
         "ray_sd_px": {"median": judged.sd_px, "worst": judged.worst_px, "asked": ACCURACY_PX, "line": judged.line()},

@@ -8,6 +8,7 @@ import numpy as np
 
 from calibration.against_truth import DepthErrors, depth_errors
 from calibration.board import Board
+from calibration.camera_files import KnownCamera, corners_digest
 from calibration.errors import CalibrationError, Degenerate
 from calibration.judging import AT_M, Judged, judge_fit, judge_refused
 from calibration.model import Identity, RigModel
@@ -21,6 +22,7 @@ from rig.calibrating.showing import Ask, Tell, require_live
 from rig.calibrating.sources import Sources
 from rig.calibrating.taking import Live, Taken, good_poses, take_kept, take_live
 from rig.config import RigConfig
+from rig.errors import UsageError
 from rig.run import OutFolder, versions
 from rig.session import open_rig
 
@@ -54,12 +56,13 @@ def run_planes(
     asked: PlanesAsked,
     *,
     base: RigModel | None = None,
+    camera: KnownCamera | None = None,
     out: OutFolder = None,
     ask: Ask | None = None,
     tell: Tell | None = None,
 ) -> CalibrationResult:
-    """Calibrate. base: a model to start from, whose defects are kept. ask: gets a person to move the board; tell: is
-    told of each view.
+    """Calibrate. base: a model to start from, whose defects are kept. camera: what other views told of it. ask: gets a
+    person to move the board; tell: is told of each view.
 
     Raises Degenerate where the views make no calibration; its notes say why, root cause first.
     """
@@ -75,7 +78,7 @@ def run_planes(
             exposures = asked.exposures or speeds_of(live)
             choose = guide if asked.guided else start
             take_live(taken, Live(live, asked.poses, choose, ask, exposures, asked.seed, asked.arm, defects), board)
-        fit = _fitted(taken, board, base)
+        fit = _fitted(taken, board, base, camera)
         judged = judge_fit(
             fit, taken.views, at_m=asked.at_m, accuracy_m=asked.accuracy_m, stated_baseline_m=asked.stated_baseline_m
         )
@@ -99,9 +102,23 @@ def speeds_of(live: RigConfig) -> tuple[int, ...]:
     return tuple(dict.fromkeys(max(1, round(times * live.scan.exposures)) for times in SPEEDS))
 
 
-def _fitted(taken: Taken, board: Board, base: RigModel | None) -> RigFit:
+def _fitted(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
+    if camera is not None:
+        twice = [view.name for view in taken.views if corners_digest(view) in camera.views]
+        if twice:
+            raise UsageError(
+                f"view {twice[0]} is one of those the camera was made of, and must not count twice; give other views, "
+                "or leave the camera out"
+            )
     try:
-        return fit_rig(taken.views, board, taken.size, start=base)
+        return fit_rig(
+            taken.views,
+            board,
+            taken.size,
+            camera=None if camera is None else camera.camera,
+            known=None if camera is None else camera.covariance,
+            start=base,
+        )
     except CalibrationError as error:
         refused = error if isinstance(error, Degenerate) else Degenerate("no-model", str(error))
         raise refusal(refused, judge_refused(refused, taken.views, board, taken.size), taken) from refused

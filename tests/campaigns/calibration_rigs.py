@@ -8,7 +8,8 @@ scan, and go the way of `rig calibrate planes`: picture, corners, passages, fit.
 compared with the true model's, for the same pixels and commands, at points 5 m away spread over the picture. Per rig:
 median and worst error, error over the stated standard deviation, whether the true depth lies in the stated 95 %
 interval, and what the model adds to a scan's error in pixels at K = 10, 1 and 20, both ways. Rigs that were refused
-are listed.
+are listed. Making the views takes nearly all of the time: `--views FOLDER` keeps them, and takes them from there where
+they are, with the corners found anew.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +37,9 @@ from calibration.rig_fit import RigFit, fit_rig
 from calibration.triangulation import depth_slope
 from calibration.uncertainty import command_at, depth_sd_m
 from calibration.views import Passages, View
+from rig.calibrating.view_files import load_views, save_view
+from sim_backend.effects.dark_counts import dark_rates
+from sim_backend.optics import Sensor
 from sim_backend.scenes.board import ShownBoard
 from tests.campaigns.board_capture import FRAME_S, HOT_PER_S, Stand, SweepAsked, SweepTaken, set_up, speed, take_sweeps
 from tests.reference.random_rigs import BOARD, random_poses, random_rig
@@ -143,19 +149,35 @@ def compare(fitted: RigModel, true: RigModel) -> Compared:
     return Compared(error, sd, added)
 
 
-def calibrated(seed: int) -> Outcome:
-    """Make a rig, calibrate it, compare."""
+def found_anew(view: View, sensor: Sensor) -> View:
+    """A kept view with the corners that are found in its picture today."""
+    assert view.picture is not None
+    try:
+        corners = find_corners(view.picture, BOARD, dark_rates(sensor, view.picture.shape) > HOT_PER_S)
+    except Degenerate:
+        return replace(view, corners=None, passages=())
+    return replace(view, corners=corners)
+
+
+def calibrated(seed: int, kept: Path | None = None) -> Outcome:
+    """Make a rig, calibrate it, compare. kept: a folder of views, one folder a rig."""
     begun = time.perf_counter()
     rng = np.random.default_rng(seed)
-    stand = set_up(random_rig(rng))
-    poses = int(rng.integers(10, 17))
-    camera = stand.rig.model.camera
+    rig = random_rig(rng)
+    camera = rig.model.camera
+    folder = None if kept is None else kept / f"{seed:05d}"
+    if folder is not None and folder.is_dir():
+        views = [found_anew(view, Sensor(pixel_seed=rig.pixel_seed)) for view in load_views(folder)]
+    else:
+        views = views_of(set_up(rig), BOARD, int(rng.integers(10, 17)), rng)
+        if folder is not None:
+            _keep(views, folder)
     try:
-        fit = fit_rig(views_of(stand, BOARD, poses, rng), BOARD, (camera.width, camera.height))
-        compared = compare(fit.model, stand.rig.model)
+        fit = fit_rig(views, BOARD, (camera.width, camera.height))
+        compared = compare(fit.model, rig.model)
     except CalibrationError as error:
         return Outcome(seed, time.perf_counter() - begun, f"{getattr(error, 'reason', 'error')}: {error}")
-    return Outcome(seed, time.perf_counter() - begun, "", poses, compared, fit)
+    return Outcome(seed, time.perf_counter() - begun, "", len(views), compared, fit)
 
 
 def summary(outcomes: Iterable[Outcome]) -> str:
@@ -190,6 +212,14 @@ def summary(outcomes: Iterable[Outcome]) -> str:
     return "\n".join(said)
 
 
+def _keep(views: Sequence[View], folder: Path) -> None:
+    part = folder.with_name(f".{folder.name}.part")
+    part.mkdir(parents=True, exist_ok=True)
+    for number, view in enumerate(views):
+        save_view(view, part / f"{number:03d}.npz")
+    part.rename(folder)
+
+
 def _passages(taken: SweepTaken, usable: NDArray[np.bool_]) -> Passages:
     volume, asked = taken.volume, taken.asked
     counts = SweepCounts(volume.counts, volume.n_frames, taken.command, volume.x0, volume.width)
@@ -204,10 +234,11 @@ def main() -> None:
     parser.add_argument("--rigs", type=int, default=500)
     parser.add_argument("--first", type=int, default=1, help="seed of the first rig")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--views", type=Path, metavar="FOLDER", help="where views are kept, to be fitted anew")
     asked = parser.parse_args()
     outcomes = []
     with ProcessPoolExecutor(asked.processes) as pool:
-        for outcome in pool.map(calibrated, range(asked.first, asked.first + asked.rigs)):
+        for outcome in pool.map(partial(calibrated, kept=asked.views), range(asked.first, asked.first + asked.rigs)):
             outcomes.append(outcome)
             print(_line(outcome), flush=True)
     print(summary(outcomes))
