@@ -5,6 +5,10 @@ best says where the corner is. All edges around it, those of the markers include
 few photons gives a tenth of the error of cv2.cornerSubPix (docs/calibration.md). Weighted least squares by
 Gauss-Newton, the variance proportional to the light as photons have it; pixels far off (an unlisted hot pixel) do not
 count.
+
+The drawing is bent as the map bends around each corner, and is as fine as what it is compared with: a homography in the
+place of the bend, or edges rounded to drawn pixels, move all corners of a picture alike by some 0.002 px, which no
+number of corners averages out. For the same reason the last fit of each corner looks at pixels of its own.
 """
 
 from dataclasses import dataclass
@@ -13,63 +17,36 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board import MARGIN_SQUARES, Board
+from calibration.board import Board
+from calibration.board_drawing import Drawing
 from calibration.board_map import BoardMap
 
 Array = NDArray[np.float64]
 
-_SUBPIXELS = 4
-"""Drawn per pixel and axis before they are averaged over the pixel's area."""
-_DRAWN_PX_PER_SQUARE = 64
-_REACH_SQUARES = 0.9
-"""How far around a corner is looked: short of the next ones."""
+SUBPIXELS = 6
+"""Drawn per pixel and axis before they are averaged over the pixel's area; even. Drawings are as fine."""
+WIDE, OWN = 0.9, 0.5
+"""How far around a corner is looked, in squares: short of the next ones, to find it; halfway to them, so that no two
+corners share pixels and their errors, which a fit takes to be independent, are."""
 _MOST_REACH_PX = 16
 _LEAST_REACH_PX = 4
 _SEARCH_SQUARES = 0.25
 """Beyond that a shift could mistake one module of a marker for the next."""
-_ALONG = np.array([0.25, 0.5, 1.0])
-_AROUND = np.concatenate([np.multiply.outer(_ALONG, np.array(to)) for to in ((-1, 0), (1, 0), (0, -1), (0, 1), (0, 0))])
-"""Points, in reaches, through which the homography goes that draws the board around a corner: on the edges that meet
-there, so that what a lens bends on top of it pulls at them to all sides alike, and not at the corner."""
+_POWERS = [(i, j) for i in range(4) for j in range(4 - i)]
+"""Of x and y in pixels, for where the board is drawn around a corner: what a tilt and a lens bend over two squares."""
+_AROUND = np.stack(np.meshgrid(*2 * [np.linspace(-1.25, 1.25, 7)]), axis=-1).reshape(-1, 2)
+"""Points, in reaches, through which that polynomial goes; the patch and what a pixel more on every side needs."""
 _STEPS = 4
-_SETTLED_SDS = 0.02
-"""A step this small ends the iteration."""
+_SETTLED_SDS = 0.1
+"""A step this small ends the iteration: what is left is a tenth of it."""
 _OUTLIER_SDS = 5.0
 _DARK_SHARE = 0.05
 """Of the picture's white: noise that is there without light."""
 _LEAST_MATCH = 0.4
 """Correlation of picture and drawing; a board under few photons gives 0.5, anything else 0.2."""
 _MOST_SD_PX = 0.5
-_DRAWING_SD_PX = 0.008
-"""What the drawing itself is off by: 0.003 to 0.010 px without noise, most where a lens bends most."""
-
-
-@dataclass(frozen=True, slots=True)
-class Drawing:
-    """The board as drawn for the comparison: white is 1, black 0."""
-
-    board: Board
-    picture: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, board: Board) -> "Drawing":
-        """Draw it: every pixel is the white share of its area, exactly, for markers end between pixels."""
-        modules, pad = board.modules, round(MARGIN_SQUARES * _DRAWN_PX_PER_SQUARE)
-        down, across, side, _ = modules.shape
-        white = np.zeros((down, across, side + 2, side + 2), np.float32)
-        white[np.add.outer(np.arange(down), np.arange(across)) % 2 == 1] = (
-            1  # the squares that are white, quiet zone and all
-        )
-        white[:, :, 1:-1, 1:-1] -= modules
-        share = 0.0 if board.marker_m is None else board.marker_m / board.square_m
-        edges = np.concatenate([[0.0], 0.5 + share * (np.arange(side + 1) / max(side, 1) - 0.5), [1.0]])
-        pixels = np.arange(_DRAWN_PX_PER_SQUARE + 1) / _DRAWN_PX_PER_SQUARE
-        upper = np.minimum(pixels[1:, None], edges[1:])
-        covered = np.maximum(upper - np.maximum(pixels[:-1, None], edges[:-1]), 0) * _DRAWN_PX_PER_SQUARE
-        covered = covered.astype(np.float32)
-        drawn = np.einsum("pi,rcij,qj->rpcq", covered, white, covered, optimize=True)
-        size = (down * _DRAWN_PX_PER_SQUARE, across * _DRAWN_PX_PER_SQUARE)
-        return cls(board, np.pad(drawn.reshape(size), pad, constant_values=1.0))
+_DRAWING_SD_PX = 0.003
+"""What the drawing itself is off by: 0.002 px without noise, for pictures drawn as finely."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +60,9 @@ class _Patch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
-    """Where a corner should be: its pixel, a square's side, half width of the patch, picture to drawing (3, 3)."""
+    """Where a corner should be: its pixel, a square's side, half width of the patch. to_drawing: (4, 4, 2) what powers
+    of x and y, in reaches from the corner, add to the place in the drawing.
+    """
 
     expected_px: Array
     side_px: float
@@ -92,13 +71,18 @@ class _Place:
 
 
 def register(
-    picture: NDArray[np.float32], drawing: Drawing, board_map: BoardMap, ids: NDArray[np.int32], search: bool
+    picture: NDArray[np.float32],
+    drawing: Drawing,
+    board_map: BoardMap,
+    ids: NDArray[np.int32],
+    reach: float,
+    search: bool,
 ) -> tuple[NDArray[np.int32], Array, Array]:
     """Corners `ids` that the picture shows near where the map has them: their ids, px (n, 2) and sd_px (n,).
 
-    search: look for each in whole pixels first (the map is rough).
+    reach: WIDE or OWN. search: look for each in whole pixels first (the map is rough).
     """
-    places = _places(drawing.board, board_map, ids)
+    places = _places(drawing, board_map, ids, reach)
     found = [_register_one(picture, drawing, place, search) for place in places]
     good = np.array([one is not None for one in found], np.bool_)
     rows = np.array([one for one in found if one is not None], np.float64).reshape(-1, 3)
@@ -113,30 +97,32 @@ def sides_px(board: Board, board_map: BoardMap, corners_m: Array) -> Array:
     return sides
 
 
-def _places(board: Board, board_map: BoardMap, ids: NDArray[np.int32]) -> list[_Place]:
+def _places(drawing: Drawing, board_map: BoardMap, ids: NDArray[np.int32], reach_squares: float) -> list[_Place]:
     """Where the map has the corners, and how the drawing lies there."""
+    board = drawing.board
     corners_m = board.corners_m[ids, :2]
     sides = sides_px(board, board_map, corners_m)
     expected = board_map.to_px(corners_m)
-    reach = np.clip(np.nan_to_num(_REACH_SQUARES * sides), _LEAST_REACH_PX, _MOST_REACH_PX).astype(int)
-    spread_m = np.minimum(_REACH_SQUARES, reach / sides)[:, None, None] * board.square_m
+    reach = np.clip(np.nan_to_num(reach_squares * sides), _LEAST_REACH_PX, _MOST_REACH_PX).astype(int)
+    spread_m = np.minimum(reach_squares, reach / sides)[:, None, None] * board.square_m
     around_m = corners_m[:, None] + spread_m * _AROUND
-    around = zip(board_map.to_px(around_m), _drawn(board, around_m), strict=True)
-    to_drawing = [_homography(px, drawn) for px, drawn in around]
+    around = (board_map.to_px(around_m) - expected[:, None]) / reach[:, None, None]
+    drawn = around_m / board.square_m * drawing.px_per_square + (drawing.margin_px - 0.5)
+    to_drawing = [_bent(*of) for of in zip(around, drawn, strict=True)]
     return [_Place(*of) for of in zip(expected, sides.tolist(), reach.tolist(), to_drawing, strict=True)]
 
 
-def _homography(px: Array, drawn: Array) -> Array | None:
-    """From picture to drawing; None where a map gone astray squeezes the board into a line."""
-    if not np.isfinite(px).all():
+def _bent(at: Array, drawn: Array) -> Array | None:
+    """The polynomial from picture to drawing; None where a map gone astray squeezes the board into a line."""
+    if not np.isfinite(at).all():
         return None
-    found, _ = cv2.findHomography(px, drawn)
-    return None if found is None or not np.isfinite(found).all() else np.asarray(found, np.float64)
-
-
-def _drawn(board: Board, points_m: Array) -> Array:
-    """Board positions in pixels of the drawing."""
-    return (points_m / board.square_m + MARGIN_SQUARES) * _DRAWN_PX_PER_SQUARE - 0.5
+    i, j = np.array(_POWERS).T
+    terms, _, rank, _ = np.linalg.lstsq(at[:, :1] ** i * at[:, 1:] ** j, drawn, rcond=1e-9)
+    if rank < len(_POWERS):
+        return None
+    powers = np.zeros((4, 4, 2))
+    powers[i, j] = terms
+    return powers
 
 
 def _register_one(
@@ -160,7 +146,7 @@ def _register_one(
         x1, y1 = min(round(float(at[0])) + reach + 1, width), min(round(float(at[1])) + reach + 1, height)
         if min(x1 - x0, y1 - y0) < _LEAST_REACH_PX:
             return None
-        patch = _draw(drawing, to_drawing, at - expected, (x0, y0, x1, y1))
+        patch = _draw(drawing, place, to_drawing, at - expected, (x0, y0, x1, y1))
         solved = _shift(picture[y0:y1, x0:x1].astype(np.float64), patch)
         if solved is None:
             return None
@@ -172,16 +158,18 @@ def _register_one(
     return None if sd > _MOST_SD_PX else (float(at[0]), float(at[1]), float(np.hypot(sd, _DRAWING_SD_PX)))
 
 
-def _draw(drawing: Drawing, to_drawing: Array, shift: Array, box: tuple[int, int, int, int]) -> _Patch:
+def _draw(drawing: Drawing, place: _Place, to_drawing: Array, shift: Array, box: tuple[int, int, int, int]) -> _Patch:
     """The drawing on pixels x0:x1, y0:y1 with everything moved by `shift`, averaged over each pixel's area."""
     x0, y0, x1, y1 = box
-    n = _SUBPIXELS
+    n = SUBPIXELS
     half = n // 2
-    # Half a pixel more on every side, for the slopes; then from subpixels to drawing.
-    place = np.array([[1 / n, 0, x0 - 1 + 0.5 / n - shift[0]], [0, 1 / n, y0 - 1 + 0.5 / n - shift[1]], [0, 0, 1]])
-    size = ((x1 - x0 + 1) * n, (y1 - y0 + 1) * n)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    fine = cv2.warpPerspective(drawing.picture, to_drawing @ place, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    # Half a pixel more on every side, for the slopes.
+    x, y = (
+        np.vander((start - 1 + (np.arange(n * (end - start + 1)) + 0.5) / n - at) / place.reach, 4, increasing=True)
+        for start, end, at in zip((x0, y0), (x1, y1), place.expected_px + shift, strict=True)
+    )
+    at_x, at_y = ((y @ to_drawing[..., axis].T @ x.T).astype(np.float32) for axis in range(2))
+    fine = cv2.remap(drawing.picture, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def averaged(right: int, down: int) -> Array:
         cut = fine[down : down + (y1 - y0) * n, right : right + (x1 - x0) * n]
@@ -203,7 +191,7 @@ def _best_whole_shift(
     reach = min(place.reach, x, y, width - 1 - x, height - 1 - y)
     if reach < _LEAST_REACH_PX:
         return None
-    patch = _draw(drawing, to_drawing, np.zeros(2), (x - reach, y - reach, x + reach + 1, y + reach + 1))
+    patch = _draw(drawing, place, to_drawing, np.zeros(2), (x - reach, y - reach, x + reach + 1, y + reach + 1))
     left, top = max(x - reach - search, 0), max(y - reach - search, 0)
     region = picture[top : y + reach + search + 1, left : x + reach + search + 1]
     match = cv2.matchTemplate(region, patch.drawn.astype(np.float32), cv2.TM_CCOEFF_NORMED)

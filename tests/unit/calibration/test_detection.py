@@ -31,6 +31,17 @@ def test_corners_of_few_photons_are_good_to_hundredths_of_a_pixel(light, white_f
     assert 0.6 < np.std(np.concatenate(off)) < 1.5
 
 
+def test_corners_of_a_picture_are_not_off_together(light):
+    """A fit takes their errors to be independent: what they share, no number of corners averages out."""
+    truth = corners_px(CHARUCO, TURNED)
+    without_noise = find_corners(light, CHARUCO)
+    assert np.abs(np.mean(without_noise.px - truth[without_noise.ids], axis=0)).max() < 0.0015
+    off = np.array([find_corners(exposed(light, 0.05, 1000, seed), CHARUCO).px - truth for seed in range(12)])
+    off -= off.mean(axis=0)
+    shared = np.linalg.qr(np.column_stack([np.ones(len(truth)), truth]))[0]  # shifts, turns, scales
+    assert np.mean((shared.T @ off) ** 2) < 1.6 * np.mean(off**2)
+
+
 def test_hot_pixels_that_are_listed_do_no_harm(light):
     picture = exposed(light, 0.02, FRAMES, 1)
     hot = np.random.default_rng(2).random(picture.shape) < 0.01
