@@ -61,7 +61,7 @@ def calibrate_planes(
     from calibration.judging import AT_M
     from rig.calibrating.planes_run import POSES, PlanesAsked, run_planes
 
-    problems = _problems(poses, seed)
+    problems = _problems(poses, seed, exposures)
     accuracy_m = _length(problems, "accuracy", accuracy)
     at_m = _length(problems, "at", at)
     baseline_m = _length(problems, "stated_baseline", stated_baseline)
@@ -101,11 +101,15 @@ def calibrate_camera(
 
     terms: of the lens model: 0, 4, 5, 8, 12 or 14, as OpenCV counts them. All else as `calibrate_planes`.
     """
+    from calibration.distortion import TERM_COUNTS
     from rig.calibrating.camera_run import CameraAsked, run_camera
     from rig.calibrating.planes_run import POSES
     from rig.calibrating.sources import sort_sources
 
-    if problems := _problems(poses, seed):
+    problems = _problems(poses, seed)
+    if terms not in (0, *TERM_COUNTS):
+        problems.append(f"terms is {terms}; OpenCV's lens models have 0, {', '.join(map(str, TERM_COUNTS))}")
+    if problems:
         raise UsageError.of(problems)
     asked = CameraAsked(poses or POSES, terms, seed, arm)
     found = sort_sources(_listed(sources), pictures=True, scene=scene)
@@ -161,7 +165,7 @@ def calibrate_sync(
     from rig.calibrating.sources import sort_sources
     from rig.calibrating.sync_run import SyncAsked, run_sync
 
-    problems = _problems(None, seed)
+    problems = _problems(None, seed, exposures)
     accuracy_m = _length(problems, "accuracy", accuracy)
     at_m = _length(problems, "at", at)
     if problems:
@@ -224,8 +228,8 @@ def _base(file: PathLike | None) -> "RigModel | None":
     return None if file is None else load_rig_model(file)
 
 
-def _problems(poses: int | None, seed: int) -> list[str]:
-    problems = []
+def _problems(poses: int | None, seed: int, exposures: Sequence[int] = ()) -> list[str]:
+    problems = [f"exposures has {k}; it must be at least 1" for k in exposures if k < 1]
     if poses is not None and poses < 1:
         problems.append(f"poses is {poses}; it must be at least 1")
     if not 0 <= seed <= MAX_SEED:

@@ -138,3 +138,16 @@ def load_widened(typing: Any, address: Any, index: Any) -> VectorCode:
         return builder.zext(loaded, INT16.llvm)
 
     return INT16(types.intp, types.intp), code
+
+
+@intrinsic_of
+def load_counts(typing: Any, address: Any, index: Any) -> VectorCode:
+    """load_counts(address, index): 16 unsigned bytes from `index` on as float32."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        loaded = builder.load(_pointer(builder, args[0], args[1], _I8, ir.VectorType(_I8, LANES)))
+        loaded.align = 1
+        # By way of signed numbers, which every processor turns into float32 at once.
+        return builder.sitofp(builder.zext(loaded, ir.VectorType(_I32, LANES)), FLOAT32.llvm)
+
+    return FLOAT32(types.intp, types.intp), code

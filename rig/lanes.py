@@ -267,6 +267,26 @@ def smallest_byte(typing: Any, a: Any) -> VectorCode:
     return types.uint8(a), code
 
 
+def _extreme(name: str) -> Any:
+    @intrinsic_of
+    def extreme(typing: Any, a: Any) -> VectorCode:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            part = args[0]
+            while part.type.count > 1:
+                half = part.type.count // 2
+                parts = [builder.shuffle_vector(part, part, place_list(range(i, i + half))) for i in (0, half)]
+                part = called(builder, f"llvm.{name}.{vector_name(parts[0].type)}", parts[0].type, *parts)
+            return builder.extract_element(part, ir.Constant(_INT32, 0))
+
+        return types.float32(a), code
+
+    return extreme
+
+
+largest_float, smallest_float = _extreme("maxnum"), _extreme("minnum")
+"""largest_float(a), smallest_float(a): the largest, and the smallest, one of float32 lanes that is a number."""
+
+
 @intrinsic_of
 def where_small(typing: Any, values: Any, sizes: Any, limit: Any) -> VectorCode:
     """where_small(values, sizes, limit): float32 lanes, 0 where the size is more than `limit` either way, or NaN."""
@@ -277,6 +297,19 @@ def where_small(typing: Any, values: Any, sizes: Any, limit: Any) -> VectorCode:
         return builder.select(small, args[0], ir.Constant(FLOAT32.llvm, [0.0] * LANES))
 
     return FLOAT32(FLOAT32, FLOAT32, limit), code
+
+
+@intrinsic_of
+def where_below(typing: Any, values: Any, others: Any, sizes: Any, limits: Any) -> VectorCode:
+    """where_below(values, others, sizes, limits): float32 lanes, of `values` where the size is below the limit."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        limit = args[3]
+        if not isinstance(signature.args[3], Lanes):
+            limit = splat(context, builder, FLOAT32, signature.args[3], limit)
+        return builder.select(builder.fcmp_ordered("<", args[2], limit), args[0], args[1])
+
+    return FLOAT32(FLOAT32, FLOAT32, FLOAT32, limits), code
 
 
 @intrinsic_of

@@ -10,7 +10,7 @@ from calibration.camera_files import camera_content, camera_file_text, corners_d
 from calibration.camera_fit import CameraFit, fit_camera
 from calibration.camera_judging import ACCURACY_PX, JudgedCamera, judge_camera
 from calibration.errors import Degenerate
-from calibration.judging import AT_M, judge_refused
+from calibration.judging import AT_M
 from rig.calibrating.planes_run import POSES
 from rig.calibrating.refusing import refusal
 from rig.calibrating.report import camera_report
@@ -47,9 +47,9 @@ def run_camera(
 
     Raises Degenerate where the views make no camera; its notes say why, root cause first.
     """
-    live = sources.live
+    live, photons = sources.live, not sources.pictures
     require_live(live, ask, asked.arm)
-    with Session(out) as session:
+    with Session(out, board) as session:
         taken = Taken(session, tell)
         take_kept(taken, sources, board)
         if live is not None:
@@ -58,8 +58,8 @@ def run_camera(
         try:
             fit = fit_camera(taken.views, board, taken.size, distortion_terms=asked.terms)
         except Degenerate as refused:
-            raise refusal(refused, judge_refused(refused, taken.views, board, taken.size), taken) from refused
-        judged = judge_camera(fit, taken.views, board, photons=not sources.pictures)
+            raise refusal(refused, taken, board, photons=photons) from refused
+        judged = judge_camera(fit, taken.views, board, photons=photons)
         summary = {"command": "camera", **_summary(fit, judged, taken), "versions": versions()}
         figures = tuple(_figures(fit, judged))
         used = [view for view in taken.views if view.name in fit.views]

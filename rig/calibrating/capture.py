@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from calibration.board import Board
 from calibration.errors import Degenerate
@@ -105,7 +106,10 @@ def _settings(config: RigConfig, exposures: int | None, *, bidirectional: bool) 
         )
     scan = config.scan.model_copy(update={"bidirectional": bidirectional, "adaptive": None})
     if exposures is not None:
-        scan = type(scan).model_validate({**scan.model_dump(mode="json"), "exposures": exposures})
+        try:
+            scan = type(scan).model_validate({**scan.model_dump(mode="json"), "exposures": exposures})
+        except ValidationError as error:
+            raise UsageError(f"exposures {exposures}: {error.errors()[0]['msg']}") from error
     return config.model_copy(update={"scan": scan, "estimate": config.estimate.model_copy(update=PLAIN)})
 
 

@@ -17,6 +17,7 @@ from calibration.judging import ACCURACY_PX, AT_M
 from calibration.sensitivity import sensitivity
 from calibration.uncertainty import DepthUncertainty, depth_uncertainty
 from calibration.verdict import Asked, Verdict
+from calibration.views import View
 from rig.calibrating.planes_run import true_errors, truth_content
 from rig.calibrating.report import check_report
 from rig.calibrating.result import CalibrationResult
@@ -64,18 +65,16 @@ def run_check(
     model = load_rig_model(file)
     poses = max(asked.poses, 2 if asked.angle_rad is not None else 1)
     require_live(live, ask, asked.arm)
-    with Session(out) as session:
+    with Session(out, board) as session:
         taken = Taken(session, tell)
         take_kept(taken, sources, board, model.defects)
         if live is not None:
             choose = good_poses(live, board, poses, asked.at_m, asked.seed)
             take_live(taken, Live(live, poses, choose, ask, (), asked.seed, asked.arm, model.defects), board)
-        views = [view for view in taken.views if view.name not in taken.refused]
-        if not views:
-            raise Degenerate("no-board", "; ".join(f"view {name}: {why}" for name, why in taken.refused.items()))
+        views = _with_board(taken, 1 if asked.angle_rad is None else 2)
         model.check_sensor(*taken.size)
         boards = check_boards(model, views, board)
-        angle = check_angle(model, views[0], views[1], board) if asked.angle_rad is not None and views[1:] else None
+        angle = None if asked.angle_rad is None else check_angle(model, views[0], views[1], board)
         worth = sensitivity(model, asked.at_m)
         goal = Asked(ACCURACY_PX * worth.per_pixel_m if asked.accuracy_m is None else asked.accuracy_m, asked.at_m)
         verdict = judge_check(boards, goal, board.size_m[0], angle, asked.angle_rad)
@@ -93,6 +92,19 @@ def run_check(
         if model.identity is not None:
             note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
         return CalibrationResult(verdict, line, figures, summary, model, session.path)
+
+
+def _with_board(taken: Taken, least: int) -> list[View]:
+    """The views that show it. Degenerate, with what is wrong with each, where they are fewer."""
+    views = [view for view in taken.views if view.corners is not None]
+    if len(views) < least:
+        reason = next((why.reason for why in taken.refused.values()), "no-board")
+        few = "1 view shows" if len(views) == 1 else f"{len(views)} views show"
+        error = Degenerate(reason, f"{reason}: {few} the board, at least {least} must; show it again")
+        for name, why in taken.refused.items():
+            error.add_note(f"view {name}: {why}")
+        raise error
+    return views
 
 
 def _summary(

@@ -10,7 +10,7 @@ from calibration.against_truth import DepthErrors, depth_errors
 from calibration.board import Board
 from calibration.camera_files import KnownCamera, corners_digest
 from calibration.errors import CalibrationError, Degenerate
-from calibration.judging import AT_M, Judged, judge_fit, judge_refused
+from calibration.judging import AT_M, Judged, judge_fit
 from calibration.model import Identity, RigModel
 from calibration.rig_fit import RigFit, fit_rig
 from rig.calibrating.guided import Guide
@@ -68,7 +68,7 @@ def run_planes(
     """
     live = sources.live
     require_live(live, ask, asked.arm)
-    with Session(out) as session:
+    with Session(out, board) as session:
         taken = Taken(session, tell)
         defects = None if base is None else base.defects
         take_kept(taken, sources, board, defects)
@@ -121,7 +121,7 @@ def _fitted(taken: Taken, board: Board, base: RigModel | None, camera: KnownCame
         )
     except CalibrationError as error:
         refused = error if isinstance(error, Degenerate) else Degenerate("no-model", str(error))
-        raise refusal(refused, judge_refused(refused, taken.views, board, taken.size), taken) from refused
+        raise refusal(refused, taken, board) from refused
 
 
 def _signed(fit: RigFit, judged: Judged, identity: Identity | None) -> RigModel:

@@ -41,7 +41,7 @@ def print_result(result: Printable, line: str = "") -> None:
     for reason in result.verdict.reasons:
         table.add_row("", str(reason))
     if line:
-        table.add_row("expected", line)
+        table.add_row("in short", line)
     for name, text in result.rows():
         table.add_row(name, text)
     if result.calibration is not None:

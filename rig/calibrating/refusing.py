@@ -1,19 +1,34 @@
 """What is said where views make no calibration."""
 
+from collections import Counter
+
+from calibration.board import Board
 from calibration.errors import Degenerate
-from calibration.verdict import Verdict
+from calibration.judging import judge_refused
 from rig.calibrating.taking import Taken
 
 
-def refusal(refused: Degenerate, verdict: Verdict, taken: Taken) -> Degenerate:
-    """The root cause; as notes what the fit said, the other reasons, and what was wrong with single views."""
-    first = verdict.reasons[0]
-    error = Degenerate(first.code, str(first))
+def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = True) -> Degenerate:
+    """The root cause; as notes what the fit said, the other reasons, and what was wrong with single views.
+
+    photons: whether the pictures count photons; those from files do not.
+    """
+    refused = _of_views(refused, taken)
+    reasons = judge_refused(refused, taken.views, board, taken.size, photons=photons).reasons
+    error = Degenerate(reasons[0].code, str(reasons[0]))
     if str(refused) not in str(error):
         error.add_note(f"{refused.reason}: {refused}")
-    for reason in verdict.reasons[1:]:
+    for reason in reasons[1:]:
         if reason.text != str(refused):
             error.add_note(str(reason))
     for name, why in taken.refused.items():
         error.add_note(f"view {name}: {why}")
     return error
+
+
+def _of_views(refused: Degenerate, taken: Taken) -> Degenerate:
+    """Why most views have no board, where that is why there is no model."""
+    if refused.reason != "no-board" or not taken.refused:
+        return refused
+    (reason, _), *_ = Counter(why.reason for why in taken.refused.values()).most_common()
+    return Degenerate(reason, f"none of {len(taken.views)} views shows the board as it should")

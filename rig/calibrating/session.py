@@ -1,6 +1,7 @@
 """The folder of a calibration: its views are written as they come and stay, whatever becomes of the rest.
 
-    views/000.npz ...  rig.json (whose they are)  calibration.yaml (+ .npy)  report.html  summary.json
+    views/000.npz ...  rig.json (whose they are)  board.yaml (of what)  calibration.yaml (+ .npy)  report.html
+    summary.json
 
 A session that was interrupted, or whose views made no calibration, leaves its views, which are a source for the next.
 """
@@ -11,6 +12,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import yaml
+
+from calibration.board import Board, load_board
 from calibration.files import save_rig_model
 from calibration.model import Identity, RigModel
 from calibration.views import View
@@ -22,6 +26,7 @@ from rig.run import OutFolder
 
 CALIBRATION_FILE = "calibration.yaml"
 RIG_FILE = "rig.json"
+BOARD_FILE = "board.yaml"
 
 
 def session_rig(folder: Path) -> Identity | None:
@@ -35,11 +40,18 @@ def session_rig(folder: Path) -> Identity | None:
         raise UsageError(f"{folder / RIG_FILE} does not say which rig it is of ({error}); remove it") from error
 
 
-class Session:
-    """Takes views one by one, then what was made of them. out: None to write nothing."""
+def session_board(folder: Path) -> Board | None:
+    """The board that a session's corners are of; None where none was looked for."""
+    file = folder / BOARD_FILE
+    return load_board(file) if file.is_file() else None
 
-    def __init__(self, out: OutFolder) -> None:
-        """Claim the folder. UsageError where it cannot be."""
+
+class Session:
+    """Takes views one by one, then what was made of them."""
+
+    def __init__(self, out: OutFolder, board: Board | None = None) -> None:
+        """Claim the folder; None: write nothing. board: what the views show. UsageError where it cannot be."""
+        self._board = board
         self._folder = None if out is None else RunFolder(out, in_place=True)
         self._views = 0
 
@@ -75,6 +87,8 @@ class Session:
         if self._folder is not None:
             folder = self._folder.place(VIEWS)
             folder.mkdir(exist_ok=True)
+            if self._board is not None and not self._views:
+                self.write_text(BOARD_FILE, _board_text(self._board))
             save_view(view, folder / f"{self._views:03d}.npz")
             self._views += 1
 
@@ -95,3 +109,15 @@ class Session:
         self._folder.write_json("summary.json", summary)
         self._folder.publish()
         return None if file is None else self._folder.path / CALIBRATION_FILE
+
+
+def _board_text(board: Board) -> str:
+    """What `load_board` reads."""
+    content: dict[str, Any] = {"kind": board.kind, "squares": list(board.squares), "square": _mm(board.square_m)}
+    if board.marker_m is not None:
+        content |= {"marker": _mm(board.marker_m), "dictionary": board.dictionary}
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+
+
+def _mm(length_m: float) -> str:
+    return f"{length_m * 1e3:.10g} mm"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calibration.covariance import Covariance
-from calibration.errors import CalibrationError
+from calibration.errors import CalibrationError, Degenerate
 from calibration.files import load_rig_model
 from calibration.judging import ACCURACY_PX, AT_M
 from calibration.model import RigModel
@@ -62,7 +62,7 @@ def run_sync(
         if live is not None:
             gates.append(_scanned(live, asked, taken))
         gate = min((one for one in gates if one is not None and one.sd_s > 0), key=lambda one: one.sd_s, default=None)
-        fit = fit_sync([sweep for view in taken.views for sweep in view.passages])
+        fit = _fitted(taken)
         goal = None if base is None else _goal(base, asked)
         verdict = judge_sync(fit, base, goal)
         model = None if base is None else _with_sync(base, fit, gate, verdict)
@@ -87,6 +87,13 @@ def _scanned(live: RigConfig, asked: SyncAsked, taken: Taken) -> GateDelay | Non
     return gate
 
 
+def _fitted(taken: Taken) -> SyncFit:
+    try:
+        return fit_sync([sweep for view in taken.views for sweep in view.passages])
+    except Degenerate as refused:
+        raise Degenerate(refused.reason, f"{refused.reason}: {refused}") from refused
+
+
 def _own(live: RigConfig | None) -> RigModel | None:
     if live is None or live.calibration is None:
         return None
@@ -103,7 +110,10 @@ def _goal(model: RigModel, asked: SyncAsked) -> Asked:
 
 
 def _with_sync(base: RigModel, fit: SyncFit, gate: GateDelay | None, verdict: Verdict) -> RigModel:
-    """The model with the lags found; what it knew of its own ones is forgotten."""
+    """The model with the lags found; what it knew of its own ones is forgotten. It fails where they did."""
+    identity = base.identity
+    if identity is not None and not verdict.passed:
+        identity = replace(identity, verdict="failed", reasons=(*identity.reasons, *verdict.codes))
     provenance = {
         **base.provenance,
         "sync": {
@@ -119,6 +129,7 @@ def _with_sync(base: RigModel, fit: SyncFit, gate: GateDelay | None, verdict: Ve
         gate_delay_s=base.gate_delay_s if gate is None else gate.delay_s,
         speed_range_per_s=fit.speed_range_per_s,
         covariance=None if base.covariance is None else _joined(base.covariance, fit),
+        identity=identity,
         provenance=provenance,
     )
 
@@ -135,7 +146,7 @@ def _joined(known: Covariance, fit: SyncFit) -> Covariance:
 
 def _line(fit: SyncFit) -> str:
     up, down = (f"{lag * 1e6:.1f} us (sd {sd * 1e6:.1g})" for lag, sd in zip(fit.lag_s, fit.sd_s[:2], strict=True))
-    return f"lag up {up}, down {down}"
+    return f"lag up {up}, down {down}" + (": their mean" if fit.common else "")
 
 
 def _summary(fit: SyncFit, gate: GateDelay | None, verdict: Verdict, truth: RigModel | None) -> dict[str, Any]:
@@ -170,7 +181,6 @@ def _summary(fit: SyncFit, gate: GateDelay | None, verdict: Verdict, truth: RigM
 def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Sequence[tuple[str, str]]:
     low, high = fit.speed_range_per_s
     rows = [
-        ("lags", _line(fit) + (": their mean" if fit.common else "")),
         ("row delay", f"{fit.row_delay_s * 1e9:.3g} ns a row, sd {fit.sd_s[2] * 1e9:.2g}"),
         ("speeds", f"{low:.3g} to {high:.3g} per second"),
         ("sweeps", f"{len(fit.sweeps)}, chi2 {fit.chi2:.1f} of {fit.dof}"),

@@ -19,7 +19,7 @@ from calibration.guide import Advice, candidates, rough_camera, sequence
 from calibration.model import Identity
 from calibration.views import View
 from rig.calibrating.capture import Capture, capture_recorded, capture_view
-from rig.calibrating.session import Session, session_rig
+from rig.calibrating.session import BOARD_FILE, Session, session_board, session_rig
 from rig.calibrating.showing import Ask, Tell, shown
 from rig.calibrating.sources import VIEWS, Sources
 from rig.calibrating.view_files import load_views
@@ -29,6 +29,13 @@ from rig.session import open_rig
 
 MISSED_SHARE = 0.5
 """So many more poses than asked for are shown where the board is not found in some."""
+
+SIMULATED_PART = "world"
+"""Of an identity's kinds, in simulated rigs only."""
+HELD = (
+    "run {} is of a simulated rig: a scan holds its light within a column, so that sweeps differ by up to 1/20 column; "
+    "name the rig instead, whose light is not held then"
+)
 
 Defects = NDArray[np.bool_] | None
 """(rows, width), pixels not to be used."""
@@ -127,13 +134,17 @@ def first_camera(config: RigConfig) -> Camera:
 
 
 def take_kept(taken: Taken, sources: Sources, board: Board | None, defects: Defects = None) -> None:
-    """Take the views that need no live rig. board: None where none is to be looked for in recordings."""
+    """Take the views that need no live rig. board: None where nothing moves and none is looked for."""
     for folder in sources.sessions:
+        _require_alike(folder, board)
         identity = session_rig(folder)
         for view in load_views(folder / VIEWS):
             taken.add(view, None, identity)
     for run in sources.recorded:
-        taken.add_capture(capture_recorded(run, run.name, board, defects=defects))
+        capture = capture_recorded(run, run.name, board, defects=defects)
+        taken.add_capture(capture)
+        if taken.tell is not None and SIMULATED_PART in capture.identity.kinds:
+            taken.tell(HELD.format(run.name))
     for file in sources.pictures:
         taken.add(*_pictured(file, board))
 
@@ -186,6 +197,30 @@ def _captured(taken: Taken, live: Live, config: RigConfig, board: Board, good: i
             if exposures is None or len(speeds) < 2:
                 raise
             speeds.remove(exposures)
+
+
+def _require_alike(folder: Path, board: Board | None) -> None:
+    """UsageError where a session's views do not show what is looked for. The squares' side may be another now: it is
+    what is corrected where it was measured wrong.
+    """
+    known = session_board(folder)
+    if known is None:
+        return
+    if board is None:
+        raise UsageError(
+            f"{folder} holds views of a board that was moved, lags are told by what stands still; name a rig, runs of "
+            "one unmoved scene, or the folder of an earlier 'rig calibrate sync'"
+        )
+    if _print(known) != _print(board):
+        raise UsageError(
+            f"{folder} holds views of a {_print(known)}, looked for is a {_print(board)}; name the board that was "
+            f"shown: --board {folder / BOARD_FILE}"
+        )
+
+
+def _print(board: Board) -> str:
+    of = "" if board.dictionary is None else f" of {board.dictionary}"
+    return f"{board.kind} board of {board.squares[0]} x {board.squares[1]} squares{of}"
 
 
 def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]:

@@ -38,8 +38,8 @@ from rig.geometry import SweepGeometry
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
-BAND_ROWS = 16
-"""Rows whose costs stay in the cache from one step to the next."""
+BAND_ROWS = 32
+"""Rows whose costs stay in the cache from one step to the next, with the tables that they share."""
 FIRST_ROUNDS = 3
 """Times that the first map's stripes teach what they are then estimated with again."""
 MOST_BYTES = 4 << 30

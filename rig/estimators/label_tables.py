@@ -53,6 +53,7 @@ class LabelTables(NamedTuple):
     tap: int16 (tables, V, taps, PHASES, LIGHTS, LANES), weight of the counts of the pixels around each position.
     constant: float32 (tables, V, PHASES, LIGHTS, LANES), nats per exposure of each position.
     span: int16 (tables, 2), pixels whose weights are not 0: from and up to.
+    used: int16 (tables,), vectors up to the last one that holds a label of any row.
     fitted_constant, fitted_edge: int16, units of constant and of each pixel's share of edge_sum, for the usual number
     of exposures.
     """
@@ -63,6 +64,7 @@ class LabelTables(NamedTuple):
     tap: NDArray[np.int16]
     constant: NDArray[np.float32]
     span: NDArray[np.int16]
+    used: NDArray[np.int16]
     fitted_constant: NDArray[np.int16]
     fitted_edge: NDArray[np.int16]
 
@@ -126,6 +128,7 @@ def fill_tables(
                 to_t = side * (here[START] - start)
                 span = max(to_t - length + 1, 0), min(to_t + 1, pixels)
                 out.span[i, 0], out.span[i, 1] = span
+                out.used[i] = -(-label_end // (PHASES * LANES))
                 for p in range(span[0], span[1]):
                     # Around its middle the halo is level; `halo_tables` tell what it is elsewhere.
                     glow[p] = state.glow[row.cell[to_t - p]]

@@ -190,6 +190,7 @@ def _empty_tables(at: NDArray[np.int32], tables: int, grid: LabelGrid, taps: int
         tap=aligned_zeros((tables, vectors, taps, PHASES, LIGHTS, LANES), np.int16),
         constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.float32),
         span=np.zeros((tables, 2), np.int16),
+        used=np.zeros(tables, np.int16),
         fitted_constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.int16),
         fitted_edge=aligned_zeros((tables, pixels), np.int16),
     )

@@ -47,6 +47,7 @@ class At(NamedTuple):
     constant: int
     constants: int
     span: int
+    used: int
     hot_start: int
     hot_x: int
 

@@ -135,7 +135,7 @@ def fill_costs(
                     score_rows(at, around.constant, around.which, 2 * ways.reach + 1, b, batch)
                 else:
                     score_rows(at, fitted.constant, b.fitted, 2 * ways.reach + 1, b, batch)
-                cost_rows(ways, b, batch)
+                cost_rows(at, ways, b, batch)
                 write_rows(places, ways, b, batch, out_at + (y * columns + c) * labels, columns * labels)
 
 
@@ -188,7 +188,7 @@ def _at(tables, hot_start, hot_x):  # type: ignore[no-untyped-def]
     return At(
         signed_address(tables.edge), signed_address(tables.edge_sum), tables.edge.shape[1], signed_address(tables.tap),
         tables.tap[:1].size, signed_address(tables.constant), tables.constant[:1].size,
-        signed_address(tables.span), signed_address(hot_start), signed_address(hot_x),
+        signed_address(tables.span), signed_address(tables.used), signed_address(hot_start), signed_address(hot_x),
     )  # fmt: skip
 
 

@@ -17,7 +17,6 @@ from rig.estimators.label_places import (
     LABEL_END,
     MEND,
     ODD,
-    PHASES,
     PLACES,
     START,
     VALID,
@@ -126,7 +125,7 @@ def _neutral(at, i, p, per_nat):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def sum_edges(at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
-    """Fill sums."""
+    """Fill sums, as far as there are labels."""
     pixels = at.pixels
     for r in range(batch):
         i = read_int32(b.here, r)
@@ -136,7 +135,7 @@ def sum_edges(at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
         edge, constant = at.edge + 2 * pixels * i, fitted.edge + 2 * pixels * read_int32(b.fitted, r)
         carry = zero_int16() + np.int16(BASE)
         write_int16(sums, 0, np.int16(BASE))
-        for p in range(0, pixels, LANES):
+        for p in range(0, min(pixels, FAR_PX + LANES * read_int16(at.used, i)), LANES):
             rise = running_sum(add_saturated(scaled(load_int16(n, p), load_int16(edge, p)), load_int16(constant, p)))
             store_int16(sums, p + 1, add_saturated(rise, carry))
             carry = add_saturated(carry, last_everywhere(rise))
@@ -148,7 +147,6 @@ def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch:
 
     taps: pixels around a position.
     """
-    vectors = b.score_row // (PHASES * LANES)
     for r in range(batch):
         i = read_int32(b.here, r)
         if i < 0:
@@ -157,7 +155,7 @@ def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch:
         n, tap = b.n + 2 * (r * b.n_row + FAR_PX - taps // 2), at.tap + 2 * at.taps * i
         constant = constants + 2 * at.constants * read_int32(which, r)
         best = zero_int16() + np.int16(-32768)
-        for _ in range(vectors):
+        for _ in range(read_int16(at.used, i)):
             far_dim, far_bright = load_int16(constant, 0), load_int16(constant, LANES)
             near_dim, near_bright = load_int16(constant, 2 * LANES), load_int16(constant, 3 * LANES)
             for d in range(taps):
@@ -179,17 +177,18 @@ def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch:
 
 
 @numba.njit(cache=True, nogil=True)
-def cost_rows(ways: Ways, b: Buffers, batch: int) -> None:
-    """Fill cost."""
-    vectors, half = b.score_row // (PHASES * LANES), (1 << ways.down) >> 1
+def cost_rows(at: At, ways: Ways, b: Buffers, batch: int) -> None:
+    """Fill cost of all that may be a label."""
+    half = (1 << ways.down) >> 1
     for r in range(batch):
         cost, score = b.cost + r * b.cost_row, b.score + 2 * r * b.score_row
-        if read_int32(b.here, r) < 0:
+        i = read_int32(b.here, r)
+        if i < 0:
             for label in range(0, b.labels, 2 * LANES):
                 store_bytes(cost, label, zero_bytes())
             continue
         level = add_saturated(zero_int16() + read_int16(b.top, r), np.int16(half))
-        for v in range(vectors):
+        for v in range(read_int16(at.used, i)):
             far = smaller(sub_saturated(level, load_int16(score, 2 * v * LANES)) >> ways.down, np.int16(COST_LIMIT))
             near = sub_saturated(level, load_int16(score, (2 * v + 1) * LANES)) >> ways.down
             store_bytes(cost, 2 * v * LANES, as_bytes(far | smaller(near, np.int16(COST_LIMIT)) << 8))

@@ -6,11 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import CountVolume
-from rig.estimators.placing_kernels import REACH_PX, Places, add_moments, measure_light
+from rig.estimators.placing_kernels import REACH_PX, Places, add_moments
+from rig.estimators.placing_light import measure_light
 from rig.estimators.placing_pools import pool_amplitude, pool_places
 from rig.estimators.placing_scores import FRACTIONS, score_places
+from rig.estimators.placing_taps import TAPS, Counts, fetch_counts
 from rig.estimators.row_input import State, Sweep
 from rig.estimators.row_model import pixel_shares
+from rig.lane_eights import EIGHT
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
@@ -37,7 +40,7 @@ def profile_table(sigma_px: float) -> NDArray[np.float32]:
     distance = np.arange(-REACH_PX, REACH_PX + 1) - centre[:, None]
     on, back = (pixel_shares(sigma_px, distance - step) for step in (SLOPE_STEP_PX, -SLOPE_STEP_PX))
     slope = (on - back) / np.float32(2 * SLOPE_STEP_PX)
-    return np.ascontiguousarray(np.stack([pixel_shares(sigma_px, distance), slope], axis=1))
+    return np.pad(np.stack([pixel_shares(sigma_px, distance), slope], axis=1), ((0, 0), (0, 0), (0, EIGHT - TAPS)))
 
 
 def new_places(rows: int, columns: int) -> Places:
@@ -59,9 +62,9 @@ def place(
     Returns its standard deviation in px; light and haze are left in `places`, with all that was found on the way.
     """
     moved, sd = (np.empty_like(x_px) for _ in range(2))
-    seen = volume.counts, volume.n_frames, sweep, state
-    weigh_light(volume, sweep, state, x_px, places, workers)
-    workers.over(len(x_px), lambda first, last: score_places(*seen, shares, x_px, first, last, places))
+    around = weigh_light(volume, sweep, state, x_px, places, workers)
+    seen = volume.n_frames, sweep, state, shares, around, x_px
+    workers.over(len(x_px), lambda first, last: score_places(*seen, first, last, places))
     workers.over(len(x_px), lambda first, last: pool_places(places, REACHES, ENOUGH, first, last, moved, sd))
     x_px += moved
     return sd
@@ -69,13 +72,22 @@ def place(
 
 def weigh_light(
     volume: CountVolume, sweep: Sweep, state: State, x_px: NDArray[np.float32], places: Places, workers: RowWorkers
-) -> None:
-    """Fill light, scale, haze and amplitude of `places` for stripes at x_px, as `state` sees them."""
+) -> Counts:
+    """Fill light, scale, haze and amplitude of `places` for stripes at x_px, as `state` sees them.
+
+    Returns the counts around the stripes, see `fetch_counts`.
+    """
     faintest, brightest = float(state.amplitude[0]) / BEYOND, float(state.amplitude[-1]) * BEYOND
-    logs = np.log(np.arange(int(volume.n_frames.max(initial=0)) + 1) + 0.5)
-    seen = volume.counts, volume.n_frames, sweep, state, logs, x_px
-    workers.over(len(x_px), lambda first, last: measure_light(*seen, first, last, places))
+    around = np.empty((*x_px.shape, EIGHT), volume.counts.dtype)
+    seen = volume.n_frames, sweep, state, around, x_px
+
+    def measure(first: int, last: int) -> None:
+        fetch_counts(volume.counts, sweep.x0, x_px, first, last, around)
+        measure_light(*seen, first, last, places)
+
+    workers.over(len(x_px), measure)
     workers.over(len(x_px), lambda first, last: pool_amplitude(LIGHT_REACH, faintest, brightest, first, last, places))
+    return around
 
 
 def line_width(

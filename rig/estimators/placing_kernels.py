@@ -15,17 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.estimators.row_input import (
-    State,
-    Sweep,
-    flux_between,
-    fluxes_at,
-    line_light,
-    others_at,
-    path_to_plane,
-    profile_place,
-)
-from rig.estimators.row_kernels import FLUX_MAX
+from rig.estimators.row_input import State, Sweep, fluxes_at, line_light
 
 Float32 = NDArray[np.float32]
 

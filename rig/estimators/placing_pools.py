@@ -1,6 +1,7 @@
 """Compiled sums over neighbours on the same surface, sixteen stripes to a vector.
 
 Neighbours whose distances from the far end differ by too much are left out one by one, so that no running sums will do.
+Rows are worked on in copies with a margin of stripes that lie nowhere: no neighbour has to be asked for.
 """
 
 from typing import Final
@@ -12,65 +13,68 @@ from numpy.typing import NDArray
 from rig.estimators.label_volume_buffers import signed_address
 from rig.estimators.placing_kernels import Places
 from rig.lane_memory import load_float32, store_float32
-from rig.lanes import LANES, where_small
+from rig.lanes import (
+    LANES,
+    larger_float,
+    smaller_float,
+    smallest_float,
+    square_root,
+    where_below,
+    where_small,
+    zero_float32,
+)
 
 Float32 = NDArray[np.float32]
 
 SAME_PX: Final = np.float32(1.0)
 """Neighbours whose distances from the far end differ by no more lie on the same surface."""
+MARGIN: Final = 4
+"""Rows above and below that copies have more, as far as anything is pooled; to both sides they have LANES columns."""
+_LEAST: Final = np.float32(1e-12)
+
+
+@numba.njit(cache=True, nogil=True)
+def with_margin(array: Float32, first_row: int, last_row: int) -> Float32:
+    """Copy of rows first_row..last_row-1 with the rows and columns around them, NaN where there are none."""
+    rows, columns = array.shape
+    top, end = max(first_row - MARGIN, 0), min(last_row + MARGIN, rows)
+    copy = np.full((last_row - first_row + 2 * MARGIN, (-(-columns // LANES) + 2) * LANES), np.float32(np.nan))
+    copy[top - first_row + MARGIN : end - first_row + MARGIN, LANES : LANES + columns] = array[top:end]
+    return copy
 
 
 @numba.njit(cache=True, nogil=True)
 def pool_row(distance: Float32, first: Float32, second: Float32, y: int, reach: int, sums: Float32) -> None:
-    """Sums (2, columns) of `first` and `second` over the neighbours of row y on the same surface, itself included."""
+    """Sums of `first` and `second` over the neighbours of row y on the same surface, itself included.
+
+    distance, first, second: of `with_margin`, y: counted from their first row that is no margin. sums: (2, columns), of
+    a number of columns that is a multiple of LANES.
+    """
     sums[:] = 0.0
-    widen_row(distance, first, second, y, -1, reach, np.inf, sums)
+    at = signed_address(distance), signed_address(first), signed_address(second)
+    widen_row(at, distance.shape[1], y, -1, reach, np.inf, signed_address(sums))
 
 
 @numba.njit(cache=True, nogil=True)
-def widen_row(
-    distance: Float32, first: Float32, second: Float32, y: int, inner: int, reach: int, enough: float, sums: Float32
-) -> None:
+def widen_row(at: tuple[int, int, int], width: int, y: int, inner: int, reach: int, enough: float, sums: int) -> None:
     """Add those neighbours that are more than `inner` rows or columns away, up to `reach`.
 
-    Stripes whose second sum is `enough` already may be left as they are. All arrays C-contiguous.
+    Stripes whose second sum is `enough` already may be left as they are. at, sums: addresses; width: of copies.
     """
-    columns = distance.shape[1]
-    rows = max(y - reach, 0), min(y + reach + 1, distance.shape[0])
-    at, to = (signed_address(distance), signed_address(first), signed_address(second)), signed_address(sums)
-    blocks = max(columns - 2 * reach, 0) // LANES
-    for c in range(reach, reach + blocks * LANES, LANES):
-        if sums[1, c : c + LANES].min() < enough:
-            _widen_block(at, to, columns, y, rows, c, inner, reach)
-    for c in range(columns if blocks == 0 else columns - blocks * LANES):
-        here = c if c < reach or blocks == 0 else c + blocks * LANES
-        if sums[1, here] < enough:
-            _widen_one(distance, first, second, y, rows, here, inner, reach, sums)
+    columns = width - 2 * LANES
+    for c in range(0, columns, LANES):
+        if smallest_float(load_float32(sums, columns + c)) < enough:
+            _widen_block(at, sums, width, (y + MARGIN) * width + LANES + c, c, inner, reach)
 
 
 @numba.njit(cache=True, nogil=True)
-def _widen_one(
-    distance: Float32, first: Float32, second: Float32, y: int, rows: tuple[int, int], c: int, inner: int, reach: int,
-    sums: Float32,
-) -> None:  # fmt: skip
-    for other in range(rows[0], rows[1]):
-        for there in range(max(c - reach, 0), min(c + reach + 1, distance.shape[1])):
-            near = abs(other - y) <= inner and abs(there - c) <= inner
-            if not near and abs(distance[other, there] - distance[y, c]) <= SAME_PX:
-                sums[0, c] += first[other, there]
-                sums[1, c] += second[other, there]
-
-
-@numba.njit(cache=True, nogil=True)
-def _widen_block(
-    at: tuple[int, int, int], to: int, columns: int, y: int, rows: tuple[int, int], c: int, inner: int, reach: int
-) -> None:
-    """The same of stripes c..c+LANES-1; at: addresses of the three arrays, to: of the sums."""
-    own = load_float32(at[0], y * columns + c)
+def _widen_block(at: tuple[int, int, int], to: int, width: int, here: int, c: int, inner: int, reach: int) -> None:
+    """The same of LANES stripes from number `here` of the copies on, whose sums are those from c on."""
+    own, columns = load_float32(at[0], here), width - 2 * LANES
     a, b = load_float32(to, c), load_float32(to, columns + c)
-    for other in range(rows[0], rows[1]):
-        line = other * columns + c
-        nearest = inner if abs(other - y) <= inner else -1
+    for away in range(-reach, reach + 1):
+        line = here + away * width
+        nearest = inner if abs(away) <= inner else -1
         for i in range(line - reach, line - max(nearest, 0)):
             off = load_float32(at[0], i) - own
             a = a + where_small(load_float32(at[1], i), off, SAME_PX)
@@ -88,13 +92,17 @@ def pool_amplitude(
     reach: int, faintest: float, brightest: float, first_row: int, last_row: int, places: Places
 ) -> None:
     """Fill amplitude: brightness of each stripe over that of its scale, pooled over neighbours, between two limits."""
-    amplitude = places.amplitude
-    sums = np.empty((2, amplitude.shape[1]), np.float32)
+    amplitude, columns = places.amplitude, places.amplitude.shape[1]
+    distance = with_margin(places.distance, first_row, last_row)
+    light, scale = with_margin(places.light, first_row, last_row), with_margin(places.scale, first_row, last_row)
+    sums = np.empty((2, distance.shape[1] - 2 * LANES), np.float32)
+    at, width = signed_address(sums), sums.shape[1]
     for y in range(first_row, last_row):
-        pool_row(places.distance, places.light, places.scale, y, reach, sums)
-        for c in range(amplitude.shape[1]):
-            own = sums[0, c] / max(sums[1, c], np.float32(1e-12))
-            amplitude[y, c] = min(max(own, np.float32(faintest)), np.float32(brightest))
+        pool_row(distance, light, scale, y - first_row, reach, sums)
+        for c in range(0, width, LANES):
+            own = load_float32(at, c) / larger_float(load_float32(at, width + c), _LEAST)
+            store_float32(at, c, smaller_float(larger_float(own, faintest), brightest))
+        amplitude[y] = sums[0, :columns]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -105,25 +113,40 @@ def pool_places(
 
     reaches: sizes of the neighbourhood, smallest first; the first one that knows `enough` (1/px^2) is taken.
     """
-    columns = moved.shape[1]
-    sums = np.empty((2, columns), np.float32)
+    columns, distance = moved.shape[1], with_margin(places.distance, first_row, last_row)
+    score, known = with_margin(places.score, first_row, last_row), with_margin(places.known, first_row, last_row)
+    # Two sums, by how far to move, and the standard deviation, negative where it is not known yet.
+    lines = np.empty((4, distance.shape[1] - 2 * LANES), np.float32)
+    at = signed_address(distance), signed_address(score), signed_address(known)
+    to, width = signed_address(lines), distance.shape[1]
     for y in range(first_row, last_row):
-        waiting = columns
-        sums[:] = 0.0
+        lines[:3], lines[3] = 0.0, -1.0
+        lines[1, columns:] = np.inf  # nothing to look for beyond the last column
+        own = at[0] + 4 * ((y - first_row + MARGIN) * width + LANES)
         for i in range(len(reaches)):
-            if waiting == 0:
+            inner, last = reaches[i - 1] if i > 0 else -1, i == len(reaches) - 1
+            widen_row(at, width, y - first_row, inner, reaches[i], enough, to)
+            if not _settle(to, width - 2 * LANES, own, -np.inf if last else enough):
                 break
-            inner = reaches[i - 1] if i > 0 else -1
-            widen_row(places.distance, places.score, places.known, y, inner, reaches[i], enough, sums)
-            waiting = 0
-            for c in range(columns):
-                if i > 0 and sd[y, c] >= 0.0:
-                    continue
-                known = sums[1, c]
-                if known < enough and i < len(reaches) - 1:
-                    sd[y, c] = -1.0
-                    waiting += 1
-                    continue
-                step = sums[0, c] / max(known, np.float32(1e-12)) - places.distance[y, c]
-                moved[y, c] = min(max(step, np.float32(-1.0)), np.float32(1.0)) if known > 0.0 else np.float32(0.0)
-                sd[y, c] = min(np.float32(1.0) / np.sqrt(max(known, np.float32(1e-12))), np.float32(1.0))
+        moved[y], sd[y] = lines[2, :columns], lines[3, :columns]
+    # They live until here: what is known by its address alone would be freed.
+    distance[:1] = score[:1] = known[:1] = 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _settle(lines: int, columns: int, distance: int, enough: float) -> bool:
+    """Place the stripes that are not placed yet and know enough; whether any others are left."""
+    one, none, least = zero_float32() + np.float32(1.0), zero_float32(), zero_float32()
+    for c in range(0, columns, LANES):
+        known, before = load_float32(lines, columns + c), load_float32(lines, 3 * columns + c)
+        information = larger_float(known, _LEAST)
+        step = load_float32(lines, c) / information - load_float32(distance, c)
+        step = smaller_float(larger_float(step, np.float32(-1.0)), np.float32(1.0))
+        step = where_below(step, none, none, known)
+        sd = smaller_float(one / square_root(information), np.float32(1.0))
+        sd = where_below(none - one, sd, known, enough)
+        store_float32(lines, 2 * columns + c, where_below(step, load_float32(lines, 2 * columns + c), before, none))
+        sd = where_below(sd, before, before, none)
+        least = smaller_float(least, sd)
+        store_float32(lines, 3 * columns + c, sd)
+    return bool(smallest_float(least) < 0.0)

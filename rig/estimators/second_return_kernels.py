@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.label_volume_buffers import signed_address
-from rig.estimators.placing_pools import pool_row
+from rig.estimators.placing_pools import pool_row, with_margin
 from rig.estimators.row_input import State, Sweep, fluxes_at, line_light, with_rays
 from rig.estimators.second_return_sums import BLOCK, HAZE_STEP, LEFT_OUT, Blocks
 from rig.lane_memory import load_float32, store_float32
-from rig.lanes import LANES, square_root, zero_float32
+from rig.lanes import LANES, larger_float, largest_float, square_root, zero_float32
 
 Float32 = NDArray[np.float32]
 
@@ -73,44 +73,53 @@ def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, las
     rows, columns, pixels = blocks.ones.shape
     three = np.zeros((2, columns, pixels), np.float32)
     nine, above = np.zeros((2, pixels + 2 * _AROUND), np.float32), np.empty(pixels, np.float32)
-    room, excess = signed_address(nine), signed_address(above)
+    room, excess, row = signed_address(nine), signed_address(above), 4 * pixels * columns
+    of_three, of_nine = signed_address(three), room + 4 * _AROUND
+    ones, expected = signed_address(blocks.ones), signed_address(blocks.expected)
     for by in range(first_block, last_block):
         lines = max(by - 1, 0), min(by + 2, rows)
-        _add_arrays(blocks.ones[lines[0] : lines[1]], three[0])
-        _add_arrays(blocks.expected[lines[0] : lines[1]], three[1])
+        _add_lines(ones + row * lines[0], row, lines[1] - lines[0], pixels * columns, of_three)
+        _add_lines(expected + row * lines[0], row, lines[1] - lines[0], pixels * columns, of_three + row)
         for bx in range(columns):
-            around = max(bx - 1, 0), min(bx + 2, columns)
-            _add_arrays(three[0, around[0] : around[1]], nine[0, _AROUND:-_AROUND])
-            _add_arrays(three[1, around[0] : around[1]], nine[1, _AROUND:-_AROUND])
-            _light_above(room, pixels, reach, excess)
+            first, number = max(bx - 1, 0), min(bx + 2, columns) - max(bx - 1, 0)
+            _add_lines(of_three + 4 * pixels * first, 4 * pixels, number, pixels, of_nine)
+            _add_lines(of_three + row + 4 * pixels * first, 4 * pixels, number, pixels, of_nine + 4 * nine[0].size)
             out.distance[by, bx], out.sure[by, bx], out.haze[by, bx] = np.nan, CANDIDATE, 1.0
+            if not _light_above(room, pixels, reach, excess) > 0.0:
+                continue
             for i in range(pixels):
                 if above[i] > 0.0:
                     sure, more = _stands_out(nine, i + _AROUND, reach)
                     if sure > out.sure[by, bx]:
                         out.distance[by, bx] = i - (pixels - 1 if side > 0 else 0)
                         out.sure[by, bx], out.haze[by, bx] = sure, more
+    three[:1] = 0.0  # it lives until here: what is known by its address alone would be freed
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_arrays(arrays: Float32, total: Float32) -> None:
-    """The sum of one to three arrays."""
-    total[:] = arrays[0]
-    for i in range(1, arrays.shape[0]):
-        total += arrays[i]
+def _add_lines(first: int, apart: int, number: int, size: int, total: int) -> None:
+    """The sum of some lines of `size` numbers, `apart` bytes from one another; first, total: addresses."""
+    for i in range(0, size, LANES):
+        lines = load_float32(first, i)
+        for k in range(1, number):
+            lines = lines + load_float32(first + k * apart, i)
+        store_float32(total, i, lines)
 
 
 @numba.njit(cache=True, nogil=True)
-def _light_above(room: int, pixels: int, reach: int, excess: int) -> None:
-    """By how much the light around each pixel exceeds what CANDIDATE allows; room, excess: addresses."""
-    row = pixels + 2 * _AROUND
+def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
+    """By how much the light around each pixel exceeds what CANDIDATE allows, and the most; room, excess: addresses."""
+    row, most = pixels + 2 * _AROUND, zero_float32()
     for i in range(0, pixels, LANES):
         ones, expected = zero_float32(), zero_float32()
         for k in range(_AROUND - reach, _AROUND + reach + 1):
             ones = ones + load_float32(room, i + k)
             expected = expected + load_float32(room, row + i + k)
         noise = square_root(expected + np.float32(1.0)) * CANDIDATE
-        store_float32(excess, i, ones - expected - noise)
+        above = ones - expected - noise
+        most = larger_float(most, above)
+        store_float32(excess, i, above)
+    return np.float32(largest_float(most))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -153,7 +162,7 @@ def measure_seconds(
     last_row: int,
     out: Seconds,
 ) -> None:
-    """Fill all but distance of rows first_row..last_row-1; zeros where there is no candidate or a stripe is near.
+    """Fill all but distance of candidates of rows first_row..last_row-1; zeros where a stripe is near.
 
     state, still: see `SecondLight`; haze: of `Candidates`.
     """
@@ -161,9 +170,11 @@ def measure_seconds(
     alone = still[LANES:-LANES].reshape(sweep.u.shape)
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
-            out.ones[y, c] = out.expected[y, c] = out.light[y, c] = out.moment[y, c] = 0.0
             place = np.float32(x_far[y, c]) + out.distance[y, c]
-            if np.isnan(place) or np.isnan(x_px[y, c]) or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
+            if np.isnan(place):
+                continue
+            out.ones[y, c] = out.expected[y, c] = out.light[y, c] = out.moment[y, c] = 0.0
+            if np.isnan(x_px[y, c]) or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
                 continue
             lo, hi = with_rays(sweep.u, y, max(sweep.x0[c], 0), min(sweep.x0[c] + sweep.window, width) - 1)
             x, frames = int(np.rint(place)), np.float32(n_frames[c])
@@ -191,12 +202,14 @@ def measure_seconds(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds, moved: Float32) -> None:
     """Distance of each candidate, moved to the middle of the light around it, pooled over neighbours."""
-    sums = np.empty((2, moved.shape[1]), np.float32)
+    distance = with_margin(seconds.distance, first_row, last_row)
+    moment, light = with_margin(seconds.moment, first_row, last_row), with_margin(seconds.light, first_row, last_row)
+    sums = np.empty((2, distance.shape[1] - 2 * LANES), np.float32)
     for y in range(first_row, last_row):
         if np.isnan(seconds.distance[y]).all():
             moved[y] = np.nan
             continue
-        pool_row(seconds.distance, seconds.moment, seconds.light, y, REACH, sums)
+        pool_row(distance, moment, light, y - first_row, REACH, sums)
         for c in range(moved.shape[1]):
             step = sums[0, c] / sums[1, c] if sums[1, c] > 0.0 else np.float32(0.0)
             moved[y, c] = seconds.distance[y, c] + min(max(step, np.float32(-reach)), np.float32(reach))
@@ -218,12 +231,14 @@ def judge_seconds(
     A candidate's light, pooled over neighbours, stands out by the signed root of twice the gain in log-likelihood of
     Poisson counts, in standard deviations: right for few photons, too. sure: of `Candidates`.
     """
-    sums = np.empty((2, x_px.shape[1]), np.float32)
+    distance = with_margin(seconds.distance, first_row, last_row)
+    ones, expected = with_margin(seconds.ones, first_row, last_row), with_margin(seconds.expected, first_row, last_row)
+    sums = np.empty((2, distance.shape[1] - 2 * LANES), np.float32)
     for y in range(first_row, last_row):
         x2_px[y], confidence2[y] = np.nan, 0.0
         if np.isnan(seconds.distance[y]).all():
             continue
-        pool_row(seconds.distance, seconds.ones, seconds.expected, y, REACH, sums)
+        pool_row(distance, ones, expected, y - first_row, REACH, sums)
         for c in range(x_px.shape[1]):
             n, e = sums[0, c], max(sums[1, c], np.float32(1e-3))
             if n > e and not np.isnan(x_px[y, c]):

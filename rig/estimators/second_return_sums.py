@@ -23,8 +23,8 @@ from rig.estimators.row_input import (
     with_rays,
 )
 from rig.estimators.row_kernels import FLUX_MAX
-from rig.lane_memory import load_float32, load_widened, prefetch, store_float32
-from rig.lanes import LANES, to_float32, where_small, zero_float32
+from rig.lane_memory import load_counts, load_float32, prefetch, store_float32
+from rig.lanes import LANES, where_below, where_small, zero_float32
 
 Float32 = NDArray[np.float32]
 
@@ -36,8 +36,6 @@ HAZE_STEP: Final = 8
 """Pixels from one place where haze is worked out to the next."""
 LEFT_OUT: Final = np.float32(2.0)
 """Marks pixels that show nothing, among probabilities."""
-_FAR: Final = np.float32(8192.0)
-"""More than any row has pixels."""
 _IN_ORDER: Final = np.arange(LANES, dtype=np.float32)
 
 
@@ -98,7 +96,7 @@ def sum_blocks(
                 y = my if alone else together
                 _clear_beside(sweep, state, y, mc, leftmost(x_far[y, mc], side, pixels), side, clear[bx])
             block, left = 4 * pixels * (by * across + bx), clear_at + 4 * clear[0].size * bx
-            at = line_at, left, left + 4 * (pixels + 1), order_at
+            at = left, left + 4 * (pixels + 1), order_at
             for y in range(by * BLOCK, min(by * BLOCK + BLOCK, rows)):
                 for c in range(bx * BLOCK, min(bx * BLOCK + BLOCK, columns)):
                     if np.isnan(x_px[y, c]) or np.isnan(x_far[y, c]):
@@ -110,15 +108,15 @@ def sum_blocks(
                         continue
                     first, last = (begin - start) // LANES * LANES, end - start
                     stored = (c * rows + y) * window + start - x0
-                    if in_bytes and stored + first >= 0 and stored + last + LANES <= counts.size:
-                        for i in range(first, last, LANES):
-                            store_float32(line_at, i, to_float32(load_widened(counts_at, stored + i)))
-                    else:
+                    seen, as_bytes = counts_at + stored, True
+                    if not in_bytes or stored + first < 0 or stored + last + LANES > counts.size:
+                        seen, as_bytes = line_at, False
                         for i in range(first, last):
                             line[i] = counts[c, y, max(start + i - x0, 0)]
                     _add_line(
-                        at, still_at + 4 * (LANES + y * width + start), to_ones + block, to_expected + block,
-                        first, last, start, begin, end, x_px[y, c], np.float32(apart), np.float32(n_frames[c]),
+                        at, seen, as_bytes, still_at + 4 * (LANES + y * width + start), to_ones + block,
+                        to_expected + block, first, last, start, begin, end, x_px[y, c], np.float32(apart),
+                        np.float32(n_frames[c]),
                     )  # fmt: skip
 
 
@@ -151,29 +149,41 @@ def _clear_beside(sweep: Sweep, state: State, y: int, c: int, start: int, side: 
         if several:
             others = others_at(sweep, state, y, c, x)
             before, behind = min(before + others, FLUX_MAX), min(behind + others, FLUX_MAX)
-        left[k], right[k] = np.exp(-before), np.exp(-behind)
+        left[k], right[k] = np.exp(-np.float32(before)), np.exp(-np.float32(behind))
     step = np.float32(1 / HAZE_STEP)
     for k in range(0, clear.shape[1] - 1, HAZE_STEP):
-        for line in (left, right):
-            rise = step * (line[k + HAZE_STEP] - line[k])
+        for line in range(2):
+            begin = clear[line, k]
+            rise = step * (clear[line, k + HAZE_STEP] - begin)
             for m in range(1, HAZE_STEP):
-                line[k + m] = line[k] + np.float32(m) * rise
+                clear[line, k + m] = begin + np.float32(m) * rise
 
 
 @numba.njit(cache=True, nogil=True)
 def _add_line(
-    at: tuple[int, int, int, int], still: int, ones: int, expected: int, first: int, last: int, start: int, begin: int,
-    end: int, x: np.float32, apart: np.float32, frames: np.float32,
+    at: tuple[int, int, int], seen: int, as_bytes: bool, still: int, ones: int, expected: int, first: int, last: int,
+    start: int, begin: int, end: int, x: np.float32, apart: np.float32, frames: np.float32,
 ) -> None:  # fmt: skip
-    """Add pixels begin..end-1 of a line to sums; at: addresses of its counts, `clear` left and right, and 0, 1, ..."""
-    middle, half = np.float32(0.5 * (begin + end - 1)), np.float32(0.5 * (end - begin - 1))
-    none, order = zero_float32(), load_float32(at[3], 0)
-    one = none + np.float32(1.0)
+    """Add pixels begin..end-1 of a line to sums; at: addresses of `clear` left and right, and 0, 1, ...
+
+    seen: address of its counts, bytes or float32.
+    """
+    middle, half = np.float32(0.5) * np.float32(begin + end - 1), np.float32(0.5) * np.float32(end - begin - 1)
+    none, order = zero_float32(), load_float32(at[2], 0)
+    one, all_frames, beside = none + np.float32(1.0), none + frames, apart * apart
+    low, high = int(np.floor(x - apart)), int(np.ceil(x + apart))
     for i in range(first, last, LANES):
-        t, alone = order + np.float32(start + i), load_float32(still, i)
-        left, right, away = load_float32(at[1], i), load_float32(at[2], i), t - x
-        weight = where_small(where_small(one, t - middle, half), alone, np.float32(1.0))
-        weight = weight - where_small(weight, away, apart)
-        dark = alone * (right + where_small(left - right, away + _FAR, _FAR))
-        store_float32(ones, i, load_float32(ones, i) + weight * load_float32(at[0], i))
-        store_float32(expected, i, load_float32(expected, i) + weight * (one - dark) * frames)
+        t, alone = start + i, load_float32(still, i)
+        weight, here = where_small(all_frames, alone, np.float32(1.0)), order + np.float32(t)
+        # Most vectors lie on one side of the stripe, and not at an end of the line.
+        if t < begin or t + LANES > end:
+            weight = where_small(weight, here - middle, half)
+        if t + LANES <= low or t > high:
+            clear = load_float32(at[0] if t < low else at[1], i)
+        else:
+            away = here - x
+            clear = where_below(load_float32(at[0], i), load_float32(at[1], i), away, none)
+            weight = where_below(none, weight, away * away, beside)
+        counted = load_counts(seen, i) if as_bytes else load_float32(seen, i)
+        store_float32(ones, i, load_float32(ones, i) + where_below(counted, none, none, weight))
+        store_float32(expected, i, load_float32(expected, i) + weight * (one - alone * clear))

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from rig.estimators.placing import new_places
-from rig.estimators.placing_pools import SAME_PX, pool_places, pool_row, widen_row
-from rig.estimators.placing_scores import LEAST_FLUX, MOST_FLUX, _dark_over_lit
+from rig.estimators.placing_pools import MARGIN, SAME_PX, pool_places, pool_row, widen_row, with_margin
+from rig.estimators.placing_scores import LEAST_FLUX, _dark_over_lit
+from rig.estimators.placing_taps import MOST_FLUX
 from rig.lane_memory import address_of, load_float32, store_float32
 from rig.lanes import LANES
 
@@ -29,16 +30,26 @@ def pooled(distance, values, y, c, reach):
 @pytest.mark.parametrize(("rows", "columns"), [(1, 1), (5, 7), (9, 24), (12, 61)])
 @pytest.mark.parametrize("reach", [0, 2, 4])
 def test_sums_are_those_of_neighbours_on_the_same_surface(rows, columns, reach):
-    distance, first, second = surfaces(rows, columns)
-    sums, wider = (np.full((2, columns), 7, np.float32) for _ in range(2))
+    arrays = distance, first, second = surfaces(rows, columns)
+    around = [with_margin(a, 0, rows) for a in arrays]
+    width = around[0].shape[1]
+    sums, wider = (np.full((2, width - 2 * LANES), 7, np.float32) for _ in range(2))
     for y in range(rows):
-        pool_row(distance, first, second, y, reach, sums)
+        pool_row(*around, y, reach, sums)
         wanted = [[pooled(distance, a, y, c, reach) for c in range(columns)] for a in (first, second)]
-        np.testing.assert_allclose(sums, wanted, rtol=1e-5, atol=1e-5)
-        pool_row(distance, first, second, y, reach, wider)
-        widen_row(distance, first, second, y, reach, reach + 2, np.inf, wider)
-        pool_row(distance, first, second, y, reach + 2, sums)
+        np.testing.assert_allclose(sums[:, :columns], wanted, rtol=1e-5, atol=1e-5)
+        pool_row(*around, y, reach, wider)
+        most = min(reach + 2, MARGIN)
+        widen_row(tuple(a.ctypes.data for a in around), width, y, reach, most, np.inf, wider.ctypes.data)
+        pool_row(*around, y, most, sums)
         np.testing.assert_allclose(wider, sums, rtol=1e-5, atol=1e-5)
+
+
+def test_rows_are_copied_with_their_neighbours():
+    array = np.arange(20 * 21, dtype=np.float32).reshape(20, 21)
+    everywhere = np.pad(array, ((MARGIN, MARGIN), (LANES, 3 * LANES - 21)), constant_values=np.nan)
+    for first, last in ((0, 20), (0, 3), (7, 8), (12, 20)):
+        np.testing.assert_array_equal(with_margin(array, first, last), everywhere[first : last + 2 * MARGIN])
 
 
 def test_each_place_is_pooled_over_as_few_neighbours_as_it_takes():

@@ -1,0 +1,169 @@
+"""Compiled light of stripes, see `placing_kernels`, sixteen stripes to a vector.
+
+Light is the sum over the pixels around a stripe of log (K + 1/2) / (K - n + 1/2): one logarithm of a product. Haze is
+looked up between bins of its profile, from a table with all that is wanted of a bin beside one another.
+"""
+
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimators.label_volume_buffers import signed_address
+from rig.estimators.placing_kernels import BLIND_FLUX, LIGHT_PX, REACH_PX, Places
+from rig.estimators.placing_taps import MOST_FLUX, Counts, ambient_place, counts_of, nearest_pixel
+from rig.estimators.row_input import State, Sweep, others_at
+from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN
+from rig.lane_eights import EIGHT, fetch_eights
+from rig.lane_memory import load_float32, store_float32
+from rig.lane_powers import logarithm
+from rig.lanes import LANES, larger_float, smaller_float, square_root, where_below, where_small, zero_float32
+
+Float32 = NDArray[np.float32]
+
+_SHOWS: Final = np.nextafter(BLIND_FLUX, np.float32(0.0))
+"""Most ambient light of a pixel that still shows something."""
+_LEAST: Final = np.float32(1e-37)
+_PX, _PY, _PZ, _GAIN, _U, _V, _BIN, _PATHS, _PART, _OTHERS, _FRAMES = range(11)
+_LIGHT, _SCALE, _HAZE, _REST, _GLOW, _FIELDS = range(11, 17)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def measure_light(
+    n_frames: NDArray[np.int32],
+    sweep: Sweep,
+    state: State,
+    around: Counts,
+    x_px: Float32,
+    first_row: int,
+    last_row: int,
+    out: Places,
+) -> None:
+    """Fill light, scale, haze, rest and glow of rows first_row..last_row-1 for stripes at x_px; zeros where none is.
+
+    around: of `fetch_counts`. Haze is that of the nearest pixel that is searched.
+    """
+    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
+    u, v, ambient, x0, x_lo, x_hi, window = (
+        sweep.u,
+        sweep.v,
+        state.ambient,
+        sweep.x0,
+        sweep.x_lo,
+        sweep.x_hi,
+        sweep.window,
+    )
+    light, scale, haze, rest, glow = out.light, out.scale, out.haze, out.rest, out.glow
+    row_gain, several, columns = state.row_gain, sweep.others.shape[1] > 0, x_px.shape[1]
+    bins, last_bin = _bins(state.profile, state.glow), np.float32(state.profile.shape[0] - 1.001)
+    # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
+    width = (-(-columns // LANES) | 1) * LANES
+    lines, spare = np.zeros((_FIELDS, width), np.float32), np.full((width, EIGHT), MOST_FLUX, np.float32)
+    taps, ambient_at, bin_at = (
+        np.zeros((2, EIGHT, LANES), np.float32),
+        np.empty(width, np.int64),
+        np.empty(width, np.int64),
+    )
+    at, spare_at, bins_at, taps_at = (
+        signed_address(lines),
+        signed_address(spare),
+        signed_address(bins),
+        signed_address(taps),
+    )
+    ambient_at[:], bin_at[:], lines[_PX] = spare_at + 4 * EIGHT * (width - 1), bins_at, 1.0
+    for c in range(columns):
+        lines[_PX, c], lines[_PY, c], lines[_PZ, c] = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]
+        lines[_GAIN, c] = state.column_gain[c]
+    for y in range(first_row, last_row):
+        for c in range(columns):
+            if np.isnan(x_px[y, c]) or n_frames[c] == 0:
+                lines[_FRAMES, c] = 0.0
+                continue
+            x = nearest_pixel(x_px[y, c])
+            searched = min(max(x, int(x_lo[y, c])), int(x_hi[y, c]))
+            lines[_U, c], lines[_V, c], lines[_FRAMES, c] = u[y, searched], v[y, searched], n_frames[c]
+            ambient_at[c] = ambient_place(ambient, y, x, int(x0[c]), window, spare_at + 4 * EIGHT * c)
+            if several:
+                lines[_OTHERS, c] = others_at(sweep, state, y, c, searched)
+        _find_bins(at, width, row_gain[y], np.float32(state.w_lo), np.float32(state.per_w), last_bin)
+        for c in range(columns):
+            i = int(lines[_BIN, c])
+            lines[_PART, c], bin_at[c] = lines[_BIN, c] - np.float32(i), bins_at + 4 * EIGHT * i
+        for c in range(0, columns, LANES):
+            counts_of(around, y, c, taps_at)
+            _measure(at + 4 * c, width, taps_at, signed_address(ambient_at) + 8 * c, signed_address(bin_at) + 8 * c)
+        light[y], scale[y], glow[y] = lines[_LIGHT, :columns], lines[_SCALE, :columns], lines[_GLOW, :columns]
+        haze[y], rest[y] = lines[_HAZE, :columns], lines[_REST, :columns]
+    # They live until here: what is known by its address alone would be freed.
+    spare[:1] = bins[:1] = taps[:1] = 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _bins(profile: Float32, glow: Float32) -> Float32:
+    """Of each bin haze before and behind a stripe, its scale and the halo's glow, and what the next bin has more."""
+    bins = np.zeros((profile.shape[0], EIGHT), np.float32)
+    half = EIGHT // 2
+    bins[:, : half - 1], bins[:, half - 1] = profile[:, : half - 1], glow
+    bins[:-1, half:] = bins[1:, :half] - bins[:-1, :half]
+    return bins
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_bins(at: int, width: int, gain: np.float32, w_lo: np.float32, per_w: np.float32, last: np.float32) -> None:
+    """Where stripes lie among the profile's bins, and the strength of haze there."""
+    for c in range(0, width, LANES):
+        px, py = load_float32(at, _PX * width + c), load_float32(at, _PY * width + c)
+        pz, u, v = load_float32(at, _PZ * width + c), load_float32(at, _U * width + c), load_float32(at, _V * width + c)
+        down = v * v + np.float32(1.0)
+        along = (py * v + pz) / px
+        path_p, path_c = square_root(down + along * along), square_root(down + u * u)
+        w = px * u + (py * v + pz)
+        place = (w * np.float32(2.0) / (path_p + path_c) - w_lo) * per_w
+        store_float32(at, _BIN * width + c, smaller_float(larger_float(place, np.float32(0.0)), last))
+        store_float32(at, _PATHS * width + c, path_p * path_c * load_float32(at, _GAIN * width + c) * gain)
+
+
+@numba.njit(cache=True, nogil=True)
+def _measure(at: int, width: int, taps: int, ambient: int, bins: int) -> None:
+    """Light of LANES stripes and all that is wanted of haze; taps: address of their counts, and room behind them."""
+    near = taps + 4 * EIGHT * LANES
+    one, none, half = zero_float32() + np.float32(1.0), zero_float32(), np.float32(0.5)
+    fetch_eights(ambient, near)
+    frames = load_float32(at, _FRAMES * width)
+    inverse = one / (frames + half)
+    dark, shown, light = one, none, none
+    for d in range(REACH_PX - LIGHT_PX, REACH_PX + LIGHT_PX + 1):
+        own, unlit = (
+            load_float32(near, d * LANES),
+            larger_float(frames - load_float32(taps, d * LANES), np.float32(0.0)),
+        )
+        shows = where_small(one, own, _SHOWS)
+        dark = dark * ((unlit + half) * inverse * shows + (one - shows))
+        shown, light = shown + shows, light - where_small(own, own, _SHOWS)
+    own = load_float32(near, REACH_PX * LANES)
+    own = where_small(own, own, _SHOWS)
+    fetch_eights(bins, near)
+    part, paths, others = (
+        load_float32(at, _PART * width),
+        load_float32(at, _PATHS * width),
+        load_float32(at, _OTHERS * width),
+    )
+    before = _flux(own + paths * (load_float32(near, 0) + part * load_float32(near, 4 * LANES)), others)
+    behind = _flux(own + paths * (load_float32(near, LANES) + part * load_float32(near, 5 * LANES)), others)
+    halo = load_float32(near, 3 * LANES) + part * load_float32(near, 7 * LANES)
+    # A pixel that the picture does not have, or that is blind, counts as one of just the expected light.
+    light = light - logarithm(larger_float(dark, _LEAST)) - shown * ((before + behind) * half - own)
+    # What the halo adds to the light of the line grows with it.
+    light = light / (one + halo * np.float32(2 * LIGHT_PX + 1))
+    scale = load_float32(near, 2 * LANES) + part * load_float32(near, 6 * LANES)
+    store_float32(at, _LIGHT * width, where_below(light, none, none, frames))
+    store_float32(at, _SCALE * width, where_below(scale, none, none, frames))
+    store_float32(at, _HAZE * width, where_below(larger_float(before - own, none), none, none, frames))
+    store_float32(at, _REST * width, where_below(larger_float(behind - own, none), none, none, frames))
+    store_float32(at, _GLOW * width, where_below(halo, none, none, frames))
+
+
+@numba.njit(forceinline=True)
+def _flux(own, others):  # type: ignore[no-untyped-def]
+    return smaller_float(smaller_float(larger_float(own, FLUX_MIN), FLUX_MAX) + others, FLUX_MAX)
