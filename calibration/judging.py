@@ -80,10 +80,13 @@ def judge_fit(
     return Judged(judge(seen, evidence, asked), asked, evidence, waves, residuals, shifts, uncertainty, worth)
 
 
-def judge_refused(refused: Degenerate, views: Sequence[View], board: Board, size: tuple[int, int]) -> Verdict:
-    """Judge views of a picture of `size` (width, height) from which no model could be made."""
+def judge_refused(
+    refused: Degenerate, views: Sequence[View], board: Board, size: tuple[int, int], *, photons: bool = True
+) -> Verdict:
+    """Judge views of a picture of `size` (width, height) from which no model could be made; photons: `data_lack`."""
     poses = rough_poses(views, board, rough_camera(size))
-    return judge_refusal(refused, view_evidence(views, size), pose_evidence(poses, board) if poses else None)
+    evidence = pose_evidence(poses, board) if poses else None
+    return judge_refusal(refused, view_evidence(views, size), evidence, photons=photons)
 
 
 def _baseline(model: RigModel) -> tuple[float, float]:

@@ -27,6 +27,8 @@ from calibration.passage_light import (
 
 Array = NDArray[np.float64]
 
+UNKNOWN_SD = 1e3
+"""Columns; of a passage that the photons do not tell."""
 ITERATIONS, WIDTH_ITERATIONS = 12, 7
 """In the first ones the common widths are found too."""
 MOST_WORSE = 2.0
@@ -103,12 +105,15 @@ def fit_passages(
     flux, slopes = light(theta, at, box)
     _, information = score_of(ones, frames, flux, slopes, theta)
     covariance = np.linalg.inv(regular(information[:, :SIGMA, :SIGMA]))
-    sd = np.sqrt(covariance[:, CENTRE, CENTRE])
-    settled = np.ones(len(sd), np.bool_)
+    # Of next to no light the inverse is rounding, and may come out negative.
+    known = covariance[:, CENTRE, CENTRE] > 0
+    sd = np.sqrt(np.where(known, covariance[:, CENTRE, CENTRE], UNKNOWN_SD**2))
+    settled = known
     # What not knowing the pixel's other parameters adds: by the information, and where photons are few.
     unknown = sd * np.sqrt(information[:, CENTRE, CENTRE]) * np.sqrt(_few(frames, flux, slopes, theta))
     if exact:
         sd, settled = _centred(ones, frames, at, box, theta, sd)
+        settled &= known
     return PassageFit(
         centre=theta[:, CENTRE], sd=sd * unknown, sigma=np.exp(theta[:, SIGMA]),
         significance=_significance(ones, frames, at, theta[:, CENTRE], flux),

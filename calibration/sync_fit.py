@@ -92,7 +92,7 @@ class SyncFit:
     @property
     def steady(self) -> bool:
         """Whether the lag is the same at all speeds, as far as these can tell."""
-        return bool(self.chi2 <= self.dof + MOST_CHI2_SDS * np.sqrt(2 * self.dof))
+        return self.dof == 0 or bool(self.chi2 <= self.dof + MOST_CHI2_SDS * np.sqrt(2 * self.dof))
 
 
 def fit_sync(sweeps: Sequence[Passages]) -> SyncFit:
@@ -100,6 +100,9 @@ def fit_sync(sweeps: Sequence[Passages]) -> SyncFit:
     one-speed, too-few-pixels, marker-polarity, negative-lag."""
     _require_speeds(sweeps)
     seen = SharedPixels.of(sweeps)
+    heard = (seen.weight > 0).sum(axis=0).tolist()
+    if not all(heard):  # a sweep that saw the line nowhere else does says nothing, least of all of its speed
+        return fit_sync([sweep for sweep, tells in zip(sweeps, heard, strict=True) if tells])
     _require_one_way_round(seen)
     told = tuple(way for way in (1, -1) if way in seen.direction)
     common = len(told) == 2 and float(np.ptp(seen.speed)) <= ALIKE_SPEEDS * float(seen.speed.max())

@@ -6,6 +6,7 @@ from calibration.sync_fit import SyncFit
 from calibration.verdict import Asked, Reason, Verdict
 
 _SPEEDS = "scan at two speeds or more, both ways"
+_STILL = "check that nothing moved between the sweeps, or calibrate at the speed of your scans"
 
 
 def judge_sync(fit: SyncFit, model: RigModel | None, asked: Asked | None) -> Verdict:
@@ -16,7 +17,7 @@ def judge_sync(fit: SyncFit, model: RigModel | None, asked: Asked | None) -> Ver
             f"the lag is not the same at all speeds: chi squared {fit.chi2:.1f} for {fit.dof} degrees of freedom; it "
             "holds for the speeds scanned only"
         )
-        found.append(Reason("lag-by-speed", text, fit.chi2, float(fit.dof), "calibrate at the speed of your scans"))
+        found.append(Reason("lag-by-speed", text, fit.chi2, float(fit.dof), _STILL))
     if fit.common:
         text = "one speed both ways tells the mean of the two lags only"
         found.append(Reason("one-speed", text, 1.0, 2.0, _SPEEDS))

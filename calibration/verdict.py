@@ -132,9 +132,14 @@ def judge(views: ViewEvidence, fit: FitEvidence, asked: Asked) -> Verdict:
     return Verdict(not reasons, tuple(reasons))
 
 
-def judge_refusal(refused: Degenerate, views: ViewEvidence, poses: PoseEvidence | None = None) -> Verdict:
-    """The verdict where no model could be fitted: what the views lack, else what the fit said. poses: roughly."""
-    lacking = data_lack(views, poses, imprecise=True)
+def judge_refusal(
+    refused: Degenerate, views: ViewEvidence, poses: PoseEvidence | None = None, *, photons: bool = True
+) -> Verdict:
+    """The verdict where no model could be fitted: what the views lack, else what the fit said. poses: roughly.
+
+    photons: as for `data_lack`.
+    """
+    lacking = data_lack(views, poses, imprecise=True, photons=photons)
     code = _REFUSED_FOR.get(refused.reason, refused.reason)
     own = Reason(code, str(refused), math.nan, math.nan, _NEXT_STEP.get(code, "show the board again"))
     if refused.reason in _SEEN_AT_ONCE:  # but for room light, which hides boards, nothing goes before it
@@ -159,6 +164,9 @@ _NEXT_STEP = {
     "board-too-far": "come nearer, until the board fills a third of the picture",
     "poor-coverage": "show the board at the borders and in the corners of the picture too",
     "no-board": "show the whole board, lit evenly, and check that the board's file is the print's",
+    "board-half-out": "move it in until all of it is in the picture",
+    "mirrored": "turn the print over, or correct the sensor's orientation in the config",
+    "two-boards": "show one at a time",
 }
 
 

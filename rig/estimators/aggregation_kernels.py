@@ -44,7 +44,7 @@ class Penalties(NamedTuple):
     one: int = 16
     two: int = 24
     three: int = 30
-    jump: int = 52
+    jump: int = 40
 
 
 @numba.njit(cache=True, nogil=True)

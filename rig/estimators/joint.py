@@ -2,9 +2,10 @@
 
 Each label of a row and column (`label_grid`) gets a cost from the counts (`label_volume`), with the halo where there is
 one (`halo_tables`) and the map before where that is asked for (`temporal`). Costs are tied to those of the neighbours
-along four paths (`aggregation_kernels`); the best label of each is placed between labels by what neighbours on its
-surface know (`placing`), judged (`joint_confidence`) and searched for a second line (`second_return`). What the rows
-know of light and medium is learned as by `likelihood`, then from the map's own stripes.
+along four paths (`aggregation_kernels`); weak answers are put to the vote of all neighbours (`aggregation_vote`); the
+best label of each is placed between labels by what neighbours on its surface know (`placing`), judged
+(`joint_confidence`) and searched for a second line (`second_return`). What the rows know of light and medium is learned
+as by `likelihood`, then from the map's own stripes.
 """
 
 from dataclasses import replace
@@ -17,6 +18,7 @@ from rig.counting import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.errors import UsageError
 from rig.estimators.aggregation_answer import Answer, answer_settings, new_answer
 from rig.estimators.aggregation_kernels import Penalties, along_columns, along_rows
+from rig.estimators.aggregation_vote import NEIGHBOURS_PX, Ballots, collect, new_ballots, vote
 from rig.estimators.ambient import ambient_map
 from rig.estimators.halo import halo_shares
 from rig.estimators.halo_learning import bright_lines, learn_first_halo, learn_next_halo
@@ -68,6 +70,7 @@ class _Memory(NamedTuple):
     cost: NDArray[np.uint8]
     message: NDArray[np.uint8]
     answer: Answer
+    ballots: Ballots
     places: Places
 
 
@@ -163,13 +166,19 @@ class Joint:
 
         x_px = np.empty((rows, columns), np.float32)
 
+        neighbours = grid.column_px <= NEIGHBOURS_PX
+
         def read(first: int, last: int) -> None:
+            if neighbours:
+                vote(memory.ballots, memory.cost, first, last, memory.answer)
             read_positions(
                 grid.x_far, volume.n_frames, grid.side, memory.answer, first, last, x_px, memory.places.distance
             )
 
         workers.over(rows, tie_rows)
         workers.over(columns, tie_columns)
+        if neighbours:
+            workers.over(rows, lambda first, last: collect(memory.answer, first, last, memory.ballots))
         workers.over(rows, read)
         sd = place(volume, tables.sweep, tables.state, tables.shares, x_px, memory.places, workers)
         return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, tables.bright, workers)
@@ -184,7 +193,8 @@ class Joint:
         memory = self._memory
         if memory is None or memory.cost.shape != (rows, columns, labels):
             cost, message = (np.zeros((rows, columns, labels), np.uint8) for _ in range(2))
-            memory = self._memory = _Memory(cost, message, new_answer(rows, columns), new_places(rows, columns))
+            answer, ballots = new_answer(rows, columns), new_ballots(rows, columns)
+            memory = self._memory = _Memory(cost, message, answer, ballots, new_places(rows, columns))
         return memory
 
     def _seen(self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable) -> Seen:

@@ -18,6 +18,8 @@ PER_PX: Final = 2
 SPARE: Final = 1
 """Labels beyond the searched pixels at either end, for the mean of a peak there."""
 VECTOR: Final = 32
+_ROWS_APART: Final = 8
+"""Rows that are looked at for the distance of columns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,13 +27,15 @@ class LabelGrid:
     """Label l of a row and column is at x_far - side * l / PER_PX, for l from 0 to stripes - 1.
 
     x_far: float64 (rows, columns), NaN where nothing is searched; x may lie outside the picture there. side: 1 where
-    near is left, else -1. labels: a multiple of VECTOR; those from stripes on mean nothing.
+    near is left, else -1. labels: a multiple of VECTOR; those from stripes on mean nothing. column_px: from a column to
+    the next, as a rule.
     """
 
     x_far: NDArray[np.float64]
     side: int
     stripes: int
     labels: int
+    column_px: float
 
 
 def label_grid(geometry: SweepGeometry) -> LabelGrid:
@@ -44,7 +48,10 @@ def label_grid(geometry: SweepGeometry) -> LabelGrid:
     seen = np.isfinite(x_far)
     span = (side * (x_far - nearest))[seen].max(initial=1.0)
     stripes = int(np.ceil(PER_PX * span)) + 1 + SPARE
-    return LabelGrid(x_far, side, stripes, -(-stripes // VECTOR) * VECTOR)
+    steps = np.abs(np.diff(x_far[::_ROWS_APART], axis=1))
+    steps = steps[np.isfinite(steps)]
+    column_px = float(np.median(steps)) if steps.size else 1.0
+    return LabelGrid(x_far, side, stripes, -(-stripes // VECTOR) * VECTOR, column_px)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -53,6 +53,15 @@ def test_one_speed_both_ways_gives_the_mean_of_the_lags():
     assert fit.common
     assert fit.lag_s.forward == fit.lag_s.backward == pytest.approx(np.mean(list(LAG_S.values())), abs=1e-6)
     assert fit.speed_range_per_s == pytest.approx((33.25, 36.75))
+    assert fit.steady  # nothing speaks against it
+
+
+def test_a_sweep_without_passages_says_nothing_of_its_speed():
+    rng = np.random.default_rng(8)
+    silent = Passages(*np.empty((4, 0)), 1, 400.0)
+    fit = fit_sync([*_sweeps(rng, (35.0, 90.0)), silent])
+    assert fit.speed_range_per_s == pytest.approx((35 * 0.95, 90 * 1.05))
+    assert np.isfinite(fit.chi2)
 
 
 def test_one_way_at_two_speeds_gives_its_lag_alone():
