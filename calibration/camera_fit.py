@@ -20,7 +20,7 @@ from calibration.covariance import Covariance
 from calibration.coverage import Coverage, coverage_of
 from calibration.distortion import TERM_COUNTS
 from calibration.errors import CalibrationError, Degenerate
-from calibration.views import BoardPose, Corners, View
+from calibration.views import LEAST_ACROSS_PX, BoardPose, Corners, View
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -83,7 +83,11 @@ def fit_camera(
     if distortion_terms not in (0, *TERM_COUNTS):
         raise CalibrationError(f"distortion has {distortion_terms} terms; OpenCV defines 0, {str(TERM_COUNTS)[1:-1]}")
     seen = [(view, view.corners) for view in views if view.corners is not None]
-    seen = [(view, corners) for view, corners in seen if len(corners.ids) >= _FEWEST_CORNERS]
+    seen = [
+        (view, corners)
+        for view, corners in seen
+        if len(corners.ids) >= _FEWEST_CORNERS and corners.across_px >= LEAST_ACROSS_PX
+    ]
     if not seen:
         raise Degenerate(
             "no-board", f"none of {len(views)} views shows the board; show all of it, closer or with more light"

@@ -15,7 +15,7 @@ from calibration.board import Board
 from calibration.camera_normal import Normal, camera_normal
 from calibration.coverage import spread_rad
 from calibration.errors import Degenerate
-from calibration.views import BoardPose, Corners
+from calibration.views import NO_POSE, BoardPose, Corners
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -144,8 +144,11 @@ class Problem:
 
     def _pose(self, view: int, matrix: Array, distortion: Array) -> BoardPose:
         points, px = self.points_m(view), self.corners[view].px
-        _, turn, shift = cv2.solvePnP(points, px, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
-        turn, shift = cv2.solvePnPRefineLM(points, px, matrix, distortion, turn, shift)
+        try:
+            _, turn, shift = cv2.solvePnP(points, px, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
+            turn, shift = cv2.solvePnPRefineLM(points, px, matrix, distortion, turn, shift)
+        except cv2.error as error:
+            raise Degenerate("no-board", NO_POSE) from error
         return BoardPose(np.ravel(turn), np.ravel(shift))
 
     def _residual(self, view: int, matrix: Array, distortion: Array, pose: BoardPose) -> Array:

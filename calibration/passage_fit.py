@@ -156,7 +156,7 @@ def _few(frames: Array, flux: Array, slopes: Array, theta: Array) -> Array:
     """Factor (pixels,) on the variance for the three parameters that were fitted besides, to so many detections."""
     level = slopes[:, BEFORE] * theta[:, BEFORE, None] + slopes[:, AFTER] * theta[:, AFTER, None]
     detections = (frames * (np.exp(-level) - np.exp(-flux))).sum(axis=1)
-    result: Array = detections / np.maximum(detections - CENTRE, 1)
+    result: Array = np.maximum(detections / np.maximum(detections - CENTRE, 1), 1)  # a dip has fewer than none
     return result
 
 

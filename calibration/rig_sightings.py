@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calibration.board import MARGIN_SQUARES, Board
 from calibration.camera import Camera
-from calibration.views import BoardPose, Corners, Passages, View
+from calibration.views import LEAST_ACROSS_PX, BoardPose, Corners, Passages, View
 
 Array = NDArray[np.float64]
 
@@ -94,7 +94,8 @@ def usable(views: Sequence[View]) -> list[View]:
         seen = np.isfinite(px).all(axis=1)
         if seen.sum() >= FEWEST_CORNERS:
             corners = Corners(ids[seen], px[seen], None if sd_px is None else sd_px[seen])
-            found.append(replace(view, corners=corners))
+            if corners.across_px >= LEAST_ACROSS_PX:
+                found.append(replace(view, corners=corners))
     return found
 
 

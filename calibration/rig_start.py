@@ -16,9 +16,10 @@ from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
 from calibration.camera import Camera
+from calibration.errors import Degenerate
 from calibration.rig_sightings import Sighting
 from calibration.scanner import PivotScanner
-from calibration.views import BoardPose
+from calibration.views import NO_POSE, BoardPose
 
 Array = NDArray[np.float64]
 
@@ -44,7 +45,12 @@ class Points:
 
 def first_pose(camera: Camera, corners_m: Array, corner_px: Array) -> BoardPose:
     """The pose of a board from its corners."""
-    _, turn, shift = cv2.solvePnP(corners_m, corner_px, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_ITERATIVE)
+    try:
+        _, turn, shift = cv2.solvePnP(
+            corners_m, corner_px, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_ITERATIVE
+        )
+    except cv2.error as error:
+        raise Degenerate("no-board", NO_POSE) from error
     return BoardPose(np.asarray(turn, np.float64).ravel(), np.asarray(shift, np.float64).ravel())
 
 

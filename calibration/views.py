@@ -12,6 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+NO_POSE = "corners of a view are no picture of a board; take the view out, or name the board that it shows"
+LEAST_ACROSS_PX = 1.0
+"""Of corners that give a pose; they are found to some 0.01 px."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corners:
@@ -24,6 +28,13 @@ class Corners:
     ids: NDArray[np.int32]
     px: Array
     sd_px: Array | None = None
+
+    @property
+    def across_px(self) -> float:
+        """Root mean square distance from the line that the corners lie along best: none gives a pose without."""
+        if len(self.px) == 0 or not np.isfinite(self.px).all():
+            return 0.0
+        return float(np.linalg.svd(self.px - self.px.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(self.px)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

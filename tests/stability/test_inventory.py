@@ -52,6 +52,40 @@ ELSEWHERE = {
     "sheets, in one kernel; those of any numbers in test_calibration_model.py": (
         "tests/unit/rig/test_bent_light.py", "rig.bent_light:*", "rig.bent_light_kernels:*",
     ),
+    "boards, their drawings and corners; pictures of anything in test_calibration_data.py": (
+        "tests/unit/calibration/test_detection.py", "calibration.board:*", "calibration.board_drawing:*",
+        "calibration.board_map:*", "calibration.board_search:*", "calibration.corner_registration:*",
+        "calibration.hot_pixels:*", "calibration.views:*",
+    ),
+    "steps of the camera's fit; whole fits of any views in test_calibration_data.py": (
+        "tests/unit/calibration/test_camera_fit.py", "calibration.camera_*:*", "calibration.coverage:*",
+    ),
+    "steps from counts to passages; any counts in test_calibration_data.py": (
+        "tests/unit/calibration/test_passages.py", "calibration.line_search:*", "calibration.passage*:*",
+        "calibration.even_*:*", "calibration.sync_pixels:*",
+    ),
+    "steps of the whole fit; whole fits of any views in test_calibration_data.py": (
+        "tests/unit/calibration/test_rig_fit.py", "calibration.rig_*:*", "calibration.sweep_fit:*",
+    ),
+    "lags and delays against drawn passages": (
+        "tests/unit/calibration/test_sync_fit.py", "calibration.sync_fit:*", "calibration.gate_fit:*",
+    ),
+    "boards at known places, scanned": (
+        "tests/unit/calibration/test_check_fit.py", "calibration.check_*:*", "calibration.propagation:*",
+    ),
+    "mistakes made on purpose, each by its own number": (
+        "tests/unit/calibration/test_verdict.py", "calibration.verdict:*", "calibration.evidence:*",
+        "calibration.judging:*", "calibration.view_shifts:*", "calibration.sensitivity:*",
+        "calibration.against_truth:*",
+    ),
+    "poses to show next": ("tests/unit/calibration/test_guide.py", "calibration.guide:*"),
+    "rates drawn from a measured distribution": (
+        "tests/unit/calibration/test_pixels.py", "calibration.pixels:*", "calibration.dark_tally:*",
+    ),
+    "words of a file": ("tests/unit/calibration/test_model_files.py", "calibration.yaml_file:*"),
+    "rays and surfaces put together; their light in test_light.py": (
+        "tests/unit/sim/test_scene.py", "sim_backend.view:make_view",
+    ),
     "intervals against drawn repeats": ("tests/unit/rig/test_intervals.py", "rig.intervals:*"),
     "a missing answer's charge": ("tests/unit/rig/test_tradeoff.py", "rig.tradeoff_rows:*"),
     "powers of two off the bits of a number": ("tests/unit/estimators/test_powers.py", "rig.estimators.powers:*"),
