@@ -20,6 +20,7 @@ from calibration.covariance import Covariance
 from calibration.coverage import Coverage, coverage_of
 from calibration.distortion import TERM_COUNTS
 from calibration.errors import CalibrationError, Degenerate
+from calibration.robust import robust_sd
 from calibration.views import LEAST_ACROSS_PX, BoardPose, Corners, View
 
 Array = NDArray[np.float64]
@@ -127,7 +128,7 @@ def _without_outliers(problem: Problem, solution: Solution, used: list[Mask]) ->
     relative = _relative_sds(problem.corners)
     for _ in range(_MAX_ROUNDS):
         scaled = [residual / sd for residual, sd in zip(solution.residual_px, relative, strict=True)]
-        scale = np.array([_robust_sd(residual) for residual in scaled])
+        scale = np.array([robust_sd(residual) for residual in scaled])
         inside = [i for i in range(len(used)) if i not in dropped]
         usual = max(float(np.median(scale[inside])), LEAST_SD_PX)
         worst = max(inside, key=lambda i: scale[i])
@@ -157,11 +158,6 @@ def _close(residual_px: Array, sd_px: float) -> Mask:
     """Corners within the limit; none of a view that has more beyond it than it should."""
     close: Mask = np.abs(residual_px).max(axis=1) <= _CORNER_LIMIT * sd_px
     return close if close.mean() >= _LEAST_CLOSE else np.zeros_like(close)
-
-
-def _robust_sd(residual_px: Array) -> float:
-    """From the median of the absolute values, as of a normal distribution."""
-    return float(1.4826 * np.median(np.abs(residual_px)))
 
 
 def _is_mirrored(corners: Corners, board: Board) -> bool:

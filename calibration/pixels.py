@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.dark_tally import LEAST_COUNTS, DarkTally
+from calibration.robust import robust_sd
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -174,7 +175,7 @@ def _is_hot(flux: Array, frames: NDArray[np.int64], level: Array, limit: Array) 
     n = np.maximum(frames, 1)
     chance = np.sqrt(np.maximum(np.expm1(level), 1 / n) / n)
     excess = flux - level
-    scatter = 1.4826 * float(np.median(np.abs(excess[seen]))) if seen.any() else 0.0
+    scatter = robust_sd(excess[seen]) if seen.any() else 0.0
     result: Mask = seen & (flux > limit) & (excess > _HOT_SIGMA * np.maximum(chance, scatter))
     return result
 

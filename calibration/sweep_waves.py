@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.robust import robust_sd
+
 Array = NDArray[np.float64]
 
 BINS = 24
 """Of the command range: wide enough for tens of passages each, narrow enough for a wave of several turns."""
 _FEWEST_IN_BIN = 5
 _FEWEST_BINS = 4
-MAD_TO_SD = 1.4826
-"""Of a normal distribution."""
 _MEDIAN_VARIANCE = np.pi / 2
 """Of a median in units of the mean's variance, normal distribution."""
 
@@ -82,7 +82,7 @@ def _binned(sweeps: Sequence[SweepResidual], edges: Array) -> tuple[Array, Array
         for k in np.flatnonzero(np.bincount(at, minlength=BINS) >= _FEWEST_IN_BIN):
             inside = sweep.residual[at == k]
             middle[i, k] = np.median(inside)
-            sd = MAD_TO_SD * np.median(np.abs(inside - middle[i, k]))
+            sd = robust_sd(inside - middle[i, k])
             variance[i, k] = _MEDIAN_VARIANCE * sd**2 / inside.size
     return middle, variance
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import Degenerate
+from calibration.robust import robust_sd
 from calibration.views import Passages
 
 Array = NDArray[np.float64]
@@ -92,7 +93,7 @@ def solve(seen: SharedPixels, designs: Sequence[Array]) -> Solved:
         share = seen.weight / np.maximum(seen.weight.sum(axis=1, keepdims=True), 1e-300)
         error = residual / np.sqrt(np.maximum(1 - share, 1e-3))
         scaled = np.abs(error) * np.sqrt(seen.weight)
-        noise = max(1.4826 * float(np.median(scaled[seen.weight > 0])), 1e-12)
+        noise = max(robust_sd(scaled[seen.weight > 0]), 1e-12)
         weight = seen.weight * (scaled < MOST_OFF * max(noise, 1.0))
     # What trembles together counts together (a sandwich over parts of a sweep), and every sweep may be off as a whole.
     pulls = clustered(weight[:, :, None] * x * error[:, :, None], clusters(seen))

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from calibration.model import RigModel
 from calibration.rig_fit import RigFit
+from calibration.robust import robust_sd
 from calibration.sweep_fit import SweepFit
-from calibration.sweep_waves import MAD_TO_SD
 from calibration.views import BoardPose, View
 
 Array = NDArray[np.float64]
@@ -50,7 +50,7 @@ def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
     if not posed:
         return ()
     left = np.concatenate([residual for _, _, residual, _, _ in posed])
-    corner_sd = MAD_TO_SD * float(np.median(np.abs(left)))
+    corner_sd = robust_sd(left)
     return tuple(_shift(model, name, pose, corner_sd**2 * inverse, sweeps) for name, pose, _, inverse, sweeps in posed)
 
 

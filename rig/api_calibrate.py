@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from drivers.units import parse_quantity
 from rig.api_config import SIMULATED, Config, PathLike
-from rig.api_scan import MAX_SEED
+from rig.api_scan import seed_problems
 from rig.config import RigConfig
 from rig.errors import UsageError
 from rig.run import OutFolder, Progress
@@ -232,9 +232,7 @@ def _problems(poses: int | None, seed: int, exposures: Sequence[int] = ()) -> li
     problems = [f"exposures has {k}; it must be at least 1" for k in exposures if k < 1]
     if poses is not None and poses < 1:
         problems.append(f"poses is {poses}; it must be at least 1")
-    if not 0 <= seed <= MAX_SEED:
-        problems.append(f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})")
-    return problems
+    return problems + seed_problems(seed)
 
 
 def _length(problems: list[str], name: str, text: str | None) -> float | None:

@@ -192,6 +192,13 @@ def _new_run(settings: RigConfig, out: OutFolder, save: SavePolicy, record: bool
     return Run(out, MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter), save, record=record)
 
 
+def seed_problems(seed: int) -> list[str]:
+    """What is wrong with a seed."""
+    if 0 <= seed <= MAX_SEED:
+        return []
+    return [f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})"]
+
+
 def _checked_policies(
     maps: int, seed: int, save: str, on_overload: str, others: Sequence[str] = ()
 ) -> "tuple[SavePolicy, Overload]":
@@ -201,8 +208,7 @@ def _checked_policies(
     problems = list(others)
     if maps < 1:
         problems.append(f"maps is {maps}; it must be at least 1")
-    if not 0 <= seed <= MAX_SEED:
-        problems.append(f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})")
+    problems += seed_problems(seed)
     policy, overload = SavePolicy(), Overload.ABORT
     try:
         policy = SavePolicy.parse(save)

@@ -18,13 +18,13 @@ from calibration.sensitivity import sensitivity
 from calibration.uncertainty import DepthUncertainty, depth_uncertainty
 from calibration.verdict import Asked, Verdict
 from calibration.views import View
-from rig.calibrating.planes_run import true_errors, truth_content
 from rig.calibrating.report import check_report
 from rig.calibrating.result import CalibrationResult
 from rig.calibrating.session import Session
 from rig.calibrating.showing import Ask, Tell, require_live
 from rig.calibrating.sources import Sources
 from rig.calibrating.taking import Live, Taken, good_poses, take_kept, take_live
+from rig.calibrating.truth import true_errors, truth_content
 from rig.calibration_identity import note_check
 from rig.errors import UsageError
 from rig.run import OutFolder, versions

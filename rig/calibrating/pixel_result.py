@@ -10,6 +10,7 @@ from calibration.pixel_drift import LEAST_ALIKE, MOST_NEW_DEFECTS, MOST_RATIO, P
 from calibration.pixel_files import PixelVersion
 from calibration.pixels import PixelMap, frames_for, hot_flux
 from calibration.verdict import Reason, Verdict
+from rig.calibrating.result import EXIT_NOT_TRUSTWORTHY
 
 MOST_LEAK: Final = 0.1
 """Correlation of neighbouring pixels' rates beyond which the lens was not covered; crosstalk makes 0.01."""
@@ -33,7 +34,7 @@ class PixelResult:
     @property
     def exit_code(self) -> int:
         """Of the command line: 1 where the map is not to be trusted, or the last one no more."""
-        return 0 if self.verdict.passed else 1
+        return 0 if self.verdict.passed else EXIT_NOT_TRUSTWORTHY
 
     def rows(self) -> list[tuple[str, str]]:
         """Figures for people, by name."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.against_truth import DepthErrors, depth_errors
+from calibration.against_truth import DepthErrors
 from calibration.board import Board
 from calibration.camera_files import KnownCamera, corners_digest
 from calibration.errors import CalibrationError, Degenerate
@@ -16,15 +16,15 @@ from calibration.rig_fit import RigFit, fit_rig
 from rig.calibrating.guided import Guide
 from rig.calibrating.refusing import refusal
 from rig.calibrating.report import planes_report
-from rig.calibrating.result import CalibrationResult, KnowsRig, named
+from rig.calibrating.result import CalibrationResult, named
 from rig.calibrating.session import Session
 from rig.calibrating.showing import Ask, Tell, require_live
 from rig.calibrating.sources import Sources
 from rig.calibrating.taking import Live, Taken, good_poses, take_kept, take_live
+from rig.calibrating.truth import true_errors, truth_content
 from rig.config import RigConfig
 from rig.errors import UsageError
 from rig.run import OutFolder, versions
-from rig.session import open_rig
 
 POSES = 12
 SPEEDS = (1.0, 0.3, 2.0)
@@ -143,33 +143,6 @@ def _signed(fit: RigFit, judged: Judged, identity: Identity | None) -> RigModel:
         "reasons": [str(reason) for reason in verdict.reasons],
     }
     return replace(fit.model, identity=identity, provenance=provenance)
-
-
-def true_model(live: RigConfig) -> RigModel | None:
-    """The rig as its world knows it; asked after everything was estimated."""
-    if live.world is None:
-        return None
-    with open_rig(live.model_copy(update={"calibration": None})) as rig:
-        return rig.world.true_model() if isinstance(rig.world, KnowsRig) else None
-
-
-def true_errors(model: RigModel, live: RigConfig, at_m: float) -> DepthErrors | None:
-    """How far depths are off, where the rig's world knows."""
-    truth = true_model(live)
-    if truth is None:
-        return None
-    speed = 0.0 if model.speed_range_per_s is None else float(np.mean(model.speed_range_per_s))
-    return depth_errors(model, truth, at_m, speed)
-
-
-def truth_content(errors: DepthErrors) -> dict[str, Any]:
-    """For programs."""
-    return {
-        "at_m": errors.depth_m,
-        "median_m": errors.median_m,
-        "worst_m": errors.worst_m,
-        "ratio_to_sd": errors.ratio,
-    }
 
 
 def _summary(fit: RigFit, judged: Judged, taken: Taken) -> dict[str, Any]:

@@ -20,13 +20,14 @@ from calibration.sync_verdict import judge_sync
 from calibration.verdict import Asked, Verdict
 from rig.calibrating.capture import capture_view
 from rig.calibrating.gate_times import GateDelay, gate_delay
-from rig.calibrating.planes_run import speeds_of, true_model
+from rig.calibrating.planes_run import speeds_of
 from rig.calibrating.report import sync_report
 from rig.calibrating.result import CalibrationResult
 from rig.calibrating.session import Session
 from rig.calibrating.showing import Tell
 from rig.calibrating.sources import Sources
 from rig.calibrating.taking import Taken, take_kept
+from rig.calibrating.truth import true_model
 from rig.config import RigConfig
 from rig.run import OutFolder, versions
 

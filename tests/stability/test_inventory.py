@@ -81,6 +81,7 @@ ELSEWHERE = {
     "poses to show next": ("tests/unit/calibration/test_guide.py", "calibration.guide:*"),
     "rates drawn from a measured distribution": (
         "tests/unit/calibration/test_pixels.py", "calibration.pixels:*", "calibration.dark_tally:*",
+        "calibration.robust:*",
     ),
     "words of a file": ("tests/unit/calibration/test_model_files.py", "calibration.yaml_file:*"),
     "rays and surfaces put together; their light in test_light.py": (
