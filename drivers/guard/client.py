@@ -91,6 +91,8 @@ class Guard:
             self._process = _start(theirs, self._heartbeat)
         self._seen = WatchedProcess(self._process.pid)
         self._channel = Channel(ours)
+        self._reader = threading.Thread(target=self._listen, name="guard listener", daemon=True)
+        self._reader.start()
         self._channel.send(
             {
                 "open": {slot: config.model_dump(mode="json") for slot, config in configs.items()},
@@ -98,11 +100,10 @@ class Guard:
                 "tap": None if tap is None else asdict(tap),
                 "limits": asdict(limits or GuardLimits()),
                 "pid": os.getpid(),
+                "listener": self._reader.native_id,
             },
             within_s=1.0,
         )
-        self._reader = threading.Thread(target=self._listen, name="guard listener", daemon=True)
-        self._reader.start()
 
     @property
     def laser(self) -> LineLaser:

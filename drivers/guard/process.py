@@ -114,7 +114,7 @@ class GuardProcess:
             self._request(message)
 
     def _open(self, message: Message) -> None:
-        self._application = WatchedProcess(message["pid"])
+        self._application = WatchedProcess(message["pid"], message["listener"])
         self._watch.limits = GuardLimits(**message["limits"])
         for slot, config in message["open"].items():
             try:

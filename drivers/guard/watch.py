@@ -38,7 +38,8 @@ class GuardLimits:
     first_wait_s: float = 0.3
     """The same before its first frame."""
     first_frame_s: float = 1.0
-    """From `run` to the first one: SPAD, scanner and the scan marker come in between."""
+    """From `run` to the first one: SPAD, scanner and the scan marker come in between. An application at work gets
+    `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""
 
 
 class FrameWatch:
@@ -92,10 +93,12 @@ class FrameWatch:
         self._silent_s += min(elapsed_s, MAX_STEP_S)
         limits = self.limits
         in_vain = waited_s > (limits.waits_within_s if self._begun else limits.first_wait_s)
-        if self._silent_s <= (limits.frames_within_s if self._begun or in_vain else limits.first_frame_s):
+        patience_s = limits.frames_within_s if self._begun or in_vain else limits.first_frame_s
+        if self._silent_s <= patience_s:
             return None
         if in_vain:
             return f"waited for the SPAD in vain for {self._silent_s * 1e3:.0f} ms after frame {frame}"
-        if self._begun and self._silent_s <= limits.busy_within_s and busy():
+        excused_s = limits.busy_within_s if self._begun else limits.first_frame_s + limits.busy_within_s
+        if self._silent_s <= excused_s and busy():
             return None
         return f"took no frame for {self._silent_s * 1e3:.0f} ms after frame {frame}"

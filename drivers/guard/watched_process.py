@@ -20,10 +20,15 @@ service thread for microseconds now and then."""
 
 
 class WatchedProcess:
-    """One process of this user. Its own pidfd is closed with `close`."""
+    """One process of this user. Its own pidfd is closed with `close`.
 
-    def __init__(self, pid: int) -> None:
+    idle_thread: number of a thread whose work is no sign of the process's, since it wakes by itself. On a machine with
+    too much to do it waits for a processor each time.
+    """
+
+    def __init__(self, pid: int, idle_thread: int | None = None) -> None:
         self._pid = pid
+        self._idle_thread = str(idle_thread)
         self._ended = False
         self._worked_ns = 0
         self._since = 0.0
@@ -65,10 +70,10 @@ class WatchedProcess:
         return any(_state(f"{task}/stat") in _AT_WORK for task in tasks)
 
     def _tasks(self) -> list[str]:
-        """Folders of its threads."""
+        """Folders of its threads, but for the one that does not count."""
         folder = f"/proc/{self._pid}/task"
         try:
-            return [f"{folder}/{task}" for task in os.listdir(folder)]
+            return [f"{folder}/{task}" for task in os.listdir(folder) if task != self._idle_thread]
         except OSError:
             return []
 

@@ -187,7 +187,7 @@ def test_without_a_running_program_no_frames_are_asked_for(rig: GuardedRig) -> N
 
 
 def test_no_first_frame_at_all_ends_the_light(rig: GuardedRig) -> None:
-    with guard_of(rig, GuardLimits(first_frame_s=0.1)) as guard:
+    with guard_of(rig, GuardLimits(first_frame_s=0.1, busy_within_s=0.05)) as guard:
         guard.laser.arm(POWER_W)
         guard.sync.program(SWEEP, 1000)
         guard.sync.run()

@@ -1,0 +1,61 @@
+"""Is another process at work? Asked of real processes."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from drivers.guard.watched_process import WatchedProcess
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
+
+SPINNING = """
+import threading, time
+def spin():
+    while True:
+        pass
+spinning = threading.Thread(target=spin, daemon=True)
+spinning.start()
+print(spinning.native_id, flush=True)
+time.sleep(60)
+"""
+ASLEEP = "import time; print(0, flush=True); time.sleep(60)"
+
+
+@contextmanager
+def running(program: str) -> Iterator[tuple[int, int]]:
+    """(process, number that it says)."""
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield process.pid, int(process.stdout.readline())
+        finally:
+            process.kill()
+
+
+def busy_looks(watched: WatchedProcess) -> int:
+    """Of 20 in a fifth of a second."""
+    watched.note_progress()
+    found = 0
+    for _ in range(20):
+        time.sleep(0.01)
+        found += watched.busy()
+    watched.close()
+    return found
+
+
+def test_a_process_that_computes_is_at_work_and_one_asleep_is_not() -> None:
+    with running(SPINNING) as (pid, _):
+        assert busy_looks(WatchedProcess(pid)) == 20
+    with running(ASLEEP) as (pid, _):
+        time.sleep(0.1)
+        assert busy_looks(WatchedProcess(pid)) <= 2
+
+
+def test_the_work_of_a_thread_that_wakes_by_itself_does_not_count() -> None:
+    with running(SPINNING) as (pid, thread):
+        time.sleep(0.2)
+        assert busy_looks(WatchedProcess(pid, thread)) <= 4  # the other one competes for the interpreter, once
