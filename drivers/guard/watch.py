@@ -20,14 +20,14 @@ MAX_STEP_S = 0.03
 
 @dataclass(frozen=True, slots=True)
 class GuardLimits:
-    """Longest times without a new frame number while the gate may open. Light is gone within 40 ms after them.
+    """Longest times without a new frame number while the gate may open. Light is gone within 50 ms after them.
 
     The defaults suit a stream with several blocks in 10 ms. A burst, which is silent until it is read out, and blocks
     that take longer need more: three times what passes between two blocks.
     """
 
-    frames_within_s: float = 0.06
-    """By an application that sleeps: with the look's 10 ms and the gate's 30 ms, 100 ms in all."""
+    frames_within_s: float = 0.05
+    """By an application that sleeps, as two looks say: with their 20 ms and the gate's 30 ms, 100 ms in all."""
     busy_within_s: float = 1.5
     """By one that computes or waits for a processor or a disk. With four times more work than processors a thread that
     only sleeps 1 ms was seen to wake 0.2 s late, one that shares its interpreter 0.35 s, and disks stall for a second:
@@ -51,6 +51,7 @@ class FrameWatch:
         self._begun = False
         self._last = 0
         self._silent_s = 0.0
+        self._found_asleep = False
 
     @property
     def watching(self) -> bool:
@@ -70,6 +71,7 @@ class FrameWatch:
     def start(self, frame: int) -> None:
         """The gate may open from now on; `frame` is the last number told before."""
         self._last, self._begun, self._silent_s, self._watching = frame, False, 0.0, True
+        self._found_asleep = False
 
     def stop(self) -> None:
         """The gate is low."""
@@ -80,15 +82,16 @@ class FrameWatch:
     ) -> str | None:
         """What is wrong with the application, `elapsed_s` after the last look; None: nothing that is known.
 
-        stopped: it is, while the laser may shine. busy: asked only in doubt, since it costs a look at every thread.
-        waited_s: for how long the SPAD has been asked in vain, as the source thread says.
+        stopped: it is, while the laser may shine. busy: asked only in doubt, since it costs a look at every thread;
+        asleep is what two looks in a row say. waited_s: for how long the SPAD has been asked in vain, as the source
+        thread says.
         """
         if stopped:
             return "is stopped"
         if not self._watching:
             return None
         if frame != self._last:
-            self._last, self._begun, self._silent_s = frame, True, 0.0
+            self._last, self._begun, self._silent_s, self._found_asleep = frame, True, 0.0, False
             return None
         self._silent_s += min(elapsed_s, MAX_STEP_S)
         limits = self.limits
@@ -99,6 +102,9 @@ class FrameWatch:
         if in_vain:
             return f"waited for the SPAD in vain for {self._silent_s * 1e3:.0f} ms after frame {frame}"
         excused_s = limits.busy_within_s if self._begun else limits.first_frame_s + limits.busy_within_s
-        if self._silent_s <= excused_s and busy():
-            return None
+        if self._silent_s <= excused_s:
+            # Threads are looked at one after the other, and work may pass from one not yet seen to one seen before.
+            asleep_before, self._found_asleep = self._found_asleep, not busy()
+            if not (asleep_before and self._found_asleep):
+                return None
         return f"took no frame for {self._silent_s * 1e3:.0f} ms after frame {frame}"

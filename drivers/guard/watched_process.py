@@ -30,7 +30,7 @@ class WatchedProcess:
         self._pid = pid
         self._idle_thread = str(idle_thread)
         self._ended = False
-        self._worked_ns = 0
+        self._worked_ns: dict[str, int] = {}
         self._since = 0.0
         self.handle: int | None = None
         """Readable once the process has ended; None where the kernel has no pidfd (before Linux 5.3)."""
@@ -58,13 +58,13 @@ class WatchedProcess:
 
     def note_progress(self) -> None:
         """Work is counted from now on."""
-        self._worked_ns = sum(_work_ns(task) for task in self._tasks())
+        self._worked_ns = {task: _work_ns(task) for task in self._tasks()}
         self._since = time.monotonic()
 
     def busy(self) -> bool:
         """Whether its threads have worked since `note_progress`, or would have if they could, or are about to."""
         tasks = self._tasks()
-        worked_s = 1e-9 * (sum(_work_ns(task) for task in tasks) - self._worked_ns)
+        worked_s = 1e-9 * sum(max(0, _work_ns(task) - self._worked_ns.get(task, 0)) for task in tasks)
         if worked_s > _BUSY_SHARE * (time.monotonic() - self._since):
             return True
         return any(_state(f"{task}/stat") in _AT_WORK for task in tasks)
