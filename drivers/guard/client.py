@@ -37,7 +37,7 @@ ANSWER_S = {"arm": 180.0, "program": 20.0}
 USUAL_ANSWER_S = 10.0
 LOWER_S = 5.0
 """Time for the rescue, where the guard is gone."""
-SILENCE_S = 1.0
+SILENCE_S = 2.0
 """A guard that gives no sign of life for so long, in time that this process was awake, hangs: it is ended..."""
 BUSY_SILENCE_S = 5.0
 """...or after this where it is at work or waits for a processor or a disk."""

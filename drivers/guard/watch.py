@@ -51,7 +51,6 @@ class FrameWatch:
         self._begun = False
         self._last = 0
         self._silent_s = 0.0
-        self._found_asleep = False
 
     @property
     def watching(self) -> bool:
@@ -71,7 +70,6 @@ class FrameWatch:
     def start(self, frame: int) -> None:
         """The gate may open from now on; `frame` is the last number told before."""
         self._last, self._begun, self._silent_s, self._watching = frame, False, 0.0, True
-        self._found_asleep = False
 
     def stop(self) -> None:
         """The gate is low."""
@@ -82,16 +80,15 @@ class FrameWatch:
     ) -> str | None:
         """What is wrong with the application, `elapsed_s` after the last look; None: nothing that is known.
 
-        stopped: it is, while the laser may shine. busy: asked only in doubt, since it costs a look at every thread;
-        asleep is what two looks in a row say. waited_s: for how long the SPAD has been asked in vain, as the source
-        thread says.
+        stopped: it is, while the laser may shine. busy: asked only in doubt, since it costs a look at every thread.
+        waited_s: for how long the SPAD has been asked in vain, as the source thread says.
         """
         if stopped:
             return "is stopped"
         if not self._watching:
             return None
         if frame != self._last:
-            self._last, self._begun, self._silent_s, self._found_asleep = frame, True, 0.0, False
+            self._last, self._begun, self._silent_s = frame, True, 0.0
             return None
         self._silent_s += min(elapsed_s, MAX_STEP_S)
         limits = self.limits
@@ -102,9 +99,6 @@ class FrameWatch:
         if in_vain:
             return f"waited for the SPAD in vain for {self._silent_s * 1e3:.0f} ms after frame {frame}"
         excused_s = limits.busy_within_s if self._begun else limits.first_frame_s + limits.busy_within_s
-        if self._silent_s <= excused_s:
-            # Threads are looked at one after the other, and work may pass from one not yet seen to one seen before.
-            asleep_before, self._found_asleep = self._found_asleep, not busy()
-            if not (asleep_before and self._found_asleep):
-                return None
+        if self._silent_s <= excused_s and busy():
+            return None
         return f"took no frame for {self._silent_s * 1e3:.0f} ms after frame {frame}"

@@ -32,6 +32,7 @@ class WatchedProcess:
         self._ended = False
         self._worked_ns: dict[str, int] = {}
         self._since = 0.0
+        self._found_asleep = False
         self.handle: int | None = None
         """Readable once the process has ended; None where the kernel has no pidfd (before Linux 5.3)."""
         if hasattr(os, "pidfd_open"):
@@ -60,14 +61,23 @@ class WatchedProcess:
         """Work is counted from now on."""
         self._worked_ns = {task: _work_ns(task) for task in self._tasks()}
         self._since = time.monotonic()
+        self._found_asleep = False
 
     def busy(self) -> bool:
-        """Whether its threads have worked since `note_progress`, or would have if they could, or are about to."""
+        """Whether its threads have worked since `note_progress`, or would have if they could, or are about to.
+
+        It takes two looks in a row to say no: threads are looked at one after the other, and work may pass from one
+        that was not yet looked at to one that was.
+        """
+        asleep_before, self._found_asleep = self._found_asleep, self._asleep()
+        return not (asleep_before and self._found_asleep)
+
+    def _asleep(self) -> bool:
         tasks = self._tasks()
         worked_s = 1e-9 * sum(max(0, _work_ns(task) - self._worked_ns.get(task, 0)) for task in tasks)
         if worked_s > _BUSY_SHARE * (time.monotonic() - self._since):
-            return True
-        return any(_state(f"{task}/stat") in _AT_WORK for task in tasks)
+            return False
+        return all(_state(f"{task}/stat") not in _AT_WORK for task in tasks)
 
     def _tasks(self) -> list[str]:
         """Folders of its threads, but for the one that does not count."""

@@ -59,3 +59,13 @@ def test_the_work_of_a_thread_that_wakes_by_itself_does_not_count() -> None:
     with running(SPINNING) as (pid, thread):
         time.sleep(0.2)
         assert busy_looks(WatchedProcess(pid, thread)) <= 4  # the other one competes for the interpreter, once
+
+
+def test_two_looks_in_a_row_have_to_find_it_asleep(monkeypatch: pytest.MonkeyPatch) -> None:
+    with running(ASLEEP) as (pid, _):
+        watched = WatchedProcess(pid)
+        watched.note_progress()
+        found = iter([True, False, True, True, True])
+        monkeypatch.setattr(WatchedProcess, "_asleep", lambda self: next(found))
+        assert [watched.busy() for _ in range(5)] == [True, True, True, False, False]
+        watched.close()
