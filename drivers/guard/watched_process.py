@@ -22,13 +22,13 @@ service thread for microseconds now and then."""
 class WatchedProcess:
     """One process of this user. Its own pidfd is closed with `close`.
 
-    idle_thread: number of a thread whose work is no sign of the process's, since it wakes by itself. On a machine with
-    too much to do it waits for a processor each time.
+    idle_thread: number of a thread that wakes by itself. On a machine with too much to do it waits for a processor each
+    time, which is no work of the process's; but while it does, others may wait for the interpreter that it holds.
     """
 
     def __init__(self, pid: int, idle_thread: int | None = None) -> None:
         self._pid = pid
-        self._idle_thread = str(idle_thread)
+        self._idle_task = f"/proc/{pid}/task/{idle_thread}"
         self._ended = False
         self._worked_ns: dict[str, int] = {}
         self._since = 0.0
@@ -74,16 +74,18 @@ class WatchedProcess:
 
     def _asleep(self) -> bool:
         tasks = self._tasks()
-        worked_s = 1e-9 * sum(max(0, _work_ns(task) - self._worked_ns.get(task, 0)) for task in tasks)
+        worked_s = 1e-9 * sum(
+            max(0, _work_ns(task) - self._worked_ns.get(task, 0)) for task in tasks if task != self._idle_task
+        )
         if worked_s > _BUSY_SHARE * (time.monotonic() - self._since):
             return False
         return all(_state(f"{task}/stat") not in _AT_WORK for task in tasks)
 
     def _tasks(self) -> list[str]:
-        """Folders of its threads, but for the one that does not count."""
+        """Folders of its threads."""
         folder = f"/proc/{self._pid}/task"
         try:
-            return [f"{folder}/{task}" for task in os.listdir(folder) if task != self._idle_thread]
+            return [f"{folder}/{task}" for task in os.listdir(folder)]
         except OSError:
             return []
 

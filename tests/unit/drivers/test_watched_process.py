@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 
+from drivers.guard import watched_process
 from drivers.guard.watched_process import WatchedProcess
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
@@ -55,10 +56,15 @@ def test_a_process_that_computes_is_at_work_and_one_asleep_is_not() -> None:
         assert busy_looks(WatchedProcess(pid)) <= 2
 
 
-def test_the_work_of_a_thread_that_wakes_by_itself_does_not_count() -> None:
+def test_what_a_thread_that_wakes_by_itself_did_does_not_count_but_that_it_is_at_work_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At work it may hold the interpreter for which the others wait."""
     with running(SPINNING) as (pid, thread):
-        time.sleep(0.2)
-        assert busy_looks(WatchedProcess(pid, thread)) <= 4  # the other one competes for the interpreter, once
+        assert busy_looks(WatchedProcess(pid, thread)) == 20
+        monkeypatch.setattr(watched_process, "_AT_WORK", ())
+        assert busy_looks(WatchedProcess(pid)) == 20
+        assert busy_looks(WatchedProcess(pid, thread)) <= 4
 
 
 def test_two_looks_in_a_row_have_to_find_it_asleep(monkeypatch: pytest.MonkeyPatch) -> None:
