@@ -46,7 +46,7 @@ def depth_errors(model: RigModel, truth: RigModel, depth_m: float, velocity_per_
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, _GRID), np.linspace(0, camera.height - 1, _GRID))
     mirror = command_at(truth, x, y, depth_m)
     lag_s = truth.lag_s.backward if velocity_per_s < 0 else truth.lag_s.forward
-    commanded = mirror + velocity_per_s * (lag_s + truth.row_delay_s * y)
+    commanded = mirror + velocity_per_s * (lag_s - truth.row_delay_s * y)
     found = model.mirror_command(commanded, y, velocity_per_s)
     low, high = model.scanner.command_range
     lit = np.isfinite(found) & (found >= low) & (found <= high)

@@ -15,12 +15,13 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from calibration.board_file import BoardFile
 from calibration.errors import CalibrationError
+from calibration.file_sections import explain
+from calibration.yaml_file import read_yaml
 
 Array = NDArray[np.float64]
 
@@ -158,18 +159,11 @@ class Board:
 def load_board(path: str | os.PathLike[str] = BUNDLED_BOARD) -> Board:
     """The board that a YAML file describes. Raises CalibrationError, one line, where it describes none."""
     file = Path(path)
-    try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationError(f"cannot read board {file}: {error.strerror or error}; check the path") from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise CalibrationError(f"board {file} is not YAML; write it like {BUNDLED_BOARD.name}") from error
-    if not isinstance(content, Mapping):
-        raise CalibrationError(f"board {file} must hold keys and values, like {BUNDLED_BOARD.name}")
+    content = read_yaml(file, "a board")
     try:
         return parse_board(content)
     except CalibrationError as error:
-        raise CalibrationError(f"board {file}: {error}") from error
+        raise CalibrationError(f"{file}: {error}") from error
 
 
 def parse_board(content: Mapping[str, Any]) -> Board:
@@ -177,18 +171,8 @@ def parse_board(content: Mapping[str, Any]) -> Board:
     try:
         parsed = BoardFile.model_validate(dict(content))
     except ValidationError as error:
-        raise CalibrationError("; ".join(_said(problem) for problem in error.errors())) from error
+        raise CalibrationError(explain(error)) from error
     return Board(parsed.kind, parsed.squares, parsed.square, parsed.marker, parsed.dictionary)
-
-
-def _said(problem: Any) -> str:
-    key = ".".join(map(str, problem["loc"]))
-    if problem["type"] == "extra_forbidden":
-        return f"unknown key '{key}'; remove it or correct its spelling"
-    if problem["type"] == "missing":
-        return f"'{key}' is missing"
-    said = problem["ctx"]["error"] if problem["type"] == "value_error" else f"is {problem['input']!r}: {problem['msg']}"
-    return f"{key} {said}"
 
 
 def _dictionary(name: str) -> cv2.aruco.Dictionary:

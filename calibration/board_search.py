@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board import Board
+from calibration.marker_layout import Markers
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -30,7 +31,7 @@ class Sighting:
     """Points of the board (n, 2) in metres and where they are seen, (n, 2) raw pixels, about half a pixel.
 
     count: markers or corners read. chessboards: how many are in the picture. part: inner corners of a chessboard that
-    is smaller than the board.
+    is smaller than the board. markers: all that were read, the board's and others.
     """
 
     points_m: Array
@@ -39,6 +40,7 @@ class Sighting:
     mirrored: bool = False
     chessboards: int = 1
     part: tuple[int, int] | None = None
+    markers: Markers | None = None
 
     def square_px(self, board: Board) -> float:
         """Side of a square, from the points' spread."""
@@ -100,14 +102,18 @@ def _most_markers(shown: Gray, board: Board) -> Sighting:
         for marker, points in zip(np.ravel(charuco.getIds()), charuco.getObjPoints(), strict=True)
     }
     detector = cv2.aruco.ArucoDetector(charuco.getDictionary())
-    best = Sighting(np.zeros((0, 2)), np.zeros((0, 2)), 0)
+    best, most = Sighting(np.zeros((0, 2)), np.zeros((0, 2)), 0), (0, 0)
     for scale, smooth in _FORMS:
-        corners, ids, _ = detector.detectMarkers(_form(shown, scale, smooth))
-        known = [] if ids is None else [i for i, marker in enumerate(ids.ravel()) if int(marker) in places]
-        if len(known) > best.count:
-            px = np.concatenate([corners[i].reshape(4, 2) for i in known]).astype(np.float64)
-            points = np.concatenate([places[int(ids.ravel()[i])] for i in known]).astype(np.float64)
-            best = Sighting(points, (px + 0.5) / scale - 0.5, len(known))
+        corners, found, _ = detector.detectMarkers(_form(shown, scale, smooth))
+        if found is None:
+            continue
+        ids = found.ravel().astype(np.int64)
+        px = (np.array(corners, np.float64).reshape(-1, 4, 2) + 0.5) / scale - 0.5
+        known = np.isin(ids, list(places))
+        if (int(known.sum()), len(ids)) > most:
+            most = int(known.sum()), len(ids)
+            points = np.array([places[marker] for marker in ids[known].tolist()]).reshape(-1, 2)
+            best = Sighting(points, px[known].reshape(-1, 2), most[0], markers=Markers(ids, px))
         if best.count >= _ENOUGH * len(places):
             break
     return best

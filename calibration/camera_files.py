@@ -23,6 +23,8 @@ from calibration.yaml_file import read_yaml_file
 
 CAMERA_FORMAT = "spadrig-camera"
 CAMERA_VERSION = 1
+CORNERS = "corners"
+"""In the provenance of a rig's calibration: digests of the views it was made of, those of its camera too."""
 
 
 class _CovarianceRows(Section):

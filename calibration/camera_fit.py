@@ -45,7 +45,7 @@ _MAX_ROUNDS = 20
 class CameraFit:
     """A camera and what it was made from. Sequences run over the views that have corners, named in `views`.
 
-    residual_px: (n, 2) float64 seen minus projected, of every corner. used: (n,) bool, those in the fit. rms_px: of
+    residual_px: (n, 2) float64 projected less seen, of every corner. used: (n,) bool, those in the fit. rms_px: of
     those, of the distance. outliers: names of the views that do not fit, wholly or in more than one corner. condition:
     of the normal equations at unit diagonal. coverage: of the views that are in the fit.
     """
@@ -147,10 +147,9 @@ def _without_outliers(problem: Problem, solution: Solution, used: list[Mask]) ->
 
 
 def _relative_sds(corners: Sequence[Corners]) -> list[Array]:
-    """(n, 1) of every view: its corners' sds against the usual one; 1 where they are not known."""
-    known = [found.sd_px for found in corners if found.sd_px is not None]
-    usual = float(np.median(np.concatenate(known))) if known else 1.0
-    sds = [np.full(len(found.ids), usual) if found.sd_px is None else found.sd_px for found in corners]
+    """(n, 1) of every view: its corners' sds against the usual one."""
+    sds = [found.likely_sd_px for found in corners]
+    usual = float(np.median(np.concatenate(sds)))
     return [(sd / usual)[:, None] for sd in sds]
 
 

@@ -5,8 +5,7 @@ error of a pixel is what is left of J C J' when the best common rotation of all 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import isfinite
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +14,10 @@ from calibration.board import Board
 from calibration.camera import Camera
 from calibration.camera_fit import CameraFit
 from calibration.covariance import Covariance
+from calibration.data_lack import data_lack
 from calibration.evidence import pose_evidence, view_evidence
 from calibration.parameters import DISTORTION, MATRIX
-from calibration.verdict import WORST_TIMES, Reason, Verdict, data_lack
+from calibration.verdict import WORST_TIMES, Verdict, more_poses
 from calibration.views import View
 
 Array = NDArray[np.float64]
@@ -50,9 +50,8 @@ def judge_camera(fit: CameraFit, views: Sequence[View], board: Board, *, photons
     evidence = view_evidence(views, (camera.width, camera.height))
     reasons = data_lack(evidence, pose_evidence(fit.poses, board), imprecise=imprecise, photons=photons)
     if imprecise and not reasons:
-        needed = np.ceil(len(fit.views) * (median / ACCURACY_PX) ** 2) if isfinite(median) else np.nan
-        text = f"rays are known to {median:.2g} px, {ACCURACY_PX:g} are asked for: about {needed:.0f} poses would do"
-        reasons = [Reason("too-few-poses", text, len(fit.views), float(needed), "show the board in more poses")]
+        too_few = more_poses(len(fit.views), "rays are known to", (median, worst), ACCURACY_PX, "{:.2g} px".format)
+        reasons = [replace(too_few, next_step="show the board in more poses")]
     return JudgedCamera(Verdict(not reasons, tuple(reasons)), median, worst)
 
 

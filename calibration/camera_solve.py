@@ -43,7 +43,7 @@ _FLAGS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """A camera, and of every view the pose and the residuals (n, 2), seen minus projected."""
+    """A camera, and of every view the pose and the residuals (n, 2), projected less seen."""
 
     matrix: Array
     distortion: Array
@@ -153,7 +153,7 @@ class Problem:
 
     def _residual(self, view: int, matrix: Array, distortion: Array, pose: BoardPose) -> Array:
         expected, _ = cv2.projectPoints(self.points_m(view), pose.rotation, pose.position_m, matrix, distortion)
-        return np.asarray(self.corners[view].px - expected.reshape(-1, 2), np.float64)
+        return np.asarray(expected.reshape(-1, 2) - self.corners[view].px, np.float64)
 
     def _normal(self, used: Sequence[Mask], solution: Solution) -> Normal:
         kept = [i for i, mask in enumerate(used) if mask.any()]

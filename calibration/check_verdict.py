@@ -35,7 +35,7 @@ def judge_check(
                 f"the angle between the boards is scanned as {math.degrees(angle.angle_rad):.2f} degrees, stated are "
                 f"{math.degrees(stated_angle_rad):.2f}; the limit is {math.degrees(limit):.2f} off"
             )
-            found.append(Reason("wrong-angle", text, error, limit, _AGAIN))
+            found.append(Reason("wrong-angle", text, error, limit, f"measure the angle once more, then {_AGAIN}"))
     return Verdict(not found, tuple(found))
 
 

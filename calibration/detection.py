@@ -2,8 +2,10 @@
 
 OpenCV finds the markers, or the chessboard, in the picture as it is, enlarged and smoothed, whichever shows most; a
 smooth map through them says where all corners are, and each is then fitted on its own (corner_registration.py). What
-cannot be used is refused with the reason: no board, half of one, its mirror image, two of them.
+cannot be used is refused with the reason: no board, another one, half of one, its mirror image, two of them.
 """
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ from calibration.board_search import Sighting, find_chessboard, find_markers, gr
 from calibration.corner_registration import OWN, SUBPIXELS, WIDE, register, sides_px
 from calibration.errors import Degenerate
 from calibration.hot_pixels import repaired
+from calibration.marker_layout import contradiction
 from calibration.views import Corners
 
 Array = NDArray[np.float64]
@@ -38,12 +41,15 @@ _LEAST_OUTLIER_SQUARES = 0.02
 def find_corners(picture: NDArray[np.generic], board: Board, defects: NDArray[np.bool_] | None = None) -> Corners:
     """The board's corners in a picture (height, width), float or uint8; defects: (height, width), True = unusable.
 
-    Raises Degenerate: no-board, board-half-out, mirrored, two-boards. A chessboard shows that it is mirrored only with
-    an even number of squares along both sides, and not the same number. About 0.2 s for 48 corners.
+    Raises Degenerate: no-board, wrong-board, board-half-out, mirrored, two-boards. A chessboard shows that it is
+    mirrored only with an even number of squares along both sides, and not the same number. About 0.2 s for 48 corners.
     """
     values = repaired(picture, defects)
     shown = gray(values)
     sighting = find_chessboard(shown, board) if board.kind == "chessboard" else find_markers(shown, board)
+    wrong = None if sighting.markers is None else contradiction(sighting.markers, board, shown)
+    if wrong is not None:
+        raise _wrong(wrong)
     board_map = _map_of(sighting, board)
     if sighting.chessboards > 1 or (board_map is not None and _another(sighting, board)):
         raise Degenerate(
@@ -123,15 +129,26 @@ def _close_to(known_m: Array, board: Board) -> NDArray[np.int32]:
     return np.flatnonzero(away <= _GROWTH_SQUARES * board.square_m).astype(np.int32)
 
 
+def _wrong(how: str) -> Degenerate:
+    return Degenerate(
+        "wrong-board",
+        f"the picture shows another board than the one looked for: {how}; name the board that is shown (--board), or "
+        "print that one",
+    )
+
+
 def _not_found(sighting: Sighting, board: Board) -> Degenerate:
     whole = len(board.charuco().getIds()) if board.kind == "charuco" else len(board.corners_m)
     what = "markers" if board.kind == "charuco" else "corners"
     if sighting.part is not None:
-        across, down = sighting.part
+        seen, whole_grid = sorted(sighting.part), sorted(board.grid)
+        shows = f"{seen[1]} x {seen[0]}", f"{whole_grid[1]} x {whole_grid[0]} corners"
+        if seen[0] > whole_grid[0] or seen[1] > whole_grid[1]:
+            return _wrong(f"a chessboard of {shows[0]}, not {shows[1]}")
         return Degenerate(
             "board-half-out",
-            f"the picture shows {across} x {down} of the chessboard's {board.grid[0]} x {board.grid[1]} corners; all "
-            "of them must be in it, with white around: move the board in, or print one with markers",
+            f"the picture shows {shows[0]} of the chessboard's {shows[1]}; all of them must be in it, with white "
+            "around: move the board in, name the board that is shown (--board), or print one with markers",
         )
     return Degenerate(
         "no-board",
@@ -141,7 +158,8 @@ def _not_found(sighting: Sighting, board: Board) -> Degenerate:
 
 
 def _too_few(found: int, board: Board, board_map: BoardMap, shape: tuple[int, ...]) -> Degenerate:
-    expected = board_map.to_px(board.corners_m[:, :2])
+    # Without the bend, which grows without limit beyond the points that it goes through.
+    expected = replace(board_map, bend_px=np.zeros_like(board_map.bend_px)).to_px(board.corners_m[:, :2])
     height, width = shape
     beyond = {
         "left": expected[:, 0] < 0,

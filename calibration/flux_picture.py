@@ -17,26 +17,24 @@ LEFT_OUT = 10
 """Columns on either side of the line's brightest, and at most the following share of all."""
 MOST_LEFT_OUT = 1 / 12
 LEAST_COUNTS = 30.0
-"""Detections per pixel, dark counts taken off, that make a picture: the median over its brighter half."""
+"""Detections per pixel that make a picture: the median over its brighter half."""
 
 
-def flux_picture(sweeps: tuple[SweepCounts, ...], dark_flux: NDArray[np.floating] | None = None) -> NDArray[np.float32]:
+def flux_picture(sweeps: tuple[SweepCounts, ...]) -> NDArray[np.float32]:
     """Flux (rows, width) of the lit frames of sweeps over the same scene, float32, NaN where no window ever was.
 
-    dark_flux: (rows, width), what a pixel counts in a frame without any light; None: not known, and left in.
+    What a pixel counts in the dark is left in.
     """
     off = [_off_the_line(sweep) for sweep in sweeps]
     ones: Array = np.sum([part[0] for part in off], axis=0)
     frames: Array = np.sum([part[1] for part in off], axis=0)
-    dark = np.zeros(ones.shape) if dark_flux is None else np.asarray(dark_flux, np.float64)
-    own = ones - dark * frames
     with np.errstate(invalid="ignore", divide="ignore"):
-        if float(np.median(own[own >= np.median(own)])) >= LEAST_COUNTS:
+        if float(np.median(ones[ones >= np.median(ones)])) >= LEAST_COUNTS:
             flux: Array = -np.log1p(-np.minimum(ones, frames - 0.5) / frames)
         else:
             parts = [_by_column(sweep) for sweep in sweeps]
             flux = np.sum([part[0] for part in parts], axis=0) / np.sum([part[1] for part in parts], axis=0)
-        picture: NDArray[np.float32] = np.where(np.isfinite(flux), flux - dark, np.nan).astype(np.float32)
+        picture: NDArray[np.float32] = np.where(np.isfinite(flux), flux, np.nan).astype(np.float32)
     return picture
 
 

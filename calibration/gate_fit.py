@@ -1,11 +1,19 @@
 """When the laser's light begins or ends, from the ones of the frames around that moment.
 
-    ones of frame i = level + slope i + brightness * share of the exposure that was lit
+    ones of frame i = level + slope i + brightness r(share of the exposure that was lit),     r(0) = 0, r(1) = 1
 
-For every moment t the three linear terms follow by least squares; the best t explains most, and its standard deviation
-is where chi squared rises by one. Ones scatter like photons, or more where the fit says so.
+One frame at most is lit in part. All others give level, slope and brightness by least squares, and so how bright that
+one is, r, with its standard deviation. A pixel that fires with probability p when lit whole has
+1 - (1 - p)^s = s p + s (1 - s) / 2 p^2 + ..., whose coefficients are all positive and sum to 1. With m the mean of p
+over the ones (sum of p^2 over sum of p) the response of a share s is therefore known within
+
+    s + s (1 - s) m / 2 <= r(s) <= s + (1 - s) m
+
+Of a weak line that is s; of one that saturates next to nothing is known within a frame, and edges that lie elsewhere
+within theirs have to tell. Ones scatter like photons, or more where the fit says so.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,44 +21,92 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-STEPS = 32
-"""Moments tried per frame."""
 SPARE_FRAMES = 2
 """Frames at either end between which the edge is looked for."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """time_s: of the edge, on the clock of the frames; sd_s: of that. brightness: ones that a lit frame has more."""
+    """chi2: (times,) of the edge at each of the moments. brightness: ones that a lit frame has more; its sd.
 
-    time_s: float
-    sd_s: float
+    scatter: variance of the ones around the fit in units of that of photons; chi2 and the sd have it in them.
+    """
+
+    chi2: Array
     brightness: float
     brightness_sd: float
+    scatter: float = 1.0
 
 
-def fit_edge(ones: Array, start_s: Array, exposure_s: float, *, rises: bool) -> Edge:
-    """The moment within some frames at which light begins (rises) or ends.
+def fit_edge(
+    ones: Array, start_s: Array, exposure_s: float, times_s: Array, *, rises: bool, saturation: float = 0.0
+) -> Edge:
+    """How well light that begins (rises) or ends at each of the moments (times,), ascending, explains some frames.
 
-    ones, start_s: (frames,), 1s of each and when its exposure began. At least 8 frames.
+    ones, start_s: (frames,), 1s of each and when its exposure began, at least 8 frames. saturation: m above. Moments
+    within two frames of either end are taken to be impossible.
     """
-    first, last = start_s[SPARE_FRAMES], start_s[-SPARE_FRAMES - 1] + exposure_s
-    times = np.linspace(first, last, max(3, round(STEPS * (last - first) / exposure_s)))
-    share = np.clip((start_s + exposure_s - times[:, None]) / exposure_s, 0, 1)
-    share = share if rises else 1 - share
-    frame = np.linspace(-1, 1, len(ones))
-    fixed = np.stack([np.ones(len(ones)), frame])
     weight = 1 / max(float(ones.mean()), 1.0)
-    # What the two terms that are there for every moment explain is taken out of ones and shares.
-    own = ones - fixed.T @ np.linalg.lstsq(fixed.T, ones, rcond=None)[0]
-    shares = share - share @ np.linalg.pinv(fixed) @ fixed
-    norm = np.maximum((shares**2).sum(axis=1), 1e-12)
-    brightness = shares @ own / norm
-    chi2 = weight * ((own**2).sum() - np.maximum(brightness, 0) ** 2 * norm)
-    best = int(np.argmin(chi2))
-    scatter = max(float(chi2[best]) / (len(ones) - 4), 1.0)
-    likely = np.exp(-0.5 * (chi2 - chi2[best]) / scatter)
+    first, last = np.searchsorted(start_s, times_s[[0, -1]], side="right") - 1
+    tries = range(max(first, SPARE_FRAMES), min(last + 1, len(ones) - SPARE_FRAMES))
+    steps = {part: _Step.fitted(ones, part, weight, rises=rises) for part in tries}
+    best = min(steps.values(), key=lambda step: step.chi2)
+    scatter = max(best.chi2 / (len(ones) - 5), 1.0)
+    chi2 = np.full(len(times_s), np.inf)
+    for part, step in steps.items():
+        end_s = start_s[part + 1]  # without light between exposures one moment is as good as another
+        here = (times_s >= start_s[part]) & (times_s < end_s)
+        share = np.clip((start_s[part] + exposure_s - times_s[here]) / exposure_s, 0, 1)
+        share = share if rises else 1 - share
+        least = share + share * (1 - share) * saturation / 2
+        most = share + (1 - share) * saturation * (share > 0)
+        off = np.maximum(least - step.response, 0) + np.maximum(step.response - most, 0)
+        chi2[here] = step.chi2 + (off / step.response_sd) ** 2 if step.brightness > 0 else _NO_LIGHT
+    return Edge(chi2 / scatter, best.brightness, best.brightness_sd * np.sqrt(scatter), scatter)
+
+
+def edge_time(edges: Sequence[Edge], times_s: Array) -> tuple[float, float]:
+    """The moment (s) that all edges share and its standard deviation; times_s: (times,), even, of what they tell.
+
+    Where they contradict each other all are worth so much less.
+    """
+    chi2 = np.sum([edge.chi2 for edge in edges], axis=0)
+    apart = (chi2.min() - sum(edge.chi2.min() for edge in edges)) / max(len(edges) - 1, 1)
+    likely = np.exp(-0.5 * (chi2 - chi2.min()) / max(apart, 1.0))
     likely /= likely.sum()
-    time_s = float((likely * times).sum())
-    sd_s = float(np.sqrt((likely * (times - time_s) ** 2).sum() + (times[1] - times[0]) ** 2 / 12))
-    return Edge(time_s, sd_s, float(brightness[best]), float(np.sqrt(scatter / weight / norm[best])))
+    time_s = float((likely * times_s).sum())
+    step_s = float(times_s[1] - times_s[0])
+    return time_s, float(np.sqrt((likely * (times_s - time_s) ** 2).sum() + step_s**2 / 12))
+
+
+_NO_LIGHT = 1e9
+"""Chi squared of light that takes ones away."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """The fit without the frame that is lit in part. response: r of that one."""
+
+    chi2: float
+    brightness: float
+    brightness_sd: float
+    response: float
+    response_sd: float
+
+    @classmethod
+    def fitted(cls, ones: Array, part: int, weight: float, *, rises: bool) -> "_Step":
+        frame = np.arange(len(ones))
+        lit = (frame > part) if rises else (frame < part)
+        terms = np.stack([np.ones(len(ones)), np.linspace(-1, 1, len(ones)), lit], axis=-1)
+        others = frame != part
+        inverse = np.linalg.inv(terms[others].T @ terms[others])
+        found = inverse @ terms[others].T @ ones[others]
+        chi2 = weight * float(((ones[others] - terms[others] @ found) ** 2).sum())
+        sd = np.sqrt(np.diag(inverse) / weight)
+        brightness = max(float(found[2]), 1e-9)
+        at = terms[part].copy()
+        at[2] = 0
+        more = float(ones[part] - at @ found)
+        at[2] = more / brightness  # its noise is its own, that of the level below it and that of the light
+        spread = float(np.sqrt((1 + at @ inverse @ at) / weight))
+        return cls(chi2, float(found[2]), float(sd[2]), more / brightness, spread / brightness)

@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 PLACES = 14
 """Along either side of the board, where passages are looked at; each stands for as many as there will be."""
+_CELLS = (9, 7)
+"""Of the picture, across and down, in whose middles the depth error is looked at."""
 BORDER_PX = 2.0
 """Corners nearer to the picture's border are not found."""
 
@@ -36,13 +38,13 @@ class Forecast:
     def __init__(self, fit: RigFit, at_m: float) -> None:
         """Of a fit, for a depth."""
         self._fit = fit
-        self._terms = Terms(sum(name in Terms(12).camera[4:] for group in fit.free for name in group))
+        self._terms = Terms(fit.model.camera.distortion.size)
         self._tie = np.zeros((len(self._terms.names), len(fit.free)))
         for column, group in enumerate(fit.free):
             self._tie[self._terms.at(group), column] = 1.0
         self._jacobian = _depth_by_free(fit, at_m)
         sweeps = [sweep for view in fit.sweeps for sweep in view]
-        self._velocities = sorted({sweep.direction * sweep.speed_per_s for sweep in sweeps})
+        self._velocities = _next_velocities(fit)
         self._sd = float(np.median(np.concatenate([sweep.sd for sweep in sweeps])))
         self._count = float(np.median([sweep.sd.size for sweep in sweeps]))
         self.now_m = self._expected(fit.information)
@@ -96,11 +98,18 @@ class Forecast:
             corner_scale=np.ones(int(found.sum())),
             x_px=np.tile(px[lit], repeats),
             y_px=row_y,
-            command=np.tile(mirror[lit], repeats) + velocity * (lag + model.row_delay_s * row_y),
+            command=np.tile(mirror[lit], repeats) + velocity * (lag - model.row_delay_s * row_y),
             sd=np.full(velocity.size, self._sd),
             velocity_per_s=velocity,
             starts=np.arange(repeats + 1) * lit.size if lit.size else np.zeros(1, np.int64),
         )
+
+
+def _next_velocities(fit: RigFit) -> tuple[float, ...]:
+    """At which the next pose will be swept: poses take turns at the speeds, so as the one that had its turn first."""
+    shown = [tuple(sweep.direction * sweep.speed_per_s for sweep in view) for view in fit.sweeps if view]
+    last = {velocities: turn for turn, velocities in enumerate(shown)}
+    return min(last, key=lambda velocities: last[velocities])
 
 
 def _inside(model: RigModel, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -118,7 +127,8 @@ def _depth_by_free(fit: RigFit, at_m: float) -> Array:
     if model.covariance is None:
         raise CalibrationError("the fit has no covariance; fit the rig again")
     names = model.covariance.names
-    x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * model.camera.width, np.linspace(0.1, 0.9, 5) * model.camera.height)
+    across, down = ((np.arange(n) + 0.5) / n for n in _CELLS)
+    x, y = np.meshgrid(across * model.camera.width - 0.5, down * model.camera.height - 0.5)
     command = command_at(model, x, y, at_m)
     velocity = max((sweep.speed_per_s for view in fit.sweeps for sweep in view), default=0.0)
     by_name = depth_jacobian(model, x, y, command, velocity)

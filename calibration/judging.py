@@ -9,14 +9,16 @@ import numpy as np
 from calibration.board import Board
 from calibration.errors import Degenerate
 from calibration.evidence import baseline_m, pose_evidence, rough_poses, view_evidence
+from calibration.fit_verdict import FitEvidence, judge, judge_refusal
 from calibration.guide import rough_camera
+from calibration.lag_speeds import SWEPT
 from calibration.model import RigModel
 from calibration.propagation import propagated
 from calibration.rig_fit import RigFit
 from calibration.sensitivity import Sensitivity, sensitivity
 from calibration.sweep_waves import SweepResidual, SweepWaves, sweep_waves
 from calibration.uncertainty import DepthUncertainty, depth_uncertainty
-from calibration.verdict import Asked, FitEvidence, Verdict, judge, judge_refusal
+from calibration.verdict import Asked, Verdict
 from calibration.view_shifts import ViewShift, common_shift, counted, last_before_move, view_shifts
 from calibration.views import View
 
@@ -48,7 +50,10 @@ def judge_fit(
     accuracy_m: float | None = None,
     stated_baseline_m: float | None = None,
 ) -> Judged:
-    """Judge a fit of `views`. accuracy_m: sd of depth at `at_m` that is good enough; None: that of ACCURACY_PX."""
+    """Judge a fit of `views`. accuracy_m: sd of depth at `at_m` that is good enough; None: that of ACCURACY_PX.
+
+    Raises CalibrationError where the line does not reach that distance.
+    """
     model = fit.model
     worth = sensitivity(model, at_m)
     asked = Asked(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
@@ -75,6 +80,7 @@ def judge_fit(
         misfit=fit.misfit,
         baseline_m=baseline,
         baseline_sd_m=baseline_sd,
+        velocities_per_s=tuple(model.provenance[SWEPT]),
     )
     seen = view_evidence(views, (model.camera.width, model.camera.height))
     return Judged(judge(seen, evidence, asked), asked, evidence, waves, residuals, shifts, uncertainty, worth)

@@ -106,12 +106,13 @@ class RigModel:
     def mirror_command(self, commands: ArrayLike, y_px: ArrayLike, velocity_per_s: ArrayLike) -> Array:
         """Where the mirror stands when row y sees the light, on the command's scale, for what is commanded then.
 
-        velocity_per_s: of the command, positive where it rises; the lag is that of its direction. All broadcast.
+        'Then' is when the first row is exposed; a later row sees the mirror farther on. velocity_per_s: of the
+        command, positive where it rises; the lag is that of its direction. All broadcast.
         """
         velocity = np.asarray(velocity_per_s, np.float64)
         lag_s = np.where(velocity < 0, self.lag_s.backward, self.lag_s.forward)
         result: Array = np.asarray(commands, np.float64) - velocity * (
-            lag_s + self.row_delay_s * np.asarray(y_px, np.float64)
+            lag_s - self.row_delay_s * np.asarray(y_px, np.float64)
         )
         return result
 
@@ -137,15 +138,18 @@ class RigModel:
     def fingerprint(self) -> str:
         """Sixteen hexadecimal digits that change with any number the depth depends on."""
         low, high = self.scanner.command_range
+        commands = getattr(self.scanner, "command", np.linspace(low, high, 33))
         digest = hashlib.sha256()
         parts: tuple[ArrayLike, ...] = (
             [self.camera.width, self.camera.height],
             self.camera.matrix,
             self.camera.distortion,
             [low, high, *self.lag_s],
-            self.scanner.planes(getattr(self.scanner, "command", np.linspace(low, high, 33))),
+            self.scanner.planes(commands),
             [] if self.defects is None else np.flatnonzero(self.defects),
         )
+        if not np.array_equal(commands, np.linspace(low, high, len(commands))):
+            parts += (commands,)
         bow_per_rad = getattr(self.scanner, "bow_per_rad", 0.0)
         if bow_per_rad:
             parts += ([bow_per_rad, *fan_origin(self.scanner, self.source_m)],)

@@ -7,36 +7,38 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.model import RigModel
-from calibration.parameters import with_parameters
+from calibration.parameters import MATRIX, TIMES, with_parameters
 
 Array = NDArray[np.float64]
 
-_STEP_SD = 0.1
-"""Of each parameter, its own standard deviations: small against what bends, large against rounding."""
+_STEPS = dict.fromkeys(MATRIX, 1e-3) | dict.fromkeys(TIMES, 1e-9) | {"row_delay": 1e-12}
+_STEP = 1e-6
+"""Of each parameter, in its own unit: small against what bends, large against rounding."""
 
 
 def propagated(model: RigModel, measure: Callable[[RigModel], Array]) -> tuple[Array, Array]:
     """measure(model) (n,) and its covariance (n, n), to first order; of zeros for a model without a covariance."""
     values = np.atleast_1d(measure(model)).astype(np.float64)
-    known = model.covariance
-    if known is None:
+    if model.covariance is None:
         return values, np.zeros((values.size, values.size))
-    slopes = np.zeros((values.size, len(known.names)))
-    steps = _STEP_SD * np.sqrt(np.diag(known.matrix))
-    for i, (name, step) in enumerate(zip(known.names, steps, strict=True)):
-        if step > 0:
-            (above, up), (below, down) = (_changed(model, measure, name, sign * step, values) for sign in (1, -1))
-            slopes[:, i] = (up - down) / (above - below)
-    covariance: Array = slopes @ known.matrix @ slopes.T
+    slopes = by_parameter(model, model.covariance.names, lambda tried: np.atleast_1d(measure(tried)))
+    covariance: Array = slopes @ model.covariance.matrix @ slopes.T
     return values, covariance
 
 
-def _changed(
-    model: RigModel, measure: Callable[[RigModel], Array], name: str, step: float, values: Array
-) -> tuple[float, Array]:
-    """The step taken and what is measured then; no step where a parameter is at its bound, as a lag of 0 s."""
+def by_parameter(model: RigModel, names: tuple[str, ...], measure: Callable[[RigModel], Array]) -> Array:
+    """(n, p): how measure(model) (n,) changes with the parameters `names`, by differences."""
+    slopes = np.empty((measure(model).size, len(names)))
+    for i, name in enumerate(names):
+        step = _STEPS.get(name, _STEP)
+        (above, more), (below, less) = (_changed(model, name, sign * step) for sign in (1, -1))
+        slopes[:, i] = (measure(more) - measure(less)) / (above - below)
+    return slopes
+
+
+def _changed(model: RigModel, name: str, step: float) -> tuple[float, RigModel]:
+    """The step taken and the model then; no step where a parameter is at its bound, as a lag of 0 s."""
     try:
-        changed = with_parameters(model, [name], [step])
+        return step, with_parameters(model, [name], [step])
     except CalibrationError:
-        return 0.0, values
-    return step, np.atleast_1d(measure(changed))
+        return 0.0, model

@@ -16,26 +16,25 @@ from calibration.camera import Camera
 from calibration.camera_fit import CameraFit, fit_camera
 from calibration.covariance import Covariance
 from calibration.errors import CalibrationError, Degenerate
+from calibration.lag_speeds import SWEPT, lag_groups, speed_range
 from calibration.model import Lag, RigModel
 from calibration.rig_degenerate import check_depth, check_poses, check_views, no_start
 from calibration.rig_misfit import misfit, widening
-from calibration.rig_noise import Noise, passage_noise
+from calibration.rig_noise import Noise, passage_noise, restated
 from calibration.rig_normal import all_rows
 from calibration.rig_rounds import Rounds
 from calibration.rig_rows import ANGLE_TERMS, LENS_TERMS, OFFSET_TERMS, Terms
 from calibration.rig_select import Decision, lag_decisions, with_free
 from calibration.rig_sightings import Sighting, sighting, usable
 from calibration.rig_solve import Problem, camera_prior
-from calibration.rig_start import board_points, first_pose, first_scanner, lag_ties
+from calibration.rig_start import board_points, first_pose, first_scanner
 from calibration.rig_state import RigState, first_state, with_terms_of
+from calibration.robust import robust_sd
 from calibration.scanner import PivotScanner
 from calibration.sweep_fit import SweepFit, sweep_fits
 from calibration.views import BoardPose, View
 
 Array = NDArray[np.float64]
-
-SAME_SPEED = 0.05
-"""A lag holds for speeds this close to those it was measured at."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,12 +81,12 @@ def fit_rig(
     known: Covariance | None = None,
     start: RigModel | None = None,
     distortion_terms: int = 5,
-    passages_per_sweep: int = 2000,
 ) -> RigFit:
     """Fit a rig to views of a board; size: (width, height) of the picture.
 
     camera: to start from (None: `start`'s or OpenCV's); with hold_camera it is not fitted and counts as known exactly.
-    known: how well that camera is known from other pictures than these, by the names of its parameters.
+    known: how well that camera is known from other pictures than these, by the names of its parameters; what has no
+    variance is not fitted.
     start: its mirror and lag are where the fit begins, its source, defects and command range are kept.
     Raises Degenerate where the views do not make a model, with the reason, and CalibrationError.
     """
@@ -97,9 +96,7 @@ def fit_rig(
     camera = camera.camera if isinstance(camera, CameraFit) else camera
     camera = _first_camera(shown, board, size, camera, start, distortion_terms)
     poses = [_pose_of(view, board, camera) for view in shown]
-    sightings = tuple(
-        sighting(view, board, camera, pose, passages_per_sweep) for view, pose in zip(shown, poses, strict=True)
-    )
+    sightings = tuple(sighting(view, board, camera, pose) for view, pose in zip(shown, poses, strict=True))
     check_views(views, sightings)
     free_camera = not hold_camera
     terms = Terms(camera.distortion.size if free_camera else 0)
@@ -110,13 +107,15 @@ def fit_rig(
     except (CalibrationError, np.linalg.LinAlgError) as error:
         raise no_start(error, poses) from error
     velocities = np.unique(np.concatenate([seen.velocity_per_s for seen in sightings]))
-    groups: list[tuple[str, ...]] = [(name,) for name in terms.camera] if free_camera else []
+    exact = () if known is None else tuple(np.array(known.names)[np.diag(known.matrix) == 0])
+    groups: list[tuple[str, ...]] = [(name,) for name in terms.camera if free_camera and name not in exact]
     groups += [(name,) for name in ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2", "angle_0", "angle_1")]
-    groups += lag_ties(velocities)
+    groups += lag_groups(velocities)
     state = with_terms_of(state, groups)
     prior = None if known is None or hold_camera else camera_prior(known, camera, terms)
     problem = with_free(Problem(sightings, terms, np.zeros((0, 0)), np.ones(len(shown), bool), prior), groups)
-    fit = Rounds(problem, tuple(groups), state, _first_noise(problem, state))
+    problem, noise = _first_noise(problem, state)
+    fit = Rounds(problem, tuple(groups), state, noise)
     try:
         fit.run()
     except np.linalg.LinAlgError as error:
@@ -182,11 +181,13 @@ def _command_range(sightings: Sequence[Sighting], start: RigModel | None) -> tup
     return low, high
 
 
-def _first_noise(problem: Problem, state: RigState) -> Noise:
+def _first_noise(problem: Problem, state: RigState) -> tuple[Problem, Noise]:
+    """The problem with the sd that the passages' errors speak for, and how noisy all is."""
     rows = all_rows(state, problem.sightings, problem.terms)
-    corners = np.concatenate([corner.residual for corner, _ in rows])
-    factor, jitter, reach = passage_noise([passage.residual for _, passage in rows], problem.sightings)
-    return Noise(max(float(np.median(np.abs(corners))) / 0.6745, 1e-4), factor, jitter, reach)
+    corners, passages = ([pair[which].residual for pair in rows] for which in (0, 1))
+    problem = replace(problem, sightings=restated(passages, problem.sightings))
+    factor, jitter, reach = passage_noise(passages, problem.sightings)
+    return problem, Noise(max(robust_sd(np.concatenate(corners)), 1e-4), factor, jitter, reach)
 
 
 def _result(fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigModel | None, velocities: Array) -> RigFit:
@@ -199,15 +200,15 @@ def _result(fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigMode
     covariance = Covariance(tuple(names[fitted].tolist()), matrix[np.ix_(fitted, fitted)])
     scanner = state.scanner
     scanner = replace(scanner, angle_rad=_trimmed(scanner.angle_rad, 2), offset_m=_trimmed(scanner.offset_m, 0))
-    speeds = np.abs(velocities)
     model = replace(
         RigModel(state.model.camera, scanner) if start is None else start,
         camera=state.model.camera,
         scanner=scanner,
         covariance=covariance,
-        lag_s=_lag(state, fit, start),
+        lag_s=Lag(*(max(float(lag), 0.0) for lag in state.timing[:2])),
         row_delay_s=float(state.timing[2]),
-        speed_range_per_s=(float(speeds.min() * (1 - SAME_SPEED)), float(speeds.max() * (1 + SAME_SPEED))),
+        provenance={SWEPT: _swept(problem)},
+        speed_range_per_s=speed_range(np.abs(velocities)),
     )
     counted = problem.counted
     check_depth(model, state.poses, solution.condition, float(velocities[np.argmax(np.abs(velocities))]))
@@ -233,15 +234,11 @@ def _result(fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigMode
     )
 
 
-def _lag(state: RigState, fit: Rounds, start: RigModel | None) -> Lag:
-    """As fitted; a direction that was never swept, of which nothing else is known, lags like the other."""
-    forward, backward = (max(float(lag), 0.0) for lag in state.timing[:2])
-    told = {name for group in fit.free for name in group}
-    if start is None and "lag_forward" in told and "lag_backward" not in told and backward == 0:
-        backward = forward
-    if start is None and "lag_backward" in told and "lag_forward" not in told and forward == 0:
-        forward = backward
-    return Lag(forward, backward)
+def _swept(problem: Problem) -> list[float]:
+    """Signed velocities of the sweeps that had a say."""
+    shown = [seen.velocity_per_s for seen, counts in zip(problem.sightings, problem.counted, strict=True) if counts]
+    swept: list[float] = np.unique(np.concatenate(shown)).tolist()
+    return swept
 
 
 def _trimmed(terms: Array, least: int) -> Array:

@@ -5,15 +5,19 @@ all pixels crossed in the same instant share (jitter), and what the model does n
 sweep. The last is kept out of the first two: every sweep's own smooth part is taken off before. Then, in narrow bins of
 the command, products of different passages of a bin give the jitter's variance, products across bins how far it
 reaches, and the scatter within a bin the factor.
+
+Before all that the sd are restated. A passage's sd is told from the same few photons as the passage: those that seem
+sharpest are so by chance in part, and a fit that believed them would think itself better than it is.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.rig_sightings import Sighting
+from calibration.robust import robust_sd
 
 Array = NDArray[np.float64]
 
@@ -28,6 +32,12 @@ OUTLIER_SD = 6.0
 """From here on it is no error of this kind, and does not count."""
 CUT_SD = 4.0
 """Errors beyond it are left out where the noise is told: the square of one outlier would be that of hundreds."""
+FEWEST_PAIRS = 200
+"""Of neighbouring passages, that tell how errors go with their sd."""
+LEAST_SPREAD = 0.05
+"""Of the logarithm of the sd, that tells it too."""
+ALIKE_SPEEDS = 1.05
+"""Speeds that differ by less are one: their frames in a column are."""
 SIGNIFICANT_SD = 3.0
 """For a jitter to be there; one overlooked makes a model look better than it is."""
 
@@ -56,6 +66,48 @@ def smooth_part(command: Array, y_px: Array, residual: Array, weight: Array) -> 
     root = np.sqrt(weight)[:, None]
     part: Array = basis @ np.linalg.lstsq(basis * root, residual * root[:, 0], rcond=1e-9)[0]
     return part
+
+
+def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
+    """The sightings with sd a s^b in the place of each passage's sd s, a and b as the errors at each speed tell them.
+
+    Told from differences of neighbouring passages, in which what the model does not describe and most of the jitter are
+    gone. The sd's geometric mean stays as it is, for a factor to be told.
+    """
+    pairs: dict[int, list[tuple[Array, Array]]] = {}
+    for residual, seen in zip(residuals, sightings, strict=True):
+        for sweep in seen.sweeps:
+            left, sd = residual[sweep], seen.sd[sweep]
+            left = left - _robust_smooth(seen.command[sweep], seen.y_px[sweep], left, 1 / sd**2)
+            shared = np.sqrt((sd[1:] ** 2 + sd[:-1] ** 2) / 2)
+            pairs.setdefault(_speed(seen, sweep), []).append((np.diff(left) / np.sqrt(2), shared))
+    laws = {speed: _law(*(np.concatenate(part) for part in zip(*of, strict=True))) for speed, of in pairs.items()}
+    changed = []
+    for seen in sightings:
+        sd = seen.sd.copy()
+        for sweep in seen.sweeps:
+            level, power = laws[_speed(seen, sweep)]
+            sd[sweep] = level * sd[sweep] ** power
+        changed.append(replace(seen, sd=sd))
+    before, after = (np.log(np.concatenate([seen.sd for seen in of])) for of in (sightings, changed))
+    scale = float(np.exp(np.mean(before - after))) if before.size else 1.0
+    return tuple(replace(seen, sd=scale * seen.sd) for seen in changed)
+
+
+def _speed(seen: Sighting, sweep: slice) -> int:
+    """A number that speeds alike share."""
+    speed = max(abs(float(seen.velocity_per_s[sweep.start])), 1e-9)
+    return round(float(np.log(speed) / np.log(ALIKE_SPEEDS)))
+
+
+def _law(away: Array, sd: Array) -> tuple[float, float]:
+    """(a, b) of errors whose standard deviation is a sd^b."""
+    power, usual = 1.0, float(np.mean(np.log(sd)))
+    spread = np.log(sd) - usual
+    if sd.size >= FEWEST_PAIRS and spread.std() > LEAST_SPREAD:
+        told = np.log(np.maximum(np.abs(away), 1e-3 * sd))
+        power = float(np.clip(spread @ told / (spread @ spread), 0.0, 1.0))
+    return max(robust_sd(away / sd**power), LEAST_FACTOR * float(np.exp((1 - power) * usual))), power
 
 
 def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple[float, float, float]:
@@ -101,7 +153,7 @@ def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> 
 def _inlying(residual: Array, command: Array, y_px: Array, sd: Array) -> tuple[Array, Array, Array]:
     """(residuals without their smooth part, commands, weights) of a sweep's passages that are no outliers."""
     left = residual - _robust_smooth(command, y_px, residual, 1 / sd**2)
-    scale = float(np.median(np.abs(left / sd))) / 0.6745
+    scale = robust_sd(left / sd)
     inlying = np.abs(left) <= CUT_SD * scale * sd
     return left[inlying], command[inlying], 1 / sd[inlying] ** 2
 
@@ -120,7 +172,7 @@ def tail_weight(normalised: Array) -> Array:
     """Weight of errors in standard deviations, among others of their kind: where all are large, none is an outlier."""
     away = np.abs(normalised)
     if away.size:
-        away = away / max(1.0, float(np.median(away)) / 0.6745)
+        away = away / max(1.0, robust_sd(away))
     return np.where(away > OUTLIER_SD, 0.0, np.minimum(1.0, TAIL_SD / np.maximum(away, 1e-300)))
 
 
@@ -128,7 +180,7 @@ def _robust_smooth(command: Array, y_px: Array, residual: Array, weight: Array) 
     part = np.full_like(residual, np.median(residual))  # an outlier at the end of a sweep would bend any other start
     for _ in range(4):
         left = np.abs(residual - part) * np.sqrt(weight)
-        scale = float(np.median(left)) / 0.6745
+        scale = robust_sd(left)
         if scale == 0:
             break
         part = smooth_part(command, y_px, residual, weight * tail_weight(left / scale))

@@ -52,11 +52,12 @@ class Rounds:
             self.state = self.solution.state
             before, self.noise = self.noise, self._noise()
             there = self.solution.converged and idle > 0
-            if self._with_new_term() or (there and self._without_negative_lag()) or self._without_odd_view():
+            last = idle + 1 == MOST_IDLE_ROUNDS
+            if self._with_new_term() or ((there or last) and self._without_negative_lag()) or self._without_odd_view():
                 idle = 0
                 continue
             idle += 1
-            if idle == MOST_IDLE_ROUNDS or (there and _settled(before, self.noise)):
+            if last or (there and _settled(before, self.noise)):
                 return
 
     def _noise(self) -> Noise:

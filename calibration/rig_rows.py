@@ -6,7 +6,7 @@ F(c) = 0, and the residual, in units of the command, changes with a parameter p 
 X = t r on the board's plane m.(X - P) = 0: a turn w and shift s of the board move X along r, which changes F by
 (n.r / m.r) (w.(m x (P - X)) + m.s), and a change dr of the ray changes it by t (n - (n.r / m.r) m).dr.
 
-Light on row y left a mirror that stood where the command was lag + row_delay y earlier. The order of the columns is
+Light on row y left a mirror that stood where the command was lag - row_delay y earlier. The order of the columns is
 that of `Terms.names`; the turns and shifts of the axis are those of `calibration.parameters`.
 """
 
@@ -117,13 +117,13 @@ def sheet_rows(
     rising = velocity_per_s > 0
     timed = -velocity_per_s * lit.per_command
     columns[:, at + 2], columns[:, at + 3] = np.where(rising, timed, 0.0), np.where(rising, 0.0, timed)
-    columns[:, at + 4] = timed * y_px
+    columns[:, at + 4] = -timed * y_px
     return Sheet(met - lit.distance_m / lit.per_command, lit.per_command, lit.normal, columns)
 
 
 def mirror_command(timing: Array, command: Array, y_px: Array, velocity_per_s: Array) -> Array:
     """Where the mirror stood, on the command's scale; see `RigModel.mirror_command`, whose lags have no sign."""
-    delay_s: Array = np.where(velocity_per_s > 0, timing[0], timing[1]) + timing[2] * y_px
+    delay_s: Array = np.where(velocity_per_s > 0, timing[0], timing[1]) - timing[2] * y_px
     return command - velocity_per_s * delay_s
 
 

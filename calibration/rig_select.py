@@ -24,13 +24,15 @@ LEAST_OWN_SHARE = 1e-7
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """One about a term. value, sd: what it is or would be, in its own unit; NaN where nothing tells."""
+    """One about a term. value, sd: what it is or would be, in its own unit; NaN where nothing tells. along: name and
+    value of the terms that would come in with it."""
 
     name: str
     kept: bool
     value: float
     sd: float
     reason: str
+    along: tuple[tuple[str, float], ...] = ()
 
 
 def with_free(problem: Problem, groups: Sequence[Sequence[str]]) -> Problem:
@@ -73,11 +75,12 @@ def tried(problem: Problem, solution: Solution, new: Sequence[str], left_over: C
     if not share > LEAST_OWN_SHARE:
         return Decision(new[-1], False, np.nan, np.nan, "cannot be told from the other terms")
     spread = np.linalg.inv(left)
-    value = float((spread @ wanted)[-1])
+    values = (spread @ wanted).tolist()
+    value = values[-1]
     sd = float(np.sqrt(left_over(float(wanted @ spread @ wanted)) * spread[-1, -1]))
     kept = abs(value) > SIGNIFICANT_SD * sd
     said = f"{abs(value) / sd:.1f} sd from 0, limit {SIGNIFICANT_SD:g}"
-    return Decision(new[-1], kept, value, sd, said)
+    return Decision(new[-1], kept, value, sd, said, tuple(zip(new[:-1], values[:-1], strict=True)))
 
 
 def best(decisions: Sequence[Decision]) -> int | None:
@@ -93,7 +96,7 @@ def lag_decisions(solution: Solution, problem: Problem, free: Sequence[Sequence[
     decisions = []
     for group in told.values():
         at = problem.terms.at(group[:1])[0]
-        said = "of each direction" if len(group) == 1 else "one for both: a single speed tells only their sum"
+        said = "of each direction" if len(group) == 1 else "one for both: the sweeps do not tell them apart"
         value = float(timing[TIMING.index(group[0])])
         decisions.append(Decision("/".join(group), True, value, float(spread[at]), said))
     if not told:
@@ -103,11 +106,12 @@ def lag_decisions(solution: Solution, problem: Problem, free: Sequence[Sequence[
 
 
 def first_order(problem: Problem, solution: Solution, open_one: Decision) -> Array:
-    """(p,) by how much all shared parameters would change, were this term taken in."""
-    at = problem.terms.at([open_one.name])
+    """(p,) by how much all shared parameters would change, were this term taken in, and those that go along."""
+    taken = dict((*open_one.along, (open_one.name, open_one.value)))
+    at, values = problem.terms.at(tuple(taken)), np.array(list(taken.values()))
     inverse, _ = scaled_inverse(problem.tie.T @ solution.matrix @ problem.tie)
-    change: Array = -problem.tie @ (inverse @ (problem.tie.T @ solution.matrix[:, at]))[:, 0] * open_one.value
-    change[at] = open_one.value
+    change: Array = -problem.tie @ (inverse @ (problem.tie.T @ (solution.matrix[:, at] @ values)))
+    change[at] = values
     return change
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calibration.board import MARGIN_SQUARES, Board
 from calibration.camera import Camera
-from calibration.views import LEAST_ACROSS_PX, BoardPose, Corners, Passages, View
+from calibration.views import LEAST_ACROSS_PX, USUAL_CORNER_SD_PX, BoardPose, Corners, Passages, View
 
 Array = NDArray[np.float64]
 
@@ -16,7 +16,6 @@ EDGE_PX = 1.5
 """Passages this close to the board's outline are left out: such pixels see what stands behind it too."""
 LEAST_SD_SHARE = 0.05
 """Of the median sd of a sweep: none counts as better known, or a few too sure of themselves would decide."""
-USUAL_CORNER_SD_PX = 0.03
 LEAST_CORNER_SD_PX = 0.02
 """What the print, the lens model and the finding of corners leave, however bright the picture."""
 PAPER_SHARE = 0.8
@@ -51,10 +50,10 @@ class Sighting:
         return [slice(int(a), int(b)) for a, b in zip(self.starts[:-1], self.starts[1:], strict=True)]
 
 
-def sighting(view: View, board: Board, camera: Camera, pose: BoardPose, most_per_sweep: int) -> Sighting:
-    """The corners of a view and those of its passages that lie on the board's paper, at most so many of each sweep."""
+def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sighting:
+    """The corners of a view and those of its passages that lie on the board's paper."""
     assert view.corners is not None
-    sweeps = [_on_board(sweep, board, camera, pose, most_per_sweep) for sweep in view.passages]
+    sweeps = [_on_board(sweep, board, camera, pose) for sweep in view.passages]
     sweeps = [sweep for sweep in sweeps if sweep.x_px.size >= FEWEST_PASSAGES]
 
     def joined(name: str) -> Array:
@@ -80,8 +79,8 @@ def _corner_scale(corners: Corners) -> Array:
     """Of each corner, 1 where the picture did not tell."""
     if corners.sd_px is None:
         return np.ones(len(corners.ids))
-    sd = np.hypot(np.nan_to_num(corners.sd_px, nan=USUAL_CORNER_SD_PX, posinf=1.0), LEAST_CORNER_SD_PX)
-    return sd / USUAL_CORNER_SD_PX
+    scale: Array = np.hypot(corners.likely_sd_px, LEAST_CORNER_SD_PX) / USUAL_CORNER_SD_PX
+    return scale
 
 
 def usable(views: Sequence[View]) -> list[View]:
@@ -99,8 +98,8 @@ def usable(views: Sequence[View]) -> list[View]:
     return found
 
 
-def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose, most: int) -> Passages:
-    """The passages of a sweep within the board's outline, thinned evenly, sorted by command."""
+def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose) -> Passages:
+    """The passages of a sweep within the board's outline, sorted by command."""
     x, y, command, sd = (np.asarray(values, np.float64) for values in (sweep.x_px, sweep.y_px, sweep.command, sweep.sd))
     keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(command) & np.isfinite(sd) & (sd > 0)
     u, v = camera.tangents_at(x, y)
@@ -116,8 +115,6 @@ def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose, mo
         keep &= (depth > 0) & (place[:, 0] > margin) & (place[:, 0] < width - margin)
         keep &= (place[:, 1] > margin) & (place[:, 1] < height - margin)
     at = np.flatnonzero(keep)
-    if at.size > most:
-        at = at[(np.arange(most) * at.size) // most]
     at = at[np.argsort(command[at], kind="stable")]
     floor = LEAST_SD_SHARE * float(np.median(sd[at])) if at.size else 0.0
     return Passages(x[at], y[at], command[at], np.maximum(sd[at], floor), sweep.direction, sweep.speed_per_s)

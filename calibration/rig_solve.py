@@ -182,7 +182,8 @@ def _counted(views: Sequence[ViewNormal], problem: Problem) -> list[ViewNormal]:
 
 def camera_prior(known: Covariance, camera: Camera, terms: Terms) -> Prior:
     """What other pictures told of the camera."""
-    names = [name for name in known.names if name in terms.camera]
+    variance = dict(zip(known.names, np.diag(known.matrix), strict=True))
+    names = [name for name in known.names if name in terms.camera and variance[name] > 0]
     at = terms.at(names)
     matrix: Array = np.zeros((len(terms.names), len(terms.names)))
     matrix[np.ix_(at, at)] = scaled_inverse(known.of(names))[0]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calibration.camera import Camera
 from calibration.errors import Degenerate
+from calibration.lag_speeds import BACKWARD, FORWARD, lag_groups
 from calibration.rig_sightings import Sighting
 from calibration.scanner import PivotScanner
 from calibration.views import NO_POSE, BoardPose
@@ -86,24 +87,6 @@ def first_scanner(points: Points, command_range: tuple[float, float]) -> tuple[P
     return PivotScanner(point, axis, first, angle, command_range), np.array([*lags, 0.0])
 
 
-def lag_ties(velocities: Array) -> tuple[tuple[str, ...], ...]:
-    """The lags that these signed speeds tell: groups of names, each of one value.
-
-    One speed either way tells the sum alone; one direction at one speed nothing, since the angle takes it up.
-    """
-    up, down = (np.abs(side) for side in (velocities[velocities > 0], velocities[velocities < 0]))
-    several_up, several_down = _differ(up), _differ(down)
-    if up.size and down.size:
-        if several_up or several_down or _differ(np.concatenate([up, down])):
-            return (("lag_forward",), ("lag_backward",))
-        return (("lag_forward", "lag_backward"),)
-    return (("lag_forward",),) if several_up else (("lag_backward",),) if several_down else ()
-
-
-def _differ(speeds: Array) -> bool:
-    return speeds.size > 1 and float(speeds.max() / speeds.min()) > 1.02
-
-
 def _often_shown(points: Points) -> Array:
     """The signed speeds at which enough boards were swept to tell their planes; where none was, the most swept."""
     velocities = np.unique(points.velocity_per_s)
@@ -157,7 +140,7 @@ def _angles(planes: Array, axis: Array, first: Array) -> Array:
 
 def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
     """Least squares of c(angle) = c0 + velocity lag over the sweeps, at an angle that all have."""
-    ties = lag_ties(velocities)
+    ties = lag_groups(velocities)
     if not ties:
         return 0.0, 0.0
     middle = float(np.mean([np.median(angle) for _, angle in curves]))
@@ -165,12 +148,11 @@ def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[flo
     commands = [polynomial.polyfit(angle - middle, command, 2, full=True)[0][0] for command, angle in curves]
     design = np.array(
         [
-            [1.0] + [v if ("lag_forward" if v > 0 else "lag_backward") in tie else 0.0 for tie in ties]
+            [1.0] + [v if (FORWARD if v > 0 else BACKWARD) in tie else 0.0 for tie in ties]
             for v in velocities
         ]
     )
     scale = np.abs(design).max(axis=0)
     values = np.linalg.lstsq(design / scale, np.array(commands), rcond=1e-8)[0] / scale
     lag = {name: float(value) for tie, value in zip(ties, values[1:], strict=True) for name in tie}
-    known = float(np.mean(list(lag.values())))
-    return lag.get("lag_forward", known), lag.get("lag_backward", known)
+    return lag[FORWARD], lag[BACKWARD]

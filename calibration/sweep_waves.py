@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 BINS = 24
 """Of the command range: wide enough for tens of passages each, narrow enough for a wave of several turns."""
 _FEWEST_IN_BIN = 5
+_LEAST_SHARE_IN_BIN = 0.25
+"""Of what a sweep's bins hold: where it only reaches into a bin, those are there whose noise led them to it."""
 _FEWEST_BINS = 4
 _MEDIAN_VARIANCE = np.pi / 2
 """Of a median in units of the mean's variance, normal distribution."""
@@ -79,7 +81,9 @@ def _binned(sweeps: Sequence[SweepResidual], edges: Array) -> tuple[Array, Array
     middle, variance = np.full((len(sweeps), BINS), np.nan), np.full((len(sweeps), BINS), np.nan)
     for i, sweep in enumerate(sweeps):
         at = np.clip(np.searchsorted(edges, sweep.command, side="right") - 1, 0, BINS - 1)
-        for k in np.flatnonzero(np.bincount(at, minlength=BINS) >= _FEWEST_IN_BIN):
+        count = np.bincount(at, minlength=BINS)
+        usual = float(np.median(count[count > 0])) if count.any() else 0.0
+        for k in np.flatnonzero(count >= max(_FEWEST_IN_BIN, _LEAST_SHARE_IN_BIN * usual)):
             inside = sweep.residual[at == k]
             middle[i, k] = np.median(inside)
             sd = robust_sd(inside - middle[i, k])

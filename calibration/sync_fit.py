@@ -3,14 +3,15 @@
 A pixel sees the line at one mirror position, whatever the speed. In a sweep with direction s = +1 or -1 and speed v it
 sees it at (calibration/views.py)
 
-    command = position + s v (lag_s + row_delay y)
+    command = position + s v (lag_s - row_delay y)
 
 Positions drop out as each pixel's weighted mean; what is left is linear in the two lags and the row delay. No board is
 needed and no geometry, only pixels that tell of a passage in several of the sweeps: 2000 pixels of 4 sweeps take 10 ms.
 
-What the sweeps can tell depends on them. Both ways at one speed: the mean of the lags alone, both are taken to be it.
-One way, or both, at two speeds or more: each lag by itself. Whether a lag is the same at all speeds shows with two
-speeds both ways, or three. The row delay needs rows, not speeds, and is 0 where it is not significant.
+What the sweeps can tell depends on them (`calibration.lag_speeds`). One speed each way: a mean of the lags alone, both
+are taken to be it. Two speeds in one direction at least: the lag of each way that was scanned. Whether a lag is the
+same at all speeds shows with two speeds both ways, or three. The row delay needs rows, not speeds, and is 0 where it is
+not significant.
 
 What no sweep tells: a delay of the markers behind the mirror's command that is always the same (the scanner's colour
 outputs trail its mirror outputs by some microseconds, hardware.md 3.1): it shortens both lags, which are then as they
@@ -26,7 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import Degenerate
+from calibration.lag_speeds import lag_groups, speed_range
 from calibration.model import Lag
+from calibration.parameters import TIMES
 from calibration.sync_pixels import (
     CLUSTERS,
     LEAST_PIXELS,
@@ -41,11 +44,7 @@ from calibration.views import Passages
 
 Array = NDArray[np.float64]
 
-NAMES: Final = ("lag_forward", "lag_backward", "row_delay")
-ALIKE_SPEEDS = 0.01
-"""Relative difference below which two speeds are one."""
-SPEED_MARGIN = 0.05
-"""So far beyond the speeds that were scanned the lag is taken to hold."""
+NAMES: Final = TIMES
 SIGNIFICANT = 5.0
 """Standard deviations of a row delay that is believed, and of a lag below 0 that is refused."""
 MOST_CHI2_SDS = 4.0
@@ -90,6 +89,11 @@ class SyncFit:
         return result
 
     @property
+    def velocities_per_s(self) -> tuple[float, ...]:
+        """Signed, of the sweeps."""
+        return tuple(sweep.direction * sweep.speed_per_s for sweep in self.sweeps)
+
+    @property
     def steady(self) -> bool:
         """Whether the lag is the same at all speeds, as far as these can tell."""
         return self.dof == 0 or bool(self.chi2 <= self.dof + MOST_CHI2_SDS * np.sqrt(2 * self.dof))
@@ -105,12 +109,15 @@ def fit_sync(sweeps: Sequence[Passages]) -> SyncFit:
         return fit_sync([sweep for sweep, tells in zip(sweeps, heard, strict=True) if tells])
     _require_one_way_round(seen)
     told = tuple(way for way in (1, -1) if way in seen.direction)
-    common = len(told) == 2 and float(np.ptp(seen.speed)) <= ALIKE_SPEEDS * float(seen.speed.max())
+    common = len(told) == 2 and len(lag_groups(seen.velocity)) == 1
     lags = [np.where(np.isin(seen.direction, ways), seen.velocity, 0.0) for ways in ([told] if common else told)]
-    with_rows = solve(seen, [*lags, seen.velocity * seen.rows[:, None]])
-    row_delay_s, row_sd_s = float(with_rows.value[-1]), float(np.sqrt(with_rows.covariance[-1, -1]))
-    believed = abs(row_delay_s) > SIGNIFICANT * row_sd_s
-    solved = with_rows if believed else solve(seen, lags)
+    solved, row_delay_s, row_sd_s = solve(seen, lags), 0.0, np.nan
+    believed = False
+    if np.ptp(seen.rows) > 0:
+        with_rows = solve(seen, [*lags, -seen.velocity * seen.rows[:, None]])
+        row_delay_s, row_sd_s = float(with_rows.value[-1]), float(np.sqrt(with_rows.covariance[-1, -1]))
+        believed = abs(row_delay_s) > SIGNIFICANT * row_sd_s
+        solved = with_rows if believed else solved
 
     # From what was solved for to NAMES: a common lag is both, one that was not scanned is not known.
     which = {way: 0 if common else told.index(way) for way in told}
@@ -128,9 +135,7 @@ def fit_sync(sweeps: Sequence[Passages]) -> SyncFit:
     return SyncFit(
         lag_s=Lag(*(max(lag_s.get(way, lag_s[told[0]]), 0.0) for way in (1, -1))),
         row_delay_s=row_delay_s if believed else 0.0, covariance=covariance,
-        speed_range_per_s=(
-            float(seen.speed.min() * (1 - SPEED_MARGIN)), float(seen.speed.max() * (1 + SPEED_MARGIN))
-        ),
+        speed_range_per_s=speed_range(seen.speed),
         common=common, told=told, sweeps=timings, chi2=chi2, dof=max(0, len(sweeps) - 1 - len(lags)),
         noise=solved.noise,
     )  # fmt: skip
@@ -154,10 +159,8 @@ def _by_sweep(seen: SharedPixels, solved: Solved, lag_s: dict[int, float]) -> tu
 
 
 def _require_speeds(sweeps: Sequence[Passages]) -> None:
-    speeds = [sweep.speed_per_s for sweep in sweeps]
-    one_way = len({sweep.direction for sweep in sweeps}) <= 1
-    if one_way and (not speeds or max(speeds) - min(speeds) <= ALIKE_SPEEDS * max(speeds)):
-        at = f" at {speeds[0]:.4g} /s" if speeds else ""
+    if not lag_groups([sweep.direction * sweep.speed_per_s for sweep in sweeps]):
+        at = f" at {sweeps[0].speed_per_s:.4g} /s" if sweeps else ""
         raise Degenerate(
             "one-speed",
             f"{len(sweeps)} sweeps ran one way{at}: a lag cannot be told from where things are; scan both ways "

@@ -21,6 +21,8 @@ SWEEP_ERROR_S = 3e-7
 LEAST_PIXELS = 50
 CLUSTERS = 64
 """Parts of the command range in which the mirror's own trembling is taken to be common to all pixels."""
+LEAST_SHARE = 1e-9
+"""Smallest eigenvalue of the scaled equations; below it nothing but rounding tells designs apart."""
 MOST_OFF = 4.7
 """Residuals, in robust standard deviations, from which on a passage does not count."""
 
@@ -79,14 +81,25 @@ class Solved:
 
 
 def solve(seen: SharedPixels, designs: Sequence[Array]) -> Solved:
-    """Weighted least squares, each pixel's own position taken out, and outliers."""
+    """Weighted least squares, each pixel's own position taken out, and outliers.
+
+    Raises Degenerate where what the sweeps share does not tell every design from the others.
+    """
     basis = np.stack([np.broadcast_to(each, seen.command.shape) for each in designs], axis=2)
     weight, noise = seen.weight, 1.0
     for _ in range(6):
         x, y = _own(basis, weight), _own(seen.command[:, :, None], weight)[:, :, 0]
         normal = np.einsum("ij,ija,ijb->ab", weight, x, x)
         scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        inverse = scale[:, None] * np.linalg.pinv(normal * np.outer(scale, scale), hermitian=True) * scale
+        values, vectors = np.linalg.eigh(normal * np.outer(scale, scale))
+        if not values[0] > LEAST_SHARE:
+            raise Degenerate(
+                "one-speed",
+                f"the pixels that sweeps share do not tell the lags apart (a share of {max(values[0], 0):.1g} of the "
+                f"equations is their own, limit {LEAST_SHARE:g}); show one unmoved scene to sweeps both ways, at two "
+                "speeds or more",
+            )
+        inverse = scale[:, None] * ((vectors / values) @ vectors.T) * scale
         value = inverse @ np.einsum("ij,ija,ij->a", weight, x, y)
         residual = np.where(seen.weight > 0, y - x @ value, 0)
         # The pixel's own position has taken a part of each residual.

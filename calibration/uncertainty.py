@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.covariance import Covariance
 from calibration.errors import CalibrationError
 from calibration.model import RigModel
-from calibration.parameters import DISTORTION, MATRIX, TIMES, with_parameters
+from calibration.parameters import DISTORTION, MATRIX, TIMES
+from calibration.propagation import by_parameter
 
 Array = NDArray[np.float64]
 
@@ -28,8 +29,8 @@ _GRID = 48
 _SEARCH_STEPS = 60
 _FOUND_M = 1e-9
 """A mirror command is found when its sheet passes the point within this: a thousandth of any calibration's error."""
-_STEP_COMMAND = 1e-6
-"""Of the command range, for differences."""
+_INSIDE = 1e-6
+"""Of the command range: by so much differences stay within it."""
 _INDEPENDENT = 1e-12
 """Eigenvalues of a correlation matrix below this are rounding."""
 
@@ -137,31 +138,23 @@ def depth_jacobian(
     The mirror stands at `command` for the model as it is; by the lag and the row delay it would stand elsewhere. NaN
     where there is no depth. Raises CalibrationError for a model without covariance.
     """
+    names = _covariance(model).names
     x, y, at = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (x_px, y_px, command)))
-    lit = np.isfinite(at)
-    result = np.full((*x.shape, len(_covariance(model).names)), np.nan)
+    lit = np.isfinite(at) & np.isfinite(y)
+    result = np.full((*x.shape, len(names)), np.nan)
     x, y, at = x[lit], y[lit], at[lit]
     rays = model.camera.tangents_at(x, y)
-
-    def depth(changed: RigModel, command: Array) -> Array:
-        u, v = rays if changed.camera is model.camera else changed.camera.tangents_at(x, y)
-        return changed.sheets(command).depth(u, v)
-
     low, high = model.scanner.command_range
-    ends = [np.clip(at + step, low, high) for step in (-_STEP_COMMAND * (high - low), _STEP_COMMAND * (high - low))]
-    by_command = (depth(model, ends[1]) - depth(model, ends[0])) / (ends[1] - ends[0])
-    moved = {
-        "lag_forward": -max(velocity_per_s, 0.0) * np.ones_like(at),
-        "lag_backward": -min(velocity_per_s, 0.0) * np.ones_like(at),
-        "row_delay": -velocity_per_s * y,
-    }
-    for i, name in enumerate(_covariance(model).names):
-        if name in moved:
-            result[lit, i] = by_command * moved[name]
-            continue
-        step = _step(name)
-        above, below = (depth(with_parameters(model, [name], [sign * step]), at) for sign in (1, -1))
-        result[lit, i] = (above - below) / (2 * step)
+    inside = _INSIDE * (high - low)
+    at = np.clip(at, low + inside, high - inside)
+    commanded = 2 * at - model.mirror_command(at, y, velocity_per_s)
+
+    def depth(tried: RigModel) -> Array:
+        u, v = rays if tried.camera is model.camera else tried.camera.tangents_at(x, y)
+        mirror = tried.mirror_command(commanded, y, velocity_per_s)
+        return tried.sheets(np.clip(mirror, low, high)).depth(u, v)
+
+    result[lit] = by_parameter(model, names, depth)
     return result
 
 
@@ -190,8 +183,3 @@ def _covariance(model: RigModel) -> Covariance:
             "the calibration has no covariance, so its depth error is unknown; calibrate with 'rig calibrate planes'"
         )
     return model.covariance
-
-
-def _step(name: str) -> float:
-    """Half the interval over which depth is differenced by a parameter: far above rounding, far below any curvature."""
-    return 1e-3 if name in MATRIX else 1e-6

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 NO_POSE = "corners of a view are no picture of a board; take the view out, or name the board that it shows"
+USUAL_CORNER_SD_PX = 0.03
 LEAST_ACROSS_PX = 1.0
 """Of corners that give a pose; they are found to some 0.01 px."""
 
@@ -28,6 +29,15 @@ class Corners:
     ids: NDArray[np.int32]
     px: Array
     sd_px: Array | None = None
+
+    @property
+    def likely_sd_px(self) -> Array:
+        """(n,) of either coordinate, above 0; the usual one where nobody knows."""
+        if self.sd_px is None:
+            return np.full(len(self.ids), USUAL_CORNER_SD_PX)
+        known = np.nan_to_num(self.sd_px, nan=USUAL_CORNER_SD_PX, posinf=1.0)
+        result: Array = np.where(known > 0, known, USUAL_CORNER_SD_PX)
+        return result
 
     @property
     def across_px(self) -> float:

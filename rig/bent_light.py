@@ -50,10 +50,10 @@ class BentLight:
         from rig.bent_light_kernels import bent_inverse_depth
 
         model, rows = self.model, slice(first_row, first_row + len(command))
-        delay = np.arange(rows.start, rows.stop) * np.float64(self.velocity_per_s * model.row_delay_s)
+        ahead = np.arange(rows.start, rows.stop) * np.float64(self.velocity_per_s * model.row_delay_s)
         result = np.empty(command.shape, np.float32)
         bent_inverse_depth(
-            command, delay, self.u[rows], self.v[rows], self.sheets, *model.scanner.command_range,
+            command, ahead, self.u[rows], self.v[rows], self.sheets, *model.scanner.command_range,
             fan_origin(model.scanner, model.source_m), bow_per_rad(model), result,
         )  # fmt: skip
         return result
@@ -112,7 +112,7 @@ def beside_px(
         per_px = np.gradient(flat, axis=1) if flat.shape[1] > 1 else np.ones_like(flat)
         inside = (flat >= 1 / far_m) & (flat <= 1 / near_m)
         for velocity in {fastest * np.sign(model.row_delay_s), -fastest * np.sign(model.row_delay_s)}:
-            delayed = np.clip(command - velocity * model.row_delay_s * y, *model.scanner.command_range)
+            delayed = np.clip(command + velocity * model.row_delay_s * y, *model.scanner.command_range)
             true = model.sheets(delayed).inverse_depth(u, v)
             off = np.abs((true - flat)[inside] / per_px[inside])
             most = max(most, float(np.max(off, initial=0.0, where=np.isfinite(off))))

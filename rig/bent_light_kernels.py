@@ -13,7 +13,7 @@ NEWTON_STEPS: Final = 2
 @numba.njit(cache=True, nogil=True)
 def bent_inverse_depth(
     command: NDArray[np.float64],
-    delay: NDArray[np.float64],
+    ahead: NDArray[np.float64],
     u: NDArray[np.float32],
     v: NDArray[np.float32],
     sheets: NDArray[np.float64],
@@ -25,14 +25,14 @@ def bent_inverse_depth(
 ) -> None:
     """Write inverse depth (rows, width) where the mirror was bound to `command`; NaN where there is none.
 
-    delay: (rows,) by how much the command is behind that. sheets: (samples, 10) float64, n, d, middle and across of the
+    ahead: (rows,) by how much the command is past that. sheets: (samples, 10) float64, n, d, middle and across of the
     sheets at even steps of the command from low to high; in between they are linear, for closely enough spaced ones.
     """
     rows, width = command.shape
     per_command = (len(sheets) - 1) / (high - low)
     for y in range(rows):
         for x in range(width):
-            at = command[y, x] - delay[y]
+            at = command[y, x] + ahead[y]
             if np.isnan(at):
                 inverse_depth[y, x] = np.nan
                 continue

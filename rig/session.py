@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 GUARDED = ("laser", "sync")
 """Slots whose devices a process of its own owns, since they let light out."""
 HOLD_EXPOSURES = 10
-"""From so many frames per column on, simulated light is held at the column's centre; with fewer, at parts of it."""
+"""From so many frames per column on, simulated light is held within columns; with fewer, within parts of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +53,10 @@ class OpenRig:
 
 @runtime_checkable
 class HoldsColumns(Protocol):
-    """A world that can keep its light constant within a column, so that it is computed once for its frames."""
+    """A world that can give all frames of a column the same light, so that it is computed once for them."""
 
     def hold_columns(self, commands: NDArray[np.float64]) -> None:
-        """Hold the light at these mirror commands (columns,)."""
+        """Hold the light within columns of these mirror commands (columns,)."""
         ...
 
 
@@ -146,8 +146,7 @@ def prepare(
     if plan.frame_rate_hz != nominal.frame_rate_hz:  # its windows may be others, its timing is the same again
         timing = rig.spad.configure(spad_request(scan, plan))
     if isinstance(rig.world, HoldsColumns):
-        # A frame's light may be held this far from where the mirror is: the mean over a column's frames is then
-        # within 1/20 column of the mean that the binding gives, at any number of exposures.
+        # A frame's light may be held this far from where the mirror is; the mean over a column's frames is right.
         parts = math.ceil(HOLD_EXPOSURES / plan.exposures)
         rig.world.hold_columns(plan.command_at((np.arange(plan.places * parts) + 0.5) / parts - 0.5))
     return plan, timing

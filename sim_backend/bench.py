@@ -24,12 +24,13 @@ Array = NDArray[np.float64]
 class Happening:
     """What happened during n frames.
 
-    mirror: (n,) mirror position, as a command, in the middle of each exposure. share: (n,) part of the exposure with
-    the gate high. edge: (n,) bool, the gate changed during the exposure. backward: (n,) bool, direction level at the
-    start. line_s, scan_s: times of marker edges. power_w: emitted power, 0 while paused. jitter: (n,) or 0, by how much
-    the mirror is off that position."""
+    mirror: (n,) mirror position, as a command, in the middle of each exposure. velocity_per_s: (n,) of it, NaN = not
+    known. share: (n,) part of the exposure with the gate high. edge: (n,) bool, the gate changed during the exposure.
+    backward: (n,) bool, direction level at the start. line_s, scan_s: times of marker edges. power_w: emitted power, 0
+    while paused. jitter: (n,) or 0, by how much the mirror is off that position."""
 
     mirror: Array
+    velocity_per_s: Array
     share: Array
     edge: NDArray[np.bool_]
     backward: NDArray[np.bool_]
@@ -126,8 +127,10 @@ class Bench:
         with self._lock:
             motion = self._motion
             share, edge = self._gate(start_s, exposure_s, until_s)
+            first, last = motion.mirror(start_s), motion.mirror(start_s + exposure_s)
             return Happening(
                 mirror=motion.mirror(start_s + 0.5 * exposure_s),
+                velocity_per_s=(last - first) / exposure_s,
                 share=share,
                 edge=edge,
                 backward=motion.backward(start_s),

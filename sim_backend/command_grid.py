@@ -1,8 +1,9 @@
-"""Mirror positions at which the flux is computed: within a column it is held at the column's centre.
+"""Mirror positions at which the flux is computed: frames of one column share one.
 
-Frames of one column share one p, so the bench rounds the mirror's position to a grid. Told the columns' commands it
-uses those (no bias: the K frames of a column all get the very centre). Not told, it divides the command range finely,
-four positions per pixel of width, and the stripe then moves within a column as the mirror does."""
+Tracing the light costs more than drawing a frame, so the frames that the mirror spends in one cell of a grid all get
+their mean position. A mean over a column's frames, which is what is counted and bound, is then that of a mirror that
+moves on, wherever in their column the frames happen to lie. Told the columns' commands the cells are the columns; not
+told, the command range is divided finely, four cells per pixel of width."""
 
 from dataclasses import dataclass
 
@@ -12,12 +13,16 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 FINE_POSITIONS_PER_PX = 4
+ROUNDING = 1e-9
+"""Positions are rounded to this, far below what a frame can tell: frames then have the very same mean."""
+_SLACK = 1e-6
+"""Of a step: where frames lie on the very border of cells."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommandGrid:
-    """Ascending positions (n,) float64; a command is rounded to the nearest. `low`, `high`: what still belongs to the
-    ends.
+    """Ascending positions (n,) float64; a cell is what is nearest to one, edges (n - 1,) are between them. `low`,
+    `high`: what still belongs to the ends.
     """
 
     positions: Array
@@ -25,11 +30,21 @@ class CommandGrid:
     low: float
     high: float
 
-    def hold(self, commands: Array) -> Array:
-        """Nearest positions for commands (n,), NaN for those past the ends of the grid."""
+    def hold(self, commands: Array, steps: Array) -> Array:
+        """Mean positions of the frames that share a cell with these, at commands (n,), NaN past the ends of the grid.
+
+        steps: (n,) how far the mirror moves from one frame to the next, 0: the frame is alone, as where one step leads
+        out of the cell; NaN: not known, it is held at the cell's own position.
+        """
         if len(self.positions) == 0:
             return np.full(commands.shape, np.nan)
-        held = self.positions[np.searchsorted(self.edges, commands, side="right")]
+        cell = np.searchsorted(self.edges, commands, side="right")
+        borders = np.concatenate([[self.low], self.edges, [self.high]])
+        step = np.where(steps == 0, 2 * (self.high - self.low), np.abs(steps))
+        below = np.maximum(np.floor((commands - borders[cell]) / step + _SLACK), 0)
+        above = np.maximum(np.ceil((borders[cell + 1] - commands) / step - _SLACK) - 1, 0)
+        mean = np.rint((commands + 0.5 * step * (above - below)) / ROUNDING) * ROUNDING
+        held = np.where(np.isnan(step), self.positions[cell], mean)
         return np.where((commands >= self.low) & (commands <= self.high), held, np.nan)
 
 

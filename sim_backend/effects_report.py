@@ -7,7 +7,7 @@ made once for all.
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -63,16 +63,16 @@ def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float
 
 
 def flux_row(
-    world: "SimulatedWorld", row: int, planes: Array, *, power_w: float, exposure_s: float
+    world: "SimulatedWorld", row: int, sheets: Sequence[LightSheet], *, power_w: float, exposure_s: float
 ) -> Mapping[str, Array]:
     """Photons per exposure (width,) of a row by effect of light or dark counts, zeros for those that are off.
 
-    planes: (lines, 4) of the lines that are there at once. power_w: of each of them.
+    sheets: of the lines that are there at once, traced on the row. power_w: of each of them.
     """
     model = world.flux_model
     lit: dict[str, Array] = {}
-    for plane in planes:
-        for name, (rate, _) in _parts(model, world.setting.view.sheet(plane), row, row + 1).items():
+    for sheet in sheets:
+        for name, (rate, _) in _parts(model, sheet, row, row + 1).items():
             lit[name] = lit.get(name, 0.0) + rate[0]
     found = {}
     for entry in CATALOGUE:

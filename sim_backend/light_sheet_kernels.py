@@ -32,16 +32,17 @@ def trace_rows(
     start: NDArray[np.int64],
     step: NDArray[np.int64],
 ) -> None:
-    """Trace rows first_row..last_row-1 of the plane p = n/d (3,), inverse depth p.(u, v, 1).
+    """Trace rows first_row..last_row-1 of planes p = n/d, (1, 3) or one a row (rows, 3), inverse depth p.(u, v, 1).
 
     surface: inverse depth of the scene (rows, width), 0 = open sky. bounds: see `span_bounds`. Writes per row:
     x_stripe, NaN where there is none; x_end, where the lit part of the sheet ends (NaN: nothing of it is lit); start,
     first pixel on the light's way; step, +1 where the light travels towards larger x (scanner on the left), -1 the
     other way, 0 where the row sees no sheet."""
-    px, py, pz = plane[0], plane[1], plane[2]
-    low_u, low_v = 0 if px >= 0 else 1, 2 if py >= 0 else 3
     width = u.shape[1]
     for y in range(first_row, last_row):
+        k = min(y, len(plane) - 1)
+        px, py, pz = plane[k, 0], plane[k, 1], plane[k, 2]
+        low_u, low_v = 0 if px >= 0 else 1, 2 if py >= 0 else 3
         x_stripe[y] = np.nan
         x_end[y] = np.nan
         step[y] = 0
@@ -66,10 +67,10 @@ def trace_rows(
             continue  # enters the picture behind what is seen there: in its shadow
         x_end[y] = last + 0.5 * move
         while x != last:
-            k = (x + move) // SPAN_PX
+            span = (x + move) // SPAN_PX
             in_span = min(SPAN_PX - (x + move) % SPAN_PX if move == 1 else (x + move) % SPAN_PX + 1, (last - x) * move)
-            least = px * bounds[y, k, low_u] + py * bounds[y, k, low_v] + pz
-            if least > bounds[y, k, 4]:
+            least = px * bounds[y, span, low_u] + py * bounds[y, span, low_v] + pz
+            if least > bounds[y, span, 4]:
                 x += move * in_span
                 continue
             here = 1.0

@@ -6,7 +6,7 @@ all spans of a block by itself; every step works row by row, so the split does n
 bits acts on whole frames, of which windows are cut afterwards. Measured, 512 x 512, the street in fog: 12 us a frame
 and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms on two (`rig bench --simulator`)."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 
 from sim_backend.effects.setting import FrameTimes, Words
 from sim_backend.flux import FluxModel
-from sim_backend.light_sheet import LightSheet, empty_sheet
-from sim_backend.line_fan import ONE_LINE, LineFan
+from sim_backend.light_sheet import LightSheet
+from sim_backend.line_fan import ONE_LINE, LineFan, SheetsOf
 from sim_backend.photon_kernels import Levels, draw_frames, new_levels, set_levels
 from sim_backend.random_lanes import WORD_PX
 
 Array = NDArray[np.float64]
-PlanesOf = Callable[[Array], Array]
 _SLACK = 1e-6
 """Of a time step: times that are meant to be a multiple of it are."""
 
@@ -49,18 +48,18 @@ class PhotonSource:
     def __init__(
         self,
         model: FluxModel,
-        planes_of: PlanesOf,
+        sheets_of: SheetsOf,
         times: FrameTimes,
         seed: int,
         threads: int,
         fan: LineFan = ONE_LINE,
         command_range: tuple[float, float] = (-np.inf, np.inf),
     ) -> None:
-        """planes_of: mirror commands (n,) within `command_range` to light planes (n, 4). fan: the lines there are."""
+        """sheets_of: of mirror commands within `command_range`. fan: the lines there are."""
         rows, width = model.steady_per_s.shape
         words = -(-width // WORD_PX)
         self._model = model
-        self._planes_of = planes_of
+        self._sheets_of = sheets_of
         self._fan, self._command_range = fan, command_range
         self._times = times
         self._seed = np.uint64(seed & 0xFFFFFFFFFFFFFFFF)
@@ -69,7 +68,8 @@ class PhotonSource:
         self._of_line: Any = None if fan == ONE_LINE else np.zeros_like(self._rate)
         self._dark, self._levels = new_levels(rows, words), new_levels(rows, words)
         self._lit = np.ones((rows, words), np.bool_)
-        self._traced: tuple[float, float] | None = None
+        self._traced: tuple[float, ...] | None = None
+        """Positions of the mirror and the moment of the sheets that were traced last."""
         self._levels_power_w = 0.0
         self._whole = np.zeros((0, rows, words), np.uint64)
         self._before = [np.zeros((rows, words), np.uint64) for _ in model.bit_effects]
@@ -90,7 +90,8 @@ class PhotonSource:
     ) -> None:
         """Fill `bits` (n, rows, row bytes) with windows of frames first_frame, first_frame + 1, ...
 
-        held: (n,) mirror positions, NaN = the light goes nowhere. power_w: (n,) power averaged over each exposure.
+        held: (n,) mirror positions, NaN = the light goes nowhere; or (n, 2), while the first and the last row are
+        exposed. power_w: (n,) power averaged over each exposure.
         x0: (n,) first pixel of each window, a multiple of 64; a window has the very bits of the whole frame. time_s:
         (n,) when each exposure begins, of the bench, for scenes that move.
         """
@@ -113,32 +114,30 @@ class PhotonSource:
 
     def _spans(self, held: Array, power_w: Array, time_s: Array) -> list[_Span]:
         """The frames' light; what is remembered of it is then that of the last one."""
-        dark = np.isnan(held) | (power_w == 0)
+        held = held if held.ndim == 2 else held[:, None]
+        dark = np.isnan(held).any(axis=1) | (power_w == 0)
         power_w = np.where(dark, 0.0, power_w)
         hold_s = self._model.hold_s
         moved_s = np.zeros(len(held)) if hold_s == 0 else np.floor(time_s / hold_s + _SLACK) * hold_s
-        light = np.where(dark, 0.0, np.stack([held, moved_s, power_w])).T
+        light = np.where(dark, 0.0, np.stack([*held.T, moved_s, power_w])).T
         change = np.flatnonzero((np.diff(light, axis=0) != 0).any(axis=1) | (dark[1:] != dark[:-1])) + 1
         starts = np.array([0, *change.tolist()])
         lit = starts[~dark[starts]]
-        planes = dict(zip(lit.tolist(), self._planes(light[lit, 0]), strict=True)) if len(lit) else {}
+        rows, limits = len(self._rate), self._command_range
+        found = self._fan.sheets(self._sheets_of, held[lit], rows, moved_s[lit].tolist(), limits)
+        sheets = dict(zip(lit.tolist(), found, strict=True))
         spans = []
         for a, b in pairwise([*starts.tolist(), len(held)]):
-            if a not in planes:
+            if a not in sheets:
                 spans.append(_Span(a, b, float(moved_s[a]), 0.0, None, False))
                 continue
-            position, moment_s, power = light[a].tolist()
-            moves = (position, moment_s) != self._traced
-            sheets = [empty_sheet(plane, len(self._rate), moment_s) for plane in planes[a]] if moves else None
-            spans.append(_Span(a, b, moment_s, power, sheets, moves or power != self._levels_power_w))
-            self._traced, self._levels_power_w = (position, moment_s), power
+            *where, power = light[a].tolist()
+            moves = tuple(where) != self._traced
+            spans.append(
+                _Span(a, b, where[-1], power, sheets[a] if moves else None, moves or power != self._levels_power_w)
+            )
+            self._traced, self._levels_power_w = tuple(where), power
         return spans
-
-    def _planes(self, held: Array) -> Sequence[Array]:
-        """Planes (lines, 4) at each of the mirror positions (n,)."""
-        if self._of_line is None:
-            return list(self._planes_of(held)[:, None])
-        return self._fan.planes(self._planes_of, held, self._command_range)
 
     def _draw(self, spans: list[_Span], first_frame: int, first_word: NDArray[np.int32], words: Words) -> None:
         model, rate, exposure_s = self._model, self._rate, self._times.exposure_s

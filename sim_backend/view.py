@@ -71,19 +71,30 @@ class View:
         return 1.0 / float(np.median(lit)) if len(lit) else 0.0
 
     def sheet(self, plane: Array, time_s: float = 0.0) -> LightSheet:
-        """The light sheet of the plane (4,) = nx, ny, nz, d at a time of the bench, traced on every row."""
+        """The flat sheet of the plane (4,) = nx, ny, nz, d at a time of the bench, traced on every row."""
         sheet = empty_sheet(plane, self.rows, time_s)
         self.trace(sheet, 0, self.rows)
         return sheet
 
     def trace(self, sheet: LightSheet, first_row: int, last_row: int) -> None:
-        """Trace rows first_row..last_row-1 of a sheet in place. Releases the GIL."""
+        """Trace rows first_row..last_row-1 of a sheet in place. Releases the GIL, but for sheets that bow."""
         now = self.at(sheet.time_s)
+        now._trace_planes(sheet, first_row, last_row)
+        if sheet.bowed is not None:
+            # The plane of the fan's middle ends a pixel or two beside the sheet: near enough for a tangent.
+            rows = np.arange(first_row, last_row)
+            ends = sheet.x_end_px[rows]
+            x = np.where(np.isnan(ends), sheet.start_px[rows], np.rint(np.clip(ends, 0, now.width - 1)))
+            at = rows, x.astype(np.int64)
+            sheet.touch(now.u[at], now.v[at], first_row, last_row)
+            now._trace_planes(sheet, first_row, last_row)
+
+    def _trace_planes(self, sheet: LightSheet, first_row: int, last_row: int) -> None:
         trace_rows(
-            now.u,
-            now.v,
-            now.surface,
-            now.bounds,
+            self.u,
+            self.v,
+            self.surface,
+            self.bounds,
             sheet.inverse,
             first_row,
             last_row,

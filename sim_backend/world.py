@@ -17,7 +17,7 @@ from drivers.interfaces import SweepTruth
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.units import parse_quantity
 from sim_backend.bench import Bench, Happening
-from sim_backend.command_grid import column_grid, fine_grid
+from sim_backend.command_grid import ROUNDING, column_grid, fine_grid
 from sim_backend.effect_planner import MOST, SAMPLED_COLUMNS, EffectPlan, Wanted, is_wanted, plan_effects
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.setting import FrameTimes, PlannedFor, Setting
@@ -76,7 +76,9 @@ class WorldConfig(KindConfig):
 
     kind: str = "simulated"
     geometry: str | None = None
-    """Rig-model file of the rig as it really is; the bundled simulated rig by default."""
+    """Rig-model file of the rig as it really is; the bundled simulated rig by default. Light that bows, passes the
+    axis or turns on a cone, and rows that are late, are simulated where this file has them.
+    """
     scene: str = "street"
     """A bundled scene's name, a scene file, or a folder of surfaces."""
     fog: Annotated[str | None, AfterValidator(_known_fog)] = None
@@ -91,7 +93,7 @@ class WorldConfig(KindConfig):
     `all`, or a list of names (for ablations).
     """
     command_grid: CommandGridConfig | None = None
-    """Mirror commands at which the flux is held, for use without an application that says `hold_columns`."""
+    """Columns in which the flux is held, for use without an application that says `hold_columns`."""
 
 
 class SimulatedWorld:
@@ -118,7 +120,7 @@ class SimulatedWorld:
             motion = MovingSurfaces(self.scene.motion.velocity)
         view = make_view(self.model, self.surfaces, motion, (u, v))
         line_width(view, config.optics, config.sensor, config.line)  # refuses a focus within the lens, before any plan
-        self.setting = Setting(view, self.scene, config.optics, config.sensor, config.line, gain)
+        self.setting = Setting(view, self.scene, config.optics, config.sensor, config.line, gain, _own(self.model))
         self._planned_for = MOST
         self._planned: tuple[EffectPlan, FluxModel] | None = None
         self.bench = Bench(surroundings.clock, self.model.lag_s)
@@ -176,7 +178,7 @@ class SimulatedWorld:
         self.fan = line_fan(offsets, shared=shared)
 
     def hold_columns(self, commands: Array) -> None:
-        """Hold the flux at these mirror commands (columns,): all frames of a column then share the p of its centre.
+        """Hold the flux in columns of these mirror commands (columns,): all frames of a column share one p.
 
         To be called before the run; without it the stripe moves within a column, as the mirror does.
         """
@@ -191,25 +193,41 @@ class SimulatedWorld:
         wanted = [e for e in kept if e.called(self.setting)[0] and is_wanted(e.name, self.config.effects)]
         self._planned = self._plan()[0], FluxModel(self.setting, wanted)
 
-    def held(self, happening: Happening) -> Array:
-        """Mirror positions (n,) whose light n frames see, NaN past the ends of the grid: those of the columns, with the
-        mirror's jitter."""
+    def held(self, happening: Happening, period_s: float) -> Array:
+        """Mirror positions whose light n frames see, one period apart, (n,): those of the columns, with the mirror's
+        jitter; or, where rows are exposed one after the other, (n, 2) of the first and the last row. NaN past the ends
+        of the grid.
+        """
         low, high = self.model.scanner.command_range
-        return np.clip(self.grid.hold(happening.mirror) + happening.jitter, low, high)
+        first = self.grid.hold(happening.mirror, happening.velocity_per_s * period_s) + happening.jitter
+        if self.model.row_delay_s == 0:
+            return np.clip(first, low, high)
+        later = np.rint(happening.velocity_per_s * self._frame_delay_s / ROUNDING) * ROUNDING
+        return np.clip(np.stack([first, first + np.nan_to_num(later)], axis=-1), low, high)
+
+    @property
+    def _frame_delay_s(self) -> float:
+        """From the exposure of the first row to that of the last."""
+        return self.model.row_delay_s * (self.size[0] - 1)
 
     def true_model(self) -> RigModel:
         """The rig as it really is: what a calibration should find."""
         return self.model
 
-    def truth(self, commands: Array, time_s: float = 0.0) -> SweepTruth:
+    def truth(self, commands: Array, velocity_per_s: float = 0.0, time_s: float = 0.0) -> SweepTruth:
         """Where the stripe of each column (commands (columns,)) truly is, and the depth of every pixel.
 
-        time_s: of the bench, where surfaces move; a scan asks for time 0, that is for the scene before it moved.
+        velocity_per_s: of the command. time_s: of the bench, where surfaces move; a scan asks for time 0, that is for
+        the scene before it moved.
         """
         view = self.setting.view.at(time_s)
         x_px = np.full((view.rows, len(commands)), np.nan, np.float32)
-        for column, plane in enumerate(self.model.planes(np.asarray(commands, dtype=np.float64))):
-            x_px[:, column] = view.sheet(plane).x_stripe_px
+        first = np.asarray(commands, dtype=np.float64)
+        held = np.stack([first, first + velocity_per_s * self._frame_delay_s], axis=-1)
+        held = np.clip(held, *self.model.scanner.command_range) if self._frame_delay_s else first
+        for column, (sheet,) in enumerate(ONE_LINE.sheets(self.model.sheets, held, view.rows, [time_s] * len(first))):
+            view.trace(sheet, 0, view.rows)
+            x_px[:, column] = sheet.x_stripe_px
         with np.errstate(divide="ignore"):
             depth = self.surfaces.depth_m.copy() if view is self.setting.view else (1 / view.surface).astype(np.float32)
         depth[~np.isfinite(depth) | np.isnan(view.u)] = np.nan
@@ -228,9 +246,11 @@ class SimulatedWorld:
         """
         from sim_backend.effects_report import flux_row
 
-        scanner = self.model.scanner
-        (planes,) = self.fan.planes(scanner.planes, np.array([command]), scanner.command_range)
-        return flux_row(self, row, planes, power_w=power_w * self.fan.share, exposure_s=exposure_s)
+        view, limits = self.setting.view, self.model.scanner.command_range
+        (sheets,) = self.fan.sheets(self.model.sheets, np.array([command]), view.rows, [0.0], limits)
+        for sheet in sheets:
+            view.trace(sheet, row, row + 1)
+        return flux_row(self, row, sheets, power_w=power_w * self.fan.share, exposure_s=exposure_s)
 
     def frame_source(self, exposure_s: float, seed: int, threads: int) -> PhotonSource:
         """What draws frames that follow one another without a gap."""
@@ -239,13 +259,23 @@ class SimulatedWorld:
     def photons(self, times: FrameTimes, seed: int, threads: int) -> PhotonSource:
         """What draws frames that follow one another like that."""
         model = self.model
-        return PhotonSource(self.flux_model, model.planes, times, seed, threads, self.fan, model.scanner.command_range)
+        return PhotonSource(self.flux_model, model.sheets, times, seed, threads, self.fan, model.scanner.command_range)
 
     def numpy_frames(self, exposure_s: float, seed: int) -> "NumpyFrames":
         """The straightforward way to the same frames, to compare with."""
         from sim_backend.numpy_frames import NumpyFrames
 
         return NumpyFrames(self.setting, self.flux_model.steady_per_s, exposure_s, seed)
+
+
+def _own(model: RigModel) -> dict[str, str]:
+    """What the rig does that not every rig does, by effect, and how much of it."""
+    found = {}
+    if bow := getattr(model.scanner, "bow_per_rad", 0.0):
+        found["sheet bow"] = f"the sheet leaves its plane by {bow:g} rad times the square of the angle within its fan"
+    if model.row_delay_s:
+        found["row delay"] = f"each row is exposed {1e9 * model.row_delay_s:g} ns later than the one above"
+    return found
 
 
 def _load_geometry(path: Path) -> RigModel:

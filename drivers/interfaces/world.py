@@ -22,6 +22,9 @@ class SweepTruth:
 class World(Protocol):
     """The scene that the simulated devices of a rig share."""
 
-    def truth(self, commands: NDArray[np.float64]) -> SweepTruth:
-        """The truth for the scanner commands (columns,) of a sweep's columns."""
+    def truth(self, commands: NDArray[np.float64], velocity_per_s: float = 0.0) -> SweepTruth:
+        """The truth for the scanner commands (columns,) of a sweep's columns, at which its first row was exposed.
+
+        velocity_per_s: of the command during the sweep, negative where it fell.
+        """
         ...

@@ -122,7 +122,7 @@ def _captured(
     defects: NDArray[np.bool_] | None,
     out: OutFolder,
 ) -> Capture:
-    # The world is not asked for the truth, nor to hold its light within a column: that shifts passages by hundredths.
+    # A simulated world is not asked for the truth, nor to hold its light within columns: it moves as the mirror does.
     rig = replace(rig, world=None)
     plan, _ = prepare(rig)
     sweeps = _sweeps(rig, maps, seed, out)

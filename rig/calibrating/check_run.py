@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from calibration.board import Board
+from calibration.camera_files import CORNERS, corners_digest
 from calibration.check_fit import CheckedAngle, CheckedBoard, check_angle, check_boards
 from calibration.check_verdict import judge_check
 from calibration.errors import Degenerate
 from calibration.files import load_rig_model
 from calibration.judging import ACCURACY_PX, AT_M
+from calibration.model import RigModel
 from calibration.sensitivity import sensitivity
 from calibration.uncertainty import DepthUncertainty, depth_uncertainty
 from calibration.verdict import Asked, Verdict
@@ -30,6 +32,8 @@ from rig.errors import UsageError
 from rig.run import OutFolder, versions
 
 NO_COVARIANCE = "the calibration has no covariance: nothing tells what depth error to expect"
+SEED_APART = 1 << 20
+"""From that of a calibration: a simulated rig shows a check other poses, and other photons."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +60,8 @@ def run_check(
 ) -> CalibrationResult:
     """Check a calibration, by default that of the live rig; how it ended is noted beside its file, if it is of a rig.
 
-    Raises Degenerate where the board was not scanned, UsageError where there is no calibration.
+    Raises Degenerate where the board was not scanned, UsageError where there is no calibration, or one made of these
+    very views.
     """
     live = sources.live
     file = calibration or (None if live is None else live.calibration)
@@ -65,18 +70,20 @@ def run_check(
     model = load_rig_model(file)
     poses = max(asked.poses, 2 if asked.angle_rad is not None else 1)
     require_live(live, ask, asked.arm)
+    worth = sensitivity(model, asked.at_m)
+    goal = Asked(ACCURACY_PX * worth.per_pixel_m if asked.accuracy_m is None else asked.accuracy_m, asked.at_m)
     with Session(out, board) as session:
         taken = Taken(session, tell)
         take_kept(taken, sources, board, model.defects)
+        _require_others(taken.views, model)
         if live is not None:
-            choose = good_poses(live, board, poses, asked.at_m, asked.seed)
-            take_live(taken, Live(live, poses, choose, ask, (), asked.seed, asked.arm, model.defects), board)
+            seed = asked.seed + SEED_APART
+            choose = good_poses(live, board, poses, asked.at_m, seed)
+            take_live(taken, Live(live, poses, choose, ask, (), seed, asked.arm, model.defects), board)
         views = _with_board(taken, 1 if asked.angle_rad is None else 2)
         model.check_sensor(*taken.size)
         boards = check_boards(model, views, board)
         angle = None if asked.angle_rad is None else check_angle(model, views[0], views[1], board)
-        worth = sensitivity(model, asked.at_m)
-        goal = Asked(ACCURACY_PX * worth.per_pixel_m if asked.accuracy_m is None else asked.accuracy_m, asked.at_m)
         verdict = judge_check(boards, goal, board.size_m[0], angle, asked.angle_rad)
         uncertainty = None if model.covariance is None else depth_uncertainty(model, asked.at_m)
         line = NO_COVARIANCE if uncertainty is None else uncertainty.line()
@@ -92,6 +99,17 @@ def run_check(
         if model.identity is not None:
             note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
         return CalibrationResult(verdict, line, figures, summary, model, session.path)
+
+
+def _require_others(views: Sequence[View], model: RigModel) -> None:
+    """UsageError for views that the model was made of: it was fitted to their errors too."""
+    made_of = model.provenance.get(CORNERS) or ()
+    same = [view.name for view in views if corners_digest(view) in made_of]
+    if same:
+        raise UsageError(
+            f"view{'s' if len(same) > 1 else ''} {', '.join(same)}: the calibration was made of the same, which is no "
+            "check of it; name a rig, runs or views taken since"
+        )
 
 
 def _with_board(taken: Taken, least: int) -> list[View]:

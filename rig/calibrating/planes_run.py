@@ -2,13 +2,14 @@
 
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from calibration.against_truth import DepthErrors
 from calibration.board import Board
-from calibration.camera_files import KnownCamera, corners_digest
+from calibration.camera_files import CORNERS, KnownCamera, corners_digest
 from calibration.errors import CalibrationError, Degenerate
 from calibration.judging import AT_M, Judged, judge_fit
 from calibration.model import Identity, RigModel
@@ -74,15 +75,16 @@ def run_planes(
         take_kept(taken, sources, board, defects)
         if live is not None:
             start = good_poses(live, board, asked.poses, asked.at_m, asked.seed)
-            guide = Guide(start, board, live, asked.at_m, asked.accuracy_m, taken, tell)
+            fit_and_judge = partial(_fit, taken, board, base, camera), partial(_judged, taken, asked)
+            guide = Guide(start, board, live.scan.depth_range, taken, *fit_and_judge, tell)
             exposures = asked.exposures or speeds_of(live)
             choose = guide if asked.guided else start
             take_live(taken, Live(live, asked.poses, choose, ask, exposures, asked.seed, asked.arm, defects), board)
         fit = _fitted(taken, board, base, camera)
-        judged = judge_fit(
-            fit, taken.views, at_m=asked.at_m, accuracy_m=asked.accuracy_m, stated_baseline_m=asked.stated_baseline_m
-        )
-        model = _signed(fit, judged, taken.identity)
+        judged = _judged(taken, asked, fit)
+        told = () if camera is None else camera.views
+        digests = sorted({*told, *(corners_digest(view) for view in taken.views if view.name in fit.views)})
+        model = _signed(fit, judged, taken.identity, digests)
         truth = None if live is None else true_errors(model, live, asked.at_m)
         line = judged.uncertainty.line()
         summary = {
@@ -102,6 +104,24 @@ def speeds_of(live: RigConfig) -> tuple[int, ...]:
     return tuple(dict.fromkeys(max(1, round(times * live.scan.exposures)) for times in SPEEDS))
 
 
+def _fit(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
+    """Of the views so far, with all that is known from elsewhere."""
+    return fit_rig(
+        taken.views,
+        board,
+        taken.size,
+        camera=None if camera is None else camera.camera,
+        known=None if camera is None else camera.covariance,
+        start=base,
+    )
+
+
+def _judged(taken: Taken, asked: PlanesAsked, fit: RigFit) -> Judged:
+    return judge_fit(
+        fit, taken.views, at_m=asked.at_m, accuracy_m=asked.accuracy_m, stated_baseline_m=asked.stated_baseline_m
+    )
+
+
 def _fitted(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
     if camera is not None:
         twice = [view.name for view in taken.views if corners_digest(view) in camera.views]
@@ -111,27 +131,21 @@ def _fitted(taken: Taken, board: Board, base: RigModel | None, camera: KnownCame
                 "or leave the camera out"
             )
     try:
-        return fit_rig(
-            taken.views,
-            board,
-            taken.size,
-            camera=None if camera is None else camera.camera,
-            known=None if camera is None else camera.covariance,
-            start=base,
-        )
+        return _fit(taken, board, base, camera)
     except CalibrationError as error:
         refused = error if isinstance(error, Degenerate) else Degenerate("no-model", str(error))
         raise refusal(refused, taken, board) from refused
 
 
-def _signed(fit: RigFit, judged: Judged, identity: Identity | None) -> RigModel:
-    """The model with its verdict, and of which rig it is."""
+def _signed(fit: RigFit, judged: Judged, identity: Identity | None, digests: list[str]) -> RigModel:
+    """The model with its verdict, of which rig it is, and of which corners: those cannot check it."""
     verdict = judged.verdict
     created = datetime.now(UTC).isoformat(timespec="seconds")
     if identity is not None:
         word = "passed" if verdict.passed else "failed"
         identity = replace(identity, created=created, verdict=word, reasons=verdict.codes)  # type: ignore[arg-type]
     provenance = {
+        **fit.model.provenance,
         "by": "rig calibrate planes",
         "created": created,
         "views": len(fit.views),
@@ -141,6 +155,7 @@ def _signed(fit: RigFit, judged: Judged, identity: Identity | None) -> RigModel:
         "asked_m": judged.asked.accuracy_m,
         "verdict": "passed" if verdict.passed else "failed",
         "reasons": [str(reason) for reason in verdict.reasons],
+        CORNERS: digests,
     }
     return replace(fit.model, identity=identity, provenance=provenance)
 
@@ -170,6 +185,7 @@ def _summary(fit: RigFit, judged: Judged, taken: Taken) -> dict[str, Any]:
         "jitter_sd": fit.noise.jitter_sd,
         "misfit": fit.misfit,
         "condition": fit.condition,
+        "converged": fit.converged,
         "wave_m": evidence.wave_m,
         "shift_m": evidence.shift_m,
         "baseline_m": evidence.baseline_m,
@@ -195,7 +211,7 @@ def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None) -> list[tup
         ("lag", f"{lag.forward * 1e6:.1f} us forward, {lag.backward * 1e6:.1f} us backward"),
         ("residuals", f"corners {fit.corner_rms_px:.3f} px, planes wave by {evidence.wave_m * 1e3:.2g} mm and views "
                       f"differ by {evidence.shift_m * 1e3:.2g} mm at {asked.at_m:g} m"),
-        ("condition", f"{fit.condition:.3g}"),
+        ("condition", f"{fit.condition:.3g}" + ("" if fit.converged else "; the fit did not come to rest")),
     ]  # fmt: skip
     if truth is not None:
         rows.append(("truth", f"median {truth.median_m * 1e3:.3g} mm, worst {truth.worst_m * 1e3:.3g} mm at "

@@ -42,9 +42,10 @@ def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequenc
     """Where corners were seen and how far the model's are from them."""
     size = (camera.width, camera.height)
     seen = [corners_px(view) for view in views]
+    coverage = coverage_picture([view.name for view in views], seen, size)
     arrows, times = residual_picture(seen, residuals_px, size)
     return [
-        Section("Coverage", picture(coverage_picture(seen, size), "Corners of all views, a colour for each view.")),
+        Section("Coverage", picture(coverage, "Corners of all views, each named at its first corner.")),
         Section("Residuals of the corners", picture(arrows, f"Drawn {times} times longer than they are.")),
     ]
 
@@ -60,7 +61,7 @@ def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
     if not np.isfinite(uncertainty.sd_m).any():
         return Section("Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m."))
     caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
-    rows = [(name, f"{np.nanmedian(part) * 1e3:.3g} mm") for name, part in uncertainty.part_m.items()]
+    rows = [(name, f"{np.nanmedian(part) * 1e3:.3g}") for name, part in uncertainty.part_m.items()]
     said = paragraph("Its parts, each the median over the picture:") + table(("from", "mm"), rows)
     return Section("Expected depth error", picture(error_picture(uncertainty), caption) + said)
 
@@ -89,7 +90,7 @@ def check_report(
     """Of a check."""
     sections = []
     for board in boards:
-        caption = "How far the board's squares lie off their plane; black: not scanned."
+        caption = "How far the board's squares lie off their plane, negative and red: in front; black: not scanned."
         rows = [
             ("flatness", f"rms {board.flatness_rms_m * 1e3:.3g} mm, expected {board.expected_m * 1e3:.3g} mm; peak "
                          f"{board.flatness_peak_m * 1e3:.3g} mm"),

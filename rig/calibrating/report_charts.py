@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 
 from calibration.sweep_waves import SweepResidual, SweepWaves
+from rig.calibrating.report_pictures import view_colour
 from rig.svg_chart import Panel, Series, chart_svg
 
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Of Okabe and Ito, by turns for the views."""
 _WAYS = {1: "rising command", -1: "falling command"}
 
 
@@ -21,7 +20,7 @@ def plane_residuals(waves: SweepWaves, sweeps: Sequence[SweepResidual], metres_p
             series=[
                 Series(
                     label="",
-                    colour=_COLOURS[views.index(sweep.view) % len(_COLOURS)],
+                    colour="#{2:02x}{1:02x}{0:02x}".format(*view_colour(views.index(sweep.view))),
                     points=[
                         (float(command), float(value) * metres_per_command * 1e3)
                         for command, value in zip(waves.command, values, strict=True)
@@ -38,7 +37,7 @@ def plane_residuals(waves: SweepWaves, sweeps: Sequence[SweepResidual], metres_p
         if any(sweep.direction == way for sweep in sweeps)
     ]
     notes = [
-        "A curve for each sweep, a colour for each view. What all curves share is the scanner model's misfit;",
+        "A curve for each sweep, in its view's colour above. What all curves share is the scanner model's misfit;",
         "waves that differ from sweep to sweep come from exposures that are not locked to the scan.",
     ]
-    return chart_svg(panels, title="Plane residuals", notes=notes) if panels else ""
+    return chart_svg(panels, title="By how much depth misses the board, sweep by sweep", notes=notes) if panels else ""

@@ -1,6 +1,7 @@
 """A report as one HTML file: text first, pictures inline, nothing loaded from elsewhere."""
 
 import base64
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -14,12 +15,14 @@ from rig.pictures import png_bytes
 _STYLE = """
 body { font: 15px/1.45 Helvetica, Arial, sans-serif; color: #33404d; max-width: 860px; margin: 2em auto }
 h1 { font-size: 1.5em } h2 { font-size: 1.15em; margin-top: 2em } p { margin: 0.5em 0 }
-.passed, .failed { padding: 0.6em 1em; border-left: 6px solid; background: #f6f8fa }
+.passed, .failed { padding: 0.6em 1em; margin-bottom: 1em; border-left: 6px solid; background: #f6f8fa }
 .passed { border-color: #009e73 } .failed { border-color: #d55e00 }
 table { border-collapse: collapse; font-size: 0.92em } td, th { padding: 0.15em 0.9em 0.15em 0; text-align: left }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums }
-img { max-width: 100%; image-rendering: auto } .small { color: #7b8896; font-size: 0.88em }
+img { max-width: 100%; margin-top: 0.7em; image-rendering: auto } .small { color: #7b8896; font-size: 0.88em }
 """
+
+_NUMBER = re.compile(r"-|[-+]?[\d.]+(e[-+]?\d+)?( of \d+)?")
 
 Picture = NDArray[np.uint8]
 
@@ -53,8 +56,8 @@ def paragraph(text: str, *, small: bool = False) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; columns whose cells all begin with a digit, a sign or a dash stand to the right."""
-    numbers = [bool(rows) and all(row[i][:1] in "0123456789+-." for row in rows) for i in range(len(head))]
+    """A table; columns whose cells are all numbers, or dashes in their place, stand to the right."""
+    numbers = [bool(rows) and all(_NUMBER.fullmatch(row[i]) for row in rows) for i in range(len(head))]
 
     def cells(row: Sequence[str], tag: str) -> str:
         kinds = (' class="number"' if number else "" for number in numbers)

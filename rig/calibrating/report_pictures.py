@@ -21,12 +21,20 @@ _COLOURS = ((178, 114, 0), (0, 94, 213), (115, 158, 0), (167, 121, 204), (0, 159
 ARROW_TIMES = (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1)
 
 
-def coverage_picture(corners_px: Sequence[Array], size: tuple[int, int]) -> Picture:
-    """The corners of all views, a colour for each view, in the outline of the picture (width, height)."""
+def view_colour(view: int) -> tuple[int, int, int]:
+    """BGR, of the view with this number, in all pictures and charts."""
+    return _COLOURS[view % len(_COLOURS)]
+
+
+def coverage_picture(names: Sequence[str], corners_px: Sequence[Array], size: tuple[int, int]) -> Picture:
+    """The corners of all views, a colour and its name for each view, in the outline of the picture (width, height)."""
     picture, scale = _sheet(size)
-    for i, corners in enumerate(corners_px):
+    for i, (name, corners) in enumerate(zip(names, corners_px, strict=True)):
         for x, y in corners:
-            cv2.circle(picture, _at(x, y, scale), 3, _COLOURS[i % len(_COLOURS)], -1, cv2.LINE_AA)
+            cv2.circle(picture, _at(x, y, scale), 3, view_colour(i), -1, cv2.LINE_AA)
+        if len(corners):
+            x, y = _at(float(corners[0, 0]), float(corners[0, 1]), scale)
+            cv2.putText(picture, name, (x + 5, y - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, _INK, 1, cv2.LINE_AA)
     return picture
 
 
@@ -54,9 +62,11 @@ def error_picture(uncertainty: DepthUncertainty) -> Picture:
 
 
 def cells_picture(cells_m: Array) -> Picture:
-    """How far the squares of a board lie off their plane, with a scale; black where they were not scanned."""
+    """How far the squares of a board lie off their plane, red in front of it; black where they were not scanned."""
     large = _enlarged_mm(cells_m)
-    return depth_picture(large, depth_limits(large), unit="mm")
+    known = large[np.isfinite(large)]
+    most = max(float(np.abs(known).max()), 1e-3) if known.size else 1.0
+    return depth_picture(large, (-most, most), unit="mm")
 
 
 def _enlarged_mm(values_m: Array) -> NDArray[np.float32]:

@@ -7,15 +7,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
-
-from calibration.covariance import Covariance
 from calibration.errors import CalibrationError, Degenerate
 from calibration.files import load_rig_model
 from calibration.judging import ACCURACY_PX, AT_M
+from calibration.lag_transfer import with_lags
 from calibration.model import RigModel
 from calibration.sensitivity import sensitivity
-from calibration.sync_fit import NAMES, SyncFit, fit_sync
+from calibration.sync_fit import SyncFit, fit_sync
 from calibration.sync_verdict import judge_sync
 from calibration.verdict import Asked, Verdict
 from rig.calibrating.capture import capture_view
@@ -52,10 +50,12 @@ def run_sync(
     tell: Tell | None = None,
 ) -> CalibrationResult:
     """Measure the lags. base: the model they go into, by default that of the live rig; without one nothing but the
-    figures is written. Raises Degenerate where the sweeps cannot tell.
+    figures is written. Raises Degenerate where the sweeps cannot tell, CalibrationError where the model's line does not
+    reach the distance asked.
     """
     live = sources.live
     base = base or _own(live)
+    goal = None if base is None else _goal(base, asked)
     with Session(out) as session:
         taken = Taken(session, tell)
         take_kept(taken, sources, None)
@@ -64,9 +64,9 @@ def run_sync(
             gates.append(_scanned(live, asked, taken))
         gate = min((one for one in gates if one is not None and one.sd_s > 0), key=lambda one: one.sd_s, default=None)
         fit = _fitted(taken)
-        goal = None if base is None else _goal(base, asked)
-        verdict = judge_sync(fit, base, goal)
-        model = None if base is None else _with_sync(base, fit, gate, verdict)
+        given, changed = (None, None) if base is None else with_lags(base, fit)
+        verdict = judge_sync(fit, base, goal, changed)
+        model = None if given is None else _signed(given, gate, verdict)
         truth = None if live is None else true_model(live)
         line = _line(fit)
         summary = {"command": "sync", **_summary(fit, gate, verdict, truth), "versions": versions()}
@@ -105,18 +105,17 @@ def _own(live: RigConfig | None) -> RigModel | None:
 
 
 def _goal(model: RigModel, asked: SyncAsked) -> Asked:
-    if asked.accuracy_m is not None:
-        return Asked(asked.accuracy_m, asked.at_m)
-    return Asked(ACCURACY_PX * sensitivity(model, asked.at_m).per_pixel_m, asked.at_m)
+    worth = sensitivity(model, asked.at_m)
+    return Asked(ACCURACY_PX * worth.per_pixel_m if asked.accuracy_m is None else asked.accuracy_m, asked.at_m)
 
 
-def _with_sync(base: RigModel, fit: SyncFit, gate: GateDelay | None, verdict: Verdict) -> RigModel:
-    """The model with the lags found; what it knew of its own ones is forgotten. It fails where they did."""
-    identity = base.identity
+def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigModel:
+    """The model with the lags found, the gate's delay and where they are from. It fails where they did."""
+    identity = model.identity
     if identity is not None and not verdict.passed:
         identity = replace(identity, verdict="failed", reasons=(*identity.reasons, *verdict.codes))
     provenance = {
-        **base.provenance,
+        **model.provenance,
         "sync": {
             "by": "rig calibrate sync",
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -124,25 +123,11 @@ def _with_sync(base: RigModel, fit: SyncFit, gate: GateDelay | None, verdict: Ve
         },
     }
     return replace(
-        base,
-        lag_s=fit.lag_s,
-        row_delay_s=fit.row_delay_s,
-        gate_delay_s=base.gate_delay_s if gate is None else gate.delay_s,
-        speed_range_per_s=fit.speed_range_per_s,
-        covariance=None if base.covariance is None else _joined(base.covariance, fit),
+        model,
+        gate_delay_s=model.gate_delay_s if gate is None else gate.delay_s,
         identity=identity,
         provenance=provenance,
     )
-
-
-def _joined(known: Covariance, fit: SyncFit) -> Covariance:
-    kept = [name for name in known.names if name not in NAMES]
-    told = [i for i in range(len(NAMES)) if np.isfinite(fit.covariance[i, i]) and fit.covariance[i, i] > 0]
-    names = (*kept, *(NAMES[i] for i in told))
-    matrix = np.zeros((len(names), len(names)))
-    matrix[: len(kept), : len(kept)] = known.of(kept)
-    matrix[len(kept) :, len(kept) :] = np.nan_to_num(fit.covariance[np.ix_(told, told)])
-    return Covariance(names, matrix)
 
 
 def _line(fit: SyncFit) -> str:

@@ -30,13 +30,6 @@ from rig.session import open_rig
 MISSED_SHARE = 0.5
 """So many more poses than asked for are shown where the board is not found in some."""
 
-SIMULATED_PART = "world"
-"""Of an identity's kinds, in simulated rigs only."""
-HELD = (
-    "run {} is of a simulated rig: a scan holds its light within a column, so that sweeps differ by up to 1/20 column; "
-    "name the rig instead, whose light is not held then"
-)
-
 Defects = NDArray[np.bool_] | None
 """(rows, width), pixels not to be used."""
 
@@ -141,10 +134,7 @@ def take_kept(taken: Taken, sources: Sources, board: Board | None, defects: Defe
         for view in load_views(folder / VIEWS):
             taken.add(view, None, identity)
     for run in sources.recorded:
-        capture = capture_recorded(run, run.name, board, defects=defects)
-        taken.add_capture(capture)
-        if taken.tell is not None and SIMULATED_PART in capture.identity.kinds:
-            taken.tell(HELD.format(run.name))
+        taken.add_capture(capture_recorded(run, run.name, board, defects=defects))
     for file in sources.pictures:
         taken.add(*_pictured(file, board))
 

@@ -231,9 +231,9 @@ class SimulatedSpad(SpadArray):
     ) -> None:
         """Draw the next frames, without the first few, into `bits`."""
         assert self._photons is not None, "configured before started"
-        held, power_w = self._world.held(happening)[first:], (happening.power_w * happening.share)[first:]
+        held, power_w = self._world.held(happening, self._period_s), happening.power_w * happening.share
         number = self._first_draw + self._next_frame + first
-        self._photons.expose(number, held, power_w, x0[first:], bits, start_s[first:])
+        self._photons.expose(number, held[first:], power_w[first:], x0[first:], bits, start_s[first:])
 
     def _advance(self, n: int, *, lost: int) -> None:
         """Let the time of n frames pass."""

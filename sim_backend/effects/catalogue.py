@@ -190,7 +190,7 @@ def _bit_errors_change(setting: Setting, planned_for: PlannedFor) -> float:
     return setting.sensor.bit_error_rate * setting.view.width * planned_for.exposures
 
 
-DEVICES_OWN = ("galvo lag", "galvo jitter", "lost frames", "duplicated frames", "clock drift")
+DEVICES_OWN = ("galvo lag", "galvo jitter", "sheet bow", "row delay", "lost frames", "duplicated frames", "clock drift")
 MEASURED = "stripe"
 """The effect without which there is nothing to decide."""
 

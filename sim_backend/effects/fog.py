@@ -80,7 +80,7 @@ class Haze:
             sheet.x_end_px,
             sheet.start_px,
             sheet.step,
-            kind.type(self._scale / abs(sheet.offset_m) if sheet.offset_m != 0 else 0.0),
+            (self._scale / np.where(sheet.offset_m != 0, np.abs(sheet.offset_m), np.inf)).astype(kind),
             self._sigma_px,
             kind.type(LOG2_E * self._extinction_per_m),
             numbers.terms,
@@ -100,7 +100,7 @@ def _add_haze(
     x_end: NDArray[np.float64],
     start: NDArray[np.int64],
     step: NDArray[np.int64],
-    scale: float,
+    scales: NDArray[np.float64],
     sigma_px: float,
     halvings_per_m: float,
     terms: NDArray[np.float64],
@@ -113,16 +113,16 @@ def _add_haze(
     # What arrays and tuples are asked for stands before the loops: within, each would be counted a reference. Numbers
     # come from outside, too: written here they would be float64.
     u, v, q, source = rays
-    a, b, c = inverse
     source_x, source_y, source_z = source
     zero, unit, two, least = simple
     width, n_terms = rate.shape[1], len(terms)
     light, halvings, phase = np.empty(width, u.dtype), np.empty(width, u.dtype), np.empty(width, u.dtype)
     reach = REACH_SIGMAS * sigma_px + 0.5
     for y in range(first_row, last_row):
-        end, move, row = x_end[y], step[y], np.uint64(y)
+        end, move, row, k = x_end[y], step[y], np.uint64(y), min(y, len(inverse) - 1)
         if np.isnan(end) or move == 0:
             continue
+        a, b, c, scale = inverse[k, 0], inverse[k, 1], inverse[k, 2], scales[k]
         soft = reach if not np.isnan(x_stripe[y]) else 0.0
         # Pixels that are lit at all, and those that are lit whole, in ascending order.
         if move > 0:
@@ -146,8 +146,8 @@ def _add_haze(
             light[x] *= power_of_half(halvings[x], halving)
         if n_terms > 0:
             phase[:] = zero
-        for k in range(n_terms):
-            weight, sharp, sign = terms[k, 0], terms[k, 1], terms[k, 2]
+        for term in range(n_terms):
+            weight, sharp, sign = terms[term, 0], terms[term, 1], terms[term, 2]
             for i in range(high - low):
                 x = np.uint64(low) + np.uint64(i)
                 ray_u, ray_v, length = u[row, x], v[row, x], q[row, x]

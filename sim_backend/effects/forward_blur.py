@@ -59,7 +59,7 @@ class ForwardBlur:
 def _add_blur(
     lit: Lit,
     inverse: NDArray[np.float64],
-    offset_m: float,
+    offset_m: NDArray[np.float64],
     x_stripe: NDArray[np.float64],
     scale: float,
     width: NDArray[np.float64],

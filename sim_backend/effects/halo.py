@@ -107,7 +107,7 @@ def _add_side(level: float, a: float, b: float, narrow: Array, wide: Array, side
 def _add_halo(
     lit: Lit,
     inverse: NDArray[np.float64],
-    offset_m: float,
+    offset_m: NDArray[np.float64],
     x_stripe: NDArray[np.float64],
     x_end: NDArray[np.float64],
     step: NDArray[np.int64],
@@ -127,7 +127,8 @@ def _add_halo(
             continue
         middle = min(max(round(x_end[y]), 0), width - 1)
         ray_u, ray_v = u[y, middle], v[y, middle]
-        w = inverse[0] * ray_u + inverse[1] * ray_v + inverse[2]
+        k = min(y, len(inverse) - 1)
+        w = inverse[k, 0] * ray_u + inverse[k, 1] * ray_v + inverse[k, 2]
         if not w > 0.0:
             continue
         z, q = 1.0 / w, math.sqrt(ray_u * ray_u + ray_v * ray_v + 1.0)
@@ -135,7 +136,7 @@ def _add_halo(
         r = math.sqrt(away_x**2 + away_y**2 + away_z**2)
         way_m = r + z * q
         # The haze at its end, as in `sim_backend.effects.fog`, and what becomes of it.
-        level = haze_scale * q / (r * w * abs(offset_m)) * math.exp(-extinction_per_m * way_m)
+        level = haze_scale * q / (r * w * abs(offset_m[k])) * math.exp(-extinction_per_m * way_m)
         level *= PEDESTAL * math.expm1(min(PEDESTAL_RISE * 0.5 * scattering_per_m * way_m, MOST_DEPTH))
         total = 0.0
         if not np.isnan(x_stripe[y]):

@@ -65,7 +65,7 @@ def share(pixel: int, first: float, length: float, sigma: float) -> float:
 def add_particles(
     view: tuple[Array, Array, Array],
     particles: tuple[Array, Array, Array, Array, Array],
-    sheet: tuple[Array, float, Array, NDArray[np.int64]],
+    sheet: tuple[Array, Array, Array, NDArray[np.int64]],
     light: tuple[float, float, float, float],
     thickness: Array,
     width: Array,
@@ -84,6 +84,8 @@ def add_particles(
     normal, offset_m, x_end, step = sheet
     scale, extinction_per_m, time_s, hold_s = light
     most_off_m = REACH_SIGMAS * (thickness[0] + thickness[1] * FARTHEST_RANGE_M)
+    middle, k = u.shape[1] // 2, 0
+    top_v, rows_per_v = v[0, middle], (len(v) - 1) / (v[len(v) - 1, middle] - v[0, middle])
     u_low, u_span, v_low, v_span = cone[0, 0], cone[0, 1], cone[1, 0], cone[1, 1]
     for i in range(len(depth)):
         z = depth[i]
@@ -91,7 +93,9 @@ def add_particles(
         at_v = at[i, 1] + per_s[i, 1] * time_s
         at_u = u_low + (at_u - math.floor(at_u)) * u_span
         at_v = v_low + (at_v - math.floor(at_v)) * v_span
-        off_m = z * (normal[0] * at_u + normal[1] * at_v + normal[2]) - offset_m
+        if len(offset_m) > 1:  # about the row that sees it; between rows that are near each other sheets differ little
+            k = min(max(int((at_v - top_v) * rows_per_v), 0), len(offset_m) - 1)
+        off_m = z * (normal[k, 0] * at_u + normal[k, 1] * at_v + normal[k, 2]) - offset_m[k]
         if abs(off_m) > most_off_m:
             continue
         away_x, away_y, away_z = z * at_u - source[0], z * at_v - source[1], z - source[2]

@@ -112,7 +112,7 @@ class ParticleLight:
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt of laser power."""
         view, all_of_them = self._view, self.particles
-        if not math.isfinite(sheet.inverse[0]):
+        if not np.isfinite(sheet.inverse).all():
             return
         add_particles(
             (view.u, view.v, view.source_m),

@@ -6,8 +6,8 @@ twice that as a diffuse surface depolarises (Goodman, "Speckle phenomena in opti
 the default sensor at f/2 the contrast is 0.15.
 
 Called for by `line: {speckle: true}`. Acts on the stripe, as the light before this effect; the grains belong to the
-pixel and to the plane of the sheet, so they stay for all exposures of a column and come again in every sweep. About
-0.4 ms per mirror position for 512 rows."""
+pixel and to where the sheet is, in steps of the line's width, so they stay for all exposures of a column and come again
+in every sweep. About 0.4 ms per mirror position for 512 rows."""
 
 import math
 
@@ -35,11 +35,14 @@ class Speckle:
     def __init__(self, setting: Setting) -> None:
         self._grains = grains(setting.optics, setting.sensor, setting.line)
         self._seed = np.uint64(setting.scene.seed)
+        self._widths_per_tangent = setting.view.focal_px / setting.line.sigma_px
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Multiply what the stripe brought."""
-        plane = np.array([sheet.inverse[0], sheet.inverse[2]]).view(np.uint64)
-        _roughen(self._seed, plane, self._grains, first_row, last_row, rate)
+        by_u, _, ahead = sheet.inverse[0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            place = np.rint(ahead / by_u * self._widths_per_tangent) + 0.0  # no negative zero
+        _roughen(self._seed, place.view(np.uint64), self._grains, first_row, last_row, rate)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -65,10 +68,10 @@ def gamma_of(key: np.uint64, shape: float) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _roughen(
-    seed: np.uint64, plane: NDArray[np.uint64], shape: float, first_row: int, last_row: int, rate: NDArray[np.float64]
+    seed: np.uint64, place: np.uint64, shape: float, first_row: int, last_row: int, rate: NDArray[np.float64]
 ) -> None:
     width = rate.shape[1]
-    key = frame_key(frame_key(seed, plane[0]), plane[1])
+    key = frame_key(seed, place)
     for y in range(first_row, last_row):
         for x in range(width):
             if rate[y, x] > 0.0:

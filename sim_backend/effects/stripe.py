@@ -70,7 +70,7 @@ def _between(values: NDArray[np.float64], y: int, x: int, t: float) -> float:
 
 @numba.njit(inline="always")
 def row_light(
-    lit: Lit, inverse: Array, offset_m: float, extinction_per_m: float, y: int, centre: float
+    lit: Lit, inverse: Array, offset_m: Array, extinction_per_m: float, y: int, centre: float
 ) -> tuple[float, float, float, float]:
     """The light of the stripe at pixel `centre` of row y, integrated along the row, that nothing has turned on its way.
 
@@ -78,11 +78,13 @@ def row_light(
     and the inverse depth.
     """
     u, v, u_x, v_x, facet, albedo, source = lit
+    k = min(y, len(inverse) - 1)
+    a, b, c = inverse[k, 0], inverse[k, 1], inverse[k, 2]
     x = min(max(math.floor(centre), 0), u.shape[1] - 2)
     t = centre - x
     ray_u, ray_v = _between(u, y, x, t), _between(v, y, x, t)
     slope_u, slope_v = _between(u_x, y, x, t), _between(v_x, y, x, t)
-    w = inverse[0] * ray_u + inverse[1] * ray_v + inverse[2]
+    w = a * ray_u + b * ray_v + c
     z = 1.0 / w
     mx = (1.0 - t) * facet[y, x, 0] + t * facet[y, x + 1, 0]
     my = (1.0 - t) * facet[y, x, 1] + t * facet[y, x + 1, 1]
@@ -91,9 +93,9 @@ def row_light(
     r = math.sqrt(away_x**2 + away_y**2 + away_z**2)
     length = math.sqrt(mx * mx + my * my + mz * mz)
     incidence = abs(mx * away_x + my * away_y + mz * away_z) / (length * r)
-    sheet_slope = inverse[0] * slope_u + inverse[1] * slope_v
+    sheet_slope = a * slope_u + b * slope_v
     slope = abs(sheet_slope - mx * slope_u - my * slope_v)
-    slope = max(slope, MIN_SLOPE * abs(sheet_slope)) * abs(offset_m) * z
+    slope = max(slope, MIN_SLOPE * abs(sheet_slope)) * abs(offset_m[k]) * z
     way_m = r + z * math.sqrt(ray_u * ray_u + ray_v * ray_v + 1.0)
     light = _between(albedo, y, x, t) * incidence / (r * slope) * math.exp(-extinction_per_m * way_m)
     return light, way_m, r, w
@@ -116,7 +118,7 @@ def spread_line(total: float, centre: float, sigma: float, row: NDArray[np.float
 def _add_stripe(
     lit: Lit,
     inverse: NDArray[np.float64],
-    offset_m: float,
+    offset_m: NDArray[np.float64],
     x_stripe: NDArray[np.float64],
     scale: float,
     width: NDArray[np.float64],

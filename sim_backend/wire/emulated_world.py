@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from drivers.errors import DeviceError
 from drivers.frames import FRAME_RECORD, packed_row_bytes
 from drivers.interfaces import OUT_GATE
 from drivers.registry import Kind, Surroundings
@@ -86,6 +87,11 @@ class EmulatedWorld(SimulatedWorld):
         bus: where the USB devices are plugged in, and who closes it is its maker; by default one within this process.
         """
         super().__init__(config, surroundings)
+        if self.model.row_delay_s != 0:
+            raise DeviceError(
+                f"world geometry {config.geometry} has a row_delay_s of {self.model.row_delay_s:g}; behind emulated "
+                "devices all rows are exposed at once: leave it out, or use simulated devices"
+            )
         rows, width = self.size
         clock, self._seed = surroundings.clock, surroundings.seed
         self._emission_lock = threading.Lock()
@@ -160,7 +166,8 @@ class EmulatedWorld(SimulatedWorld):
         times, words = np.array([t for t, _ in changes]), np.array([word for _, word in changes], np.int64)
         share, edge = gate_shares(times, words, start_s, exposure_s)
         power_w = self._power(middle)
-        return Happening(mirror, share, edge, backward, line_s, scan_s, float(power_w[0])), power_w
+        unknown = np.full(len(mirror), np.nan)  # of the DAC's stairs
+        return Happening(mirror, unknown, share, edge, backward, line_s, scan_s, float(power_w[0])), power_w
 
     def light(self, from_s: float, until_s: float) -> list[tuple[float, float]]:
         """(start, end) of every time with light in [from_s, until_s], ascending: emission AND gate.
@@ -236,7 +243,7 @@ class WorldFrames:
         x0 = windows_at(span.window, sweep, records)
         records["x0"] = x0
         if bits is not None:
-            held = self._world.grid.hold(happening.mirror)
+            held = self._world.held(happening, span.period_s)
             source = self._source(FrameTimes(span.exposure_s, span.period_s))
             source.expose(span.first_frame, held, power_w * happening.share, x0, bits, start_s)
         return sweep

@@ -201,7 +201,7 @@ class RecordedWorld:
                 self._servers.append(server)
                 self.ports[device] = server.endpoint
 
-    def truth(self, commands: NDArray[np.float64]) -> SweepTruth:
+    def truth(self, commands: NDArray[np.float64], velocity_per_s: float = 0.0) -> SweepTruth:
         """Nobody asks: the recording keeps its own."""
         raise DeviceError("a world of recorded devices knows no truth")
 

@@ -104,7 +104,7 @@ def take_sweeps(
     light = FluxModel(Setting(view, SceneFile.model_validate(ambient), optics, sensor, line, gain))
     first, last, x0, window = _where(rig, points)
     seed = int(rng.integers(1 << 62))
-    source = PhotonSource(light, rig.model.planes, FrameTimes(FRAME_S, FRAME_S), seed, 1)
+    source = PhotonSource(light, rig.model.sheets, FrameTimes(FRAME_S, FRAME_S), seed, 1)
     taken, frame = [], 0
     try:
         for asked in sweeps:

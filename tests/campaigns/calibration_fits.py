@@ -13,12 +13,11 @@ import numpy as np
 
 from calibration.errors import CalibrationError
 from calibration.rig_fit import RigFit, fit_rig
+from calibration.robust import MAD_TO_SD
 from tests.reference.calibration_data import BOARD, Seen, random_rig, random_views
 from tests.reference.fitted_depth import depth_errors
 
 AT_M = 5.0
-PROBABLE = 0.6745
-"""Median of the absolute value of a normal error, in standard deviations."""
 
 
 def one_rig(seed: int, passages: int = 600) -> tuple[RigFit, np.ndarray, np.ndarray]:
@@ -54,7 +53,7 @@ def main() -> None:
             refused.append(f"{seed}: {problem}")
             continue
         actual.append(np.median(np.abs(error)))
-        stated.append(PROBABLE * np.median(sd))
+        stated.append(np.median(sd) / MAD_TO_SD)
         inside.append(np.mean(np.abs(error) < 1.96 * sd))
         squares.append(np.mean((error / sd) ** 2))
         kept = [decision.name for decision in fit.decisions if decision.kept]

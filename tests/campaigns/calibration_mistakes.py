@@ -211,6 +211,14 @@ def two_boards(session: Session, good: list[View]) -> str:
     return session.refused([ShownBoard(BOARD, pose) for pose in sides])
 
 
+def another_board(session: Session, good: list[View]) -> str:
+    """A print of the same markers with more or fewer squares across or down."""
+    squares = [(9, 6), (7, 6), (10, 7), (6, 4), (6, 8), (8, 5), (8, 8)][int(session.rng.integers(7))]
+    other = replace(BOARD, squares=squares)
+    pose = random_pose(session.rng, session.stand.rig.model.camera, other, cell=int(session.rng.integers(16)))
+    return session.refused([ShownBoard(other, pose)])
+
+
 def no_mistake(session: Session, good: list[View]) -> str:
     """A calibration as it should be."""
     return session.named(good, stated_baseline_m=round(baseline_m(session.stand.rig.model.scanner), 3))
@@ -232,15 +240,20 @@ MISTAKES: dict[Callable[[Session, list[View]], str], str] = {
     half_out: "board-half-out",
     mirrored: "mirrored",
     two_boards: "two-boards",
+    another_board: "wrong-board",
 }
 """What each is called."""
+OF_ONE_VIEW = (no_board, half_out, mirrored, two_boards, another_board)
+"""Those that need no good views."""
 
 
 def trial(seed: int, only: Sequence[str]) -> dict[str, str]:
     """What every mistake was called with one random rig."""
     begin = Session(set_up(random_rig(np.random.default_rng(seed))), np.random.default_rng([seed, 0]))
     made = [mistake for mistake in MISTAKES if not only or mistake.__name__ in only]
-    good = begin.views(random_poses(begin.rng, begin.stand.rig.model.camera, BOARD, POSES))
+    good: list[View] = []
+    if not set(made) <= set(OF_ONE_VIEW):
+        good = begin.views(random_poses(begin.rng, begin.stand.rig.model.camera, BOARD, POSES))
     said = {}
     for number, mistake in enumerate(made, start=1):
         said[mistake.__name__] = mistake(replace(begin, rng=np.random.default_rng([seed, number])), good)

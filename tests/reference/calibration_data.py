@@ -89,7 +89,7 @@ class TrueRig:
         """The command given at the instant in which the line crosses points."""
         _, y = self.project(points)
         lag = self.lag[0] if velocity > 0 else self.lag[1]
-        return self.mirror_at(points) + velocity * (lag + self.row_delay * y)
+        return self.mirror_at(points) + velocity * (lag - self.row_delay * y)
 
     def moved(self, shift: Array, turn: Array) -> TrueRig:
         """The same camera with its scanner shifted (m) and turned (rad)."""

@@ -96,7 +96,7 @@ def test_depth_on_a_bowed_sheet_is_exact(worst) -> None:
 @given(lag=st.floats(0, 1), delay=st.floats(-1e-3, 1e-3), row=st.floats(0, 1e4), velocity=st.floats(-1e5, 1e5))
 def test_the_mirror_is_behind_by_lag_and_row(lag, delay, row, velocity) -> None:
     model = RigModel(CAMERA, mirror(), Lag(lag, 2 * lag), row_delay_s=delay)
-    behind_s = (lag if velocity >= 0 else 2 * lag) + delay * row
+    behind_s = (lag if velocity >= 0 else 2 * lag) - delay * row
     assert np.isclose(model.mirror_command(0.5, row, velocity), 0.5 - velocity * behind_s, rtol=1e-12)
     assert np.array_equal(model.sheets([0.1, 0.2]).planes, model.planes([0.1, 0.2]))
 

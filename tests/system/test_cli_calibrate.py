@@ -12,11 +12,10 @@ from calibration.board import load_board
 from calibration.files import load_rig_model
 from rig import api
 from rig.errors import UsageError
-from tests.system.board_rig import FOCAL_PX, write_board_rig
+from tests.system.board_rig import write_board_rig
 from tests.system.conftest import Rig
 
 POSES = 6
-BASELINE_M = 0.3
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +129,14 @@ def test_a_check_scans_the_board_anew_and_says_how_flat_and_large_it_is(calibrat
     assert (Path("check") / "report.html").is_file()
 
 
+def test_views_that_a_calibration_was_made_of_are_no_check_of_it(calibrated: Path, rig: Rig) -> None:
+    out, board = calibrated / "out", calibrated / "board.yaml"
+    ran = rig("calibrate", "check", out, "--board", board, "--calibration", out / "calibration.yaml", "--out", "check")
+    assert ran.code == 2
+    assert "views 000, 001" in ran.problems[0]
+    assert "the calibration was made of the same" in ran.problems[0]
+
+
 def test_lags_are_found_from_one_unmoved_scene(calibrated: Path, rig: Rig) -> None:
     ran = rig(
         "calibrate", "sync", calibrated / "board-rig.yaml", "--scene", calibrated / "scene.yaml", "--exposures", "3,6",
@@ -178,26 +185,6 @@ def bright(calibrated: Path) -> Path:
     return config
 
 
-def test_a_calibration_serves_other_exposures_both_ways(calibrated: Path, bright: Path, tmp_path: Path) -> None:
-    sync = api.calibrate_sync(
-        bright, calibration=calibrated / "out" / "calibration.yaml", scene=str(calibrated / "scene.yaml"),
-        exposures=(1, 20), out=tmp_path / "sync",
-    )  # fmt: skip
-    assert sync.verdict.passed, sync.verdict
-    assert sync.calibration is not None
-    for exposures in (1, 20):
-        run, again = tmp_path / f"{exposures}", tmp_path / f"{exposures}-estimated"
-        api.scan(bright, maps=2, exposures=exposures, min_confidence=0.0, record=True, out=run)
-        api.reconstruct(run, calibration=sync.calibration, min_confidence=0.0, out=again)
-        for sweep in ("000000", "000001"):
-            true_m, ours_m = (np.load(folder / "depth" / f"{sweep}.npy") for folder in (run, again))
-            with np.load(run / "truth" / f"{sweep}.npz") as truth:
-                right = np.isfinite(ours_m) & (np.abs(true_m / truth["depth_m"] - 1) < 0.05)
-            assert np.count_nonzero(right) > 500  # of single frames, `argmax` makes little more than chance
-            added_px = (ours_m - true_m)[right] * FOCAL_PX * BASELINE_M / true_m[right] ** 2
-            assert np.mean(np.abs(added_px)) < 0.1
-
-
 def test_recorded_runs_are_sources_of_every_command(calibrated: Path, bright: Path, rig: Rig) -> None:
     for exposures in (3, 6):
         run = f"run-{exposures}"
@@ -205,12 +192,11 @@ def test_recorded_runs_are_sources_of_every_command(calibrated: Path, bright: Pa
         assert ran.code == 0, ran.err
     board, file = calibrated / "board.yaml", calibrated / "out" / "calibration.yaml"
     ran = rig("calibrate", "sync", "run-3", "run-6", "--calibration", file, "--out", "sync", "--json")
-    assert ran.code in (0, 1), ran.err
-    assert "holds its light within a column" in ran.err  # which differs with the exposures, as lags then seem to
+    assert ran.code == 0, ran.err  # light that is held at the middle of columns makes lags that change with the speed
     assert json.loads(ran.out)["lag_s"]["forward"] == pytest.approx(2e-4, abs=5e-6)
     identity = load_rig_model(Path("sync/calibration.yaml")).identity
     assert identity is not None
-    assert identity.verdict == ("passed" if ran.code == 0 else "failed")
+    assert identity.verdict == "passed"
     ran = rig(
         "calibrate", "check", "run-3", "--board", board, "--calibration", file, "--at", "3 m", "--accuracy", "20 mm",
         "--out", "check",

@@ -53,7 +53,7 @@ def test_lengths_read_as_the_nearest_float():
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"square": 60}, "square is 60; write the length with a unit"),
+        ({"square": 60}, "square: 60 is no length; write it with a unit"),
         ({"square": "60 inch"}, "with a unit"),
         ({"square": "0 mm"}, "measure the print"),
         ({"marker": "61 mm"}, "must be smaller"),

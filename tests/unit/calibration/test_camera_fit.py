@@ -1,5 +1,6 @@
 """The camera from corners: as good as it says, with what does not fit named, and nothing from too little."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -145,3 +146,22 @@ def test_real_pictures_fit_no_worse_than_opencv_on_the_same_corners():
     assert fit.rms_px <= rms + 1e-4
     assert fit.rms_px < 0.25
     assert fit.camera.matrix[0, 0] == pytest.approx(535, rel=0.01)
+
+
+def test_corners_whose_sd_nobody_knows_are_usual_ones() -> None:
+    views = shown(3)
+    sd_px = np.full(len(views[0].corners.ids), SD_PX)
+    sd_px[:3] = np.nan, 0.0, np.inf
+    views[0] = replace(views[0], corners=replace(views[0].corners, sd_px=sd_px))
+    fit = fit_camera(views, CHARUCO, SIZE)
+    assert fit.rms_px == pytest.approx(SD_PX * np.sqrt(2), rel=0.15)
+    assert np.isfinite(views[0].corners.likely_sd_px).all()
+
+
+def test_residuals_of_camera_and_rig_have_one_sign() -> None:
+    views = shown(4)
+    moved = views[0].corners.px.copy()
+    moved[7] += [4.0, -3.0]
+    views[0] = replace(views[0], corners=replace(views[0].corners, px=moved))
+    less_seen = fit_camera(views, CHARUCO, SIZE).residual_px[0][7]
+    assert less_seen == pytest.approx([-4.0, 3.0], abs=0.2)

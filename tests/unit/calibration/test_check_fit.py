@@ -124,3 +124,26 @@ def test_a_board_that_was_not_found_or_not_scanned_is_refused() -> None:
     )
     with pytest.raises(Degenerate, match="squares"):
         check_boards(_model(), [replace(view, passages=few)], BOARD)
+
+
+def test_noise_is_what_sweeps_and_boards_of_any_tilt_show() -> None:
+    exact = replace(_model(), covariance=Covariance(("fx",), np.array([[1e-12]])))
+    for sweeps, tilt in ((2, 0.0), (2, 0.9), (4, 0.5)):
+        shares = []
+        for seed in range(20):
+            rng = np.random.default_rng(100 + seed)
+            pairs = [_view(rng, (0.3, tilt, 0.0), 1.5) for _ in range(sweeps // 2)]
+            view = replace(pairs[0], passages=tuple(sweep for pair in pairs for sweep in pair.passages))
+            (board,) = check_boards(exact, [view], BOARD)
+            shares.append(board.chi2 / board.freedom)
+        assert 0.8 < np.mean(shares) < 1.25, (sweeps, tilt)
+
+
+def test_an_angle_is_known_as_well_as_its_scans_are() -> None:
+    exact = replace(_model(), covariance=Covariance(("fx",), np.array([[1e-12]])))
+    found = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        found.append(check_angle(exact, _view(rng, (0.3, 0.0, 0.0), 2.5), _view(rng, (0.0, 0.3, 0.0), 2.5, "b"), BOARD))
+    scatter = np.std([one.angle_rad for one in found])
+    assert 0.7 < scatter / np.mean([one.sd_rad for one in found]) < 1.4

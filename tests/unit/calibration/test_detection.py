@@ -1,12 +1,14 @@
 """Corners from pictures of few photons, and pictures that are refused."""
 
+import cv2
 import numpy as np
 import pytest
 
-from calibration.board import Board
+from calibration.board import BLACK, WHITE, Board
 from calibration.detection import find_corners
 from calibration.errors import Degenerate
 from calibration.hot_pixels import repaired
+from calibration.views import BoardPose
 from tests.reference.board_pictures import CHARUCO, CHESSBOARD, SIZE, albedo, corners_px, exposed, pose
 
 TURNED = pose(CHARUCO, 0.9, (0.03, -0.02), (0.35, -0.3, 0.1))
@@ -82,11 +84,74 @@ def test_a_board_half_out_is_refused_and_the_border_named():
     assert refused.value.reason == "board-half-out"
 
 
+def test_the_border_is_named_where_few_markers_are_left_to_say_where_the_board_goes_on():
+    turned, position = [-0.52864302, -0.09538359, -0.02809038], [-0.34518863, 0.15000805, 0.95930784]
+    beyond = BoardPose(np.array(turned), np.array(position))  # a bend through these markers leads astray
+    with pytest.raises(Degenerate, match="lower border") as refused:
+        find_corners(exposed(albedo(CHARUCO, beyond), 0.05, FRAMES, 1), CHARUCO)
+    assert refused.value.reason == "board-half-out"
+
+
 def test_two_boards_alike_are_refused():
     two = [pose(CHARUCO, 1.7, (x, 0.05), (0.1, x, 0)) for x in (-0.2, 0.2)]
     with pytest.raises(Degenerate, match="two boards") as refused:
         find_corners(exposed(albedo(CHARUCO, *two), 0.05, FRAMES, 1), CHARUCO)
     assert refused.value.reason == "two-boards"
+
+
+class Printed:
+    """A ChArUco board as OpenCV draws it, in white paper."""
+
+    PX = 120
+
+    def __init__(self, squares: tuple[int, int], legacy: bool = False, first_id: int = 0) -> None:
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
+        ids = np.arange(squares[0] * squares[1] // 2) + first_id
+        drawn = cv2.aruco.CharucoBoard(squares, CHARUCO.square_m, CHARUCO.marker_m, dictionary, ids)
+        drawn.setLegacyPattern(legacy)
+        bare = drawn.generateImage((squares[0] * self.PX, squares[1] * self.PX), marginSize=0, borderBits=1)
+        self.drawn = np.pad(bare, self.PX // 2, constant_values=255)
+        self.size_m = squares[0] * CHARUCO.square_m, squares[1] * CHARUCO.square_m
+
+    def albedo_at(self, x_m, y_m):
+        i, j = (np.floor((at / CHARUCO.square_m + 0.5) * self.PX).astype(int) for at in (x_m, y_m))
+        height, width = self.drawn.shape
+        paper = (i >= 0) & (i < width) & (j >= 0) & (j < height)
+        white = self.drawn[np.where(paper, j, 0), np.where(paper, i, 0)] > 127
+        return np.where(paper, np.where(white, WHITE, BLACK), np.nan)
+
+
+@pytest.mark.parametrize(
+    ("stated", "shown", "said"),
+    [
+        ((9, 7), Printed((10, 7)), "10 squares wide, the board 9"),
+        ((9, 7), Printed((8, 6)), "8 squares wide, the board 9"),
+        ((9, 7), Printed((9, 9)), "those of the board are 0 to 30"),
+        ((9, 7), Printed((9, 6)), "ends below its row 6, the board has 7"),
+        ((9, 7), Printed((9, 7), first_id=5), "markers are numbered from 5 on|those of the board are 0 to 30"),
+        ((8, 6), Printed((8, 6), legacy=True), "OpenCV before 4.6"),
+    ],
+)
+def test_another_print_than_the_stated_one_is_refused_and_named(stated, shown, said):
+    board = Board("charuco", stated, CHARUCO.square_m, CHARUCO.marker_m, "DICT_4X4_100")
+    stands = pose(shown, 1.2, (0.02, 0.03), (0.3, -0.35, 0.1))
+    with pytest.raises(Degenerate, match=said) as refused:
+        find_corners(exposed(albedo(shown, stands), 0.03, FRAMES, 3), board)
+    assert refused.value.reason == "wrong-board"
+
+
+def test_a_board_whose_lower_rows_are_hidden_is_no_other_board(light):
+    hidden = light.copy()
+    lower = corners_px(CHARUCO, TURNED)[4 * 8 + 4]
+    hidden[int(lower[1]) + 8 :] = 0.4
+    assert len(find_corners(exposed(hidden, 0.05, FRAMES, 1), CHARUCO).ids) > 24
+
+
+def test_a_chessboard_with_more_corners_is_another_board():
+    larger = Board("chessboard", (10, 7), 0.06)
+    with pytest.raises(Degenerate, match="9 x 6, not 8 x 5") as refused:
+        find_corners(exposed(albedo(larger, pose(larger, 1.1, (0, 0), (0, 0.1, 0))), 0.05, FRAMES, 1), CHESSBOARD)
+    assert refused.value.reason == "wrong-board"
 
 
 @pytest.mark.parametrize("upside_down", [False, True])

@@ -133,12 +133,13 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
         RigModel(camera([]), table(), lag_s=Lag(1e-6, 0)),
         RigModel(Camera(512, 511, MATRIX, np.zeros(0)), table()),
         RigModel(camera([]), table(), row_delay_s=1e-9),
+        RigModel(camera([]), PlaneTable(np.array([-1, 0.1, 0.7]), table().rows)),
         *(
             RigModel(camera([]), replace(pivot(), bow_per_rad=0.01), source_m=at)
             for at in (None, np.array([0, 1e-3, 0]))
         ),
     ]
-    assert len({model.fingerprint() for model in [base, *others]}) == 8
+    assert len({model.fingerprint() for model in [base, *others]}) == 9
     assert RigModel(camera([]), table(), gate_delay_s=1e-6).fingerprint() == base.fingerprint()
     assert RigModel(camera([]), table()).fingerprint() == base.fingerprint()
 

@@ -8,6 +8,7 @@ import pytest
 from calibration.camera import Camera
 from calibration.covariance import Covariance
 from calibration.errors import CalibrationError, Degenerate
+from calibration.information import Forecast
 from calibration.rig_fit import RigFit, fit_rig
 from calibration.views import Passages, View
 from tests.reference.calibration_data import (
@@ -142,6 +143,16 @@ def test_what_other_pictures_told_of_the_camera_counts() -> None:
     assert np.median(sd) < 0.8 * np.median(depth_errors(alone.model, RIG, 5.0, 35.2)[1])
     assert np.sqrt(np.mean((error / sd) ** 2)) < 2.5
     assert abs(told.model.camera.matrix[0, 0] - RIG.fx) < 0.2
+
+
+def test_a_term_of_the_camera_that_is_known_exactly_is_held() -> None:
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    known = Covariance(names, np.diag(np.array([0.05, 0.05, 0.05, 0.05, 0.0, 1e-4, 1e-5, 1e-5, 1e-4]) ** 2))
+    told = fitted(RIG, 10, poses=6, camera=true_camera(RIG), known=known)
+    assert told.model.camera.distortion[0] == RIG.lens[0]
+    assert told.model.covariance is not None
+    assert "k1" not in told.model.covariance.names
+    assert Forecast(told, 5.0).now_m < 0.01
 
 
 def test_jitter_that_pixels_share_is_told_from_their_own_noise() -> None:
@@ -290,6 +301,13 @@ def test_a_mirror_ahead_of_its_command_is_refused() -> None:
     with pytest.raises(Degenerate, match="ahead of its command") as raised:
         fitted(replace(RIG, lag=(-2e-4, -2e-4)), 20, poses=6)
     assert raised.value.reason == "negative-lag"
+
+
+def test_a_lag_that_noise_made_negative_is_held_even_where_a_fit_does_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("calibration.rig_rounds.MOST_IDLE_ROUNDS", 1)
+    fit = fitted(replace(RIG, lag=(-1e-6, -1e-6)), 20, replace(SEEN, passage=3e-3), poses=5)
+    assert any(decision.reason.endswith("held at 0") for decision in fit.decisions)
+    assert fit.model.lag_s == (0, 0)
 
 
 def test_residuals_come_with_their_place_and_unit() -> None:

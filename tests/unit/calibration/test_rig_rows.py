@@ -35,7 +35,7 @@ def test_every_derivative_is_that_of_the_residual(lens: int) -> None:
     rig = TrueRig()
     view = seen_view(np.random.default_rng(0), rig, turn, position, Seen(passages=60, passage=1e-3))
     pose = BoardPose(turn, position)
-    seen = sighting(view, BOARD, camera, pose, 50)
+    seen = sighting(view, BOARD, camera, pose)
     terms = Terms(lens)
     state = first_state(RigModel(camera, scanner), np.array([2e-4, 1e-4, 2e-8]), [pose], [seen])
     # Passages that the light meets exactly: elsewhere, only the model's own place of the light counts.

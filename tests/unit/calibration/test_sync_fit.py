@@ -19,7 +19,7 @@ def _sweeps(rng, speeds, ways=(1, -1), *, lag_s=LAG_S, row_s=0.0, pixels=1500, j
     for speed in speeds:
         for way in ways:
             there = rng.random(pixels) < 0.9
-            lag = lag_s[way] * (1 + slope * (speed / speeds[0] - 1)) + row_s * y
+            lag = lag_s[way] * (1 + slope * (speed / speeds[0] - 1)) - row_s * y
             trembles = jitter * rng.normal(size=400)[((stands + 1) * 200).astype(int)]
             sd = SD * rng.uniform(0.5, 2, pixels)
             command = stands + way * speed * lag + trembles + rng.normal(0, sd)

@@ -9,8 +9,9 @@ import pytest
 from calibration.board import Board
 from calibration.errors import Degenerate
 from calibration.evidence import PoseEvidence, ViewEvidence, pose_evidence, view_evidence
+from calibration.fit_verdict import FitEvidence, judge, judge_refusal
 from calibration.sweep_waves import SweepResidual, sweep_waves
-from calibration.verdict import Asked, FitEvidence, judge, judge_refusal
+from calibration.verdict import Asked
 from calibration.view_shifts import ViewShift, common_shift, counted, last_before_move
 from calibration.views import BoardPose, Corners, View
 
@@ -76,6 +77,16 @@ def test_a_baseline_that_is_badly_known_contradicts_nothing() -> None:
     assert judge(VIEWS, replace(fit, baseline_m=nan), ASKED).passed
 
 
+def test_what_is_too_large_is_what_is_named() -> None:
+    worst = judge(VIEWS, replace(FIT, expected_m=0.01, worst_m=0.08), ASKED).reasons[0]
+    assert worst.text == (
+        "in the worst 5 % of the picture the expected depth error at 5 m is 80 mm, asked for are 56 mm: about 25 poses "
+        "would do"
+    )
+    usual = judge(VIEWS, replace(FIT, expected_m=0.02, worst_m=0.06), ASKED).reasons[0]
+    assert usual.text == "the expected depth error at 5 m is 20 mm, asked for are 14 mm: about 25 poses would do"
+
+
 def test_unknown_errors_do_not_pass() -> None:
     assert not judge(VIEWS, replace(FIT, expected_m=nan), ASKED).passed
 
@@ -136,6 +147,15 @@ def test_waves_are_what_tells_sweeps_of_a_view_apart(wave: float) -> None:
 def test_single_sweeps_show_their_waves_too() -> None:
     sweeps = _sweeps(np.random.default_rng(4), wave=2e-3)[::2]
     assert sweep_waves(sweeps).rms == pytest.approx(2e-3, rel=0.25)
+
+
+def test_a_bin_that_a_sweep_hardly_reaches_tells_nothing() -> None:
+    """The few passages in it are those whose noise led them there."""
+    wide, narrow = np.linspace(0, 2.4, 4800), np.linspace(0, 1, 2000)
+    noise = 0.005 * np.random.default_rng(5).normal(size=2000)
+    waves = sweep_waves([SweepResidual("a", 1, wide, 0 * wide), SweepResidual("b", 1, narrow + noise, noise)])
+    assert np.isfinite(waves.sweeps[1]).sum() == 10
+    assert np.nanmax(np.abs(waves.sweeps[1])) < 0.002
 
 
 def test_without_sweeps_nothing_is_told() -> None:

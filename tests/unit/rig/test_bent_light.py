@@ -75,7 +75,7 @@ def test_depth_from_a_command_is_that_of_the_traced_light(light: dict, velocity:
     z = wall_m(u, v, 3.0)
     stands = mirror_at(fan, model, np.stack([u * z, v * z, z], -1)[y, x])
     bound = np.full(u.shape, np.nan)
-    bound[y, x] = stands + velocity * light.get("row_delay", 0.0) * y  # what the first row is bound to then
+    bound[y, x] = stands - velocity * light.get("row_delay", 0.0) * y  # what the first row is bound to then
     bent = replace(bent_light(model, u.astype(np.float32), v.astype(np.float32), COMMANDS), velocity_per_s=velocity)
     found = bent.inverse_depth(bound[50:], 50)[y[y >= 50] - 50, x[y >= 50]]
     assert found == pytest.approx(1 / z[y, x][y >= 50], rel=1e-6)
@@ -92,7 +92,7 @@ def seen_stripes(
     for y in rows:
         z = wall_m(u[y, x], v[y, x], distance_m)
         stands = mirror_at(fan, model, np.stack([u[y, x] * z, v[y, x] * z, z], -1))
-        bound = stands + velocity * model.row_delay_s * y
+        bound = stands - velocity * model.row_delay_s * y
         order = np.argsort(bound)
         inside = (bound.min() <= commands) & (bound.max() >= commands)
         # Smooth: a polynomial through 32 points leaves 1e-5 px.

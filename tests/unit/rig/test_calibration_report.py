@@ -63,9 +63,10 @@ def test_whatever_users_name_is_escaped() -> None:
 
 
 def test_columns_of_numbers_stand_to_the_right() -> None:
-    html = table(("name", "mm"), [("a", "1.5"), ("b", "-2")])
+    html = table(("name", "mm", "why"), [("a", "1.5", "3 sd from 0"), ("b", "-2e-05", "-")])
     assert '<th class="number">mm</th>' in html
     assert "<th>name</th>" in html
+    assert "<th>why</th>" in html
 
 
 def test_a_model_of_the_right_rig_is_found(judged: Judged) -> None:

@@ -8,6 +8,7 @@ from rig import lane_shuffles, lanes
 from rig.lane_memory import (
     add_bytes,
     address_of,
+    copy_floats,
     load_block,
     load_bytes,
     load_float32,
@@ -383,3 +384,11 @@ def test_bytes_become_wider_lanes():
     a[5] = 255
     kernel(a, out)
     np.testing.assert_array_equal(out, a[3 : 3 + LANES])
+
+
+@pytest.mark.parametrize("number", [0, 1, LANES - 1, LANES, LANES + 3, 5 * LANES])
+def test_copies_are_as_long_as_asked(number) -> None:
+    source, to = np.arange(1.0, 100.0, dtype=np.float32), np.zeros(99, np.float32)
+    copy_floats(source.ctypes.data, to.ctypes.data, number)
+    np.testing.assert_array_equal(to[:number], source[:number])
+    assert not to[number:].any()

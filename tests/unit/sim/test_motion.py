@@ -97,7 +97,7 @@ def test_frames_of_a_moving_scene_do_not_depend_on_blocks_or_threads() -> None:
 
     def drawn(block: int, threads: int) -> NDArray[np.uint8]:
         moving = replace(still, view=make_view(model, surfaces, MovingSurfaces((1.0, 0.0, -20.0))))
-        source = PhotonSource(FluxModel(moving), model.planes, times, 5, threads)
+        source = PhotonSource(FluxModel(moving), model.sheets, times, 5, threads)
         bits = np.zeros((frames, 64, 16), np.uint8)
         for a in range(0, frames, block):
             part = slice(a, a + block)

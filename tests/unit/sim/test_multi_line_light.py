@@ -18,7 +18,7 @@ FOG = {"medium": {"extinction": "0.2 /m"}}
 
 
 def frames(flux, model, fan, n=12, power_w=0.05, threads=2):
-    source = PhotonSource(flux, model.planes, TIMES, 9, threads, fan, model.scanner.command_range)
+    source = PhotonSource(flux, model.sheets, TIMES, 9, threads, fan, model.scanner.command_range)
     bits = np.zeros((n, 64, 16), np.uint8)
     try:
         source.expose(0, np.full(n, 0.2), np.full(n, power_w), np.zeros(n, np.int32), bits, np.zeros(n))
@@ -66,9 +66,9 @@ def test_a_line_past_the_range_goes_nowhere():
     model = rig()
     low, high = model.scanner.command_range
     fan = line_fan((-2.5, 0.0, 2.5), shared=True)
-    planes = fan.planes(model.planes, np.array([low, 0.0, high]), (low, high))
-    assert [len(one) for one in planes] == [1, 1, 1]
-    np.testing.assert_array_equal(planes[1][0], model.planes(0.0))
+    sheets = fan.sheets(model.sheets, np.array([low, 0.0, high]), 64, [0.0] * 3, (low, high))
+    assert [len(lines) for lines in sheets] == [1, 1, 1]
+    np.testing.assert_array_equal(sheets[1][0].normal[0], model.planes(0.0)[:3])
 
 
 def test_speckle_of_one_line_leaves_the_others_alone():

@@ -131,17 +131,17 @@ def _model(size: tuple[int, int], sensor: bool) -> tuple[FluxModel, PhotonSource
     flux = FluxModel(setting(model, wall(model, (0.1, 0, 1), 2.0), medium={"extinction": "0.1 /m"}))
     if sensor:
         flux.bits = {"first": _Carries(), "second": _Carries()}
-    return flux, model.planes
+    return flux, model.sheets
 
 
 @pytest.mark.parametrize("sensor", [False, True], ids=["photons", "sensor"])
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("block", [1, 7, 40])
 def test_bits_do_not_depend_on_block_size_or_threads(threads: int, block: int, sensor: bool) -> None:
-    flux, planes = _model((21, 70), sensor)
+    flux, sheets = _model((21, 70), sensor)
 
     def frames(block: int, threads: int) -> NDArray[np.uint8]:
-        source = PhotonSource(flux, planes, TIMES, 9, threads)
+        source = PhotonSource(flux, sheets, TIMES, 9, threads)
         held = np.repeat([np.nan, 0.1, 0.2, 0.1, np.nan], 8)
         power = np.full(40, 0.5)
         power[11], power[20:23] = 0.2, 0.0
@@ -158,10 +158,10 @@ def test_bits_do_not_depend_on_block_size_or_threads(threads: int, block: int, s
 
 @pytest.mark.parametrize("sensor", [False, True], ids=["photons", "sensor"])
 def test_a_window_has_the_very_bits_of_the_whole_frame(sensor: bool) -> None:
-    flux, planes = _model((9, 200), sensor)
+    flux, sheets = _model((9, 200), sensor)
     held, power = np.repeat([np.nan, 0.1, 0.2], 4), np.full(12, 0.5)
     x0 = np.array([0, 64, 128, 0] * 3, np.int32)
-    source = PhotonSource(flux, planes, TIMES, 9, 2)
+    source = PhotonSource(flux, sheets, TIMES, 9, 2)
     whole, window = np.empty((12, 9, 32), np.uint8), np.empty((12, 9, 16), np.uint8)
     source.expose(7, held, power, np.zeros(12, np.int32), whole, np.zeros(12))
     source.expose(7, held, power, x0, window, np.zeros(12))
@@ -173,7 +173,7 @@ def test_a_window_has_the_very_bits_of_the_whole_frame(sensor: bool) -> None:
 
 
 def test_light_that_moves_is_made_anew_at_each_step_of_its_time_whatever_the_block() -> None:
-    flux, planes = _model((9, 64), False)
+    flux, sheets = _model((9, 64), False)
     seen: list[float] = []
 
     class Moves:
@@ -187,7 +187,7 @@ def test_light_that_moves_is_made_anew_at_each_step_of_its_time_whatever_the_blo
     times = np.arange(12) * 1e-5 + 6e-5
     both = []
     for block in (12, 5):
-        source, bits = PhotonSource(flux, planes, TIMES, 9, 1), np.zeros((12, 9, 8), np.uint8)
+        source, bits = PhotonSource(flux, sheets, TIMES, 9, 1), np.zeros((12, 9, 8), np.uint8)
         for first in range(0, 12, block):
             n = len(bits[first : first + block])
             part = slice(first, first + n)

@@ -28,7 +28,7 @@ def _frames(
     scene: Setting, *, block: int = FRAMES, threads: int = 1, x0: NDArray[np.int32] | None = None
 ) -> NDArray[np.uint8]:
     """Frames FIRST, FIRST + 1, ... packed: whole ones, or windows of 64 pixels from x0 (FRAMES,)."""
-    source = PhotonSource(FluxModel(scene), rig(size=(ROWS, WIDTH)).planes, TIMES, 9, threads)
+    source = PhotonSource(FluxModel(scene), rig(size=(ROWS, WIDTH)).sheets, TIMES, 9, threads)
     held = np.repeat([np.nan, 0.1, 0.2, 0.1, np.nan], FRAMES // 5)
     bits = np.full((FRAMES, ROWS, 24 if x0 is None else 8), 255, np.uint8)
     x0 = np.zeros(FRAMES, np.int32) if x0 is None else x0

@@ -368,14 +368,23 @@ def test_headers_carry_the_timing_exactly(tmp_path: Path) -> None:
     assert float(timing.exposure_ticks / timing.tick_hz) == pytest.approx(1e-5, rel=1e-3)
 
 
-def test_the_frames_of_a_column_share_the_flux_of_its_centre(small: Rig) -> None:
+def test_the_frames_of_a_column_share_the_flux_of_their_mean_position(small: Rig) -> None:
     commands = np.linspace(-0.3, 0.3, 13)
     small.world.hold_columns(commands)
-    near = commands[4] + np.linspace(-0.45, 0.45, 10) * 0.05
-    assert np.all(small.world.grid.hold(near) == commands[4])
-    assert np.isnan(small.world.grid.hold(np.array([1.2]))[0])
-    outside = small.world.grid.hold(np.array([0.41]))
-    assert outside[0] == pytest.approx(0.4)
+    hold = small.world.grid.hold
+    for step in (0.005, -0.005, 0.0071):  # 10 frames a column, 10 on the way back, 7 or 8
+        at = 0.0013 + step * np.arange(-60, 60)
+        column = np.rint(at / 0.05)
+        whole = np.abs(column) < 4
+        held = hold(at, np.full(120, step))
+        for here in np.unique(column[whole]):
+            assert np.all(held[column == here] == held[column == here][0])
+            assert held[column == here][0] == pytest.approx(at[column == here].mean(), abs=1e-9)
+    near, unknown = commands[4] + np.linspace(-0.45, 0.45, 10) * 0.05, np.full(10, np.nan)
+    assert np.all(hold(near, unknown) == commands[4])
+    assert hold(near[:1], np.array([0.06]))[0] == pytest.approx(near[0], abs=1e-9)  # one frame a column
+    assert np.isnan(hold(np.array([1.2]), np.zeros(1))[0])
+    assert hold(np.array([0.41]), unknown[:1])[0] == pytest.approx(0.4)
 
 
 def test_a_spad_without_a_world_is_refused() -> None:

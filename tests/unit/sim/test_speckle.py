@@ -43,9 +43,12 @@ def test_it_stays_for_a_column_and_is_another_one_in_the_next() -> None:
     assert ratio.std() == pytest.approx(1 / np.sqrt(42.9), rel=0.15)
     assert ratio.mean() == pytest.approx(1, abs=0.03)
     assert np.array_equal(rough, _light(0.1)[1])
+    assert np.array_equal(rough == 0, ~lit)
+    nearly = _light(0.1001)  # a thousandth of a pixel on
+    assert nearly[1][lit] / nearly[0][lit] == pytest.approx(ratio)
     top, bottom = _light(0.1, 0, 20)[1], _light(0.1, 20, 64)[1]
     assert np.array_equal(rough, top + bottom)
-    other_smooth, other = _light(0.1003)
+    other_smooth, other = _light(0.13)
     both = lit & (other_smooth > 0)
     correlation = np.corrcoef(rough[both] / smooth[both], other[both] / other_smooth[both])[0, 1]
     assert abs(correlation) < 5 / np.sqrt(both.sum())

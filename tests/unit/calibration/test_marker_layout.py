@@ -1,0 +1,72 @@
+"""Markers are put on the lattice of squares by their outlines, and their ids compared with a layout."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calibration.board import Board
+from calibration.marker_layout import Markers, contradiction
+
+BOARD = Board("charuco", (9, 7), 0.06, 0.047, "DICT_4X4_100")
+PICTURE = np.full((480, 640), 255, np.uint8)
+TILTED = np.array([[30.0, 3.0, 200.0], [-2.0, 31.0, 150.0], [1e-3, 8e-3, 1.0]])
+"""From squares to pixels."""
+
+
+def _seen(
+    squares: tuple[int, int], first_id: int = 0, at: tuple[int, int] = (0, 0), white_first: bool = False
+) -> Markers:
+    """The markers of a print as a tilted camera sees them, half a pixel off."""
+    places = [(x, y) for y in range(squares[1]) for x in range(squares[0]) if (x + y + white_first) % 2]
+    outline = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (BOARD.marker_m or 0) / BOARD.square_m / 2
+    corners = (np.array(places) + at)[:, None] + outline
+    seen = np.concatenate([corners, np.ones((*corners.shape[:2], 1))], axis=-1) @ TILTED.T
+    px: NDArray[np.float64] = seen[..., :2] / seen[..., 2:] + np.random.default_rng(0).normal(0, 0.5, corners.shape)
+    return Markers(np.arange(len(places)) + first_id, px)
+
+
+def _both(one: Markers, other: Markers) -> Markers:
+    return Markers(np.concatenate([one.ids, other.ids]), np.concatenate([one.px, other.px]))
+
+
+def test_the_stated_print_is_not_contradicted() -> None:
+    whole = _seen((9, 7))
+    for every in (1, 2, 3):
+        assert contradiction(Markers(whole.ids[::every], whole.px[::every]), BOARD, PICTURE) is None
+
+
+def test_a_marker_misread_is_no_other_print() -> None:
+    whole = _seen((9, 7))
+    ids = whole.ids.copy()
+    ids[[5, 17]] = 44, 3
+    assert contradiction(Markers(ids, whole.px), BOARD, PICTURE) is None
+
+
+def test_a_second_board_alike_on_the_same_lattice_is_no_other_print() -> None:
+    assert contradiction(_both(_seen((9, 7)), _seen((9, 7), at=(-11, 3))), BOARD, PICTURE) is None
+
+
+def test_markers_of_something_else_in_the_room_do_not_count() -> None:
+    outline = np.array([[9.0, 9.0], [29, 14], [24, 34], [4, 29]])
+    other = Markers(np.array([41, 42, 43]), outline + np.array([[[0.0, 0.0]], [[60, 9]], [[5, 70]]]))
+    assert contradiction(_both(_seen((9, 7)), other), BOARD, PICTURE) is None
+
+
+@pytest.mark.parametrize("squares", [(8, 7), (10, 7), (5, 9), (12, 4)])
+def test_another_width_is_told_from_half_of_the_markers(squares: tuple[int, int]) -> None:
+    whole = _seen(squares)
+    said = contradiction(Markers(whole.ids[::2], whole.px[::2]), BOARD, PICTURE)
+    assert said == f"it is {squares[0]} squares wide, the board 9"
+
+
+def test_ids_that_begin_elsewhere_are_told() -> None:
+    said = contradiction(_seen((9, 7), first_id=40), BOARD, PICTURE)
+    assert said == "it has marker 70, those of the board are 0 to 30: its rows are more, or numbered otherwise"
+
+
+@pytest.mark.parametrize("across", [8, 9])
+def test_a_board_that_begins_with_white_is_told(across: int) -> None:
+    board = Board("charuco", (across, 6), 0.06, 0.047, "DICT_4X4_100")
+    said = contradiction(_seen((across, 6), white_first=True), board, PICTURE)
+    assert said is not None
+    assert "OpenCV before 4.6" in said

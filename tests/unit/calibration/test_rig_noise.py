@@ -1,0 +1,68 @@
+"""What the residuals of passages say of their noise."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calibration.rig_noise import restated
+from calibration.rig_sightings import Sighting
+
+Array = NDArray[np.float64]
+
+PER_SWEEP = 3000
+SPEEDS = (88.0, -88.0, 293.0)
+
+
+def seen(sd: Array, rng: np.random.Generator) -> Sighting:
+    """A view swept at SPEEDS, its passages having these sd (sweeps, PER_SWEEP)."""
+    count = sd.size
+    return Sighting(
+        name="view",
+        corners_m=np.zeros((0, 3)),
+        corner_px=np.zeros((0, 2)),
+        corner_scale=np.zeros(0),
+        x_px=rng.uniform(0, 511, count),
+        y_px=rng.uniform(0, 511, count),
+        command=np.sort(rng.uniform(-0.5, 0.5, sd.shape), axis=1).ravel(),
+        sd=sd.ravel(),
+        velocity_per_s=np.repeat(SPEEDS, PER_SWEEP),
+        starts=np.arange(len(SPEEDS) + 1) * PER_SWEEP,
+    )
+
+
+def told(chance: float, spread: float, seed: int = 0) -> tuple[Array, Array, Array]:
+    """(sd stated, restated, true), (sweeps, PER_SWEEP): what is stated is off by `chance`, true sd differ by `spread`;
+    both are sd of the logarithm. The mirror's slow misfit and outliers are in the residuals.
+    """
+    rng = np.random.default_rng(seed)
+    shape = (len(SPEEDS), PER_SWEEP)
+    true = 3e-4 * np.array([[1.0], [1.0], [2.0]]) * np.exp(rng.normal(0, spread, shape))
+    view = seen(true * np.exp(rng.normal(0, chance, shape)), rng)
+    residual = rng.normal(size=true.size) * true.ravel() + 2e-4 * np.sin(4 * view.command)
+    residual[:: PER_SWEEP // 10] += 0.01
+    (changed,) = restated([residual], [view])
+    return view.sd.reshape(shape), changed.sd.reshape(shape), true
+
+
+def test_sd_that_are_right_stay() -> None:
+    stated, after, _ = told(chance=0.0, spread=0.4)
+    assert np.abs(np.log(after / stated)).max() < 0.25
+    assert np.abs(np.log(after / stated)).mean() < 0.08
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_a_passage_that_is_sharp_by_chance_gets_no_more_than_its_due(spread: float) -> None:
+    stated, after, true = told(chance=0.4, spread=spread)
+    weighted = [np.average((true / sd) ** 2, weights=1 / sd**2) / np.mean((true / sd) ** 2) for sd in (stated, after)]
+    assert weighted[0] > 1.3
+    assert abs(weighted[1] - 1) < 0.1
+    assert np.mean(np.log(after)) == pytest.approx(np.mean(np.log(stated)))
+
+
+def test_a_speed_whose_sd_are_all_too_large_is_put_right() -> None:
+    rng = np.random.default_rng(2)
+    true = np.full((len(SPEEDS), PER_SWEEP), 3e-4)
+    view = seen(true * np.array([[1.0], [1.0], [1.5]]), rng)
+    (changed,) = restated([rng.normal(size=true.size) * true.ravel()], [view])
+    level = changed.sd.reshape(true.shape).mean(axis=1)
+    assert level[2] / level[0] == pytest.approx(1, abs=0.12)

@@ -1,0 +1,28 @@
+"""What a term would change is what changes once it is in."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from calibration.rig_rows import Terms
+from calibration.rig_select import first_order, tried, with_free
+from calibration.rig_solve import Problem
+
+
+def test_a_term_changes_all_that_it_would_with_those_that_come_along() -> None:
+    rng = np.random.default_rng(0)
+    terms = Terms(0)
+    names = terms.names
+    free = [(name,) for name in ("axis_turn_1", "axis_shift_1", "angle_0", "angle_1")]
+    new = ("angle_2", "angle_3")
+    root = rng.normal(size=(len(names), 3 * len(names)))
+    matrix, right = root @ root.T, np.zeros(len(names))
+    right[terms.at(new)] = rng.normal(size=2)  # of what is free nothing is left to gain
+    problem = with_free(Problem((), terms, np.zeros((0, 0)), np.ones(0, bool)), free)
+    solution = SimpleNamespace(matrix=matrix, right=right)
+    decision = tried(problem, solution, new, lambda gain: 1.0)
+    everything = terms.at([*(name for (name,) in free), *new])
+    step = np.zeros(len(names))
+    step[everything] = np.linalg.solve(matrix[np.ix_(everything, everything)], right[everything])
+    assert np.isclose(decision.value, step[terms.at(["angle_3"])[0]])
+    assert np.allclose(first_order(problem, solution, decision), step)

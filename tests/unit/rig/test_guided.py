@@ -1,0 +1,37 @@
+"""The guided mode believes what the calibration itself will find."""
+
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+
+from calibration.camera import Camera
+from calibration.camera_files import KnownCamera
+from calibration.covariance import Covariance
+from calibration.rig_fit import fit_rig
+from rig.calibrating import planes_run
+from rig.calibrating.guided import Guide
+from rig.calibrating.taking import FixedPoses
+from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_views
+
+SIZE = (512, 512)
+RIG = TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0))
+
+
+def test_a_camera_that_is_known_counts_in_what_the_guide_expects() -> None:
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    known = Covariance(names, np.diag([0.05] * 4 + [1e-4] * 5) ** 2)
+    lens = Camera(*SIZE, np.array([[600, 0, 255.5], [0, 600, 255.5], [0, 0, 1.0]]), np.array(RIG.lens))
+    views = random_views(np.random.default_rng(4), RIG, 3, Seen(passages=150))
+    taken = SimpleNamespace(views=views, size=SIZE)
+    asked = planes_run.PlanesAsked(accuracy_m=1e-4)
+    before = []
+    for camera in (None, KnownCamera(lens, known, frozenset())):
+        fit = partial(planes_run._fit, taken, BOARD, None, camera)
+        judge = partial(planes_run._judged, taken, asked)
+        advice = Guide(FixedPoses(()), BOARD, (0.5, 4.0), taken, fit, judge, None).next(views)
+        assert advice is not None
+        before.append(advice.before_m)
+    told = fit_rig(views, BOARD, SIZE, camera=lens, known=known)
+    assert before[1] == planes_run._judged(taken, asked, told).evidence.expected_m
+    assert before[1] < 0.8 * before[0]
