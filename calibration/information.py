@@ -57,7 +57,7 @@ class Forecast:
         fit = self._fit
         timing = np.array([*fit.model.lag_s, fit.model.row_delay_s])
         corners, passages = first_state(fit.model, timing, [pose], [seen]).rows(0, seen, self._terms)
-        corner_weight = np.full(corners.residual.size, 1 / fit.noise.corner_sd_px**2)
+        corner_weight = np.full(corners.residual.size, 1 / (fit.corner_scale * fit.noise.corner_sd_px) ** 2)
         each = self._count * len(seen.sweeps) / max(seen.sd.size, 1)
         weight = each / (fit.noise.passage_factor * seen.sd) ** 2
         starts = bin_starts(seen, fit.noise.reach)

@@ -42,10 +42,11 @@ class RigFit:
     """A fitted rig. Per view, in the order of `views`: poses, corner_residual_px (n, 2) predicted less seen, sweeps.
 
     left_out: names of views without corners; outliers: of views that do not fit the others, which had no say.
-    noise: what the residuals speak for. misfit: by which variances were multiplied, 1 where the model describes all.
-    condition: of the scaled equations of the shared parameters. converged: False where data that contradict each other
-    keep the fit from coming to rest. decisions: about terms and lags. free: what was fitted, names of one group having
-    one value; information: (free, free) about it, the inverse of its covariance.
+    noise: what the residuals speak for; corner_scale: of the usual corner, by which its sd is the noise's. misfit: by
+    which variances were multiplied, 1 where the model describes all. condition: of the scaled equations of the shared
+    parameters. converged: False where data that contradict each other keep the fit from coming to rest. decisions:
+    about terms and lags. free: what was fitted, names of one group having one value; information: (free, free) about
+    it, the inverse of its covariance.
     """
 
     model: RigModel
@@ -56,6 +57,7 @@ class RigFit:
     left_out: tuple[str, ...]
     outliers: tuple[str, ...]
     noise: Noise
+    corner_scale: float
     misfit: float
     condition: float
     converged: bool
@@ -224,6 +226,7 @@ def _result(fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigMode
         left_out=left_out,
         outliers=tuple(seen.name for seen, counts in zip(problem.sightings, counted, strict=True) if not counts),
         noise=fit.noise,
+        corner_scale=float(np.median(np.concatenate([seen.corner_scale for seen in problem.sightings]))),
         misfit=unexplained,
         condition=solution.condition,
         converged=solution.converged,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.rig_sightings import Sighting
-from calibration.robust import robust_sd
+from calibration.robust import MAD_TO_SD, robust_sd
 
 Array = NDArray[np.float64]
 
@@ -44,8 +44,8 @@ SIGNIFICANT_SD = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """corner_sd_px: of each coordinate. passage_factor: by which the passages' sd are multiplied. jitter_sd: of the
-    mirror, in command units; reach: commands as far apart as this share it.
+    """corner_sd_px: of each coordinate of a corner of scale 1. passage_factor: by which passages' sd are multiplied.
+    jitter_sd: of the mirror, in command units; reach: commands as far apart as this share it.
     """
 
     corner_sd_px: float
@@ -168,11 +168,14 @@ def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
     return np.flatnonzero(first)
 
 
-def tail_weight(normalised: Array) -> Array:
-    """Weight of errors in standard deviations, among others of their kind: where all are large, none is an outlier."""
+def tail_weight(normalised: Array, usual: float = 1 / MAD_TO_SD) -> Array:
+    """Weight of errors in standard deviations, among others of their kind: where all are large, none is an outlier.
+
+    usual: the median of such errors' sizes, that of a normal distribution where nothing else is said.
+    """
     away = np.abs(normalised)
     if away.size:
-        away = away / max(1.0, robust_sd(away))
+        away = away / max(1.0, float(np.median(away)) / usual)
     return np.where(away > OUTLIER_SD, 0.0, np.minimum(1.0, TAIL_SD / np.maximum(away, 1e-300)))
 
 

@@ -19,6 +19,9 @@ from calibration.rig_state import RigState
 
 Array = NDArray[np.float64]
 
+_USUAL_MISS = float(np.sqrt(np.log(2.0)))
+"""Median of a distance in a plane (Rayleigh's distribution), its mean square 1."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewNormal:
@@ -61,13 +64,19 @@ def weights(rows: Sequence[tuple[Rows, Rows]], sightings: Sequence[Sighting], no
     corners, passages, starts = [], [], []
     for (corner, passage), seen in zip(rows, sightings, strict=True):
         sd_px = noise.corner_sd_px * seen.corner_scale
-        miss = np.hypot(*corner.residual.reshape(2, -1)) / (sd_px * np.sqrt(2.0))
-        corners.append(np.tile(tail_weight(miss) / sd_px**2, 2))
+        corners.append(np.tile(corner_weights(corner.residual.reshape(2, -1), sd_px), 2))
         own = (noise.passage_factor * seen.sd) ** 2
         away = passage.residual / np.sqrt(own + noise.jitter_sd**2)
         passages.append(np.concatenate([np.zeros(0), *(tail_weight(away[sweep]) for sweep in seen.sweeps)]) / own)
         starts.append(bin_starts(seen, noise.reach))
     return Weights(tuple(corners), tuple(passages), tuple(starts), noise.jitter_sd**2)
+
+
+def corner_weights(residual_px: Array, sd_px: Array) -> Array:
+    """(n,) of either coordinate of corners that are off by (2, n); sd_px: (n,) of a coordinate."""
+    miss = np.hypot(*residual_px) / (sd_px * np.sqrt(2.0))
+    weight: Array = tail_weight(miss, _USUAL_MISS) / sd_px**2
+    return weight
 
 
 def all_rows(state: RigState, sightings: Sequence[Sighting], terms: Terms) -> list[tuple[Rows, Rows]]:

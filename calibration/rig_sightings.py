@@ -65,7 +65,7 @@ def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sight
         name=view.name,
         corners_m=board.corners_m[view.corners.ids],
         corner_px=np.asarray(view.corners.px, np.float64),
-        corner_scale=_corner_scale(view.corners),
+        corner_scale=corner_scale(view.corners),
         x_px=joined("x_px"),
         y_px=joined("y_px"),
         command=joined("command"),
@@ -75,7 +75,7 @@ def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sight
     )
 
 
-def _corner_scale(corners: Corners) -> Array:
+def corner_scale(corners: Corners) -> Array:
     """Of each corner, 1 where the picture did not tell."""
     if corners.sd_px is None:
         return np.ones(len(corners.ids))

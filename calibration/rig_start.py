@@ -147,10 +147,7 @@ def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[flo
     # Full: angles of too few poses may all be the same, which is no reason to warn.
     commands = [polynomial.polyfit(angle - middle, command, 2, full=True)[0][0] for command, angle in curves]
     design = np.array(
-        [
-            [1.0] + [v if (FORWARD if v > 0 else BACKWARD) in tie else 0.0 for tie in ties]
-            for v in velocities
-        ]
+        [[1.0] + [v if (FORWARD if v > 0 else BACKWARD) in tie else 0.0 for tie in ties] for v in velocities]
     )
     scale = np.abs(design).max(axis=0)
     values = np.linalg.lstsq(design / scale, np.array(commands), rcond=1e-8)[0] / scale

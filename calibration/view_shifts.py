@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from calibration.model import RigModel
 from calibration.rig_fit import RigFit
-from calibration.robust import robust_sd
+from calibration.rig_normal import corner_weights
+from calibration.rig_sightings import corner_scale
 from calibration.sweep_fit import SweepFit
 from calibration.views import BoardPose, View
 
@@ -23,6 +24,8 @@ Array = NDArray[np.float64]
 _STEP = 1e-6
 """Of the command range, and of a pose in rad and m, for differences."""
 _FEWEST_CORNERS = 6
+_ROUNDS = 8
+"""In which a pose settles with the weights of its corners."""
 _FEWEST_TO_SPLIT = 4
 MOST_MISFIT = 3.0
 """Factor on the variances up to which the views are taken to agree."""
@@ -47,11 +50,7 @@ def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
         found = _corner_pose(model, fit, views[name], pose)
         if found is not None and sweeps:
             posed.append((name, *found, sweeps))
-    if not posed:
-        return ()
-    left = np.concatenate([residual for _, _, residual, _, _ in posed])
-    corner_sd = robust_sd(left)
-    return tuple(_shift(model, name, pose, corner_sd**2 * inverse, sweeps) for name, pose, _, inverse, sweeps in posed)
+    return tuple(_shift(model, *of_view) for of_view in posed)
 
 
 def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> float:
@@ -86,8 +85,8 @@ def last_before_move(shifts: tuple[ViewShift, ...]) -> str | None:
     return shifts[best].name if parts[best] < MOST_UNEXPLAINED * spread else None
 
 
-def _corner_pose(model: RigModel, fit: RigFit, view: View, start: BoardPose) -> tuple[BoardPose, Array, Array] | None:
-    """Pose by the corners alone, what it leaves of them (2n,), and the inverse of its equations (6, 6)."""
+def _corner_pose(model: RigModel, fit: RigFit, view: View, start: BoardPose) -> tuple[BoardPose, Array] | None:
+    """Pose by the corners alone, which count as they do in the fit, and its covariance (6, 6)."""
     if view.corners is None:
         return None
     px = np.asarray(view.corners.px, np.float64)
@@ -95,12 +94,15 @@ def _corner_pose(model: RigModel, fit: RigFit, view: View, start: BoardPose) -> 
     if np.count_nonzero(known) < _FEWEST_CORNERS:
         return None
     points, px, camera = fit.board.corners_m[view.corners.ids[known]], px[known], model.camera
-    first = np.asarray(start.rotation, np.float64).reshape(3, 1), np.asarray(start.position_m).reshape(3, 1)
-    turn, shift = cv2.solvePnPRefineLM(points, px, camera.matrix, camera.distortion, first[0].copy(), first[1].copy())
-    seen, slopes = cv2.projectPoints(points, turn, shift, camera.matrix, camera.distortion)
-    slopes = slopes[:, :6]
-    pose = BoardPose(np.asarray(turn, np.float64).ravel(), np.asarray(shift, np.float64).ravel())
-    return pose, (seen.reshape(-1, 2) - px).ravel(), np.linalg.pinv(slopes.T @ slopes)
+    sd_px = fit.noise.corner_sd_px * corner_scale(view.corners)[known]
+    pose = np.concatenate([start.rotation, start.position_m]).astype(np.float64)
+    for _ in range(_ROUNDS):
+        seen, slopes = cv2.projectPoints(points, pose[:3], pose[3:], camera.matrix, camera.distortion)
+        left = seen.reshape(-1, 2) - px
+        weighted = slopes[:, :6] * np.repeat(corner_weights(left.T, sd_px), 2)[:, None]
+        covariance = np.asarray(np.linalg.pinv(weighted.T @ slopes[:, :6]), np.float64)
+        pose -= covariance @ (weighted.T @ left.ravel())
+    return BoardPose(pose[:3], pose[3:]), covariance
 
 
 def _shift(model: RigModel, name: str, pose: BoardPose, covariance: Array, sweeps: tuple[SweepFit, ...]) -> ViewShift:

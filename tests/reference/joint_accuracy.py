@@ -24,6 +24,7 @@ from tests.reference.answers import Answers, pooled
 from tests.reference.asked import Finding, Measured, findings
 from tests.reference.made_figures import figures_of
 from tests.reference.made_scenes import pane_scene, smooth_scene, thin_scene
+from tests.reference.random_scenes import random_scene
 from tests.reference.scene import Scene, load_scene, procedural_scene, scene_names
 from tests.reference.working_point import POINTS, REPORT, WorkingPoint
 
@@ -61,7 +62,7 @@ class Campaign:
             yield thin_scene()[0]
         else:
             for name in self.scenes:
-                scene = procedural_scene() if name == "procedural" else load_scene(name)
+                scene = _scene(name)
                 if scene is None:
                     raise SystemExit(f"scene {name!r} is absent; present: {', '.join([*scene_names(), 'procedural'])}")
                 yield scene if self.rows is None else scene.crop(self.rows, scene.shape[1])
@@ -87,6 +88,12 @@ class Campaign:
                 for name, answers in gathered.items():
                     extras = figures_of(point, world, tables[name], k)
                     yield Measured(point, scene.name, k, name, pooled(answers), extras)
+
+
+def _scene(name: str) -> Scene | None:
+    if name.startswith("random-"):
+        return random_scene(int(name.removeprefix("random-")))
+    return procedural_scene() if name == "procedural" else load_scene(name)
 
 
 def as_row(cells: Sequence[object]) -> str:
@@ -126,7 +133,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tests.reference.joint_accuracy", description=__doc__.splitlines()[0]
     )
-    parser.add_argument("--scenes", help="comma-separated; 'procedural' is the built-in one; default: all prepared")
+    parser.add_argument(
+        "--scenes", help="comma-separated; 'procedural', 'random-NUMBER': built in; default: all prepared"
+    )
     parser.add_argument("--points", default=",".join(EXPOSURES), help=f"of {', '.join(EXPOSURES)}")
     parser.add_argument("--exposures", help="comma-separated, instead of those asked for")
     parser.add_argument("--estimators", default=",".join(ESTIMATORS))

@@ -55,7 +55,7 @@ ELSEWHERE = {
     "boards, their drawings and corners; pictures of anything in test_calibration_data.py": (
         "tests/unit/calibration/test_detection.py", "calibration.board:*", "calibration.board_drawing:*",
         "calibration.board_map:*", "calibration.board_search:*", "calibration.corner_registration:*",
-        "calibration.hot_pixels:*", "calibration.views:*",
+        "calibration.hot_pixels:*", "calibration.marker_layout:*", "calibration.views:*",
     ),
     "steps of the camera's fit; whole fits of any views in test_calibration_data.py": (
         "tests/unit/calibration/test_camera_fit.py", "calibration.camera_*:*", "calibration.coverage:*",
@@ -70,11 +70,16 @@ ELSEWHERE = {
     "lags and delays against drawn passages": (
         "tests/unit/calibration/test_sync_fit.py", "calibration.sync_fit:*", "calibration.gate_fit:*",
     ),
+    "which lags sweeps tell, against sweeps and fits of them": (
+        "tests/unit/calibration/test_lags.py", "calibration.lag_speeds:*", "calibration.lag_verdict:*",
+    ),
     "boards at known places, scanned": (
-        "tests/unit/calibration/test_check_fit.py", "calibration.check_*:*", "calibration.propagation:*",
+        "tests/unit/calibration/test_check_fit.py", "calibration.board_cells:*", "calibration.check_*:*",
+        "calibration.propagation:*",
     ),
     "mistakes made on purpose, each by its own number": (
-        "tests/unit/calibration/test_verdict.py", "calibration.verdict:*", "calibration.evidence:*",
+        "tests/unit/calibration/test_verdict.py", "calibration.data_lack:*", "calibration.verdict:*",
+        "calibration.evidence:*",
         "calibration.judging:*", "calibration.view_shifts:*", "calibration.sensitivity:*",
         "calibration.against_truth:*",
     ),

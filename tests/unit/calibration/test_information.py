@@ -1,5 +1,7 @@
 """What a pose that nobody has shown yet would bring."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from calibration.information import Forecast
@@ -25,6 +27,17 @@ def test_a_shown_pose_brings_what_was_forecast() -> None:
     found = Forecast(fit_rig(views, BOARD, (512, 512)), 5.0).now_m
     assert expected < forecast.now_m
     assert abs(found / expected - 1) < 0.15
+
+
+def test_a_forecast_counts_corners_as_the_fit_found_them_whatever_they_state() -> None:
+    rng = np.random.default_rng(2)
+    views = random_views(rng, RIG, 5, SEEN)
+    stated = [
+        replace(view, corners=replace(view.corners, sd_px=np.full(len(view.corners.ids), 0.005))) for view in views
+    ]
+    pose = BoardPose(*random_pose(rng, RIG))
+    silent, sharp = (Forecast(fit_rig(of, BOARD, (512, 512)), 5.0)(pose) for of in (views, stated))
+    assert abs(sharp / silent - 1) < 0.01
 
 
 def test_poses_differ_and_one_out_of_sight_brings_nothing() -> None:

@@ -66,6 +66,28 @@ def test_the_depth_error_is_what_the_covariance_says(seed: int) -> None:
     assert abs(fit.noise.passage_factor - 1) < 0.1
 
 
+def test_over_rigs_the_depth_error_is_neither_larger_nor_smaller_than_stated() -> None:
+    rig, seen = replace(RIG, angle=(0.09, 0.53)), replace(SEEN, passages=100)
+    squares = []
+    for seed in range(500, 508):
+        fit = fitted(rig, seed, seen, poses=6, camera=true_camera(rig), hold_camera=True)
+        error, sd = depth_errors(fit.model, rig, 5.0, 35.2)
+        squares.append(np.mean((error / sd) ** 2))
+    assert 0.7 < np.sqrt(np.mean(squares)) < 1.4
+
+
+def test_a_term_that_is_neither_there_nor_not_widens_the_covariance() -> None:
+    rig, seen = replace(RIG, angle=(0.09, 0.53, 0.0, -0.002)), replace(SEEN, passages=100)
+    fit = fitted(rig, 7, seen, poses=6, camera=true_camera(rig), hold_camera=True)
+    (open_one,) = (d for d in fit.decisions if not d.kept and abs(d.value) > 2.5 * d.sd)
+    assert fit.model.covariance is not None
+    variance = np.diag(fit.model.covariance.of([group[0] for group in fit.free]))
+    narrow = np.diag(np.linalg.inv(fit.information))
+    assert open_one.name == "angle_3"
+    assert np.all(variance > 0.999 * narrow)
+    assert np.max(variance / narrow) > 1.5
+
+
 @pytest.mark.parametrize(
     ("changed", "term", "value"),
     [

@@ -9,9 +9,9 @@ import pytest
 from rig.estimators.label_grid import label_grid
 from rig.estimators.row_input import state_of, sweep_of
 from rig.estimators.row_kernels import FLUX_MAX
-from rig.estimators.second_return import second_light, second_returns
-from rig.estimators.second_return_sums import BLOCK, Blocks, sum_blocks
-from rig.lanes import LANES
+from rig.estimators.second_return import distance_pixels, second_light, second_returns, second_room
+from rig.estimators.second_return_lines import BLOCK
+from rig.estimators.second_return_sums import Blocks, sum_blocks
 from rig.row_threads import RowWorkers
 from tests.reference.geometry import Geometry
 from tests.reference.made_scenes import pane_scene
@@ -36,8 +36,8 @@ def seconds_of(sweep: Sweep, x_px, haze=0.14, threads=WORKERS):
     model = known_model(sweep.geometry, haze=haze)
     grid = label_grid(sweep.geometry)
     x_px = x_px.astype(np.float32)
-    light = second_light(state_of(model), 0.6)
-    return second_returns(sweep.volume, grid, sweep_of(sweep.geometry), light, x_px, threads)
+    light = second_light(state_of(model), 0.6, grid, sweep_of(sweep.geometry))
+    return second_returns(sweep.volume, grid, sweep_of(sweep.geometry), light, x_px, second_room(grid), threads)
 
 
 @pytest.mark.parametrize("rig", ["left", "right"])
@@ -91,8 +91,8 @@ def test_columns_without_exposures_are_left_alone() -> None:
     model = known_model(sweep.geometry)
     grid = label_grid(sweep.geometry)
     x_px = np.where(volume.n_frames > 0, sweep.point.x_true, np.nan).astype(np.float32)
-    light = second_light(state_of(model), 0.6)
-    x2_px, _ = second_returns(volume, grid, sweep_of(sweep.geometry), light, x_px, WORKERS)
+    light = second_light(state_of(model), 0.6, grid, sweep_of(sweep.geometry))
+    x2_px, _ = second_returns(volume, grid, sweep_of(sweep.geometry), light, x_px, second_room(grid), WORKERS)
     assert np.isnan(x2_px[:, ::7]).all()
     two = np.isfinite(sweep.point.x_second) & np.isfinite(x_px)
     assert (np.abs(x2_px - sweep.point.x_second)[two] <= 1).mean() > 0.95
@@ -133,8 +133,9 @@ def test_pixels_not_to_be_used_neither_show_nor_hide_a_second_return() -> None:
         replace(volume, counts=counts),
         grid,
         sweep_of(sweep.geometry),
-        second_light(state_of(model), 0.6),
+        second_light(state_of(model), 0.6, grid, sweep_of(sweep.geometry)),
         x_px,
+        second_room(grid),
         WORKERS,
     )
     two = np.isfinite(sweep.point.x_second) & np.isfinite(x_px)
@@ -148,13 +149,13 @@ def test_strong_ambient_light_is_expected_as_ones_not_as_photons() -> None:
     geometry, model, grid = sweep.geometry, known_model(sweep.geometry, haze=1e-9), label_grid(sweep.geometry)
     model.ambient[:] = 2.0
     model.ambient[::3, 200] = FLUX_MAX
-    light, x_px = second_light(state_of(model), 0.6), sweep.point.x_true.astype(np.float32)
-    pixels = -(-grid.stripes // (2 * LANES)) * LANES
+    light = second_light(state_of(model), 0.6, grid, sweep_of(geometry))
+    x_px, pixels = sweep.point.x_true.astype(np.float32), distance_pixels(grid)
     for counts in (np.uint8, np.uint16):
         blocks = Blocks(*(np.empty((ROWS // BLOCK, COLUMNS // BLOCK, pixels), np.float32) for _ in range(2)))
         once = np.ones_like(sweep.volume.counts, counts)
         sum_blocks(
-            once, sweep.volume.n_frames, sweep_of(geometry), light.state, light.still, grid.x_far, grid.side,
+            once, sweep.volume.n_frames, sweep_of(geometry), light.state, light.still, light.place, grid.side,
             light.apart, x_px, 0, ROWS // BLOCK, blocks,
         )  # fmt: skip
         np.testing.assert_allclose(blocks.expected, blocks.ones * 10 * -np.expm1(-2), rtol=1e-4)
@@ -162,3 +163,22 @@ def test_strong_ambient_light_is_expected_as_ones_not_as_photons() -> None:
         seen = (x >= geometry.x_lo[..., None]) & (x <= geometry.x_hi[..., None]) & ((x != 200) | (y % 3 != 0))
         seen &= np.abs(x - x_px[..., None]) > light.apart
         assert blocks.ones.sum() == seen.sum()
+
+
+@pytest.mark.parametrize("rig", ["left", "right"])
+def test_bytes_at_once_and_other_counts_one_by_one_give_the_same_sums(rig) -> None:
+    sweep = pane(rig=rig)
+    geometry, grid = sweep.geometry, label_grid(sweep.geometry)
+    light = second_light(state_of(known_model(geometry)), 0.6, grid, sweep_of(geometry))
+    x_px = sweep.point.x_true.astype(np.float32)
+    sums = []
+    for counts in (sweep.volume.counts, sweep.volume.counts.astype(np.uint16)):
+        blocks = second_room(grid).blocks
+        sum_blocks(
+            counts, sweep.volume.n_frames, sweep_of(geometry), light.state, light.still, light.place, grid.side,
+            light.apart, x_px, 0, ROWS // BLOCK, blocks,
+        )  # fmt: skip
+        sums.append(blocks)
+    for one, other in zip(*sums, strict=True):
+        assert one.max() > 0
+        np.testing.assert_array_equal(one, other)

@@ -1,0 +1,116 @@
+"""How sure answers of `joint` are: neighbours are counted as they are; surfaces, light and margin have a say."""
+
+import numpy as np
+import pytest
+
+from rig.estimators.aggregation_answer import UNITS, new_answer
+from rig.estimators.joint_agreement import AROUND, NEIGHBOURS, agreement_row, count_neighbours, new_neighbours
+from rig.estimators.joint_answer import stripe_table
+from rig.estimators.joint_confidence import Brightness
+from rig.estimators.label_volume_buffers import signed_address
+from rig.estimators.placing import new_places
+from rig.estimators.placing_pools import SAME_PX
+from rig.lanes import LANES
+from rig.row_threads import RowWorkers
+
+ROWS, COLUMNS = 40, 37
+ONE, TWO, THREE = RowWorkers(1), RowWorkers(2), RowWorkers(3)
+BRIGHT = Brightness(0.1, 10.0, 0.005)
+
+
+def judged(distance, *, light=0.7, haze=0.1, exposures=3, margin=10.0, sd=0.1, workers=ONE):
+    """The table of answers at `distance` (rows, columns) from the far end, all of one light and margin."""
+    rows, columns = distance.shape
+    answer, places = new_answer(rows, columns), new_places(rows, columns)
+    answer.margin[:] = round(margin * UNITS)
+    places.distance[:], places.light[:], places.scale[:], places.haze[:] = distance, light, 1.0, haze
+    x_px = np.where(np.isnan(distance), np.nan, 100.0).astype(np.float32)
+    frames = np.broadcast_to(np.asarray(exposures, np.int32), columns).copy()
+    sds = np.full(distance.shape, sd, np.float32)
+    return stripe_table(x_px, sds, frames, answer, places, BRIGHT, workers)
+
+
+def wall(rows=ROWS, columns=COLUMNS):
+    return np.full((rows, columns), 20.0, np.float32)
+
+
+def scattered(rows=ROWS, columns=COLUMNS):
+    return np.random.default_rng(3).uniform(0, 60, (rows, columns)).astype(np.float32)
+
+
+def test_neighbours_and_the_pairs_around_are_counted_as_they_are():
+    distance = np.random.default_rng(1).choice([0.0, 0.9, 3.0, np.nan], (ROWS, COLUMNS)).astype(np.float32)
+    there = new_neighbours(ROWS, np.ones(COLUMNS, np.int32))
+    for first, last in ((0, 7), (7, ROWS)):
+        count_neighbours(distance, first, last, there)
+    padded = np.pad(distance, NEIGHBOURS, constant_values=np.nan)
+    side = 2 * NEIGHBOURS + 1
+    near = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
+    expected = (np.abs(near - distance[:, :, None, None]) <= SAME_PX).sum(axis=(2, 3))
+    np.testing.assert_array_equal(there.number[AROUND:-AROUND, LANES : LANES + COLUMNS], expected)
+
+    width = there.number.shape[1]
+    line, pairs = np.zeros(width, np.int16), np.zeros(width, np.float32)
+    box = np.pad(expected, AROUND)
+    for y in (0, 2, ROWS // 2, ROWS - 1):
+        agreement_row(signed_address(there.number), width, y, signed_address(line), signed_address(pairs))
+        rows = box[y : y + 2 * AROUND + 1].sum(axis=0)
+        np.testing.assert_array_equal(pairs[:COLUMNS], np.convolve(rows, np.ones(2 * AROUND + 1), "valid"))
+
+
+def test_all_pairs_of_a_wall_agree_up_to_its_border_and_beside_columns_without_frames():
+    frames = np.ones(COLUMNS, np.int32)
+    frames[10:14] = 0
+    distance = wall()
+    distance[:, frames == 0] = np.nan
+    there = new_neighbours(ROWS, frames)
+    count_neighbours(distance, 0, ROWS, there)
+    width = there.number.shape[1]
+    line, pairs = np.zeros(width, np.int16), np.zeros(width, np.float32)
+    for y in range(ROWS):
+        agreement_row(signed_address(there.number), width, y, signed_address(line), signed_address(pairs))
+        shares = pairs[:COLUMNS] / (there.per_row[y] * there.per_column)
+        np.testing.assert_allclose(shares[frames > 0], 1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("exposures", [1, 3, 20, 1000])
+def test_a_lit_surface_is_believed_and_scattered_answers_are_not(exposures):
+    light = 3.0 / exposures + 0.7
+    assert judged(wall(), light=light, exposures=exposures, margin=14).confidence.min() > 0.9
+    assert judged(scattered(), light=0.0, exposures=exposures, margin=3).confidence.max() < 0.3
+
+
+def test_haze_that_only_ends_is_no_stripe():
+    """Half of the haze in front of an answer passes for its light where the answer lies before the haze's end."""
+    haze = 0.2
+    ends = judged(wall(), light=2.5 * haze, haze=haze, exposures=10).confidence
+    shines = judged(wall(), light=2.5 * haze + 0.5, haze=haze, exposures=10).confidence
+    assert ends.max() < shines.min()
+
+
+@pytest.mark.parametrize(("better", "worse"), [({"sd": 0.1}, {"sd": 0.9}), ({"margin": 12}, {"margin": 2})])
+def test_well_placed_answers_without_rivals_are_surer(better, worse):
+    assert judged(wall(), **better).confidence.min() > judged(wall(), **worse).confidence.max()
+
+
+def test_a_pole_is_surer_than_single_answers():
+    pole = scattered()
+    pole[:, 15:19] = 50.0
+    found = judged(pole).confidence
+    assert found[:, 16:18].mean() > 2 * np.delete(found, range(12, 22), axis=1).mean()
+
+
+def test_bits_do_not_depend_on_threads():
+    alone, others = judged(scattered()), [judged(scattered(), workers=workers) for workers in (TWO, THREE)]
+    for other in others:
+        np.testing.assert_array_equal(other.confidence, alone.confidence)
+
+
+def test_what_has_no_place_has_no_confidence():
+    distance = wall()
+    distance[:5] = np.nan
+    found = judged(distance)
+    assert not found.confidence[:5].any()
+    assert found.confidence[5:].all()
+    for field in (found.signal, found.haze, found.x_sd_px):
+        assert np.isnan(field[:5]).all()
