@@ -85,6 +85,16 @@ write_float32 = _writer(types.float32, _F32, _F32, 4)
 """write_...(address, index, number): one number."""
 
 
+@numba.njit(cache=True, nogil=True)
+def copy_floats(source: int, to: int, number: int) -> None:
+    """Copy so many float32 from one address to another: numba copies slices number by number."""
+    whole = number - number % LANES
+    for i in range(0, whole, LANES):
+        store_float32(to, i, load_float32(source, i))
+    for i in range(whole, number):
+        write_float32(to, i, read_float32(source, i))
+
+
 @intrinsic_of
 def add_bytes(typing: Any, address: Any, index: Any, counts: Any) -> VectorCode:
     """add_bytes(address, index, counts): add 32 unsigned bytes to as many int32 at `address`, from `index` on."""
@@ -114,18 +124,24 @@ def load_two_rows(typing: Any, address: Any, first: Any, second: Any) -> VectorC
     return BYTES(types.intp, types.intp, types.intp), code
 
 
-@intrinsic_of
-def prefetch(typing: Any, address: Any) -> VectorCode:
-    """prefetch(address): fetch the cache line there into the second cache; any address will do."""
+def _prefetch(to_write: int, locality: int) -> Any:
+    @intrinsic_of
+    def fetch(typing: Any, address: Any) -> VectorCode:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            pointer = builder.inttoptr(args[0], _I8.as_pointer())
+            how = [ir.Constant(_I32, number) for number in (to_write, locality, 1)]
+            called(builder, "llvm.prefetch.p0", ir.VoidType(), pointer, *how)
+            return context.get_dummy_value()
 
-    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointer = builder.inttoptr(args[0], _I8.as_pointer())
-        # To be read, next to last of the levels of locality, data.
-        how = [ir.Constant(_I32, number) for number in (0, 2, 1)]
-        called(builder, "llvm.prefetch.p0", ir.VoidType(), pointer, *how)
-        return context.get_dummy_value()
+        return types.void(types.intp), code
 
-    return types.void(types.intp), code
+    return fetch
+
+
+prefetch = _prefetch(0, 2)
+"""prefetch(address): fetch the cache line there into the second cache; any address will do."""
+prefetch_to_write = _prefetch(1, 3)
+"""prefetch_to_write(address): fetch the cache line there into the first cache, for this core alone."""
 
 
 @intrinsic_of

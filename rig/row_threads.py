@@ -60,6 +60,7 @@ class RowWorkers:
         wanted = state.posted - under_way
         if min(state.done) < wanted or state.error is not None:
             with state.changed:
+                state.wanted = wanted
                 state.changed.wait_for(lambda: min(state.done) >= (wanted if state.error is None else state.posted))
         if state.error is not None:
             error, state.error = state.error, None
@@ -87,6 +88,8 @@ class _State:
         self.queues: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(threads)]
         self.done = [0] * threads
         self.posted = 0
+        self.wanted = 0
+        """Posts that the caller waits for."""
         self.changed = threading.Condition()
         self.error: BaseException | None = None
         """The first failure, until the caller has been told and nothing is left over."""
@@ -114,7 +117,9 @@ def _run(state: _State, queue: "SimpleQueue[_Job | None]", i: int) -> None:
         del work, job
         with state.changed:
             state.done[i] += 1
-            state.changed.notify_all()
+            # Whoever waits is not woken to find that others are not done.
+            if min(state.done) >= state.wanted or state.error is not None:
+                state.changed.notify_all()
 
 
 def _end(state: _State) -> None:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.aligned import aligned_zeros
 from rig.counting import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.errors import UsageError
 from rig.estimators.aggregation_answer import Answer, answer_settings, new_answer
@@ -25,23 +26,22 @@ from rig.estimators.halo_learning import bright_lines, learn_first_halo, learn_n
 from rig.estimators.joint_answer import brightness_of, stripe_table
 from rig.estimators.joint_confidence import Brightness
 from rig.estimators.joint_kernels import add_quiet, read_positions
+from rig.estimators.joint_teaching import fill_trust
 from rig.estimators.label_grid import LabelGrid, label_grid
-from rig.estimators.label_volume import Costs, costs_of
+from rig.estimators.label_volume import BAND_ROWS, Costs, costs_of
 from rig.estimators.learning import learn_again, lines_of, next_lattice
 from rig.estimators.lessons import Lessons, Seen, Setting, first_model
 from rig.estimators.placing import amplitudes_of, line_width, new_places, place, profile_table, weigh_light
 from rig.estimators.placing_kernels import Places
 from rig.estimators.row_input import State, Sweep, state_of, sweep_of
 from rig.estimators.row_model import RowModel
-from rig.estimators.second_return import SecondLight, second_light, second_returns
+from rig.estimators.second_return import SecondLight, SecondRoom, second_light, second_returns, second_room
 from rig.estimators.temporal import TemporalPrior
 from rig.estimators.volume_search import nominal_exposures
 from rig.geometry import SweepGeometry
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
-BAND_ROWS = 32
-"""Rows whose costs stay in the cache from one step to the next, with the tables that they share."""
 FIRST_ROUNDS = 3
 """Times that the first map's stripes teach what they are then estimated with again."""
 MOST_BYTES = 4 << 30
@@ -72,6 +72,7 @@ class _Memory(NamedTuple):
     answer: Answer
     ballots: Ballots
     places: Places
+    seconds: SecondRoom
 
 
 class Joint:
@@ -133,7 +134,7 @@ class Joint:
         exposures, dark = nominal_exposures(volume), volume.dark_counts is not None
         for _ in range(FIRST_ROUNDS):
             tables = _tables(Setting(model, geometry, exposures, dark), self._workers)
-            stripes = self._stripes(volume, tables)
+            stripes = self._teaching(volume, tables, self._stripes(volume, tables))
             quiet = self._quiet(volume, geometry, tables, stripes)
             ambient = ambient_map(volume, volume.intensity(), geometry, quiet)
             width = line_width(volume, tables.sweep, tables.state, stripes, self._workers)
@@ -144,17 +145,31 @@ class Joint:
             model = learn_first_halo(volume, geometry, model, ambient, stripes, places, self._workers)
             # Amplitudes are relative to the scale of the model that they are written into.
             weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
+            self._workers.settle()
             amplitude, weight = amplitudes_of(places)
             model = replace(model, amplitude=amplitude, weight=weight)
         return model
 
+    def _teaching(self, volume: CountVolume, tables: _Tables, stripes: StripeTable) -> StripeTable:
+        """The table with the trust that lessons put into each answer instead of its confidence."""
+        memory, trust = self._room(tables.grid), np.empty_like(stripes.confidence)
+        self._workers.over(
+            len(trust),
+            lambda first, last: fill_trust(
+                stripes.x_px, stripes.x_sd_px, volume.n_frames, memory.answer.margin, memory.places,
+                tables.bright.ambient, first, last, trust,
+            ),
+        )  # fmt: skip
+        return replace(stripes, confidence=trust)
+
     def _stripes(self, volume: CountVolume, tables: _Tables) -> StripeTable:
         grid, workers = tables.grid, self._workers
         rows, columns = grid.x_far.shape
-        memory = self._room(rows, columns, grid.labels)
+        memory = self._room(grid)
         settings, penalties = answer_settings(grid.stripes), Penalties()
 
         def tie_rows(first: int, last: int) -> None:
+            # Rows that share tables: those are fetched once, and costs are tied along rows while the cache has them.
             for band in range(first, last, BAND_ROWS):
                 end = min(band + BAND_ROWS, last)
                 tables.costs.fill(volume, band, end, memory.cost)
@@ -179,22 +194,25 @@ class Joint:
         workers.over(columns, tie_columns)
         if neighbours:
             workers.over(rows, lambda first, last: collect(memory.answer, first, last, memory.ballots))
-        workers.over(rows, read)
+        workers.post(rows, read)  # what is placed next is of the same rows
         sd = place(volume, tables.sweep, tables.state, tables.shares, x_px, memory.places, workers)
         return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, tables.bright, workers)
 
     def _with_seconds(self, volume: CountVolume, tables: _Tables, stripes: StripeTable) -> StripeTable:
+        room = self._room(tables.grid).seconds
         x2_px, confidence2 = second_returns(
-            volume, tables.grid, tables.sweep, tables.light, stripes.x_px, self._workers
+            volume, tables.grid, tables.sweep, tables.light, stripes.x_px, room, self._workers
         )
         return replace(stripes, x2_px=x2_px, confidence2=confidence2)
 
-    def _room(self, rows: int, columns: int, labels: int) -> _Memory:
-        memory = self._memory
-        if memory is None or memory.cost.shape != (rows, columns, labels):
-            cost, message = (np.zeros((rows, columns, labels), np.uint8) for _ in range(2))
-            answer, ballots = new_answer(rows, columns), new_ballots(rows, columns)
-            memory = self._memory = _Memory(cost, message, answer, ballots, new_places(rows, columns))
+    def _room(self, grid: LabelGrid) -> _Memory:
+        memory, (rows, columns) = self._memory, grid.x_far.shape
+        if memory is None or memory.cost.shape != (rows, columns, grid.labels):
+            cost, message = (aligned_zeros((rows, columns, grid.labels), np.uint8) for _ in range(2))
+            memory = self._memory = _Memory(
+                cost, message, new_answer(rows, columns), new_ballots(rows, columns), new_places(rows, columns),
+                second_room(grid),
+            )  # fmt: skip
         return memory
 
     def _seen(self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable) -> Seen:
@@ -234,9 +252,9 @@ def _grid(geometry: SweepGeometry) -> LabelGrid:
 def _tables(setting: Setting, workers: RowWorkers) -> _Tables:
     grid = _grid(setting.geometry)
     costs = costs_of(setting.model, setting.geometry, grid, setting.exposures, workers)
-    state, sigma_px = state_of(setting.model), setting.model.line_sigma_px
+    state, sigma_px, sweep = state_of(setting.model), setting.model.line_sigma_px, sweep_of(setting.geometry)
     halo = halo_shares(setting.model, setting.geometry.width if setting.model.halo.any() else 0)
     return _Tables(
-        grid, costs, sweep_of(setting.geometry), state, profile_table(sigma_px), halo, second_light(state, sigma_px),
+        grid, costs, sweep, state, profile_table(sigma_px), halo, second_light(state, sigma_px, grid, sweep),
         brightness_of(setting.model), setting.dark,
     )  # fmt: skip

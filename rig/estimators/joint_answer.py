@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.aggregation_answer import Answer
+from rig.estimators.joint_agreement import count_neighbours, new_neighbours
 from rig.estimators.joint_confidence import Brightness, confidences
 from rig.estimators.placing_kernels import Places
 from rig.estimators.row_model import RowModel
@@ -27,9 +28,11 @@ def stripe_table(
 ) -> StripeTable:
     """The table of a map; arrays float32 (rows, columns), x_px NaN where there are no data."""
     confidence, signal, haze = (np.empty_like(x_px) for _ in range(3))
+    neighbours = new_neighbours(len(x_px), n_frames)
 
     def work(first: int, last: int) -> None:
-        confidences(x_px, sd_px, n_frames, answer, places, bright, first, last, confidence, signal, haze)
+        confidences(x_px, sd_px, n_frames, answer, places, neighbours, bright, first, last, confidence, signal, haze)
 
+    workers.over(len(x_px), lambda first, last: count_neighbours(places.distance, first, last, neighbours))
     workers.over(len(x_px), work)
     return StripeTable(x_px, confidence, sd_px, signal, haze)

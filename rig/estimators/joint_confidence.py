@@ -1,14 +1,19 @@
 """Compiled: how probably an answer of `joint` lies within a pixel of a stripe, from three things that can be wrong.
 
-    confidence = erf(1 / (sqrt 2 WIDER sd))          the stripe is farther off than it should be
-               / (1 + exp(A - B margin))             another position is the right one
-               / (1 + C z^-D)                        there is no stripe: haze ends, but nothing shines
+    confidence = erf(1 / (sqrt 2 WIDER sd))                        the stripe is farther off than it should be
+               / (1 + exp(A - B margin))                           another position is the right one
+               / (1 + exp(C - D ln contrast' + g (E - F ln odds))) there is no stripe: haze ends, but nothing shines
 
 margin: by how much the next best place is worse, or what neighbours say for it where there was a vote, over UNITS of
-cost; z: light of the stripe over its noise, pooled over neighbours. The five numbers are fitted (maximum likelihood) to
-10 maps of a second simulator, `cones` and `art` in clear air, thin and dense fog at 1 to 10 exposures, all answers
-counted, also those where there is no stripe; on 7 other maps (`moebius`, `motorcycle`, `aloe`) the calibration error
-was 0.026.
+cost. contrast' = max(contrast + 3, 1), contrast: light that 3 x 3 neighbours on the surface have in common above the
+*whole* haze before the stripe, over its noise; where haze just ends an answer can lie a little before the end, and half
+of the haze would pass for light. odds: of answers around that agree to those that do not (`joint_agreement`). They
+count as far as there is haze, g = k / (k + SOME_HAZE), k photons of it in all exposures: in clear air nothing but a
+stripe makes a margin, and small things, whose surroundings do not agree, are as sure as others.
+
+A is chosen: fitted it comes out at 0.7, which believes answers without any margin too readily. The others are
+fitted (maximum likelihood) to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, all answers
+counted, also those where there is no stripe.
 """
 
 import math
@@ -19,25 +24,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.aggregation_answer import UNITS, Answer
+from rig.estimators.joint_agreement import BAND_ROWS, Neighbours, agreement_row, light_row
 from rig.estimators.label_volume_buffers import signed_address
 from rig.estimators.placing_kernels import LIGHT_PX, Places
-from rig.lane_memory import load_float32, store_float32
+from rig.estimators.placing_pools import MARGIN, with_margin
+from rig.lane_memory import copy_floats, load_float32, store_float32
 from rig.lane_powers import error_function, exponential, logarithm
-from rig.lanes import LANES, larger_float, smaller_float, zero_float32
+from rig.lanes import LANES, larger_float, smaller_float, square_root, zero_float32
 
 Float32 = NDArray[np.float32]
 
-WIDER: Final = 1.156
+WIDER: Final = 1.556
 """The noise of the counts is not all that moves a stripe: surfaces bend, and neighbours are shared."""
-A: Final = 1.880
-B: Final = 0.635
-LOG_C: Final = -2.410
-D: Final = 0.994
-POOLED: Final = 25.0
-"""Answers whose light counts as one: about half of the neighbours that it is pooled over lie on the same surface."""
-LEAST_Z: Final = 0.05
-_LINES: Final = 8
-_SD, _SCALE, _LIGHT, _AMPLITUDE, _HAZE, _MARGIN, _FRAMES, _CONFIDENCE = range(_LINES)
+A: Final = 2.0
+B: Final = 0.890
+C: Final = -1.539
+D: Final = 1.569
+E: Final = 5.871
+F: Final = 2.585
+SOME_HAZE: Final = 0.05
+"""Photons of haze per pixel, over all exposures, from which on its end can be taken for a stripe."""
+_HALF_PX: Final = LIGHT_PX + 0.5
+"""Half the pixels that a stripe's light is summed over."""
+_LEAST_ODDS: Final = 1e-3
+_MOST_AGREE: Final = 1.02
+"""Odds of agreement stay between 0.001 and 50."""
+_PAIRS, _LIT, _LIGHT_SUM, _SD, _SCALE, _LIGHT, _HAZE, _REST, _MARGIN, _FRAMES, _ALL, _CONFIDENCE = range(12)
+_LINES: Final = 12
 
 
 class Brightness(NamedTuple):
@@ -55,6 +68,7 @@ def confidences(
     n_frames: NDArray[np.int32],
     answer: Answer,
     places: Places,
+    neighbours: Neighbours,
     bright: Brightness,
     first_row: int,
     last_row: int,
@@ -64,43 +78,84 @@ def confidences(
 ) -> None:
     """Fill confidence, signal and haze of rows first_row..last_row-1, all (rows, columns).
 
-    Where x_px is NaN the confidence is 0 and the others, sd_px too, are made NaN.
+    Where x_px is NaN the confidence is 0 and the others, sd_px too, are made NaN. The neighbours of all rows must have
+    been counted before.
     """
     nothing = np.float32(np.nan)
     # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
-    scales, lights, amplitudes, hazes = places.scale, places.light, places.amplitude, places.haze
-    margins, columns = answer.margin, x_px.shape[1]
+    scales, lights, hazes, rests = places.scale, places.light, places.haze, places.rest
+    number, per_row, margins, columns = neighbours.number, neighbours.per_row, answer.margin, x_px.shape[1]
     # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
-    width = (-(-columns // LANES) | 1) * LANES
-    lines = np.zeros((_LINES, width), np.float32)
+    width, wide = (-(-columns // LANES) | 1) * LANES, number.shape[1]
+    lines, pairs = np.zeros((_LINES, width), np.float32), np.zeros(wide, np.int16)
+    at, to_number, to_pairs = signed_address(lines), signed_address(number), signed_address(pairs)
+    sources = (
+        (signed_address(sd_px), _SD), (signed_address(scales), _SCALE), (signed_address(lights), _LIGHT),
+        (signed_address(hazes), _HAZE), (signed_address(rests), _REST),
+    )  # fmt: skip
+    targets = (
+        (signed_address(confidence), _CONFIDENCE), (signed_address(signal), _LIGHT), (signed_address(haze), _HAZE),
+    )  # fmt: skip
     for c in range(columns):
-        lines[_FRAMES, c] = max(n_frames[c], 1)
-    for y in range(first_row, last_row):
-        lines[_SD, :columns], lines[_SCALE, :columns], lines[_LIGHT, :columns] = sd_px[y], scales[y], lights[y]
-        lines[_AMPLITUDE, :columns], lines[_HAZE, :columns] = amplitudes[y], hazes[y]
-        for c in range(columns):
-            lines[_MARGIN, c] = margins[y, c]
-        _judge(signed_address(lines), width, bright)
-        confidence[y], signal[y], haze[y] = lines[_CONFIDENCE, :columns], lines[_LIGHT, :columns], hazes[y]
-        for c in range(columns):
-            if np.isnan(x_px[y, c]):
-                confidence[y, c] = 0.0
-                signal[y, c] = haze[y, c] = sd_px[y, c] = nothing
+        lines[_FRAMES, c], lines[_ALL, c] = max(n_frames[c], 1), neighbours.per_column[c]
+    for band in range(first_row, last_row, BAND_ROWS):
+        end = min(band + BAND_ROWS, last_row)
+        distance, light = with_margin(places.distance, band, end), with_margin(lights, band, end)
+        around = signed_address(distance), signed_address(light)
+        for y in range(band, end):
+            agreement_row(to_number, wide, y, to_pairs, at + 4 * _PAIRS * width)
+            light_row(around, wide, (y - band + MARGIN) * wide + LANES, at + 4 * _LIT * width, width)
+            for source, line in sources:
+                copy_floats(source + 4 * columns * y, at + 4 * line * width, columns)
+            for c in range(columns):
+                lines[_MARGIN, c] = margins[y, c]
+            _judge(at, width, bright, per_row[y])
+            for target, line in targets:
+                copy_floats(at + 4 * line * width, target + 4 * columns * y, columns)
+            for c in range(columns):
+                if np.isnan(x_px[y, c]):
+                    confidence[y, c] = 0.0
+                    signal[y, c] = haze[y, c] = sd_px[y, c] = nothing
+        distance[:1] = light[:1] = 0.0
+    # They live until here: what is known by its address alone would be freed.
+    lines[:1], pairs[:1] = 0.0, 0
 
 
 @numba.njit(cache=True, nogil=True)
-def _judge(at: int, width: int, bright: Brightness) -> None:
-    """Fill the confidence of a line of stripes, and cut their light."""
-    one, none, half_width = zero_float32() + 1.0, zero_float32(), LIGHT_PX + 0.5
+def _judge(at: int, width: int, bright: Brightness, per_row: np.float32) -> None:
+    """Fill the confidence of a line of stripes, and cut their light; per_row: of `Neighbours`."""
+    one, none = zero_float32() + 1.0, zero_float32()
     for c in range(0, width, LANES):
-        scale, haze = load_float32(at, _SCALE * width + c), load_float32(at, _HAZE * width + c)
-        exposures = load_float32(at, _FRAMES * width + c) * POOLED
-        light = larger_float(load_float32(at, _LIGHT * width + c), scale * bright.faintest)
-        store_float32(at, _LIGHT * width + c, smaller_float(light, scale * bright.brightest))
-        light = larger_float(load_float32(at, _AMPLITUDE * width + c) * scale, none)
-        square = light * light * exposures / (light + (haze + 2.0 * bright.ambient) * half_width + one / exposures)
-        dark = exponential(logarithm(larger_float(square, LEAST_Z**2)) * (-0.5 * D) + LOG_C)
-        rival = exponential(load_float32(at, _MARGIN * width + c) * (-B / UNITS) + A)
+        scale, light = load_float32(at, _SCALE * width + c), load_float32(at, _LIGHT * width + c)
+        light = smaller_float(larger_float(light, scale * bright.faintest), scale * bright.brightest)
+        store_float32(at, _LIGHT * width + c, light)
+        shines = logarithm(larger_float(_contrast(at, width, c, bright.ambient) + 3.0, one))
+        pairs = larger_float(load_float32(at, _ALL * width + c) * per_row, one)
+        agree = load_float32(at, _PAIRS * width + c) / pairs
+        agree = logarithm(agree / (none + _MOST_AGREE - agree) + _LEAST_ODDS)
+        haze = load_float32(at, _FRAMES * width + c) * _ending(at, width, c)
+        dark = exponential(none + C - shines * D + haze / (haze + SOME_HAZE) * (none + E - agree * F))
+        margin = load_float32(at, _MARGIN * width + c)
+        rival = exponential(none + A - margin * (B / UNITS))
         sd = larger_float(load_float32(at, _SD * width + c), none + 1e-3)
         within = error_function(one / (sd * (WIDER * math.sqrt(2.0))))
         store_float32(at, _CONFIDENCE * width + c, within / ((rival + 1.0) * (dark + 1.0)))
+
+
+@numba.njit(forceinline=True)
+def _ending(at, width, c):  # type: ignore[no-untyped-def]
+    """Haze that ends at a stripe: what is before it less what is behind."""
+    ends = load_float32(at, _HAZE * width + c) - load_float32(at, _REST * width + c)
+    return larger_float(ends, zero_float32())
+
+
+@numba.njit(forceinline=True)
+def _contrast(at, width, c, ambient):  # type: ignore[no-untyped-def]
+    """Light that stripes share with neighbours above the whole haze before them, over its noise."""
+    one, none = zero_float32() + 1.0, zero_float32()
+    haze, rest = load_float32(at, _HAZE * width + c), load_float32(at, _REST * width + c)
+    number = larger_float(load_float32(at, _LIT * width + c), one)
+    exposures = load_float32(at, _FRAMES * width + c)
+    light = load_float32(at, _LIGHT_SUM * width + c) / number
+    noise = larger_float(light, none) + (haze + rest + 2.0 * ambient) * _HALF_PX + one / (exposures * 9.0)
+    return (light - _ending(at, width, c) * _HALF_PX) * square_root(exposures * number / noise)

@@ -50,6 +50,8 @@ BASE: Final = -8000
 """Score of 'everything is before the stripe': most of the range lies above it."""
 HIGHEST: Final = 30000
 """Scores and their parts are cut there."""
+_USUAL_TAPS: Final = 5
+"""Pixels around a position where the line is as narrow as it mostly is."""
 COUNT_BITS: Final = 15
 """Counts are kept as fractions of 2^15 of what they can be."""
 
@@ -141,6 +143,30 @@ def sum_edges(at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
             carry = add_saturated(carry, last_everywhere(rise))
 
 
+@numba.njit(forceinline=True)
+def _score_row(sums, n, tap, constant, score, vectors, taps):  # type: ignore[no-untyped-def]
+    """The scores of a row, and the largest one of each lane."""
+    best = zero_int16() + np.int16(-32768)
+    for _ in range(vectors):
+        far_dim, far_bright = load_int16(constant, 0), load_int16(constant, LANES)
+        near_dim, near_bright = load_int16(constant, 2 * LANES), load_int16(constant, 3 * LANES)
+        for d in range(taps):
+            counts, of_tap = load_int16(n, d), d * POSITION
+            far_dim = far_dim + scaled(counts, load_int16(tap, of_tap))
+            far_bright = far_bright + scaled(counts, load_int16(tap, of_tap + LANES))
+            near_dim = near_dim + scaled(counts, load_int16(tap, of_tap + 2 * LANES))
+            near_bright = near_bright + scaled(counts, load_int16(tap, of_tap + 3 * LANES))
+        level = load_int16(sums, 0)
+        far = add_saturated(level, larger(far_dim, far_bright))
+        near = add_saturated(level, larger(near_dim, near_bright))
+        store_int16(score, 0, far)
+        store_int16(score, LANES, near)
+        best = larger(best, larger(far, near))
+        n, sums, score, constant = n + 2 * LANES, sums + 2 * LANES, score + 4 * LANES, constant + 2 * POSITION
+        tap += 2 * POSITION * taps
+    return best
+
+
 @numba.njit(cache=True, nogil=True)
 def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch: int) -> None:
     """Fill score and top; constants: address of those of positions, which: of what each row's number there is.
@@ -154,24 +180,12 @@ def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch:
         sums, score = b.sums + 2 * (r * b.n_row + FAR_PX), b.score + 2 * r * b.score_row
         n, tap = b.n + 2 * (r * b.n_row + FAR_PX - taps // 2), at.tap + 2 * at.taps * i
         constant = constants + 2 * at.constants * read_int32(which, r)
-        best = zero_int16() + np.int16(-32768)
-        for _ in range(read_int16(at.used, i)):
-            far_dim, far_bright = load_int16(constant, 0), load_int16(constant, LANES)
-            near_dim, near_bright = load_int16(constant, 2 * LANES), load_int16(constant, 3 * LANES)
-            for d in range(taps):
-                counts = load_int16(n, d)
-                far_dim = far_dim + scaled(counts, load_int16(tap, 0))
-                far_bright = far_bright + scaled(counts, load_int16(tap, LANES))
-                near_dim = near_dim + scaled(counts, load_int16(tap, 2 * LANES))
-                near_bright = near_bright + scaled(counts, load_int16(tap, 3 * LANES))
-                tap += 2 * POSITION
-            level = load_int16(sums, 0)
-            far = add_saturated(level, larger(far_dim, far_bright))
-            near = add_saturated(level, larger(near_dim, near_bright))
-            store_int16(score, 0, far)
-            store_int16(score, LANES, near)
-            best = larger(best, larger(far, near))
-            n, sums, score, constant = n + 2 * LANES, sums + 2 * LANES, score + 4 * LANES, constant + 2 * POSITION
+        vectors = read_int16(at.used, i)
+        # With a usual width of the line the loop over its taps is unrolled.
+        if taps == _USUAL_TAPS:
+            best = _score_row(sums, n, tap, constant, score, vectors, _USUAL_TAPS)
+        else:
+            best = _score_row(sums, n, tap, constant, score, vectors, taps)
         store_int16(b.top, r * LANES, best)
     store_int16(b.top, 0, largest_of_rows(b.top))
 

@@ -64,9 +64,13 @@ def place(
     moved, sd = (np.empty_like(x_px) for _ in range(2))
     around = weigh_light(volume, sweep, state, x_px, places, workers)
     seen = volume.n_frames, sweep, state, shares, around, x_px
+
+    def move(first: int, last: int) -> None:
+        pool_places(places, REACHES, ENOUGH, first, last, moved, sd)
+        x_px[first:last] += moved[first:last]
+
     workers.over(len(x_px), lambda first, last: score_places(*seen, first, last, places))
-    workers.over(len(x_px), lambda first, last: pool_places(places, REACHES, ENOUGH, first, last, moved, sd))
-    x_px += moved
+    workers.over(len(x_px), move)
     return sd
 
 
@@ -75,7 +79,8 @@ def weigh_light(
 ) -> Counts:
     """Fill light, scale, haze and amplitude of `places` for stripes at x_px, as `state` sees them.
 
-    Returns the counts around the stripes, see `fetch_counts`.
+    Returns the counts around the stripes, see `fetch_counts`. Amplitudes are only posted: the same rows' next work can
+    go by them, others settle first.
     """
     faintest, brightest = float(state.amplitude[0]) / BEYOND, float(state.amplitude[-1]) * BEYOND
     around = np.empty((*x_px.shape, EIGHT), volume.counts.dtype)
@@ -86,7 +91,7 @@ def weigh_light(
         measure_light(*seen, first, last, places)
 
     workers.over(len(x_px), measure)
-    workers.over(len(x_px), lambda first, last: pool_amplitude(LIGHT_REACH, faintest, brightest, first, last, places))
+    workers.post(len(x_px), lambda first, last: pool_amplitude(LIGHT_REACH, faintest, brightest, first, last, places))
     return around
 
 

@@ -16,7 +16,15 @@ from rig.estimators.placing_taps import MOST_FLUX, Counts, ambient_place, counts
 from rig.estimators.row_input import State, Sweep, others_at
 from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN
 from rig.lane_eights import EIGHT, fetch_eights
-from rig.lane_memory import load_float32, store_float32
+from rig.lane_memory import (
+    copy_floats,
+    load_float32,
+    read_float32,
+    read_int32,
+    store_float32,
+    write_float32,
+    write_int64,
+)
 from rig.lane_powers import logarithm
 from rig.lanes import LANES, larger_float, smaller_float, square_root, where_below, where_small, zero_float32
 
@@ -44,59 +52,63 @@ def measure_light(
 
     around: of `fetch_counts`. Haze is that of the nearest pixel that is searched.
     """
-    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
-    u, v, ambient, x0, x_lo, x_hi, window = (
-        sweep.u,
-        sweep.v,
-        state.ambient,
-        sweep.x0,
-        sweep.x_lo,
-        sweep.x_hi,
-        sweep.window,
-    )
-    light, scale, haze, rest, glow = out.light, out.scale, out.haze, out.rest, out.glow
-    row_gain, several, columns = state.row_gain, sweep.others.shape[1] > 0, x_px.shape[1]
-    bins, last_bin = _bins(state.profile, state.glow), np.float32(state.profile.shape[0] - 1.001)
+    columns, (pixels, last_bin) = x_px.shape[1], (sweep.u.shape[1], np.float32(state.profile.shape[0] - 1.001))
+    window, several, bins = sweep.window, sweep.others.shape[1] > 0, _bins(state.profile, state.glow)
     # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
     width = (-(-columns // LANES) | 1) * LANES
     lines, spare = np.zeros((_FIELDS, width), np.float32), np.full((width, EIGHT), MOST_FLUX, np.float32)
-    taps, ambient_at, bin_at = (
+    taps, ambient_places, bin_places = (
         np.zeros((2, EIGHT, LANES), np.float32),
         np.empty(width, np.int64),
         np.empty(width, np.int64),
     )
+    # Addresses: threads that count references to the same array wait for one another.
     at, spare_at, bins_at, taps_at = (
         signed_address(lines),
         signed_address(spare),
         signed_address(bins),
         signed_address(taps),
     )
-    ambient_at[:], bin_at[:], lines[_PX] = spare_at + 4 * EIGHT * (width - 1), bins_at, 1.0
+    ambient_at, bin_at = signed_address(ambient_places), signed_address(bin_places)
+    at_x, at_x0 = signed_address(x_px), signed_address(sweep.x0)
+    at_u, at_v, ambient = signed_address(sweep.u), signed_address(sweep.v), signed_address(state.ambient)
+    at_lo, at_hi, around_at = signed_address(sweep.x_lo), signed_address(sweep.x_hi), signed_address(around)
+    found = (signed_address(out.light), signed_address(out.scale), signed_address(out.haze), signed_address(out.rest),
+             signed_address(out.glow))  # fmt: skip
+    ambient_places[:], bin_places[:], lines[_PX] = spare_at + 4 * EIGHT * (width - 1), bins_at, 1.0
     for c in range(columns):
         lines[_PX, c], lines[_PY, c], lines[_PZ, c] = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]
         lines[_GAIN, c] = state.column_gain[c]
     for y in range(first_row, last_row):
         for c in range(columns):
-            if np.isnan(x_px[y, c]) or n_frames[c] == 0:
-                lines[_FRAMES, c] = 0.0
+            x_line, frames = read_float32(at_x, y * columns + c), n_frames[c]
+            if np.isnan(x_line) or frames == 0:
+                write_float32(at, _FRAMES * width + c, np.float32(0.0))
                 continue
-            x = nearest_pixel(x_px[y, c])
-            searched = min(max(x, int(x_lo[y, c])), int(x_hi[y, c]))
-            lines[_U, c], lines[_V, c], lines[_FRAMES, c] = u[y, searched], v[y, searched], n_frames[c]
-            ambient_at[c] = ambient_place(ambient, y, x, int(x0[c]), window, spare_at + 4 * EIGHT * c)
+            x = nearest_pixel(x_line)
+            searched = max(x, int(read_int32(at_lo, y * columns + c)))
+            searched = min(searched, int(read_int32(at_hi, y * columns + c)))
+            write_float32(at, _U * width + c, read_float32(at_u, y * pixels + searched))
+            write_float32(at, _V * width + c, read_float32(at_v, y * pixels + searched))
+            write_float32(at, _FRAMES * width + c, np.float32(frames))
+            own, x0 = spare_at + 4 * EIGHT * c, int(read_int32(at_x0, c))
+            write_int64(ambient_at, c, ambient_place(ambient, pixels, y, x, x0, window, own))
             if several:
                 lines[_OTHERS, c] = others_at(sweep, state, y, c, searched)
-        _find_bins(at, width, row_gain[y], np.float32(state.w_lo), np.float32(state.per_w), last_bin)
+        _find_bins(at, width, state.row_gain[y], np.float32(state.w_lo), np.float32(state.per_w), last_bin)
         for c in range(columns):
-            i = int(lines[_BIN, c])
-            lines[_PART, c], bin_at[c] = lines[_BIN, c] - np.float32(i), bins_at + 4 * EIGHT * i
+            place = read_float32(at, _BIN * width + c)
+            i = int(place)
+            write_float32(at, _PART * width + c, place - np.float32(i))
+            write_int64(bin_at, c, bins_at + 4 * EIGHT * i)
         for c in range(0, columns, LANES):
-            counts_of(around, y, c, taps_at)
-            _measure(at + 4 * c, width, taps_at, signed_address(ambient_at) + 8 * c, signed_address(bin_at) + 8 * c)
-        light[y], scale[y], glow[y] = lines[_LIGHT, :columns], lines[_SCALE, :columns], lines[_GLOW, :columns]
-        haze[y], rest[y] = lines[_HAZE, :columns], lines[_REST, :columns]
+            counts_of(around, around_at, y, c, taps_at)
+            _measure(at + 4 * c, width, taps_at, ambient_at + 8 * c, bin_at + 8 * c)
+        for i in range(len(found)):
+            copy_floats(at + 4 * width * (_LIGHT + i), found[i] + 4 * columns * y, columns)
     # They live until here: what is known by its address alone would be freed.
-    spare[:1] = bins[:1] = taps[:1] = 0.0
+    spare[:1] = bins[:1] = taps[:1] = lines[:1] = 0.0
+    ambient_places[:1] = bin_places[:1] = 0
 
 
 @numba.njit(cache=True, nogil=True)

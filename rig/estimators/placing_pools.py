@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rig.estimators.label_volume_buffers import signed_address
 from rig.estimators.placing_kernels import Places
-from rig.lane_memory import load_float32, store_float32
+from rig.lane_memory import copy_floats, load_float32, store_float32
 from rig.lanes import (
     LANES,
     larger_float,
@@ -38,8 +38,16 @@ def with_margin(array: Float32, first_row: int, last_row: int) -> Float32:
     """Copy of rows first_row..last_row-1 with the rows and columns around them, NaN where there are none."""
     rows, columns = array.shape
     top, end = max(first_row - MARGIN, 0), min(last_row + MARGIN, rows)
-    copy = np.full((last_row - first_row + 2 * MARGIN, (-(-columns // LANES) + 2) * LANES), np.float32(np.nan))
-    copy[top - first_row + MARGIN : end - first_row + MARGIN, LANES : LANES + columns] = array[top:end]
+    width = (-(-columns // LANES) + 2) * LANES
+    copy, nowhere = np.empty((last_row - first_row + 2 * MARGIN, width), np.float32), np.float32(np.nan)
+    source, to = signed_address(array), signed_address(copy)
+    for y in range(first_row - MARGIN, last_row + MARGIN):
+        line = copy[y - first_row + MARGIN]
+        if top <= y < end:
+            line[:LANES], line[LANES + columns :] = nowhere, nowhere
+            copy_floats(source + 4 * columns * y, to + 4 * (width * (y - first_row + MARGIN) + LANES), columns)
+        else:
+            line[:] = nowhere
     return copy
 
 
@@ -92,7 +100,7 @@ def pool_amplitude(
     reach: int, faintest: float, brightest: float, first_row: int, last_row: int, places: Places
 ) -> None:
     """Fill amplitude: brightness of each stripe over that of its scale, pooled over neighbours, between two limits."""
-    amplitude, columns = places.amplitude, places.amplitude.shape[1]
+    amplitude, columns = signed_address(places.amplitude), places.amplitude.shape[1]
     distance = with_margin(places.distance, first_row, last_row)
     light, scale = with_margin(places.light, first_row, last_row), with_margin(places.scale, first_row, last_row)
     sums = np.empty((2, distance.shape[1] - 2 * LANES), np.float32)
@@ -102,7 +110,8 @@ def pool_amplitude(
         for c in range(0, width, LANES):
             own = load_float32(at, c) / larger_float(load_float32(at, width + c), _LEAST)
             store_float32(at, c, smaller_float(larger_float(own, faintest), brightest))
-        amplitude[y] = sums[0, :columns]
+        copy_floats(at, amplitude + 4 * columns * y, columns)
+    sums[:1] = 0.0  # it lives until here: what is known by its address alone would be freed
 
 
 @numba.njit(cache=True, nogil=True)
@@ -118,7 +127,7 @@ def pool_places(
     # Two sums, by how far to move, and the standard deviation, negative where it is not known yet.
     lines = np.empty((4, distance.shape[1] - 2 * LANES), np.float32)
     at = signed_address(distance), signed_address(score), signed_address(known)
-    to, width = signed_address(lines), distance.shape[1]
+    to, width, to_moved, to_sd = signed_address(lines), distance.shape[1], signed_address(moved), signed_address(sd)
     for y in range(first_row, last_row):
         lines[:3], lines[3] = 0.0, -1.0
         lines[1, columns:] = np.inf  # nothing to look for beyond the last column
@@ -128,9 +137,10 @@ def pool_places(
             widen_row(at, width, y - first_row, inner, reaches[i], enough, to)
             if not _settle(to, width - 2 * LANES, own, -np.inf if last else enough):
                 break
-        moved[y], sd[y] = lines[2, :columns], lines[3, :columns]
+        copy_floats(to + 8 * (width - 2 * LANES), to_moved + 4 * columns * y, columns)
+        copy_floats(to + 12 * (width - 2 * LANES), to_sd + 4 * columns * y, columns)
     # They live until here: what is known by its address alone would be freed.
-    distance[:1] = score[:1] = known[:1] = 0.0
+    distance[:1] = score[:1] = known[:1] = lines[:1] = 0.0
 
 
 @numba.njit(cache=True, nogil=True)

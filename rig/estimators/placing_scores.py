@@ -14,7 +14,16 @@ from rig.estimators.placing_kernels import REACH_PX, Places
 from rig.estimators.placing_taps import MOST_FLUX, TAPS, Counts, ambient_place, counts_of, nearest_pixel
 from rig.estimators.row_input import State, Sweep
 from rig.lane_eights import EIGHT, fetch_eights
-from rig.lane_memory import load_float32, read_int64, store_float32, write_int64
+from rig.lane_memory import (
+    copy_floats,
+    load_float32,
+    read_float32,
+    read_int32,
+    read_int64,
+    store_float32,
+    write_float32,
+    write_int64,
+)
 from rig.lanes import LANES, larger_float, smaller_float, where_below, where_small, zero_float32
 
 Float32 = NDArray[np.float32]
@@ -46,44 +55,54 @@ def score_places(
     shares: (FRACTIONS, 2, EIGHT), share of the line in each of the TAPS pixels around the one that holds its centre,
     and by how much that grows with every pixel that the centre moves on. around: of `fetch_counts`.
     """
-    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
-    ambient, x0, window, columns = state.ambient, sweep.x0, sweep.window, x_px.shape[1]
-    amplitude, scale, glow, haze, rest = out.amplitude, out.scale, out.glow, out.haze, out.rest
-    distance, to_score, to_known = out.distance, out.score, out.known
-    side, half = 1 if sweep.near_is_left else -1, np.float32(0.5)
+    window, (pixels, columns) = sweep.window, (state.ambient.shape[1], x_px.shape[1])
+    side, half, one = 1 if sweep.near_is_left else -1, np.float32(0.5), np.float32(1.0)
     # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
     width = (-(-columns // LANES) | 1) * LANES
     lines, spare = np.zeros((_FIELDS, width), np.float32), np.full((width, EIGHT), MOST_FLUX, np.float32)
     taps = np.zeros((4, EIGHT, LANES), np.float32)
-    ambient_at, shares_at = np.empty(width, np.int64), np.empty(width, np.int64)
+    ambient_places, share_places = np.empty(width, np.int64), np.empty(width, np.int64)
+    # Addresses: threads that count references to the same array wait for one another.
     at, spare_at, taps_at, all_shares = (
         signed_address(lines),
         signed_address(spare),
         signed_address(taps),
         signed_address(shares),
     )
-    ambient_at[:], shares_at[:] = spare_at + 4 * EIGHT * (width - 1), all_shares
+    ambient_at, shares_at, ambient = (
+        signed_address(ambient_places),
+        signed_address(share_places),
+        signed_address(state.ambient),
+    )
+    at_x, at_x0 = signed_address(x_px), signed_address(sweep.x0)
+    around_at, to_score, to_known = signed_address(around), signed_address(out.score), signed_address(out.known)
+    known = (signed_address(out.amplitude), signed_address(out.scale), signed_address(out.glow),
+             signed_address(out.haze), signed_address(out.rest), signed_address(out.distance))  # fmt: skip
+    ambient_places[:], share_places[:] = spare_at + 4 * EIGHT * (width - 1), all_shares
     for y in range(first_row, last_row):
-        lines[_AMPLITUDE, :columns], lines[_SCALE, :columns], lines[_GLOW, :columns] = amplitude[y], scale[y], glow[y]
-        lines[_HAZE, :columns], lines[_REST, :columns], lines[_DISTANCE, :columns] = haze[y], rest[y], distance[y]
+        for i in range(len(known)):
+            copy_floats(known[i] + 4 * columns * y, at + 4 * width * (_AMPLITUDE + i), columns)
         for c in range(columns):
-            if np.isnan(x_px[y, c]) or n_frames[c] == 0:
-                lines[_FRAMES, c] = 0.0
+            x_line, frames = read_float32(at_x, y * columns + c), n_frames[c]
+            if np.isnan(x_line) or frames == 0:
+                write_float32(at, _FRAMES * width + c, np.float32(0.0))
                 continue
-            x = nearest_pixel(x_px[y, c])
-            part = x_px[y, c] + half - np.float32(x)
+            x = nearest_pixel(x_line)
+            part = x_line + half - np.float32(x)
             # The pixel that holds the centre is in haze on its near part only.
-            lines[_LIT, c], lines[_FRAMES, c] = part if side > 0 else np.float32(1.0) - part, n_frames[c]
-            shares_at[c] = all_shares + 8 * EIGHT * min(int(part * FRACTIONS), FRACTIONS - 1)
-            ambient_at[c] = ambient_place(ambient, y, x, int(x0[c]), window, spare_at + 4 * EIGHT * c)
+            write_float32(at, _LIT * width + c, part if side > 0 else one - part)
+            write_float32(at, _FRAMES * width + c, np.float32(frames))
+            write_int64(shares_at, c, all_shares + 8 * EIGHT * min(int(part * FRACTIONS), FRACTIONS - 1))
+            own, x0 = spare_at + 4 * EIGHT * c, int(read_int32(at_x0, c))
+            write_int64(ambient_at, c, ambient_place(ambient, pixels, y, x, x0, window, own))
         for c in range(0, columns, LANES):
-            counts_of(around, y, c, taps_at)
-            _score(
-                at + 4 * c, width, taps_at, signed_address(ambient_at) + 8 * c, signed_address(shares_at) + 8 * c, side
-            )
-        to_score[y], to_known[y] = lines[_SCORE, :columns], lines[_KNOWN, :columns]
+            counts_of(around, around_at, y, c, taps_at)
+            _score(at + 4 * c, width, taps_at, ambient_at + 8 * c, shares_at + 8 * c, side)
+        copy_floats(at + 4 * width * _SCORE, to_score + 4 * columns * y, columns)
+        copy_floats(at + 4 * width * _KNOWN, to_known + 4 * columns * y, columns)
     # They live until here: what is known by its address alone would be freed.
-    spare[:1] = taps[:1] = 0.0
+    spare[:1] = taps[:1] = lines[:1] = 0.0
+    ambient_places[:1] = share_places[:1] = 0
 
 
 @numba.njit(cache=True, nogil=True)

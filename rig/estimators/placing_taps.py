@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rig.estimators.label_volume_buffers import signed_address
 from rig.estimators.placing_kernels import REACH_PX
 from rig.lane_eights import EIGHT, spread_eights
-from rig.lane_memory import prefetch, read_int64, write_float32, write_int64
+from rig.lane_memory import prefetch, read_float32, read_int64, write_float32, write_int64
 from rig.lanes import LANES
 
 Float32 = NDArray[np.float32]
@@ -63,26 +63,27 @@ def nearest_pixel(x):  # type: ignore[no-untyped-def]
     return int(np.floor(x + np.float32(0.5)))
 
 
-@numba.njit(inline="always")
-def ambient_place(ambient, y, x, x0, window, spare):  # type: ignore[no-untyped-def]
+@numba.njit(forceinline=True)
+def ambient_place(ambient, width, y, x, x0, window, spare):  # type: ignore[no-untyped-def]
     """Address of the ambient light from REACH_PX before pixel x on; it is written to `spare` where it is not all there.
 
-    spare: (EIGHT,), given MOST_FLUX at pixels that were not stored or that the picture does not have.
+    ambient: address of rows of `width` pixels; spare: that of EIGHT numbers, given MOST_FLUX at pixels that were not
+    stored or that the picture does not have.
     """
-    first, width = x - REACH_PX, ambient.shape[1]
-    if max(x0, 0) <= first <= min(x0 + window, width) - EIGHT:
-        return signed_address(ambient) + 4 * (y * width + first)
+    first, low, high = x - REACH_PX, max(x0, 0), min(x0 + window, width)
+    if low <= first <= high - EIGHT:
+        return ambient + 4 * (y * width + first)
     for d in range(EIGHT):
-        there = max(x0, 0) <= first + d < min(x0 + window, width)
-        write_float32(spare, d, ambient[y, first + d] if there else MOST_FLUX)
+        there = low <= first + d < high
+        write_float32(spare, d, read_float32(ambient, y * width + first + d) if there else MOST_FLUX)
     return spare
 
 
 @numba.njit(forceinline=True)
-def counts_of(around, y, c, to):  # type: ignore[no-untyped-def]
-    """Write EIGHT vectors of the counts of stripes c..c+LANES-1, see `fetch_counts`, to address `to`."""
+def counts_of(around, at, y, c, to):  # type: ignore[no-untyped-def]
+    """Write EIGHT vectors of the counts of stripes c..c+LANES-1, see `fetch_counts`, to address `to`; at: of around."""
     if around.itemsize == 1 and c + LANES <= around.shape[1]:
-        spread_eights(signed_address(around) + (y * around.shape[1] + c) * EIGHT, to)
+        spread_eights(at + (y * around.shape[1] + c) * EIGHT, to)
         return
     for i in range(LANES):
         for d in range(EIGHT):

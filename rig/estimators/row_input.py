@@ -103,9 +103,11 @@ class Row(NamedTuple):
 def sweep_of(geometry: SweepGeometry) -> Sweep:
     """Kernel input of a sweep's geometry."""
     near_m, far_m = geometry.depth_range_m
+    # Kernels read most of them by their addresses.
+    x0, x_lo, x_hi = (np.ascontiguousarray(a, np.int32) for a in (geometry.x0, geometry.x_lo, geometry.x_hi))
+    u, v = (np.ascontiguousarray(a, np.float32) for a in (geometry.u, geometry.v))
     return Sweep(
-        geometry.window, geometry.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left, geometry.plane, geometry.u,
-        geometry.v, 1.0 / near_m, 1.0 / far_m,
+        geometry.window, x0, x_lo, x_hi, geometry.near_is_left, geometry.plane, u, v, 1.0 / near_m, 1.0 / far_m,
         np.zeros((geometry.columns, 0, 3)) if geometry.others is None else geometry.others,
     )  # fmt: skip
 

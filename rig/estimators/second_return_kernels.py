@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from rig.estimators.label_volume_buffers import signed_address
 from rig.estimators.placing_pools import pool_row, with_margin
 from rig.estimators.row_input import State, Sweep, fluxes_at, line_light, with_rays
-from rig.estimators.second_return_sums import BLOCK, HAZE_STEP, LEFT_OUT, Blocks
+from rig.estimators.second_return_lines import BLOCK, LEFT_OUT
+from rig.estimators.second_return_sums import HAZE_STEP, Blocks
 from rig.lane_memory import load_float32, store_float32
 from rig.lanes import LANES, larger_float, largest_float, square_root, zero_float32
 

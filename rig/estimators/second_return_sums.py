@@ -1,8 +1,7 @@
 """Compiled sums of light over blocks of rows and columns, sixteen pixels of a line at a time.
 
 Rows of a block are added at equal distances from the far end, without what lies near their stripes: the ones counted,
-and those that haze and ambient light bring. A vector of pixels is weighed with 0 where they are left out, so that no
-line is cut into pieces.
+and those that haze and ambient light bring (`second_return_lines`).
 """
 
 from typing import Final, NamedTuple
@@ -23,19 +22,40 @@ from rig.estimators.row_input import (
     with_rays,
 )
 from rig.estimators.row_kernels import FLUX_MAX
-from rig.lane_memory import load_counts, load_float32, prefetch, store_float32
-from rig.lanes import LANES, where_below, where_small, zero_float32
+from rig.estimators.second_return_lines import (
+    BEGIN,
+    BLOCK,
+    END,
+    FIELDS,
+    HERE,
+    LEFT_END,
+    LIMITS,
+    NOWHERE,
+    PLACE_BEGIN,
+    PLACE_END,
+    PLACE_X,
+    PLACES,
+    RIGHT,
+    SEEN,
+    STILL,
+    Table,
+    sum_lines,
+)
+from rig.lane_memory import (
+    prefetch,
+    read_float32,
+    read_int16,
+    write_float32,
+    write_int64,
+)
+from rig.lanes import LANES
 
 Float32 = NDArray[np.float32]
 
-BLOCK: Final = 4
-"""Rows, and columns, whose light is summed at once; a block is judged together with its eight neighbours."""
 HAZE_BLOCKS: Final = 4
 """Blocks above one another that haze is worked out for at once: it changes slowly from row to row."""
 HAZE_STEP: Final = 8
 """Pixels from one place where haze is worked out to the next."""
-LEFT_OUT: Final = np.float32(2.0)
-"""Marks pixels that show nothing, among probabilities."""
 _IN_ORDER: Final = np.arange(LANES, dtype=np.float32)
 
 
@@ -56,7 +76,7 @@ def sum_blocks(
     sweep: Sweep,
     state: State,
     still: Float32,
-    x_far: NDArray[np.float64],
+    place: NDArray[np.int16],
     side: int,
     apart: float,
     x_px: Float32,
@@ -67,63 +87,81 @@ def sum_blocks(
     """Fill the sums of rows of blocks first_block..last_block-1, without what lies within `apart` px of stripes x_px.
 
     Haze is that in the middle of HAZE_BLOCKS blocks, or of the block where there is nothing to search there. state,
-    still: see `SecondLight`.
+    still: see `SecondLight`; place: of `line_places`.
     """
     rows, columns = x_px.shape
     width, pixels, window = sweep.u.shape[1], out.ones.shape[2], counts.shape[2]
-    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
-    x_lo, x_hi, all_x0, across = sweep.x_lo, sweep.x_hi, sweep.x0, out.ones.shape[1]
-    clear = np.zeros((across, 2, pixels + 1), np.float32)
-    line, order, group = np.zeros(pixels, np.float32), _IN_ORDER, -1
-    line_at, clear_at, order_at = signed_address(line), signed_address(clear), signed_address(order)
-    to_ones, to_expected, still_at = signed_address(out.ones), signed_address(out.expected), signed_address(still)
-    counts_at, in_bytes, row_bytes = signed_address(counts), counts.itemsize == 1, window * counts.itemsize
+    across, aside, x0 = out.ones.shape[1], np.float32(apart), sweep.x0
+    clear, spare = np.zeros((across, 2, pixels + 1), np.float32), np.zeros((2, BLOCK**2, pixels), np.float32)
+    lines, limits = np.zeros((BLOCK**2, FIELDS), np.int64), np.zeros((BLOCK**2, LIMITS), np.float32)
+    ends, frames, order = np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.float32), _IN_ORDER
+    # Addresses: every use of an array in the loop would count references to all of its tuple.
+    at_x, places, clear_at = signed_address(x_px), signed_address(place), signed_address(clear)
+    counts_at, still_at = signed_address(counts), signed_address(still) + 4 * LANES
+    table = Table(signed_address(lines), signed_address(limits), signed_address(ends), signed_address(frames),
+                   signed_address(order))  # fmt: skip
+    to_ones, to_expected, group = signed_address(out.ones), signed_address(out.expected), -1
+    zero, all_pixels = np.float32(0.0), np.float32(pixels)
+    in_bytes, row_bytes, size, pad = counts.itemsize == 1, window * counts.itemsize, counts.size, still.size - LANES
     for by in range(first_block, last_block):
-        out.ones[by] = 0.0
-        out.expected[by] = 0.0
         known, group = group == by // HAZE_BLOCKS, by // HAZE_BLOCKS
         together = min(group * HAZE_BLOCKS * BLOCK + HAZE_BLOCKS * BLOCK // 2, rows - 1)
+        top, bottom = by * BLOCK, min(by * BLOCK + BLOCK, rows)
         for bx in range(across):
-            my, mc = min(by * BLOCK + BLOCK // 2, rows - 1), min(bx * BLOCK + BLOCK // 2, columns - 1)
+            my, mc = min(top + BLOCK // 2, rows - 1), min(bx * BLOCK + BLOCK // 2, columns - 1)
             # Asked for one block early: counts of one column after the other are not what a processor foresees.
             for c in range((bx + 1) * BLOCK, min((bx + 2) * BLOCK, columns)):
                 for ahead in range(0, BLOCK * row_bytes, CACHE_LINE):
-                    prefetch(counts_at + (c * rows + by * BLOCK) * row_bytes + ahead)
-            alone = np.isnan(x_far[together, mc])
-            if alone and np.isnan(x_far[my, mc]):
+                    prefetch(counts_at + (c * rows + top) * row_bytes + ahead)
+            alone = place[together, mc, PLACE_X] == NOWHERE
+            if alone and place[my, mc, PLACE_X] == NOWHERE:
+                out.ones[by, bx] = 0.0
+                out.expected[by, bx] = 0.0
                 continue
             if alone or not known:
                 y = my if alone else together
-                _clear_beside(sweep, state, y, mc, leftmost(x_far[y, mc], side, pixels), side, clear[bx])
-            block, left = 4 * pixels * (by * across + bx), clear_at + 4 * clear[0].size * bx
-            at = left, left + 4 * (pixels + 1), order_at
-            for y in range(by * BLOCK, min(by * BLOCK + BLOCK, rows)):
-                for c in range(bx * BLOCK, min(bx * BLOCK + BLOCK, columns)):
-                    if np.isnan(x_px[y, c]) or np.isnan(x_far[y, c]):
+                _clear_beside(sweep, state, y, mc, int(place[y, mc, PLACE_X]), side, clear[bx])
+            number, safe, inner = 0, in_bytes, (zero, all_pixels, zero, all_pixels)
+            for k in range(BLOCK):
+                c = min(bx * BLOCK + k, columns - 1)
+                column = c * rows * window - int(x0[c])
+                for y in range(top, bottom if bx * BLOCK + k < columns else top):
+                    here = y * columns + c
+                    x, begin = read_float32(at_x, here), read_int16(places, PLACES * here + PLACE_BEGIN)
+                    end = read_int16(places, PLACES * here + PLACE_END)
+                    if np.isnan(x) or begin == end:
                         continue
-                    start, x0 = leftmost(x_far[y, c], side, pixels), int(all_x0[c])
-                    begin = max(int(x_lo[y, c]), x0, 0, start)
-                    end = min(int(x_hi[y, c]) + 1, x0 + window, width, start + pixels)
-                    if begin >= end:
-                        continue
-                    first, last = (begin - start) // LANES * LANES, end - start
-                    stored = (c * rows + y) * window + start - x0
-                    seen, as_bytes = counts_at + stored, True
-                    if not in_bytes or stored + first < 0 or stored + last + LANES > counts.size:
-                        seen, as_bytes = line_at, False
-                        for i in range(first, last):
-                            line[i] = counts[c, y, max(start + i - x0, 0)]
-                    _add_line(
-                        at, seen, as_bytes, still_at + 4 * (LANES + y * width + start), to_ones + block,
-                        to_expected + block, first, last, start, begin, end, x_px[y, c], np.float32(apart),
-                        np.float32(n_frames[c]),
-                    )  # fmt: skip
-
-
-@numba.njit(inline="always")
-def leftmost(x_far, side, pixels):  # type: ignore[no-untyped-def]
-    """Pixel that the first of so many pixels of distance is at: they run from left to right."""
-    return int(np.rint(x_far)) - (pixels - 1 if side > 0 else 0)
+                    start = int(read_int16(places, PLACES * here + PLACE_X))
+                    stored, level = column + y * window + start, y * width + start
+                    safe &= stored >= 0 and stored + pixels <= size and level >= -LANES and level + pixels <= pad
+                    write_int64(table.lines, FIELDS * number + SEEN, counts_at + stored)
+                    write_int64(table.lines, FIELDS * number + STILL, still_at + 4 * level)
+                    write_int64(table.lines, FIELDS * number + HERE, here)
+                    low, high, off = np.float32(begin), np.float32(end), x - np.float32(start)
+                    left_end, right = off - aside, off + aside
+                    write_float32(table.limits, LIMITS * number + BEGIN, low)
+                    write_float32(table.limits, LIMITS * number + LEFT_END, left_end)
+                    write_float32(table.limits, LIMITS * number + RIGHT, right)
+                    write_float32(table.limits, LIMITS * number + END, high)
+                    inner = max(inner[0], low), min(inner[1], left_end), max(inner[2], right), min(inner[3], high)
+                    number += 1
+                write_int64(table.ends, k, number)
+                write_float32(table.frames, k, np.float32(n_frames[c]))
+            if not safe:
+                for i in range(number):
+                    y, c = lines[i, HERE] // columns, lines[i, HERE] % columns
+                    start = place[y, c, PLACE_X]
+                    for p in range(place[y, c, PLACE_BEGIN], place[y, c, PLACE_END]):
+                        spare[0, i, p], spare[1, i, p] = (
+                            counts[c, y, start + p - x0[c]],
+                            still[LANES + y * width + start + p],
+                        )
+                    lines[i, SEEN], lines[i, STILL] = signed_address(spare[0, i]), signed_address(spare[1, i])
+            at = 4 * pixels * (by * across + bx)
+            sum_lines(table, inner, safe, clear_at + 4 * clear[0].size * bx, pixels, to_ones + at, to_expected + at)
+    # They live until here: what is known by its address alone would be freed.
+    lines[0, 0] = ends[0] = 0
+    limits[0, 0] = spare[0, 0, 0] = frames[0] = 0.0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -157,33 +195,3 @@ def _clear_beside(sweep: Sweep, state: State, y: int, c: int, start: int, side: 
             rise = step * (clear[line, k + HAZE_STEP] - begin)
             for m in range(1, HAZE_STEP):
                 clear[line, k + m] = begin + np.float32(m) * rise
-
-
-@numba.njit(cache=True, nogil=True)
-def _add_line(
-    at: tuple[int, int, int], seen: int, as_bytes: bool, still: int, ones: int, expected: int, first: int, last: int,
-    start: int, begin: int, end: int, x: np.float32, apart: np.float32, frames: np.float32,
-) -> None:  # fmt: skip
-    """Add pixels begin..end-1 of a line to sums; at: addresses of `clear` left and right, and 0, 1, ...
-
-    seen: address of its counts, bytes or float32.
-    """
-    middle, half = np.float32(0.5) * np.float32(begin + end - 1), np.float32(0.5) * np.float32(end - begin - 1)
-    none, order = zero_float32(), load_float32(at[2], 0)
-    one, all_frames, beside = none + np.float32(1.0), none + frames, apart * apart
-    low, high = int(np.floor(x - apart)), int(np.ceil(x + apart))
-    for i in range(first, last, LANES):
-        t, alone = start + i, load_float32(still, i)
-        weight, here = where_small(all_frames, alone, np.float32(1.0)), order + np.float32(t)
-        # Most vectors lie on one side of the stripe, and not at an end of the line.
-        if t < begin or t + LANES > end:
-            weight = where_small(weight, here - middle, half)
-        if t + LANES <= low or t > high:
-            clear = load_float32(at[0] if t < low else at[1], i)
-        else:
-            away = here - x
-            clear = where_below(load_float32(at[0], i), load_float32(at[1], i), away, none)
-            weight = where_below(none, weight, away * away, beside)
-        counted = load_counts(seen, i) if as_bytes else load_float32(seen, i)
-        store_float32(ones, i, load_float32(ones, i) + where_below(counted, none, none, weight))
-        store_float32(expected, i, load_float32(expected, i) + weight * (one - alone * clear))
