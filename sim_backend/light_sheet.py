@@ -58,9 +58,11 @@ class LightSheet:
             offset_m = np.sum(normal * points, axis=-1) - off_m
             length = np.linalg.norm(normal, axis=-1, keepdims=True)
             normal, offset_m = normal / length, offset_m / length[:, 0]
+            inverse = normal / np.where(offset_m != 0, offset_m, np.nan)[:, None]
         met = np.isfinite(offset_m)
-        self.normal[rows][met], self.offset_m[rows][met] = normal[met], offset_m[met]
-        self.inverse[rows][met] = normal[met] / offset_m[met, None]
+        self.normal[rows][met], self.offset_m[rows][met], self.inverse[rows][met] = (
+            normal[met], offset_m[met], inverse[met],
+        )  # fmt: skip
 
 
 def empty_sheet(planes: Array, rows: int, time_s: float = 0.0, bowed: LightSheets | None = None) -> LightSheet:

@@ -1,5 +1,7 @@
 """The simulated light from clear air to optical depth 50; bits and their probabilities are in test_photon_bits.py."""
 
+from dataclasses import replace
+
 import mpmath
 import numpy as np
 import pytest
@@ -129,6 +131,25 @@ def test_a_sheet_through_the_camera_is_seen_by_nobody() -> None:
     assert np.isnan(setup.view.sheet(plane).x_end_px).all()
     for name in ("stripe", "fog"):
         assert not effect_rate(setup, name, plane).any()
+
+
+@covers("sim_backend.light_sheet:LightSheet.touch")
+@EXAMPLES
+@given(
+    bow=st.floats(-0.2, 0.2), baseline=st.sampled_from([-0.3, 0.0, 1e-9, 0.3]), command=st.floats(-1, 1),
+    u=st.lists(st.floats(-1e6, 1e6), min_size=8, max_size=8), v=st.lists(st.floats(-1e6, 1e6), min_size=8, max_size=8),
+)  # fmt: skip
+def test_planes_that_touch_a_bowed_sheet_are_planes_wherever_they_are_touched(bow, baseline, command, u, v) -> None:
+    model = rig(size=(8, 24), baseline_m=baseline)
+    bowed = replace(model, scanner=replace(model.scanner, bow_per_rad=bow)).sheets(np.full(8, command))
+    sheet = empty_sheet(bowed.planes, 8, bowed=bowed)
+    for first, last in ((0, 3), (3, 8)):
+        sheet.touch(np.array(u[first:last]), np.array(v[first:last]), first, last)
+    assert np.isfinite(sheet.offset_m).all()
+    assert np.allclose(np.linalg.norm(sheet.normal, axis=1), 1, atol=1e-9)
+    seen = sheet.offset_m != 0
+    assert np.isnan(sheet.inverse[~seen]).all()
+    assert np.allclose(sheet.inverse[seen] * sheet.offset_m[seen, None], sheet.normal[seen], atol=1e-12)
 
 
 @covers("sim_backend.optics:detections_per_radiance", "sim_backend.optics:ambient_irradiance")
