@@ -1,6 +1,6 @@
 """What a calibration file may say, section by section, and what is said of a file that says something else."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -88,6 +88,15 @@ class IdentitySection(Section):
     reasons: list[str] = []
 
 
+class ProvenanceSection(BaseModel):
+    """Where it is from: what anybody likes to note, and the two notes that programs go by."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    velocities_per_s: list[Number] | None = None
+    corners: list[str] | None = None
+
+
 class CalibrationFile(Section):
     """The whole file."""
 
@@ -107,7 +116,7 @@ class CalibrationFile(Section):
     dark_rate: str | None = None
     covariance: CovarianceSection | None = None
     identity: IdentitySection | None = None
-    provenance: dict[str, Any] = {}
+    provenance: ProvenanceSection = ProvenanceSection()
 
     @model_validator(mode="after")
     def _one_scanner(self) -> "CalibrationFile":

@@ -13,7 +13,8 @@ or, instead of `planes`, a scanner with commands of its own:
 
 Optional: source_m, lag_s: {forward, backward}, speed_range_per_s: [low, high], row_delay_s, gate_delay_s,
 colour_skew_s, marker_rising, defects: a bool .npy, dark_rate: a float .npy, covariance: {names, file}, identity,
-provenance: any mapping. Paths are relative to the file's folder; docs/calibration-file.md says it all.
+provenance: any mapping, two of whose keys are read. Paths are relative to the file's folder; docs/calibration-file.md
+says it all.
 """
 
 import os
@@ -116,7 +117,7 @@ def _build(parsed: CalibrationFile, folder: Path) -> RigModel:
         speed_range_per_s=None if speed is None else (speed[0], speed[1]),
         source_m=None if parsed.source_m is None else np.array(parsed.source_m, dtype=np.float64),
         defects=defects,
-        provenance=parsed.provenance,
+        provenance=parsed.provenance.model_dump(exclude_unset=True),
         dark_rate_per_s=dark_rate,
         covariance=_build_covariance(parsed, folder),
         identity=_build_identity(parsed),

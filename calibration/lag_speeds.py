@@ -15,10 +15,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.parameters import BACKWARD, FORWARD
+
 Array = NDArray[np.float64]
 
-FORWARD: Final = "lag_forward"
-BACKWARD: Final = "lag_backward"
 SWEPT: Final = "velocities_per_s"
 """In a model's provenance: the signed velocities of the sweeps that its planes were found from."""
 ALIKE_SPEEDS: Final = 0.02
@@ -54,11 +54,18 @@ def untold(velocities_per_s: Sequence[float]) -> Array:
         return np.zeros((0, 3))
     fastest = float(np.abs(velocity).max())
     design = np.stack([np.full(velocity.size, fastest), np.maximum(velocity, 0), np.minimum(velocity, 0)], axis=-1)
-    groups = lag_groups(velocity)
-    told = 1 + (len(groups) if groups else 0)
+    told = 1 + len(lag_groups(velocity))
     open_ones: Array = np.linalg.svd(design)[2][told:]
     open_ones = open_ones / np.abs(open_ones[:, 1:]).max(axis=1, keepdims=True)
     return open_ones * [fastest, 1.0, 1.0]
+
+
+def alike_speeds(speeds_per_s: ArrayLike) -> NDArray[np.int64]:
+    """(n,): a number for each speed, shared by all between which and it there is no gap, whichever way they went."""
+    speeds, which = np.unique(np.abs(np.asarray(speeds_per_s, np.float64)), return_inverse=True)
+    apart = np.diff(speeds, prepend=speeds[:1]) > ALIKE_SPEEDS * speeds
+    result: NDArray[np.int64] = np.cumsum(apart, dtype=np.int64)[which.reshape(-1)]
+    return result
 
 
 def speed_range(speeds_per_s: ArrayLike) -> tuple[float, float]:

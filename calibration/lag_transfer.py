@@ -8,6 +8,9 @@ angle of its own: C is wide open then. With x the lags, y all else, S the covari
 
 It takes a mirror whose lags were then what they are now. Where both contradict each other, the lags have changed: the
 angle stays as it was, if it is known without them.
+
+The row delay goes with the lags where the sweeps told of it; `sync_fit` was given what the model knows of it, and has
+both in its value.
 """
 
 from dataclasses import replace
@@ -16,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.covariance import Covariance
-from calibration.lag_speeds import BACKWARD, FORWARD, SWEPT, untold
+from calibration.lag_speeds import SWEPT, untold
 from calibration.model import Lag, RigModel
-from calibration.parameters import TIMES, parameters, with_parameters
+from calibration.parameters import BACKWARD, FORWARD, ROW_DELAY, TIMES, parameters, with_parameters
 from calibration.scanner import PivotScanner
 from calibration.sync_fit import SIGNIFICANT, SyncFit
 from calibration.verdict import Reason
@@ -32,8 +35,18 @@ _LEAST_SHARE = 1e-9
 _AGAIN = "calibrate the planes again, both ways and at two speeds or more (--exposures)"
 
 
+def known_row_delay(base: RigModel) -> tuple[float, float]:
+    """(value, sd) of a model's row delay, seconds; sd 0 where nothing is said of its error."""
+    covariance = base.covariance
+    if covariance is None or ROW_DELAY not in covariance.names:
+        return base.row_delay_s, 0.0
+    return base.row_delay_s, float(np.sqrt(covariance.of([ROW_DELAY])[0, 0]))
+
+
 def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
-    """The model with these lags; and why its angle cannot be right with them, None where it may be."""
+    """The model with these lags, fitted with its `known_row_delay`; and why its angle cannot be right with them, None
+    where it may be."""
+    assert fit.row_told or fit.row_delay_s == base.row_delay_s, "lags of another row delay"
     told, spread = _told(fit)
     names, values = parameters(base)
     was = np.array([values[names.index(name)] for name in told])
@@ -41,7 +54,7 @@ def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
     model = replace(
         base,
         lag_s=Lag(told[FORWARD], told[BACKWARD]),
-        row_delay_s=told.get("row_delay", base.row_delay_s),
+        row_delay_s=told.get(ROW_DELAY, base.row_delay_s),
         speed_range_per_s=fit.speed_range_per_s,
     )
     if base.covariance is None:
@@ -62,7 +75,7 @@ def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
 def _told(fit: SyncFit) -> tuple[dict[str, float], Array]:
     """What the sweeps tell, by name, and its covariance: a lag that was not scanned is the other."""
     ways = [at if np.isfinite(fit.covariance[at, at]) else 1 - at for at in (0, 1)]
-    at = [*ways, 2] if np.isfinite(fit.covariance[2, 2]) else ways
+    at = [*ways, 2] if fit.row_told else ways
     values = dict(zip(TIMES, (*fit.lag_s, fit.row_delay_s), strict=True))
     return {name: values[name] for name in TIMES[: len(at)]}, np.nan_to_num(fit.covariance[np.ix_(at, at)])
 

@@ -78,23 +78,30 @@ def contradiction(read: Markers, board: Board, shown: NDArray[np.uint8]) -> str 
     fitting, origin = _support(stated, ids[known], lattice[known])
     different = len(np.unique(ids))  # a second board alike repeats them, and may stand on the same lattice by chance
     if fitting < different:
-        for layout in _others(board, int(ids.min())):
-            if _support(layout, ids, lattice)[0] >= max(fitting + _CLEARLY_MORE, _LEAST_SHARE * different):
-                return _named(layout, ids, board)
+        others = list(_others(board, int(ids.min())))
+        support = [_support(layout, ids, lattice)[0] for layout in others]
+        best = int(np.argmax(support))  # of several the likeliest
+        if support[best] >= max(fitting + _CLEARLY_MORE, _LEAST_SHARE * different):
+            return _named(others[best], ids, board)
         if different >= _FEWEST and fitting < _LEAST_SHARE * different:
             return f"{different - fitting} of the {different} markers read do not stand where the board has them"
     return _ends_early(board, shown, read.px[placed], lattice - origin)
 
 
 def _others(board: Board, least_id: int) -> Iterator[_Layout]:
-    """What else may have been printed, the likeliest first; that of the board too, with rows without end."""
+    """What else may have been printed, the likeliest first; that of the board too, with rows without end.
+
+    Ids repeat their pattern every two rows, which hold as many as a row has squares: first ids farther below the least
+    one that was read put markers where one of these does.
+    """
     across, down = board.squares
     yield _Layout(across)
     if down % 2 == 0:
         yield _Layout(across, white_first=True)
     widths = range(3, _MOST_ACROSS + 1)
     yield from (_Layout(width) for width in widths)
-    yield from (_Layout(width, first_id=first) for first in range(1, least_id + 1) for width in (across, *widths))
+    for width in (across, *widths):
+        yield from (_Layout(width, first_id=first) for first in range(least_id, max(0, least_id - width), -1))
 
 
 def _named(layout: _Layout, ids: Places, board: Board) -> str:
@@ -108,7 +115,10 @@ def _named(layout: _Layout, ids: Places, board: Board) -> str:
             "rows so"
         )
     last = board.squares[0] * board.squares[1] // 2 - 1
-    return f"it has marker {ids.max()}, those of the board are 0 to {last}: its rows are more, or numbered otherwise"
+    return (
+        f"its markers are {ids.min()} to {ids.max()}, those of the board are 0 to {last}: its rows are more, or "
+        "numbered otherwise"
+    )
 
 
 def _support(layout: _Layout, ids: Places, lattice: Places) -> tuple[int, Places]:

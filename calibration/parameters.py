@@ -32,7 +32,7 @@ DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", 
 AXIS = ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2")
 MOST_TERMS = 32
 """Of a polynomial; a galvo's law has two to five."""
-TIMES = ("lag_forward", "lag_backward", "row_delay")
+TIMES = FORWARD, BACKWARD, ROW_DELAY = "lag_forward", "lag_backward", "row_delay"
 
 
 def parameters(model: RigModel) -> tuple[tuple[str, ...], Array]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.lag_speeds import alike_speeds
 from calibration.rig_sightings import Sighting
 from calibration.robust import MAD_TO_SD, robust_sd
 
@@ -36,8 +37,6 @@ FEWEST_PAIRS = 200
 """Of neighbouring passages, that tell how errors go with their sd."""
 LEAST_SPREAD = 0.05
 """Of the logarithm of the sd, that tells it too."""
-ALIKE_SPEEDS = 1.05
-"""Speeds that differ by less are one: their frames in a column are."""
 SIGNIFICANT_SD = 3.0
 """For a jitter to be there; one overlooked makes a model look better than it is."""
 
@@ -75,18 +74,19 @@ def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple
     gone. The sd's geometric mean stays as it is, for a factor to be told.
     """
     pairs: dict[int, list[tuple[Array, Array]]] = {}
-    for residual, seen in zip(residuals, sightings, strict=True):
-        for sweep in seen.sweeps:
+    kinds = _kinds(sightings)
+    for residual, seen, of_view in zip(residuals, sightings, kinds, strict=True):
+        for sweep, kind in zip(seen.sweeps, of_view, strict=True):
             left, sd = residual[sweep], seen.sd[sweep]
             left = left - _robust_smooth(seen.command[sweep], seen.y_px[sweep], left, 1 / sd**2)
             shared = np.sqrt((sd[1:] ** 2 + sd[:-1] ** 2) / 2)
-            pairs.setdefault(_speed(seen, sweep), []).append((np.diff(left) / np.sqrt(2), shared))
-    laws = {speed: _law(*(np.concatenate(part) for part in zip(*of, strict=True))) for speed, of in pairs.items()}
+            pairs.setdefault(kind, []).append((np.diff(left) / np.sqrt(2), shared))
+    laws = {kind: _law(*(np.concatenate(part) for part in zip(*of, strict=True))) for kind, of in pairs.items()}
     changed = []
-    for seen in sightings:
+    for seen, of_view in zip(sightings, kinds, strict=True):
         sd = seen.sd.copy()
-        for sweep in seen.sweeps:
-            level, power = laws[_speed(seen, sweep)]
+        for sweep, kind in zip(seen.sweeps, of_view, strict=True):
+            level, power = laws[kind]
             sd[sweep] = level * sd[sweep] ** power
         changed.append(replace(seen, sd=sd))
     before, after = (np.log(np.concatenate([seen.sd for seen in of])) for of in (sightings, changed))
@@ -94,10 +94,11 @@ def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple
     return tuple(replace(seen, sd=scale * seen.sd) for seen in changed)
 
 
-def _speed(seen: Sighting, sweep: slice) -> int:
-    """A number that speeds alike share."""
-    speed = max(abs(float(seen.velocity_per_s[sweep.start])), 1e-9)
-    return round(float(np.log(speed) / np.log(ALIKE_SPEEDS)))
+def _kinds(sightings: Sequence[Sighting]) -> list[list[int]]:
+    """For every sweep of every view a number that those of speeds alike share: their frames in a column are, too."""
+    speeds = [[float(seen.velocity_per_s[sweep.start]) for sweep in seen.sweeps] for seen in sightings]
+    kinds = iter(alike_speeds([speed for of_view in speeds for speed in of_view]).tolist())
+    return [[next(kinds) for _ in of_view] for of_view in speeds]
 
 
 def _law(away: Array, sd: Array) -> tuple[float, float]:

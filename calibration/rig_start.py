@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from calibration.camera import Camera
 from calibration.errors import Degenerate
-from calibration.lag_speeds import BACKWARD, FORWARD, lag_groups
+from calibration.lag_speeds import lag_groups
+from calibration.parameters import BACKWARD, FORWARD
 from calibration.rig_sightings import Sighting
 from calibration.scanner import PivotScanner
 from calibration.views import NO_POSE, BoardPose

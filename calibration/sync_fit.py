@@ -10,8 +10,8 @@ needed and no geometry, only pixels that tell of a passage in several of the swe
 
 What the sweeps can tell depends on them (`calibration.lag_speeds`). One speed each way: a mean of the lags alone, both
 are taken to be it. Two speeds in one direction at least: the lag of each way that was scanned. Whether a lag is the
-same at all speeds shows with two speeds both ways, or three. The row delay needs rows, not speeds, and is 0 where it is
-not significant.
+same at all speeds shows with two speeds both ways, or three. The row delay needs rows, not speeds. One that is known
+from elsewhere counts with what the sweeps tell of it, unless they contradict it significantly; nothing known is 0.
 
 What no sweep tells: a delay of the markers behind the mirror's command that is always the same (the scanner's colour
 outputs trail its mirror outputs by some microseconds, hardware.md 3.1): it shortens both lags, which are then as they
@@ -20,8 +20,7 @@ binding, whose residual it breaks; the gate's delay in the frames at its edges (
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,6 @@ from numpy.typing import NDArray
 from calibration.errors import Degenerate
 from calibration.lag_speeds import lag_groups, speed_range
 from calibration.model import Lag
-from calibration.parameters import TIMES
 from calibration.sync_pixels import (
     CLUSTERS,
     LEAST_PIXELS,
@@ -44,9 +42,8 @@ from calibration.views import Passages
 
 Array = NDArray[np.float64]
 
-NAMES: Final = TIMES
 SIGNIFICANT = 5.0
-"""Standard deviations of a row delay that is believed, and of a lag below 0 that is refused."""
+"""Standard deviations of a row delay that is believed against the known one, and of a lag below 0 that is refused."""
 MOST_CHI2_SDS = 4.0
 """How far, in its standard deviations, chi squared of the speeds may lie above its mean."""
 
@@ -64,11 +61,13 @@ class SweepTiming:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyncFit:
-    """lag_s, row_delay_s: as in `RigModel`. covariance: (3, 3), s^2, of NAMES. speed_range_per_s: where they hold.
+    """lag_s, row_delay_s: as in `RigModel`. covariance: (3, 3), s^2, of the three.
 
-    common: whether the two lags could not be told apart. told: which directions were scanned. sweeps: lag of each by
-    itself, at the row delay found. chi2, dof: of those against common lags; `steady`: whether they agree. noise:
-    robust standard deviation of the residuals in units of what was stated.
+    speed_range_per_s: where they hold. common: whether the two lags could not be told apart. told: which directions
+    were scanned. row_told: whether the row delay is news; else it is the one known before, and its variance what the
+    sweeps alone would have had. sweeps: lag of each by itself, at the row delay found. chi2, dof: of those against
+    common lags; `steady`: whether they agree. noise: robust standard deviation of the residuals in units of what was
+    stated.
     """
 
     lag_s: Lag
@@ -77,6 +76,7 @@ class SyncFit:
     speed_range_per_s: tuple[float, float]
     common: bool
     told: tuple[int, ...]
+    row_told: bool
     sweeps: tuple[SweepTiming, ...]
     chi2: float
     dof: int
@@ -84,7 +84,7 @@ class SyncFit:
 
     @property
     def sd_s(self) -> Array:
-        """Standard deviations (3,) of NAMES; NaN where the direction was not scanned."""
+        """Standard deviations (3,) of both lags and the row delay; NaN where the direction was not scanned."""
         result: Array = np.sqrt(np.diag(self.covariance))
         return result
 
@@ -99,44 +99,54 @@ class SyncFit:
         return self.dof == 0 or bool(self.chi2 <= self.dof + MOST_CHI2_SDS * np.sqrt(2 * self.dof))
 
 
-def fit_sync(sweeps: Sequence[Passages]) -> SyncFit:
-    """Lags and row delay from the passages of one unmoved scene. Raises Degenerate where they cannot be told:
-    one-speed, too-few-pixels, marker-polarity, negative-lag."""
+def fit_sync(sweeps: Sequence[Passages], row_delay_s: float = 0.0, row_delay_sd_s: float = 0.0) -> SyncFit:
+    """Lags and row delay from the passages of one unmoved scene. row_delay_s, row_delay_sd_s: what is known of it.
+
+    Raises Degenerate where they cannot be told: one-speed, too-few-pixels, marker-polarity, negative-lag.
+    """
     _require_speeds(sweeps)
     seen = SharedPixels.of(sweeps)
     heard = (seen.weight > 0).sum(axis=0).tolist()
     if not all(heard):  # a sweep that saw the line nowhere else does says nothing, least of all of its speed
-        return fit_sync([sweep for sweep, tells in zip(sweeps, heard, strict=True) if tells])
+        return fit_sync(
+            [sweep for sweep, tells in zip(sweeps, heard, strict=True) if tells], row_delay_s, row_delay_sd_s
+        )
     _require_one_way_round(seen)
     told = tuple(way for way in (1, -1) if way in seen.direction)
     common = len(told) == 2 and len(lag_groups(seen.velocity)) == 1
     lags = [np.where(np.isin(seen.direction, ways), seen.velocity, 0.0) for ways in ([told] if common else told)]
-    solved, row_delay_s, row_sd_s = solve(seen, lags), 0.0, np.nan
-    believed = False
+    by_row = -seen.velocity * seen.rows[:, None]
+    seen = replace(seen, command=seen.command - row_delay_s * by_row)
+    row_variance, row_told = np.nan, False
     if np.ptp(seen.rows) > 0:
-        with_rows = solve(seen, [*lags, -seen.velocity * seen.rows[:, None]])
-        row_delay_s, row_sd_s = float(with_rows.value[-1]), float(np.sqrt(with_rows.covariance[-1, -1]))
-        believed = abs(row_delay_s) > SIGNIFICANT * row_sd_s
-        solved = with_rows if believed else solved
+        solved = solve(seen, [*lags, by_row])
+        change_s, row_variance = float(solved.value[-1]), float(solved.covariance[-1, -1])
+        believed = abs(change_s) > SIGNIFICANT * np.hypot(np.sqrt(row_variance), row_delay_sd_s)
+        row_told = bool(believed) or row_delay_sd_s > 0
+        solved = solved if believed else solved.with_last_near_0(row_delay_sd_s)
+        row_delay_s += float(solved.value[-1])
+    else:
+        solved = solve(seen, lags)
 
-    # From what was solved for to NAMES: a common lag is both, one that was not scanned is not known.
+    # From what was solved for to the three: a common lag is both, one that was not scanned is not known.
     which = {way: 0 if common else told.index(way) for way in told}
     kept = [which.get(way) for way in (1, -1)]
     covariance = np.full((3, 3), np.nan)
-    for a, i in enumerate([*kept, len(lags) if believed else None]):
-        for b, j in enumerate([*kept, len(lags) if believed else None]):
+    for a, i in enumerate([*kept, len(lags) if row_told else None]):
+        for b, j in enumerate([*kept, len(lags) if row_told else None]):
             if i is not None and j is not None:
                 covariance[a, b] = solved.covariance[i, j]
-    covariance[2, 2] = row_sd_s**2
+    if not row_told:
+        covariance[2, 2] = row_variance
     lag_s = {way: float(solved.value[i]) for way, i in which.items()}
     for way, lag in lag_s.items():
         _require_no_lead(way, lag, float(np.sqrt(solved.covariance[which[way], which[way]])))
     timings, chi2 = _by_sweep(seen, solved, lag_s)
     return SyncFit(
         lag_s=Lag(*(max(lag_s.get(way, lag_s[told[0]]), 0.0) for way in (1, -1))),
-        row_delay_s=row_delay_s if believed else 0.0, covariance=covariance,
+        row_delay_s=row_delay_s, covariance=covariance,
         speed_range_per_s=speed_range(seen.speed),
-        common=common, told=told, sweeps=timings, chi2=chi2, dof=max(0, len(sweeps) - 1 - len(lags)),
+        common=common, told=told, row_told=row_told, sweeps=timings, chi2=chi2, dof=max(0, len(sweeps) - 1 - len(lags)),
         noise=solved.noise,
     )  # fmt: skip
 

@@ -5,7 +5,7 @@ Passages that tremble together count together, since a mirror's jitter is common
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,13 +71,27 @@ class SharedPixels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """value, covariance: of the designs. residual: (pixels, sweeps), in command units. weight: what each counted."""
+    """value, covariance: of the designs. residual: (pixels, sweeps), in command units. weight: what each counted.
+    design: (pixels, sweeps, designs), without what a pixel's own position takes.
+    """
 
     value: Array
     covariance: Array
     residual: Array
     weight: Array
     noise: float
+    design: Array
+
+    def with_last_near_0(self, sd: float) -> "Solved":
+        """The same, where the last design's value was known to be 0 with this standard deviation."""
+        gain = self.covariance[:, -1] / (self.covariance[-1, -1] + sd**2)
+        moved = -gain * self.value[-1]
+        return replace(
+            self,
+            value=self.value + moved,
+            covariance=self.covariance - np.outer(gain, self.covariance[-1]),
+            residual=np.where(self.weight > 0, self.residual - self.design @ moved, self.residual),
+        )
 
 
 def solve(seen: SharedPixels, designs: Sequence[Array]) -> Solved:
@@ -112,7 +126,7 @@ def solve(seen: SharedPixels, designs: Sequence[Array]) -> Solved:
     pulls = clustered(weight[:, :, None] * x * error[:, :, None], clusters(seen))
     by_sweep = np.einsum("ij,ija->ja", weight, x) * (SWEEP_ERROR_S * seen.speed)[:, None]
     covariance = inverse @ (pulls.T @ pulls + by_sweep.T @ by_sweep) @ inverse
-    return Solved(value, covariance, residual, weight, noise)
+    return Solved(value, covariance, residual, weight, noise, x)
 
 
 def _own(values: Array, weight: Array) -> Array:

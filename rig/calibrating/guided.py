@@ -23,8 +23,8 @@ class Guide:
         self, start: FixedPoses, board: Board, depth_range_m: tuple[float, float], taken: Taken,
         fit: Callable[[], RigFit], judge: Callable[[RigFit], Judged], tell: Tell | None,
     ) -> None:  # fmt: skip
-        """start: poses for as long as there is no fit. taken: all views so far, those kept earlier too. fit, judge: of
-        these, as the calibration itself will be fitted and judged."""
+        """start: poses for as long as no fit can be judged. taken: all views so far, those kept earlier too. fit,
+        judge: of these, as the calibration itself will be fitted and judged."""
         self._start = start
         self._board = board
         self._depth_range_m = depth_range_m
@@ -37,10 +37,10 @@ class Guide:
     def next(self, views: Sequence[View]) -> Advice | None:
         """The next pose; None where the error is small enough."""
         known = self._taken.views
-        fit = self._fit() if len(known) >= START_POSES else None
-        if fit is None:
+        told = self._told() if len(known) >= START_POSES else None
+        if told is None:
             return self._start.next(views)
-        judged = self._judged(fit)
+        fit, judged = told
         at_m = judged.asked.at_m
         now_m = judged.evidence.expected_m
         if self._tell is not None:
@@ -59,8 +59,10 @@ class Guide:
         self._asked.add((chosen.fill, chosen.place, chosen.tilt))  # a board that was not found there will not be again
         return advice
 
-    def _fit(self) -> RigFit | None:
+    def _told(self) -> tuple[RigFit, Judged] | None:
+        """What the views so far tell; None where that is no model yet, or one whose line misses the distance asked."""
         try:
-            return self._fitted()
+            fit = self._fitted()
+            return fit, self._judged(fit)
         except CalibrationError:
             return None

@@ -10,7 +10,7 @@ from typing import Any
 from calibration.errors import CalibrationError, Degenerate
 from calibration.files import load_rig_model
 from calibration.judging import ACCURACY_PX, AT_M
-from calibration.lag_transfer import with_lags
+from calibration.lag_transfer import known_row_delay, with_lags
 from calibration.model import RigModel
 from calibration.sensitivity import sensitivity
 from calibration.sync_fit import SyncFit, fit_sync
@@ -63,7 +63,7 @@ def run_sync(
         if live is not None:
             gates.append(_scanned(live, asked, taken))
         gate = min((one for one in gates if one is not None and one.sd_s > 0), key=lambda one: one.sd_s, default=None)
-        fit = _fitted(taken)
+        fit = _fitted(taken, base)
         given, changed = (None, None) if base is None else with_lags(base, fit)
         verdict = judge_sync(fit, base, goal, changed)
         model = None if given is None else _signed(given, gate, verdict)
@@ -88,9 +88,10 @@ def _scanned(live: RigConfig, asked: SyncAsked, taken: Taken) -> GateDelay | Non
     return gate
 
 
-def _fitted(taken: Taken) -> SyncFit:
+def _fitted(taken: Taken, base: RigModel | None) -> SyncFit:
+    known = (0.0, 0.0) if base is None else known_row_delay(base)
     try:
-        return fit_sync([sweep for view in taken.views for sweep in view.passages])
+        return fit_sync([sweep for view in taken.views for sweep in view.passages], *known)
     except Degenerate as refused:
         raise Degenerate(refused.reason, f"{refused.reason}: {refused}") from refused
 

@@ -23,6 +23,7 @@ from rig.estimators.aggregation_vote import NEIGHBOURS_PX, Ballots, collect, new
 from rig.estimators.ambient import ambient_map
 from rig.estimators.halo import halo_shares
 from rig.estimators.halo_learning import bright_lines, learn_first_halo, learn_next_halo
+from rig.estimators.joint_agreement import pairs_to_ask
 from rig.estimators.joint_answer import brightness_of, stripe_table
 from rig.estimators.joint_confidence import Brightness
 from rig.estimators.joint_kernels import add_quiet, read_positions
@@ -62,6 +63,8 @@ class _Tables(NamedTuple):
     light: SecondLight
     bright: Brightness
     dark: bool
+    pairs: NDArray[np.float32]
+    """Of maps whose columns all have frames."""
 
 
 class _Memory(NamedTuple):
@@ -196,7 +199,9 @@ class Joint:
             workers.over(rows, lambda first, last: collect(memory.answer, first, last, memory.ballots))
         workers.post(rows, read)  # what is placed next is of the same rows
         sd = place(volume, tables.sweep, tables.state, tables.shares, x_px, memory.places, workers)
-        return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, tables.bright, workers)
+        lit = volume.n_frames > 0
+        pairs = tables.pairs if lit.all() else pairs_to_ask(np.isfinite(grid.x_far) & lit)
+        return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, pairs, tables.bright, workers)
 
     def _with_seconds(self, volume: CountVolume, tables: _Tables, stripes: StripeTable) -> StripeTable:
         room = self._room(tables.grid).seconds
@@ -256,5 +261,5 @@ def _tables(setting: Setting, workers: RowWorkers) -> _Tables:
     halo = halo_shares(setting.model, setting.geometry.width if setting.model.halo.any() else 0)
     return _Tables(
         grid, costs, sweep, state, profile_table(sigma_px), halo, second_light(state, sigma_px, grid, sweep),
-        brightness_of(setting.model), setting.dark,
+        brightness_of(setting.model), setting.dark, pairs_to_ask(np.isfinite(grid.x_far)),
     )  # fmt: skip

@@ -24,42 +24,52 @@ NEIGHBOURS: Final = 2
 AROUND: Final = 3
 """The same of the answers whose neighbours are counted."""
 
-BAND_ROWS: Final = 32
-"""Rows whose copies stay in the cache."""
+COPIED_ROWS: Final = 32
+"""Rows that are copied at once: their copies stay in the cache."""
 
 
 class Neighbours(NamedTuple):
     """How many neighbours of each answer lie on its surface, and how many there are to ask.
 
-    number: int16 (rows, columns) with AROUND rows and LANES columns around, 0 there. per_row, per_column: float32, of a
-    place the number of pairs around it is the product of both.
+    number: int16 (rows, columns) with AROUND rows and LANES columns around, 0 there. pairs: of `pairs_to_ask`.
     """
 
     number: NDArray[np.int16]
-    per_row: NDArray[np.float32]
-    per_column: NDArray[np.float32]
+    pairs: NDArray[np.float32]
 
 
-def new_neighbours(rows: int, n_frames: NDArray[np.int32]) -> Neighbours:
-    """Room for a map of so many rows, whose columns without frames have no say."""
-    columns = len(n_frames)
-    number = np.zeros((rows + 2 * AROUND, (-(-columns // LANES) + 2) * LANES), np.int16)
-    return Neighbours(number, _pairs(np.ones(rows, np.bool_)), _pairs(n_frames > 0))
+def new_neighbours(pairs: NDArray[np.float32]) -> Neighbours:
+    """Room for a map with so many pairs to ask."""
+    rows, columns = pairs.shape
+    return Neighbours(np.zeros((rows + 2 * AROUND, (-(-columns // LANES) + 2) * LANES), np.int16), pairs)
 
 
-def _pairs(there: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Of each place on a line the pairs of neighbours of which one is near it, both there."""
-    weight = there.astype(np.float64)
-    near = weight * np.convolve(weight, np.ones(2 * NEIGHBOURS + 1), "full")[NEIGHBOURS:-NEIGHBOURS]
-    around = np.convolve(near, np.ones(2 * AROUND + 1), "full")[AROUND:-AROUND]
-    return np.maximum(around, 1.0).astype(np.float32)
+def pairs_to_ask(there: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """How many pairs of neighbours there are around each place (rows, columns), both of them there; at least 1.
+
+    there: whether a place is searched and has frames; others have no say.
+    """
+    weight = there.astype(np.int16)
+    return np.maximum(_around(weight * _around(weight, NEIGHBOURS), AROUND), 1).astype(np.float32)
+
+
+def _around(number: NDArray[np.int16], reach: int) -> NDArray[np.int16]:
+    """Sums over so many rows and columns to either side."""
+    (rows, columns), wide = number.shape, np.pad(number, reach)
+    tall = wide[:rows].copy()
+    for i in range(1, 2 * reach + 1):
+        tall += wide[i : i + rows]
+    total = tall[:, :columns].copy()
+    for i in range(1, 2 * reach + 1):
+        total += tall[:, i : i + columns]
+    return total
 
 
 @numba.njit(cache=True, nogil=True)
 def count_neighbours(distance: NDArray[np.float32], first_row: int, last_row: int, out: Neighbours) -> None:
     """Fill number of rows first_row..last_row-1; distance: (rows, columns) of answers from the far end, NaN: none."""
-    for band in range(first_row, last_row, BAND_ROWS):
-        end = min(band + BAND_ROWS, last_row)
+    for band in range(first_row, last_row, COPIED_ROWS):
+        end = min(band + COPIED_ROWS, last_row)
         copy = with_margin(distance, band, end)
         at, to, width = signed_address(copy), signed_address(out.number), copy.shape[1]
         for y in range(band, end):

@@ -23,12 +23,13 @@ def stripe_table(
     n_frames: NDArray[np.int32],
     answer: Answer,
     places: Places,
+    pairs: NDArray[np.float32],
     bright: Brightness,
     workers: RowWorkers,
 ) -> StripeTable:
-    """The table of a map; arrays float32 (rows, columns), x_px NaN where there are no data."""
+    """The table of a map; arrays (rows, columns), x_px NaN where there are no data. pairs: of `pairs_to_ask`."""
     confidence, signal, haze = (np.empty_like(x_px) for _ in range(3))
-    neighbours = new_neighbours(len(x_px), n_frames)
+    neighbours = new_neighbours(pairs)
 
     def work(first: int, last: int) -> None:
         confidences(x_px, sd_px, n_frames, answer, places, neighbours, bright, first, last, confidence, signal, haze)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.aggregation_answer import UNITS, Answer
-from rig.estimators.joint_agreement import BAND_ROWS, Neighbours, agreement_row, light_row
+from rig.estimators.joint_agreement import COPIED_ROWS, Neighbours, agreement_row, light_row
 from rig.estimators.label_volume_buffers import signed_address
 from rig.estimators.placing_kernels import LIGHT_PX, Places
 from rig.estimators.placing_pools import MARGIN, with_margin
@@ -84,22 +84,22 @@ def confidences(
     nothing = np.float32(np.nan)
     # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
     scales, lights, hazes, rests = places.scale, places.light, places.haze, places.rest
-    number, per_row, margins, columns = neighbours.number, neighbours.per_row, answer.margin, x_px.shape[1]
+    number, margins, columns = neighbours.number, answer.margin, x_px.shape[1]
     # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
     width, wide = (-(-columns // LANES) | 1) * LANES, number.shape[1]
     lines, pairs = np.zeros((_LINES, width), np.float32), np.zeros(wide, np.int16)
     at, to_number, to_pairs = signed_address(lines), signed_address(number), signed_address(pairs)
     sources = (
         (signed_address(sd_px), _SD), (signed_address(scales), _SCALE), (signed_address(lights), _LIGHT),
-        (signed_address(hazes), _HAZE), (signed_address(rests), _REST),
+        (signed_address(hazes), _HAZE), (signed_address(rests), _REST), (signed_address(neighbours.pairs), _ALL),
     )  # fmt: skip
     targets = (
         (signed_address(confidence), _CONFIDENCE), (signed_address(signal), _LIGHT), (signed_address(haze), _HAZE),
     )  # fmt: skip
     for c in range(columns):
-        lines[_FRAMES, c], lines[_ALL, c] = max(n_frames[c], 1), neighbours.per_column[c]
-    for band in range(first_row, last_row, BAND_ROWS):
-        end = min(band + BAND_ROWS, last_row)
+        lines[_FRAMES, c] = max(n_frames[c], 1)
+    for band in range(first_row, last_row, COPIED_ROWS):
+        end = min(band + COPIED_ROWS, last_row)
         distance, light = with_margin(places.distance, band, end), with_margin(lights, band, end)
         around = signed_address(distance), signed_address(light)
         for y in range(band, end):
@@ -109,7 +109,7 @@ def confidences(
                 copy_floats(source + 4 * columns * y, at + 4 * line * width, columns)
             for c in range(columns):
                 lines[_MARGIN, c] = margins[y, c]
-            _judge(at, width, bright, per_row[y])
+            _judge(at, width, bright)
             for target, line in targets:
                 copy_floats(at + 4 * line * width, target + 4 * columns * y, columns)
             for c in range(columns):
@@ -122,15 +122,15 @@ def confidences(
 
 
 @numba.njit(cache=True, nogil=True)
-def _judge(at: int, width: int, bright: Brightness, per_row: np.float32) -> None:
-    """Fill the confidence of a line of stripes, and cut their light; per_row: of `Neighbours`."""
+def _judge(at: int, width: int, bright: Brightness) -> None:
+    """Fill the confidence of a line of stripes, and cut their light."""
     one, none = zero_float32() + 1.0, zero_float32()
     for c in range(0, width, LANES):
         scale, light = load_float32(at, _SCALE * width + c), load_float32(at, _LIGHT * width + c)
         light = smaller_float(larger_float(light, scale * bright.faintest), scale * bright.brightest)
         store_float32(at, _LIGHT * width + c, light)
         shines = logarithm(larger_float(_contrast(at, width, c, bright.ambient) + 3.0, one))
-        pairs = larger_float(load_float32(at, _ALL * width + c) * per_row, one)
+        pairs = larger_float(load_float32(at, _ALL * width + c), one)
         agree = load_float32(at, _PAIRS * width + c) / pairs
         agree = logarithm(agree / (none + _MOST_AGREE - agree) + _LEAST_ODDS)
         haze = load_float32(at, _FRAMES * width + c) * _ending(at, width, c)

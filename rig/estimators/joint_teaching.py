@@ -6,6 +6,9 @@ As `joint_confidence`, but for z, the stripe's light over its noise, pooled over
 above half of the haze, and not whether answers around agree. The honest confidence of a table learns worse: before
 haze, halo and line width are known, it is their errors that it shows, and lessons that leave out the lines that show
 them stay with them (`art` with a halo 1.57 px where these have 0.79, `thin` a bias of 0.17 px where these have 0.05).
+Later lessons go by the table's confidence, for by then the model is known; how they fare has been looked at only in
+the tests of streams of maps.
+
 The five numbers are fitted (maximum likelihood) to 10 maps of a second simulator, `cones` and `art` in clear air, thin
 and dense fog at 1 to 10 exposures.
 """

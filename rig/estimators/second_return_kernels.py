@@ -163,7 +163,7 @@ def measure_seconds(
     last_row: int,
     out: Seconds,
 ) -> None:
-    """Fill all but distance of candidates of rows first_row..last_row-1; zeros where a stripe is near.
+    """Fill all but distance of candidates of rows first_row..last_row-1; zeros near a stripe and where none is asked.
 
     state, still: see `SecondLight`; haze: of `Candidates`.
     """
@@ -171,11 +171,10 @@ def measure_seconds(
     alone = still[LANES:-LANES].reshape(sweep.u.shape)
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
-            place = np.float32(x_far[y, c]) + out.distance[y, c]
-            if np.isnan(place):
-                continue
+            # Whatever an earlier map left there: neighbours pool it where the distance is known, searched or not.
             out.ones[y, c] = out.expected[y, c] = out.light[y, c] = out.moment[y, c] = 0.0
-            if np.isnan(x_px[y, c]) or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
+            place = np.float32(x_far[y, c]) + out.distance[y, c]
+            if np.isnan(place) or np.isnan(x_px[y, c]) or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
                 continue
             lo, hi = with_rays(sweep.u, y, max(sweep.x0[c], 0), min(sweep.x0[c] + sweep.window, width) - 1)
             x, frames = int(np.rint(place)), np.float32(n_frames[c])

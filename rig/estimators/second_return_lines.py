@@ -1,4 +1,4 @@
-"""Lines of a block of rows and columns: where they lie, once per geometry, and the sums of their light.
+"""Lines of a block of rows and columns: where they lie, once per model, and the sums of their light.
 
 Of frames K, a pixel's share q of no one by ambient light and c by haze,
 
@@ -46,7 +46,7 @@ class Table(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def line_places(sweep: Sweep, x_far: NDArray[np.float64], side: int, pixels: int) -> NDArray[np.int16]:
-    """Where the lines of all rows and columns lie: int16 (rows, columns, PLACES), made once per geometry.
+    """Where the lines of all rows and columns lie: int16 (rows, columns, PLACES), made once per model.
 
     PLACE_X: x of pixel 0 of distance, the leftmost of `pixels`, NOWHERE where nothing is searched; PLACE_BEGIN,
     PLACE_END: pixels of distance that are searched and were stored, from and up to.

@@ -40,6 +40,9 @@ ELSEWHERE = {
     "answers of whole maps; those to any counts in test_estimators.py": (
         "tests/unit/estimators/test_joint.py", "rig.estimators.joint_*:*",
     ),
+    "trust of any light, margin and sd": (
+        "tests/unit/estimators/test_joint_teaching.py", "rig.estimators.joint_teaching:*",
+    ),
     "places pooled over walls and neighbours; those of any counts in test_estimators.py": (
         "tests/unit/estimators/test_placing.py", "rig.estimators.placing*:*",
     ),

@@ -6,10 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from calibration.covariance import Covariance
 from calibration.errors import CalibrationError, Degenerate
 from calibration.judging import judge_fit
-from calibration.lag_speeds import SWEPT, lag_groups, untold
-from calibration.lag_transfer import with_lags
+from calibration.lag_speeds import SWEPT, alike_speeds, lag_groups, untold
+from calibration.lag_transfer import known_row_delay, with_lags
 from calibration.lag_verdict import lag_lack
 from calibration.model import Lag
 from calibration.rig_fit import RigFit, fit_rig
@@ -34,7 +35,7 @@ def planes(*velocities: float, seed: int = 3) -> tuple[RigFit, list[View]]:
 
 
 def found(lag: Lag = LAG, sd_s: float = 3e-7) -> SyncFit:
-    return SyncFit(lag, 0.0, np.diag([sd_s, sd_s, 1e-11]) ** 2, (15.0, 400.0), False, (1, -1), (), 0.0, 1, 1.0)
+    return SyncFit(lag, 0.0, np.diag([sd_s, sd_s, 1e-11]) ** 2, (15.0, 400.0), False, (1, -1), False, (), 0.0, 1, 1.0)
 
 
 def swept(*velocities: float) -> list[Passages]:
@@ -155,6 +156,34 @@ def test_lags_that_changed_leave_planes_alone_that_had_told_them_apart() -> None
     model, reason = with_lags(replace(together.model, provenance={}), changed)
     assert reason is not None
     assert reason.code == "lags-together"
+
+
+@pytest.mark.parametrize("sd_s", [0.0, 1e-10])
+def test_a_row_delay_that_the_planes_know_is_not_thrown_away(sd_s: float) -> None:
+    model = planes(35.2, -35.2, 70.4, -70.4)[0].model
+    assert model.covariance is not None
+    names, matrix = model.covariance.names, model.covariance.matrix
+    if sd_s:
+        names = (*names, "row_delay")
+        matrix = np.block([[matrix, np.zeros((len(matrix), 1))], [np.zeros((1, len(matrix))), np.eye(1) * sd_s**2]])
+    base = replace(model, row_delay_s=2e-9, covariance=Covariance(names, matrix))
+    late = [
+        replace(s, command=s.command - s.direction * s.speed_per_s * 2e-9 * s.y_px) for s in swept(40, -40, 90, -90)
+    ]
+    fit = fit_sync(late, *known_row_delay(base))
+    given, reason = with_lags(base, fit)
+    assert reason is None
+    assert given.covariance is not None
+    assert given.row_delay_s == pytest.approx(2e-9, abs=4 * sd_s)
+    assert ("row_delay" in given.covariance.names) == (sd_s > 0)
+    if sd_s:
+        assert np.sqrt(given.covariance.of(["row_delay"])[0, 0]) <= sd_s
+    assert np.all(np.abs(np.subtract(given.lag_s, LAG)) < 4 * fit.sd_s[:2])
+
+
+def test_speeds_are_alike_where_no_gap_is_between_them() -> None:
+    assert alike_speeds([70.4, -35.2, 35.201, 36.5, -71.0]).tolist() == [2, 0, 0, 1, 2]
+    assert alike_speeds([]).size == 0
 
 
 def test_a_model_that_says_nothing_of_its_errors_takes_the_lags_alone() -> None:

@@ -60,8 +60,17 @@ def test_another_width_is_told_from_half_of_the_markers(squares: tuple[int, int]
 
 
 def test_ids_that_begin_elsewhere_are_told() -> None:
-    said = contradiction(_seen((9, 7), first_id=40), BOARD, PICTURE)
-    assert said == "it has marker 70, those of the board are 0 to 30: its rows are more, or numbered otherwise"
+    for first in (5, 14, 40, 400):
+        said = contradiction(_seen((9, 7), first_id=first), BOARD, PICTURE)
+        assert said == f"its markers are numbered from {first} on, those of the board from 0"
+    said = contradiction(_seen((9, 7), first_id=396), BOARD, PICTURE)  # as rows 88 to 94 of a board of that width
+    assert said is not None
+    assert said.startswith("its markers are 396 to 426, those of the board are 0 to 30: ")
+
+
+def test_more_rows_are_told() -> None:
+    said = contradiction(_seen((9, 11)), BOARD, PICTURE)
+    assert said == "its markers are 0 to 48, those of the board are 0 to 30: its rows are more, or numbered otherwise"
 
 
 @pytest.mark.parametrize("across", [8, 9])

@@ -76,7 +76,7 @@ def test_what_is_saved_is_read_back(
         speed_range_per_s=(10.0, 400.0),
         source_m=np.array([-0.3, 0, 0]),
         defects=defects,
-        provenance={"rig": "bench", "residual_px": 0.1},
+        provenance={"rig": "bench", "velocities_per_s": [-35.2, 35.2], "residual_px": 0.1},
     )
     save_rig_model(model, tmp_path / "rig.yaml")
     again = load_rig_model(tmp_path / "rig.yaml")
@@ -173,6 +173,9 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
             "the model has no parameter bow; it has fx",
         ),
         (HEAD + CAMERA + ROWS + "identity: {rig: a, created: b, verdict: fine}\n", "identity.verdict is 'fine'"),
+        (HEAD + CAMERA + ROWS + "provenance: {velocities_per_s: fast}\n", "provenance.velocities_per_s is 'fast'"),
+        (HEAD + CAMERA + ROWS + "provenance: {velocities_per_s: [a]}\n", "provenance.velocities_per_s.0 is 'a'"),
+        (HEAD + CAMERA + ROWS + "provenance: {corners: 35.2}\n", "provenance.corners is 35.2"),
     ],
 )
 def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path: Path, text: str, said: str) -> None:

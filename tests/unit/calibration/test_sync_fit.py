@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.errors import Degenerate
-from calibration.sync_fit import NAMES, fit_sync
+from calibration.sync_fit import fit_sync
 from calibration.views import Passages
 
 LAG_S = {1: 2.1e-4, -1: 1.6e-4}
@@ -45,7 +45,35 @@ def test_row_delay_is_found_where_there_is_one():
     fit = fit_sync(_sweeps(np.random.default_rng(2), (35.0, 90.0), row_s=2e-8))
     assert abs(fit.row_delay_s - 2e-8) < 4 * fit.sd_s[2]
     assert abs(fit.lag_s.forward - LAG_S[1]) < 4 * fit.sd_s[0]
-    assert NAMES[2] == "row_delay"
+    assert fit.row_told
+
+
+def test_a_row_delay_that_is_known_counts_with_what_the_sweeps_tell():
+    rng = np.random.default_rng(9)
+    off = []
+    for _ in range(30):
+        known_s = 2e-9 + 5e-10 * rng.normal()
+        fit = fit_sync(_sweeps(rng, (35.0, 90.0), row_s=2e-9, jitter=3e-4), known_s, 5e-10)
+        assert fit.row_told
+        assert fit.sd_s[2] < 5e-10
+        found = np.array([*fit.lag_s, fit.row_delay_s])
+        off.append((found - [LAG_S[1], LAG_S[-1], 2e-9]) / fit.sd_s)
+        for sweep in fit.sweeps:
+            assert abs(sweep.lag_s - LAG_S[sweep.direction]) < 5 * sweep.sd_s
+    assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.2
+
+
+def test_a_row_delay_known_exactly_stays_unless_it_is_contradicted():
+    rng = np.random.default_rng(10)
+    off = []
+    for _ in range(30):
+        fit = fit_sync(_sweeps(rng, (35.0, 90.0), row_s=2e-9), 2e-9)
+        assert (fit.row_delay_s, fit.row_told) == (2e-9, False)
+        off.append((np.array(fit.lag_s) - [LAG_S[1], LAG_S[-1]]) / fit.sd_s[:2])
+    assert np.sqrt(np.mean(np.square(off))) < 1.1
+    other = fit_sync(_sweeps(rng, (35.0, 90.0), row_s=2e-8), 2e-9, 1e-10)
+    assert other.row_told
+    assert abs(other.row_delay_s - 2e-8) < 4 * other.sd_s[2]
 
 
 def test_one_speed_both_ways_gives_the_mean_of_the_lags():

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from rig.estimators.aggregation_answer import UNITS, new_answer
-from rig.estimators.joint_agreement import AROUND, NEIGHBOURS, agreement_row, count_neighbours, new_neighbours
+from rig.estimators.joint_agreement import (
+    AROUND,
+    NEIGHBOURS,
+    agreement_row,
+    count_neighbours,
+    new_neighbours,
+    pairs_to_ask,
+)
 from rig.estimators.joint_answer import stripe_table
 from rig.estimators.joint_confidence import Brightness
 from rig.estimators.label_volume_buffers import signed_address
@@ -18,7 +25,7 @@ ONE, TWO, THREE = RowWorkers(1), RowWorkers(2), RowWorkers(3)
 BRIGHT = Brightness(0.1, 10.0, 0.005)
 
 
-def judged(distance, *, light=0.7, haze=0.1, exposures=3, margin=10.0, sd=0.1, workers=ONE):
+def judged(distance, *, light=0.7, haze=0.1, exposures=3, margin=10.0, sd=0.1, workers=ONE, searched=True):
     """The table of answers at `distance` (rows, columns) from the far end, all of one light and margin."""
     rows, columns = distance.shape
     answer, places = new_answer(rows, columns), new_places(rows, columns)
@@ -27,7 +34,8 @@ def judged(distance, *, light=0.7, haze=0.1, exposures=3, margin=10.0, sd=0.1, w
     x_px = np.where(np.isnan(distance), np.nan, 100.0).astype(np.float32)
     frames = np.broadcast_to(np.asarray(exposures, np.int32), columns).copy()
     sds = np.full(distance.shape, sd, np.float32)
-    return stripe_table(x_px, sds, frames, answer, places, BRIGHT, workers)
+    pairs = pairs_to_ask(np.broadcast_to(searched, distance.shape))
+    return stripe_table(x_px, sds, frames, answer, places, pairs, BRIGHT, workers)
 
 
 def wall(rows=ROWS, columns=COLUMNS):
@@ -40,7 +48,7 @@ def scattered(rows=ROWS, columns=COLUMNS):
 
 def test_neighbours_and_the_pairs_around_are_counted_as_they_are():
     distance = np.random.default_rng(1).choice([0.0, 0.9, 3.0, np.nan], (ROWS, COLUMNS)).astype(np.float32)
-    there = new_neighbours(ROWS, np.ones(COLUMNS, np.int32))
+    there = new_neighbours(pairs_to_ask(np.ones((ROWS, COLUMNS), np.bool_)))
     for first, last in ((0, 7), (7, ROWS)):
         count_neighbours(distance, first, last, there)
     padded = np.pad(distance, NEIGHBOURS, constant_values=np.nan)
@@ -58,19 +66,36 @@ def test_neighbours_and_the_pairs_around_are_counted_as_they_are():
         np.testing.assert_array_equal(pairs[:COLUMNS], np.convolve(rows, np.ones(2 * AROUND + 1), "valid"))
 
 
-def test_all_pairs_of_a_wall_agree_up_to_its_border_and_beside_columns_without_frames():
-    frames = np.ones(COLUMNS, np.int32)
-    frames[10:14] = 0
-    distance = wall()
-    distance[:, frames == 0] = np.nan
-    there = new_neighbours(ROWS, frames)
-    count_neighbours(distance, 0, ROWS, there)
+def places_there(case):
+    """Places of a map of which some have no frames or are not searched."""
+    there, (y, x) = np.ones((ROWS, COLUMNS), np.bool_), np.mgrid[:ROWS, :COLUMNS]
+    if "columns" in case:
+        there &= (x < 10) | (x > 13)
+    if "oblique" in case:
+        there &= x >= y - 5
+    return there if case != "scattered" else np.random.default_rng(2).random(there.shape) < 0.6
+
+
+@pytest.mark.parametrize("case", ["all", "columns", "oblique", "columns oblique", "scattered"])
+def test_all_pairs_of_a_wall_agree_up_to_its_border_and_to_what_is_not_there(case):
+    here = places_there(case)
+    there = new_neighbours(pairs_to_ask(here))
+    count_neighbours(np.where(here, wall(), np.float32(np.nan)), 0, ROWS, there)
     width = there.number.shape[1]
     line, pairs = np.zeros(width, np.int16), np.zeros(width, np.float32)
     for y in range(ROWS):
         agreement_row(signed_address(there.number), width, y, signed_address(line), signed_address(pairs))
-        shares = pairs[:COLUMNS] / (there.per_row[y] * there.per_column)
-        np.testing.assert_allclose(shares[frames > 0], 1, rtol=1e-6)
+        np.testing.assert_array_equal(pairs[:COLUMNS][here[y]], there.pairs[y, here[y]])
+
+
+def test_a_surface_is_as_sure_beside_places_that_are_not_searched():
+    settings = {"light": 0.3, "haze": 0.14, "exposures": 10}  # haze enough for neighbours to have a say
+    alone, here = judged(wall(), **settings).confidence, places_there("oblique")
+    found = judged(np.where(here, wall(), np.float32(np.nan)), searched=here, **settings).confidence
+    # Light is pooled over 3 x 3: where some of it is missing, it tells a little less.
+    lit = np.lib.stride_tricks.sliding_window_view(np.pad(here, 1), (3, 3)).all((2, 3))
+    np.testing.assert_allclose(found[lit], alone[lit], rtol=1e-3)
+    assert found[here].min() > alone.min() - 0.02
 
 
 @pytest.mark.parametrize("exposures", [1, 3, 20, 1000])

@@ -32,12 +32,16 @@ def pane(light="report", rig="left", exposures=10) -> Sweep:
     return Sweep(point, geometry_of(g), point.counts(exposures, 1), exposures)
 
 
-def seconds_of(sweep: Sweep, x_px, haze=0.14, threads=WORKERS):
+def seconds_of(sweep: Sweep, x_px, haze=0.14, threads=WORKERS, left=0.0):
+    """left: what an earlier map left in the room."""
     model = known_model(sweep.geometry, haze=haze)
     grid = label_grid(sweep.geometry)
     x_px = x_px.astype(np.float32)
     light = second_light(state_of(model), 0.6, grid, sweep_of(sweep.geometry))
-    return second_returns(sweep.volume, grid, sweep_of(sweep.geometry), light, x_px, second_room(grid), threads)
+    room = second_room(grid)
+    for array in (*room.blocks, *room.candidates, *room.seconds, room.moved):
+        array[:] = left
+    return second_returns(sweep.volume, grid, sweep_of(sweep.geometry), light, x_px, room, threads)
 
 
 @pytest.mark.parametrize("rig", ["left", "right"])
@@ -82,6 +86,18 @@ def test_rows_without_data_have_none_and_threads_do_not_matter() -> None:
     with RowWorkers(3) as workers:
         for one, other in zip((x2_px, confidence2), seconds_of(sweep, x_px, threads=workers), strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("left", [1e6, np.nan])
+def test_what_an_earlier_map_left_is_forgotten_where_nothing_is_searched(left) -> None:
+    sweep = pane()
+    g, empty = sweep.geometry, np.random.default_rng(2).random((ROWS, COLUMNS)) < 0.2
+    g = replace(g, x_lo=np.where(empty, 0, g.x_lo), x_hi=np.where(empty, -1, g.x_hi))
+    x_px = np.where(empty, np.nan, sweep.point.x_true)
+    found = [seconds_of(replace(sweep, geometry=g), x_px, left=each) for each in (0.0, left)]
+    assert (found[0][1] > SURE).any()
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_columns_without_exposures_are_left_alone() -> None:

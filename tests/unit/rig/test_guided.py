@@ -4,10 +4,13 @@ from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from calibration.camera import Camera
 from calibration.camera_files import KnownCamera
 from calibration.covariance import Covariance
+from calibration.errors import CalibrationError
+from calibration.guide import Advice, candidates
 from calibration.rig_fit import fit_rig
 from rig.calibrating import planes_run
 from rig.calibrating.guided import Guide
@@ -35,3 +38,15 @@ def test_a_camera_that_is_known_counts_in_what_the_guide_expects() -> None:
     told = fit_rig(views, BOARD, SIZE, camera=lens, known=known)
     assert before[1] == planes_run._judged(taken, asked, told).evidence.expected_m
     assert before[1] < 0.8 * before[0]
+
+
+def test_a_fit_whose_line_misses_the_distance_asked_does_not_end_the_session() -> None:
+    views = random_views(np.random.default_rng(4), RIG, 3, Seen(passages=150))
+    taken = SimpleNamespace(views=views, size=SIZE)
+    asked = planes_run.PlanesAsked(at_m=0.05)
+    fit, judge = partial(planes_run._fit, taken, BOARD, None, None), partial(planes_run._judged, taken, asked)
+    with pytest.raises(CalibrationError, match="does not reach"):
+        judge(fit())
+    lens = Camera(*SIZE, np.array([[600, 0, 255.5], [0, 600, 255.5], [0, 0, 1.0]]), np.zeros(5))
+    poses = [Advice(choice, 0.05) for choice in candidates(lens, BOARD, (0.5, 4.0))[:4]]
+    assert Guide(FixedPoses(poses), BOARD, (0.5, 4.0), taken, fit, judge, None).next(views) is poses[3]
