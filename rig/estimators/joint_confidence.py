@@ -1,15 +1,16 @@
 """Compiled: how probably an answer of `joint` lies within a pixel of a stripe, from three things that can be wrong.
 
-    confidence = erf(1 / (sqrt 2 WIDER sd))                        the stripe is farther off than it should be
-               / (1 + exp(A - B margin))                           another position is the right one
-               / (1 + exp(C - D ln contrast' + g (E - F ln odds))) there is no stripe: haze ends, but nothing shines
+    confidence = erf(1 / (sqrt 2 WIDER sd))                               the stripe is farther off than it should be
+               / (1 + exp(A - B margin))                                  another position is the right one
+               / (1 + exp(C - D ln contrast' + hole + g (E - F ln odds))) there is no stripe: haze ends, nothing shines
 
 margin: by how much the next best place is worse, or what neighbours say for it where there was a vote, over UNITS of
 cost. contrast' = max(contrast + 3, 1), contrast: light that 3 x 3 neighbours on the surface have in common above the
 *whole* haze before the stripe, over its noise; where haze just ends an answer can lie a little before the end, and half
-of the haze would pass for light. odds: of answers around that agree to those that do not (`joint_agreement`). They
-count as far as there is haze, g = k / (k + SOME_HAZE), k photons of it in all exposures: in clear air nothing but a
-stripe makes a margin, and small things, whose surroundings do not agree, are as sure as others.
+of the haze would pass for light. hole: by how much contrast is below -6, 30 at most. odds: of answers around that agree
+to those that do not (`joint_agreement`). They count as far as there is haze, g = k / (k + SOME_HAZE), k photons of it
+in all exposures: in clear air nothing but a stripe makes a margin, and small things, whose surroundings do not agree,
+are as sure as others.
 
 A is chosen: fitted it comes out at 0.7, which believes answers without any margin too readily. The others are
 fitted (maximum likelihood) to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, all answers
@@ -44,6 +45,9 @@ E: Final = 5.871
 F: Final = 2.585
 SOME_HAZE: Final = 0.05
 """Photons of haze per pixel, over all exposures, from which on its end can be taken for a stripe."""
+FAR_BELOW: Final = 6.0
+"""Standard deviations below the haze from which on no agreement around makes up for a hole where light should be, as in
+counts that are all ones."""
 _HALF_PX: Final = LIGHT_PX + 0.5
 """Half the pixels that a stripe's light is summed over."""
 _LEAST_ODDS: Final = 1e-3
@@ -129,12 +133,14 @@ def _judge(at: int, width: int, bright: Brightness) -> None:
         scale, light = load_float32(at, _SCALE * width + c), load_float32(at, _LIGHT * width + c)
         light = smaller_float(larger_float(light, scale * bright.faintest), scale * bright.brightest)
         store_float32(at, _LIGHT * width + c, light)
-        shines = logarithm(larger_float(_contrast(at, width, c, bright.ambient) + 3.0, one))
+        contrast = _contrast(at, width, c, bright.ambient)
+        shines = logarithm(larger_float(contrast + 3.0, one))
+        hole = smaller_float(larger_float(none - FAR_BELOW - contrast, none), none + 30.0)
         pairs = larger_float(load_float32(at, _ALL * width + c), one)
         agree = load_float32(at, _PAIRS * width + c) / pairs
         agree = logarithm(agree / (none + _MOST_AGREE - agree) + _LEAST_ODDS)
         haze = load_float32(at, _FRAMES * width + c) * _ending(at, width, c)
-        dark = exponential(none + C - shines * D + haze / (haze + SOME_HAZE) * (none + E - agree * F))
+        dark = exponential(none + C - shines * D + hole + haze / (haze + SOME_HAZE) * (none + E - agree * F))
         margin = load_float32(at, _MARGIN * width + c)
         rival = exponential(none + A - margin * (B / UNITS))
         sd = larger_float(load_float32(at, _SD * width + c), none + 1e-3)

@@ -75,6 +75,7 @@ ELSEWHERE = {
     ),
     "which lags sweeps tell, against sweeps and fits of them": (
         "tests/unit/calibration/test_lags.py", "calibration.lag_speeds:*", "calibration.lag_verdict:*",
+        "calibration.lag_transfer:*",
     ),
     "boards at known places, scanned": (
         "tests/unit/calibration/test_check_fit.py", "calibration.board_cells:*", "calibration.check_*:*",

@@ -14,7 +14,7 @@ ROWS, WIDTH = 12, 150
 
 def _traced(maps: tuple[Array, Array, Array], bounds: Array, plane: Array) -> tuple[NDArray[np.generic], ...]:
     found = np.zeros(ROWS), np.zeros(ROWS), np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64)
-    trace_rows(*maps, bounds, plane, 0, ROWS, *found)
+    trace_rows(*maps, bounds, plane[None], 0, ROWS, *found)
     return found
 
 
