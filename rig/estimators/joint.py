@@ -125,8 +125,11 @@ class Joint:
         self.used = model if self._prior.before is None else replace(model, before=self._prior.before)
         stripes = self._with_seconds(sweep, tables, self._stripes(sweep, tables))
         self._prior.leave(stripes, tables.grid, self._workers)
+        # Whether the first map has taught anything is for the trust of its lessons to say.
+        known = self._lessons.model is not None
+        judged = stripes if known else self._teaching(sweep, tables, stripes)
         self._lessons.attend(
-            stripes, model, int(sweep.n_frames.sum()), lambda: self._seen(sweep, geometry, tables, stripes)
+            judged, model, int(sweep.n_frames.sum()), lambda: self._seen(sweep, geometry, tables, stripes)
         )
         return stripes
 
