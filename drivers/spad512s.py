@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.errors import DeviceFault, DeviceTimeout, LimitExceeded
+from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, LimitExceeded
 from drivers.frames import BlockFlag, BlockHeader
 from drivers.interfaces import BurstMode, SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
 from drivers.orientation import QuarterTurn, turn_packed, turned_size
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.ring import BlockRing
-from drivers.spad512s_line import Deadlines, Spad512sLine
+from drivers.spad512s_line import Deadlines, Spad512sIdentity, Spad512sLine
 from drivers.spad512s_run import SLICE_S, Spad512sRun
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from drivers.transports.endpoints import Endpoint, resolve
@@ -40,6 +40,8 @@ ROW_BYTES = COLUMNS // 8
 TICK_HZ = 100_000_000
 """Nominal: the vendor's stream carries no time. Where it does not divide the period, a multiple of the frame rate."""
 TICKS_PER_FRAME = 1024
+LISTENS_AGAIN_S = 1.0
+"""A program that serves one client may take so long to listen again once that one has left."""
 _TEMPERATURES = ("master FPGA", "slave FPGA", "board", "chip")
 """What `R` measures first."""
 _US_SLACK = 1e-6
@@ -164,13 +166,24 @@ class Spad512s(SpadArray):
         """The program was restarted, or left by hanging up. DeviceFault where another device answers now."""
         if self._line.is_open:
             return
-        again, before = self._line.connect().master_serial, self._identity.master_serial
+        again, before = self._connect_again().master_serial, self._identity.master_serial
         if again != before:
             self._line.hang_up()
             raise DeviceFault(
                 f"{self.name}: another device ({again}) answers at {self._line.address} now, it was {before}; "
                 "open it again"
             )
+
+    def _connect_again(self) -> Spad512sIdentity:
+        """The program serves one client, and listens again a moment after that one has left."""
+        ends_at = time.monotonic() + LISTENS_AGAIN_S
+        while True:
+            try:
+                return self._line.connect()
+            except DeviceNotFound:
+                if time.monotonic() >= ends_at:
+                    raise
+                time.sleep(0.02)
 
     def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
         with self._busy:

@@ -237,9 +237,13 @@ def test_a_slow_recorder_loses_by_the_policy_and_both_readers_have_the_same_fram
 
     rig.spad.behaviour = slow
     acquired = acquisition(rig, PLAN, MAPS, policy=Overload.DROP, recording=recording)
-    _, lost = accounted(list(acquired.run()))
+    maps = list(acquired.run())
+    _, lost = accounted(maps)
     recording.close()
-    assert lost == acquired.stages.dropped_frames == len(rig.spad.dropped) > 0
+    assert acquired.stages.dropped_frames == len(rig.spad.dropped) > 0
+    # The few frames behind the last sweep may be dropped too, when the scan has ended and nobody waits for them.
+    inside = range(maps[0].sweep.first_frame, maps[-1].sweep.end_frame)
+    assert lost == sum(frame in inside for frame in rig.spad.dropped)
     recorded = np.concatenate([block.frame_numbers for block in blocks_in(tmp_path)]).tolist()
     assert recorded == rig.spad.delivered
 
