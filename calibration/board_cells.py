@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 from calibration.board import Board
 from calibration.errors import Degenerate
 from calibration.model import RigModel
-from calibration.views import Passages, View
+from calibration.views import FEWEST_CORNERS, Passages, View
 
 Array = NDArray[np.float64]
 
 _FEWEST_CELLS = 8
 """Scanned squares of a board; three of them already go into its plane."""
 _FEWEST_IN_CELL = 5
-_FEWEST_CORNERS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +60,7 @@ def cells_of(model: RigModel, view: View, board: Board) -> BoardCells:
         x_px=mean[:, 2],
         y_px=mean[:, 3],
         command=mean[:, 4],
-        velocity_per_s=np.array([[sweep.direction * sweep.speed_per_s] for sweep in view.passages]),
+        velocity_per_s=np.array([[sweep.velocity_per_s] for sweep in view.passages]),
         sd=np.sqrt(mean[:, 5] / number[:, known]),
         at=np.unravel_index(known, shape),  # type: ignore[arg-type]
     )
@@ -117,11 +116,11 @@ def inside_points(model: RigModel, view: View, board: Board) -> Array:
 
 def corner_pixels(view: View) -> Array:
     """(n, 2) the view's corners. Degenerate where they are too few to say where the board is."""
-    if view.corners is None or len(view.corners.ids) < _FEWEST_CORNERS:
+    if view.corners is None or len(view.corners.ids) < FEWEST_CORNERS:
         found = 0 if view.corners is None else len(view.corners.ids)
         raise Degenerate(
             "no-board",
-            f"view {view.name}: {found} corners of the board were found, {_FEWEST_CORNERS} are needed; show the whole "
+            f"view {view.name}: {found} corners of the board were found, {FEWEST_CORNERS} are needed; show the whole "
             "board, lit evenly",
         )
     return view.corners.px
@@ -129,8 +128,7 @@ def corner_pixels(view: View) -> Array:
 
 def _scanned_points(model: RigModel, passages: Passages) -> Array:
     """(m, 3) points of passages in the camera's frame; NaN where the command lies outside the model's range."""
-    velocity = passages.direction * passages.speed_per_s
-    return _triangulated(model, passages.x_px, passages.y_px, passages.command, velocity)
+    return _triangulated(model, passages.x_px, passages.y_px, passages.command, passages.velocity_per_s)
 
 
 def off_plane(xy: Array) -> Array:

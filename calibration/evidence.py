@@ -15,12 +15,10 @@ from calibration.board import Board
 from calibration.camera import Camera
 from calibration.coverage import spread_rad
 from calibration.scanner import PivotScanner, Scanner
-from calibration.views import BoardPose, Corners, View
+from calibration.views import FEWEST_CORNERS, BoardPose, Corners, View
 
 Array = NDArray[np.float64]
 
-_FEWEST_CORNERS = 6
-"""For a pose."""
 _WHITE_PERCENT = 75
 """Half of a board is white: this percentile of its pixels is."""
 
@@ -85,7 +83,7 @@ def rough_poses(views: Sequence[View], board: Board, camera: Camera) -> list[Boa
     """Where the boards stood, as a camera sees it that is known only roughly."""
     found = []
     for view in views:
-        if view.corners is None or len(view.corners.ids) < _FEWEST_CORNERS:
+        if view.corners is None or len(view.corners.ids) < FEWEST_CORNERS:
             continue
         corners_m = board.corners_m[view.corners.ids]
         done, turn, shift = cv2.solvePnP(corners_m, view.corners.px, camera.matrix, camera.distortion)

@@ -20,7 +20,7 @@ says it all.
 import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import yaml
@@ -35,6 +35,8 @@ from calibration.parameters import with_parameters
 from calibration.scanner import PivotScanner, PlaneTable, Scanner
 from calibration.yaml_file import read_yaml_file
 
+CALIBRATION_FILE: Final = "calibration.yaml"
+"""Its name wherever the project writes one."""
 _PLAIN = {"row_delay_s": 0.0, "gate_delay_s": 0.0, "colour_skew_s": 0.0, "marker_rising": True}
 """Values of a model that its file has under the same name, and what they are where it does not."""
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from calibration.board import Board
 from calibration.camera import Camera
+from calibration.verdict import mm
 from calibration.views import BoardPose
 
 Array = NDArray[np.float64]
@@ -85,8 +86,8 @@ class Advice:
         """What to do and why."""
         if not math.isfinite(self.after_m):
             return str(self.candidate)
-        before = f"from {_mm(self.before_m)} " if math.isfinite(self.before_m) else ""
-        return f"{self.candidate}: expected error at {self.at_m:g} m falls {before}to {_mm(self.after_m)}"
+        before = f"from {mm(self.before_m)} " if math.isfinite(self.before_m) else ""
+        return f"{self.candidate}: expected error at {self.at_m:g} m falls {before}to {mm(self.after_m)}"
 
 
 def candidates(camera: Camera, board: Board, depth_range_m: tuple[float, float]) -> tuple[Candidate, ...]:
@@ -175,7 +176,3 @@ def _candidate(
 def _traits(candidate: Candidate) -> Array:
     """Where a pose stands among others: distance, place, tilt, in steps that matter about as much."""
     return np.array([1.5 * math.log(candidate.distance_m), *(0.7 * np.array(candidate.place)), *candidate.tilt])
-
-
-def _mm(length_m: float) -> str:
-    return f"{length_m * 1e3:.3g} mm"

@@ -16,11 +16,11 @@ from calibration.rig_fit import RigFit
 from calibration.rig_noise import bin_starts
 from calibration.rig_normal import view_normal
 from calibration.rig_rows import Terms
-from calibration.rig_sightings import FEWEST_CORNERS, Sighting
+from calibration.rig_sightings import Sighting
 from calibration.rig_solve import scaled_inverse
 from calibration.rig_state import first_state
 from calibration.uncertainty import command_at, depth_jacobian
-from calibration.views import BoardPose
+from calibration.views import FEWEST_CORNERS, BoardPose
 
 Array = NDArray[np.float64]
 

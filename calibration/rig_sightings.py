@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calibration.board import MARGIN_SQUARES, Board
 from calibration.camera import Camera
-from calibration.views import LEAST_ACROSS_PX, USUAL_CORNER_SD_PX, BoardPose, Corners, Passages, View
+from calibration.views import FEWEST_CORNERS, LEAST_ACROSS_PX, USUAL_CORNER_SD_PX, BoardPose, Corners, Passages, View
 
 Array = NDArray[np.float64]
 
@@ -20,7 +20,6 @@ LEAST_CORNER_SD_PX = 0.02
 """What the print, the lens model and the finding of corners leave, however bright the picture."""
 PAPER_SHARE = 0.8
 """Of the white paper around the squares, which is as flat as they are; its very edge may bend."""
-FEWEST_CORNERS = 6
 FEWEST_PASSAGES = 30
 """Of a sweep; fewer say nothing that the noise can be told from."""
 
@@ -60,7 +59,7 @@ def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sight
         return np.concatenate([np.zeros(0), *(getattr(sweep, name) for sweep in sweeps)])
 
     sizes = [sweep.x_px.size for sweep in sweeps]
-    velocity = [np.full(sweep.x_px.size, np.sign(sweep.direction) * sweep.speed_per_s) for sweep in sweeps]
+    velocity = [np.full(sweep.x_px.size, sweep.velocity_per_s) for sweep in sweeps]
     return Sighting(
         name=view.name,
         corners_m=board.corners_m[view.corners.ids],

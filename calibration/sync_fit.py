@@ -58,6 +58,11 @@ class SweepTiming:
     sd_s: float
     passages: int
 
+    @property
+    def velocity_per_s(self) -> float:
+        """Signed."""
+        return self.direction * self.speed_per_s
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyncFit:
@@ -91,7 +96,7 @@ class SyncFit:
     @property
     def velocities_per_s(self) -> tuple[float, ...]:
         """Signed, of the sweeps."""
-        return tuple(sweep.direction * sweep.speed_per_s for sweep in self.sweeps)
+        return tuple(sweep.velocity_per_s for sweep in self.sweeps)
 
     @property
     def steady(self) -> bool:
@@ -169,7 +174,7 @@ def _by_sweep(seen: SharedPixels, solved: Solved, lag_s: dict[int, float]) -> tu
 
 
 def _require_speeds(sweeps: Sequence[Passages]) -> None:
-    if not lag_groups([sweep.direction * sweep.speed_per_s for sweep in sweeps]):
+    if not lag_groups([sweep.velocity_per_s for sweep in sweeps]):
         at = f" at {sweeps[0].speed_per_s:.4g} /s" if sweeps else ""
         raise Degenerate(
             "one-speed",

@@ -17,13 +17,12 @@ from calibration.rig_fit import RigFit
 from calibration.rig_normal import corner_weights
 from calibration.rig_sightings import corner_scale
 from calibration.sweep_fit import SweepFit
-from calibration.views import BoardPose, View
+from calibration.views import FEWEST_CORNERS, BoardPose, View
 
 Array = NDArray[np.float64]
 
 _STEP = 1e-6
 """Of the command range, and of a pose in rad and m, for differences."""
-_FEWEST_CORNERS = 6
 _ROUNDS = 8
 """In which a pose settles with the weights of its corners."""
 _FEWEST_TO_SPLIT = 4
@@ -91,7 +90,7 @@ def _corner_pose(model: RigModel, fit: RigFit, view: View, start: BoardPose) -> 
         return None
     px = np.asarray(view.corners.px, np.float64)
     known = np.isfinite(px).all(axis=1)
-    if np.count_nonzero(known) < _FEWEST_CORNERS:
+    if np.count_nonzero(known) < FEWEST_CORNERS:
         return None
     points, px, camera = fit.board.corners_m[view.corners.ids[known]], px[known], model.camera
     sd_px = fit.noise.corner_sd_px * corner_scale(view.corners)[known]

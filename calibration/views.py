@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 
 NO_POSE = "corners of a view are no picture of a board; take the view out, or name the board that it shows"
 USUAL_CORNER_SD_PX = 0.03
+FEWEST_CORNERS = 6
+"""That give a board's pose, with some to spare."""
 LEAST_ACROSS_PX = 1.0
 """Of corners that give a pose; they are found to some 0.01 px."""
 
@@ -61,6 +63,11 @@ class Passages:
     sd: Array
     direction: int
     speed_per_s: float
+
+    @property
+    def velocity_per_s(self) -> float:
+        """Of the command, signed."""
+        return float(np.sign(self.direction)) * self.speed_per_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,9 +16,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
+from calibration.files import CALIBRATION_FILE
 from calibration.model import Identity, RigModel
 from rig.errors import UsageError
-from rig.recording.inputs import CALIBRATION_FILE
 from rig.recording.manifest import read_manifest
 from rig.replaying import PlaysRecording
 from rig.session import OpenRig

@@ -13,6 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from calibration.files import CALIBRATION_FILE
 from calibration.model import RigModel
 from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
 from drivers.recorded import RecordedRun, RunRecording
@@ -23,7 +24,7 @@ from rig.config_files import parse_config
 from rig.errors import DamagedRecordingError, UsageError
 from rig.estimators import Learned
 from rig.plan import spad_request
-from rig.recording.inputs import CALIBRATION_FILE, read_plan
+from rig.recording.inputs import read_plan
 from rig.recording.manifest import MANIFEST, is_cut_short, read_manifest, require_inputs
 from rig.recording.part import part_learned, part_starts
 from rig.recording.passes import pass_plan, recorded_passes

@@ -120,6 +120,10 @@ class ScanPlan:
         """Speed of the command over the lit part, per second, positive."""
         return abs(self.command_range[1] - self.command_range[0]) / float(self.places * self.column_s)
 
+    def velocity_per_s(self, direction: int) -> float:
+        """Velocity of the command over the lit part of a sweep up (+1) or down (-1), signed."""
+        return direction * self.speed_per_s
+
     @property
     def map_rate_hz(self) -> float:
         """Depth maps per second of scanning."""

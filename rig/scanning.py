@@ -268,7 +268,7 @@ def _collect(
             if replayed is not None:
                 truth = replayed.truth(found.sweep.index)
             elif rig.world is not None:  # asked only now: no estimate ever sees it
-                velocity_per_s = found.sweeps[0].direction * plan.speed_per_s
+                velocity_per_s = plan.velocity_per_s(found.sweeps[0].direction)
                 truth = rig.world.truth(plan.line_commands(found.column), velocity_per_s)
             of_maps.append(found.sweeps)  # before its map: whatever ends the run, no map is without its account
             run.add(found.result, found.compute_s, truth)

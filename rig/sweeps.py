@@ -163,7 +163,7 @@ class SweepAssembler:
         self._gaps = [gap for gap in self._gaps if gap[1] >= clock.end_frame]
         begun = time.perf_counter()
         direction = self._plan.leg(clock.sweep).direction
-        volume = replace(self._counter.finish(), velocity_per_s=direction * self._plan.speed_per_s)
+        volume = replace(self._counter.finish(), velocity_per_s=self._plan.velocity_per_s(direction))
         self._count_s += time.perf_counter() - begun
         data = SweepData(
             index=self._first_index + clock.sweep - self._start.sweep,

@@ -173,7 +173,7 @@ def score_methods(
         running = Acquisition(rig, plan, timing, MAPS, maker, on_progress=tell).run()
         with closing(running):
             last = [found for found in running][-1]
-        truth = rig.world.truth(plan.line_commands(last.column), last.sweep.direction * plan.speed_per_s)
+        truth = rig.world.truth(plan.line_commands(last.column), plan.velocity_per_s(last.sweep.direction))
     expected = last.sweep.frames.expected
     sensor_ms = 1e3 * (expected / float(plan.frame_rate_hz) + plan.readout_s(expected))
     return {

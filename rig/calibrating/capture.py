@@ -161,7 +161,7 @@ def _sweep_counts(sweep: SweepData, plan: ScanPlan) -> SweepCounts:
     volume = sweep.volume
     assert isinstance(volume, CountVolume), "what argmax has counted"
     lag_s = _leg(plan, sweep.direction).lag_s
-    command = plan.command_at(volume.column) + sweep.direction * plan.speed_per_s * lag_s
+    command = plan.command_at(volume.column) + plan.velocity_per_s(sweep.direction) * lag_s
     return SweepCounts(volume.counts, volume.n_frames, command, volume.x0, volume.width)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from calibration.dark_tally import DarkTally
 from calibration.errors import CalibrationError
-from calibration.files import load_rig_model, save_rig_model
+from calibration.files import CALIBRATION_FILE, load_rig_model, save_rig_model
 from calibration.model import RigModel
 from calibration.pixel_drift import PixelDrift, pixel_drift
 from calibration.pixel_files import PixelVersion, load_pixels, save_pixels
@@ -39,7 +39,6 @@ from rig.session import OpenRig, open_rig
 _log = logging.getLogger(__name__)
 
 PIXELS_FILE: Final = "pixels.npz"
-CALIBRATION_FILE: Final = "calibration.yaml"
 LIT_FRAMES: Final = 100
 """Exposures with the line on a pixel: one that sees a photon in three is judged."""
 

@@ -15,7 +15,7 @@ from typing import Any, Self
 import yaml
 
 from calibration.board import Board, load_board
-from calibration.files import save_rig_model
+from calibration.files import CALIBRATION_FILE, save_rig_model
 from calibration.model import Identity, RigModel
 from calibration.views import View
 from rig.calibrating.sources import VIEWS
@@ -24,7 +24,6 @@ from rig.errors import UsageError
 from rig.outputs import RunFolder
 from rig.run import OutFolder
 
-CALIBRATION_FILE = "calibration.yaml"
 RIG_FILE = "rig.json"
 BOARD_FILE = "board.yaml"
 

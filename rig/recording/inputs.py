@@ -6,14 +6,13 @@ from typing import Final
 import yaml
 
 from calibration.errors import CalibrationError
-from calibration.files import load_rig_model, save_rig_model
+from calibration.files import CALIBRATION_FILE, load_rig_model, save_rig_model
 from calibration.model import RigModel
 from rig.errors import UsageError
 from rig.recording.plain import from_plain, to_plain
 from rig.scan_plan import ScanPlan
 
 PLAN_FILE: Final = "plan.yaml"
-CALIBRATION_FILE: Final = "calibration.yaml"
 PLAN_FORMAT: Final = "spadrig-plan"
 PLAN_VERSION: Final = 1
 

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.files import CALIBRATION_FILE
 from rig import api
 from rig.errors import RigError
-from rig.recording.inputs import CALIBRATION_FILE, PLAN_FILE
+from rig.recording.inputs import PLAN_FILE
 from rig.summary import Verdict
 from tests.campaigns.outcomes import Ending, ending, run
 from tests.campaigns.recording_corruptions import scratch_folder, wound
