@@ -1,14 +1,17 @@
 """The rig model and its mathematics: camera, light planes, triangulation, and the calibration file.
 
-Pure functions on arrays. This package imports nothing else of the project.
+Pure functions on arrays. This package imports nothing else of the project. Its parts, each knowing only those before
+it: `model` and `depth` are the rig and what errors are worth, `files` what is written; `board`, `passages`, `pixels`
+and `sync` go from frames to numbers; `camera_fit`, `rig_fit`, `check` and `guide` from those to a model and to more
+views; `judging` says whether it will do.
 """
 
-from calibration.camera import Camera
-from calibration.covariance import Covariance
 from calibration.errors import CalibrationError
-from calibration.files import load_rig_model, save_rig_model
-from calibration.model import Identity, Lag, RigModel
-from calibration.scanner import PivotScanner, PlaneTable, Scanner
+from calibration.files.rig_file import load_rig_model, save_rig_model
+from calibration.model.camera import Camera
+from calibration.model.covariance import Covariance
+from calibration.model.rig_model import Identity, Lag, RigModel
+from calibration.model.scanner import PivotScanner, PlaneTable, Scanner
 
 __all__ = [
     "CalibrationError",

@@ -19,8 +19,8 @@ from rig.errors import UsageError
 from rig.run import OutFolder, Progress
 
 if TYPE_CHECKING:
-    from calibration.board import Board
-    from calibration.model import RigModel
+    from calibration.board.board import Board
+    from calibration.model.rig_model import RigModel
     from rig.calibrating.pixel_result import PixelResult
     from rig.calibrating.result import CalibrationResult
     from rig.calibrating.showing import Ask, Tell
@@ -57,8 +57,8 @@ def calibrate_planes(
     per column, by turns. arm: must be True where laser or gate are real. ask: has the board of a real rig moved and
     returns once it is. tell: takes a line for each view. out: a folder to write, None: nothing.
     """
-    from calibration.camera_files import load_camera
-    from calibration.judging import AT_M
+    from calibration.files.camera_file import load_camera
+    from calibration.judging.rig import AT_M
     from rig.calibrating.planes_run import POSES, PlanesAsked, run_planes
 
     problems = _problems(poses, seed, exposures)
@@ -101,7 +101,7 @@ def calibrate_camera(
 
     terms: of the lens model: 0, 4, 5, 8, 12 or 14, as OpenCV counts them. All else as `calibrate_planes`.
     """
-    from calibration.distortion import TERM_COUNTS
+    from calibration.model.distortion import TERM_COUNTS
     from rig.calibrating.camera_run import CameraAsked, run_camera
     from rig.calibrating.planes_run import POSES
     from rig.calibrating.sources import sort_sources
@@ -161,7 +161,7 @@ def calibrate_sync(
     calibration: the model they go into; None: that of the live rig. exposures: per column, a speed each. All else as
     `calibrate_planes`.
     """
-    from calibration.judging import AT_M
+    from calibration.judging.rig import AT_M
     from rig.calibrating.sources import sort_sources
     from rig.calibrating.sync_run import SyncAsked, run_sync
 
@@ -196,7 +196,7 @@ def calibrate_check(
     calibration: a file; None: that of the live rig. angle: between the boards of the first two views, such as '30 deg'.
     All else as `calibrate_planes`.
     """
-    from calibration.judging import AT_M
+    from calibration.judging.rig import AT_M
     from rig.calibrating.check_run import CheckAsked, run_check
     from rig.calibrating.sources import sort_sources
 
@@ -217,13 +217,13 @@ def _listed(sources: SourcesLike) -> Sequence[Config]:
 
 
 def _board(file: PathLike | None) -> "Board":
-    from calibration.board import BUNDLED_BOARD, load_board
+    from calibration.board.board import BUNDLED_BOARD, load_board
 
     return load_board(BUNDLED_BOARD if file is None else file)
 
 
 def _base(file: PathLike | None) -> "RigModel | None":
-    from calibration.files import load_rig_model
+    from calibration.files.rig_file import load_rig_model
 
     return None if file is None else load_rig_model(file)
 

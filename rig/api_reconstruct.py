@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from calibration.errors import CalibrationError
-from calibration.files import load_rig_model
-from calibration.model import RigModel
+from calibration.files.rig_file import load_rig_model
+from calibration.model.rig_model import RigModel
 from rig.api_config import PathLike
 from rig.api_scan import replay
 from rig.config import CubePlan, EstimateConfig, Estimator, Filter
@@ -39,7 +39,7 @@ def reconstruct(
         if plan is not None:
             raise UsageError(f"{source} is a recording, which has the plan it was taken with; leave --plan out")
         if isinstance(calibration, RigModel):
-            raise UsageError("the calibration for a recording is a file; calibration.files.save_rig_model writes one")
+            raise UsageError("the calibration for a recording is a file; calibration.save_rig_model writes one")
         return replay(
             source,
             clock="max",

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.light_sheet import fan_origin
-from calibration.model import RigModel
-from calibration.scanner import PivotScanner
-from calibration.triangulation import inverse_depth
+from calibration.model.light_sheet import fan_origin
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PivotScanner
+from calibration.model.triangulation import inverse_depth
 
 Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""Compiled depth of pixels on bowed sheets of light, see `calibration.light_sheet` for the formula."""
+"""Compiled depth of pixels on bowed sheets of light, see `calibration.model.light_sheet` for the formula."""
 
 from typing import Final
 

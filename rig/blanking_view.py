@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.model import RigModel
+from calibration.model.rig_model import RigModel
 from rig.scan_plan import ScanPlan
 
 DEPTHS_TRIED = 32

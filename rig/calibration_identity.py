@@ -16,8 +16,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from calibration.files import CALIBRATION_FILE
-from calibration.model import Identity, RigModel
+from calibration.files.rig_file import CALIBRATION_FILE
+from calibration.model.rig_model import Identity, RigModel
 from rig.errors import UsageError
 from rig.recording.manifest import read_manifest
 from rig.replaying import PlaysRecording

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.model import RigModel
-from calibration.scanner import PlaneTable
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PlaneTable
 from rig.config import CubePlan
 from rig.counting import Counter, FrameTally
 from rig.errors import UsageError

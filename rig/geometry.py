@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.model import RigModel
-from calibration.triangulation import LEAST_OFFSET_M, near_side
+from calibration.model.rig_model import RigModel
+from calibration.model.triangulation import LEAST_OFFSET_M, near_side
 from rig.bent_light import BentLight, bent_light, bent_u, beside_px, is_bent
 from rig.errors import UsageError
 

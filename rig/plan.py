@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.model import Lag, RigModel
+from calibration.model.rig_model import Lag, RigModel
 from drivers.errors import LimitExceeded
 from drivers.frames import frame_bytes
 from drivers.interfaces import (

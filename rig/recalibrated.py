@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.errors import CalibrationError
-from calibration.model import RigModel
+from calibration.model.rig_model import RigModel
 from rig.errors import UsageError
 from rig.geometry import WORD_PX, sweep_geometry
 from rig.multi_line import window_overlap

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.model import RigModel
+from calibration.model.rig_model import RigModel
 from rig.counting import Counter, FrameTally, SweepLayout
 from rig.depth import depth_map
 from rig.errors import UsageError

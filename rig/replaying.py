@@ -13,8 +13,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from calibration.files import CALIBRATION_FILE
-from calibration.model import RigModel
+from calibration.files.rig_file import CALIBRATION_FILE
+from calibration.model.rig_model import RigModel
 from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.recorded.segments import NO_SEGMENT, segment_files

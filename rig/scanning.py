@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from calibration.model import RigModel
+from calibration.model.rig_model import RigModel
 from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
 from drivers.registry import KindConfig

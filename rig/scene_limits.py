@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.files import load_rig_model
-from calibration.model import RigModel
+from calibration.files.rig_file import load_rig_model
+from calibration.model.rig_model import RigModel
 from rig.config import RigConfig
 from rig.effects import ReportsEffects, open_world
 from rig.errors import UsageError

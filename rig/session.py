@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.files import load_rig_model
-from calibration.model import RigModel
+from calibration.files.rig_file import load_rig_model
+from calibration.model.rig_model import RigModel
 from drivers.clock import Clock, SystemClock, VirtualClock
 from drivers.errors import DeviceError
 from drivers.guard import Guard

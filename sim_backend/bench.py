@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.model import Lag
+from calibration.model.rig_model import Lag
 from drivers.clock import NS_PER_S, Clock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, Pulse, ScanWaveform
 from sim_backend.gate_program import GateProgram, gate_shares

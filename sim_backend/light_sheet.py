@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.light_sheet import LightSheets
+from calibration.model.light_sheet import LightSheets
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.light_sheet import LightSheets
+from calibration.model.light_sheet import LightSheets
 from sim_backend.light_sheet import LightSheet, empty_sheet
 
 Array = NDArray[np.float64]

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.model import RigModel
+from calibration.model.rig_model import RigModel
 from sim_backend.light_sheet import LightSheet, empty_sheet
 from sim_backend.light_sheet_kernels import DEPTH_JUMP, span_bounds, trace_rows
 from sim_backend.scenes.surfaces import Surfaces

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from calibration.errors import CalibrationError
-from calibration.files import load_rig_model
-from calibration.model import RigModel
+from calibration.files.rig_file import load_rig_model
+from calibration.model.rig_model import RigModel
 from drivers.errors import DeviceError
 from drivers.interfaces import SweepTruth
 from drivers.registry import Kind, KindConfig, Surroundings

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from calibration.board import Board
-from calibration.camera_files import camera_content, camera_file_text, corners_digest
-from calibration.camera_fit import CameraFit, fit_camera
-from calibration.camera_judging import ACCURACY_PX, JudgedCamera, judge_camera
+from calibration.board.board import Board
+from calibration.camera_fit.fit import CameraFit, fit_camera
 from calibration.errors import Degenerate
-from calibration.judging import AT_M
+from calibration.files.camera_file import camera_content, camera_file_text, corners_digest
+from calibration.judging.camera import ACCURACY_PX, JudgedCamera, judge_camera
+from calibration.judging.rig import AT_M
 from rig.calibrating.planes_run import POSES
 from rig.calibrating.refusing import refusal
 from rig.calibrating.report import camera_report
@@ -43,7 +43,7 @@ def run_camera(
     ask: Ask | None = None,
     tell: Tell | None = None,
 ) -> CalibrationResult:
-    """Calibrate the camera; camera.yaml (`calibration.camera_files`) can be given to a calibration of the planes.
+    """Calibrate the camera; camera.yaml (`calibration.files.camera_file`) can be given to a calibration of the planes.
 
     Raises Degenerate where the views make no camera; its notes say why, root cause first.
     """

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from calibration.board import Board
+from calibration.board.board import Board
 from calibration.errors import Degenerate
-from calibration.even_albedo import board_pixels, even_pixels
-from calibration.flux_picture import flux_picture
-from calibration.model import Identity
-from calibration.passages import SweepCounts, find_passages
+from calibration.model.rig_model import Identity
+from calibration.passages.even_albedo import board_pixels, even_pixels
+from calibration.passages.finding import SweepCounts, find_passages
+from calibration.passages.flux_picture import flux_picture
 from calibration.views import Corners, Passages, View
 from rig.calibration_identity import identity_of
 from rig.config import RigConfig
@@ -183,7 +183,7 @@ def _corners(
 ) -> tuple[Corners | None, Degenerate | None]:
     if board is None:
         return None, None
-    from calibration.detection import find_corners
+    from calibration.board.detection import find_corners
 
     try:
         return find_corners(picture, board, defects), None

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from calibration.board import Board
-from calibration.camera_files import CORNERS, corners_digest
-from calibration.check_fit import CheckedAngle, CheckedBoard, check_angle, check_boards
-from calibration.check_verdict import judge_check
+from calibration.board.board import Board
+from calibration.check.boards import CheckedAngle, CheckedBoard, check_angle, check_boards
+from calibration.depth.sensitivity import sensitivity
+from calibration.depth.uncertainty import DepthUncertainty, depth_uncertainty
 from calibration.errors import Degenerate
-from calibration.files import load_rig_model
-from calibration.judging import ACCURACY_PX, AT_M
-from calibration.model import RigModel
-from calibration.sensitivity import sensitivity
-from calibration.uncertainty import DepthUncertainty, depth_uncertainty
+from calibration.files.camera_file import CORNERS, corners_digest
+from calibration.files.rig_file import load_rig_model
+from calibration.judging.check import judge_check
+from calibration.judging.rig import ACCURACY_PX, AT_M
+from calibration.model.rig_model import RigModel
 from calibration.verdict import Asked, Verdict
 from calibration.views import View
 from rig.calibrating.report import check_report

@@ -15,7 +15,7 @@ from typing import Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.dark_tally import DarkTally
+from calibration.pixels.dark_tally import DarkTally
 from drivers.frames import FrameBlock, frame_bytes
 from drivers.interfaces import SpadInfo, SpadMode, SpadRequest
 from drivers.ring import BlockRing

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.gate_fit import Edge, edge_time, fit_edge
+from calibration.sync.gate_fit import Edge, edge_time, fit_edge
 from drivers.frames import FrameBlock
 from drivers.recorded import RunRecording
 from rig.binding import FrameBinder

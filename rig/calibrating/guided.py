@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Sequence
 
-from calibration.board import Board
+from calibration.board.board import Board
 from calibration.errors import CalibrationError
-from calibration.guide import Advice, candidates, next_pose
-from calibration.information import Forecast
-from calibration.judging import Judged
-from calibration.rig_fit import RigFit
+from calibration.guide.forecast import Forecast
+from calibration.guide.poses import Advice, candidates, next_pose
+from calibration.judging.rig import Judged
+from calibration.rig_fit.fit import RigFit
 from calibration.views import View
 from rig.calibrating.showing import Tell
 from rig.calibrating.taking import FixedPoses, Taken

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.pixel_drift import PixelDrift
-from calibration.pixel_files import PixelVersion
-from calibration.pixels import PixelMap
+from calibration.pixels.drift import PixelDrift
+from calibration.pixels.pixel_file import PixelVersion
+from calibration.pixels.pixel_map import PixelMap
 from calibration.verdict import Verdict
 from rig.calibrating.report_page import Section, page, paragraph, picture, table
 from rig.svg_chart import Panel, Series, chart_svg

@@ -6,9 +6,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from calibration.pixel_drift import LEAST_ALIKE, MOST_NEW_DEFECTS, MOST_RATIO, PixelDrift
-from calibration.pixel_files import PixelVersion
-from calibration.pixels import PixelMap, frames_for, hot_flux
+from calibration.pixels.drift import LEAST_ALIKE, MOST_NEW_DEFECTS, MOST_RATIO, PixelDrift
+from calibration.pixels.pixel_file import PixelVersion
+from calibration.pixels.pixel_map import PixelMap, frames_for, hot_flux
 from calibration.verdict import Reason, Verdict
 from rig.calibrating.result import EXIT_NOT_TRUSTWORTHY
 

@@ -14,13 +14,13 @@ from typing import Final
 
 import numpy as np
 
-from calibration.dark_tally import DarkTally
 from calibration.errors import CalibrationError
-from calibration.files import CALIBRATION_FILE, load_rig_model, save_rig_model
-from calibration.model import RigModel
-from calibration.pixel_drift import PixelDrift, pixel_drift
-from calibration.pixel_files import PixelVersion, load_pixels, save_pixels
-from calibration.pixels import SIGNAL, PixelMap, frames_for, hot_flux, judge_pixels, light_leak
+from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
+from calibration.model.rig_model import RigModel
+from calibration.pixels.dark_tally import DarkTally
+from calibration.pixels.drift import PixelDrift, pixel_drift
+from calibration.pixels.pixel_file import PixelVersion, load_pixels, save_pixels
+from calibration.pixels.pixel_map import SIGNAL, PixelMap, frames_for, hot_flux, judge_pixels, light_leak
 from drivers.recorded.segments import segment_files
 from rig.api_config import SIMULATED, Config, PathLike, configure
 from rig.calibrating.dark_frames import SPREAD_S, Sums, recorded_exposure_s, take_dark, take_sweeps

@@ -2,9 +2,9 @@
 
 from collections import Counter
 
-from calibration.board import Board
+from calibration.board.board import Board
 from calibration.errors import Degenerate
-from calibration.judging import judge_refused
+from calibration.judging.rig import judge_refused
 from rig.calibrating.taking import Taken
 
 

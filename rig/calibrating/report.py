@@ -5,15 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board import Board
-from calibration.camera import Camera
-from calibration.camera_fit import CameraFit
-from calibration.camera_judging import JudgedCamera
-from calibration.check_fit import CheckedBoard
-from calibration.judging import Judged
-from calibration.rig_fit import RigFit
-from calibration.sync_fit import SyncFit
-from calibration.uncertainty import DepthUncertainty
+from calibration.board.board import Board
+from calibration.camera_fit.fit import CameraFit
+from calibration.check.boards import CheckedBoard
+from calibration.depth.uncertainty import DepthUncertainty
+from calibration.judging.camera import JudgedCamera
+from calibration.judging.rig import Judged
+from calibration.model.camera import Camera
+from calibration.rig_fit.fit import RigFit
+from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import Verdict
 from calibration.views import BoardPose, View
 from rig.calibrating.report_charts import plane_residuals

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from calibration.sweep_waves import SweepResidual, SweepWaves
+from calibration.judging.sweep_waves import SweepResidual, SweepWaves
 from rig.calibrating.report_pictures import view_colour
 from rig.svg_chart import Panel, Series, chart_svg
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.uncertainty import DepthUncertainty
+from calibration.depth.uncertainty import DepthUncertainty
 from rig.pictures import depth_limits, depth_picture
 
 Array = NDArray[np.float64]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from calibration.model import RigModel
+from calibration.model.rig_model import RigModel
 from calibration.verdict import Verdict
 
 EXIT_NOT_TRUSTWORTHY = 1

@@ -14,9 +14,9 @@ from typing import Any, Self
 
 import yaml
 
-from calibration.board import Board, load_board
-from calibration.files import CALIBRATION_FILE, save_rig_model
-from calibration.model import Identity, RigModel
+from calibration.board.board import Board, load_board
+from calibration.files.rig_file import CALIBRATION_FILE, save_rig_model
+from calibration.model.rig_model import Identity, RigModel
 from calibration.views import View
 from rig.calibrating.sources import VIEWS
 from rig.calibrating.view_files import save_view

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from calibration.guide import Candidate
+from calibration.guide.poses import Candidate
 from calibration.views import BoardPose
 from drivers.units import format_quantity
 from rig.config import RigConfig

@@ -7,14 +7,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from calibration.depth.sensitivity import sensitivity
 from calibration.errors import CalibrationError, Degenerate
-from calibration.files import load_rig_model
-from calibration.judging import ACCURACY_PX, AT_M
-from calibration.lag_transfer import known_row_delay, with_lags
-from calibration.model import RigModel
-from calibration.sensitivity import sensitivity
-from calibration.sync_fit import SyncFit, fit_sync
-from calibration.sync_verdict import judge_sync
+from calibration.files.rig_file import load_rig_model
+from calibration.judging.rig import ACCURACY_PX, AT_M
+from calibration.judging.sync import judge_sync
+from calibration.model.rig_model import RigModel
+from calibration.sync.lag_fit import SyncFit, fit_sync
+from calibration.sync.transfer import known_row_delay, with_lags
 from calibration.verdict import Asked, Verdict
 from rig.calibrating.capture import capture_view
 from rig.calibrating.gate_times import GateDelay, gate_delay

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board import Board
-from calibration.camera import Camera
-from calibration.detection import find_corners
+from calibration.board.board import Board
+from calibration.board.detection import find_corners
 from calibration.errors import CalibrationError, Degenerate
-from calibration.files import load_rig_model
-from calibration.guide import Advice, candidates, rough_camera, sequence
-from calibration.model import Identity
+from calibration.files.rig_file import load_rig_model
+from calibration.guide.poses import Advice, candidates, rough_camera, sequence
+from calibration.model.camera import Camera
+from calibration.model.rig_model import Identity
 from calibration.views import View
 from rig.calibrating.capture import Capture, capture_recorded, capture_view
 from rig.calibrating.session import BOARD_FILE, Session, session_board, session_rig

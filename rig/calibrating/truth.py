@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration.against_truth import DepthErrors, depth_errors
-from calibration.model import RigModel
+from calibration.depth.against_truth import DepthErrors, depth_errors
+from calibration.model.rig_model import RigModel
 from rig.calibrating.result import KnowsRig
 from rig.config import RigConfig
 from rig.session import open_rig

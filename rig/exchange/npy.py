@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, Final
 
 import numpy as np
 
-from calibration.camera import Camera
+from calibration.model.camera import Camera
 from drivers.frames import FrameBlock
 from rig.exchange.frame_log import FrameLog
 from rig.exchange.photoncube import SIDECAR_FORMAT, TRANSFORMS

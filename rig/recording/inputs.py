@@ -6,8 +6,8 @@ from typing import Final
 import yaml
 
 from calibration.errors import CalibrationError
-from calibration.files import CALIBRATION_FILE, load_rig_model, save_rig_model
-from calibration.model import RigModel
+from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
+from calibration.model.rig_model import RigModel
 from rig.errors import UsageError
 from rig.recording.plain import from_plain, to_plain
 from rig.scan_plan import ScanPlan

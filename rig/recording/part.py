@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.model import RigModel
+from calibration.model.rig_model import RigModel
 from drivers.frames import Mark
 from drivers.recorded import RecordedRun, RunRecording
 from rig.config import EstimateConfig

@@ -1,6 +1,6 @@
 """Where a simulated device stands: on the bench of the world it was created in, or on one of its own."""
 
-from calibration.model import Lag
+from calibration.model.rig_model import Lag
 from drivers.errors import DeviceError
 from drivers.registry import Surroundings
 from sim_backend.bench import Bench

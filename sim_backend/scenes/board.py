@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board import BUNDLED_BOARD, Board, load_board
+from calibration.board.board import BUNDLED_BOARD, Board, load_board
 from calibration.errors import CalibrationError
 from calibration.views import BoardPose
 from drivers.errors import DeviceError

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board import MARGIN_SQUARES, Board
+from calibration.board.board import MARGIN_SQUARES, Board
 from calibration.views import BoardPose
 from rig.counting import CountVolume, SweepCounter, SweepLayout
 from rig.row_threads import RowWorkers

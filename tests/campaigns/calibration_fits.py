@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from calibration.errors import CalibrationError
-from calibration.rig_fit import RigFit, fit_rig
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.robust import MAD_TO_SD
 from tests.reference.calibration_data import BOARD, Seen, random_rig, random_views
 from tests.reference.fitted_depth import depth_errors

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.errors import CalibrationError
-from calibration.guide import candidates, next_pose, rough_camera, sequence
-from calibration.information import Forecast
-from calibration.judging import judge_fit
-from calibration.rig_fit import RigFit, fit_rig
+from calibration.guide.forecast import Forecast
+from calibration.guide.poses import candidates, next_pose, rough_camera, sequence
+from calibration.judging.rig import judge_fit
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import View
 from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_rig, seen_view
 

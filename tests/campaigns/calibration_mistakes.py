@@ -19,13 +19,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board import Board
-from calibration.detection import find_corners
+from calibration.board.board import Board
+from calibration.board.detection import find_corners
 from calibration.errors import Degenerate
-from calibration.evidence import baseline_m
-from calibration.judging import judge_fit, judge_refused
-from calibration.rig_fit import fit_rig
-from calibration.scanner import PivotScanner
+from calibration.judging.evidence import baseline_m
+from calibration.judging.rig import judge_fit, judge_refused
+from calibration.model.scanner import PivotScanner
+from calibration.rig_fit.fit import fit_rig
 from calibration.views import BoardPose, View
 from sim_backend.scenes.board import ShownBoard
 from tests.campaigns.board_capture import HOT_PER_S, Stand, SweepAsked, set_up, take_sweeps

@@ -26,16 +26,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board import Board
-from calibration.detection import find_corners
+from calibration.board.board import Board
+from calibration.board.detection import find_corners
+from calibration.depth.uncertainty import command_at, depth_sd_m
 from calibration.errors import CalibrationError, Degenerate
-from calibration.even_albedo import board_pixels, even_pixels
-from calibration.even_pixels import evenly
-from calibration.model import RigModel
-from calibration.passages import SweepCounts, find_passages
-from calibration.rig_fit import RigFit, fit_rig
-from calibration.triangulation import depth_slope
-from calibration.uncertainty import command_at, depth_sd_m
+from calibration.model.rig_model import RigModel
+from calibration.model.triangulation import depth_slope
+from calibration.passages.even_albedo import board_pixels, even_pixels
+from calibration.passages.even_pixels import evenly
+from calibration.passages.finding import SweepCounts, find_passages
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import Passages, View
 from rig.calibrating.view_files import load_views, save_view
 from sim_backend.effects.dark_counts import dark_rates
@@ -95,8 +95,8 @@ def view_of(name: str, stand: Stand, taken: Sequence[SweepTaken], board: Board) 
 
 
 def room_picture(stand: Stand, taken: Sequence[SweepTaken]) -> NDArray[np.float32]:
-    """What the room's light shows (rows, width), photons per exposure, as `calibration.flux_picture` has it but for its
-    care of windows that move; NaN outside the window."""
+    """What the room's light shows (rows, width), photons per exposure, NaN outside the window: as
+    `calibration.passages.flux_picture` has it but for its care of windows that move."""
     ones, frames = np.zeros(taken[0].volume.counts.shape[1:], np.int64), 0
     for sweep in taken:
         counts, n = sweep.volume.counts, sweep.asked.exposures

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.files import CALIBRATION_FILE
+from calibration.files.rig_file import CALIBRATION_FILE
 from rig import api
 from rig.errors import RigError
 from rig.recording.inputs import PLAN_FILE

@@ -39,7 +39,7 @@ def reconstructor_of(
     temporal_prior: bool = False,
 ) -> Any:
     """The project's Reconstructor for the rig of a working point; it has learned nothing yet. lines: a LineGrid."""
-    from calibration.files import load_rig_model
+    from calibration.files.rig_file import load_rig_model
     from rig.reconstruction import Reconstructor
 
     with tempfile.TemporaryDirectory() as folder:

@@ -67,7 +67,7 @@ class Study:
     """Estimates of one scene at a working point by the project's estimators, columns with exposures of their own."""
 
     def __init__(self, scene: Scene, point: str, rows: slice) -> None:
-        from calibration.files import load_rig_model
+        from calibration.files.rig_file import load_rig_model
 
         height, width = scene.shape
         self.point = WorkingPoint(scene, POINTS[point], Geometry.build(width=width, height=height))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board import WHITE, Board
+from calibration.board.board import WHITE, Board
 from calibration.views import BoardPose
 
 Array = NDArray[np.float64]

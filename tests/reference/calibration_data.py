@@ -1,6 +1,6 @@
 """Views of a calibration board as a known rig would see them: corners and passages by exact ray tracing.
 
-A yardstick for `calibration.rig_fit`: its own lens, rotations and light, nothing shared with what it judges but the
+A yardstick for `calibration.rig_fit.fit`: its own lens, rotations and light, nothing shared with what it judges but the
 data classes it hands over. Light leaves the mirror in sheets that turn about an axis; a sheet may pass the axis at a
 distance, lie on a cone and bow.
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board import Board
+from calibration.board.board import Board
 from calibration.views import Corners, Passages, View
 
 Array = NDArray[np.float64]

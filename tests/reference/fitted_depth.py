@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.model import RigModel
-from calibration.uncertainty import depth_sd_m
+from calibration.depth.uncertainty import depth_sd_m
+from calibration.model.rig_model import RigModel
 from tests.reference.calibration_data import TrueRig, points_at
 
 Array = NDArray[np.float64]

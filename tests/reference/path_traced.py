@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera import Camera
-from calibration.model import RigModel
-from calibration.scanner import PlaneTable
+from calibration.model.camera import Camera
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PlaneTable
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.flux import FluxModel
 from tests.unit.sim.rigs import setting, wall

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board import MARGIN_SQUARES, Board
-from calibration.camera import Camera
-from calibration.model import Lag, RigModel
-from calibration.scanner import PivotScanner
+from calibration.board.board import MARGIN_SQUARES, Board
+from calibration.model.camera import Camera
+from calibration.model.rig_model import Lag, RigModel
+from calibration.model.scanner import PivotScanner
 from calibration.views import BoardPose
 
 Array = NDArray[np.float64]

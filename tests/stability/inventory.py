@@ -1,7 +1,7 @@
 """Which public numeric functions there are, and by what each is held to its whole domain.
 
-A test says with `@covers("calibration.triangulation:depth")` whose domain it goes through; what needs no such test is
-in `EXCUSED` with the reason. `test_inventory.py` fails where a function of `SCOPE` is in neither.
+A test says with `@covers("calibration.model.triangulation:depth")` whose domain it goes through; what needs no such
+test is in `EXCUSED` with the reason. `test_inventory.py` fails where a function of `SCOPE` is in neither.
 """
 
 import ast

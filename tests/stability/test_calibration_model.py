@@ -7,15 +7,15 @@ import numpy as np
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from calibration.camera import Camera
-from calibration.covariance import Covariance
+from calibration.depth.uncertainty import command_at, depth_jacobian, depth_sd_m, depth_uncertainty, explained
 from calibration.errors import CalibrationError
-from calibration.light_sheet import fan_origin, light_sheets
-from calibration.model import Lag, RigModel
-from calibration.parameters import parameters, with_parameters
-from calibration.scanner import PivotScanner, PlaneTable
-from calibration.triangulation import NEARLY_PARALLEL
-from calibration.uncertainty import command_at, depth_jacobian, depth_sd_m, depth_uncertainty, explained
+from calibration.model.camera import Camera
+from calibration.model.covariance import Covariance
+from calibration.model.light_sheet import fan_origin, light_sheets
+from calibration.model.parameters import parameters, with_parameters
+from calibration.model.rig_model import Lag, RigModel
+from calibration.model.scanner import PivotScanner, PlaneTable
+from calibration.model.triangulation import NEARLY_PARALLEL
 from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 
@@ -35,8 +35,8 @@ def mirror(**changes) -> PivotScanner:
 
 
 @covers(
-    "calibration.light_sheet:light_sheets", "calibration.light_sheet:LightSheets.*",
-    "calibration.light_sheet:fan_origin", "calibration.scanner:PivotScanner.turned",
+    "calibration.model.light_sheet:light_sheets", "calibration.model.light_sheet:LightSheets.*",
+    "calibration.model.light_sheet:fan_origin", "calibration.model.scanner:PivotScanner.turned",
 )  # fmt: skip
 @EXAMPLES
 @given(
@@ -67,7 +67,7 @@ def test_bowed_sheets_of_any_numbers_give_depth_or_none(
     assert np.all(np.abs(sheets.distance_m(points))[met] <= 1e-9 * size[met])
 
 
-@covers("calibration.light_sheet:LightSheets.depth")
+@covers("calibration.model.light_sheet:LightSheets.depth")
 def test_depth_on_a_bowed_sheet_is_exact(worst) -> None:
     bow, point, terms = 0.03, (-0.3, 0.01, 0.02), (0.1, 0.4)
     phi, way = np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(0.5, 9, 5))
@@ -91,7 +91,7 @@ def test_depth_on_a_bowed_sheet_is_exact(worst) -> None:
     worst("depth on a bowed sheet, rays 1 to 30 degrees off it", "light traced in 50 digits", errors, 1e-13)
 
 
-@covers("calibration.model:RigModel.sheets", "calibration.model:RigModel.mirror_command")
+@covers("calibration.model.rig_model:RigModel.sheets", "calibration.model.rig_model:RigModel.mirror_command")
 @EXAMPLES
 @given(lag=st.floats(0, 1), delay=st.floats(-1e-3, 1e-3), row=st.floats(0, 1e4), velocity=st.floats(-1e5, 1e5))
 def test_the_mirror_is_behind_by_lag_and_row(lag, delay, row, velocity) -> None:
@@ -101,7 +101,7 @@ def test_the_mirror_is_behind_by_lag_and_row(lag, delay, row, velocity) -> None:
     assert np.array_equal(model.sheets([0.1, 0.2]).planes, model.planes([0.1, 0.2]))
 
 
-@covers("calibration.parameters:parameters", "calibration.parameters:with_parameters")
+@covers("calibration.model.parameters:parameters", "calibration.model.parameters:with_parameters")
 @EXAMPLES
 @given(changes=st.dictionaries(st.sampled_from(["fx", "k1", "axis_turn_1", "axis_turn_2", "axis_shift_2", "angle_1",
        "angle_3", "offset_0", "cone", "bow", "lag_forward", "row_delay"]), ANY | st.floats(-0.1, 0.1)))  # fmt: skip
@@ -117,7 +117,7 @@ def test_changed_models_are_models_or_refused(changes) -> None:
     assert np.abs(np.linalg.norm(changed.planes([-1, 0, 1])[:, :3], axis=1) - 1).max() < 1e-12
 
 
-@covers("calibration.uncertainty:*", "calibration.covariance:Covariance.of")
+@covers("calibration.depth.uncertainty:*", "calibration.model.covariance:Covariance.of")
 @EXAMPLES
 @given(
     seed=st.integers(0, 10**6), scale=st.sampled_from([0.0, 1e-12, 1e-3, 1e3]), depth_m=st.floats(1e-3, 1e4),

@@ -56,43 +56,39 @@ ELSEWHERE = {
         "tests/unit/rig/test_bent_light.py", "rig.bent_light:*", "rig.bent_light_kernels:*",
     ),
     "boards, their drawings and corners; pictures of anything in test_calibration_data.py": (
-        "tests/unit/calibration/test_detection.py", "calibration.board:*", "calibration.board_drawing:*",
-        "calibration.board_map:*", "calibration.board_search:*", "calibration.corner_registration:*",
-        "calibration.hot_pixels:*", "calibration.marker_layout:*", "calibration.views:*",
+        "tests/unit/calibration/test_detection.py", "calibration.board.*:*", "calibration.views:*",
     ),
     "steps of the camera's fit; whole fits of any views in test_calibration_data.py": (
-        "tests/unit/calibration/test_camera_fit.py", "calibration.camera_*:*", "calibration.coverage:*",
+        "tests/unit/calibration/test_camera_fit.py", "calibration.camera_fit.*:*", "calibration.judging.camera:*",
     ),
     "steps from counts to passages; any counts in test_calibration_data.py": (
-        "tests/unit/calibration/test_passages.py", "calibration.line_search:*", "calibration.passage*:*",
-        "calibration.even_*:*", "calibration.sync_pixels:*",
+        "tests/unit/calibration/test_passages.py", "calibration.passages.*:*", "calibration.sync.shared_pixels:*",
     ),
     "steps of the whole fit; whole fits of any views in test_calibration_data.py": (
-        "tests/unit/calibration/test_rig_fit.py", "calibration.rig_*:*", "calibration.sweep_fit:*",
+        "tests/unit/calibration/test_rig_fit.py", "calibration.rig_fit.*:*",
     ),
     "lags and delays against drawn passages": (
-        "tests/unit/calibration/test_sync_fit.py", "calibration.sync_fit:*", "calibration.gate_fit:*",
+        "tests/unit/calibration/test_sync_fit.py", "calibration.sync.lag_fit:*", "calibration.sync.gate_fit:*",
     ),
     "which lags sweeps tell, against sweeps and fits of them": (
-        "tests/unit/calibration/test_lags.py", "calibration.lag_speeds:*", "calibration.lag_verdict:*",
-        "calibration.lag_transfer:*",
+        "tests/unit/calibration/test_lags.py", "calibration.model.lag_speeds:*", "calibration.judging.lags:*",
+        "calibration.sync.transfer:*",
     ),
     "boards at known places, scanned": (
-        "tests/unit/calibration/test_check_fit.py", "calibration.board_cells:*", "calibration.check_*:*",
-        "calibration.propagation:*",
+        "tests/unit/calibration/test_check_fit.py", "calibration.check.*:*", "calibration.judging.check:*",
+        "calibration.depth.propagation:*",
     ),
     "mistakes made on purpose, each by its own number": (
-        "tests/unit/calibration/test_verdict.py", "calibration.data_lack:*", "calibration.verdict:*",
-        "calibration.evidence:*",
-        "calibration.judging:*", "calibration.view_shifts:*", "calibration.sensitivity:*",
-        "calibration.against_truth:*",
+        "tests/unit/calibration/test_verdict.py", "calibration.judging.data_lack:*", "calibration.verdict:*",
+        "calibration.judging.evidence:*", "calibration.judging.rig:*", "calibration.judging.view_shifts:*",
+        "calibration.depth.sensitivity:*", "calibration.depth.against_truth:*",
     ),
-    "poses to show next": ("tests/unit/calibration/test_guide.py", "calibration.guide:*"),
+    "poses to show next": ("tests/unit/calibration/test_guide.py", "calibration.guide.poses:*"),
     "rates drawn from a measured distribution": (
-        "tests/unit/calibration/test_pixels.py", "calibration.pixels:*", "calibration.dark_tally:*",
+        "tests/unit/calibration/test_pixels.py", "calibration.pixels.pixel_map:*", "calibration.pixels.dark_tally:*",
         "calibration.robust:*",
     ),
-    "words of a file": ("tests/unit/calibration/test_model_files.py", "calibration.yaml_file:*"),
+    "words of a file": ("tests/unit/calibration/test_model_files.py", "calibration.files.yaml_file:*"),
     "rays and surfaces put together; their light in test_light.py": (
         "tests/unit/sim/test_scene.py", "sim_backend.view:make_view",
     ),

@@ -7,9 +7,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
-from calibration.camera import Camera
-from calibration.distortion import TERM_COUNTS, LensModel
 from calibration.errors import CalibrationError
+from calibration.model.camera import Camera
+from calibration.model.distortion import TERM_COUNTS, LensModel
 from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 
@@ -51,7 +51,7 @@ def first_fold(k1: float, k2: float, k3: float, k4: float, k5: float, k6: float)
     return float(np.sqrt(real.min(initial=np.inf)))
 
 
-@covers("calibration.distortion:LensModel.valid", "calibration.distortion:LensModel.distort")
+@covers("calibration.model.distortion:LensModel.valid", "calibration.model.distortion:LensModel.distort")
 @EXAMPLES
 @given(radial=RADIAL)
 def test_past_the_first_fold_nothing_is_seen(radial) -> None:
@@ -67,7 +67,7 @@ def test_past_the_first_fold_nothing_is_seen(radial) -> None:
     np.testing.assert_array_equal(np.isfinite(x) & np.isfinite(y), r < fold)
 
 
-@covers("calibration.distortion:LensModel.undistort", "calibration.distortion:LensModel.distort")
+@covers("calibration.model.distortion:LensModel.undistort", "calibration.model.distortion:LensModel.distort")
 @EXAMPLES
 @given(terms=LENS)
 def test_what_is_seen_leads_back_to_its_ray(terms) -> None:
@@ -91,9 +91,10 @@ def test_what_is_seen_leads_back_to_its_ray(terms) -> None:
 
 
 @covers(
-    "calibration.camera:Camera.tangents", "calibration.camera:Camera.tangents_at", "calibration.camera:Camera.project",
-    "calibration.camera:Camera.tangent_slopes", "calibration.distortion:LensModel.undistort_slope",
-    "calibration.distortion:LensModel.forward", "calibration.distortion:Forward.determinant",
+    "calibration.model.camera:Camera.tangents", "calibration.model.camera:Camera.tangents_at",
+    "calibration.model.camera:Camera.project", "calibration.model.camera:Camera.tangent_slopes",
+    "calibration.model.distortion:LensModel.undistort_slope",
+    "calibration.model.distortion:LensModel.forward", "calibration.model.distortion:Forward.determinant",
 )  # fmt: skip
 @EXAMPLES
 @given(
@@ -114,7 +115,7 @@ def test_cameras_of_any_numbers_see_a_finite_ray_or_none(terms, count, focal, x,
     assert np.isnan(pairs[2][0][1])  # behind the camera
 
 
-@covers("calibration.distortion:LensModel.forward", "calibration.distortion:LensModel.undistort")
+@covers("calibration.model.distortion:LensModel.forward", "calibration.model.distortion:LensModel.undistort")
 @pytest.mark.parametrize(
     "terms",
     [[-0.35, 0.1, 0.001, -0.002, 0.01], [-0.3, 0.1, 0.001, 0.001, 0, 0.1, 0.1, 0, 0.01, 0.02, -0.01, 0.01]],

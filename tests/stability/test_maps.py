@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.camera import Camera
 from calibration.errors import CalibrationError
-from calibration.model import RigModel
-from calibration.scanner import PlaneTable
+from calibration.model.camera import Camera
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PlaneTable
 from rig.counting import BIN_DARK, CountVolume, SweepCounter, SweepLayout, SweepTally
 from rig.depth import depth_map
 from rig.errors import UsageError

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from calibration.model import RigModel
+from calibration.model.rig_model import RigModel
 from rig import api
 from tests.system.board_rig import FOCAL_PX, SIZE, write_board_rig
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from calibration.board import load_board
-from calibration.files import load_rig_model
+from calibration.board.board import load_board
+from calibration.files.rig_file import load_rig_model
 from drivers.clock import VirtualClock
 from drivers.registry import Surroundings
 from rig.api import configure

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibration.files import load_rig_model, save_rig_model
-from calibration.pixel_files import load_pixels
-from calibration.pixels import frames_for, hot_flux
+from calibration.files.rig_file import load_rig_model, save_rig_model
+from calibration.pixels.pixel_file import load_pixels
+from calibration.pixels.pixel_map import frames_for, hot_flux
 from drivers.interfaces import SpadRequest
 from rig import api
 from rig.calibrating.pixel_result import PixelResult

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from calibration.files import load_rig_model, save_rig_model
-from calibration.model import Identity
+from calibration.files.rig_file import load_rig_model, save_rig_model
+from calibration.model.rig_model import Identity
 from tests.system.conftest import Rig
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration.board import load_board
-from calibration.files import load_rig_model
+from calibration.board.board import load_board
+from calibration.files.rig_file import load_rig_model
 from rig import api
 from rig.errors import UsageError
 from tests.system.board_rig import write_board_rig

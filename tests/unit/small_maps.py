@@ -5,9 +5,9 @@ from functools import cache
 
 import numpy as np
 
-from calibration.camera import Camera
-from calibration.model import RigModel
-from calibration.scanner import PlaneTable
+from calibration.model.camera import Camera
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PlaneTable
 from rig.counting import CountVolume
 from rig.geometry import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from tests.reference.adapter import windowed

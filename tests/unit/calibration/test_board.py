@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.board import BLACK, WHITE, Board, load_board, parse_board
+from calibration.board.board import BLACK, WHITE, Board, load_board, parse_board
 from calibration.errors import CalibrationError
 
 GIVEN = {"kind": "charuco", "squares": [9, 7], "square": "60 mm", "marker": "45 mm", "dictionary": "DICT_4X4_50"}

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibration.board import Board
-from calibration.camera import Camera
-from calibration.check_fit import check_angle, check_boards
-from calibration.covariance import Covariance
+from calibration.board.board import Board
+from calibration.check.boards import check_angle, check_boards
 from calibration.errors import Degenerate
-from calibration.model import Lag, RigModel
-from calibration.parameters import with_parameters
-from calibration.scanner import PivotScanner
+from calibration.model.camera import Camera
+from calibration.model.covariance import Covariance
+from calibration.model.parameters import with_parameters
+from calibration.model.rig_model import Lag, RigModel
+from calibration.model.scanner import PivotScanner
 from calibration.views import BoardPose, Corners, Passages, View
 
 Array = NDArray[np.float64]

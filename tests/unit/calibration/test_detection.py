@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.board import BLACK, WHITE, Board
-from calibration.detection import find_corners
+from calibration.board.board import BLACK, WHITE, Board
+from calibration.board.detection import find_corners
+from calibration.board.hot_pixels import repaired
 from calibration.errors import Degenerate
-from calibration.hot_pixels import repaired
 from calibration.views import BoardPose
 from tests.reference.board_pictures import CHARUCO, CHESSBOARD, SIZE, albedo, corners_px, exposed, pose
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibration.gate_fit import Edge, edge_time, fit_edge
+from calibration.sync.gate_fit import Edge, edge_time, fit_edge
 
 FRAME_S, EXPOSURE_S = 1e-5, 0.9e-5
 START_S = np.arange(24) * FRAME_S

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from calibration.board import load_board
-from calibration.camera import Camera
-from calibration.guide import candidates, next_pose, rough_camera, sequence
+from calibration.board.board import load_board
+from calibration.guide.poses import candidates, next_pose, rough_camera, sequence
+from calibration.model.camera import Camera
 from calibration.views import BoardPose
 
 BOARD = load_board()

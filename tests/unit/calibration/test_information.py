@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.information import Forecast
-from calibration.rig_fit import fit_rig
+from calibration.guide.forecast import Forecast
+from calibration.rig_fit.fit import fit_rig
 from calibration.views import BoardPose
 from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view
 

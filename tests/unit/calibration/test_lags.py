@@ -6,16 +6,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from calibration.covariance import Covariance
 from calibration.errors import CalibrationError, Degenerate
-from calibration.judging import judge_fit
-from calibration.lag_speeds import SWEPT, alike_speeds, lag_groups, untold
-from calibration.lag_transfer import known_row_delay, with_lags
-from calibration.lag_verdict import lag_lack
-from calibration.model import Lag
-from calibration.rig_fit import RigFit, fit_rig
-from calibration.sync_fit import SyncFit, fit_sync
-from calibration.sync_verdict import judge_sync
+from calibration.judging.lags import lag_lack
+from calibration.judging.rig import judge_fit
+from calibration.judging.sync import judge_sync
+from calibration.model.covariance import Covariance
+from calibration.model.lag_speeds import SWEPT, alike_speeds, lag_groups, untold
+from calibration.model.rig_model import Lag
+from calibration.rig_fit.fit import RigFit, fit_rig
+from calibration.sync.lag_fit import SyncFit, fit_sync
+from calibration.sync.transfer import known_row_delay, with_lags
 from calibration.verdict import Asked
 from calibration.views import Passages, View
 from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view

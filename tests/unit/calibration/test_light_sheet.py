@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from calibration import CalibrationError, PivotScanner, PlaneTable
-from calibration.light_sheet import light_sheets
-from calibration.triangulation import depth
+from calibration.model.light_sheet import light_sheets
+from calibration.model.triangulation import depth
 from tests.unit.calibration.fans import Fan
 
 ANGLE = [0.1, 0.4, 0.02]

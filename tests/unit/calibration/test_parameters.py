@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from calibration import CalibrationError, Lag, PivotScanner, PlaneTable, RigModel
-from calibration.parameters import parameters, with_parameters
+from calibration.model.parameters import parameters, with_parameters
 from tests.unit.calibration.cameras import camera
 
 COMMANDS = np.linspace(-1, 1, 9)

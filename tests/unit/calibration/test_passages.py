@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from calibration.even_pixels import evenly
-from calibration.passage_light import light
-from calibration.passages import SweepCounts, find_passages
+from calibration.passages.even_pixels import evenly
+from calibration.passages.finding import SweepCounts, find_passages
+from calibration.passages.light import light
 from tests.unit.calibration.passed_lines import Light, passed, true_at
 
 CASES = {

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibration.dark_tally import DarkTally
 from calibration.errors import CalibrationError
-from calibration.pixel_drift import pixel_drift
-from calibration.pixel_files import PixelVersion, load_pixels, save_pixels
-from calibration.pixels import (
+from calibration.pixels.dark_tally import DarkTally
+from calibration.pixels.drift import pixel_drift
+from calibration.pixels.pixel_file import PixelVersion, load_pixels, save_pixels
+from calibration.pixels.pixel_map import (
     FALSE_ALARM,
     SIGNAL,
     PixelMap,

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.camera import Camera
-from calibration.covariance import Covariance
 from calibration.errors import CalibrationError, Degenerate
-from calibration.information import Forecast
-from calibration.rig_fit import RigFit, fit_rig
+from calibration.guide.forecast import Forecast
+from calibration.model.camera import Camera
+from calibration.model.covariance import Covariance
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import Passages, View
 from tests.reference.calibration_data import (
     BOARD,
@@ -326,7 +326,7 @@ def test_a_mirror_ahead_of_its_command_is_refused() -> None:
 
 
 def test_a_lag_that_noise_made_negative_is_held_even_where_a_fit_does_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calibration.rig_rounds.MOST_IDLE_ROUNDS", 1)
+    monkeypatch.setattr("calibration.rig_fit.rounds.MOST_IDLE_ROUNDS", 1)
     fit = fitted(replace(RIG, lag=(-1e-6, -1e-6)), 20, replace(SEEN, passage=3e-3), poses=5)
     assert any(decision.reason.endswith("held at 0") for decision in fit.decisions)
     assert fit.model.lag_s == (0, 0)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibration.rig_noise import restated
-from calibration.rig_sightings import Sighting
+from calibration.rig_fit.noise import restated
+from calibration.rig_fit.sightings import Sighting
 
 Array = NDArray[np.float64]
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.camera import Camera
-from calibration.model import RigModel
-from calibration.rig_rows import Rows, Terms
-from calibration.rig_sightings import sighting
-from calibration.rig_state import first_state
-from calibration.scanner import PivotScanner
+from calibration.model.camera import Camera
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PivotScanner
+from calibration.rig_fit.rows import Rows, Terms
+from calibration.rig_fit.sightings import sighting
+from calibration.rig_fit.state import first_state
 from calibration.views import BoardPose
 from tests.reference.calibration_data import BOARD, Seen, TrueRig, rotation, seen_view
 

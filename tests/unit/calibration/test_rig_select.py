@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from calibration.rig_rows import Terms
-from calibration.rig_select import first_order, tried, with_free
-from calibration.rig_solve import Problem
+from calibration.rig_fit.rows import Terms
+from calibration.rig_fit.select import first_order, tried, with_free
+from calibration.rig_fit.solve import Problem
 
 
 def test_a_term_changes_all_that_it_would_with_those_that_come_along() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.errors import Degenerate
-from calibration.sync_fit import fit_sync
+from calibration.sync.lag_fit import fit_sync
 from calibration.views import Passages
 
 LAG_S = {1: 2.1e-4, -1: 1.6e-4}

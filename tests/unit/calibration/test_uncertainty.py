@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from calibration import CalibrationError, Covariance, Lag, PivotScanner, PlaneTable, RigModel
-from calibration.parameters import parameters, with_parameters
-from calibration.uncertainty import (
+from calibration.depth.uncertainty import (
     GROUPS,
     command_at,
     depth_jacobian,
@@ -16,6 +15,7 @@ from calibration.uncertainty import (
     explained,
     group_of,
 )
+from calibration.model.parameters import parameters, with_parameters
 from tests.unit.calibration.cameras import camera
 
 SD = {"f": 0.3, "c": 0.3, "k": 1e-3, "p": 1e-4, "a": 2e-5, "o": 2e-5, "b": 2e-5, "l": 1e-7, "r": 1e-10}

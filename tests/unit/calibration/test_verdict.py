@@ -6,13 +6,13 @@ from math import nan, radians
 import numpy as np
 import pytest
 
-from calibration.board import Board
+from calibration.board.board import Board
 from calibration.errors import Degenerate
-from calibration.evidence import PoseEvidence, ViewEvidence, pose_evidence, view_evidence
-from calibration.fit_verdict import FitEvidence, judge, judge_refusal
-from calibration.sweep_waves import SweepResidual, sweep_waves
+from calibration.judging.evidence import PoseEvidence, ViewEvidence, pose_evidence, view_evidence
+from calibration.judging.rules import FitEvidence, judge, judge_refusal
+from calibration.judging.sweep_waves import SweepResidual, sweep_waves
+from calibration.judging.view_shifts import ViewShift, common_shift, counted, last_before_move
 from calibration.verdict import Asked
-from calibration.view_shifts import ViewShift, common_shift, counted, last_before_move
 from calibration.views import BoardPose, Corners, View
 
 ASKED = Asked(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)

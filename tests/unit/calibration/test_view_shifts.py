@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.judging import judge_fit
-from calibration.rig_fit import fit_rig
+from calibration.judging.rig import judge_fit
+from calibration.rig_fit.fit import fit_rig
 from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_pose, seen_view
 
 SIZE = (512, 512)

@@ -7,9 +7,9 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera import Camera
-from calibration.model import Lag, RigModel
-from calibration.scanner import PivotScanner
+from calibration.model.camera import Camera
+from calibration.model.rig_model import Lag, RigModel
+from calibration.model.scanner import PivotScanner
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock, Mark, packed_row_bytes
 from drivers.interfaces import (
     LEVEL_BACKWARD,

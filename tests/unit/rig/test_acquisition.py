@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.model import Lag
+from calibration.model.rig_model import Lag
 from drivers.errors import DeviceDisconnected, DeviceFault, DeviceTimeout, ProtocolError
 from drivers.interfaces import BurstMode
 from rig.counting import SweepCounter, SweepLayout

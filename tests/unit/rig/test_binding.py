@@ -6,7 +6,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from calibration.model import Lag
+from calibration.model.rig_model import Lag
 from drivers.errors import ProtocolError
 from drivers.frames import SUBFRAME_SHIFT, Mark
 from rig.binding import FrameBinder, SweepClock

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from calibration.files import load_rig_model, save_rig_model
-from calibration.model import Identity, RigModel
+from calibration.files.rig_file import load_rig_model, save_rig_model
+from calibration.model.rig_model import Identity, RigModel
 from rig import api
 from rig.calibration_identity import carry_notes, identity_of, note_check, recorded_identity, refusals
 from rig.config import CubePlan

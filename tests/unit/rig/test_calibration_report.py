@@ -8,8 +8,8 @@ from html import escape
 import numpy as np
 import pytest
 
-from calibration.judging import Judged, judge_fit
-from calibration.rig_fit import RigFit, fit_rig
+from calibration.judging.rig import Judged, judge_fit
+from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.verdict import Reason, Verdict
 from calibration.views import View
 from rig.calibrating.report import planes_report

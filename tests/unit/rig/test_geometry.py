@@ -6,9 +6,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from calibration.camera import Camera
-from calibration.model import RigModel
-from calibration.scanner import PlaneTable
+from calibration.model.camera import Camera
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PlaneTable
 from rig.errors import UsageError
 from rig.geometry import MARGIN_PX, sweep_geometry, uncalibrated_geometry
 from rig.geometry_kernels import row_windows

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calibration.camera import Camera
-from calibration.camera_files import KnownCamera
-from calibration.covariance import Covariance
 from calibration.errors import CalibrationError
-from calibration.guide import Advice, candidates
-from calibration.rig_fit import fit_rig
+from calibration.files.camera_file import KnownCamera
+from calibration.guide.poses import Advice, candidates
+from calibration.model.camera import Camera
+from calibration.model.covariance import Covariance
+from calibration.rig_fit.fit import fit_rig
 from rig.calibrating import planes_run
 from rig.calibrating.guided import Guide
 from rig.calibrating.taking import FixedPoses

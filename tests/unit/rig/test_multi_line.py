@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.model import Lag
+from calibration.model.rig_model import Lag
 from rig.counting import BIN_DARK, BIN_UNUSABLE, SweepCounter, SweepLayout
 from rig.errors import PlanError
 from rig.geometry import sweep_geometry

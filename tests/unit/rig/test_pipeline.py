@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.model import Lag
+from calibration.model.rig_model import Lag
 from drivers.errors import DeviceFault, RingOverflow
 from drivers.recorded.index import INDEX_FILE, segment_name
 from drivers.spb1 import walk_blocks

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from calibration.model import Lag
+from calibration.model.rig_model import Lag
 from drivers.interfaces import (
     LEVEL_BACKWARD,
     MARKER_LINE,

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from calibration.camera import Camera
-from calibration.model import Lag, RigModel
-from calibration.scanner import PivotScanner
+from calibration.model.camera import Camera
+from calibration.model.rig_model import Lag, RigModel
+from calibration.model.scanner import PivotScanner
 from drivers.errors import ProtocolError
 from drivers.frames import FrameBlock, Mark
 from drivers.interfaces import BurstMode, StreamMode

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.camera import Camera
-from calibration.model import RigModel
-from calibration.scanner import PivotScanner
+from calibration.model.camera import Camera
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PivotScanner
 from sim_backend.effects.setting import Setting
 from sim_backend.flux import FluxModel
 from sim_backend.optics import Line, Optics, Sensor, detections_per_radiance

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from calibration.model import Lag
+from calibration.model.rig_model import Lag
 from drivers.clock import VirtualClock
 from drivers.interfaces import (
     HOLD_S,

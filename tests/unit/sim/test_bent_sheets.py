@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.model import RigModel
+from calibration.model.rig_model import RigModel
 from drivers.clock import VirtualClock
 from drivers.registry import Surroundings
 from sim_backend.effects.setting import FrameTimes

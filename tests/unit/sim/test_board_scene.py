@@ -8,7 +8,7 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from calibration.board import BLACK, WHITE, Board
+from calibration.board.board import BLACK, WHITE, Board
 from calibration.views import BoardPose
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceError

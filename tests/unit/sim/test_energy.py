@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibration.model import RigModel
+from calibration.model.rig_model import RigModel
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.setting import Setting
 from sim_backend.flux import FluxModel

@@ -204,7 +204,7 @@ def test_the_flux_of_a_row_is_the_sum_of_its_effects() -> None:
 def test_a_world_without_a_light_source_is_refused(tmp_path: Path) -> None:
     from dataclasses import replace
 
-    from calibration.files import save_rig_model
+    from calibration.files.rig_file import save_rig_model
 
     save_rig_model(replace(rig(), source_m=None), tmp_path / "rig.yaml")
     with pytest.raises(DeviceError, match="source_m"):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibration.files import save_rig_model
+from calibration.files.rig_file import save_rig_model
 from drivers.clock import SystemClock, VirtualClock
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.frames import BlockFlag, FrameBlock, Mark

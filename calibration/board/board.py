@@ -1,0 +1,182 @@
+"""The calibration board, a ChArUco board or a plain chessboard, and its file.
+
+Board coordinates in metres: x right, y down, z into the board, origin at the top left corner of the top left square,
+which is black. The inner corners are numbered row by row, as cv2.aruco.CharucoBoard does.
+
+A chessboard looks the same from more than one side. Only with an even number of squares along both sides, and not the
+same number, does its mirror image differ; only with one of the two even can it be told from itself upside down.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
+
+from calibration.board.board_file import BoardFile
+from calibration.errors import CalibrationError
+from calibration.files.sections import explain
+from calibration.files.yaml_file import read_yaml
+
+Array = NDArray[np.float64]
+
+BLACK, WHITE = 0.05, 0.85
+"""Reflectance of a laser printer's black and of matt white paper, rounded."""
+MARGIN_SQUARES = 0.5
+"""White paper around the squares."""
+BUNDLED_BOARD = Path(__file__).parents[2] / "config" / "board.yaml"
+"""The board that the commands take when none is named."""
+
+_FEWEST_SQUARES = 3
+"""Along a side; fewer leave less than 2 x 2 inner corners."""
+_MOST_SQUARES = 100
+"""Along a side; no dictionary of markers goes further."""
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A printed board: squares along (x, y), their side in metres and, on a ChArUco board, the side of its markers.
+
+    dictionary: a name of OpenCV's, such as DICT_5X5_100. modules: (squares down, across, side, side), True where a
+    marker is black, its border included; empty squares are False. Raises CalibrationError on a board that cannot be
+    printed.
+    """
+
+    kind: Literal["charuco", "chessboard"]
+    squares: tuple[int, int]
+    square_m: float
+    marker_m: float | None = None
+    dictionary: str | None = None
+    modules: NDArray[np.bool_] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Check the numbers and draw the squares."""
+        if not all(_FEWEST_SQUARES <= count <= _MOST_SQUARES for count in self.squares):
+            raise CalibrationError(
+                f"board has {self.squares[0]} x {self.squares[1]} squares; each side takes {_FEWEST_SQUARES} to "
+                f"{_MOST_SQUARES}"
+            )
+        if not 0 < self.square_m < np.inf:
+            raise CalibrationError(f"board's square is {self.square_m:g} m; measure the print and give its side")
+        if self.kind == "chessboard":
+            if self.marker_m is not None or self.dictionary is not None:
+                raise CalibrationError(
+                    "a chessboard has no markers; remove marker and dictionary, or set kind: charuco"
+                )
+        elif self.marker_m is None or self.dictionary is None:
+            raise CalibrationError("a ChArUco board needs marker and dictionary; without markers set kind: chessboard")
+        elif not 0 < self.marker_m < self.square_m:
+            raise CalibrationError(
+                f"board's marker is {self.marker_m:g} m in a square of {self.square_m:g} m; it must be smaller"
+            )
+        object.__setattr__(self, "modules", self._drawn_modules())
+
+    @property
+    def corners_m(self) -> Array:
+        """(n, 3) float64 inner corners in the order of their ids; z = 0."""
+        across, down = self.grid
+        y, x = np.mgrid[1 : down + 1, 1 : across + 1] * self.square_m
+        return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Inner corners along (x, y)."""
+        return self.squares[0] - 1, self.squares[1] - 1
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """(width, height) of the squares, without the paper around them."""
+        return self.squares[0] * self.square_m, self.squares[1] * self.square_m
+
+    def albedo_at(self, x_m: ArrayLike, y_m: ArrayLike) -> Array:
+        """Reflectance at board positions (broadcast together); white paper around the squares, NaN off the paper."""
+        x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
+        x, y = x / self.square_m, y / self.square_m
+        across, down = self.squares
+        margin = MARGIN_SQUARES
+        paper = (x >= -margin) & (x <= across + margin) & (y >= -margin) & (y <= down + margin)
+        inside = (x >= 0) & (x < across) & (y >= 0) & (y < down)
+        x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+        column, row = x.astype(np.int64), y.astype(np.int64)
+        black = self._module_at(column, row, x - column, y - row)
+        return np.where(paper, np.where(inside & black, BLACK, WHITE), np.nan)
+
+    def picture(self, px_per_square: int) -> NDArray[np.uint8]:
+        """The board with its white margin, 0 for black and 255 for white: to print, at any number of pixels."""
+        side = 1 + 2 * MARGIN_SQUARES / np.array(self.squares)
+        width, height = (np.round(side * self.squares * px_per_square)).astype(int)
+        x = ((np.arange(width) + 0.5) / px_per_square - MARGIN_SQUARES) * self.square_m
+        y = ((np.arange(height) + 0.5) / px_per_square - MARGIN_SQUARES) * self.square_m
+        return np.where(self.albedo_at(x, y[:, None]) > BLACK, np.uint8(255), np.uint8(0))
+
+    def charuco(self) -> cv2.aruco.CharucoBoard:
+        """The same board as OpenCV knows it. CalibrationError for a chessboard."""
+        if self.dictionary is None or self.marker_m is None:
+            raise CalibrationError("a chessboard has no markers to look for; set kind: charuco")
+        return cv2.aruco.CharucoBoard(self.squares, self.square_m, self.marker_m, _dictionary(self.dictionary))
+
+    def _module_at(
+        self, column: NDArray[np.int64], row: NDArray[np.int64], along: Array, below: Array
+    ) -> NDArray[np.bool_]:
+        """True where the print is black; along, below: position in the square, 0 to 1."""
+        black: NDArray[np.bool_] = (column + row) % 2 == 0
+        if self.marker_m is None:
+            return black
+        side = self.modules.shape[-1]
+        share = self.marker_m / self.square_m
+        i, j = (np.floor(((at - 0.5) / share + 0.5) * side).astype(np.int64) for at in (along, below))
+        in_marker = ~black & (i >= 0) & (i < side) & (j >= 0) & (j < side)
+        i, j = np.clip(i, 0, side - 1), np.clip(j, 0, side - 1)
+        printed: NDArray[np.bool_] = black | (in_marker & self.modules[row, column, j, i])
+        return printed
+
+    def _drawn_modules(self) -> NDArray[np.bool_]:
+        """The markers, one in every white square, row by row."""
+        across, down = self.squares
+        if self.dictionary is None:
+            return np.zeros((down, across, 0, 0), np.bool_)
+        dictionary = _dictionary(self.dictionary)
+        has = len(dictionary.bytesList)
+        needed = across * down // 2
+        if needed > has:
+            raise CalibrationError(
+                f"board of {across} x {down} squares needs {needed} markers; {self.dictionary} has {has}: choose a "
+                "larger dictionary"
+            )
+        side = dictionary.markerSize + 2
+        modules = np.zeros((down, across, side, side), np.bool_)
+        white = [(row, column) for row in range(down) for column in range(across) if (row + column) % 2]
+        for marker, (row, column) in enumerate(white):
+            modules[row, column] = cv2.aruco.generateImageMarker(dictionary, marker, side) == 0
+        return modules
+
+
+def load_board(path: str | os.PathLike[str] = BUNDLED_BOARD) -> Board:
+    """The board that a YAML file describes. Raises CalibrationError, one line, where it describes none."""
+    file = Path(path)
+    content = read_yaml(file, "a board")
+    try:
+        return parse_board(content)
+    except CalibrationError as error:
+        raise CalibrationError(f"{file}: {error}") from error
+
+
+def parse_board(content: Mapping[str, Any]) -> Board:
+    """A board from the keys of its file, lengths as text with a unit. Raises CalibrationError."""
+    try:
+        parsed = BoardFile.model_validate(dict(content))
+    except ValidationError as error:
+        raise CalibrationError(explain(error)) from error
+    return Board(parsed.kind, parsed.squares, parsed.square, parsed.marker, parsed.dictionary)
+
+
+def _dictionary(name: str) -> cv2.aruco.Dictionary:
+    known = sorted(entry for entry in dir(cv2.aruco) if entry.startswith("DICT_"))
+    if name not in known:
+        raise CalibrationError(f"there is no dictionary '{name}'; OpenCV has {', '.join(known)}")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))

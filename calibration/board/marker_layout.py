@@ -1,0 +1,211 @@
+"""Whether markers stand as a board's file says: their places on the lattice of squares, told without their ids.
+
+A marker's own outline says where the next squares are; from one to the next, all markers of a print get whole numbers
+(column, row). A layout gives each id its place; where another layout than the stated one puts clearly more of the
+markers where they are seen, the print is another board. Ids run row by row over the white squares, from 0 unless
+somebody chose otherwise; OpenCV before 4.6 began boards of an even number of rows with a white square.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.board import Board
+
+Array = NDArray[np.float64]
+Places = NDArray[np.int64]
+
+_NEXT_SQUARES = 2.5
+"""From a placed marker to the next while they are few, twice that then; markers are 1.4 squares apart."""
+_OFF_SQUARES = 0.3
+"""Farther from the middle of a square, a marker is none of this lattice."""
+_MOST_TURN_RAD = 0.6
+_FOR_HOMOGRAPHY = 4
+_MOST_ACROSS = 40
+_CLEARLY_MORE = 2
+"""Markers that are where another layout has them: single ones are misread."""
+_LEAST_SHARE = 0.6
+"""Of the markers of a lattice, that a layout must put where they are."""
+_EDGE_SQUARES = 0.2
+"""How far beyond a row the next one is looked for: within the white paper around a print."""
+_WHITE_PERCENT = 90
+"""Of the pixels among markers; half of them are white."""
+_FEWEST = 6
+"""Markers of which a share can be asked."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Markers:
+    """What was read, whether the board has it or not. ids: (n,) int64; px: (n, 4, 2) corners, clockwise from its own
+    top left.
+    """
+
+    ids: Places
+    px: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Layout:
+    """Squares across; white_first: whether the top left one is white; the first marker's id."""
+
+    across: int
+    white_first: bool = False
+    first_id: int = 0
+
+    def places(self, ids: Places) -> Places:
+        """(n, 2) column and row of markers, those before the first one too."""
+        if self.across % 2 == 0:
+            row, at = np.divmod(ids - self.first_id, self.across // 2)
+            column = 2 * at + (row + (not self.white_first)) % 2
+        else:  # two rows hold as many markers as a row has squares
+            pair, at = np.divmod(ids - self.first_id, self.across)
+            upper = (self.across + self.white_first) // 2
+            row = 2 * pair + (at >= upper)
+            column = 2 * (at - upper * (at >= upper)) + (row + (not self.white_first)) % 2
+        return np.stack([column, row], axis=-1)
+
+
+def contradiction(read: Markers, board: Board, shown: NDArray[np.uint8]) -> str | None:
+    """What of the markers read in the picture `shown` does not fit the board; None where nothing speaks against it."""
+    assert board.marker_m is not None, "asked of boards with markers"
+    placed, lattice = _lattice(read.px, board.marker_m / board.square_m)
+    ids, lattice = read.ids[placed], lattice[placed]
+    stated = _Layout(board.squares[0])
+    known = ids < board.squares[0] * board.squares[1] // 2
+    fitting, origin = _support(stated, ids[known], lattice[known])
+    different = len(np.unique(ids))  # a second board alike repeats them, and may stand on the same lattice by chance
+    if fitting < different:
+        others = list(_others(board, int(ids.min())))
+        support = [_support(layout, ids, lattice)[0] for layout in others]
+        best = int(np.argmax(support))  # of several the likeliest
+        if support[best] >= max(fitting + _CLEARLY_MORE, _LEAST_SHARE * different):
+            return _named(others[best], ids, board)
+        if different >= _FEWEST and fitting < _LEAST_SHARE * different:
+            return f"{different - fitting} of the {different} markers read do not stand where the board has them"
+    return _ends_early(board, shown, read.px[placed], lattice - origin)
+
+
+def _others(board: Board, least_id: int) -> Iterator[_Layout]:
+    """What else may have been printed, the likeliest first; that of the board too, with rows without end.
+
+    Ids repeat their pattern every two rows, which hold as many as a row has squares: first ids farther below the least
+    one that was read put markers where one of these does.
+    """
+    across, down = board.squares
+    yield _Layout(across)
+    if down % 2 == 0:
+        yield _Layout(across, white_first=True)
+    widths = range(3, _MOST_ACROSS + 1)
+    yield from (_Layout(width) for width in widths)
+    for width in (across, *widths):
+        yield from (_Layout(width, first_id=first) for first in range(least_id, max(0, least_id - width), -1))
+
+
+def _named(layout: _Layout, ids: Places, board: Board) -> str:
+    if layout.first_id:
+        return f"its markers are numbered from {layout.first_id} on, those of the board from 0"
+    if layout.across != board.squares[0]:
+        return f"it is {layout.across} squares wide, the board {board.squares[0]}"
+    if layout.white_first:
+        return (
+            "its top left square is white, the board's is black: OpenCV before 4.6 drew boards with an even number of "
+            "rows so"
+        )
+    last = board.squares[0] * board.squares[1] // 2 - 1
+    return (
+        f"its markers are {ids.min()} to {ids.max()}, those of the board are 0 to {last}: its rows are more, or "
+        "numbered otherwise"
+    )
+
+
+def _support(layout: _Layout, ids: Places, lattice: Places) -> tuple[int, Places]:
+    """How many markers are where a layout has them, and where its top left square is on the lattice."""
+    if len(ids) == 0:
+        return 0, np.zeros(2, np.int64)
+    origins, counts = np.unique(lattice - layout.places(ids), axis=0, return_counts=True)
+    most = int(np.argmax(counts))
+    return int(counts[most]), origins[most]
+
+
+def _lattice(px: Array, marker_squares: float) -> tuple[NDArray[np.bool_], Places]:
+    """Which markers (n, 4, 2) stand on one lattice, most of them if possible, and their (n, 2) columns and rows."""
+    best, places = np.zeros(len(px), np.bool_), np.zeros((len(px), 2), np.int64)
+    tried = np.zeros(len(px), np.bool_)
+    for start in np.argsort([-cv2.contourArea(corners.astype(np.float32)) for corners in px]):
+        if tried[start]:
+            continue
+        placed, found = _grown(px, int(start), marker_squares)
+        tried |= placed
+        if placed.sum() > best.sum():
+            best, places = placed, found
+    return best, places
+
+
+def _grown(px: Array, start: int, marker_squares: float) -> tuple[NDArray[np.bool_], Places]:
+    places = np.zeros((len(px), 2), np.int64)
+    placed = np.arange(len(px)) == start
+    while True:
+        to_lattice = _map_to_lattice(places[placed], px[placed], marker_squares)
+        if to_lattice is None:
+            return placed, places
+        at = cv2.perspectiveTransform(px.reshape(-1, 1, 2), to_lattice).reshape(-1, 4, 2)
+        middle, right = at.mean(axis=1), at[:, 1] - at[:, 0] + at[:, 2] - at[:, 3]
+        nearest = np.round(middle)
+        apart = np.abs(nearest[:, None] - places[placed]).max(axis=-1)
+        good = np.abs(middle - nearest).max(axis=1) < _OFF_SQUARES
+        good &= np.abs(np.arctan2(right[:, 1], right[:, 0])) < _MOST_TURN_RAD
+        good &= (apart.min(axis=1) > 0) & ~placed
+        good &= apart.min(axis=1) < (_NEXT_SQUARES if placed.sum() < _FOR_HOMOGRAPHY else 2 * _NEXT_SQUARES)
+        if not good.any():
+            return placed, places
+        places[good] = nearest[good].astype(np.int64)
+        placed |= good
+
+
+def _map_to_lattice(places: Places, px: Array, marker_squares: float) -> Array | None:
+    """(3, 3) from pixels to squares, (0, 0) the middle of the first; of few markers affine, whose errors grow less."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (marker_squares / 2)
+    lattice, seen = (places[:, None] + corners).reshape(-1, 2), px.reshape(-1, 2)
+    if len(places) < _FOR_HOMOGRAPHY:
+        to_lattice = np.eye(3)
+        to_lattice[:2] = np.linalg.lstsq(np.column_stack([seen, np.ones(len(seen))]), lattice, rcond=None)[0].T
+    else:
+        found, _ = cv2.findHomography(seen, lattice)
+        if found is None:
+            return None
+        to_lattice = np.asarray(found, np.float64)
+    return to_lattice if np.isfinite(to_lattice).all() and abs(np.linalg.det(to_lattice)) > 0 else None
+
+
+def _ends_early(board: Board, shown: NDArray[np.uint8], px: Array, places: Places) -> str | None:
+    """Where a print has fewer rows, there is white paper below its last markers, at black squares of the board too."""
+    across, down = board.squares
+    assert board.marker_m is not None, "asked of boards with markers"
+    to_lattice = _map_to_lattice(places, px, board.marker_m / board.square_m)
+    if to_lattice is None:
+        return None
+    (left, top), (right, bottom) = px.reshape(-1, 2).min(axis=0).astype(int), px.reshape(-1, 2).max(axis=0).astype(int)
+    white = float(np.percentile(shown[max(top, 0) : bottom + 1, max(left, 0) : right + 1], _WHITE_PERCENT))
+    column = np.arange(across, dtype=np.float64)
+    last = int(places[:, 1].max())
+    for rows in range(last + 1, min(last + 3, down)):  # the last row's markers may not have been read
+        below = _seen(shown, to_lattice, column[rows % 2 :: 2], rows - 0.5 + _EDGE_SQUARES)
+        black = _seen(shown, to_lattice, column[(rows - 1) % 2 :: 2], rows - 1.0)
+        if below is None or black is None:
+            return None
+        if float(below.min()) > (white + float(np.median(black))) / 2:
+            return f"it ends below its row {rows}, the board has {down} rows"
+    return None
+
+
+def _seen(shown: NDArray[np.uint8], to_lattice: Array, column: Array, row: float) -> Array | None:
+    """The picture at places of the lattice; None where one lies outside."""
+    at = np.stack([column, np.full(column.size, row)], axis=-1)[:, None]
+    px = np.round(cv2.perspectiveTransform(at, np.linalg.inv(to_lattice))[:, 0]).astype(int)
+    height, width = shown.shape
+    if px.min() < 0 or px[:, 0].max() >= width or px[:, 1].max() >= height:
+        return None
+    return np.asarray(shown[px[:, 1], px[:, 0]], np.float64)

@@ -1,0 +1,236 @@
+"""Corners to a few hundredths of a pixel: the board, drawn as it should look around each, laid over the picture.
+
+Around a corner the picture is offset + gain * (1 + slopes) * drawn board, shifted by (dx, dy); the shift that fits
+best says where the corner is. All edges around it, those of the markers included, pull together, so that a picture of
+few photons gives a tenth of the error of cv2.cornerSubPix (docs/calibration.md). Weighted least squares by
+Gauss-Newton, the variance proportional to the light as photons have it; pixels far off (an unlisted hot pixel) do not
+count.
+
+The drawing is bent as the map bends around each corner, and is as fine as what it is compared with: a homography in the
+place of the bend, or edges rounded to drawn pixels, move all corners of a picture alike by some 0.002 px, which no
+number of corners averages out. For the same reason the last fit of each corner looks at pixels of its own.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.board import Board
+from calibration.board.drawing import Drawing
+from calibration.board.picture_map import BoardMap
+
+Array = NDArray[np.float64]
+
+SUBPIXELS = 6
+"""Drawn per pixel and axis before they are averaged over the pixel's area; even. Drawings are as fine."""
+WIDE, OWN = 0.9, 0.5
+"""How far around a corner is looked, in squares: short of the next ones, to find it; halfway to them, so that no two
+corners share pixels and their errors, which a fit takes to be independent, are."""
+_MOST_REACH_PX = 16
+_LEAST_REACH_PX = 4
+_SEARCH_SQUARES = 0.25
+"""Beyond that a shift could mistake one module of a marker for the next."""
+_POWERS = [(i, j) for i in range(4) for j in range(4 - i)]
+"""Of x and y in pixels, for where the board is drawn around a corner: what a tilt and a lens bend over two squares."""
+_AROUND = np.stack(np.meshgrid(*2 * [np.linspace(-1.25, 1.25, 7)]), axis=-1).reshape(-1, 2)
+"""Points, in reaches, through which that polynomial goes; the patch and what a pixel more on every side needs."""
+_STEPS = 4
+_SETTLED_SDS = 0.1
+"""A step this small ends the iteration: what is left is a tenth of it."""
+_OUTLIER_SDS = 5.0
+_DARK_SHARE = 0.05
+"""Of the picture's white: noise that is there without light."""
+_LEAST_MATCH = 0.4
+"""Correlation of picture and drawing; a board under few photons gives 0.5, anything else 0.2."""
+_MOST_SD_PX = 0.5
+_DRAWING_SD_PX = 0.003
+"""What the drawing itself is off by: 0.002 px without noise, for pictures drawn as finely."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Patch:
+    """The drawing around a corner on the pixels x0.. and y0.. of the picture; slopes per pixel of shift."""
+
+    drawn: Array
+    along_x: Array
+    along_y: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """Where a corner should be: its pixel, a square's side, half width of the patch. to_drawing: (4, 4, 2) what powers
+    of x and y, in reaches from the corner, add to the place in the drawing.
+    """
+
+    expected_px: Array
+    side_px: float
+    reach: int
+    to_drawing: Array | None
+
+
+def register(
+    picture: NDArray[np.float32],
+    drawing: Drawing,
+    board_map: BoardMap,
+    ids: NDArray[np.int32],
+    reach: float,
+    search: bool,
+) -> tuple[NDArray[np.int32], Array, Array]:
+    """Corners `ids` that the picture shows near where the map has them: their ids, px (n, 2) and sd_px (n,).
+
+    reach: WIDE or OWN. search: look for each in whole pixels first (the map is rough).
+    """
+    places = _places(drawing, board_map, ids, reach)
+    found = [_register_one(picture, drawing, place, search) for place in places]
+    good = np.array([one is not None for one in found], np.bool_)
+    rows = np.array([one for one in found if one is not None], np.float64).reshape(-1, 3)
+    return ids[good], rows[:, :2], rows[:, 2]
+
+
+def sides_px(board: Board, board_map: BoardMap, corners_m: Array) -> Array:
+    """(n,) side of a square around positions (n, 2), in pixels: the shorter one."""
+    step = board.square_m / 2
+    ends = board_map.to_px(corners_m[:, None] + np.array([[-step, 0], [step, 0], [0, -step], [0, step]]))
+    sides: Array = np.linalg.norm(ends[:, 1::2] - ends[:, ::2], axis=-1).min(axis=1)
+    return sides
+
+
+def _places(drawing: Drawing, board_map: BoardMap, ids: NDArray[np.int32], reach_squares: float) -> list[_Place]:
+    """Where the map has the corners, and how the drawing lies there."""
+    board = drawing.board
+    corners_m = board.corners_m[ids, :2]
+    sides = sides_px(board, board_map, corners_m)
+    expected = board_map.to_px(corners_m)
+    reach = np.clip(np.nan_to_num(reach_squares * sides), _LEAST_REACH_PX, _MOST_REACH_PX).astype(int)
+    spread_m = np.minimum(reach_squares, reach / sides)[:, None, None] * board.square_m
+    around_m = corners_m[:, None] + spread_m * _AROUND
+    around = (board_map.to_px(around_m) - expected[:, None]) / reach[:, None, None]
+    drawn = around_m / board.square_m * drawing.px_per_square + (drawing.margin_px - 0.5)
+    to_drawing = [_bent(*of) for of in zip(around, drawn, strict=True)]
+    return [_Place(*of) for of in zip(expected, sides.tolist(), reach.tolist(), to_drawing, strict=True)]
+
+
+def _bent(at: Array, drawn: Array) -> Array | None:
+    """The polynomial from picture to drawing; None where a map gone astray squeezes the board into a line."""
+    if not np.isfinite(at).all():
+        return None
+    i, j = np.array(_POWERS).T
+    terms, _, rank, _ = np.linalg.lstsq(at[:, :1] ** i * at[:, 1:] ** j, drawn, rcond=1e-9)
+    if rank < len(_POWERS):
+        return None
+    powers = np.zeros((4, 4, 2))
+    powers[i, j] = terms
+    return powers
+
+
+def _register_one(
+    picture: NDArray[np.float32], drawing: Drawing, place: _Place, search: bool
+) -> tuple[float, float, float] | None:
+    """(x, y, sd) of one corner in pixels; None where the picture does not show it."""
+    expected, side, reach, to_drawing = place.expected_px, place.side_px, place.reach, place.to_drawing
+    farthest = _SEARCH_SQUARES * side + 1
+    at = expected
+    height, width = picture.shape
+    if to_drawing is None or not (0 <= at[0] <= width - 1 and 0 <= at[1] <= height - 1):
+        return None
+    if search:
+        shift = _best_whole_shift(picture, drawing, place, to_drawing, max(1, round(_SEARCH_SQUARES * side)))
+        if shift is None:
+            return None
+        at = at + shift
+    start, sd = at, np.inf
+    for _ in range(_STEPS):
+        x0, y0 = max(round(float(at[0])) - reach, 0), max(round(float(at[1])) - reach, 0)
+        x1, y1 = min(round(float(at[0])) + reach + 1, width), min(round(float(at[1])) + reach + 1, height)
+        if min(x1 - x0, y1 - y0) < _LEAST_REACH_PX:
+            return None
+        patch = _draw(drawing, place, to_drawing, at - expected, (x0, y0, x1, y1))
+        solved = _shift(picture[y0:y1, x0:x1].astype(np.float64), patch)
+        if solved is None:
+            return None
+        at, sd = at + solved[:2], solved[2]
+        if np.hypot(*(at - start)) > farthest:
+            return None
+        if max(abs(solved[0]), abs(solved[1])) < _SETTLED_SDS * sd:
+            break
+    return None if sd > _MOST_SD_PX else (float(at[0]), float(at[1]), float(np.hypot(sd, _DRAWING_SD_PX)))
+
+
+def _draw(drawing: Drawing, place: _Place, to_drawing: Array, shift: Array, box: tuple[int, int, int, int]) -> _Patch:
+    """The drawing on pixels x0:x1, y0:y1 with everything moved by `shift`, averaged over each pixel's area."""
+    x0, y0, x1, y1 = box
+    n = SUBPIXELS
+    half = n // 2
+    # Half a pixel more on every side, for the slopes.
+    x, y = (
+        np.vander((start - 1 + (np.arange(n * (end - start + 1)) + 0.5) / n - at) / place.reach, 4, increasing=True)
+        for start, end, at in zip((x0, y0), (x1, y1), place.expected_px + shift, strict=True)
+    )
+    at_x, at_y = ((y @ to_drawing[..., axis].T @ x.T).astype(np.float32) for axis in range(2))
+    fine = cv2.remap(drawing.picture, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def averaged(right: int, down: int) -> Array:
+        cut = fine[down : down + (y1 - y0) * n, right : right + (x1 - x0) * n]
+        return np.asarray(cv2.resize(cut, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA), np.float64)
+
+    return _Patch(
+        drawn=averaged(half, half),
+        along_x=averaged(2 * half, half) - averaged(0, half),
+        along_y=averaged(half, 2 * half) - averaged(half, 0),
+    )
+
+
+def _best_whole_shift(
+    picture: NDArray[np.float32], drawing: Drawing, place: _Place, to_drawing: Array, search: int
+) -> Array | None:
+    """The shift in whole pixels at which picture and drawing correlate best; None where they do not."""
+    x, y = (round(float(value)) for value in place.expected_px)
+    height, width = picture.shape
+    reach = min(place.reach, x, y, width - 1 - x, height - 1 - y)
+    if reach < _LEAST_REACH_PX:
+        return None
+    patch = _draw(drawing, place, to_drawing, np.zeros(2), (x - reach, y - reach, x + reach + 1, y + reach + 1))
+    left, top = max(x - reach - search, 0), max(y - reach - search, 0)
+    region = picture[top : y + reach + search + 1, left : x + reach + search + 1]
+    match = cv2.matchTemplate(region, patch.drawn.astype(np.float32), cv2.TM_CCOEFF_NORMED)
+    _, best, _, found = cv2.minMaxLoc(match)
+    if best < _LEAST_MATCH:
+        return None
+    return np.array([left + found[0] - (x - reach), top + found[1] - (y - reach)], np.float64)
+
+
+def _shift(seen: Array, patch: _Patch) -> tuple[float, float, float] | None:
+    """(dx, dy, sd) that brings the drawing onto what is seen; None where the drawing is not there."""
+    rows, columns = seen.shape
+    x, y = np.linspace(-1, 1, columns), np.linspace(-1, 1, rows)[:, None]
+    drawn = patch.drawn
+    light = np.stack([np.ones_like(drawn), drawn, drawn * x, drawn * y], axis=-1).reshape(-1, 4)
+    values = seen.ravel()
+    try:
+        level = np.linalg.solve(light.T @ light, light.T @ values)
+    except np.linalg.LinAlgError:
+        return None
+    gain = level[1]
+    if not gain > 0:
+        return None
+    terms = np.concatenate([light, -gain * patch.along_x.reshape(-1, 1), -gain * patch.along_y.reshape(-1, 1)], axis=1)
+    weights = 1 / np.maximum(light @ level, _DARK_SHARE * gain)
+    for _ in range(2):
+        weighted = terms * weights[:, None]
+        normal = terms.T @ weighted
+        try:
+            inverse = np.linalg.inv(normal)
+        except np.linalg.LinAlgError:
+            return None
+        solved = inverse @ (weighted.T @ values)
+        missed = (values - terms @ solved) * np.sqrt(weights)
+        counting = weights > 0
+        variance = float(missed @ missed / max(counting.sum() - len(solved), 1))
+        outliers = np.abs(missed) > _OUTLIER_SDS * np.sqrt(variance)
+        if not outliers.any():
+            break
+        weights = np.where(outliers, 0.0, weights)
+    sd = float(np.sqrt(variance * (inverse[4, 4] + inverse[5, 5]) / 2))
+    return (float(solved[4]), float(solved[5]), sd) if np.isfinite(sd) else None

@@ -1,0 +1,1 @@
+"""The camera alone from the corners of many views."""

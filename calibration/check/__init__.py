@@ -1,0 +1,1 @@
+"""A finished calibration against boards that it was not made of."""

@@ -1,0 +1,1 @@
+"""calibration.yaml and camera.yaml, read and written."""

@@ -1,0 +1,223 @@
+"""The calibration file: YAML, `format: spadrig-calibration`, version 1.
+
+    format: spadrig-calibration
+    version: 1
+    camera: {width, height, matrix: 3 x 3 in pixels, distortion: 4, 5, 8, 12 or 14 OpenCV terms}
+    planes: planes.npy             # (columns, 4) nx ny nz d (metres), command = column index; a path, or the rows
+
+or, instead of `planes`, a scanner with commands of its own:
+
+    scanner: {table: {command: [...], planes: rows or path}}
+    scanner: {pivot: {axis_point_m, axis_direction, zero_normal, angle_rad: [a0, a1, ...], command_range: [-1, 1],
+                      offset_m: [b0, b1, ...], cone_rad, bow_per_rad}}        # the last three: none
+
+Optional: source_m, lag_s: {forward, backward}, speed_range_per_s: [low, high], row_delay_s, gate_delay_s,
+colour_skew_s, marker_rising, defects: a bool .npy, dark_rate: a float .npy, covariance: {names, file}, identity,
+provenance: any mapping, two of whose keys are read. Paths are relative to the file's folder; docs/calibration-file.md
+says it all.
+"""
+
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationError
+from calibration.files.camera_file import build_camera, camera_content
+from calibration.files.sections import FORMAT, VERSION, CalibrationFile, PlaneRows
+from calibration.files.yaml_file import read_yaml_file
+from calibration.model.covariance import Covariance
+from calibration.model.parameters import with_parameters
+from calibration.model.rig_model import Identity, Lag, RigModel
+from calibration.model.scanner import PivotScanner, PlaneTable, Scanner
+
+CALIBRATION_FILE: Final = "calibration.yaml"
+"""Its name wherever the project writes one."""
+_PLAIN = {"row_delay_s": 0.0, "gate_delay_s": 0.0, "colour_skew_s": 0.0, "marker_rising": True}
+"""Values of a model that its file has under the same name, and what they are where it does not."""
+
+
+def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
+    """Read a calibration file. Paths inside it are relative to its folder.
+
+    Raises CalibrationError, one line: the file, the key, what is wrong and what would be right.
+    """
+    file = Path(path)
+    parsed = read_yaml_file(file, "a calibration", FORMAT, VERSION, CalibrationFile)
+    try:
+        return _build(parsed, file.parent)
+    except CalibrationError as error:
+        raise CalibrationError(f"{file}: {error}") from error
+
+
+def save_rig_model(model: RigModel, path: str | os.PathLike[str]) -> None:
+    """Write a model so that `load_rig_model` gives the same numbers back; maps and covariance become .npy beside it.
+
+    Each file appears whole or not at all, the YAML last. Raises OSError where the folder cannot be written.
+    """
+    file = Path(path)
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "camera": camera_content(model.camera),
+        "scanner": _scanner_content(model.scanner),
+        "lag_s": model.lag_s._asdict(),
+    }
+    if model.source_m is not None:
+        content["source_m"] = np.asarray(model.source_m).tolist()
+    if model.speed_range_per_s is not None:
+        content["speed_range_per_s"] = list(model.speed_range_per_s)
+    content |= {name: getattr(model, name) for name in _PLAIN if getattr(model, name) != _PLAIN[name]}
+    if model.provenance:
+        content["provenance"] = dict(model.provenance)
+    if model.identity is not None:
+        content["identity"] = _identity_content(model.identity)
+    if model.defects is not None:
+        content["defects"] = _save_beside(file, "defects", model.defects)
+    if model.dark_rate_per_s is not None:
+        content["dark_rate"] = _save_beside(file, "dark-rate", model.dark_rate_per_s)
+    if model.covariance is not None:
+        beside = _save_beside(file, "covariance", model.covariance.matrix)
+        content["covariance"] = {"names": list(model.covariance.names), "file": beside}
+    scratch = file.with_name(f".{file.name}.part")
+    scratch.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120), encoding="utf-8")
+    scratch.replace(file)
+
+
+def _save_beside(file: Path, what: str, array: NDArray[Any]) -> str:
+    """Write an array to `FILE-what.npy` and say its name."""
+    beside = file.with_name(f"{file.stem}-{what}.npy")
+    scratch = beside.with_name(f".{beside.name}.part")
+    with scratch.open("wb") as stream:
+        np.save(stream, array, allow_pickle=False)
+    scratch.replace(beside)
+    return beside.name
+
+
+def _build(parsed: CalibrationFile, folder: Path) -> RigModel:
+    defects = None
+    if parsed.defects is not None:
+        defects = _load_array(folder / parsed.defects, "defects")
+        if defects.dtype != np.bool_:
+            raise CalibrationError(f"defects {parsed.defects} holds {defects.dtype}; it must be bool, True = unusable")
+    dark_rate = None
+    if parsed.dark_rate is not None:
+        dark_rate = _load_array(folder / parsed.dark_rate, "dark_rate")
+        if dark_rate.dtype.kind != "f":
+            raise CalibrationError(
+                f"dark_rate {parsed.dark_rate} holds {dark_rate.dtype}; it must be float32, counts/s"
+            )
+    speed = parsed.speed_range_per_s
+    model = RigModel(
+        camera=build_camera(parsed.camera),
+        scanner=_build_scanner(parsed, folder),
+        lag_s=Lag(parsed.lag_s.forward, parsed.lag_s.backward),
+        speed_range_per_s=None if speed is None else (speed[0], speed[1]),
+        source_m=None if parsed.source_m is None else np.array(parsed.source_m, dtype=np.float64),
+        defects=defects,
+        provenance=parsed.provenance.model_dump(exclude_unset=True),
+        dark_rate_per_s=dark_rate,
+        covariance=_build_covariance(parsed, folder),
+        identity=_build_identity(parsed),
+        **{name: getattr(parsed, name) for name in _PLAIN},
+    )
+    if model.covariance is not None:
+        _check_names(model, model.covariance)
+    return model
+
+
+def _check_names(model: RigModel, covariance: Covariance) -> None:
+    """A fit may have tried more terms than the model kept: their uncertainty counts."""
+    try:
+        with_parameters(model, covariance.names, np.zeros(len(covariance.names)))
+    except CalibrationError as error:
+        raise CalibrationError(f"covariance.names: {error}") from error
+
+
+def _build_covariance(parsed: CalibrationFile, folder: Path) -> Covariance | None:
+    section = parsed.covariance
+    if section is None:
+        return None
+    matrix = _load_array(folder / section.file, "covariance.file")
+    if matrix.dtype.kind not in "fiu":
+        raise CalibrationError(f"covariance {section.file} holds {matrix.dtype}; it must be float64 (names, names)")
+    return Covariance(tuple(section.names), matrix)
+
+
+def _build_identity(parsed: CalibrationFile) -> Identity | None:
+    section = parsed.identity
+    return None if section is None else Identity(**section.model_dump() | {"reasons": tuple(section.reasons)})
+
+
+def _build_scanner(parsed: CalibrationFile, folder: Path) -> Scanner:
+    if parsed.planes is not None:
+        rows = _plane_rows(parsed.planes, folder)
+        return PlaneTable(command=np.arange(len(rows), dtype=np.float64), rows=rows)
+    assert parsed.scanner is not None  # CalibrationFile admits exactly one of the two
+    if parsed.scanner.table is not None:
+        table = parsed.scanner.table
+        return PlaneTable(command=np.array(table.command, dtype=np.float64), rows=_plane_rows(table.planes, folder))
+    pivot = parsed.scanner.pivot
+    assert pivot is not None  # ScannerSection admits exactly one of the two
+    return PivotScanner(
+        axis_point_m=np.array(pivot.axis_point_m),
+        axis_direction=np.array(pivot.axis_direction),
+        zero_normal=np.array(pivot.zero_normal),
+        angle_rad=np.array(pivot.angle_rad),
+        command_range=(pivot.command_range[0], pivot.command_range[1]),
+        offset_m=np.array(pivot.offset_m, dtype=np.float64),
+        cone_rad=pivot.cone_rad,
+        bow_per_rad=pivot.bow_per_rad,
+    )
+
+
+def _plane_rows(planes: PlaneRows, folder: Path) -> NDArray[np.float64]:
+    if isinstance(planes, str):
+        rows = _load_array(folder / planes, "planes")
+        if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != 4:
+            raise CalibrationError(
+                f"planes {planes} holds {rows.dtype} {rows.shape}; it must be float64 (columns, 4): nx, ny, nz, d"
+            )
+        return rows.astype(np.float64)
+    return np.array(planes, dtype=np.float64).reshape(-1, 4)
+
+
+def _load_array(file: Path, what: str) -> NDArray[Any]:
+    try:
+        array = np.load(file, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise CalibrationError(
+            f"{what} names {file}, which does not exist; paths are relative to the calibration file"
+        ) from error
+    except (OSError, ValueError, EOFError) as error:
+        raise CalibrationError(f"{what} {file} is not a readable .npy array; write it with numpy.save") from error
+    if not isinstance(array, np.ndarray):
+        raise CalibrationError(f"{what} {file} is an archive, not a single .npy array; write it with numpy.save")
+    return array
+
+
+def _scanner_content(scanner: Scanner) -> dict[str, Any]:
+    if isinstance(scanner, PlaneTable):
+        return {"table": {"command": scanner.command.tolist(), "planes": scanner.rows.tolist()}}
+    if isinstance(scanner, PivotScanner):
+        pivot: dict[str, Any] = {
+            "axis_point_m": scanner.axis_point_m.tolist(),
+            "axis_direction": scanner.axis_direction.tolist(),
+            "zero_normal": scanner.zero_normal.tolist(),
+            "angle_rad": scanner.angle_rad.tolist(),
+            "command_range": list(scanner.command_range),
+        }
+        if scanner.offset_m.size:
+            pivot["offset_m"] = scanner.offset_m.tolist()
+        pivot |= {name: float(getattr(scanner, name)) for name in ("cone_rad", "bow_per_rad") if getattr(scanner, name)}
+        return {"pivot": pivot}
+    raise CalibrationError(f"a scanner of type {type(scanner).__name__} has no form in a calibration file")
+
+
+def _identity_content(identity: Identity) -> dict[str, Any]:
+    said = asdict(identity)
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in said.items() if value}

@@ -1,0 +1,95 @@
+"""From a fit of the camera alone to its verdict: how well it knows where rays go, in pixels.
+
+A camera whose rays are all turned by one angle is as good as before, since the mirror is calibrated with it. So the
+error of a pixel is what is left of J C J' when the best common rotation of all rays is taken off J.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.board import Board
+from calibration.camera_fit.fit import CameraFit
+from calibration.judging.data_lack import data_lack
+from calibration.judging.evidence import pose_evidence, view_evidence
+from calibration.model.camera import Camera
+from calibration.model.covariance import Covariance
+from calibration.model.parameters import DISTORTION, MATRIX
+from calibration.verdict import WORST_TIMES, Verdict, more_poses
+from calibration.views import View
+
+Array = NDArray[np.float64]
+
+ACCURACY_PX = 0.1
+"""Good enough: no estimator finds the stripe better in fog."""
+_GRID = 16
+_STEP = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedCamera:
+    """A verdict and what it was made of: sd_px, worst_px: of a pixel's place along the row, median and 95 %."""
+
+    verdict: Verdict
+    sd_px: float
+    worst_px: float
+
+    def line(self) -> str:
+        """One line."""
+        return f"rays are known to {self.sd_px:.2g} px (95 % of the picture: {self.worst_px:.2g} px)"
+
+
+def judge_camera(fit: CameraFit, views: Sequence[View], board: Board, *, photons: bool) -> JudgedCamera:
+    """Judge a fit of `views`. photons: whether their pictures count photons; grey levels tell nothing of the light."""
+    camera = fit.camera
+    sd = ray_sd_px(camera, fit.covariance)
+    median, worst = float(np.median(sd)), float(np.percentile(sd, 95))
+    imprecise = not (median <= ACCURACY_PX and worst <= WORST_TIMES * ACCURACY_PX)
+    evidence = view_evidence(views, (camera.width, camera.height))
+    reasons = data_lack(evidence, pose_evidence(fit.poses, board), imprecise=imprecise, photons=photons)
+    if imprecise and not reasons:
+        too_few = more_poses(len(fit.views), "rays are known to", (median, worst), ACCURACY_PX, "{:.2g} px".format)
+        reasons = [replace(too_few, next_step="show the board in more poses")]
+    return JudgedCamera(Verdict(not reasons, tuple(reasons)), median, worst)
+
+
+def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:
+    """(n,) sd along the row of where rays of a grid over the picture are seen, a common rotation taken off."""
+    x, y = np.meshgrid(np.linspace(0, camera.width - 1, _GRID), np.linspace(0, camera.height - 1, _GRID))
+    u, v = camera.tangents_at(x.ravel(), y.ravel())
+    known = np.isfinite(u)
+    rays = np.stack([u[known], v[known], np.ones(np.count_nonzero(known))], axis=-1)
+
+    def seen(tried: Camera, points: Array) -> Array:
+        return np.concatenate(tried.project(points))
+
+    slopes = np.stack(
+        [
+            (seen(_changed(camera, name, _STEP), rays) - seen(_changed(camera, name, -_STEP), rays)) / (2 * _STEP)
+            for name in covariance.names
+        ],
+        axis=-1,
+    )
+    still = seen(camera, rays)
+    turned = np.stack(
+        [(seen(camera, rays + _STEP * np.cross(axis, rays)) - still) / _STEP for axis in np.eye(3)],
+        axis=-1,
+    )
+    sound = np.isfinite(slopes).all(axis=1) & np.isfinite(turned).all(axis=1)
+    basis = np.linalg.qr(turned[sound])[0]
+    left = slopes[sound] - basis @ (basis.T @ slopes[sound])
+    along_row = np.flatnonzero(sound) < len(rays)
+    variance = np.einsum("ni,ij,nj->n", left, covariance.matrix, left)[along_row]
+    result: Array = np.sqrt(np.maximum(variance, 0.0))
+    return result
+
+
+def _changed(camera: Camera, name: str, step: float) -> Camera:
+    matrix, distortion = camera.matrix.copy(), camera.distortion.copy()
+    if name in MATRIX:
+        matrix[MATRIX[name]] += step
+    else:
+        distortion[DISTORTION.index(name)] += step
+    return Camera(camera.width, camera.height, matrix, distortion)

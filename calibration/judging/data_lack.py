@@ -1,0 +1,89 @@
+"""What views of a board lack to make a calibration: light of the line only, poses, tilts, size, coverage."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from calibration.judging.evidence import PoseEvidence, ViewEvidence
+from calibration.verdict import Reason, reason_for
+
+_FEWEST_TO_JUDGE = 3
+"""Of fewer poses neither tilt nor coverage can be asked."""
+FEWEST_POSES: Final = 6
+"""With fewer, a single bad view bends the fit to it, so that nothing shows that it was bad."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """Of a number: what is never enough, and what is no likely cause of an error that is too large."""
+
+    always: float
+    imprecise: float
+
+    def at(self, imprecise: bool) -> float:
+        """The one that counts."""
+        return self.imprecise if imprecise else self.always
+
+
+LEAST_TILT_RAD: Final = Limit(math.radians(12), math.radians(20))
+"""Between two boards. Of boards parallel to each other focal length and distance cannot be told apart: they hang on the
+mirror's model alone, which nothing checks then."""
+LEAST_BOARD_RAD: Final = Limit(0.11, 0.15)
+"""Seen under smaller angles, a board's perspective (by which focal length is told) goes with the angle's square."""
+LEAST_COVERAGE: Final = Limit(0.3, 0.5)
+"""Share of the picture within the outline of all corners; the lens is extrapolated outside, which nothing checks."""
+MOST_ROOM_FLUX: Final = Limit(3.0, 1.0)
+"""Photons per pixel and exposure from white. At 3, 95 % of the frames hold a 1 whether the line is there or not; from 1
+on room light costs more than half of what a frame can tell of the line."""
+
+
+def data_lack(
+    views: ViewEvidence, poses: PoseEvidence | None, *, imprecise: bool, photons: bool = True
+) -> list[Reason]:
+    """What the data lack: more counts where the result is not precise enough.
+
+    poses: None where nothing tells. photons: whether pictures count photons; those from files do not.
+    """
+    found = []
+    bright = MOST_ROOM_FLUX.at(imprecise) if photons else math.inf
+    if views.room_flux > max(bright, MOST_ROOM_FLUX.always):
+        found.append(_room_light(views.room_flux, bright))
+    if views.shown < FEWEST_POSES:
+        were = "pose was" if views.shown == 1 else "poses were"
+        text = f"{views.shown} {were} shown, {FEWEST_POSES} are the fewest that can be checked against each other"
+        found.append(reason_for("too-few-poses", text, views.shown, FEWEST_POSES))
+    if views.shown < _FEWEST_TO_JUDGE:
+        return found
+    if poses is not None:
+        found += _poses_lack(poses, imprecise)
+    least = LEAST_COVERAGE.at(imprecise)
+    if views.coverage < least:
+        text = f"corners reach {views.coverage:.0%} of the picture, {least:.0%} are needed"
+        found.append(reason_for("poor-coverage", text, views.coverage, least))
+    if bright < views.room_flux <= MOST_ROOM_FLUX.always:
+        found.append(_room_light(views.room_flux, bright))
+    return found
+
+
+def _poses_lack(poses: PoseEvidence, imprecise: bool) -> list[Reason]:
+    found = []
+    least = LEAST_TILT_RAD.at(imprecise)
+    if poses.tilt_rad < least:
+        text = (
+            f"no two boards are tilted more than {math.degrees(poses.tilt_rad):.0f} degrees against each other, "
+            f"{math.degrees(least):.0f} are needed"
+        )
+        found.append(reason_for("no-tilt", text, poses.tilt_rad, least))
+    least = LEAST_BOARD_RAD.at(imprecise)
+    if poses.board_rad < least:
+        text = (
+            f"boards stood {poses.distance_m:.2g} m away (median) and were seen under "
+            f"{math.degrees(poses.board_rad):.1f} degrees, {math.degrees(least):.1f} are needed"
+        )
+        found.append(reason_for("board-too-far", text, poses.board_rad, least))
+    return found
+
+
+def _room_light(flux: float, limit: float) -> Reason:
+    text = f"room light gives {flux:.2g} photons per pixel and exposure on white, the limit is {limit:g}"
+    return reason_for("room-light", text, flux, limit)

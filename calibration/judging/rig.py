@@ -1,0 +1,101 @@
+"""From a fit to its verdict: what was asked, what the fit tells, and the words of `calibration.verdict` for it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calibration.board.board import Board
+from calibration.depth.propagation import propagated
+from calibration.depth.sensitivity import Sensitivity, sensitivity
+from calibration.depth.uncertainty import DepthUncertainty, depth_uncertainty
+from calibration.errors import Degenerate
+from calibration.guide.poses import rough_camera
+from calibration.judging.evidence import baseline_m, pose_evidence, rough_poses, view_evidence
+from calibration.judging.rules import FitEvidence, judge, judge_refusal
+from calibration.judging.sweep_waves import SweepResidual, SweepWaves, sweep_waves
+from calibration.judging.view_shifts import ViewShift, common_shift, counted, last_before_move, view_shifts
+from calibration.model.lag_speeds import SWEPT
+from calibration.model.rig_model import RigModel
+from calibration.rig_fit.fit import RigFit
+from calibration.verdict import Asked, Verdict
+from calibration.views import View
+
+AT_M: Final = 5.0
+ACCURACY_PX: Final = 0.1
+"""Where no accuracy is asked for: what a stripe that is off by this costs. No estimator does better in fog."""
+_WORST_PERCENT = 95
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """A verdict and what it was made of."""
+
+    verdict: Verdict
+    asked: Asked
+    evidence: FitEvidence
+    waves: SweepWaves
+    residuals: tuple[SweepResidual, ...]
+    shifts: tuple[ViewShift, ...]
+    uncertainty: DepthUncertainty
+    sensitivity: Sensitivity
+
+
+def judge_fit(
+    fit: RigFit,
+    views: Sequence[View],
+    *,
+    at_m: float = AT_M,
+    accuracy_m: float | None = None,
+    stated_baseline_m: float | None = None,
+) -> Judged:
+    """Judge a fit of `views`. accuracy_m: sd of depth at `at_m` that is good enough; None: that of ACCURACY_PX.
+
+    Raises CalibrationError where the line does not reach that distance.
+    """
+    model = fit.model
+    worth = sensitivity(model, at_m)
+    asked = Asked(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
+    residuals = tuple(
+        SweepResidual(name, sweep.direction, sweep.command, sweep.residual)
+        for name, sweeps in zip(fit.views, fit.sweeps, strict=True)
+        for sweep in sweeps
+    )
+    waves = sweep_waves(residuals)
+    shifts = view_shifts(fit, {view.name: view for view in views})
+    agreeing = counted(shifts, fit.outliers, fit.misfit)
+    sweeps = max((len(of_view) for of_view in fit.sweeps), default=1)
+    uncertainty = depth_uncertainty(model, at_m)
+    baseline, baseline_sd = _baseline(model)
+    known = uncertainty.sd_m[np.isfinite(uncertainty.sd_m)]
+    evidence = FitEvidence(
+        poses=pose_evidence(fit.poses, fit.board),
+        expected_m=float(np.median(known)) if known.size else np.nan,
+        worst_m=float(np.percentile(known, _WORST_PERCENT)) if known.size else np.nan,
+        wave_m=waves.rms * worth.per_command_m,
+        shift_m=common_shift(agreeing, waves.rms, sweeps) * worth.per_command_m,
+        moved_after=last_before_move(agreeing),
+        outliers=fit.outliers,
+        misfit=fit.misfit,
+        baseline_m=baseline,
+        baseline_sd_m=baseline_sd,
+        velocities_per_s=tuple(model.provenance[SWEPT]),
+    )
+    seen = view_evidence(views, (model.camera.width, model.camera.height))
+    return Judged(judge(seen, evidence, asked), asked, evidence, waves, residuals, shifts, uncertainty, worth)
+
+
+def judge_refused(
+    refused: Degenerate, views: Sequence[View], board: Board, size: tuple[int, int], *, photons: bool = True
+) -> Verdict:
+    """Judge views of a picture of `size` (width, height) from which no model could be made; photons: `data_lack`."""
+    poses = rough_poses(views, board, rough_camera(size))
+    evidence = pose_evidence(poses, board) if poses else None
+    return judge_refusal(refused, view_evidence(views, size), evidence, photons=photons)
+
+
+def _baseline(model: RigModel) -> tuple[float, float]:
+    """Distance of camera and mirror axis, and its sd, metres; NaN for a table of planes."""
+    values, covariance = propagated(model, lambda tried: np.array([baseline_m(tried.scanner)]))
+    return float(values[0]), float(np.sqrt(covariance[0, 0]))

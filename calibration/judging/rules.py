@@ -1,0 +1,131 @@
+"""Is a calibration good enough, and if not, why: a verdict whose limits are depth errors.
+
+A calibration passes where the depth error that its covariance predicts is at most what was asked for, and where its
+data agree with each other and with what is known of the rig. The first reason is the root cause. Their order:
+
+1. Data that no one rig can have made (planes that wave, a rig that moved): nothing else can be believed then.
+2. A baseline other than the stated one: everything is in proportion, only too large or too small.
+3. Data that say too little (room light, too few poses, no tilt, boards too far, corners in a part of the picture only):
+   a likely cause where the predicted error is too large; and where the covariance promises enough, but by the model
+   alone, with next to nothing left to check the model by.
+
+Where the error is too large and the data have none of these faults, there are simply too few of them. Last comes what
+the predicted error does not show: sweeps that told no lag for one of the ways that a scan may go.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from calibration.errors import Degenerate
+from calibration.judging.data_lack import data_lack
+from calibration.judging.evidence import PoseEvidence, ViewEvidence
+from calibration.judging.lags import lag_lack
+from calibration.verdict import SIGMAS, WORST_TIMES, Asked, Reason, Verdict, mm, more_poses, reason_for
+
+LEAST_BASELINE_CHANGE: Final = 0.01
+"""What a tape measure may be wrong: 3 mm in 300 mm."""
+
+
+@dataclass(frozen=True, slots=True)
+class FitEvidence:
+    """What a fit tells, besides where the boards stood; NaN where it cannot.
+
+    expected_m, worst_m: predicted sd of the depth at the distance asked, median and 95 % of the picture. wave_m: error
+    of one sweep against another of the same view there; shift_m: of a view against the others; moved_after: the view
+    after which they changed, where one move explains them. outliers: views that do not fit. misfit: by which the
+    expected variances grew because the data contradict each other. baseline_m, baseline_sd_m: distance of camera and
+    mirror axis. velocities_per_s: of the sweeps, signed; none: not known.
+    """
+
+    poses: PoseEvidence
+    expected_m: float
+    worst_m: float
+    wave_m: float = math.nan
+    shift_m: float = math.nan
+    moved_after: str | None = None
+    outliers: tuple[str, ...] = ()
+    misfit: float = 1.0
+    baseline_m: float = math.nan
+    baseline_sd_m: float = math.nan
+    velocities_per_s: tuple[float, ...] = ()
+
+
+def judge(views: ViewEvidence, fit: FitEvidence, asked: Asked) -> Verdict:
+    """The verdict on a fitted rig model."""
+    imprecise = not (fit.expected_m <= asked.accuracy_m and fit.worst_m <= WORST_TIMES * asked.accuracy_m)
+    reasons = [*_contradictions(fit, asked, imprecise)]
+    poverty = data_lack(views, fit.poses, imprecise=imprecise)
+    scale = _scale(fit, asked)
+    # A baseline is only as good as the fit it comes from.
+    reasons += [*poverty, *scale] if imprecise else [*scale, *poverty]
+    if imprecise and not reasons:
+        what = f"the expected depth error at {asked.at_m:g} m is"
+        reasons.append(more_poses(views.shown, what, (fit.expected_m, fit.worst_m), asked.accuracy_m, mm))
+    reasons += lag_lack(fit.velocities_per_s, mean_will_do=True)
+    return Verdict(not reasons, tuple(reasons))
+
+
+def judge_refusal(
+    refused: Degenerate, views: ViewEvidence, poses: PoseEvidence | None = None, *, photons: bool = True
+) -> Verdict:
+    """The verdict where no model could be fitted: what the views lack, else what the fit said. poses: roughly.
+
+    photons: as for `data_lack`.
+    """
+    lacking = data_lack(views, poses, imprecise=True, photons=photons)
+    code = _REFUSED_FOR.get(refused.reason, refused.reason)
+    own = reason_for(code, str(refused))
+    if refused.reason in _SEEN_AT_ONCE:  # but for room light, which hides boards, nothing goes before it
+        return Verdict(False, (*[reason for reason in lacking if reason.code == "room-light"], own))
+    return Verdict(False, (*lacking, *([] if code in [reason.code for reason in lacking] else [own])))
+
+
+_REFUSED_FOR = {"one-pose": "too-few-poses", "coplanar": "no-tilt"}
+"""What a fit that is impossible was short of."""
+_SEEN_AT_ONCE = ("no-board", "wrong-board", "board-half-out", "mirrored", "two-boards")
+"""What is wrong with single views."""
+
+
+def _contradictions(fit: FitEvidence, asked: Asked, imprecise: bool) -> list[Reason]:
+    """What no one rig can have made. Sweeps of one view that differ tell waves from a rig that moved in between.
+
+    Where the result would be precise but for the misfit, less than the accuracy asked is the cause already.
+    """
+    limit = asked.accuracy_m
+    grown = math.sqrt(max(fit.misfit, 1.0))
+    if imprecise and fit.expected_m <= limit * grown and fit.worst_m <= WORST_TIMES * limit * grown:
+        limit /= grown
+    waves = fit.wave_m > limit
+    moved = fit.shift_m > max(limit, fit.wave_m if waves else 0.0)
+    found = []
+    if waves:
+        found.append(
+            reason_for(
+                "exposure-not-locked",
+                f"planes wave: sweeps of one view differ by {mm(fit.wave_m)} of depth at {asked.at_m:g} m, the limit "
+                f"is {mm(limit)}",
+                fit.wave_m,
+                limit,
+            )
+        )
+    if moved:
+        named = f" (the rig moved after view {fit.moved_after})" if fit.moved_after else ""
+        text = f"views contradict each other by {mm(fit.shift_m)} of depth at {asked.at_m:g} m{named}"
+        found.insert(0, reason_for("moved-rig", f"{text}, the limit is {mm(limit)}", fit.shift_m, limit))
+    return found
+
+
+def _scale(fit: FitEvidence, asked: Asked) -> list[Reason]:
+    stated = asked.stated_baseline_m
+    if stated is None or not math.isfinite(fit.baseline_m):
+        return []
+    change = fit.baseline_m / stated - 1
+    limit = max(LEAST_BASELINE_CHANGE, SIGMAS * (fit.baseline_sd_m / stated if fit.baseline_sd_m > 0 else 0.0))
+    if abs(change) <= limit:
+        return []
+    text = (
+        f"the baseline comes out as {mm(fit.baseline_m)}, stated are {mm(stated)}: {change:+.1%}, the limit is "
+        f"{limit:.1%}; so is every depth"
+    )
+    return [reason_for("wrong-square-size", text, change, limit)]

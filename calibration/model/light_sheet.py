@@ -1,0 +1,119 @@
+"""The sheet of light at one mirror command: a plane, or a sheet that bows out of it.
+
+A line lens spreads the beam into a fan of directions. Seen from the fan's origin O, with f the fan's middle, t across
+it (along the mirror's axis) and n the plane's normal, light leaves at the angle phi within the plane and, where the
+sheet is bowed, at the angle bow phi^2 out of it towards n. A point X with p = (X - O).f, q = (X - O).t lies on it where
+
+    n.X = d + tan(bow phi^2) hypot(p, q),    phi = atan2(q, p),
+
+whether O itself lies in the plane or a little beside it. O is the model's `source_m`; where that is unknown, the point
+of the mirror's axis that is nearest to the camera.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.model.scanner import PivotScanner, Scanner
+from calibration.model.triangulation import NEARLY_PARALLEL, depth, inverse_depth
+
+Array = NDArray[np.float64]
+
+_MOST_STEPS = 12
+_CONVERGED = 1e-12
+"""Relative step at which Newton's method has arrived; sheets are so nearly flat that three steps do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightSheets:
+    """Sheets of any shape (...): planes (..., 4), |n| = 1, and how they bow.
+
+    origin_m: (3,) O. middle, across: (..., 3) unit vectors f and t. bow_per_rad: 0 for planes.
+    """
+
+    planes: Array
+    origin_m: Array
+    middle: Array
+    across: Array
+    bow_per_rad: float
+
+    def distance_m(self, points_m: ArrayLike) -> Array:
+        """How far points (..., 3) lie off their sheets along n, metres: 0 on the sheet."""
+        points = np.asarray(points_m, np.float64)
+        off: Array = np.sum(self.planes[..., :3] * points, axis=-1) - self.planes[..., 3]
+        if self.bow_per_rad:
+            off = off - self._bowed(points - self.origin_m)[0]
+        return off
+
+    def inverse_depth(self, u: ArrayLike, v: ArrayLike) -> Array:
+        """1/z (1/m) of rays (u, v), by the same rules as `triangulation.inverse_depth`, which it is for planes.
+
+        With w = 1/z and the ray r it is n.r - d w = tan(bow phi^2) hypot(p, q) of r - w O: nearly linear in w, and
+        regular for rays that never meet the sheet. Newton's method begins at the plane.
+        """
+        w = inverse_depth(u, v, self.planes)
+        if not self.bow_per_rad:
+            return w
+        u_, v_, _ = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64), w)
+        ray = np.stack([u_, v_, np.ones_like(w)], axis=-1)
+        offset = self.planes[..., 3]
+        with np.errstate(all="ignore"):
+            along = np.sum(self.planes[..., :3] * ray, axis=-1)
+            for _ in range(_MOST_STEPS):
+                bowed, slope, ahead = self._bowed(ray - w[..., None] * self.origin_m)
+                step = (along - offset * w - bowed) / (offset + slope)
+                w = w + step
+                moved = np.abs(step) > _CONVERGED * np.abs(w)
+                if not moved.any():
+                    break
+            found = np.isfinite(w) & ahead & ~moved
+        return np.where(found, w, np.nan)
+
+    def depth(self, u: ArrayLike, v: ArrayLike) -> Array:
+        """Depth z (m) of rays (u, v), by the same rules as `triangulation.depth`, which it is for planes."""
+        if not self.bow_per_rad:
+            return depth(u, v, self.planes)
+        w = self.inverse_depth(u, v)
+        with np.errstate(all="ignore"):
+            length = np.sqrt(np.square(np.asarray(u, np.float64)) + np.square(np.asarray(v, np.float64)) + 1)
+            met = (w > 0) & (np.abs(self.planes[..., 3] * w) >= NEARLY_PARALLEL * length)
+            z: Array = 1.0 / np.where(met, w, np.nan)
+        return z
+
+    def _bowed(self, seen: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """For X - O, or that over z: off the plane, its slope by w, and whether it lies ahead of the fan."""
+        p, q = np.sum(seen * self.middle, axis=-1), np.sum(seen * self.across, axis=-1)
+        dp, dq = -(self.middle @ self.origin_m), -(self.across @ self.origin_m)
+        reach = np.hypot(p, q)
+        phi = np.arctan2(q, p)
+        tangent = np.tan(self.bow_per_rad * phi * phi)
+        turn = 2 * self.bow_per_rad * phi * (p * dq - q * dp) / reach
+        slope = tangent * (p * dp + q * dq) / reach + (1 + tangent * tangent) * turn
+        return tangent * reach, slope, p > 0
+
+
+def light_sheets(scanner: Scanner, source_m: ArrayLike | None, commands: ArrayLike) -> LightSheets:
+    """The sheets (...) at commands (...). A table of planes has no bow. CalibrationError outside the range."""
+    if not isinstance(scanner, PivotScanner) or scanner.bow_per_rad == 0:
+        planes = scanner.planes(commands)
+        nothing = np.zeros_like(planes[..., :3])
+        return LightSheets(planes, np.zeros(3), nothing, nothing, 0.0)
+    planes = scanner.turned(commands)
+    normal = planes[..., :3]
+    across = scanner.axis_direction - np.sum(normal * scanner.axis_direction, axis=-1, keepdims=True) * normal
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    middle = np.cross(across, normal)
+    middle = np.where(middle[..., 2:] < 0, -middle, middle)  # the light goes where the camera looks
+    return LightSheets(planes, fan_origin(scanner, source_m), middle, across, scanner.bow_per_rad)
+
+
+def fan_origin(scanner: Scanner, source_m: ArrayLike | None) -> Array:
+    """Where the fan of light starts (3,): the source, or the point of the mirror's axis nearest to the camera."""
+    if source_m is not None:
+        return np.asarray(source_m, np.float64)
+    if not isinstance(scanner, PivotScanner):
+        return np.zeros(3)
+    point, axis = scanner.axis_point_m, scanner.axis_direction
+    nearest: Array = point - (point @ axis) * axis
+    return nearest

@@ -1,0 +1,131 @@
+"""A model's numbers as a list of parameters, local and minimal, for fits and covariances.
+
+Directions and points have fewer degrees of freedom than numbers, so those of the axis are changes: 0 for the model at
+hand, counted about and along two fixed directions across the axis, e1 = zero_normal and e2 = axis x zero_normal.
+
+    fx fy cx cy                     pixels
+    k1 k2 p1 p2 k3 ... tau_y        distortion, those terms that the camera has
+    axis_turn_1, axis_turn_2        rad; axis and zero_normal turned together about e1, e2, through axis_point_m
+    axis_shift_1, axis_shift_2      m; axis_point_m along e1, e2
+    angle_0, angle_1, ...           rad; terms of angle_rad
+    offset_0, ..., cone, bow        m, ..., rad, rad per rad^2; terms of offset_m, cone_rad, bow_per_rad
+    lag_forward, lag_backward, row_delay   s
+
+A table of planes has no parameters of its own: only the camera's and the lags' are given.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.errors import CalibrationError
+from calibration.model.camera import Camera
+from calibration.model.rig_model import Lag, RigModel
+from calibration.model.scanner import PivotScanner
+
+Array = NDArray[np.float64]
+
+MATRIX = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
+AXIS = ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2")
+MOST_TERMS = 32
+"""Of a polynomial; a galvo's law has two to five."""
+TIMES = FORWARD, BACKWARD, ROW_DELAY = "lag_forward", "lag_backward", "row_delay"
+
+
+def parameters(model: RigModel) -> tuple[tuple[str, ...], Array]:
+    """Names and values (p,) of all parameters of a model."""
+    camera, scanner = model.camera, model.scanner
+    named = {name: camera.matrix[at] for name, at in MATRIX.items()}
+    named |= dict(zip(DISTORTION, camera.distortion, strict=False))
+    if isinstance(scanner, PivotScanner):
+        named |= dict.fromkeys(AXIS, 0.0)
+        named |= {f"angle_{i}": term for i, term in enumerate(scanner.angle_rad)}
+        named |= {f"offset_{i}": term for i, term in enumerate(scanner.offset_m)}
+        named |= {"cone": scanner.cone_rad, "bow": scanner.bow_per_rad}
+    named |= dict(zip(TIMES, (*model.lag_s, model.row_delay_s), strict=True))
+    return tuple(named), np.array(list(named.values()), np.float64)
+
+
+def with_parameters(model: RigModel, names: Sequence[str], deltas: ArrayLike) -> RigModel:
+    """The model with `deltas` (n,) added to the parameters `names`; the others stay.
+
+    Terms angle_i and offset_i beyond those of the model begin at 0. CalibrationError for a parameter that a model of
+    this kind does not have, and where the change leaves no valid model.
+    """
+    change = dict(zip(names, np.asarray(deltas, np.float64).tolist(), strict=True))
+    camera = _camera(model.camera, change)
+    scanner = model.scanner
+    if isinstance(scanner, PivotScanner):
+        scanner = _pivot(scanner, change)
+    forward, backward, row_delay = (change.pop(name, 0.0) for name in TIMES)
+    if change:
+        raise CalibrationError(
+            f"the model has no parameter {', '.join(change)}; it has {', '.join(parameters(model)[0])}"
+        )
+    lag = model.lag_s
+    return replace(
+        model,
+        camera=camera,
+        scanner=scanner,
+        lag_s=Lag(lag.forward + forward, lag.backward + backward),
+        row_delay_s=model.row_delay_s + row_delay,
+    )
+
+
+def _camera(camera: Camera, change: dict[str, float]) -> Camera:
+    """The camera with its part of the change, which is taken out."""
+    matrix, distortion = camera.matrix.copy(), camera.distortion.copy()
+    touched = False
+    for name, at in MATRIX.items():
+        if name in change:
+            matrix[at] += change.pop(name)
+            touched = True
+    for i, name in enumerate(DISTORTION[: distortion.size]):
+        if name in change:
+            distortion[i] += change.pop(name)
+            touched = True
+    return Camera(camera.width, camera.height, matrix, distortion) if touched else camera
+
+
+def _pivot(scanner: PivotScanner, change: dict[str, float]) -> PivotScanner:
+    """The scanner with its part of the change, which is taken out."""
+    first, axis = scanner.zero_normal, scanner.axis_direction
+    second = np.cross(axis, first)
+    turn_1, turn_2, shift_1, shift_2 = (change.pop(name, 0.0) for name in AXIS)
+    turn = _rotation(turn_1 * first + turn_2 * second)
+    return replace(
+        scanner,
+        axis_point_m=scanner.axis_point_m + shift_1 * first + shift_2 * second,
+        axis_direction=turn @ axis,
+        zero_normal=turn @ first,
+        angle_rad=_terms(scanner.angle_rad, "angle_", change),
+        offset_m=_terms(scanner.offset_m, "offset_", change),
+        cone_rad=scanner.cone_rad + change.pop("cone", 0.0),
+        bow_per_rad=scanner.bow_per_rad + change.pop("bow", 0.0),
+    )
+
+
+def _terms(terms: Array, stem: str, change: dict[str, float]) -> Array:
+    """Polynomial terms with those changes whose names begin with the stem, as many as are needed."""
+    asked = {i: f"{stem}{i}" for i in range(MOST_TERMS) if f"{stem}{i}" in change}
+    result: Array = np.zeros(max([terms.size, *(i + 1 for i in asked)]))
+    result[: terms.size] = terms
+    for i, name in asked.items():
+        result[i] += change.pop(name)
+    return result
+
+
+def _rotation(vector: Array) -> Array:
+    """Rotation matrix (3, 3) of a Rodrigues vector, smooth at zero."""
+    if not np.all(np.abs(vector) <= np.pi):
+        raise CalibrationError(f"axis turns by {np.abs(vector).max():.3g} rad; changes are small, at most half a turn")
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector
+    cross: Array = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # np.sinc is sin(pi t) / (pi t): no division by an angle that may be zero.
+    once, twice = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    result: Array = np.eye(3) + once * cross + twice * (cross @ cross)
+    return result

@@ -1,0 +1,165 @@
+"""The rig model: the calibrated camera and scanner together, with what else the calibration knows of the rig."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.errors import CalibrationError
+from calibration.model.camera import Camera
+from calibration.model.covariance import Covariance
+from calibration.model.light_sheet import LightSheets, fan_origin, light_sheets
+from calibration.model.scanner import Scanner
+
+Array = NDArray[np.float64]
+
+
+class Lag(NamedTuple):
+    """Seconds by which the mirror follows its command, per sweep direction (forward: rising command)."""
+
+    forward: float = 0.0
+    backward: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Of which rig this is the calibration, from when, and what became of it; compared before a model is used.
+
+    rig: hash over what matters of the rig's config. name: the rig's name. created: date and time, ISO 8601. kinds,
+    serials: of the devices by slot (spad, scanner, ...), those that were known. verdict, reasons: of the calibration
+    and of the last check of it; None where there was none.
+    """
+
+    rig: str
+    created: str
+    name: str = ""
+    kinds: Mapping[str, str] = field(default_factory=dict)
+    serials: Mapping[str, str] = field(default_factory=dict)
+    verdict: Literal["passed", "failed"] | None = None
+    reasons: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class RigModel:
+    """Camera, scanner, lag, defects and provenance of one rig.
+
+    speed_range_per_s: command speeds the lag was measured at, None where it was not measured.
+    source_m: (3,) where the light leaves the mirror, camera frame; None where unknown.
+    defects: (height, width) bool, True = pixel not to be used; None where unknown.
+    dark_rate_per_s: (height, width) float32 counts a second in the dark; None where unknown.
+    row_delay_s: by which every row is exposed later than the row above it. gate_delay_s: from the gate's edge until
+    the light follows. colour_skew_s: by which the scanner's gate output runs ahead of its mirror. marker_rising:
+    whether the edge of a scan marker that counts is the rising one.
+    covariance: of the parameters that were estimated, see `parameters`. identity: None where nobody wrote it down.
+    Raises CalibrationError for planes within 45 degrees of the search axis: along the row they give no position.
+    """
+
+    camera: Camera
+    scanner: Scanner
+    lag_s: Lag = field(default_factory=Lag)
+    speed_range_per_s: tuple[float, float] | None = None
+    source_m: Array | None = None
+    defects: NDArray[np.bool_] | None = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    dark_rate_per_s: NDArray[np.float32] | None = None
+    row_delay_s: float = 0.0
+    gate_delay_s: float = 0.0
+    colour_skew_s: float = 0.0
+    marker_rising: bool = True
+    covariance: Covariance | None = None
+    identity: Identity | None = None
+
+    def __post_init__(self) -> None:
+        """Check that the parts fit each other."""
+        if not all(np.isfinite(lag) and lag >= 0 for lag in self.lag_s):
+            raise CalibrationError(f"lag_s is {tuple(self.lag_s)}; a mirror follows its command by 0 s or more")
+        for name in ("row_delay_s", "gate_delay_s", "colour_skew_s"):
+            if not np.isfinite(getattr(self, name)):
+                raise CalibrationError(f"{name} is {getattr(self, name)}; it must be a finite number of seconds")
+        size = (self.camera.height, self.camera.width)
+        for what, pixels in (("defect", self.defects), ("dark rate", self.dark_rate_per_s)):
+            if pixels is not None and pixels.shape != size:
+                raise CalibrationError(f"{what} map is {_size(pixels.shape)} pixels, the camera {_size(size)}")
+        low, high = self.scanner.command_range
+        commands = getattr(self.scanner, "command", np.linspace(low, high, 33))
+        planes = self.scanner.planes(commands)
+        flat = np.abs(planes[:, 0]) <= np.abs(planes[:, 1])
+        if np.any(flat):
+            at = int(np.argmax(flat))
+            angle = np.degrees(np.arctan2(abs(planes[at, 0]), abs(planes[at, 1])))
+            raise CalibrationError(
+                f"light plane at command {commands[at]:g} lies {angle:.1f} degrees from the search axis (image row); "
+                "it must be more than 45: turn the line, or mount the sensor sideways"
+            )
+
+    def planes(self, commands: ArrayLike) -> Array:
+        """Light planes (..., 4) = nx, ny, nz, d (metres) for mirror commands (...)."""
+        return self.scanner.planes(commands)
+
+    def sheets(self, commands: ArrayLike) -> LightSheets:
+        """The light at mirror commands (...): `planes`, and how they bow."""
+        return light_sheets(self.scanner, self.source_m, commands)
+
+    def mirror_command(self, commands: ArrayLike, y_px: ArrayLike, velocity_per_s: ArrayLike) -> Array:
+        """Where the mirror stands when row y sees the light, on the command's scale, for what is commanded then.
+
+        'Then' is when the first row is exposed; a later row sees the mirror farther on. velocity_per_s: of the
+        command, positive where it rises; the lag is that of its direction. All broadcast.
+        """
+        velocity = np.asarray(velocity_per_s, np.float64)
+        lag_s = np.where(velocity < 0, self.lag_s.backward, self.lag_s.forward)
+        result: Array = np.asarray(commands, np.float64) - velocity * (
+            lag_s - self.row_delay_s * np.asarray(y_px, np.float64)
+        )
+        return result
+
+    def check_sensor(self, width: int, height: int) -> None:
+        """Raise CalibrationError unless the model was made for a sensor of this size."""
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise CalibrationError(
+                f"calibration is for a sensor of {self.camera.width} x {self.camera.height} pixels, this one has "
+                f"{width} x {height}; use the calibration made with this sensor"
+            )
+
+    def check_speed(self, speed_per_s: float) -> None:
+        """Raise CalibrationError unless the lag was measured around this command speed."""
+        if self.speed_range_per_s is None:
+            return
+        low, high = self.speed_range_per_s
+        if not low <= speed_per_s <= high:
+            raise CalibrationError(
+                f"sweep speed {speed_per_s:.4g} /s lies outside the {low:.4g} to {high:.4g} /s the lag was calibrated "
+                "at; change columns, exposures or frame_rate, or calibrate at this speed"
+            )
+
+    def fingerprint(self) -> str:
+        """Sixteen hexadecimal digits that change with any number the depth depends on."""
+        low, high = self.scanner.command_range
+        commands = getattr(self.scanner, "command", np.linspace(low, high, 33))
+        digest = hashlib.sha256()
+        parts: tuple[ArrayLike, ...] = (
+            [self.camera.width, self.camera.height],
+            self.camera.matrix,
+            self.camera.distortion,
+            [low, high, *self.lag_s],
+            self.scanner.planes(commands),
+            [] if self.defects is None else np.flatnonzero(self.defects),
+        )
+        if not np.array_equal(commands, np.linspace(low, high, len(commands))):
+            parts += (commands,)
+        bow_per_rad = getattr(self.scanner, "bow_per_rad", 0.0)
+        if bow_per_rad:
+            parts += ([bow_per_rad, *fan_origin(self.scanner, self.source_m)],)
+        if self.row_delay_s:
+            parts += ([self.row_delay_s],)
+        for part in parts:
+            values = np.ascontiguousarray(part, dtype="<f8")
+            digest.update(str(values.shape).encode() + values.tobytes())
+        return digest.hexdigest()[:16]
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return " x ".join(str(n) for n in reversed(shape))

@@ -1,0 +1,185 @@
+"""When the laser line passed over each pixel of a sweep, from the counts of its columns.
+
+For each of many pixels, spread evenly over the picture: where the line stands out most from what is on both sides, then
+the maximum likelihood of the columns around it (`calibration.passages.pixel_fit`). A pixel that tells nothing is left
+out, and what is given says how far it is to be trusted: the standard deviation of a passage within a flat top, where
+all frames are lit, is a long one. The line has to be seen in two columns or more: at columns wider than 2 pixels most
+pixels tell nothing, so calibrate with many columns of few exposures rather than few columns of many.
+
+10 000 pixels of 500 columns take about 0.5 s.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.passages.even_pixels import evenly
+from calibration.passages.line_search import ColumnSums, brightest
+from calibration.passages.pixel_fit import PassageFit, fit_passages
+from calibration.views import Passages
+
+Array = NDArray[np.float64]
+Counts = NDArray[np.unsignedinteger[Any]]
+
+MOST_PASSAGES = 2000
+"""Of a sweep; more say little more about a dozen parameters."""
+TRIES = 6
+"""So many times more pixels are looked at where few of them see the line."""
+CHUNK = 3000
+"""Pixels at a time."""
+NEAR_SIGMAS = 4.5
+"""How far from its centre the line still is, and a column: what is farther away tells of the levels only."""
+REACH = 14
+"""Columns on either side of the line that tell of the levels, and at least twice as many as it has itself."""
+FAR = 1e4
+BOXES = (0.0, 1.5, 2.5, 4.0)
+"""Widths of pixel and column that are tried, in sigmas of the line."""
+LEAST_SAMPLE, SAMPLE = 50, 300
+"""Pixels that tell of the passage's shape: fewer than the first find one for themselves alone, more are not asked."""
+LEAST_SIGNIFICANCE = 5.0
+"""Of the line, in standard deviations."""
+MOST_MISFIT = 5.0
+"""Of what was fitted, in standard deviations of chi squared: another line, or something that moved."""
+MOST_SD = 1.0
+"""In columns."""
+GROUPS = 4
+"""Parts of the picture, in each direction, that have a line width of their own."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepCounts:
+    """What a sweep counted.
+
+    counts: (columns, rows, window), 1s of each pixel over the frames of a column. n_frames: (columns,), frames of each.
+    command: (columns,), mean mirror command of them, without any lag; NaN where there are none. x0: (columns,), first
+    pixel of each column's window. width: of the picture, in pixels.
+    """
+
+    counts: Counts
+    n_frames: NDArray[np.integer[Any]]
+    command: Array
+    x0: NDArray[np.integer[Any]]
+    width: int
+
+    @property
+    def step(self) -> float:
+        """Command from a column to the next."""
+        there = np.flatnonzero(np.isfinite(self.command))
+        if len(there) < 2:
+            return np.nan
+        return float((self.command[there[-1]] - self.command[there[0]]) / (there[-1] - there[0]))
+
+    @property
+    def position(self) -> Array:
+        """Of each column (columns,), in columns: its own number, as far as its frames lay evenly in it."""
+        number = np.arange(len(self.command), dtype=np.float64)
+        there = np.flatnonzero(np.isfinite(self.command))
+        if len(there) < 2:
+            return number
+        first = there[0]
+        return np.where(np.isfinite(self.command), first + (self.command - self.command[first]) / self.step, number)
+
+    def at_pixels(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """1s (columns, pixels) of pixels (n, 2), and frames (columns, pixels or 1), none where a window ends before."""
+        total, rows, window = self.counts.shape
+        ones = np.zeros((total, len(pixels)), np.int32)
+        n = self.n_frames.astype(np.int32)[:, None]
+        if np.all(self.x0 == self.x0[0]):  # the usual case, and the quicker one
+            at = pixels[:, 0] * window + pixels[:, 1] - int(self.x0[0])
+            for k in range(total):
+                ones[k] = self.counts[k].reshape(rows * window).take(at)
+            return ones, n
+        x = pixels[None, :, 1] - self.x0[:, None]
+        inside = (x >= 0) & (x < window)
+        for k in range(total):
+            here = inside[k]
+            ones[k, here] = self.counts[k, pixels[here, 0], x[k, here]]
+        return ones, inside * n
+
+
+def find_passages(
+    sweep: SweepCounts,
+    direction: int,
+    speed_per_s: float,
+    mask: NDArray[np.bool_] | None = None,
+    most: int = MOST_PASSAGES,
+) -> Passages:
+    """Passages of at most `most` pixels of a mask (rows, width), by default of any; none where the line is not seen."""
+    rows = sweep.counts.shape[1]
+    pixels = evenly(np.ones((rows, sweep.width), np.bool_) if mask is None else mask)
+    kept: list[tuple[NDArray[np.int64], Array, Array]] = [(pixels[:0], np.empty(0), np.empty(0))]
+    found, shape = 0, None
+    for first in range(0, min(len(pixels), TRIES * most), CHUNK):
+        good, shape = _passages(sweep, pixels[first : first + CHUNK], shape)
+        kept.append(good)
+        found += len(good[1])
+        if found >= most:
+            break
+    place, centre, sd = (np.concatenate(parts)[:most] for parts in zip(*kept, strict=True))
+    first_command = float(sweep.command[np.isfinite(sweep.command)][:1].sum())
+    begin = int(np.argmax(np.isfinite(sweep.command)))
+    return Passages(
+        x_px=place[:, 1].astype(np.float64),
+        y_px=place[:, 0].astype(np.float64),
+        command=first_command + (centre - begin) * sweep.step,
+        sd=sd * abs(sweep.step),
+        direction=direction,
+        speed_per_s=speed_per_s,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """Of the passages of a sweep. near: columns on either side of a line that it reaches. box: as of `fit_passages`."""
+
+    near: int
+    box: float
+
+
+def _passages(
+    sweep: SweepCounts, pixels: NDArray[np.int64], shape: _Shape | None
+) -> tuple[tuple[NDArray[np.int64], Array, Array], _Shape | None]:
+    """The pixels (m, 2) of these that tell of a passage, its centre and sd (m,) in columns; and the passages' shape."""
+    ones, frames = sweep.at_pixels(pixels)
+    sums = ColumnSums.of(ones, frames)
+    start, seen = brightest(sums)
+    pixels, start, sums = pixels[seen], start[seen], sums.some(seen)
+    if not len(pixels):
+        return (pixels, np.empty(0), np.empty(0)), shape
+    group = _groups(pixels, (sweep.counts.shape[1], sweep.width))
+
+    def fit(shape: _Shape, first: int | None = None, *, exact: bool = True) -> PassageFit:
+        some = slice(None, first)
+        data = _around(sums.some(some), sweep.position, start[some], shape.near)
+        return fit_passages(*data, start[some], group[some], shape.box, exact=exact)
+
+    sure = shape is not None or len(pixels) >= LEAST_SAMPLE
+    if shape is None:
+        sigma = float(np.median(fit(_Shape(REACH, 0.0), SAMPLE, exact=False).sigma))
+        shapes = [_Shape(int(np.ceil(NEAR_SIGMAS * sigma + 1)), box) for box in BOXES]
+        shape = max(shapes, key=lambda one: float(fit(one, SAMPLE, exact=False).likelihood.sum()))
+    found = fit(shape)
+    good = found.settled & (found.sd < MOST_SD) & (found.significance > LEAST_SIGNIFICANCE)
+    good &= (found.misfit < MOST_MISFIT) & (np.abs(found.centre - start) < np.maximum(2, 2 * found.sigma))
+    return (pixels[good], found.centre[good], found.sd[good]), shape if sure else None
+
+
+def _around(sums: ColumnSums, position: Array, start: Array, near: int) -> tuple[Array, Array, Array]:
+    """1s, frames and positions (pixels, 2 near + 3) around the passages; what is farther away lies far on its side."""
+    middle = np.rint(start).astype(np.int64)[:, None]
+    far = max(REACH, 2 * near)
+    begin = np.concatenate([middle - far, middle + np.arange(-near, near + 2)], axis=1)
+    end = np.concatenate([begin[:, 1:], middle + far + 1], axis=1)
+    ones, frames = sums.ranges(begin, end)
+    at = position[np.clip(begin, 0, sums.columns - 1)]
+    at[:, 0], at[:, -1] = -FAR, FAR
+    return ones, frames, at
+
+
+def _groups(pixels: NDArray[np.int64], size: tuple[int, int]) -> NDArray[np.int64]:
+    """Part of the picture that each pixel is in."""
+    parts = pixels * GROUPS // np.array(size)
+    group: NDArray[np.int64] = parts[:, 0] * GROUPS + parts[:, 1]
+    return group

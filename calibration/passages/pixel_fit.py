@@ -1,0 +1,245 @@
+"""Where the line's centre crosses each pixel, by maximum likelihood of the pixel's counts over the columns.
+
+The light is that of `calibration.passages.light`. Its width is common to the pixels of a group (a part of the picture),
+the four other parameters are the pixel's own. Fisher scoring on all pixels at once, steps damped where they would make
+things worse (Levenberg and Marquardt); the width's part of the information is a border of the pixels' blocks.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.passages.light import (
+    AFTER,
+    AREA,
+    BEFORE,
+    CENTRE,
+    LEAST_FLUX,
+    LEVEL_COUNTS,
+    SIGMA,
+    light,
+    log_likelihood,
+    regular,
+    residual_of,
+    score_of,
+)
+
+Array = NDArray[np.float64]
+
+UNKNOWN_SD = 1e3
+"""Columns; of a passage that the photons do not tell."""
+ITERATIONS, WIDTH_ITERATIONS = 12, 7
+"""In the first ones the common widths are found too."""
+MOST_WORSE = 2.0
+"""Of the logarithm of a pixel's likelihood, while the width is being found."""
+MOST_STEP = 0.6
+"""Of the centre in one iteration, in sigmas, and of the logarithm of sigma."""
+DAMPING = 0.01
+"""To begin with: share by which the information's diagonal is raised, so that steps fall short."""
+LEAST_STEP = 1e-3
+"""Of the centre, in columns: where it is less for all but one pixel in a hundred, that is it."""
+SPAN, SPACING = 4, 0.8
+"""At how many places the likelihood of a centre is looked at on either side of its best, so many deviations apart."""
+MOST_AT_END = 0.03
+"""Most chance at an end of that: where there is more, the centre is not known."""
+ALIKE = 1.25
+"""Factor by which what was found may differ from what was looked for."""
+LEAST_LOOK, MOST_LOOK = 0.01, 0.7
+"""Within these, in columns."""
+LEAST_SIGMA, MOST_SIGMA = 0.25, 12.0
+"""In columns. A narrower line lies in one column or two, which do not say where."""
+SIGMA_SPREAD = 0.15
+"""By how much (standard deviation of the logarithm) sigma may differ from one part of the picture to another."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassageFit:
+    """One entry per pixel, in columns. centre, sd: of the passage. sigma: of the pixel's group.
+
+    significance: of the line, against levels alone, in standard deviations (the square root of twice the logarithm of
+    the likelihoods' ratio). misfit: Pearson's chi squared, as standard deviations above its mean. settled: whether the
+    scoring came to an end.
+    """
+
+    centre: Array
+    sd: Array
+    sigma: Array
+    significance: Array
+    misfit: Array
+    likelihood: Array
+    settled: NDArray[np.bool_]
+
+
+def fit_passages(
+    ones: Array, frames: Array, at: Array, start: Array, group: NDArray[np.int64], box: float, *, exact: bool = True
+) -> PassageFit:
+    """Fit the passages of pixels from their counts around them.
+
+    ones, frames, at: (pixels, columns) float64, 1s, frames and position of each column; frames 0 where there are none.
+    The first and the last one stand for all that is far away on their side. start: (pixels,) first guess of the
+    passage. group: (pixels,) part of the picture, from 0 on. box: width of pixel and travel together, in widths of the
+    line. exact: not the parabola's width at the top for `sd`, but that of the whole likelihood.
+    """
+    theta = _start(ones, frames, at, start)
+    damping = np.full(len(start), DAMPING)
+    flux, slopes = light(theta, at, box)
+    likelihood = log_likelihood(ones, frames, flux)
+    for iteration in range(ITERATIONS):
+        score, information = score_of(ones, frames, flux, slopes, theta)
+        wanted = _moved(theta, score, information, damping)
+        worse_by = 0.0
+        if iteration < WIDTH_ITERATIONS:
+            wanted[:, SIGMA] += _width_step(theta[:, SIGMA], score, information, group)
+            worse_by = MOST_WORSE  # what is better for the group may be worse for a pixel of it
+        new_flux, new_slopes = light(wanted, at, box)
+        new_likelihood = log_likelihood(ones, frames, new_flux)
+        better = new_likelihood >= likelihood - worse_by
+        step = np.abs(wanted[:, CENTRE] - theta[:, CENTRE])
+        theta[better], likelihood[better] = wanted[better], new_likelihood[better]
+        flux[better], slopes[better] = new_flux[better], new_slopes[better]
+        damping *= np.where(better, 0.1, 10.0)
+        if iteration >= WIDTH_ITERATIONS and np.percentile(step, 99) < LEAST_STEP:
+            break
+    theta[:, SIGMA] = (np.bincount(group, theta[:, SIGMA]) / np.maximum(np.bincount(group), 1))[group]
+    flux, slopes = light(theta, at, box)
+    _, information = score_of(ones, frames, flux, slopes, theta)
+    covariance = np.linalg.inv(regular(information[:, :SIGMA, :SIGMA]))
+    # Of next to no light the inverse is rounding, and may come out negative.
+    known = covariance[:, CENTRE, CENTRE] > 0
+    sd = np.sqrt(np.where(known, covariance[:, CENTRE, CENTRE], UNKNOWN_SD**2))
+    settled = known
+    # What not knowing the pixel's other parameters adds: by the information, and where photons are few.
+    unknown = sd * np.sqrt(information[:, CENTRE, CENTRE]) * np.sqrt(_few(frames, flux, slopes, theta))
+    if exact:
+        sd, settled = _centred(ones, frames, at, box, theta, sd)
+        settled &= known
+    return PassageFit(
+        centre=theta[:, CENTRE], sd=sd * unknown, sigma=np.exp(theta[:, SIGMA]),
+        significance=_significance(ones, frames, at, theta[:, CENTRE], flux),
+        misfit=_misfit(ones, frames, flux),
+        likelihood=log_likelihood(ones, frames, flux), settled=settled,
+    )  # fmt: skip
+
+
+def _start(ones: Array, frames: Array, at: Array, start: Array) -> Array:
+    """First guess (pixels, 5): levels from the outermost columns, area from what stands above them."""
+    flux = np.log((frames + 0.5) / (frames - ones + 0.5))
+    theta = np.empty((len(start), 5))
+    away = at - start[:, None]
+    for which, column in ((BEFORE, 0), (AFTER, -1)):
+        theta[:, which] = (ones[:, column] + LEVEL_COUNTS) / np.maximum(frames[:, column], 1.0)
+    base = np.where(away < 0, theta[:, BEFORE, None], theta[:, AFTER, None])
+    over = np.maximum(flux - base, 0) * (np.abs(away) < MOST_SIGMA) * (frames > 0)
+    theta[:, AREA] = np.maximum(over.sum(axis=1), 0.1)
+    spread = np.sqrt((over * away**2).sum(axis=1) / np.maximum(over.sum(axis=1), 1e-12))
+    theta[:, CENTRE] = start
+    theta[:, SIGMA] = np.log(np.clip(np.median(spread), LEAST_SIGMA, MOST_SIGMA))
+    return theta
+
+
+def _moved(theta: Array, score: Array, information: Array, damping: Array) -> Array:
+    """`theta` after a step of the pixels' own parameters, the smaller the more it is damped."""
+    own = regular(information[:, :SIGMA, :SIGMA])
+    own += (damping[:, None] * np.einsum("pii->pi", own))[:, :, None] * np.eye(SIGMA)
+    step = np.linalg.solve(own, score[:, :SIGMA, None])[:, :, 0]
+    moved = theta.copy()
+    most = MOST_STEP * np.exp(theta[:, SIGMA])
+    moved[:, CENTRE] += np.clip(step[:, CENTRE], -most, most)
+    for which in (BEFORE, AFTER, AREA):
+        here = theta[:, which]
+        moved[:, which] = np.clip(here + step[:, which], 0.2 * here, 5 * here + 1e-6)
+    return moved
+
+
+def _few(frames: Array, flux: Array, slopes: Array, theta: Array) -> Array:
+    """Factor (pixels,) on the variance for the three parameters that were fitted besides, to so many detections."""
+    level = slopes[:, BEFORE] * theta[:, BEFORE, None] + slopes[:, AFTER] * theta[:, AFTER, None]
+    detections = (frames * (np.exp(-level) - np.exp(-flux))).sum(axis=1)
+    result: Array = np.maximum(detections / np.maximum(detections - CENTRE, 1), 1)  # a dip has fewer than none
+    return result
+
+
+def _centred(
+    ones: Array, frames: Array, at: Array, box: float, theta: Array, sd: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Move the centres of `theta` to their means; gives back sd and `settled`. Looked at twice where first too near."""
+    sd, settled, again = sd.copy(), np.ones(len(sd), np.bool_), np.arange(len(sd))
+    for _ in range(2):
+        look = np.clip(sd[again], LEAST_LOOK, MOST_LOOK)
+        mean, spread, within = _posterior(ones[again], frames[again], at[again], box, theta[again], look)
+        theta[again, CENTRE], sd[again], settled[again] = mean, spread, within
+        again = again[~within | (spread < look / ALIKE) | (spread > look * ALIKE)]
+        if not len(again):
+            break
+    return sd, settled
+
+
+def _posterior(
+    ones: Array, frames: Array, at: Array, box: float, theta: Array, sd: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Mean and standard deviation of the centre (pixels,) where all else is known; whether both lie within the look.
+
+    Few photons make no parabola of the likelihood: its width at the top is then not what the centre errs by.
+    """
+    shifts = sd[:, None] * np.arange(-SPAN, SPAN + 1) * SPACING
+    gain = np.empty(shifts.shape)
+    for side in (range(SPAN, -1, -1), range(SPAN, 2 * SPAN + 1)):  # outward, each from what its neighbour found
+        moved = theta.copy()
+        for j in side:
+            moved[:, CENTRE] = theta[:, CENTRE] + shifts[:, j]
+            flux, slopes = light(moved, at, box)
+            own = slopes[:, :CENTRE]  # flux is linear in these
+            residual, weight = residual_of(ones, frames, flux)
+            score = (own * residual[:, None]).sum(axis=2)
+            information = (own * own * weight[:, None]).sum(axis=2)
+            score[:, :AREA] += LEVEL_COUNTS / moved[:, :AREA]
+            information[:, :AREA] += LEVEL_COUNTS / moved[:, :AREA] ** 2
+            here = moved[:, :CENTRE]
+            moved[:, :CENTRE] = np.clip(here + score / np.maximum(information, 1e-12), 0.5 * here, 2 * here)
+            flux = np.maximum((moved[:, :CENTRE, None] * own).sum(axis=1), LEAST_FLUX)
+            gain[:, j] = log_likelihood(ones, frames, flux)
+    chance = np.exp(gain - gain.max(axis=1, keepdims=True))
+    chance /= chance.sum(axis=1, keepdims=True)
+    mean = (chance * shifts).sum(axis=1)
+    spread = (chance * (shifts - mean[:, None]) ** 2).sum(axis=1)
+    return theta[:, CENTRE] + mean, np.sqrt(spread), chance[:, [0, -1]].max(axis=1) < MOST_AT_END
+
+
+def _width_step(log_sigma: Array, score: Array, information: Array, group: NDArray[np.int64]) -> Array:
+    """Step of each pixel's log sigma: that of its group, held to the mean of all groups, the others following."""
+    border = information[:, :SIGMA, SIGMA]
+    solved = np.linalg.solve(regular(information[:, :SIGMA, :SIGMA]), np.stack([score[:, :SIGMA], border], axis=2))
+    effective = score[:, SIGMA] - (border * solved[:, :, 0]).sum(axis=1)
+    width = np.maximum(information[:, SIGMA, SIGMA] - (border * solved[:, :, 1]).sum(axis=1), 0)
+    gradient, weight = (np.bincount(group, of) for of in (effective, width))
+    now = np.bincount(group, log_sigma) / np.maximum(np.bincount(group), 1)
+    wanted = now + gradient / np.maximum(weight, 1e-12)
+    sure = np.where(weight > 0, 1 / (1 / np.maximum(weight, 1e-12) + SIGMA_SPREAD**2), 0)
+    mean = (sure * wanted).sum() / max(sure.sum(), 1e-12)
+    target = (weight * wanted + mean / SIGMA_SPREAD**2) / (weight + 1 / SIGMA_SPREAD**2)
+    step = np.clip(target - now, -MOST_STEP, MOST_STEP)
+    result: Array = (np.clip(now + step, np.log(LEAST_SIGMA), np.log(MOST_SIGMA)) - now)[group]
+    return result
+
+
+def _significance(ones: Array, frames: Array, at: Array, centre: Array, flux: Array) -> Array:
+    """Of the line (pixels,), against a level before the centre and one behind it with all the light."""
+    level = np.zeros_like(flux)
+    for side in (at < centre[:, None], at >= centre[:, None]):
+        share = ((ones * side).sum(axis=1) + LEVEL_COUNTS) / ((frames * side).sum(axis=1) + 2 * LEVEL_COUNTS)
+        level += side * -np.log1p(-share)[:, None]
+    gain = log_likelihood(ones, frames, flux) - log_likelihood(ones, frames, level)
+    result: Array = np.sqrt(2 * np.maximum(gain, 0))
+    return result
+
+
+def _misfit(ones: Array, frames: Array, flux: Array) -> Array:
+    """Pearson's chi squared (pixels,) as standard deviations above its mean, exact for binomial counts."""
+    p = np.clip(-np.expm1(-flux), 1e-9, 1 - 1e-9)
+    variance = np.maximum(frames * p * (1 - p), 1e-12)
+    there = frames > 0
+    chi2 = (there * (ones - frames * p) ** 2 / variance).sum(axis=1)
+    spread = (there * np.maximum(2 + (1 - 6 * p * (1 - p)) / variance, 0)).sum(axis=1)
+    result: Array = (chi2 - there.sum(axis=1)) / np.sqrt(np.maximum(spread, 1e-12))
+    return result

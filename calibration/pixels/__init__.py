@@ -1,0 +1,1 @@
+"""From dark frames to hot, noisy and dead pixels, and how they drift."""

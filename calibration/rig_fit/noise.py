@@ -1,0 +1,203 @@
+"""How noisy corners and passages are, from what is left of them.
+
+Passages have three kinds of error: that of their own photons (their sd, times one factor), that of the mirror, which
+all pixels crossed in the same instant share (jitter), and what the model does not describe, which varies slowly over a
+sweep. The last is kept out of the first two: every sweep's own smooth part is taken off before. Then, in narrow bins of
+the command, products of different passages of a bin give the jitter's variance, products across bins how far it
+reaches, and the scatter within a bin the factor.
+
+Before all that the sd are restated. A passage's sd is told from the same few photons as the passage: those that seem
+sharpest are so by chance in part, and a fit that believed them would think itself better than it is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model.lag_speeds import alike_speeds
+from calibration.rig_fit.sightings import Sighting
+from calibration.robust import MAD_TO_SD, robust_sd
+
+Array = NDArray[np.float64]
+
+BINS = 1024
+"""Of all commands there are: some to a column, within which jitter hardly changes."""
+MOST_REACH_BINS = 96
+LEAST_FACTOR = 0.3
+"""Of the passages' own sd; an sd that is stated more than three times too large is not believed to be."""
+TAIL_SD = 3.0
+"""From here on an error counts as unlikely, and pulls no more than it would here."""
+OUTLIER_SD = 6.0
+"""From here on it is no error of this kind, and does not count."""
+CUT_SD = 4.0
+"""Errors beyond it are left out where the noise is told: the square of one outlier would be that of hundreds."""
+FEWEST_PAIRS = 200
+"""Of neighbouring passages, that tell how errors go with their sd."""
+LEAST_SPREAD = 0.05
+"""Of the logarithm of the sd, that tells it too."""
+SIGNIFICANT_SD = 3.0
+"""For a jitter to be there; one overlooked makes a model look better than it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """corner_sd_px: of each coordinate of a corner of scale 1. passage_factor: by which passages' sd are multiplied.
+    jitter_sd: of the mirror, in command units; reach: commands as far apart as this share it.
+    """
+
+    corner_sd_px: float
+    passage_factor: float
+    jitter_sd: float
+    reach: float
+
+
+def smooth_basis(command: Array, y_px: Array) -> Array:
+    """(m, 5): what is quadratic in the command and linear along the line."""
+    c, y = _centred(command), _centred(y_px)
+    return np.stack([np.ones_like(c), c, c * c, y, y * c], axis=-1)
+
+
+def smooth_part(command: Array, y_px: Array, residual: Array, weight: Array) -> Array:
+    """The part of a sweep's residuals (m,) that is as smooth as the basis."""
+    basis = smooth_basis(command, y_px)
+    root = np.sqrt(weight)[:, None]
+    part: Array = basis @ np.linalg.lstsq(basis * root, residual * root[:, 0], rcond=1e-9)[0]
+    return part
+
+
+def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple[Sighting, ...]:
+    """The sightings with sd a s^b in the place of each passage's sd s, a and b as the errors at each speed tell them.
+
+    Told from differences of neighbouring passages, in which what the model does not describe and most of the jitter are
+    gone. The sd's geometric mean stays as it is, for a factor to be told.
+    """
+    pairs: dict[int, list[tuple[Array, Array]]] = {}
+    kinds = _kinds(sightings)
+    for residual, seen, of_view in zip(residuals, sightings, kinds, strict=True):
+        for sweep, kind in zip(seen.sweeps, of_view, strict=True):
+            left, sd = residual[sweep], seen.sd[sweep]
+            left = left - _robust_smooth(seen.command[sweep], seen.y_px[sweep], left, 1 / sd**2)
+            shared = np.sqrt((sd[1:] ** 2 + sd[:-1] ** 2) / 2)
+            pairs.setdefault(kind, []).append((np.diff(left) / np.sqrt(2), shared))
+    laws = {kind: _law(*(np.concatenate(part) for part in zip(*of, strict=True))) for kind, of in pairs.items()}
+    changed = []
+    for seen, of_view in zip(sightings, kinds, strict=True):
+        sd = seen.sd.copy()
+        for sweep, kind in zip(seen.sweeps, of_view, strict=True):
+            level, power = laws[kind]
+            sd[sweep] = level * sd[sweep] ** power
+        changed.append(replace(seen, sd=sd))
+    before, after = (np.log(np.concatenate([seen.sd for seen in of])) for of in (sightings, changed))
+    scale = float(np.exp(np.mean(before - after))) if before.size else 1.0
+    return tuple(replace(seen, sd=scale * seen.sd) for seen in changed)
+
+
+def _kinds(sightings: Sequence[Sighting]) -> list[list[int]]:
+    """For every sweep of every view a number that those of speeds alike share: their frames in a column are, too."""
+    speeds = [[float(seen.velocity_per_s[sweep.start]) for sweep in seen.sweeps] for seen in sightings]
+    kinds = iter(alike_speeds([speed for of_view in speeds for speed in of_view]).tolist())
+    return [[next(kinds) for _ in of_view] for of_view in speeds]
+
+
+def _law(away: Array, sd: Array) -> tuple[float, float]:
+    """(a, b) of errors whose standard deviation is a sd^b."""
+    power, usual = 1.0, float(np.mean(np.log(sd)))
+    spread = np.log(sd) - usual
+    if sd.size >= FEWEST_PAIRS and spread.std() > LEAST_SPREAD:
+        told = np.log(np.maximum(np.abs(away), 1e-3 * sd))
+        power = float(np.clip(spread @ told / (spread @ spread), 0.0, 1.0))
+    return max(robust_sd(away / sd**power), LEAST_FACTOR * float(np.exp((1 - power) * usual))), power
+
+
+def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple[float, float, float]:
+    """(factor, jitter sd, reach) from the passages' residuals of all views.
+
+    The mirror's error is taken to be held for a while, so that what two passages share falls as a straight line with
+    the commands between them; of all lengths the one is taken that stands out most from independent errors.
+    """
+    width = _bin_width(sightings)
+    pairs, shares = np.zeros(MOST_REACH_BINS), np.zeros(MOST_REACH_BINS)
+    spread = within = 0.0
+    lengths = []
+    for residual, seen in zip(residuals, sightings, strict=True):
+        for sweep in seen.sweeps:
+            left, command, weight = _inlying(residual[sweep], seen.command[sweep], seen.y_px[sweep], seen.sd[sweep])
+            at = np.floor((command - command[0]) / width).astype(np.int64)
+            n = int(at[-1]) + 1
+            lengths.append(n * width)
+            total, product = np.bincount(at, weight, n), np.bincount(at, weight * left, n)
+            # Of a bin's own pairs each counts once, as of two bins', and none of a passage with itself.
+            pairs[0] += 0.5 * np.sum(product**2 - np.bincount(at, (weight * left) ** 2, n))
+            shares[0] += 0.5 * np.sum(total**2 - np.bincount(at, weight**2, n))
+            for lag in range(1, min(MOST_REACH_BINS, n)):
+                pairs[lag] += np.sum(product[lag:] * product[:-lag])
+                shares[lag] += np.sum(total[lag:] * total[:-lag])
+            occupied = total > 0
+            spread += np.sum(weight * left**2) - np.sum(product[occupied] ** 2 / total[occupied])
+            within += len(left) - np.count_nonzero(occupied)
+    factor = max(float(np.sqrt(spread / within)) if within > 0 else 1.0, LEAST_FACTOR)
+    reaches = np.unique(np.round(np.geomspace(1, MOST_REACH_BINS, 24)))
+    shape = np.maximum(0.0, 1 - np.arange(MOST_REACH_BINS) / reaches[:, None])
+    told = np.maximum(shape**2 @ shares, 1e-300)
+    stands_out = (shape @ pairs) / np.sqrt(told) / factor**2
+    best = int(np.argmax(stands_out))
+    if stands_out[best] < SIGNIFICANT_SD or not lengths:
+        return factor, 0.0, width
+    reach = float(reaches[best]) * width
+    # The smooth part that was taken off had three terms along the command, and took the jitter of three reaches.
+    taken = min(3 * reach / float(np.mean(lengths)), 0.6)
+    return factor, float(np.sqrt((shape[best] @ pairs) / told[best] / (1 - taken))), reach
+
+
+def _inlying(residual: Array, command: Array, y_px: Array, sd: Array) -> tuple[Array, Array, Array]:
+    """(residuals without their smooth part, commands, weights) of a sweep's passages that are no outliers."""
+    left = residual - _robust_smooth(command, y_px, residual, 1 / sd**2)
+    scale = robust_sd(left / sd)
+    inlying = np.abs(left) <= CUT_SD * scale * sd
+    return left[inlying], command[inlying], 1 / sd[inlying] ** 2
+
+
+def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
+    """Where, in a view's passages, each run begins that shares the mirror's jitter."""
+    first = np.zeros(len(seen.command), bool)
+    for sweep in seen.sweeps:
+        command = seen.command[sweep]
+        at = np.floor((command - command[0]) / reach)
+        first[sweep] = np.concatenate([[True], np.diff(at) != 0])
+    return np.flatnonzero(first)
+
+
+def tail_weight(normalised: Array, usual: float = 1 / MAD_TO_SD) -> Array:
+    """Weight of errors in standard deviations, among others of their kind: where all are large, none is an outlier.
+
+    usual: the median of such errors' sizes, that of a normal distribution where nothing else is said.
+    """
+    away = np.abs(normalised)
+    if away.size:
+        away = away / max(1.0, float(np.median(away)) / usual)
+    return np.where(away > OUTLIER_SD, 0.0, np.minimum(1.0, TAIL_SD / np.maximum(away, 1e-300)))
+
+
+def _robust_smooth(command: Array, y_px: Array, residual: Array, weight: Array) -> Array:
+    part = np.full_like(residual, np.median(residual))  # an outlier at the end of a sweep would bend any other start
+    for _ in range(4):
+        left = np.abs(residual - part) * np.sqrt(weight)
+        scale = robust_sd(left)
+        if scale == 0:
+            break
+        part = smooth_part(command, y_px, residual, weight * tail_weight(left / scale))
+    return part
+
+
+def _bin_width(sightings: Sequence[Sighting]) -> float:
+    low = min(float(seen.command.min()) for seen in sightings if seen.command.size)
+    high = max(float(seen.command.max()) for seen in sightings if seen.command.size)
+    return (high - low) / BINS
+
+
+def _centred(values: Array) -> Array:
+    low, high = float(values.min()), float(values.max())
+    result: Array = (2 * values - low - high) / max(high - low, 1e-12)
+    return result

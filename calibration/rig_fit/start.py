@@ -1,0 +1,156 @@
+"""First values for a rig's fit: poses from corners, planes from passages, the mirror's axis from the planes.
+
+With the poses known, every passage is a point of space that the light met at a command. For a line turned about an axis
+x = d(c) - b(c) y - e(c) z with d, b, e smooth in c: polynomials, found by one linear least squares over all points that
+a direction and speed of sweep gave. Their planes' normals lie across the axis, and the commands at which two sweeps
+reach the same angle differ by what the mirror lags.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.polynomial import polynomial
+from numpy.typing import NDArray
+
+from calibration.errors import Degenerate
+from calibration.model.camera import Camera
+from calibration.model.lag_speeds import lag_groups
+from calibration.model.parameters import BACKWARD, FORWARD
+from calibration.model.scanner import PivotScanner
+from calibration.rig_fit.sightings import Sighting
+from calibration.views import NO_POSE, BoardPose
+
+Array = NDArray[np.float64]
+
+_ORDERS = (3, 1, 3)
+"""Of d, b and e in the command: tangents of an angle that turns a quarter of a right angle either way."""
+POSES_FOR_PLANES = 5
+"""On fewer boards a command's light leaves too few lines to lay a plane through, all errors considered."""
+MOST_FIRST_LAG_S = 1e-3
+"""Ten times that of a small galvo."""
+_STEP = 0.7
+"""Share of its range by which a sweep's planes are sampled; the ends are worst known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """Where light met the board: points_m (m, 3), command (m,), velocity_per_s (m,), and in which view (m,)."""
+
+    points_m: Array
+    command: Array
+    velocity_per_s: Array
+    view: NDArray[np.int64]
+
+
+def first_pose(camera: Camera, corners_m: Array, corner_px: Array) -> BoardPose:
+    """The pose of a board from its corners."""
+    try:
+        _, turn, shift = cv2.solvePnP(
+            corners_m, corner_px, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_ITERATIVE
+        )
+    except cv2.error as error:
+        raise Degenerate("no-board", NO_POSE) from error
+    return BoardPose(np.asarray(turn, np.float64).ravel(), np.asarray(shift, np.float64).ravel())
+
+
+def board_points(camera: Camera, sightings: Sequence[Sighting], poses: Sequence[BoardPose]) -> Points:
+    """The points at which the light met the boards."""
+    points = []
+    for seen, pose in zip(sightings, poses, strict=True):
+        ray = np.stack([*camera.tangents_at(seen.x_px, seen.y_px), np.ones(seen.x_px.size)], axis=-1)
+        board = pose.matrix[:, 2]
+        points.append(ray * ((board @ pose.position_m) / (ray @ board))[:, None])
+    return Points(
+        np.concatenate(points),
+        np.concatenate([seen.command for seen in sightings]),
+        np.concatenate([seen.velocity_per_s for seen in sightings]),
+        np.repeat(np.arange(len(sightings)), [seen.command.size for seen in sightings]),
+    )
+
+
+def first_scanner(points: Points, command_range: tuple[float, float]) -> tuple[PivotScanner, Array]:
+    """A mirror and (lag forward, lag backward, 0); the lags are one where only their sum can be told, or 0."""
+    velocities = _often_shown(points)
+    curves = []
+    axis, point, first = _pivot(_planes_of(points, velocities[np.argmax(_counts(points, velocities))])[1])
+    for velocity in velocities:
+        commands, planes = _planes_of(points, velocity)
+        curves.append((commands, _angles(planes, axis, first)))
+    lags = np.clip(_lags(velocities, curves), 0.0, MOST_FIRST_LAG_S)
+    mirror = points.command - points.velocity_per_s * np.where(points.velocity_per_s > 0, lags[0], lags[1])
+    one = Points(points.points_m, mirror, np.ones_like(mirror), points.view)
+    commands, planes = _planes_of(one, 1.0)
+    axis, point, first = _pivot(planes)
+    angle: Array = polynomial.polyfit(commands, _angles(planes, axis, first), 1).astype(np.float64)
+    return PivotScanner(point, axis, first, angle, command_range), np.array([*lags, 0.0])
+
+
+def _often_shown(points: Points) -> Array:
+    """The signed speeds at which enough boards were swept to tell their planes; where none was, the most swept."""
+    velocities = np.unique(points.velocity_per_s)
+    shown = np.array([np.unique(points.view[points.velocity_per_s == velocity]).size for velocity in velocities])
+    result: Array = velocities[shown >= min(POSES_FOR_PLANES, int(shown.max()))]
+    return result
+
+
+def _counts(points: Points, velocities: Array) -> Array:
+    return np.array([np.count_nonzero(points.velocity_per_s == velocity) for velocity in velocities])
+
+
+def _planes_of(points: Points, velocity: float) -> tuple[Array, Array]:
+    """(commands, planes (n, 4)) of the passages at one signed speed."""
+    chosen = points.velocity_per_s == velocity
+    command, at = points.command[chosen], points.points_m[chosen]
+    low, high = np.percentile(command, [1, 99])
+    c = (2 * command - low - high) / (high - low)
+
+    def powers(order: int) -> Array:
+        return np.stack([c**k for k in range(order + 1)], axis=-1)
+
+    d, b, e = (powers(order) for order in _ORDERS)
+    design = np.hstack([d, -b * at[:, 1:2], -e * at[:, 2:3]])
+    weight = np.ones(len(c))
+    for _ in range(6):  # points of light that was not the line's are few and far off
+        terms = np.linalg.lstsq(design * weight[:, None], at[:, 0] * weight, rcond=1e-10)[0]
+        left = np.abs(at[:, 0] - design @ terms)
+        weight = 1 / np.hypot(1, left / max(2 * float(np.median(left)), 1e-12))
+    ends = np.cumsum([0, *(order + 1 for order in _ORDERS)])
+    sampled = np.linspace(-_STEP, _STEP, 21)
+    plane_d, plane_b, plane_e = (polynomial.polyval(sampled, terms[i:j]) for i, j in pairwise(ends))
+    planes = np.stack([np.ones_like(sampled), plane_b, plane_e, plane_d], axis=-1)
+    planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+    return (sampled * (high - low) + low + high) / 2, planes
+
+
+def _pivot(planes: Array) -> tuple[Array, Array, Array]:
+    """(axis direction, its point nearest to the camera, normal of the middle plane) of planes (n, 4)."""
+    axis = np.linalg.svd(planes[:, :3])[2][2]
+    axis = axis if axis[1] >= 0 else -axis
+    point = np.linalg.lstsq(planes[:, :3], planes[:, 3], rcond=1e-4)[0]
+    middle = planes[len(planes) // 2, :3]
+    return axis, point - (point @ axis) * axis, middle - (middle @ axis) * axis
+
+
+def _angles(planes: Array, axis: Array, first: Array) -> Array:
+    first = first / np.linalg.norm(first)
+    return np.unwrap(np.arctan2(planes[:, :3] @ np.cross(axis, first), planes[:, :3] @ first))
+
+
+def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
+    """Least squares of c(angle) = c0 + velocity lag over the sweeps, at an angle that all have."""
+    ties = lag_groups(velocities)
+    if not ties:
+        return 0.0, 0.0
+    middle = float(np.mean([np.median(angle) for _, angle in curves]))
+    # Full: angles of too few poses may all be the same, which is no reason to warn.
+    commands = [polynomial.polyfit(angle - middle, command, 2, full=True)[0][0] for command, angle in curves]
+    design = np.array(
+        [[1.0] + [v if (FORWARD if v > 0 else BACKWARD) in tie else 0.0 for tie in ties] for v in velocities]
+    )
+    scale = np.abs(design).max(axis=0)
+    values = np.linalg.lstsq(design / scale, np.array(commands), rcond=1e-8)[0] / scale
+    lag = {name: float(value) for tie, value in zip(ties, values[1:], strict=True) for name in tie}
+    return lag[FORWARD], lag[BACKWARD]

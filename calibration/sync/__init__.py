@@ -1,0 +1,1 @@
+"""Lags, row delay and gate delay from a scene that stands still."""

@@ -1,0 +1,211 @@
+"""When light, mirror and frames happen, from sweeps over one unmoved scene at several speeds, both ways.
+
+A pixel sees the line at one mirror position, whatever the speed. In a sweep with direction s = +1 or -1 and speed v it
+sees it at (calibration/views.py)
+
+    command = position + s v (lag_s - row_delay y)
+
+Positions drop out as each pixel's weighted mean; what is left is linear in the two lags and the row delay. No board is
+needed and no geometry, only pixels that tell of a passage in several of the sweeps: 2000 pixels of 4 sweeps take 10 ms.
+
+What the sweeps can tell depends on them (`calibration.model.lag_speeds`). One speed each way: a mean of the lags alone,
+both are taken to be it. Two speeds in one direction at least: the lag of each way that was scanned. Whether a lag is
+the same at all speeds shows with two speeds both ways, or three. The row delay needs rows, not speeds. One that is
+known from elsewhere counts with what the sweeps tell of it, unless they contradict it significantly; nothing known is
+0.
+What no sweep tells: a delay of the markers behind the mirror's command that is always the same (the scanner's colour
+outputs trail its mirror outputs by some microseconds, hardware.md 3.1): it shortens both lags, which are then as they
+have to be for binding with these very markers. It takes an oscilloscope. A marker of the wrong polarity shows in the
+binding, whose residual it breaks; the gate's delay in the frames at its edges (`gate_delay`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import Degenerate
+from calibration.model.lag_speeds import lag_groups, speed_range
+from calibration.model.rig_model import Lag
+from calibration.sync.shared_pixels import (
+    CLUSTERS,
+    LEAST_PIXELS,
+    SWEEP_ERROR_S,
+    SharedPixels,
+    Solved,
+    clustered,
+    clusters,
+    solve,
+)
+from calibration.views import Passages
+
+Array = NDArray[np.float64]
+
+SIGNIFICANT = 5.0
+"""Standard deviations of a row delay that is believed against the known one, and of a lag below 0 that is refused."""
+MOST_CHI2_SDS = 4.0
+"""How far, in its standard deviations, chi squared of the speeds may lie above its mean."""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepTiming:
+    """What one sweep says beside the others. lag_s: as if it were the only one of its kind; sd_s: of that."""
+
+    direction: int
+    speed_per_s: float
+    lag_s: float
+    sd_s: float
+    passages: int
+
+    @property
+    def velocity_per_s(self) -> float:
+        """Signed."""
+        return self.direction * self.speed_per_s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SyncFit:
+    """lag_s, row_delay_s: as in `RigModel`. covariance: (3, 3), s^2, of the three.
+
+    speed_range_per_s: where they hold. common: whether the two lags could not be told apart. told: which directions
+    were scanned. row_told: whether the row delay is news; else it is the one known before, and its variance what the
+    sweeps alone would have had. sweeps: lag of each by itself, at the row delay found. chi2, dof: of those against
+    common lags; `steady`: whether they agree. noise: robust standard deviation of the residuals in units of what was
+    stated.
+    """
+
+    lag_s: Lag
+    row_delay_s: float
+    covariance: Array
+    speed_range_per_s: tuple[float, float]
+    common: bool
+    told: tuple[int, ...]
+    row_told: bool
+    sweeps: tuple[SweepTiming, ...]
+    chi2: float
+    dof: int
+    noise: float
+
+    @property
+    def sd_s(self) -> Array:
+        """Standard deviations (3,) of both lags and the row delay; NaN where the direction was not scanned."""
+        result: Array = np.sqrt(np.diag(self.covariance))
+        return result
+
+    @property
+    def velocities_per_s(self) -> tuple[float, ...]:
+        """Signed, of the sweeps."""
+        return tuple(sweep.velocity_per_s for sweep in self.sweeps)
+
+    @property
+    def steady(self) -> bool:
+        """Whether the lag is the same at all speeds, as far as these can tell."""
+        return self.dof == 0 or bool(self.chi2 <= self.dof + MOST_CHI2_SDS * np.sqrt(2 * self.dof))
+
+
+def fit_sync(sweeps: Sequence[Passages], row_delay_s: float = 0.0, row_delay_sd_s: float = 0.0) -> SyncFit:
+    """Lags and row delay from the passages of one unmoved scene. row_delay_s, row_delay_sd_s: what is known of it.
+
+    Raises Degenerate where they cannot be told: one-speed, too-few-pixels, marker-polarity, negative-lag.
+    """
+    _require_speeds(sweeps)
+    seen = SharedPixels.of(sweeps)
+    heard = (seen.weight > 0).sum(axis=0).tolist()
+    if not all(heard):  # a sweep that saw the line nowhere else does says nothing, least of all of its speed
+        return fit_sync(
+            [sweep for sweep, tells in zip(sweeps, heard, strict=True) if tells], row_delay_s, row_delay_sd_s
+        )
+    _require_one_way_round(seen)
+    told = tuple(way for way in (1, -1) if way in seen.direction)
+    common = len(told) == 2 and len(lag_groups(seen.velocity)) == 1
+    lags = [np.where(np.isin(seen.direction, ways), seen.velocity, 0.0) for ways in ([told] if common else told)]
+    by_row = -seen.velocity * seen.rows[:, None]
+    seen = replace(seen, command=seen.command - row_delay_s * by_row)
+    row_variance, row_told = np.nan, False
+    if np.ptp(seen.rows) > 0:
+        solved = solve(seen, [*lags, by_row])
+        change_s, row_variance = float(solved.value[-1]), float(solved.covariance[-1, -1])
+        believed = abs(change_s) > SIGNIFICANT * np.hypot(np.sqrt(row_variance), row_delay_sd_s)
+        row_told = bool(believed) or row_delay_sd_s > 0
+        solved = solved if believed else solved.with_last_near_0(row_delay_sd_s)
+        row_delay_s += float(solved.value[-1])
+    else:
+        solved = solve(seen, lags)
+
+    # From what was solved for to the three: a common lag is both, one that was not scanned is not known.
+    which = {way: 0 if common else told.index(way) for way in told}
+    kept = [which.get(way) for way in (1, -1)]
+    covariance = np.full((3, 3), np.nan)
+    for a, i in enumerate([*kept, len(lags) if row_told else None]):
+        for b, j in enumerate([*kept, len(lags) if row_told else None]):
+            if i is not None and j is not None:
+                covariance[a, b] = solved.covariance[i, j]
+    if not row_told:
+        covariance[2, 2] = row_variance
+    lag_s = {way: float(solved.value[i]) for way, i in which.items()}
+    for way, lag in lag_s.items():
+        _require_no_lead(way, lag, float(np.sqrt(solved.covariance[which[way], which[way]])))
+    timings, chi2 = _by_sweep(seen, solved, lag_s)
+    return SyncFit(
+        lag_s=Lag(*(max(lag_s.get(way, lag_s[told[0]]), 0.0) for way in (1, -1))),
+        row_delay_s=row_delay_s, covariance=covariance,
+        speed_range_per_s=speed_range(seen.speed),
+        common=common, told=told, row_told=row_told, sweeps=timings, chi2=chi2, dof=max(0, len(sweeps) - 1 - len(lags)),
+        noise=solved.noise,
+    )  # fmt: skip
+
+
+def _by_sweep(seen: SharedPixels, solved: Solved, lag_s: dict[int, float]) -> tuple[tuple[SweepTiming, ...], float]:
+    """Each sweep's own lag, and chi squared of their residuals."""
+    total = np.maximum(solved.weight.sum(axis=0), 1e-300)
+    mean = (solved.weight * solved.residual).sum(axis=0) / total
+    around = solved.weight * (solved.residual - mean)
+    pulls = clustered(around[:, :, None], clusters(seen))[:, 0]
+    sweep = np.arange(len(pulls)) // CLUSTERS
+    sd = np.sqrt(np.bincount(sweep, pulls**2, len(seen.speed)) / total**2 + (SWEEP_ERROR_S * seen.speed) ** 2)
+    timings = tuple(
+        SweepTiming(int(way), float(speed), lag_s[int(way)] + float(off / (way * speed)), float(s / speed), int(n))
+        for way, speed, off, s, n in zip(
+            seen.direction, seen.speed, mean, sd, (seen.weight > 0).sum(axis=0), strict=True
+        )
+    )
+    return timings, float(np.sum((mean / sd) ** 2))
+
+
+def _require_speeds(sweeps: Sequence[Passages]) -> None:
+    if not lag_groups([sweep.velocity_per_s for sweep in sweeps]):
+        at = f" at {sweeps[0].speed_per_s:.4g} /s" if sweeps else ""
+        raise Degenerate(
+            "one-speed",
+            f"{len(sweeps)} sweeps ran one way{at}: a lag cannot be told from where things are; scan both ways "
+            "(scan.bidirectional), and at two speeds (--exposures)",
+        )
+
+
+def _require_one_way_round(seen: SharedPixels) -> None:
+    """Degenerate where the commands of one way run against those of the other: the level of one is taken for both."""
+    ahead, back = (seen.direction == way for way in (1, -1))
+    if not (ahead.any() and back.any()):
+        return
+    first, second = (
+        (seen.weight[:, way] * seen.command[:, way]).sum(axis=1) / np.maximum(seen.weight[:, way].sum(axis=1), 1e-300)
+        for way in (ahead, back)
+    )
+    both = (seen.weight[:, ahead] > 0).any(axis=1) & (seen.weight[:, back] > 0).any(axis=1)
+    if both.sum() >= LEAST_PIXELS and np.corrcoef(first[both], second[both])[0, 1] < 0:
+        raise Degenerate(
+            "marker-polarity",
+            "the line passes the pixels of the sweeps back in the order of those out, while their commands run the "
+            "other way: the direction marker has the wrong polarity; invert its line, or the scanner's axis",
+        )
+
+
+def _require_no_lead(way: int, lag_s: float, sd_s: float) -> None:
+    if lag_s < -SIGNIFICANT * sd_s:
+        raise Degenerate(
+            "negative-lag",
+            f"the lag {'up' if way > 0 else 'down'} is {lag_s * 1e6:.1f} us with a standard deviation of "
+            f"{sd_s * 1e6:.1f}, the limit is 0: no mirror runs ahead of its command; check delay and polarity of the "
+            "line markers, and the scanner's clock",
+        )

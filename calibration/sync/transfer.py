@@ -1,0 +1,126 @@
+"""A model with the lags that other sweeps told, and what follows from them for its mirror's angle.
+
+A mirror's angle was fitted together with lags, and given other lags it is another: by how much, their covariance C
+tells. Where the sweeps of the planes told no lags apart (`calibration.model.lag_speeds`), any lags go with them, each
+with an angle of its own: C is wide open then. With x the lags, y all else, S the covariance of the new lags:
+
+    y | x = y0 + A (x - x0),    A = C_yx C_xx^-1,    cov y = (1 -A) C (1 -A)' + A S A',    cov (y, x) = A S
+
+It takes a mirror whose lags were then what they are now. Where both contradict each other, the lags have changed: the
+angle stays as it was, if it is known without them.
+
+The row delay goes with the lags where the sweeps told of it; `sync_fit` was given what the model knows of it, and has
+both in its value.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model.covariance import Covariance
+from calibration.model.lag_speeds import SWEPT, untold
+from calibration.model.parameters import BACKWARD, FORWARD, ROW_DELAY, TIMES, parameters, with_parameters
+from calibration.model.rig_model import Lag, RigModel
+from calibration.model.scanner import PivotScanner
+from calibration.sync.lag_fit import SIGNIFICANT, SyncFit
+from calibration.verdict import Reason
+
+Array = NDArray[np.float64]
+
+_OPEN_S = 1e-4, 1e-2
+"""Standard deviation of a lag that nothing tells: enough to follow it, and to be surprised by none."""
+_LEAST_SHARE = 1e-9
+"""Of the scaled covariance of lags; below it they were taken for one."""
+_AGAIN = "calibrate the planes again, both ways and at two speeds or more (--exposures)"
+
+
+def known_row_delay(base: RigModel) -> tuple[float, float]:
+    """(value, sd) of a model's row delay, seconds; sd 0 where nothing is said of its error."""
+    covariance = base.covariance
+    if covariance is None or ROW_DELAY not in covariance.names:
+        return base.row_delay_s, 0.0
+    return base.row_delay_s, float(np.sqrt(covariance.of([ROW_DELAY])[0, 0]))
+
+
+def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
+    """The model with these lags, fitted with its `known_row_delay`; and why its angle cannot be right with them, None
+    where it may be."""
+    assert fit.row_told or fit.row_delay_s == base.row_delay_s, "lags of another row delay"
+    told, spread = _told(fit)
+    names, values = parameters(base)
+    was = np.array([values[names.index(name)] for name in told])
+    change = np.array(list(told.values())) - was
+    model = replace(
+        base,
+        lag_s=Lag(told[FORWARD], told[BACKWARD]),
+        row_delay_s=told.get(ROW_DELAY, base.row_delay_s),
+        speed_range_per_s=fit.speed_range_per_s,
+    )
+    if base.covariance is None:
+        return model, None
+    others = tuple(name for name in base.covariance.names if name not in told)
+    known = np.zeros((len(others) + len(told), len(others) + len(told)))
+    at = [(*others, *told).index(name) for name in base.covariance.names]
+    known[np.ix_(at, at)] = base.covariance.matrix
+    slopes, reason = _slopes(base, known, (*others, *told), len(told), change, spread)
+    left = np.hstack([np.eye(len(others)), -slopes])
+    across = slopes @ spread
+    matrix = np.block([[left @ known @ left.T + across @ slopes.T, across], [across.T, spread]])
+    model = with_parameters(model, others, slopes @ change)
+    kept = {name: said for name, said in base.provenance.items() if name != SWEPT or reason is not None}
+    return replace(model, covariance=Covariance((*others, *told), matrix), provenance=kept), reason
+
+
+def _told(fit: SyncFit) -> tuple[dict[str, float], Array]:
+    """What the sweeps tell, by name, and its covariance: a lag that was not scanned is the other."""
+    ways = [at if np.isfinite(fit.covariance[at, at]) else 1 - at for at in (0, 1)]
+    at = [*ways, 2] if fit.row_told else ways
+    values = dict(zip(TIMES, (*fit.lag_s, fit.row_delay_s), strict=True))
+    return {name: values[name] for name in TIMES[: len(at)]}, np.nan_to_num(fit.covariance[np.ix_(at, at)])
+
+
+def _slopes(
+    base: RigModel, known: Array, names: tuple[str, ...], lags: int, change: Array, spread: Array
+) -> tuple[Array, Reason | None]:
+    """How all else goes with the lags (the last of the names), (others, lags): A; and why that is not to be told."""
+    n = len(names) - lags
+    slopes = np.zeros((n, lags))
+    velocities = base.provenance.get(SWEPT) or ()
+    opened, wide = (known + _open(base, names, velocities, sd_s) for sd_s in _OPEN_S)
+    free = np.flatnonzero(np.diag(opened)[n:] > 0)
+    if free.size == 0:
+        return slopes, None
+    own = opened[n:, n:][np.ix_(free, free)]
+    if not velocities and _least_share(own) < _LEAST_SHARE:
+        text = "the planes were found with one lag for both ways, and the file does not say at what speeds"
+        return slopes, Reason("lags-together", text, 1.0, 2.0, _AGAIN)
+    likely = (wide[n:, n:] + spread)[np.ix_(free, free)]
+    off = float(np.sqrt(change[free] @ np.linalg.solve(likely, change[free])))
+    if off > SIGNIFICANT:
+        text = f"the lags have changed since the planes were found, by {off:.1f} standard deviations"
+        told_apart = len(untold(velocities)) == 0
+        return slopes, None if told_apart else Reason("changed-lag", text, off, SIGNIFICANT, _AGAIN)
+    slopes[:, free] = np.linalg.solve(own, opened[n:, :n][free]).T
+    return slopes, None
+
+
+def _open(base: RigModel, names: tuple[str, ...], velocities: tuple[float, ...], sd_s: float) -> Array:
+    """Covariance of what no sweep at these velocities shows, its lags having this standard deviation."""
+    matrix = np.zeros((len(names), len(names)))
+    if not isinstance(base.scanner, PivotScanner):
+        return matrix
+    for moved, forward, backward in untold(velocities):
+        together = np.zeros(len(names))
+        together[[names.index(FORWARD), names.index(BACKWARD)]] = forward, backward
+        # Where the light of a command c was, there is now that of c + moved.
+        for k, term in enumerate(base.scanner.angle_rad[1:], start=1):
+            if f"angle_{k - 1}" in names:
+                together[names.index(f"angle_{k - 1}")] -= k * term * moved
+        matrix += np.outer(together, together) * sd_s**2
+    return matrix
+
+
+def _least_share(matrix: Array) -> float:
+    scale = 1 / np.sqrt(np.diag(matrix))
+    return float(np.linalg.eigvalsh(matrix * np.outer(scale, scale))[0])
