@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibration.board.board import Board
 from calibration.camera_fit.fit import CameraFit
-from calibration.judging.data_lack import data_lack
+from calibration.judging.data_lack import data_lack, drowned
 from calibration.judging.evidence import pose_evidence, view_evidence
 from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
@@ -48,7 +48,8 @@ def judge_camera(fit: CameraFit, views: Sequence[View], board: Board, *, photons
     median, worst = float(np.median(sd)), float(np.percentile(sd, 95))
     imprecise = not (median <= ACCURACY_PX and worst <= WORST_TIMES * ACCURACY_PX)
     evidence = view_evidence(views, (camera.width, camera.height))
-    reasons = data_lack(evidence, pose_evidence(fit.poses, board), imprecise=imprecise, photons=photons)
+    lacking = data_lack(evidence, pose_evidence(fit.poses, board), imprecise=imprecise, photons=photons)
+    reasons = [*drowned(evidence, photons=photons), *lacking]
     if imprecise and not reasons:
         too_few = more_poses(len(fit.views), "rays are known to", (median, worst), ACCURACY_PX, "{:.2g} px".format)
         reasons = [replace(too_few, next_step="show the board in more poses")]

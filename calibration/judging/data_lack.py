@@ -40,14 +40,11 @@ on room light costs more than half of what a frame can tell of the line."""
 def data_lack(
     views: ViewEvidence, poses: PoseEvidence | None, *, imprecise: bool, photons: bool = True
 ) -> list[Reason]:
-    """What the data lack: more counts where the result is not precise enough.
+    """What the data lack, but for those that are `drowned`: more counts where the result is not precise enough.
 
     poses: None where nothing tells. photons: whether pictures count photons; those from files do not.
     """
     found = []
-    bright = MOST_ROOM_FLUX.at(imprecise) if photons else math.inf
-    if views.room_flux > max(bright, MOST_ROOM_FLUX.always):
-        found.append(_room_light(views.room_flux, bright))
     if views.shown < FEWEST_POSES:
         were = "pose was" if views.shown == 1 else "poses were"
         text = f"{views.shown} {were} shown, {FEWEST_POSES} are the fewest that can be checked against each other"
@@ -60,9 +57,16 @@ def data_lack(
     if views.coverage < least:
         text = f"corners reach {views.coverage:.0%} of the picture, {least:.0%} are needed"
         found.append(reason_for("poor-coverage", text, views.coverage, least))
-    if bright < views.room_flux <= MOST_ROOM_FLUX.always:
-        found.append(_room_light(views.room_flux, bright))
+    if photons and MOST_ROOM_FLUX.at(imprecise) < views.room_flux <= MOST_ROOM_FLUX.always:
+        found.append(_room_light(views.room_flux, MOST_ROOM_FLUX.at(imprecise)))
     return found
+
+
+def drowned(views: ViewEvidence, *, photons: bool = True) -> list[Reason]:
+    """Room light so bright that frames hold little else, whatever seems to be found in them. photons: `data_lack`."""
+    if photons and views.room_flux > MOST_ROOM_FLUX.always:
+        return [_room_light(views.room_flux, MOST_ROOM_FLUX.always)]
+    return []
 
 
 def _poses_lack(poses: PoseEvidence, imprecise: bool) -> list[Reason]:

@@ -3,9 +3,10 @@
 A calibration passes where the depth error that its covariance predicts is at most what was asked for, and where its
 data agree with each other and with what is known of the rig. The first reason is the root cause. Their order:
 
-1. Data that no one rig can have made (planes that wave, a rig that moved): nothing else can be believed then.
-2. A baseline other than the stated one: everything is in proportion, only too large or too small.
-3. Data that say too little (room light, too few poses, no tilt, boards too far, corners in a part of the picture only):
+1. Room light that drowns the line: what is found then is not of the line.
+2. Data that no one rig can have made (planes that wave, a rig that moved): nothing else can be believed then.
+3. A baseline other than the stated one: everything is in proportion, only too large or too small.
+4. Data that say too little (room light, too few poses, no tilt, boards too far, corners in a part of the picture only):
    a likely cause where the predicted error is too large; and where the covariance promises enough, but by the model
    alone, with next to nothing left to check the model by.
 
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from calibration.errors import Degenerate
-from calibration.judging.data_lack import data_lack
+from calibration.judging.data_lack import data_lack, drowned
 from calibration.judging.evidence import PoseEvidence, ViewEvidence
 from calibration.judging.lags import lag_lack
 from calibration.verdict import SIGMAS, WORST_TIMES, Asked, Reason, Verdict, mm, more_poses, reason_for
@@ -54,7 +55,7 @@ class FitEvidence:
 def judge(views: ViewEvidence, fit: FitEvidence, asked: Asked) -> Verdict:
     """The verdict on a fitted rig model."""
     imprecise = not (fit.expected_m <= asked.accuracy_m and fit.worst_m <= WORST_TIMES * asked.accuracy_m)
-    reasons = [*_contradictions(fit, asked, imprecise)]
+    reasons = [*drowned(views), *_contradictions(fit, asked, imprecise)]
     poverty = data_lack(views, fit.poses, imprecise=imprecise)
     scale = _scale(fit, asked)
     # A baseline is only as good as the fit it comes from.
@@ -73,7 +74,7 @@ def judge_refusal(
 
     photons: as for `data_lack`.
     """
-    lacking = data_lack(views, poses, imprecise=True, photons=photons)
+    lacking = [*drowned(views, photons=photons), *data_lack(views, poses, imprecise=True, photons=photons)]
     code = _REFUSED_FOR.get(refused.reason, refused.reason)
     own = reason_for(code, str(refused))
     if refused.reason in _SEEN_AT_ONCE:  # but for room light, which hides boards, nothing goes before it

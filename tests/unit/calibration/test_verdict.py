@@ -46,6 +46,7 @@ def test_a_sound_calibration_passes() -> None:
         ("room-light", replace(VIEWS, room_flux=8.0), IMPRECISE),
         ("room-light", replace(VIEWS, room_flux=8.0), FIT),
         ("room-light", replace(VIEWS, room_flux=1.5), IMPRECISE),
+        ("room-light", replace(VIEWS, room_flux=5.3), replace(IMPRECISE, wave_m=0.1)),
         ("too-few-poses", replace(VIEWS, shown=3, coverage=0.3), IMPRECISE),
         ("too-few-poses", replace(VIEWS, shown=3), FIT),
         ("no-tilt", VIEWS, replace(IMPRECISE, poses=replace(FIT.poses, tilt_rad=radians(3)))),
