@@ -11,12 +11,16 @@ WORST_TIMES: Final = 4.0
 """The picture's worst places (95 %) may have this many times the error asked for."""
 
 
+AT_M: Final = 5.0
+"""Where depth is judged unless another distance is asked for."""
+
+
 @dataclass(frozen=True, slots=True)
 class Asked:
     """How good a calibration is to be: sd of depth at a distance; the baseline where somebody has measured it."""
 
     accuracy_m: float
-    at_m: float = 5.0
+    at_m: float = AT_M
     stated_baseline_m: float | None = None
 
 

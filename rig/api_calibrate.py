@@ -58,7 +58,7 @@ def calibrate_planes(
     returns once it is. tell: takes a line for each view. out: a folder to write, None: nothing.
     """
     from calibration.files.camera_file import load_camera
-    from calibration.judging.rig import AT_M
+    from calibration.verdict import AT_M
     from rig.calibrating.planes_run import POSES, PlanesAsked, run_planes
 
     problems = _problems(poses, seed, exposures)
@@ -161,7 +161,7 @@ def calibrate_sync(
     calibration: the model they go into; None: that of the live rig. exposures: per column, a speed each. All else as
     `calibrate_planes`.
     """
-    from calibration.judging.rig import AT_M
+    from calibration.verdict import AT_M
     from rig.calibrating.sources import sort_sources
     from rig.calibrating.sync_run import SyncAsked, run_sync
 
@@ -196,7 +196,7 @@ def calibrate_check(
     calibration: a file; None: that of the live rig. angle: between the boards of the first two views, such as '30 deg'.
     All else as `calibrate_planes`.
     """
-    from calibration.judging.rig import AT_M
+    from calibration.verdict import AT_M
     from rig.calibrating.check_run import CheckAsked, run_check
     from rig.calibrating.sources import sort_sources
 

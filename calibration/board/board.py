@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 BLACK, WHITE = 0.05, 0.85
 """Reflectance of a laser printer's black and of matt white paper, rounded."""
 MARGIN_SQUARES = 0.5
+PAPER_SQUARES = 0.8 * MARGIN_SQUARES
 """White paper around the squares."""
 BUNDLED_BOARD = Path(__file__).parents[2] / "config" / "board.yaml"
 """The board that the commands take when none is named."""

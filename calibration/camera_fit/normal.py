@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.model.covariance import Covariance
-from calibration.model.parameters import DISTORTION
+from calibration.model.parameters import DISTORTION, MATRIX
 from calibration.views import BoardPose
 
 Array = NDArray[np.float64]
@@ -58,4 +58,4 @@ def camera_normal(
         basis, _ = np.linalg.qr(pose_part)
         rest = camera_part - basis @ (basis.T @ camera_part)
         total += rest.T @ rest
-    return Normal(("fx", "fy", "cx", "cy", *DISTORTION[:terms]), total)
+    return Normal((*MATRIX, *DISTORTION[:terms]), total)

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.model.parameters import MATRIX, TIMES, with_parameters
+from calibration.model.parameters import MATRIX, ROW_DELAY, TIMES, with_parameters
 from calibration.model.rig_model import RigModel
 
 Array = NDArray[np.float64]
 
-_STEPS = dict.fromkeys(MATRIX, 1e-3) | dict.fromkeys(TIMES, 1e-9) | {"row_delay": 1e-12}
+_STEPS = dict.fromkeys(MATRIX, 1e-3) | dict.fromkeys(TIMES, 1e-9) | {ROW_DELAY: 1e-12}
 _STEP = 1e-6
 """Of each parameter, in its own unit: small against what bends, large against rounding."""
 

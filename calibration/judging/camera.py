@@ -16,7 +16,7 @@ from calibration.judging.data_lack import data_lack, drowned
 from calibration.judging.evidence import pose_evidence, view_evidence
 from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
-from calibration.model.parameters import DISTORTION, MATRIX
+from calibration.model.parameters import changed_camera
 from calibration.verdict import WORST_TIMES, Verdict, more_poses
 from calibration.views import View
 
@@ -68,7 +68,8 @@ def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:
 
     slopes = np.stack(
         [
-            (seen(_changed(camera, name, _STEP), rays) - seen(_changed(camera, name, -_STEP), rays)) / (2 * _STEP)
+            (seen(changed_camera(camera, {name: _STEP}), rays) - seen(changed_camera(camera, {name: -_STEP}), rays))
+            / (2 * _STEP)
             for name in covariance.names
         ],
         axis=-1,
@@ -85,12 +86,3 @@ def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:
     variance = np.einsum("ni,ij,nj->n", left, covariance.matrix, left)[along_row]
     result: Array = np.sqrt(np.maximum(variance, 0.0))
     return result
-
-
-def _changed(camera: Camera, name: str, step: float) -> Camera:
-    matrix, distortion = camera.matrix.copy(), camera.distortion.copy()
-    if name in MATRIX:
-        matrix[MATRIX[name]] += step
-    else:
-        distortion[DISTORTION.index(name)] += step
-    return Camera(camera.width, camera.height, matrix, distortion)

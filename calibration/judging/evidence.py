@@ -27,15 +27,12 @@ _WHITE_PERCENT = 75
 class ViewEvidence:
     """What is seen before anything is fitted; NaN where nothing tells.
 
-    shown: poses; with_board: those in which the board was found. coverage: share of the picture within the outline of
-    all corners. board_share: of the picture within one board's corners, median. room_flux: photons per pixel and
+    shown: poses. coverage: share of the picture within the outline of all corners. room_flux: photons per pixel and
     exposure of white on the board (of the bright parts of the picture where there is no board), median over the views.
     """
 
     shown: int
-    with_board: int
     coverage: float
-    board_share: float
     room_flux: float
 
 
@@ -55,13 +52,10 @@ def view_evidence(views: Sequence[View], size: tuple[int, int]) -> ViewEvidence:
     """Look at the views alone; size: (width, height) of the picture."""
     found = [view.corners for view in views if view.corners is not None and len(view.corners.ids) > 2]
     area = float(size[0] * size[1])
-    shares = [_outline_area(corners.px) / area for corners in found]
     fluxes = [_room_flux(view) for view in views if view.picture is not None]
     return ViewEvidence(
         shown=len(views),
-        with_board=len(found),
         coverage=_outline_area(np.concatenate([corners.px for corners in found])) / area if found else 0.0,
-        board_share=float(np.median(shares)) if shares else np.nan,
         room_flux=float(np.median(fluxes)) if fluxes else np.nan,
     )
 

@@ -19,10 +19,9 @@ from calibration.judging.view_shifts import ViewShift, common_shift, counted, la
 from calibration.model.lag_speeds import SWEPT
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.fit import RigFit
-from calibration.verdict import Asked, Verdict
+from calibration.verdict import AT_M, Asked, Verdict
 from calibration.views import View
 
-AT_M: Final = 5.0
 ACCURACY_PX: Final = 0.1
 """Where no accuracy is asked for: what a stripe that is off by this costs. No estimator does better in fog."""
 _WORST_PERCENT = 95
@@ -42,6 +41,13 @@ class Judged:
     sensitivity: Sensitivity
 
 
+def goal(
+    worth: Sensitivity, accuracy_m: float | None, at_m: float = AT_M, stated_baseline_m: float | None = None
+) -> Asked:
+    """What a calibration is held to. accuracy_m: sd of depth at `at_m`, for which `worth` is; None: ACCURACY_PX."""
+    return Asked(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
+
+
 def judge_fit(
     fit: RigFit,
     views: Sequence[View],
@@ -56,7 +62,7 @@ def judge_fit(
     """
     model = fit.model
     worth = sensitivity(model, at_m)
-    asked = Asked(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
+    asked = goal(worth, accuracy_m, at_m, stated_baseline_m)
     residuals = tuple(
         SweepResidual(name, sweep.direction, sweep.command, sweep.residual)
         for name, sweeps in zip(fit.views, fit.sweeps, strict=True)
@@ -76,7 +82,6 @@ def judge_fit(
         wave_m=waves.rms * worth.per_command_m,
         shift_m=common_shift(agreeing, waves.rms, sweeps) * worth.per_command_m,
         moved_after=last_before_move(agreeing),
-        outliers=fit.outliers,
         misfit=fit.misfit,
         baseline_m=baseline,
         baseline_sd_m=baseline_sd,

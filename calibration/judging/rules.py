@@ -34,7 +34,7 @@ class FitEvidence:
 
     expected_m, worst_m: predicted sd of the depth at the distance asked, median and 95 % of the picture. wave_m: error
     of one sweep against another of the same view there; shift_m: of a view against the others; moved_after: the view
-    after which they changed, where one move explains them. outliers: views that do not fit. misfit: by which the
+    after which they changed, where one move explains them. misfit: by which the
     expected variances grew because the data contradict each other. baseline_m, baseline_sd_m: distance of camera and
     mirror axis. velocities_per_s: of the sweeps, signed; none: not known.
     """
@@ -45,7 +45,6 @@ class FitEvidence:
     wave_m: float = math.nan
     shift_m: float = math.nan
     moved_after: str | None = None
-    outliers: tuple[str, ...] = ()
     misfit: float = 1.0
     baseline_m: float = math.nan
     baseline_sd_m: float = math.nan

@@ -56,7 +56,7 @@ def with_parameters(model: RigModel, names: Sequence[str], deltas: ArrayLike) ->
     this kind does not have, and where the change leaves no valid model.
     """
     change = dict(zip(names, np.asarray(deltas, np.float64).tolist(), strict=True))
-    camera = _camera(model.camera, change)
+    camera = changed_camera(model.camera, change)
     scanner = model.scanner
     if isinstance(scanner, PivotScanner):
         scanner = _pivot(scanner, change)
@@ -75,7 +75,7 @@ def with_parameters(model: RigModel, names: Sequence[str], deltas: ArrayLike) ->
     )
 
 
-def _camera(camera: Camera, change: dict[str, float]) -> Camera:
+def changed_camera(camera: Camera, change: dict[str, float]) -> Camera:
     """The camera with its part of the change, which is taken out."""
     matrix, distortion = camera.matrix.copy(), camera.distortion.copy()
     touched = False

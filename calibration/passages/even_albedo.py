@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.board import MARGIN_SQUARES, Board
+from calibration.board.board import PAPER_SQUARES, Board
 from calibration.views import Corners
 
 BLUR_PX = 1.0
@@ -18,8 +18,6 @@ LEAST_SLOPE = 0.1
 NOISE_TIMES = 4.0
 AWAY_PX = 2
 """Pixels kept clear of an edge."""
-PAPER_SQUARES = 0.8 * MARGIN_SQUARES
-"""How far the white paper around the squares is taken for the board's: bright, even and as flat."""
 
 
 def even_pixels(picture: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -27,6 +27,8 @@ from calibration.passages.light import (
 
 Array = NDArray[np.float64]
 
+FITTED_BESIDES = 3
+"""Levels before and after, and the line's light."""
 UNKNOWN_SD = 1e3
 """Columns; of a passage that the photons do not tell."""
 ITERATIONS, WIDTH_ITERATIONS = 12, 7
@@ -153,10 +155,10 @@ def _moved(theta: Array, score: Array, information: Array, damping: Array) -> Ar
 
 
 def _few(frames: Array, flux: Array, slopes: Array, theta: Array) -> Array:
-    """Factor (pixels,) on the variance for the three parameters that were fitted besides, to so many detections."""
+    """Factor (pixels,) on the variance for the parameters that were fitted besides, to so many detections."""
     level = slopes[:, BEFORE] * theta[:, BEFORE, None] + slopes[:, AFTER] * theta[:, AFTER, None]
     detections = (frames * (np.exp(-level) - np.exp(-flux))).sum(axis=1)
-    result: Array = np.maximum(detections / np.maximum(detections - CENTRE, 1), 1)  # a dip has fewer than none
+    result: Array = np.maximum(detections / np.maximum(detections - FITTED_BESIDES, 1), 1)  # a dip has fewer than none
     return result
 
 

@@ -9,6 +9,7 @@ from calibration.depth.uncertainty import command_at, depth_sd_m
 from calibration.errors import Degenerate
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.sightings import Sighting
+from calibration.verdict import AT_M
 from calibration.views import BoardPose, View
 
 Array = NDArray[np.float64]
@@ -19,7 +20,6 @@ LEAST_THICKNESS = 0.01
 """Of the points about the plane that fits them best, as a share of their distance: less is one plane."""
 LEAST_SPAN = 0.02
 """Of the mirror's command range: a line that hardly moved tells nothing of how it turns."""
-JUDGED_AT_M = 5.0
 LEAST_LIT_SHARE = 0.1
 """Of the picture, for a distance to be judged at."""
 MOST_DEPTH_SD_SHARE = 0.2
@@ -83,7 +83,7 @@ def check_depth(model: RigModel, poses: Sequence[BoardPose], condition: float, v
     """Raise Degenerate where the fitted model knows next to nothing of depth."""
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
-    for at_m in (JUDGED_AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):
+    for at_m in (AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):
         command = command_at(model, x, y, at_m)
         sd = depth_sd_m(model, x, y, command, velocity_per_s)
         if np.isfinite(sd).mean() >= LEAST_LIT_SHARE:

@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 from calibration.model.camera import Camera
 from calibration.model.distortion import LensModel
 from calibration.model.light_sheet import fan_origin
+from calibration.model.parameters import AXIS, DISTORTION, MATRIX, TIMES
 from calibration.model.scanner import PivotScanner
 from calibration.views import BoardPose
 
 Array = NDArray[np.float64]
 
-LENS_TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
-TIMING = ("lag_forward", "lag_backward", "row_delay")
+LENS_TERMS = DISTORTION[:12]
+"""All but a tilted sensor's."""
 ANGLE_TERMS = 6
 OFFSET_TERMS = 2
 
@@ -41,20 +42,20 @@ class Terms:
     @property
     def camera(self) -> tuple[str, ...]:
         """Of the camera."""
-        return ("fx", "fy", "cx", "cy", *LENS_TERMS[: self.lens])
+        return (*MATRIX, *LENS_TERMS[: self.lens])
 
     @property
     def scanner(self) -> tuple[str, ...]:
         """Of the mirror."""
         return (
-            "axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2",
+            *AXIS,
             *(f"angle_{k}" for k in range(ANGLE_TERMS)), *(f"offset_{k}" for k in range(OFFSET_TERMS)), "cone", "bow",
         )  # fmt: skip
 
     @property
     def names(self) -> tuple[str, ...]:
         """Of all columns."""
-        return (*self.camera, *self.scanner, *TIMING)
+        return (*self.camera, *self.scanner, *TIMES)
 
     def at(self, names: Sequence[str]) -> list[int]:
         """The columns of some."""
@@ -105,7 +106,7 @@ def sheet_rows(
     across_2 = np.cross(axis, across_1)
     cos_cone, sin_cone = np.cos(scanner.cone_rad), np.sin(scanner.cone_rad)
     moment = np.cross(lit.normal, lit.lever)
-    columns: Array = np.empty((len(met), 4 + ANGLE_TERMS + OFFSET_TERMS + 2 + len(TIMING)))
+    columns: Array = np.empty((len(met), 4 + ANGLE_TERMS + OFFSET_TERMS + 2 + len(TIMES)))
     columns[:, 0], columns[:, 1] = moment @ across_1, moment @ across_2
     columns[:, 2], columns[:, 3] = -lit.normal @ across_1, -lit.normal @ across_2
     columns[:, 4 : 4 + ANGLE_TERMS] = lit.per_angle[:, None] * np.vander(met, ANGLE_TERMS, increasing=True)

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.model.parameters import TIMES
 from calibration.rig_fit.noise import Noise
-from calibration.rig_fit.rows import ANGLE_TERMS, TIMING
+from calibration.rig_fit.rows import ANGLE_TERMS
 from calibration.rig_fit.solve import Problem, Solution, scaled_inverse
 
 Array = NDArray[np.float64]
@@ -97,7 +98,7 @@ def lag_decisions(solution: Solution, problem: Problem, free: Sequence[Sequence[
     for group in told.values():
         at = problem.terms.at(group[:1])[0]
         said = "of each direction" if len(group) == 1 else "one for both: the sweeps do not tell them apart"
-        value = float(timing[TIMING.index(group[0])])
+        value = float(timing[TIMES.index(group[0])])
         decisions.append(Decision("/".join(group), True, value, float(spread[at]), said))
     if not told:
         value = float(timing[0])

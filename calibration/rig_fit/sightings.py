@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.board import MARGIN_SQUARES, Board
+from calibration.board.board import PAPER_SQUARES, Board
 from calibration.model.camera import Camera
 from calibration.views import FEWEST_CORNERS, LEAST_ACROSS_PX, USUAL_CORNER_SD_PX, BoardPose, Corners, Passages, View
 
@@ -18,8 +18,6 @@ LEAST_SD_SHARE = 0.05
 """Of the median sd of a sweep: none counts as better known, or a few too sure of themselves would decide."""
 LEAST_CORNER_SD_PX = 0.02
 """What the print, the lens model and the finding of corners leave, however bright the picture."""
-PAPER_SHARE = 0.8
-"""Of the white paper around the squares, which is as flat as they are; its very edge may bend."""
 FEWEST_PASSAGES = 30
 """Of a sweep; fewer say nothing that the noise can be told from."""
 
@@ -108,7 +106,7 @@ def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose) ->
         depth = (turn[:, 2] @ pose.position_m) / (ray @ turn[:, 2])
         place = (depth[:, None] * ray - pose.position_m) @ turn
     margin = EDGE_PX * float(np.linalg.norm(pose.position_m)) / camera.matrix[0, 0]
-    margin -= PAPER_SHARE * MARGIN_SQUARES * board.square_m
+    margin -= PAPER_SQUARES * board.square_m
     width, height = board.size_m
     with np.errstate(invalid="ignore"):
         keep &= (depth > 0) & (place[:, 0] > margin) & (place[:, 0] < width - margin)

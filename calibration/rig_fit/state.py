@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.model.parameters import with_parameters
+from calibration.model.parameters import ROW_DELAY, TIMES, with_parameters
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner
-from calibration.rig_fit.rows import TIMING, Rows, Terms, corner_rows, passage_rows, refined_rays
+from calibration.rig_fit.rows import Rows, Terms, corner_rows, passage_rows, refined_rays
 from calibration.rig_fit.sightings import Sighting
 from calibration.views import BoardPose
 
@@ -46,7 +46,7 @@ class RigState:
 
     def stepped(self, terms: Terms, shared: Array, poses: Sequence[Array], sightings: Sequence[Sighting]) -> "RigState":
         """Moved by changes of the shared parameters (p,) and of each pose (6,). CalibrationError: no such model."""
-        untimed = len(terms.names) - len(TIMING)
+        untimed = len(terms.names) - len(TIMES)
         moved = [name for name, change in zip(terms.names[:untimed], shared, strict=False) if change != 0]
         model = with_parameters(self.model, moved, [shared[terms.names.index(name)] for name in moved])
         rays = self.rays
@@ -77,7 +77,7 @@ def with_terms_of(state: RigState, groups: Sequence[Sequence[str]]) -> RigState:
         cone_rad=scanner.cone_rad if "cone" in named else 0.0,
         bow_per_rad=scanner.bow_per_rad if "bow" in named else 0.0,
     )
-    timing = np.where([name != "row_delay" or name in named for name in TIMING], state.timing, 0.0)
+    timing = np.where([name != ROW_DELAY or name in named for name in TIMES], state.timing, 0.0)
     return RigState(replace(state.model, scanner=plain), timing, state.poses, state.rays)
 
 

@@ -10,7 +10,7 @@ from calibration.camera_fit.fit import CameraFit, fit_camera
 from calibration.errors import Degenerate
 from calibration.files.camera_file import camera_content, camera_file_text, corners_digest
 from calibration.judging.camera import ACCURACY_PX, JudgedCamera, judge_camera
-from calibration.judging.rig import AT_M
+from calibration.verdict import AT_M
 from rig.calibrating.planes_run import POSES
 from rig.calibrating.refusing import refusal
 from rig.calibrating.report import camera_report

@@ -16,9 +16,9 @@ from calibration.errors import Degenerate
 from calibration.files.camera_file import CORNERS, corners_digest
 from calibration.files.rig_file import load_rig_model
 from calibration.judging.check import judge_check
-from calibration.judging.rig import ACCURACY_PX, AT_M
+from calibration.judging.rig import goal
 from calibration.model.rig_model import RigModel
-from calibration.verdict import Asked, Verdict
+from calibration.verdict import AT_M, Asked, Verdict
 from calibration.views import View
 from rig.calibrating.report import check_report
 from rig.calibrating.result import CalibrationResult
@@ -71,7 +71,7 @@ def run_check(
     poses = max(asked.poses, 2 if asked.angle_rad is not None else 1)
     require_live(live, ask, asked.arm)
     worth = sensitivity(model, asked.at_m)
-    goal = Asked(ACCURACY_PX * worth.per_pixel_m if asked.accuracy_m is None else asked.accuracy_m, asked.at_m)
+    wanted = goal(worth, asked.accuracy_m, asked.at_m)
     with Session(out, board) as session:
         taken = Taken(session, tell)
         take_kept(taken, sources, board, model.defects)
@@ -84,13 +84,13 @@ def run_check(
         model.check_sensor(*taken.size)
         boards = check_boards(model, views, board)
         angle = None if asked.angle_rad is None else check_angle(model, views[0], views[1], board)
-        verdict = judge_check(boards, goal, board.size_m[0], angle, asked.angle_rad)
+        verdict = judge_check(boards, wanted, board.size_m[0], angle, asked.angle_rad)
         uncertainty = None if model.covariance is None else depth_uncertainty(model, asked.at_m)
         line = NO_COVARIANCE if uncertainty is None else uncertainty.line()
         truth = None if live is None else true_errors(model, live, asked.at_m)
         summary = {
             "command": "check",
-            **_summary(verdict, boards, angle, asked, goal, uncertainty, file),
+            **_summary(verdict, boards, angle, asked, wanted, uncertainty, file),
             "truth": None if truth is None else truth_content(truth),
             "versions": versions(),
         }
@@ -130,7 +130,7 @@ def _summary(
     boards: Sequence[CheckedBoard],
     angle: CheckedAngle | None,
     asked: CheckAsked,
-    goal: Asked,
+    wanted: Asked,
     uncertainty: DepthUncertainty | None,
     file: Path,
 ) -> dict[str, Any]:
@@ -156,8 +156,8 @@ def _summary(
         if angle is None
         else {"rad": angle.angle_rad, "sd_rad": angle.sd_rad, "stated_rad": asked.angle_rad},
         "depth_error": {
-            "at_m": goal.at_m,
-            "asked_m": goal.accuracy_m,
+            "at_m": wanted.at_m,
+            "asked_m": wanted.accuracy_m,
             "median_m": None if uncertainty is None else float(np.nanmedian(uncertainty.sd_m)),
             "line": None if uncertainty is None else uncertainty.line(),
         },

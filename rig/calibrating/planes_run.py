@@ -11,9 +11,10 @@ from calibration.board.board import Board
 from calibration.depth.against_truth import DepthErrors
 from calibration.errors import CalibrationError, Degenerate
 from calibration.files.camera_file import CORNERS, KnownCamera, corners_digest
-from calibration.judging.rig import AT_M, Judged, judge_fit
+from calibration.judging.rig import Judged, judge_fit
 from calibration.model.rig_model import Identity, RigModel
 from calibration.rig_fit.fit import RigFit, fit_rig
+from calibration.verdict import AT_M
 from rig.calibrating.guided import Guide
 from rig.calibrating.refusing import refusal
 from rig.calibrating.report import planes_report

@@ -10,12 +10,12 @@ from typing import Any
 from calibration.depth.sensitivity import sensitivity
 from calibration.errors import CalibrationError, Degenerate
 from calibration.files.rig_file import load_rig_model
-from calibration.judging.rig import ACCURACY_PX, AT_M
+from calibration.judging.rig import goal
 from calibration.judging.sync import judge_sync
 from calibration.model.rig_model import RigModel
 from calibration.sync.lag_fit import SyncFit, fit_sync
 from calibration.sync.transfer import known_row_delay, with_lags
-from calibration.verdict import Asked, Verdict
+from calibration.verdict import AT_M, Asked, Verdict
 from rig.calibrating.capture import capture_view
 from rig.calibrating.gate_times import GateDelay, gate_delay
 from rig.calibrating.planes_run import speeds_of
@@ -106,8 +106,7 @@ def _own(live: RigConfig | None) -> RigModel | None:
 
 
 def _goal(model: RigModel, asked: SyncAsked) -> Asked:
-    worth = sensitivity(model, asked.at_m)
-    return Asked(ACCURACY_PX * worth.per_pixel_m if asked.accuracy_m is None else asked.accuracy_m, asked.at_m)
+    return goal(sensitivity(model, asked.at_m), asked.accuracy_m, asked.at_m)
 
 
 def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigModel:

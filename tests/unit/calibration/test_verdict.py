@@ -16,7 +16,7 @@ from calibration.verdict import Asked
 from calibration.views import BoardPose, Corners, View
 
 ASKED = Asked(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)
-VIEWS = ViewEvidence(shown=12, with_board=12, coverage=0.8, board_share=0.06, room_flux=0.2)
+VIEWS = ViewEvidence(shown=12, coverage=0.8, room_flux=0.2)
 FIT = FitEvidence(
     PoseEvidence(tilt_rad=radians(60), distance_m=1.6, board_rad=0.35),
     expected_m=0.004,
@@ -98,7 +98,7 @@ def test_unknown_errors_do_not_pass() -> None:
 )
 def test_a_refusal_names_the_cause(reason: str, room_flux: float, code: str) -> None:
     shown = 1 if reason == "one-pose" else 10
-    views = replace(VIEWS, shown=shown, with_board=min(shown, 4), room_flux=room_flux)
+    views = replace(VIEWS, shown=shown, room_flux=room_flux)
     verdict = judge_refusal(Degenerate(reason, "all boards lie in one plane"), views)
     assert not verdict.passed
     assert verdict.codes[0] == code
@@ -112,7 +112,7 @@ def test_views_tell_coverage_and_room_light() -> None:
     seen = View("a", Corners(np.arange(len(px), dtype=np.int32), px), picture=picture)
     unseen = View("b", None, picture=np.full((300, 400), 2.0, np.float32))
     evidence = view_evidence([seen, unseen], (400, 300))
-    assert (evidence.shown, evidence.with_board) == (2, 1)
+    assert evidence.shown == 2
     assert evidence.coverage == pytest.approx(120 * 80 / (400 * 300))
     assert evidence.room_flux == pytest.approx(2.0)
 
