@@ -1,5 +1,6 @@
 """Views that make no model of a rig: refused with the reason, what was measured, its limit and what to do."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -79,8 +80,13 @@ def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:
     )
 
 
-def check_depth(model: RigModel, poses: Sequence[BoardPose], condition: float, velocity_per_s: float) -> None:
-    """Raise Degenerate where the fitted model knows next to nothing of depth."""
+def check_depth(
+    model: RigModel, poses: Sequence[BoardPose], condition: float, velocity_per_s: float, misfit: float = 1.0
+) -> None:
+    """Raise Degenerate where the poses of a fitted model tell next to nothing of depth.
+
+    misfit: by which its variances were widened since the data contradict each other; that says nothing of the poses.
+    """
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
     for at_m in (AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):
@@ -92,7 +98,7 @@ def check_depth(model: RigModel, poses: Sequence[BoardPose], condition: float, v
         raise Degenerate(
             reason_of(poses), f"line reaches nothing at {at_m:.3g} m; sweep further, or show the board at more poses"
         )
-    usual = float(np.nanmedian(sd))
+    usual = float(np.nanmedian(sd)) / math.sqrt(misfit)
     if usual > MOST_DEPTH_SD_SHARE * at_m:
         raise Degenerate(
             reason_of(poses),

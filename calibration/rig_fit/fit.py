@@ -213,7 +213,8 @@ def _result(fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigMode
         speed_range_per_s=speed_range(np.abs(velocities)),
     )
     counted = problem.counted
-    check_depth(model, state.poses, solution.condition, float(velocities[np.argmax(np.abs(velocities))]))
+    fastest = float(velocities[np.argmax(np.abs(velocities))])
+    check_depth(model, state.poses, solution.condition, fastest, unexplained)
     return RigFit(
         model=model,
         views=tuple(seen.name for seen in problem.sightings),

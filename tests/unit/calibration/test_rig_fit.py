@@ -206,6 +206,13 @@ def test_a_rig_moved_half_way_shows_as_misfit() -> None:
     assert abs(fit.noise.corner_sd_px / SEEN.corner_px - 1) < 0.5  # corners are not blamed for it
 
 
+def test_exposures_that_drift_are_no_fault_of_the_poses() -> None:
+    fit = fitted(RIG, 1, replace(SEEN, wave=(0.05, 2.0), passages=200))
+    assert fit.misfit > 100
+    _, sd = depth_errors(fit.model, RIG, 5.0, 35.2)
+    assert np.median(sd) > 1.0  # said by the verdict, with the cause
+
+
 def test_passages_on_the_wall_behind_the_board_are_left_out() -> None:
     rng = np.random.default_rng(14)
     wall = points_at(rng, RIG, 4.0, 400)
