@@ -15,7 +15,7 @@ from calibration.judging.sync import judge_sync
 from calibration.model.rig_model import RigModel
 from calibration.sync.lag_fit import SyncFit, fit_sync
 from calibration.sync.transfer import known_row_delay, with_lags
-from calibration.verdict import AT_M, Asked, Verdict
+from calibration.verdict import AT_M, Verdict
 from rig.calibrating.capture import capture_view
 from rig.calibrating.gate_times import GateDelay, gate_delay
 from rig.calibrating.planes_run import speeds_of
@@ -55,7 +55,7 @@ def run_sync(
     """
     live = sources.live
     base = base or _own(live)
-    goal = None if base is None else _goal(base, asked)
+    wanted = None if base is None else goal(sensitivity(base, asked.at_m), asked.accuracy_m, asked.at_m)
     with Session(out) as session:
         taken = Taken(session, tell)
         take_kept(taken, sources, None)
@@ -65,7 +65,7 @@ def run_sync(
         gate = min((one for one in gates if one is not None and one.sd_s > 0), key=lambda one: one.sd_s, default=None)
         fit = _fitted(taken, base)
         given, changed = (None, None) if base is None else with_lags(base, fit)
-        verdict = judge_sync(fit, base, goal, changed)
+        verdict = judge_sync(fit, base, wanted, changed)
         model = None if given is None else _signed(given, gate, verdict)
         truth = None if live is None else true_model(live)
         line = _line(fit)
@@ -103,10 +103,6 @@ def _own(live: RigConfig | None) -> RigModel | None:
         return load_rig_model(live.calibration)
     except CalibrationError:
         return None  # what is wrong with it says the command that needs it
-
-
-def _goal(model: RigModel, asked: SyncAsked) -> Asked:
-    return goal(sensitivity(model, asked.at_m), asked.accuracy_m, asked.at_m)
 
 
 def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigModel:
