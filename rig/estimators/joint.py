@@ -9,34 +9,29 @@ as by `likelihood`, then from the map's own stripes.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.aligned import aligned_zeros
 from rig.counting import Counter, CountVolume, SweepCounter, SweepLayout
-from rig.errors import UsageError
-from rig.estimators.aggregation_answer import Answer, answer_settings, new_answer
+from rig.estimators.aggregation_answer import answer_settings
 from rig.estimators.aggregation_kernels import Penalties, along_columns, along_rows
-from rig.estimators.aggregation_vote import NEIGHBOURS_PX, Ballots, collect, new_ballots, vote
+from rig.estimators.aggregation_vote import NEIGHBOURS_PX, collect, vote
 from rig.estimators.ambient import ambient_map
-from rig.estimators.halo import halo_shares
 from rig.estimators.halo_learning import bright_lines, learn_first_halo, learn_next_halo
 from rig.estimators.joint_agreement import pairs_to_ask
-from rig.estimators.joint_answer import brightness_of, stripe_table
-from rig.estimators.joint_confidence import Brightness
+from rig.estimators.joint_answer import stripe_table
 from rig.estimators.joint_kernels import add_quiet, read_positions
+from rig.estimators.joint_tables import Memory, Tables, grid_of, memory_for, tables_of
 from rig.estimators.joint_teaching import fill_trust
-from rig.estimators.label_grid import LabelGrid, label_grid
-from rig.estimators.label_volume import BAND_ROWS, Costs, costs_of
+from rig.estimators.label_grid import LabelGrid
+from rig.estimators.label_volume import BAND_ROWS
 from rig.estimators.learning import learn_again, lines_of, next_lattice
 from rig.estimators.lessons import Lessons, Seen, Setting, first_model
-from rig.estimators.placing import amplitudes_of, line_width, new_places, place, profile_table, weigh_light
-from rig.estimators.placing_kernels import Places
-from rig.estimators.row_input import State, Sweep, state_of, sweep_of
+from rig.estimators.placing import amplitudes_of, line_width, place, weigh_light
+from rig.estimators.row_input import state_of
 from rig.estimators.row_model import RowModel
-from rig.estimators.second_return import SecondLight, SecondRoom, second_light, second_returns, second_room
+from rig.estimators.second_return import second_returns
 from rig.estimators.temporal import TemporalPrior
 from rig.estimators.volume_search import nominal_exposures
 from rig.geometry import SweepGeometry
@@ -45,37 +40,8 @@ from rig.stripes import StripeTable
 
 FIRST_ROUNDS = 3
 """Times that the first map's stripes teach what they are then estimated with again."""
-MOST_BYTES = 4 << 30
-"""Costs and messages of a map may take so much: room for 1000 columns, each searched over all of 1024 x 1024 pixels."""
 QUIET_COLUMNS = 8
 """Every so manieth column teaches the ambient light where there are dark frames too."""
-
-
-class _Tables(NamedTuple):
-    """What is made once per model."""
-
-    grid: LabelGrid
-    costs: Costs
-    sweep: Sweep
-    state: State
-    shares: NDArray[np.float32]
-    halo: NDArray[np.float32]
-    light: SecondLight
-    bright: Brightness
-    dark: bool
-    pairs: NDArray[np.float32]
-    """Of maps whose columns all have frames."""
-
-
-class _Memory(NamedTuple):
-    """Room for one map after the other: costs and messages (rows, columns, labels) uint8, and the answers."""
-
-    cost: NDArray[np.uint8]
-    message: NDArray[np.uint8]
-    answer: Answer
-    ballots: Ballots
-    places: Places
-    seconds: SecondRoom
 
 
 class Joint:
@@ -89,9 +55,9 @@ class Joint:
         self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True, temporal_prior: bool = False
     ) -> None:
         self._workers = RowWorkers(threads)
-        self._lessons = Lessons(_tables, None, learns=learns, learn_more=learn_next_halo)
+        self._lessons = Lessons(tables_of, None, learns=learns, learn_more=learn_next_halo)
         self._prior = TemporalPrior(temporal_prior)
-        self._memory: _Memory | None = None
+        self._memory: Memory | None = None
         self.used: RowModel | None = None
         """The state that the last map was estimated with."""
         if model is not None:
@@ -113,7 +79,7 @@ class Joint:
 
         UsageError where its maps would take too much memory: before any light is let out.
         """
-        _grid(geometry)
+        grid_of(geometry)
         return SweepCounter(layout, self._workers)
 
     def estimate(self, sweep: CountVolume, geometry: SweepGeometry) -> StripeTable:
@@ -139,7 +105,7 @@ class Joint:
         model = first_model(volume, geometry, self._workers)
         exposures, dark = nominal_exposures(volume), volume.dark_counts is not None
         for _ in range(FIRST_ROUNDS):
-            tables = _tables(Setting(model, geometry, exposures, dark), self._workers)
+            tables = tables_of(Setting(model, geometry, exposures, dark), self._workers)
             stripes = self._teaching(volume, tables, self._stripes(volume, tables))
             quiet = self._quiet(volume, geometry, tables, stripes)
             ambient = ambient_map(volume, volume.intensity(), geometry, quiet)
@@ -156,7 +122,7 @@ class Joint:
             model = replace(model, amplitude=amplitude, weight=weight)
         return model
 
-    def _teaching(self, volume: CountVolume, tables: _Tables, stripes: StripeTable) -> StripeTable:
+    def _teaching(self, volume: CountVolume, tables: Tables, stripes: StripeTable) -> StripeTable:
         """The table with the trust that lessons put into each answer instead of its confidence."""
         memory, trust = self._room(tables.grid), np.empty_like(stripes.confidence)
         self._workers.over(
@@ -168,7 +134,7 @@ class Joint:
         )  # fmt: skip
         return replace(stripes, confidence=trust)
 
-    def _stripes(self, volume: CountVolume, tables: _Tables) -> StripeTable:
+    def _stripes(self, volume: CountVolume, tables: Tables) -> StripeTable:
         grid, workers = tables.grid, self._workers
         rows, columns = grid.x_far.shape
         memory = self._room(grid)
@@ -206,24 +172,20 @@ class Joint:
         pairs = tables.pairs if lit.all() else pairs_to_ask(np.isfinite(grid.x_far) & lit)
         return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, pairs, tables.bright, workers)
 
-    def _with_seconds(self, volume: CountVolume, tables: _Tables, stripes: StripeTable) -> StripeTable:
+    def _with_seconds(self, volume: CountVolume, tables: Tables, stripes: StripeTable) -> StripeTable:
         room = self._room(tables.grid).seconds
         x2_px, confidence2 = second_returns(
             volume, tables.grid, tables.sweep, tables.light, stripes.x_px, room, self._workers
         )
         return replace(stripes, x2_px=x2_px, confidence2=confidence2)
 
-    def _room(self, grid: LabelGrid) -> _Memory:
-        memory, (rows, columns) = self._memory, grid.x_far.shape
-        if memory is None or memory.cost.shape != (rows, columns, grid.labels):
-            cost, message = (aligned_zeros((rows, columns, grid.labels), np.uint8) for _ in range(2))
-            memory = self._memory = _Memory(
-                cost, message, new_answer(rows, columns), new_ballots(rows, columns), new_places(rows, columns),
-                second_room(grid),
-            )  # fmt: skip
+    def _room(self, grid: LabelGrid) -> Memory:
+        memory = self._memory
+        if memory is None or not memory.fits(grid):
+            memory = self._memory = memory_for(grid)
         return memory
 
-    def _seen(self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable) -> Seen:
+    def _seen(self, volume: CountVolume, geometry: SweepGeometry, tables: Tables, stripes: StripeTable) -> Seen:
         assert self._memory is not None, "a map has been estimated"
         quiet = self._quiet(volume, geometry, tables, stripes)
         lines = lines_of(volume, next_lattice(geometry), stripes)
@@ -231,7 +193,7 @@ class Joint:
         return Seen(volume, volume.intensity(), quiet, lines, bright)
 
     def _quiet(
-        self, volume: CountVolume, geometry: SweepGeometry, tables: _Tables, stripes: StripeTable
+        self, volume: CountVolume, geometry: SweepGeometry, tables: Tables, stripes: StripeTable
     ) -> NDArray[np.float64]:
         quiet = np.zeros((2, geometry.rows, geometry.width))
 
@@ -243,26 +205,3 @@ class Joint:
 
         self._workers.over(geometry.rows, work)
         return quiet
-
-
-def _grid(geometry: SweepGeometry) -> LabelGrid:
-    grid = label_grid(geometry)
-    rows, columns = grid.x_far.shape
-    if (needed := 2 * rows * columns * grid.labels) > MOST_BYTES:
-        raise UsageError(
-            f"joint weighs {grid.labels} places on each of {rows} rows of {columns} columns, which takes "
-            f"{needed / 2**30:.1f} GiB; it may take {MOST_BYTES / 2**30:.3g}: narrow depth_range, or use the estimator "
-            "likelihood"
-        )
-    return grid
-
-
-def _tables(setting: Setting, workers: RowWorkers) -> _Tables:
-    grid = _grid(setting.geometry)
-    costs = costs_of(setting.model, setting.geometry, grid, setting.exposures, workers)
-    state, sigma_px, sweep = state_of(setting.model), setting.model.line_sigma_px, sweep_of(setting.geometry)
-    halo = halo_shares(setting.model, setting.geometry.width if setting.model.halo.any() else 0)
-    return _Tables(
-        grid, costs, sweep, state, profile_table(sigma_px), halo, second_light(state, sigma_px, grid, sweep),
-        brightness_of(setting.model), setting.dark, pairs_to_ask(np.isfinite(grid.x_far)),
-    )  # fmt: skip

@@ -101,7 +101,10 @@ def test_the_mirror_is_behind_by_lag_and_row(lag, delay, row, velocity) -> None:
     assert np.array_equal(model.sheets([0.1, 0.2]).planes, model.planes([0.1, 0.2]))
 
 
-@covers("calibration.model.parameters:parameters", "calibration.model.parameters:with_parameters")
+@covers(
+    "calibration.model.parameters:parameters", "calibration.model.parameters:with_parameters",
+    "calibration.model.parameters:changed_camera",
+)  # fmt: skip
 @EXAMPLES
 @given(changes=st.dictionaries(st.sampled_from(["fx", "k1", "axis_turn_1", "axis_turn_2", "axis_shift_2", "angle_1",
        "angle_3", "offset_0", "cone", "bow", "lag_forward", "row_delay"]), ANY | st.floats(-0.1, 0.1)))  # fmt: skip

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from rig.errors import UsageError
-from rig.estimators import joint, lessons
+from rig.estimators import joint_tables, lessons
 from rig.estimators.joint import Joint
 from rig.estimators.lessons import LAG_FRAMES, LEAST_SURE, TEACH_FRAMES, Lessons, Setting
 from rig.estimators.likelihood import Likelihood
@@ -121,7 +121,7 @@ def test_a_state_of_another_sweeps_size_is_refused(lacking):
 
 
 def test_a_map_that_would_not_fit_the_memory_is_refused_before_the_scan(monkeypatch):
-    monkeypatch.setattr(joint, "MOST_BYTES", 2 * GEOMETRY.rows * GEOMETRY.columns)
+    monkeypatch.setattr(joint_tables, "MOST_BYTES", 2 * GEOMETRY.rows * GEOMETRY.columns)
     with pytest.raises(UsageError, match=r"places on each of 32 rows of 96 columns.*narrow depth_range"):
         Joint(1).counter(None, GEOMETRY)
     with pytest.raises(UsageError, match="narrow depth_range"):
