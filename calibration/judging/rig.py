@@ -80,6 +80,7 @@ def judge_fit(
         expected_m=float(np.median(known)) if known.size else np.nan,
         worst_m=float(np.percentile(known, _WORST_PERCENT)) if known.size else np.nan,
         wave_m=waves.rms * worth.per_command_m,
+        wave_noise_m=waves.noise * worth.per_command_m,
         shift_m=common_shift(agreeing, waves.rms, sweeps) * worth.per_command_m,
         moved_after=last_before_move(agreeing),
         misfit=fit.misfit,

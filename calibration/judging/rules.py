@@ -33,16 +33,17 @@ class FitEvidence:
     """What a fit tells, besides where the boards stood; NaN where it cannot.
 
     expected_m, worst_m: predicted sd of the depth at the distance asked, median and 95 % of the picture. wave_m: error
-    of one sweep against another of the same view there; shift_m: of a view against the others; moved_after: the view
-    after which they changed, where one move explains them. misfit: by which the
-    expected variances grew because the data contradict each other. baseline_m, baseline_sd_m: distance of camera and
-    mirror axis. velocities_per_s: of the sweeps, signed; none: not known.
+    of one sweep against another of the same view there; wave_noise_m: up to here that may be noise. shift_m: of a view
+    against the others; moved_after: the view after which they changed, where one move explains them. misfit: by which
+    the expected variances grew because the data contradict each other. baseline_m, baseline_sd_m: distance of camera
+    and mirror axis. velocities_per_s: of the sweeps, signed; none: not known.
     """
 
     poses: PoseEvidence
     expected_m: float
     worst_m: float
     wave_m: float = math.nan
+    wave_noise_m: float = 0.0
     shift_m: float = math.nan
     moved_after: str | None = None
     misfit: float = 1.0
@@ -96,7 +97,7 @@ def _contradictions(fit: FitEvidence, asked: Asked, imprecise: bool) -> list[Rea
     grown = math.sqrt(max(fit.misfit, 1.0))
     if imprecise and fit.expected_m <= limit * grown and fit.worst_m <= WORST_TIMES * limit * grown:
         limit /= grown
-    waves = fit.wave_m > limit
+    waves = fit.wave_m > max(limit, fit.wave_noise_m)
     moved = fit.shift_m > max(limit, fit.wave_m if waves else 0.0)
     found = []
     if waves:

@@ -2,7 +2,8 @@
 
 While the sweeps of a view were taken nothing moved, so their residuals, binned over the mirror's command, may differ by
 noise and by one constant for each direction (what is left of the lag). The rest are waves that each sweep has on its
-own. A view with a single sweep shows them against its own straight line. Medians in bins keep bad passages out.
+own. A view with a single sweep shows them against its own straight line. Medians in bins keep bad passages out. Where
+few passages are left, as in bright room light, a mean square of so few bins is noise: how large it may be is told too.
 """
 
 from collections.abc import Sequence
@@ -23,6 +24,10 @@ _LEAST_SHARE_IN_BIN = 0.25
 _FEWEST_BINS = 4
 _MEDIAN_VARIANCE = np.pi / 2
 """Of a median in units of the mean's variance, normal distribution."""
+_MEDIAN_TAKES = 0.8
+"""Of n values: their robust scatter around their own median is (n - 0.8) / n of the true (Croux, Rousseeuw, 1992)."""
+SIGMAS = 4.0
+"""Standard deviations of a mean square up to which it may be noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,12 +42,14 @@ class SweepResidual:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepWaves:
-    """rms: of the waves in command units, noise taken off; NaN where there are too few passages to tell.
+    """rms: of the waves in command units, noise taken off; NaN where there are too few passages to tell. noise: up to
+    here that may be noise.
 
     command: (BINS,) middles of bins; sweeps: (sweeps, BINS) medians, NaN where there are too few passages.
     """
 
     rms: float
+    noise: float
     command: Array
     sweeps: Array
 
@@ -60,11 +67,12 @@ def sweep_waves(sweeps: Sequence[SweepResidual]) -> SweepWaves:
         [i for i, sweep in enumerate(sweeps) if sweep.view == name]
         for name in dict.fromkeys(sweep.view for sweep in sweeps)
     ]
-    square = _between(left, variance, views)
+    square, sd = _between(left, variance, views)
     if np.isnan(square):
-        square = _off_lines(left, variance)
+        square, sd = _off_lines(left, variance)
     return SweepWaves(
         rms=float(np.sqrt(max(square, 0.0))) if np.isfinite(square) else np.nan,
+        noise=float(np.sqrt(SIGMAS * sd)),
         command=(edges[1:] + edges[:-1]) / 2,
         sweeps=middle,
     )
@@ -86,26 +94,28 @@ def _binned(sweeps: Sequence[SweepResidual], edges: Array) -> tuple[Array, Array
         for k in np.flatnonzero(count >= max(_FEWEST_IN_BIN, _LEAST_SHARE_IN_BIN * usual)):
             inside = sweep.residual[at == k]
             middle[i, k] = np.median(inside)
-            sd = robust_sd(inside - middle[i, k])
+            sd = robust_sd(inside - middle[i, k]) * inside.size / (inside.size - _MEDIAN_TAKES)
             variance[i, k] = _MEDIAN_VARIANCE * sd**2 / inside.size
     return middle, variance
 
 
-def _between(left: Array, variance: Array, views: Sequence[Sequence[int]]) -> float:
-    """Mean square of what tells the sweeps of a view apart; NaN where no view has two."""
-    found, weight = [], []
+def _between(left: Array, variance: Array, views: Sequence[Sequence[int]]) -> tuple[float, float]:
+    """Mean square of what tells the sweeps of a view apart, NaN where no view has two; and its sd, were all noise."""
+    found = weight = chance = 0.0
     for rows in views:
         if len(rows) > 1:
-            spread = np.var(left[rows], axis=0, ddof=1) - np.mean(variance[rows], axis=0)
-            known = spread[np.isfinite(spread)]
-            found.append(float(known.sum()) * (len(rows) - 1))
-            weight.append(known.size * (len(rows) - 1))
-    return sum(found) / sum(weight) if sum(weight) else np.nan
+            noise = np.mean(variance[rows], axis=0)
+            spread = np.var(left[rows], axis=0, ddof=1) - noise
+            known, free = np.isfinite(spread), len(rows) - 1
+            found += float(spread[known].sum()) * free
+            weight += np.count_nonzero(known) * free
+            chance += 2 * free * float(np.sum(noise[known] ** 2))
+    return (found / weight, float(np.sqrt(chance)) / weight) if weight else (np.nan, np.nan)
 
 
-def _off_lines(left: Array, variance: Array) -> float:
-    """Mean square of single sweeps off their straight lines; NaN where none is long enough."""
-    found, weight = 0.0, 0.0
+def _off_lines(left: Array, variance: Array) -> tuple[float, float]:
+    """Mean square of single sweeps off their straight lines, NaN where none is long enough; and its sd, as above."""
+    found = weight = chance = 0.0
     bins = np.arange(BINS)
     for values, noise in zip(left, variance, strict=True):
         known = np.isfinite(values)
@@ -116,4 +126,5 @@ def _off_lines(left: Array, variance: Array) -> float:
         free = count - 2
         found += float(np.sum((values[known] - line(bins[known])) ** 2)) - free * float(noise[known].mean())
         weight += free
-    return found / weight if weight else np.nan
+        chance += 2 * free * float(noise[known].mean()) ** 2
+    return (found / weight, float(np.sqrt(chance)) / weight) if weight else (np.nan, np.nan)

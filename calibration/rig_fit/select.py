@@ -2,7 +2,9 @@
 
 A term that is not in the model is tried to first order: the equations say what value it would take and how sure that
 would be. It comes in where it would be SIGNIFICANT_SD of its own standard deviations and can be told from the others.
-The angle's polynomial grows by one order or two, since a symmetric mirror has no even terms.
+The angle's polynomial grows by one order or two, since a symmetric mirror has no even terms. Of several that would come
+in the first is the one that leaves least unexplained: what is not there can stand for a part of what is, as light that
+passes the axis for an angle that bends, and be surer of its value than what it stands for.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +28,7 @@ LEAST_OWN_SHARE = 1e-7
 @dataclass(frozen=True, slots=True)
 class Decision:
     """One about a term. value, sd: what it is or would be, in its own unit; NaN where nothing tells. along: name and
-    value of the terms that would come in with it."""
+    value of the terms that would come in with it. gain: by which chi2 would fall with all of them."""
 
     name: str
     kept: bool
@@ -34,6 +36,7 @@ class Decision:
     sd: float
     reason: str
     along: tuple[tuple[str, float], ...] = ()
+    gain: float = 0.0
 
 
 def with_free(problem: Problem, groups: Sequence[Sequence[str]]) -> Problem:
@@ -77,17 +80,17 @@ def tried(problem: Problem, solution: Solution, new: Sequence[str], left_over: C
         return Decision(new[-1], False, np.nan, np.nan, "cannot be told from the other terms")
     spread = np.linalg.inv(left)
     values = (spread @ wanted).tolist()
-    value = values[-1]
-    sd = float(np.sqrt(left_over(float(wanted @ spread @ wanted)) * spread[-1, -1]))
+    value, gain = values[-1], float(wanted @ spread @ wanted)
+    sd = float(np.sqrt(left_over(gain) * spread[-1, -1]))
     kept = abs(value) > SIGNIFICANT_SD * sd
     said = f"{abs(value) / sd:.1f} sd from 0, limit {SIGNIFICANT_SD:g}"
-    return Decision(new[-1], kept, value, sd, said, tuple(zip(new[:-1], values[:-1], strict=True)))
+    return Decision(new[-1], kept, value, sd, said, tuple(zip(new[:-1], values[:-1], strict=True)), gain)
 
 
 def best(decisions: Sequence[Decision]) -> int | None:
-    """The most significant of those that would be kept."""
+    """Of those that would be kept the one that leaves least unexplained."""
     kept = [at for at, decision in enumerate(decisions) if decision.kept]
-    return max(kept, key=lambda at: abs(decisions[at].value) / decisions[at].sd) if kept else None
+    return max(kept, key=lambda at: decisions[at].gain) if kept else None
 
 
 def lag_decisions(solution: Solution, problem: Problem, free: Sequence[Sequence[str]], timing: Array) -> list[Decision]:

@@ -1,11 +1,11 @@
-"""What a term would change is what changes once it is in."""
+"""What a term would change is what changes once it is in; which of several comes in."""
 
 from types import SimpleNamespace
 
 import numpy as np
 
 from calibration.rig_fit.rows import Terms
-from calibration.rig_fit.select import first_order, tried, with_free
+from calibration.rig_fit.select import Decision, best, first_order, tried, with_free
 from calibration.rig_fit.solve import Problem
 
 
@@ -26,3 +26,11 @@ def test_a_term_changes_all_that_it_would_with_those_that_come_along() -> None:
     step[everything] = np.linalg.solve(matrix[np.ix_(everything, everything)], right[everything])
     assert np.isclose(decision.value, step[terms.at(["angle_3"])[0]])
     assert np.allclose(first_order(problem, solution, decision), step)
+
+
+def test_the_term_that_leaves_least_unexplained_comes_in_first() -> None:
+    sure = Decision("offset_0", True, -0.76, 0.037, "", gain=98257.0)
+    right = Decision("angle_3", True, -0.0109, 0.0006, "", (("angle_2", -0.006),), 111647.0)
+    left_out = Decision("bow", False, 0.02, 0.015, "", gain=2e5)
+    assert best([sure, right, left_out]) == 1
+    assert best([left_out]) is None
