@@ -8,6 +8,7 @@ from dataclasses import replace
 import yaml
 
 from rig.config import RigConfig
+from rig.config_files import portable_content
 from rig.outputs import RunFolder
 from rig.run import versions
 from rig.tradeoff import Tradeoff
@@ -43,5 +44,5 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
 
 
 def config_text(config: RigConfig, comment: str) -> str:
-    """A config as a YAML file that every command takes."""
-    return f"# {comment}\n" + yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    """A config as a YAML file that every command takes, wherever it lies."""
+    return f"# {comment}\n" + yaml.safe_dump(portable_content(config), sort_keys=False, allow_unicode=True)

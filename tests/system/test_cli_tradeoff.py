@@ -14,9 +14,13 @@ ASKED = {
 }  # fmt: skip
 
 
-def test_rows_files_and_the_setting_to_use(rig: Rig, small: Path, tmp_path: Path) -> None:
+def test_rows_files_and_the_setting_to_use(
+    rig: Rig, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    named = Path("..", small.parent.name, small.name)
+    assert named.is_file()
     ran = rig(
-        "tradeoff", small, "--fog", "60m,clear", "--exposures", "2,8", "--estimators", "argmax,edge", "--filters",
+        "tradeoff", named, "--fog", "60m,clear", "--exposures", "2,8", "--estimators", "argmax,edge", "--filters",
         "none,median", "--no-limits", "--error", "30 px", "--out", tmp_path / "out", "--json",
     )  # fmt: skip
     assert ran.code == 0, ran.err
@@ -38,6 +42,7 @@ def test_rows_files_and_the_setting_to_use(rig: Rig, small: Path, tmp_path: Path
     }  # fmt: skip
     answer = told["answer"]
     assert answer["fits"]
+    monkeypatch.chdir("/")
     again = rig("scan", tmp_path / "out" / "setting.yaml", "--out", tmp_path / "scan", "--json")
     assert again.code == 0, again.err
     scanned = json.loads(again.out)
