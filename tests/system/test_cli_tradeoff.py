@@ -10,7 +10,8 @@ from tests.system.conftest import Rig
 
 ASKED = {
     "scene", "fog", "estimator", "filter", "exposures", "lines", "sensor_ms", "compute_ms", "mean_abs_px",
-    "within_1px", "depth_mm", "ci95", "times_limit", "pareto",
+    "within_1px", "depth_mm", "ci95", "times_limit", "exponent_nats", "times_wrong_limit", "local_sd_px",
+    "position_sd_px", "times_position_limit", "pareto",
 }  # fmt: skip
 
 
@@ -62,6 +63,9 @@ def test_repeats_differ_and_what_cannot_be_had_ends_with_1_and_the_nearest(rig: 
     (row,) = json.loads(Path("out/tradeoff.json").read_text())["rows"]
     assert row["ci95"][0] < row["mean_abs_px"] < row["ci95"][1]
     assert row["times_limit"] > 0.7
+    assert row["exponent_nats"] > 0
+    assert 0 < row["position_sd_px"] < 1
+    assert "beside what its light allows" in ran.out
     assert not Path("out/setting.yaml").exists()
 
 
