@@ -51,6 +51,8 @@ def tradeoff_table(done: Tradeoff) -> None:
     print("*, +: nothing has less error in as little sensor time (*), compute time (+).")
     if any(not row.counts for row in done.rows):
         print("In brackets: more than 5 % of the answers are missing, such an error counts for\nnothing.")
+    for reason in done.accepted_calibration:
+        print(f"calibration accepted in spite of {reason}")
     if done.answer is not None:
         print(done.answer)
     if done.folder is not None:
