@@ -23,6 +23,7 @@ from rig.calibrating.session import BOARD_FILE, Session, session_board, session_
 from rig.calibrating.showing import Ask, Tell, shown
 from rig.calibrating.sources import VIEWS, Sources
 from rig.calibrating.view_files import load_views
+from rig.calibration_identity import same_rig
 from rig.config import RigConfig
 from rig.errors import PlanError, UsageError
 from rig.session import open_rig
@@ -72,7 +73,7 @@ class Taken:
             return
         if self.identity is None:
             self._session.note_rig(identity)
-        elif (self.identity.rig, self.identity.serials) != (identity.rig, identity.serials):
+        elif not same_rig(self.identity, identity):
             raise UsageError(
                 f"views are of two rigs: {self.identity.name} ({_devices(self.identity)}) and {identity.name} "
                 f"({_devices(identity)}); calibrate each with its own"
