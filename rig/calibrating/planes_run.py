@@ -167,8 +167,9 @@ def _summary(fit: RigFit, judged: Judged, taken: Taken) -> dict[str, Any]:
         "verdict": judged.verdict.as_json(),
         "views": {
             "shown": len(taken.views),
-            "used": len(fit.views) - len(fit.outliers),
+            "used": len(fit.used),
             "without_board": list(fit.left_out),
+            "without_line": list(fit.without_line),
             "outliers": list(fit.outliers),
             "refused": {name: str(why) for name, why in taken.refused.items()},
         },
@@ -203,8 +204,8 @@ def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None) -> list[tup
     lag = fit.model.lag_s
     asked = judged.asked
     rows = [
-        ("views", f"{len(fit.views) - len(fit.outliers)} used, {named(fit.outliers)} outliers, "
-                  f"{named(fit.left_out)} without board"),
+        ("views", f"{len(fit.used)} used, {named(fit.outliers)} outliers, {named(fit.left_out)} without board, "
+                  f"{named(fit.without_line)} without passages"),
         ("depth error", f"{evidence.expected_m * 1e3:.3g} mm at {asked.at_m:g} m (95 % of the picture: "
                         f"{evidence.worst_m * 1e3:.3g} mm), asked {asked.accuracy_m * 1e3:.3g} mm"),
         ("camera", f"f {matrix[0, 0]:.2f}, {matrix[1, 1]:.2f} px, centre {matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px"),
