@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calibration.board.board import Board
 from calibration.board.detection import find_corners
 from calibration.errors import CalibrationError, Degenerate
+from calibration.files.camera_file import corners_digest
 from calibration.files.rig_file import load_rig_model
 from calibration.guide.poses import Advice, candidates, rough_camera, sequence
 from calibration.model.camera import Camera
@@ -54,9 +55,19 @@ class Taken:
         self.identity: Identity | None = None
         self._session = session
         self.tell = tell
+        self._seen: dict[str, str] = {}
 
-    def add(self, view: View, refused: Degenerate | None = None, identity: Identity | None = None) -> None:
-        """One more; a name that there is already gets a number."""
+    def add(
+        self,
+        view: View,
+        refused: Degenerate | None = None,
+        identity: Identity | None = None,
+        source: Path | None = None,
+    ) -> None:
+        """One more; a name that there is already gets a number. source: the file or run that it is from. UsageError for
+        one that there is already: it would count twice.
+        """
+        self._require_new(view, str(source or view.name))
         if view.name in [known.name for known in self.views]:
             view = replace(view, name=f"{view.name}-{len(self.views)}")
         self.views.append(view)
@@ -66,6 +77,17 @@ class Taken:
         self._session.add(view)
         if self.tell is not None:
             self.tell(_told(view, refused))
+
+    def _require_new(self, view: View, where: str) -> None:
+        if view.corners is None:
+            return
+        digest = corners_digest(view)
+        if digest in self._seen:
+            raise UsageError(
+                f"{where} holds the very corners of {self._seen[digest]}; a view must not count twice: name it once, "
+                "or show the board again"
+            )
+        self._seen[digest] = where
 
     def _of_rig(self, identity: Identity | None) -> None:
         if identity is None:
@@ -79,9 +101,9 @@ class Taken:
             )
         self.identity = identity
 
-    def add_capture(self, capture: Capture) -> None:
-        """The view of a scan."""
-        self.add(capture.view, capture.refused, capture.identity)
+    def add_capture(self, capture: Capture, source: Path | None = None) -> None:
+        """The view of a scan, of a recorded one where a source is named."""
+        self.add(capture.view, capture.refused, capture.identity, source)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -132,11 +154,11 @@ def take_kept(taken: Taken, sources: Sources, board: Board | None, defects: Defe
         _require_alike(folder, board)
         identity = session_rig(folder)
         for view in load_views(folder / VIEWS):
-            taken.add(view, None, identity)
+            taken.add(view, None, identity, folder / VIEWS / view.name)
     for run in sources.recorded:
-        taken.add_capture(capture_recorded(run, run.name, board, defects=defects))
+        taken.add_capture(capture_recorded(run, run.name, board, defects=defects), run)
     for file in sources.pictures:
-        taken.add(*_pictured(file, board))
+        taken.add(*_pictured(file, board), source=file)
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,6 +69,24 @@ def test_views_kept_earlier_are_a_source_and_a_wrong_baseline_fails(calibrated: 
     assert (model.identity.name, model.identity.verdict) == ("board-rig", "failed")
 
 
+def test_a_view_that_is_named_twice_counts_for_neither(calibrated: Path, rig: Rig) -> None:
+    out, board = calibrated / "out", ("--board", calibrated / "board.yaml")
+    ran = rig("calibrate", "planes", out, out, *board, "--out", "twice")
+    assert ran.code == 2
+    assert ran.problems == [f"error: {out} is named twice; what is in it must count once: name it once"]
+    Path("copy/views").mkdir(parents=True)
+    Path("copy/views/007.npz").write_bytes((out / "views" / "001.npz").read_bytes())
+    ran = rig("calibrate", "planes", out, "copy", *board, "--out", "copied")
+    assert ran.code == 2
+    assert ran.problems[0].startswith(f"error: copy/views/001 holds the very corners of {out / 'views' / '001'}; ")
+    assert not Path("copied/calibration.yaml").exists()
+    board_file = _draw_pictures(1)
+    Path("pictures/copy.png").write_bytes(Path("pictures/0.png").read_bytes())
+    ran = rig("calibrate", "camera", "pictures", "--board", board_file, "--out", "camera")
+    assert ran.code == 2
+    assert ran.problems[0].startswith("error: pictures/copy.png holds the very corners of pictures/0.png; ")
+
+
 def test_one_view_is_refused_with_its_reason_and_only_the_view_stays(calibrated: Path, rig: Rig) -> None:
     Path("one/views").mkdir(parents=True)
     Path("one/views/000.npz").write_bytes((calibrated / "out" / "views" / "000.npz").read_bytes())
