@@ -56,7 +56,7 @@ def run_camera(
         take_kept(taken, sources, board)
         if live is not None:
             choose = good_poses(live, board, asked.poses, AT_M, asked.seed)
-            take_live(taken, Live(live, asked.poses, choose, ask, seed=asked.seed, arm=asked.arm), board)
+            take_live(taken, Live(live, asked.poses, choose, ask, seed=asked.seed, arm=asked.arm, line=False), board)
         try:
             fit = _fitted(taken, board, asked.terms)
         except Degenerate as refused:

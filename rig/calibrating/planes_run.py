@@ -29,9 +29,10 @@ from rig.errors import UsageError
 from rig.run import OutFolder, versions
 
 POSES = 12
-SPEEDS = (1.0, 0.3, 2.0)
-"""Exposures per column by turns, in units of the config's: the lags of both directions need several speeds, and hold
-between the lowest and the highest of them."""
+SPEEDS = ((1.0, 1), (0.3, 2), (2.0, 4))
+"""Exposures per column by turns, in units of the config's, and at least so many: the lags of both directions need
+several speeds, and hold between the lowest and the highest of them. One exposure shows the line in bright light only,
+so that it is tried where it is the config's own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +103,7 @@ def run_planes(
 
 def speeds_of(live: RigConfig) -> tuple[int, ...]:
     """Exposures per column at which a rig is looked at by turns."""
-    return tuple(dict.fromkeys(max(1, round(times * live.scan.exposures)) for times in SPEEDS))
+    return tuple(dict.fromkeys(max(least, round(times * live.scan.exposures)) for times, least in SPEEDS))
 
 
 def _fit(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
