@@ -55,7 +55,7 @@ def run_camera(
         taken = Taken(session, tell)
         take_kept(taken, sources, board)
         if live is not None:
-            choose = good_poses(live, board, asked.poses, AT_M, asked.seed)
+            choose = good_poses(live, board, asked.poses, AT_M, asked.seed, len(taken.views))
             take_live(taken, Live(live, asked.poses, choose, ask, seed=asked.seed, arm=asked.arm, line=False), board)
         try:
             fit = _fitted(taken, board, asked.terms)

@@ -76,7 +76,7 @@ def run_planes(
         defects = None if base is None else base.defects
         take_kept(taken, sources, board, defects)
         if live is not None:
-            start = good_poses(live, board, asked.poses, asked.at_m, asked.seed)
+            start = good_poses(live, board, asked.poses, asked.at_m, asked.seed, len(taken.views))
             fit_and_judge = partial(_fit, taken, board, base, camera), partial(_judged, taken, asked)
             guide = Guide(start, board, live.scan.depth_range, taken, *fit_and_judge, tell)
             exposures = asked.exposures or speeds_of(live)

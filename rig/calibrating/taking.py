@@ -131,14 +131,17 @@ class FixedPoses:
         return self.poses[len(views)] if len(views) < len(self.poses) else None
 
 
-def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int) -> FixedPoses:
-    """Poses that tell most about any rig, and a few more for those in which the board is missed."""
+def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> FixedPoses:
+    """Poses that tell most about any rig, and a few more for those in which the board is missed.
+
+    behind: so many of the sequence were shown before, by an earlier session: the next tell more than the same again.
+    """
     choices = candidates(first_camera(config), board, config.scan.depth_range)
     if not choices:
         raise UsageError(f"no pose of a board of {board.size_m[0]:g} x {board.size_m[1]:g} m fits the picture within "
                          f"scan.depth_range; use a smaller board or widen the range")  # fmt: skip
-    chosen = sequence(choices, poses + math.ceil(MISSED_SHARE * poses), seed)
-    return FixedPoses([Advice(candidate, at_m) for candidate in chosen])
+    chosen = sequence(choices, behind + poses + math.ceil(MISSED_SHARE * poses), seed)
+    return FixedPoses([Advice(candidate, at_m) for candidate in chosen[behind:]])
 
 
 def first_camera(config: RigConfig) -> Camera:
