@@ -42,7 +42,8 @@ AccuracyOption = Annotated[
 ]
 AtOption = Annotated[str | None, typer.Option("--at", help="distance at which it counts", show_default="5 m")]
 CalibrationScene = Annotated[
-    str | None, typer.Option("--scene", help="of a simulated rig, with a board in it", show_default="board")
+    str | None,
+    typer.Option("--scene", help="of a simulated rig, with a board", show_default="its own, else board"),
 ]
 ExposuresOption = Annotated[
     list[str] | None,

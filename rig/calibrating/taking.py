@@ -79,8 +79,12 @@ class Taken:
             self.refused[view.name] = refused
         self._of_rig(identity)
         self._session.add(view)
+        self.say(told(view, refused))
+
+    def say(self, line: str) -> None:
+        """Tell whoever listens."""
         if self.tell is not None:
-            self.tell(told(view, refused))
+            self.tell(line)
 
     def _require_new(self, view: View, where: str) -> None:
         if view.corners is None:
@@ -157,6 +161,8 @@ def first_camera(config: RigConfig) -> Camera:
 
 def take_kept(taken: Taken, sources: Sources, board: Board | None, defects: Defects = None) -> None:
     """Take the views that need no live rig. board: None where nothing moves and none is looked for."""
+    for note in sources.notes:
+        taken.say(note)
     for folder in sources.sessions:
         _require_alike(folder, board)
         identity = session_rig(folder)
