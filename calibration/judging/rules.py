@@ -26,6 +26,9 @@ from calibration.verdict import SIGMAS, WORST_TIMES, Asked, Reason, Verdict, mm,
 
 LEAST_BASELINE_CHANGE: Final = 0.01
 """What a tape measure may be wrong: 3 mm in 300 mm."""
+MOST_SHIFT = 0.25
+"""Of the accuracy asked: what views may contradict each other by. A fit has gone between them already, and its depth is
+off by several times what is left: 2 to 5 times over 30 knocks of the second simulator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +36,11 @@ class FitEvidence:
     """What a fit tells, besides where the boards stood; NaN where it cannot.
 
     expected_m, worst_m: predicted sd of the depth at the distance asked, median and 95 % of the picture. wave_m: error
-    of one sweep against another of the same view there; wave_noise_m: up to here that may be noise. shift_m: of a view
-    against the others; moved_after: the view after which they changed, where one move explains them. misfit: by which
-    the expected variances grew because the data contradict each other. baseline_m, baseline_sd_m: distance of camera
-    and mirror axis. velocities_per_s: of the sweeps, signed; none: not known.
+    of one sweep against another of the same view there; wave_noise_m: up to here that may be noise. shift_m,
+    shift_noise_m: of a view against the others, and up to where that may be; moved_after: the view after which they
+    changed, where one move explains them. misfit: by which the expected variances grew because the data contradict each
+    other. baseline_m, baseline_sd_m: distance of camera and mirror axis. velocities_per_s: of the sweeps, signed; none:
+    not known.
     """
 
     poses: PoseEvidence
@@ -45,6 +49,7 @@ class FitEvidence:
     wave_m: float = math.nan
     wave_noise_m: float = 0.0
     shift_m: float = math.nan
+    shift_noise_m: float = 0.0
     moved_after: str | None = None
     misfit: float = 1.0
     baseline_m: float = math.nan
@@ -98,7 +103,8 @@ def _contradictions(fit: FitEvidence, asked: Asked, imprecise: bool) -> list[Rea
     if imprecise and fit.expected_m <= limit * grown and fit.worst_m <= WORST_TIMES * limit * grown:
         limit /= grown
     waves = fit.wave_m > max(limit, fit.wave_noise_m)
-    moved = fit.shift_m > max(limit, fit.wave_m if waves else 0.0)
+    most_shift = max(MOST_SHIFT * limit, fit.shift_noise_m)
+    moved = fit.shift_m > max(most_shift, fit.wave_m if waves else 0.0)
     found = []
     if waves:
         found.append(
@@ -113,7 +119,7 @@ def _contradictions(fit: FitEvidence, asked: Asked, imprecise: bool) -> list[Rea
     if moved:
         named = f" (the rig moved after view {fit.moved_after})" if fit.moved_after else ""
         text = f"views contradict each other by {mm(fit.shift_m)} of depth at {asked.at_m:g} m{named}"
-        found.insert(0, reason_for("moved-rig", f"{text}, the limit is {mm(limit)}", fit.shift_m, limit))
+        found.insert(0, reason_for("moved-rig", f"{text}, the limit is {mm(most_shift)}", fit.shift_m, most_shift))
     return found
 
 

@@ -33,6 +33,7 @@ def test_a_sound_calibration_passes() -> None:
     verdict = judge(VIEWS, FIT, ASKED)
     assert verdict.passed
     assert verdict.codes == ()
+    assert judge(VIEWS, replace(FIT, shift_m=0.005, shift_noise_m=0.006), ASKED).passed
 
 
 @pytest.mark.parametrize(
@@ -42,6 +43,7 @@ def test_a_sound_calibration_passes() -> None:
         ("moved-rig", VIEWS, replace(IMPRECISE, wave_m=0.002, shift_m=0.1)),
         ("moved-rig", VIEWS, replace(FIT, wave_m=0.02, shift_m=0.3)),
         ("moved-rig", VIEWS, replace(FIT, expected_m=0.02, misfit=21.0, shift_m=0.005)),
+        ("moved-rig", VIEWS, replace(FIT, shift_m=0.005, shift_noise_m=0.002)),
         ("wrong-square-size", VIEWS, replace(FIT, baseline_m=0.309)),
         ("room-light", replace(VIEWS, room_flux=8.0), IMPRECISE),
         ("room-light", replace(VIEWS, room_flux=8.0), FIT),
