@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.judging.sweep_waves import NOISE_SIGMAS
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.fit import RigFit
 from calibration.rig_fit.normal import corner_weights
@@ -30,8 +31,6 @@ MOST_MISFIT = 3.0
 """Factor on the variances up to which the views are taken to agree."""
 MOST_UNEXPLAINED = 0.35
 """Share of the shifts' variance that a single move may leave."""
-SIGMAS = 4.0
-"""Standard deviations of a mean square up to which it may be noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +68,7 @@ def shift_noise(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> floa
     if len(shifts) < 2:
         return np.nan
     chance = float(np.sqrt(2 * np.sum(_variances(shifts, wave, sweeps) ** 2))) / len(shifts)
-    return math.sqrt(SIGMAS * chance)
+    return math.sqrt(NOISE_SIGMAS * chance)
 
 
 def _variances(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> Array:
