@@ -67,7 +67,7 @@ def judge(views: ViewEvidence, fit: FitEvidence, asked: Asked) -> Verdict:
     reasons += [*poverty, *scale] if imprecise else [*scale, *poverty]
     if imprecise and not reasons:
         what = f"the expected depth error at {asked.at_m:g} m is"
-        reasons.append(more_poses(views.shown, what, (fit.expected_m, fit.worst_m), asked.accuracy_m, mm))
+        reasons.append(more_poses(views.used, what, (fit.expected_m, fit.worst_m), asked.accuracy_m, mm))
     reasons += lag_lack(fit.velocities_per_s, mean_will_do=True)
     return Verdict(not reasons, tuple(reasons))
 
@@ -89,8 +89,8 @@ def judge_refusal(
 
 _REFUSED_FOR = {"one-pose": "too-few-poses", "coplanar": "no-tilt"}
 """What a fit that is impossible was short of."""
-_SEEN_AT_ONCE = ("no-board", "wrong-board", "board-half-out", "mirrored", "two-boards")
-"""What is wrong with single views."""
+_SEEN_AT_ONCE = ("no-board", "wrong-board", "board-half-out", "mirrored", "two-boards", "no-line")
+"""What is wrong with single views, so that too few of them can be used."""
 
 
 def _contradictions(fit: FitEvidence, asked: Asked, imprecise: bool) -> list[Reason]:

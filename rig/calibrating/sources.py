@@ -65,9 +65,21 @@ def sort_sources(sources: Sequence[Config], *, pictures: bool = False, scene: st
         problems.append(
             f"{found[0]} is a picture, which serves 'rig calibrate camera' only; name runs taken with --record"
         )
+    problems += _named_twice([*sessions, *recorded, *found])
     if problems:
         raise UsageError.of(problems)
     return Sources(live[0] if live else None, tuple(sessions), tuple(recorded), tuple(found))
+
+
+def _named_twice(paths: Sequence[Path]) -> list[str]:
+    """A line for each source that an earlier one is already."""
+    problems, known = [], dict[Path, Path]()
+    for path in paths:
+        first = known.setdefault(path.resolve(), path)
+        if first is not path:
+            also = "" if str(first) == str(path) else f" (the first time as {first})"
+            problems.append(f"{path} is named twice{also}; what is in it must count once: name it once")
+    return problems
 
 
 def _live(source: Config, scene: str | None) -> RigConfig:
