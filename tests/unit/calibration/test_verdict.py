@@ -60,6 +60,8 @@ def test_a_sound_calibration_passes() -> None:
         ("room-light", replace(VIEWS, used=2, room_flux=1.5), IMPRECISE),
         ("no-tilt", VIEWS, replace(IMPRECISE, poses=replace(FIT.poses, tilt_rad=radians(3)))),
         ("board-too-far", VIEWS, replace(IMPRECISE, poses=replace(FIT.poses, board_rad=0.08))),
+        ("board-too-far", VIEWS, replace(IMPRECISE, shift_m=0.3, poses=replace(FIT.poses, board_rad=0.08))),
+        ("exposure-not-locked", VIEWS, replace(IMPRECISE, wave_m=0.22, shift_m=0.3)),
         ("poor-coverage", replace(VIEWS, coverage=0.2), IMPRECISE),
         ("too-few-poses", VIEWS, IMPRECISE),  # nothing wrong with the data but their number
     ],
