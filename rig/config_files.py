@@ -51,6 +51,23 @@ def parse_config(content: Mapping[str, object], folder: Path | None = None) -> R
     return _validated(RigConfig, dict(content), Sources("config", {}), folder)
 
 
+def portable_content(config: RigConfig) -> dict[str, Any]:
+    """A config as plain values that mean the same in a file of any folder: every path in it is absolute.
+
+    The paths of a loaded config are absolute or relative to the working directory.
+    """
+    content: dict[str, Any] = config.model_dump(mode="json")
+    here = Path.cwd()
+    _anchor_paths(content, here)
+    if config.calibration is not None:
+        content["calibration"] = _absolute(here / config.calibration)
+    scene = (content["world"] or {}).get("scene")
+    if isinstance(scene, str) and not (BUNDLED / "scenes" / f"{scene}.yaml").is_file():
+        file = here / Path(scene).expanduser()  # a folder's name alone may be a scene too
+        content["world"]["scene"] = _absolute(file) if file.exists() else scene
+    return content
+
+
 def bundled_configs() -> tuple[str, ...]:
     """Names of the rigs that travel with the program, sorted."""
     return tuple(sorted(path.stem for path in BUNDLED.glob("*.yaml") if _is_rig(path)))
@@ -158,7 +175,7 @@ def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
 
     def anchored(value: object) -> object:
         if isinstance(value, str) and (value.startswith(("./", "../")) or _exists_beside(value, folder)):
-            return str((folder / value).resolve())
+            return _absolute(folder / value)
         if isinstance(value, dict):
             return {key: anchored(part) for key, part in value.items()}
         return value
@@ -166,6 +183,11 @@ def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
     for slot in SLOTS:
         if slot in content:
             content[slot] = anchored(content[slot])
+
+
+def _absolute(path: Path) -> str:
+    """Without '..'; what is itself a link stays, as those of /dev/serial/by-id/ must."""
+    return str(path.parent.resolve() / path.name)
 
 
 def _exists_beside(value: str, folder: Path) -> bool:

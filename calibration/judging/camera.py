@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibration.board.board import Board
 from calibration.camera_fit.fit import CameraFit
-from calibration.judging.data_lack import data_lack, drowned
+from calibration.judging.data_lack import data_lack, hiding
 from calibration.judging.evidence import pose_evidence, view_evidence
 from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
@@ -51,7 +51,7 @@ def judge_camera(fit: CameraFit, views: Sequence[View], board: Board, *, photons
     evidence = view_evidence(views, (camera.width, camera.height), len(fit.kept), fit.dropped)
     poses = pose_evidence([pose for name, pose in pairs if name in fit.kept], board)
     lacking = data_lack(evidence, poses, imprecise=imprecise, photons=photons)
-    reasons = [*drowned(evidence, photons=photons), *lacking]
+    reasons = [*hiding(evidence, poses, photons=photons), *lacking]
     if imprecise and not reasons:
         found = median, worst
         reasons = [more_poses(len(fit.kept), "rays are known to", found, ACCURACY_PX, "{:.2g} px".format)]

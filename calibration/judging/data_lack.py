@@ -41,7 +41,7 @@ on room light costs more than half of what a frame can tell of the line."""
 def data_lack(
     views: ViewEvidence, poses: PoseEvidence | None, *, imprecise: bool, photons: bool = True
 ) -> list[Reason]:
-    """What the data lack, but for those that are `drowned`: more counts where the result is not precise enough.
+    """What the data lack, but for what is `hiding` the rest: more counts where the result is not precise enough.
 
     poses: None where nothing tells. photons: whether pictures count photons; those from files do not.
     """
@@ -63,11 +63,16 @@ def data_lack(
     return found + light
 
 
-def drowned(views: ViewEvidence, *, photons: bool = True) -> list[Reason]:
-    """Room light so bright that frames hold little else, whatever seems to be found in them. photons: `data_lack`."""
+def hiding(views: ViewEvidence, poses: PoseEvidence | None, *, photons: bool = True) -> list[Reason]:
+    """What makes up other faults: room light in which frames hold little else, and boards so far away that their
+    corners do not say where they are. As for `data_lack`.
+    """
+    found = []
     if photons and views.room_flux > MOST_ROOM_FLUX.always:
-        return [_room_light(views.room_flux, MOST_ROOM_FLUX.always)]
-    return []
+        found.append(_room_light(views.room_flux, MOST_ROOM_FLUX.always))
+    if views.used >= _FEWEST_TO_JUDGE and poses is not None and poses.board_rad < LEAST_BOARD_RAD.always:
+        found.append(_too_far(poses, LEAST_BOARD_RAD.always))
+    return found
 
 
 def _too_few(views: ViewEvidence) -> Reason:
@@ -88,14 +93,17 @@ def _poses_lack(poses: PoseEvidence, imprecise: bool) -> list[Reason]:
             f"{math.degrees(least):.0f} are needed"
         )
         found.append(reason_for("no-tilt", text, poses.tilt_rad, least))
-    least = LEAST_BOARD_RAD.at(imprecise)
-    if poses.board_rad < least:
-        text = (
-            f"boards stood {poses.distance_m:.2g} m away (median) and were seen under "
-            f"{math.degrees(poses.board_rad):.1f} degrees, {math.degrees(least):.1f} are needed"
-        )
-        found.append(reason_for("board-too-far", text, poses.board_rad, least))
+    if LEAST_BOARD_RAD.always <= poses.board_rad < LEAST_BOARD_RAD.at(imprecise):
+        found.append(_too_far(poses, LEAST_BOARD_RAD.at(imprecise)))
     return found
+
+
+def _too_far(poses: PoseEvidence, least: float) -> Reason:
+    text = (
+        f"boards stood {poses.distance_m:.2g} m away (median) and were seen under "
+        f"{math.degrees(poses.board_rad):.1f} degrees, {math.degrees(least):.1f} are needed"
+    )
+    return reason_for("board-too-far", text, poses.board_rad, least)
 
 
 def _room_light(flux: float, limit: float) -> Reason:

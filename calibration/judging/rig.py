@@ -15,7 +15,7 @@ from calibration.guide.poses import rough_camera
 from calibration.judging.evidence import baseline_m, pose_evidence, rough_poses, view_evidence
 from calibration.judging.rules import FitEvidence, judge, judge_refusal
 from calibration.judging.sweep_waves import SweepResidual, SweepWaves, sweep_waves
-from calibration.judging.view_shifts import ViewShift, common_shift, counted, last_before_move, view_shifts
+from calibration.judging.view_shifts import ViewShift, common_shift, counted, last_before_move, shift_noise, view_shifts
 from calibration.model.lag_speeds import SWEPT
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.fit import RigFit
@@ -84,6 +84,7 @@ def judge_fit(
         wave_m=waves.rms * worth.per_command_m,
         wave_noise_m=waves.noise * worth.per_command_m,
         shift_m=common_shift(agreeing, waves.rms, sweeps) * worth.per_command_m,
+        shift_noise_m=shift_noise(agreeing, waves.rms, sweeps) * worth.per_command_m,
         moved_after=last_before_move(agreeing),
         misfit=fit.misfit,
         baseline_m=baseline,

@@ -36,6 +36,7 @@ def test_a_sound_calibration_passes() -> None:
     verdict = judge(VIEWS, FIT, ASKED)
     assert verdict.passed
     assert verdict.codes == ()
+    assert judge(VIEWS, replace(FIT, shift_m=0.005, shift_noise_m=0.006), ASKED).passed
 
 
 @pytest.mark.parametrize(
@@ -45,6 +46,7 @@ def test_a_sound_calibration_passes() -> None:
         ("moved-rig", VIEWS, replace(IMPRECISE, wave_m=0.002, shift_m=0.1)),
         ("moved-rig", VIEWS, replace(FIT, wave_m=0.02, shift_m=0.3)),
         ("moved-rig", VIEWS, replace(FIT, expected_m=0.02, misfit=21.0, shift_m=0.005)),
+        ("moved-rig", VIEWS, replace(FIT, shift_m=0.005, shift_noise_m=0.002)),
         ("wrong-square-size", VIEWS, replace(FIT, baseline_m=0.309)),
         ("room-light", replace(VIEWS, room_flux=8.0), IMPRECISE),
         ("room-light", replace(VIEWS, room_flux=8.0), FIT),
@@ -58,6 +60,8 @@ def test_a_sound_calibration_passes() -> None:
         ("room-light", replace(VIEWS, used=2, room_flux=1.5), IMPRECISE),
         ("no-tilt", VIEWS, replace(IMPRECISE, poses=replace(FIT.poses, tilt_rad=radians(3)))),
         ("board-too-far", VIEWS, replace(IMPRECISE, poses=replace(FIT.poses, board_rad=0.08))),
+        ("board-too-far", VIEWS, replace(IMPRECISE, shift_m=0.3, poses=replace(FIT.poses, board_rad=0.08))),
+        ("exposure-not-locked", VIEWS, replace(IMPRECISE, wave_m=0.22, shift_m=0.3)),
         ("poor-coverage", replace(VIEWS, coverage=0.2), IMPRECISE),
         ("too-few-poses", VIEWS, IMPRECISE),  # nothing wrong with the data but their number
     ],
