@@ -30,11 +30,14 @@ _STEP = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedCamera:
-    """A verdict and what it was made of: sd_px, worst_px: of a pixel's place along the row, median and 95 %."""
+    """A verdict and what it was made of: sd_px, worst_px: of a pixel's place along the row, median and 95 %. coverage:
+    share of the picture within the outline of all corners.
+    """
 
     verdict: Verdict
     sd_px: float
     worst_px: float
+    coverage: float
 
     def line(self) -> str:
         """One line."""
@@ -55,7 +58,7 @@ def judge_camera(fit: CameraFit, views: Sequence[View], board: Board, *, photons
     if imprecise and not reasons:
         found = median, worst
         reasons = [more_poses(len(fit.kept), "rays are known to", found, ACCURACY_PX, "{:.2g} px".format)]
-    return JudgedCamera(unguided(Verdict(not reasons, tuple(reasons))), median, worst)
+    return JudgedCamera(unguided(Verdict(not reasons, tuple(reasons))), median, worst, evidence.coverage)
 
 
 def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:

@@ -98,7 +98,7 @@ def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, An
         "sd": fit.sd,
         "rms_px": fit.rms_px,
         "ray_sd_px": {"median": judged.sd_px, "worst": judged.worst_px, "asked": ACCURACY_PX, "line": judged.line()},
-        "coverage": fit.coverage.share,
+        "coverage": judged.coverage,
         "condition": fit.condition,
     }
 
@@ -115,7 +115,7 @@ def _figures(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> list[tuple[s
         ("centre", f"{matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px, sd {sd['cx']:.2g}, {sd['cy']:.2g}"),
         ("distortion", terms),
         ("residuals", f"{fit.rms_px:.3f} px rms"),
-        ("coverage", f"{fit.coverage.share:.0%} of the picture's cells, boards up to "
+        ("coverage", f"{judged.coverage:.0%} of the picture within the outline of all corners, boards up to "
                      f"{np.degrees(fit.coverage.spread_rad):.0f} degrees apart"),
         ("condition", f"{fit.condition:.3g}"),
     ]  # fmt: skip

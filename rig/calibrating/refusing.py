@@ -9,7 +9,8 @@ from rig.calibrating.taking import Taken
 
 
 def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = True, line: bool = True) -> Degenerate:
-    """The root cause; as notes what the fit said, the other reasons, and what was wrong with single views.
+    """The root cause; as notes what the fit said, the other reasons, and what was wrong with single views unless that
+    was told when they were taken.
 
     photons: whether the pictures count photons; those from files do not. line: whether it was to be seen, or a camera
     alone was asked for.
@@ -22,7 +23,7 @@ def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = 
     for reason in reasons[1:]:
         if reason.text != str(refused):
             error.add_note(str(reason))
-    for name, why in taken.refused.items():
+    for name, why in taken.refused.items() if taken.tell is None else ():
         error.add_note(f"view {name}: {why}")
     return error
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rig.api_config import SIMULATED, Config, configure
 from rig.config import RigConfig
+from rig.config_files import NO_CONFIG
 from rig.errors import UsageError
 from rig.recording.manifest import MANIFEST
 
@@ -63,7 +64,8 @@ def sort_sources(sources: Sequence[Config], *, pictures: bool = False, scene: st
             try:
                 live.append(_live(source, scene, notes))
             except UsageError as error:
-                problems += error.problems
+                also = f"; nor is there a folder of that name ({'pictures, ' * pictures}a run, an earlier calibration)"
+                problems += [one + also * one.startswith(NO_CONFIG) for one in error.problems]
     if len(live) > 1:
         problems.append(f"{len(live)} rigs are named; one at a time can be calibrated")
     if found and not pictures:

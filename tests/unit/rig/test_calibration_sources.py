@@ -7,6 +7,7 @@ import pytest
 from drivers.errors import DeviceError
 from rig.api_config import configure
 from rig.calibrating.sources import sort_sources
+from rig.errors import UsageError
 from tests.system.board_rig import write_board_rig
 
 
@@ -31,3 +32,10 @@ def test_a_scene_that_cannot_be_read_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").unlink()
     with pytest.raises(DeviceError, match=r"scene\.yaml"):
         sort_sources([config])
+
+
+def test_a_source_that_is_not_there_is_said_to_be_none_of_all() -> None:
+    with pytest.raises(UsageError, match=r"no config 'nopics'.*nor is there a folder of that name \(pictures, a run"):
+        sort_sources(["nopics"], pictures=True)
+    with pytest.raises(UsageError, match=r"no config 'nopics'.*of that name \(a run, an earlier calibration\)"):
+        sort_sources(["nopics"])
