@@ -19,6 +19,8 @@ from rig.errors import UsageError
 BUNDLED = Path(rig.__file__).parent.parent / "config"
 """Folder of the configs that travel with the program."""
 SUFFIXES = (".yaml", ".yml")
+NO_CONFIG = "no config"
+"""Begins what is said of a name that means none."""
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -88,7 +90,7 @@ def find_config(name_or_path: str | Path) -> Path:
     meant = f"did you mean '{close[0]}'? " if close else ""
     missing = "" if plain and not str(name_or_path).endswith(("/", os.sep)) else "that path does not exist; "
     raise UsageError(
-        f"no config '{name_or_path}': {missing}{meant}bundled configs are {', '.join(names) or 'none'}; "
+        f"{NO_CONFIG} '{name_or_path}': {missing}{meant}bundled configs are {', '.join(names) or 'none'}; "
         "anything else is the path of a YAML file"
     )
 
