@@ -50,6 +50,8 @@ BLOCK_S = 5e-3
 waits for its block to fill."""
 BLOCK_BYTES = 16 << 20
 """Most bytes of a block's frames: 512 whole frames of 512 x 512 pixels."""
+MOST_TIMES = 1000.0
+"""As many exposures as a scan that a calibration at its speed is advised to look at: more say nothing of a mirror."""
 
 ColumnWindows = tuple[NDArray[np.int32], int]
 """First pixel of each column's window (columns,), and their width."""
@@ -306,7 +308,8 @@ def require_speed(model: RigModel, speed_per_s: float, exposures: int) -> None:
         model.check_speed(speed_per_s)
     except CalibrationError as error:
         low, high = model.speed_range_per_s or (speed_per_s, speed_per_s)
-        times = speed_per_s / (low if speed_per_s > high else high) * exposures
+        end = low if speed_per_s > high else high
+        times = exposures * (min(speed_per_s / end, MOST_TIMES) if end > 0 else MOST_TIMES)
         other = max(1, math.floor(times) if speed_per_s > high else math.ceil(times))
         shown = ",".join(map(str, sorted({exposures, other if other != exposures else 2 * exposures})))
         raise CalibrationError(f"{error}: rig calibrate sync CONFIG --calibration FILE --exposures {shown}") from error
