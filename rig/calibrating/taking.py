@@ -28,6 +28,7 @@ from rig.calibrating.sources import VIEWS, Sources
 from rig.calibrating.speed_turns import SpeedTurns
 from rig.calibrating.view_files import load_views
 from rig.calibrating.view_text import told
+from rig.calibration_identity import same_rig
 from rig.config import RigConfig
 from rig.errors import UsageError
 from rig.session import open_rig
@@ -105,7 +106,7 @@ class Taken:
             return
         if self.identity is None:
             self._session.note_rig(identity)
-        elif (self.identity.rig, self.identity.serials) != (identity.rig, identity.serials):
+        elif not same_rig(self.identity, identity):
             raise UsageError(
                 f"views are of two rigs: {self.identity.name} ({_devices(self.identity)}) and {identity.name} "
                 f"({_devices(identity)}); calibrate each with its own"

@@ -11,6 +11,7 @@ import yaml
 from calibration.board.board import load_board
 from calibration.files.rig_file import load_rig_model
 from rig import api
+from rig.calibration_identity import refusals
 from rig.errors import UsageError
 from tests.system.board_rig import write_board_rig
 from tests.system.conftest import Rig
@@ -145,6 +146,31 @@ def test_a_check_scans_the_board_anew_and_says_how_flat_and_large_it_is(calibrat
     assert board["scale"] == pytest.approx(1, abs=0.01)
     assert summary["depth_error"]["line"].startswith("at 3 m: ")
     assert (Path("check") / "report.html").is_file()
+    assert summary["scans_refuse_it"] is False
+
+
+def test_a_check_that_fails_says_that_scans_refuse_the_calibration_now_and_what_takes_that_back(
+    calibrated: Path, rig: Rig
+) -> None:
+    text, file = (calibrated / "board.yaml").read_text(), calibrated / "out" / "calibration.yaml"
+    board = yaml.safe_load(text)
+    side_mm = float(board["square"].removesuffix(" mm"))
+    Path("mistyped.yaml").write_text(yaml.safe_dump(board | {"square": f"{1.2 * side_mm:g} mm"}))
+    asked = ["--calibration", file, "--at", "3 m", "--accuracy", "20 mm"]
+    shown = [calibrated / "board-rig.yaml", "--scene", calibrated / "scene.yaml", "--seed", "6"]
+    ran = rig("calibrate", "check", *shown, "--board", "mistyped.yaml", *asked, "--out", "failed")
+    assert ran.code == 1, ran.err
+    assert f"from now on  scan, replay and reconstruct refuse {file} " in ran.out
+    assert "a check of it that passes, with the right angle or board, takes that back" in ran.out
+    assert "rig calibrate check" in _against(file)
+    ran = rig("calibrate", "check", "failed", "--board", calibrated / "board.yaml", *asked, "--out", "passed")
+    assert ran.code == 0, ran.err
+    assert "from now on" not in ran.out
+    assert not _against(file)
+
+
+def _against(calibration: Path) -> str:
+    return "; ".join(each.text for each in refusals(load_rig_model(calibration), calibration, None))
 
 
 def test_views_that_a_calibration_was_made_of_are_no_check_of_it(calibrated: Path, rig: Rig) -> None:
