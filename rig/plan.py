@@ -39,7 +39,7 @@ from rig.path_search import PathDemand, find_path, remedy
 from rig.scan_plan import Leg, ScanPlan, column_command, rounded
 from rig.windows import LEAST_MARKER_FRAMES, LEAST_MARKER_POINTS, moving_windows, window_widths
 
-__all__ = ["Leg", "ScanPlan", "compile_plan", "require_speed", "spad_request"]
+__all__ = ["Leg", "ScanPlan", "compile_plan", "spad_request"]
 
 CLOCK_TOLERANCE = 2e-4
 """Relative difference allowed for between SPAD, scanner and sync clocks: three crystals of +-50 ppm, and margin."""
@@ -50,8 +50,8 @@ BLOCK_S = 5e-3
 waits for its block to fill."""
 BLOCK_BYTES = 16 << 20
 """Most bytes of a block's frames: 512 whole frames of 512 x 512 pixels."""
-MOST_ADVISED = 1000
-"""Exposures of a column that a message still advises."""
+MOST_TIMES = 1000.0
+"""As many exposures as a scan that a calibration at its speed is advised to look at: more say nothing of a mirror."""
 
 ColumnWindows = tuple[NDArray[np.int32], int]
 """First pixel of each column's window (columns,), and their width."""
@@ -308,12 +308,9 @@ def require_speed(model: RigModel, speed_per_s: float, exposures: int) -> None:
         model.check_speed(speed_per_s)
     except CalibrationError as error:
         low, high = model.speed_range_per_s or (speed_per_s, speed_per_s)
-        faster = speed_per_s > high
-        end_per_s = low if faster else high
-        times = exposures * speed_per_s / end_per_s if end_per_s > 0 else math.inf
-        other = 2 * exposures
-        if 0 < times < MOST_ADVISED:
-            other = max(1, math.floor(times) if faster else math.ceil(times))
+        end = low if speed_per_s > high else high
+        times = exposures * (min(speed_per_s / end, MOST_TIMES) if end > 0 else MOST_TIMES)
+        other = max(1, math.floor(times) if speed_per_s > high else math.ceil(times))
         shown = ",".join(map(str, sorted({exposures, other if other != exposures else 2 * exposures})))
         raise CalibrationError(f"{error}: rig calibrate sync CONFIG --calibration FILE --exposures {shown}") from error
 

@@ -20,7 +20,6 @@ from calibration.model.triangulation import (
 )
 from rig.errors import UsageError
 from rig.geometry import sweep_geometry
-from rig.plan import require_speed
 from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 
@@ -206,19 +205,12 @@ def test_pivoted_planes_are_exact(worst) -> None:
         worst("planes of a turning mirror", "mpmath, 50 digits", relative(planes[:, i], of, at), 1e-13)
 
 
-@covers(
-    "calibration.model.rig_model:RigModel.check_speed",
-    "calibration.model.rig_model:RigModel.check_sensor",
-    "rig.plan:require_speed",
-)
+@covers("calibration.model.rig_model:RigModel.check_speed", "calibration.model.rig_model:RigModel.check_sensor")
 def test_a_model_of_no_baseline_is_refused_where_depth_is_asked_for() -> None:
     planes = np.array([[1.0, 0, -0.1, 1e-9], [1.0, 0, -0.2, 1e-9]])
     model = RigModel(CAMERA, PlaneTable(np.arange(2.0), planes), speed_range_per_s=(1.0, 2.0))
     model.check_sensor(512, 512)
     with pytest.raises(CalibrationError):
         model.check_speed(np.nan)
-    for speed_per_s in (np.nan, 0.0, 5e-324, 1e308, np.inf):
-        with pytest.raises(CalibrationError, match=r"--exposures \d+,\d+$"):
-            require_speed(model, speed_per_s, 10)
     with pytest.raises(UsageError, match="baseline"):
         sweep_geometry(model, np.arange(2.0), (1.0, 8.0))
