@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 SIGMAS: Final = 4.0
@@ -56,6 +56,7 @@ class Verdict:
         return {"passed": self.passed, "reasons": [asdict(reason) for reason in self.reasons]}
 
 
+_GUIDED = " ('--guided' says which)"
 _NEXT_STEP = {
     "exposure-not-locked": "lock the exposures to the scan (shared clock, markers in the stream) and check for a loose "
     "marker cable",
@@ -63,7 +64,7 @@ _NEXT_STEP = {
     "wrong-square-size": "measure a square of the print and write its side into the board's file, or correct the "
     "stated baseline",
     "room-light": "darken the room or shorten the exposures",
-    "too-few-poses": "show the board in more poses ('--guided' says which)",
+    "too-few-poses": f"show the board in more poses{_GUIDED}",
     "no-tilt": "tilt the board by 20 to 40 degrees, to all sides",
     "board-too-far": "come nearer, until the board fills a third of the picture",
     "poor-coverage": "show the board at the borders and in the corners of the picture too",
@@ -78,6 +79,12 @@ _NEXT_STEP = {
 def reason_for(code: str, text: str, value: float = math.nan, limit: float = math.nan) -> Reason:
     """A reason with the step that is taken where it has this code."""
     return Reason(code, text, value, limit, _NEXT_STEP.get(code, "show the board again"))
+
+
+def unguided(verdict: Verdict) -> Verdict:
+    """The same for a command that has no guided mode."""
+    reasons = tuple(replace(reason, next_step=reason.next_step.replace(_GUIDED, "")) for reason in verdict.reasons)
+    return replace(verdict, reasons=reasons)
 
 
 def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, said: Callable[[float], str]) -> Reason:

@@ -1,13 +1,14 @@
 """What the passes of a live map are decided by: an estimate of the counts so far, and the time that passes take."""
 
 import functools
-from typing import Protocol
+import math
+from typing import Any, Protocol
 
 import numpy as np
 
 from calibration.errors import CalibrationError
 from drivers.interfaces import SpadTiming
-from rig.adaptive import Pass, Unsettled, moved_rows, next_pass, thinned
+from rig.adaptive import BLOCKS, EXPOSURES, Pass, Unsettled, moved_rows, next_pass, thinned
 from rig.config import AdaptiveConfig
 from rig.counting import CountVolume
 from rig.errors import PlanError
@@ -48,7 +49,7 @@ class DecidedPasses:
         self._searched = geometry.x_lo <= geometry.x_hi
         self._first = first_pass(rig, whole)
         self._pass_time = functools.cache(functools.partial(pass_time_s, rig, whole))
-        self._budget_s = self._settings.time_budget or float(whole.sweep_s)
+        self._budget_s = budget_s(self._settings, whole)
 
     def next(self, index: int, taken: int, counts: CountVolume | None, spent_s: float) -> Pass | None:
         """See `ChoosesPasses`."""
@@ -69,8 +70,34 @@ class DecidedPasses:
         return _prepared(self._rig, self._whole, one)
 
 
+def budget_s(settings: AdaptiveConfig, whole: ScanPlan) -> float:
+    """Most sensor time of a map in passes; by default that of one plain sweep, whose plan is `whole`."""
+    return settings.time_budget or float(whole.sweep_s)
+
+
+def passes_content(settings: AdaptiveConfig, whole: ScanPlan) -> dict[str, Any]:
+    """What passes a map will have at most, for programs."""
+    return {
+        "most_passes": settings.passes,
+        "time_budget_s": budget_s(settings, whole),
+        "first_exposures": settings.first_exposures,
+        "target_share": settings.target_share,
+    }
+
+
+def describe_passes(settings: AdaptiveConfig, whole: ScanPlan) -> str:
+    """The same for people, a line below those of the plan of a plain sweep."""
+    return (
+        f"passes      at most {settings.passes} a map in {budget_s(settings, whole) * 1e3:.1f} ms of sensor time; "
+        f"first {settings.first_exposures} exposures of all columns (above: the plain sweep)"
+    )
+
+
 def first_pass(rig: OpenRig, whole: ScanPlan) -> Pass:
-    """The first pass of every map, its plan checked. PlanError where it cannot be, or takes more than a map may."""
+    """The first pass of every map, its plan checked.
+
+    PlanError where it cannot be, takes more time than a map may, or so much of it that no other pass can follow.
+    """
     settings = rig.config.scan.adaptive
     assert settings is not None, "asked for by the config"
     first = Pass(0, whole.columns, settings.first_exposures)
@@ -81,13 +108,28 @@ def first_pass(rig: OpenRig, whole: ScanPlan) -> Pass:
         said = (problem.replace("scan.exposures", "first_exposures") for problem in error.problems)
         raise PlanError(*(what + problem for problem in said)) from error
     first_s = pass_time_s(rig, whole, first.columns, first.exposures)
-    budget_s = settings.time_budget or float(whole.sweep_s)
-    if first_s is not None and first_s > budget_s:
+    allowed_s = budget_s(settings, whole)
+    allowed = f"{allowed_s * 1e3:.1f} ms"
+    next_step = f"raise {'scan.exposures' if settings.time_budget is None else 'time_budget'} or lower first_exposures"
+    if first_s is not None and first_s > allowed_s:
         raise PlanError(
-            f"scan.adaptive: the first pass takes {first_s * 1e3:.1f} ms, all passes of a map may take "
-            f"{budget_s * 1e3:.1f} ms; raise time_budget or lower first_exposures"
+            f"scan.adaptive: the first pass takes {first_s * 1e3:.1f} ms, all passes of a map may take {allowed}; "
+            + next_step
+        )
+    left_s, shortest_s = allowed_s - (first_s or 0.0), _shortest_s(rig, whole)
+    if left_s < shortest_s:
+        raise PlanError(
+            f"scan.adaptive: {first.exposures} first_exposures leave {left_s * 1e3:.1f} ms of the {allowed} of a map, "
+            f"the shortest other pass takes {shortest_s * 1e3:.1f} ms, so that it would be a plain sweep; {next_step}"
         )
     return first
+
+
+def _shortest_s(rig: OpenRig, whole: ScanPlan) -> float:
+    """Sensor time of the shortest further pass, inf where there is none."""
+    columns = max(1, whole.columns // BLOCKS)
+    times = [pass_time_s(rig, whole, columns, exposures) for exposures in EXPOSURES]
+    return min((time_s for time_s in times if time_s is not None), default=math.inf)
 
 
 def pass_time_s(rig: OpenRig, whole: ScanPlan, columns: int, exposures: int) -> float | None:

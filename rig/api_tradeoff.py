@@ -1,6 +1,7 @@
 """The call that tries settings: `tradeoff`."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rig.api_config import SIMULATED, Config, configure
@@ -31,6 +32,7 @@ def tradeoff(
     time_budget: str | None = None,
     error: str | None = None,
     of: str = "sensor",
+    accept_calibration: bool = False,
     out: OutFolder = None,
     progress: Progress | None = None,
 ) -> "Tradeoff":
@@ -40,12 +42,15 @@ def tradeoff(
     exposures: none: EXPOSURES; estimators: none: all but argmax; filters: none: both. repeat: scans of each setting,
     seeds from `seed` on. limits: compare each error with the least that the scene's light allows, some seconds each.
     time_budget, such as '5 ms', or error, such as '0.1 px': ask for the setting to use; of: whose time, 'sensor' or
-    'compute'. out: a folder to write, None to write nothing. progress: called with frames done and all. Raises
-    UsageError, a line per problem. An interrupt ends it after the last whole row, with verdict 'aborted'.
+    'compute'. accept_calibration: as `scan`; asked is the rig with the lines that it has. out: a folder to write, None
+    to write nothing. progress: called with frames done and all. Raises UsageError, a line per problem. An interrupt
+    ends it after the last whole row, with verdict 'aborted'.
     """
+    from rig.calibration_identity import accepted_by, calibration_use
     from rig.estimators import ESTIMATORS, FILTERS
     from rig.multi_line_config import with_lines
     from rig.outputs import RunFolder
+    from rig.session import open_rig
     from rig.tradeoff import Trial, Trials, require_methods, run_tradeoff
     from rig.tradeoff_choice import wish_of
     from rig.tradeoff_files import write_files
@@ -89,10 +94,16 @@ def tradeoff(
         limits,
     )
     trials.require_plans()  # before a folder is claimed
+    with open_rig(config_of(trials.first())) as rig:
+        accepted = accepted_by(calibration_use(rig, accept=accept_calibration))
+
+    def run() -> "Tradeoff":
+        return replace(run_tradeoff(trials, wish, progress), accepted_calibration=accepted)
+
     if out is None:
-        return run_tradeoff(trials, wish, progress)
+        return run()
     with RunFolder(out) as folder:
-        done = run_tradeoff(trials, wish, progress)
+        done = run()
         chosen = None
         if done.answer is not None and done.answer.fits:
             setting = done.answer.setting

@@ -2,8 +2,9 @@
 
 A calibration that was estimated says of which devices it is, when it was made and with what verdict
 (`calibration.Identity`); one written by hand says nothing, and is used unchecked. What depth depends on is compared:
-kinds and serial numbers of sensor and scanner, how they are mounted, the laser lines. Settings of a scan are not. A
-recording is compared with the devices that it was taken with, at the date on which it was taken.
+kinds and serial numbers of sensor and scanner, how they are mounted, the laser lines; of a simulated rig, its
+geometry. Settings of a scan are not. A recording is compared with the devices that it was taken with, at the date on
+which it was taken.
 
 A check that fails later is noted in a file beside the calibration (`note_check`), which itself stays as it is.
 """
@@ -11,13 +12,14 @@ A check that fails later is noted in a file beside the calibration (`note_check`
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import Identity, RigModel
+from rig.calibrating.result import KnowsRig
 from rig.errors import UsageError
 from rig.recording.manifest import read_manifest
 from rig.replaying import PlaysRecording
@@ -28,6 +30,8 @@ DAY_S: Final = 86400.0
 _SLOTS: Final = ("spad", "scanner")
 """Devices that depth depends on: laser and sync source only let the light out."""
 _NO_SERIAL: Final = ("", "none")
+_GEOMETRY: Final = "geometry"
+"""What a simulated rig really is like, by its numbers; `world` is the name of its file, which says less."""
 _CHECKS: Final = {"check": "rig calibrate check", "pixels": "rig calibrate pixels"}
 
 
@@ -74,6 +78,8 @@ def identity_of(rig: OpenRig, created: datetime | None = None) -> Identity:
     world = {} if config.world is None else dict(config.world)
     if "geometry" in world:  # of a simulated rig: as it really is
         kinds["world"] = Path(str(world["geometry"] or "bundled")).name
+    if isinstance(rig.world, KnowsRig):
+        kinds[_GEOMETRY] = replace(rig.world.true_model(), defects=None).fingerprint()
     serials = {slot: serial for slot in _SLOTS if (serial := getattr(rig, slot).serial) and serial not in _NO_SERIAL}
     return _identity(config.name, kinds, serials, (created or datetime.now(UTC)).isoformat(timespec="seconds"))
 
@@ -83,6 +89,12 @@ def recorded_identity(run: Path) -> Identity:
     noted = (read_manifest(run) or {}).get("rig") or {}
     kinds, serials = noted.get("kinds") or {}, noted.get("serials") or {}
     return _identity(str(noted.get("name", "")), kinds, serials, str(noted.get("taken", "")))
+
+
+def same_rig(one: Identity, other: Identity) -> bool:
+    """Whether views of these two are of one rig."""
+    kinds, others = _comparable(one, other)
+    return kinds == others and one.serials == other.serials
 
 
 def rig_content(identity: Identity) -> dict[str, Any]:
@@ -172,13 +184,24 @@ def _used(model: RigModel, file: Path | None, found: tuple[Refusal, ...], accept
 
 def _foreign(made: Identity, here: Identity) -> list[Refusal]:
     """Parts that both know and that differ."""
+    of = f" of the rig '{made.name}'" if made.name else ""
     found = []
-    for what, ours, theirs in (("", made.kinds, here.kinds), (" serial number", made.serials, here.serials)):
+    for what, ours, theirs in (("", *_comparable(made, here)), (" serial number", made.serials, here.serials)):
         for slot in [slot for slot in ours if slot in theirs and ours[slot] != theirs[slot]]:
-            of = f" of the rig '{made.name}'" if made.name else ""
             said = f"is{of} with {slot}{what} '{ours[slot]}', this rig has '{theirs[slot]}'"
             found.append(Refusal(f"other-{slot}", said))
     return found
+
+
+def _comparable(made: Identity, here: Identity) -> tuple[dict[str, str], dict[str, str]]:
+    """Kinds of both; simulated worlds by their geometry, or by its file's name where one knows no more, as of old."""
+    both = dict(made.kinds), dict(here.kinds)
+    digests = [kinds.pop(_GEOMETRY, "") for kinds in both]
+    if all(digests):
+        alike = digests[0] == digests[1]
+        for kinds, digest in zip(both, digests, strict=True):
+            kinds["world"] = digest if alike else f"{kinds.get('world', '')} ({digest})"
+    return both
 
 
 def _aged(made: Identity, here: Identity, max_age_s: float | None) -> list[Refusal]:

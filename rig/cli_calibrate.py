@@ -34,7 +34,12 @@ BoardOption = Annotated[
     Path | None, typer.Option("--board", help="what is printed on the board: its YAML file", show_default="the bundled")
 ]
 PosesOption = Annotated[
-    int | None, typer.Option("--poses", help="of the board, shown to a live rig", show_default=False)
+    int | None,
+    typer.Option("--poses", help="of the board, shown to a live rig", show_default="12"),
+]
+CheckPosesOption = Annotated[
+    int | None,
+    typer.Option("--poses", help="of the board, shown to a live rig", show_default="1, or 2 for an angle"),
 ]
 AccuracyOption = Annotated[
     str | None,
@@ -42,7 +47,8 @@ AccuracyOption = Annotated[
 ]
 AtOption = Annotated[str | None, typer.Option("--at", help="distance at which it counts", show_default="5 m")]
 CalibrationScene = Annotated[
-    str | None, typer.Option("--scene", help="of a simulated rig, with a board in it", show_default="board")
+    str | None,
+    typer.Option("--scene", help="of a simulated rig, with a board", show_default="its own, else board"),
 ]
 ExposuresOption = Annotated[
     list[str] | None,
@@ -233,7 +239,7 @@ def sync_command(
 def check_command(
     sources: SourcesArgument = None,
     board: BoardOption = None,
-    poses: PosesOption = None,
+    poses: CheckPosesOption = None,
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="what to check", show_default="the rig's own")
     ] = None,

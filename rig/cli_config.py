@@ -29,10 +29,11 @@ def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = Fa
 
 @command
 def show_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
-    """Print a config with every default filled in."""
+    """Print a config with every default filled in and every path absolute."""
     from rig.api import configure
+    from rig.config_files import portable_content
 
-    content = configure(config).model_dump(mode="json")
+    content = portable_content(configure(config))
     if as_json:
         print_json(content)
     else:

@@ -25,6 +25,7 @@ from rig.cli_command import (
 )
 
 if TYPE_CHECKING:
+    from rig.config import AdaptiveConfig
     from rig.scan_plan import ScanPlan
 
 
@@ -84,11 +85,11 @@ def scan_command(
         "min_confidence": min_confidence,
         "temporal_prior": temporal_prior,
         "adaptive": _passes(adaptive, time_budget),
-        "accept_calibration": accept_calibration,
     }
     if dry_run:
-        plan = api.plan_scan(config, maps=maps, seed=seed, save=save, on_overload=on_overload, **options)
-        return _show_plan(plan, as_json)
+        checked: dict[str, Any] = {"maps": maps, "seed": seed, "save": save, "on_overload": on_overload}
+        plan = api.plan_scan(config, accept_calibration=accept_calibration, **checked, **options)
+        return _show_plan(plan, api.configure(config, **options).scan.adaptive, as_json)
     with live_progress() as live:
         result = api.scan(
             config,
@@ -100,6 +101,7 @@ def scan_command(
             record=record,
             on_overload=on_overload,
             live=live,
+            accept_calibration=accept_calibration,
             **options,
         )
     return report(result, as_json)
@@ -112,13 +114,18 @@ def _passes(adaptive: bool, time_budget: str | None) -> dict[str, str] | None:
     return {} if adaptive else None
 
 
-def _show_plan(plan: "ScanPlan", as_json: bool) -> int:
+def _show_plan(plan: "ScanPlan", adaptive: "AdaptiveConfig | None", as_json: bool) -> int:
+    from rig.adaptive_decision import describe_passes, passes_content
+
     if as_json:
         from rig.scanning import plan_content
 
-        print_json({"plan": plan_content(plan)})
+        passes = {} if adaptive is None else {"adaptive": passes_content(adaptive, plan)}
+        print_json({"plan": plan_content(plan), **passes})
     else:
         print(plan.describe())
+        if adaptive is not None:
+            print(describe_passes(adaptive, plan))
     return 0
 
 

@@ -6,6 +6,7 @@ import typer
 
 from rig.cli_command import (
     EXIT_ABORTED,
+    AcceptOption,
     ConfigArgument,
     JsonOption,
     OutOption,
@@ -49,6 +50,7 @@ def tradeoff_command(
         str | None, typer.Option("--error", help="'0.1 px': what takes the least time for it", show_default=False)
     ] = None,
     of: Annotated[str, typer.Option("--of", help="whose time these mean: sensor or compute")] = "sensor",
+    accept_calibration: AcceptOption = False,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> int:
@@ -71,6 +73,7 @@ def tradeoff_command(
             time_budget=time_budget,
             error=error,
             of=of,
+            accept_calibration=accept_calibration,
             out=default_out() if out is None else out,
             progress=bar,
         )

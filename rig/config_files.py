@@ -19,6 +19,8 @@ from rig.errors import UsageError
 BUNDLED = Path(rig.__file__).parent.parent / "config"
 """Folder of the configs that travel with the program."""
 SUFFIXES = (".yaml", ".yml")
+NO_CONFIG = "no config"
+"""Begins what is said of a name that means none."""
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -51,6 +53,23 @@ def parse_config(content: Mapping[str, object], folder: Path | None = None) -> R
     return _validated(RigConfig, dict(content), Sources("config", {}), folder)
 
 
+def portable_content(config: RigConfig) -> dict[str, Any]:
+    """A config as plain values that mean the same in a file of any folder: every path in it is absolute.
+
+    The paths of a loaded config are absolute or relative to the working directory.
+    """
+    content: dict[str, Any] = config.model_dump(mode="json")
+    here = Path.cwd()
+    _anchor_paths(content, here)
+    if config.calibration is not None:
+        content["calibration"] = _absolute(here / config.calibration)
+    scene = (content["world"] or {}).get("scene")
+    if isinstance(scene, str) and not (BUNDLED / "scenes" / f"{scene}.yaml").is_file():
+        file = here / Path(scene).expanduser()  # a folder's name alone may be a scene too
+        content["world"]["scene"] = _absolute(file) if file.exists() else scene
+    return content
+
+
 def bundled_configs() -> tuple[str, ...]:
     """Names of the rigs that travel with the program, sorted."""
     return tuple(sorted(path.stem for path in BUNDLED.glob("*.yaml") if _is_rig(path)))
@@ -71,7 +90,7 @@ def find_config(name_or_path: str | Path) -> Path:
     meant = f"did you mean '{close[0]}'? " if close else ""
     missing = "" if plain and not str(name_or_path).endswith(("/", os.sep)) else "that path does not exist; "
     raise UsageError(
-        f"no config '{name_or_path}': {missing}{meant}bundled configs are {', '.join(names) or 'none'}; "
+        f"{NO_CONFIG} '{name_or_path}': {missing}{meant}bundled configs are {', '.join(names) or 'none'}; "
         "anything else is the path of a YAML file"
     )
 
@@ -158,7 +177,7 @@ def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
 
     def anchored(value: object) -> object:
         if isinstance(value, str) and (value.startswith(("./", "../")) or _exists_beside(value, folder)):
-            return str((folder / value).resolve())
+            return _absolute(folder / value)
         if isinstance(value, dict):
             return {key: anchored(part) for key, part in value.items()}
         return value
@@ -166,6 +185,11 @@ def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
     for slot in SLOTS:
         if slot in content:
             content[slot] = anchored(content[slot])
+
+
+def _absolute(path: Path) -> str:
+    """Without '..'; what is itself a link stays, as those of /dev/serial/by-id/ must."""
+    return str(path.parent.resolve() / path.name)
 
 
 def _exists_beside(value: str, folder: Path) -> bool:

@@ -14,11 +14,13 @@ Error bars are those of the sandwich, H^-1 (sum of g g^T) H^-1, g the likelihood
 and columns: what the model leaves out shows as scatter between them, as in a jackknife, of which this is the first
 order. Light scattered more than once flattens the decay all over the picture, which no scatter shows; REST_SHARE of
 `rest` is therefore added to the extinction's relative error. Where the fog lays a halo around the stripes (`halo`), its
-light falls off on both sides of them as haze would, and neither extinction nor veil is stated. 5 ms a map.
+light falls off on both sides of them as haze would, and neither extinction nor veil is stated. Nor are they of several
+lines at once: the other lines' haze ends at stripes of their own, where is not known, and takes the form of the decay
+with it. 5 ms a map.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -118,15 +120,15 @@ def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: An
     sums, at_stripe = np.zeros((BLOCKS**2, 2, BINS, SUMS)), np.zeros((len(row), 2))
     hot_flux = 5.0 * float(np.median(state.ambient)) + 1e-3
     add_clear_rows(
-        sweep_of(geometry), state_of(state), lines, stripe.x_px[row, column], clear, block.astype(np.int32), CLEAR_PX,
-        hot_flux, sums, at_stripe,
+        sweep_of(replace(geometry, others=None)), state_of(state), lines, stripe.x_px[row, column], clear,
+        block.astype(np.int32), CLEAR_PX, hot_flux, sums, at_stripe,
     )  # fmt: skip
     fit = fit_fog(sums, state.path_m())
     if fit is None:
         return FogEstimate()
     dark = _dark_offset(sweep, state.ambient, hot_flux)
-    if state.halo.any():
-        return _under_halo(sums, dark)
+    if state.halo.any() or geometry.others is not None:
+        return _dark_alone(sums, dark)
     read = clear & (at_stripe[:, 1] > 0)
     signal = float(np.mean(stripe.signal[row, column][read])) if read.any() else math.nan
     return _stated(fit, sums, state.path_m(), dark, at_stripe[read], signal)
@@ -145,8 +147,10 @@ def _dark_offset(sweep: Any, ambient: NDArray[np.float32], hot_flux: float) -> t
     return level - float(np.average(ambient[used], weights=frames[used])), level / math.sqrt(ones)
 
 
-def _under_halo(sums: Array, dark: tuple[float, float] | None) -> FogEstimate:
-    """What is stated where the stripes' halo lies on all that is read: the ambient light, if dark frames tell of it."""
+def _dark_alone(sums: Array, dark: tuple[float, float] | None) -> FogEstimate:
+    """What is stated where light that is no haze of the line's own lies on all that is read, a halo or that of other
+    lines: the ambient light, if dark frames tell of it.
+    """
     if dark is None:
         return FogEstimate()
     level = float(sums[..., 3].sum() / sums[..., 1].sum()) + dark[0]

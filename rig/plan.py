@@ -50,6 +50,8 @@ BLOCK_S = 5e-3
 waits for its block to fill."""
 BLOCK_BYTES = 16 << 20
 """Most bytes of a block's frames: 512 whole frames of 512 x 512 pixels."""
+MOST_TIMES = 1000.0
+"""As many exposures as a scan that a calibration at its speed is advised to look at: more say nothing of a mirror."""
 
 ColumnWindows = tuple[NDArray[np.int32], int]
 """First pixel of each column's window (columns,), and their width."""
@@ -285,7 +287,7 @@ def _model_problems(
     problems = []
     checks: tuple[Callable[[], object], ...] = (
         lambda: model.check_sensor(info.width, info.height),
-        lambda: model.check_speed(speed_per_s),
+        lambda: require_speed(model, speed_per_s, scan.exposures),
         lambda: model.planes(np.add.outer(np.array(scan.command_range), np.array(line_offsets))),
     )
     for check in checks:
@@ -294,6 +296,23 @@ def _model_problems(
         except CalibrationError as error:
             problems.append(f"calibration: {error}")
     return problems
+
+
+def require_speed(model: RigModel, speed_per_s: float, exposures: int) -> None:
+    """CalibrationError where the lag was not measured around this speed, with the command that measures it here too.
+
+    A sweep is as many times faster as it has fewer exposures: named are this scan's, and those of the end of the old
+    range that is farther off, so that what was scanned before still can be.
+    """
+    try:
+        model.check_speed(speed_per_s)
+    except CalibrationError as error:
+        low, high = model.speed_range_per_s or (speed_per_s, speed_per_s)
+        end = low if speed_per_s > high else high
+        times = exposures * (min(speed_per_s / end, MOST_TIMES) if end > 0 else MOST_TIMES)
+        other = max(1, math.floor(times) if speed_per_s > high else math.ceil(times))
+        shown = ",".join(map(str, sorted({exposures, other if other != exposures else 2 * exposures})))
+        raise CalibrationError(f"{error}: rig calibrate sync CONFIG --calibration FILE --exposures {shown}") from error
 
 
 def _legs(path: SweepPath, scan: ScanConfig, lag: Lag, margin_s: float, rate: Fraction) -> tuple[Leg, ...]:

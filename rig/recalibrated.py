@@ -9,6 +9,7 @@ from calibration.model.rig_model import RigModel
 from rig.errors import UsageError
 from rig.geometry import WORD_PX, sweep_geometry
 from rig.multi_line import window_overlap
+from rig.plan import require_speed
 from rig.scan_plan import ScanPlan
 
 
@@ -26,7 +27,7 @@ def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
     """
     try:
         model.check_sensor(plan.width, plan.rows)
-        model.check_speed(plan.speed_per_s)
+        require_speed(model, plan.speed_per_s, plan.exposures)
         model.planes(np.array(plan.command_range))
         geometry = sweep_geometry(model, plan.commands, plan.depth_range_m)
     except CalibrationError as error:

@@ -49,6 +49,10 @@ class Trials:
         """Every one once; repeats are scans of their own."""
         return starmap(Trial, product(self.scenes, self.fogs, self.exposures, self.lines))
 
+    def first(self) -> Trial:
+        """One of them, of the lines that the config has."""
+        return next(iter(self))._replace(lines=None)
+
     def configs(self) -> dict[Trial, RigConfig]:
         """The config of each. UsageError with all that is wrong with any."""
         return _all_or_problems(self, self.config_of)
@@ -80,7 +84,8 @@ class Tradeoff:
     """Rows of all settings; answer: the setting to use, where one was asked for and any counts.
 
     ci95_by: what the intervals are over. verdict: aborted where an interrupt ended it; the rows are those that were
-    whole by then. folder: where everything was written, None where nothing was.
+    whole by then. folder: where everything was written, None where nothing was. accepted_calibration: what the
+    calibration was used in spite of.
     """
 
     rows: tuple[TradeoffRow, ...]
@@ -89,12 +94,15 @@ class Tradeoff:
     answer: Answer | None
     verdict: Literal["complete", "aborted"]
     folder: Path | None = None
+    accepted_calibration: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; `answer` only where a setting was asked for."""
         content: dict[str, Any] = {"rows": [row.as_json() for row in self.rows], "ci95_by": self.ci95_by}
         if self.wish is not None:
             content["answer"] = None if self.answer is None else self.answer.as_json()
+        if self.accepted_calibration:
+            content["accepted_calibration"] = list(self.accepted_calibration)
         return {**content, "verdict": self.verdict}
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import yaml
 
 from rig.config import RigConfig
+from rig.config_files import portable_content
 from rig.outputs import RunFolder
 from rig.run import versions
 from rig.tradeoff import Tradeoff
@@ -23,7 +24,10 @@ def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) ->
     folder.write_text("tradeoff.csv", csv_text(done.rows))
     folder.write_text("tradeoff.svg", tradeoff_svg(done.rows, done.ci95_by))
     if setting is not None:
-        folder.write_text(SETTING_FILE, config_text(setting, f"rig tradeoff: {done.answer}"))
+        comments = [f"rig tradeoff: {done.answer}"]
+        if done.accepted_calibration:
+            comments.append("its calibration was accepted all the same: scan with --accept-calibration")
+        folder.write_text(SETTING_FILE, config_text(setting, comments))
     return replace(done, folder=folder.publish())
 
 
@@ -42,6 +46,7 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
     return stream.getvalue()
 
 
-def config_text(config: RigConfig, comment: str) -> str:
-    """A config as a YAML file that every command takes."""
-    return f"# {comment}\n" + yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+def config_text(config: RigConfig, comments: Sequence[str]) -> str:
+    """A config as a YAML file that every command takes, wherever it lies."""
+    head = "".join(f"# {comment}\n" for comment in comments)
+    return head + yaml.safe_dump(portable_content(config), sort_keys=False, allow_unicode=True)

@@ -17,6 +17,11 @@ from rig.scoring import MISSING_PX, depth_errors
 MOST_MISSING = 0.05
 """A figure counts only where at most this share of the true stripes has no answer."""
 
+LOCAL_PX = 1.0
+"""Answers within so much of the truth found the stripe; what is left of their errors is that of placing it."""
+_SD_OF_MEDIAN = 1.4826
+"""Standard deviation of a Gaussian over the median of its absolute values."""
+
 Clock = Literal["sensor", "compute"]
 """Whose time an error is traded for."""
 
@@ -41,7 +46,8 @@ class Setting:
 class MapScore:
     """Errors of one map against the world's truth, over every (row, column) with a true stripe, and its times.
 
-    mean_abs_px: a missing answer counts as `MISSING_PX`. sums, numbers: of the blocks of `rig.intervals`.
+    mean_abs_px: a missing answer counts as `MISSING_PX`. local_sd_px: of the errors of answers within LOCAL_PX, from
+    their median; None where there are none. sums, numbers: of the blocks of `rig.intervals`.
     """
 
     mean_abs_px: float
@@ -52,6 +58,7 @@ class MapScore:
     compute_ms: float
     sums: NDArray[np.float64]
     numbers: NDArray[np.int64]
+    local_sd_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +67,12 @@ class TradeoffRow:
 
     fog: a visibility or 'clear', None: as the scene says. sensor_ms: of one map, with dark frames and fly-back.
     compute_ms: of a map after the first, counting and all. depth_mm: None where no pixel has a depth. ci95: of
-    mean_abs_px. times_limit: mean_abs_px over the statistical limit, None where that is not known. pareto,
-    pareto_compute: whether no other setting in the same scene and fog has less error in as little time of sensor or
-    computer, and no less time.
+    mean_abs_px. local_sd_px: of the errors of answers within LOCAL_PX. pareto, pareto_compute: whether no other setting
+    in the same scene and fog has less error in as little time of sensor or computer, and no less time.
+
+    Beside what the light allows (`rig.tradeoff_limits`), each None where that is not known: times_limit, mean_abs_px
+    over the statistical limit; exponent_nats, Chernoff's per exposure, and times_wrong_limit, the share of answers more
+    than 1 px off over the ideal's; position_sd_px, Cramer-Rao's, and times_position_limit, local_sd_px over that.
     """
 
     scene: str
@@ -79,6 +89,11 @@ class TradeoffRow:
     depth_mm: float | None
     ci95: Interval
     times_limit: float | None = None
+    exponent_nats: float | None = None
+    times_wrong_limit: float | None = None
+    local_sd_px: float | None = None
+    position_sd_px: float | None = None
+    times_position_limit: float | None = None
     pareto: bool = False
     pareto_compute: bool = False
 
@@ -109,18 +124,20 @@ def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms
     errors = np.abs(result.stripe.x_px - true_px)
     missing = np.isfinite(true_px) & ~np.isfinite(result.stripe.x_px)
     errors[missing] = MISSING_PX
+    near = (errors <= LOCAL_PX) & ~missing
     sums, numbers = blocks_of(errors)
     total = int(numbers.sum())
     depth_m = depth_errors(result.depth_m, truth.depth_m)["mean_abs"]
     return MapScore(
         mean_abs_px=float(sums.sum() / total),
-        within_1px=float(np.count_nonzero((errors <= 1) & ~missing) / total),
+        within_1px=float(np.count_nonzero(near) / total),
         missing=float(np.count_nonzero(missing) / total),
         depth_mm=None if depth_m is None else 1e3 * depth_m,
         sensor_ms=sensor_ms,
         compute_ms=compute_ms,
         sums=sums,
         numbers=numbers,
+        local_sd_px=float(_SD_OF_MEDIAN * np.median(errors[near])) if near.any() else None,
     )
 
 
@@ -129,6 +146,7 @@ def row_of(scene: str, fog: str | None, setting: Setting, scores: Sequence[MapSc
     mean = statistics.fmean
     errors = [score.mean_abs_px for score in scores]
     depths = [score.depth_mm for score in scores if score.depth_mm is not None]
+    local = [score.local_sd_px for score in scores if score.local_sd_px is not None]
     alone = scores[0]
     return TradeoffRow(
         scene=scene,
@@ -143,6 +161,7 @@ def row_of(scene: str, fog: str | None, setting: Setting, scores: Sequence[MapSc
         within_1px=mean(score.within_1px for score in scores),
         missing=mean(score.missing for score in scores),
         depth_mm=mean(depths) if depths else None,
+        local_sd_px=mean(local) if local else None,
         ci95=repeats_interval(errors) if len(errors) > 1 else blocks_interval(alone.sums, alone.numbers),
     )
 

@@ -1,4 +1,6 @@
-"""A trade-off for people: a table, the setting to use and where the files are."""
+"""A trade-off for people: tables of at most 80 characters, the setting to use and where the files are."""
+
+from collections.abc import Callable, Sequence
 
 from rich.table import Table
 
@@ -6,50 +8,79 @@ from rig.report_text import console
 from rig.tradeoff import Tradeoff
 from rig.tradeoff_rows import TradeoffRow
 
-_COLUMNS = ("estimator", "filter", "exposures", "sensor", "compute", "error", "95 %", "within 1 px", "missing", "depth")
+Column = tuple[str, Callable[[TradeoffRow], str]]
+"""Heading and cell."""
+
+_SETTING: tuple[Column, ...] = (
+    ("estimator", lambda row: row.estimator),
+    ("filter", lambda row: row.filter),
+    ("K", lambda row: str(row.exposures)),
+)
+_FIGURES: tuple[Column, ...] = (
+    *_SETTING,
+    ("sensor\nms", lambda row: _short(row.sensor_ms)),
+    ("compute\nms", lambda row: _short(row.compute_ms)),
+    ("error\npx", lambda row: _short(row.mean_abs_px) if row.counts else f"({_short(row.mean_abs_px)})"),
+    ("95 %\npx", lambda row: f"{_short(row.ci95[0])}..{_short(row.ci95[1])}"),
+    ("< 1 px\n%", lambda row: f"{100 * row.within_1px:.1f}"),
+    ("miss.\n%", lambda row: f"{100 * row.missing:.1f}"),
+    ("depth\nmm", lambda row: _short(row.depth_mm)),
+    ("", lambda row: ("*" if row.pareto else " ") + ("+" if row.pareto_compute else "")),
+)
+_LIMITS: tuple[Column, ...] = (
+    *_SETTING,
+    ("error\nx limit", lambda row: _times(row.times_limit)),
+    ("> 1 px\nx limit", lambda row: _times(row.times_wrong_limit)),
+    ("exponent\nnats", lambda row: _short(row.exponent_nats)),
+    ("sub-pixel\npx", lambda row: _short(row.local_sd_px)),
+    ("Cramer-Rao\npx", lambda row: _short(row.position_sd_px)),
+    ("sub-pixel\nx limit", lambda row: _times(row.times_position_limit)),
+)
+_LEFT = ("estimator", "filter", "")
 
 
 def tradeoff_table(done: Tradeoff) -> None:
     """Print it to stdout; * marks what lies on the front of error over sensor time, + on that over compute time."""
-    places = list(dict.fromkeys((row.scene, row.fog) for row in done.rows))
-    several_lines = any(row.lines != 1 for row in done.rows)
-    limits = any(row.times_limit is not None for row in done.rows)
-    for scene, fog in places:
-        air = "" if fog is None else ", clear air" if fog == "clear" else f", visibility {fog}"
-        table = Table(title=f"{scene}{air}", title_justify="left", title_style="bold", box=None, pad_edge=False)
-        for name in (*_COLUMNS, *(["lines"] if several_lines else []), *(["x limit"] if limits else []), ""):
-            table.add_column(name, justify="left" if name in ("estimator", "filter", "") else "right", no_wrap=True)
-        for row in done.rows:
-            if (row.scene, row.fog) == (scene, fog):
-                cells = _cells(row)
-                if several_lines:
-                    cells.append(str(row.lines))
-                if limits:
-                    cells.append("-" if row.times_limit is None else f"{row.times_limit:.1f}")
-                table.add_row(*cells, ("*" if row.pareto else " ") + ("+" if row.pareto_compute else ""))
-        console().print(table)
-        print()
-    print(f"*, +: nothing has less error in as little sensor time (*), compute time (+). 95 %: over {done.ci95_by}.")
+    for place in dict.fromkeys((row.scene, row.fog, row.lines) for row in done.rows):
+        rows = [row for row in done.rows if (row.scene, row.fog, row.lines) == place]
+        _print(_named(*place), _FIGURES, rows)
+        if any(row.times_limit is not None for row in rows):
+            _print(f"{_named(*place)}: beside what its light allows", _LIMITS, rows)
+    print("K: exposures of a column. < 1 px, miss.: answers so near, and missing ones.")
+    print(f"95 %: interval of the mean error, over {done.ci95_by}.")
+    print("*, +: nothing has less error in as little sensor time (*), compute time (+).")
     if any(not row.counts for row in done.rows):
-        print("In brackets: more than 5 % of the answers are missing, such an error counts for nothing.")
+        print("In brackets: more than 5 % of the answers are missing, such an error counts for\nnothing.")
+    for reason in done.accepted_calibration:
+        print(f"calibration accepted in spite of {reason}")
     if done.answer is not None:
         print(done.answer)
     if done.folder is not None:
         print(f"files: {done.folder}")
 
 
-def _cells(row: TradeoffRow) -> list[str]:
-    low, high = row.ci95
-    error = f"{row.mean_abs_px:.3g} px"
-    return [
-        row.estimator,
-        row.filter,
-        str(row.exposures),
-        f"{row.sensor_ms:.3g} ms",
-        f"{row.compute_ms:.3g} ms",
-        error if row.counts else f"({error})",
-        f"{low:.3g} .. {high:.3g}",
-        f"{row.within_1px:.1%}",
-        f"{row.missing:.1%}",
-        "-" if row.depth_mm is None else f"{row.depth_mm:.3g} mm",
-    ]
+def _named(scene: str, fog: str | None, lines: int) -> str:
+    air = "" if fog is None else ", clear air" if fog == "clear" else f", visibility {fog}"
+    return scene + air + ("" if lines == 1 else f", {lines} lines at once")
+
+
+def _print(title: str, columns: Sequence[Column], rows: Sequence[TradeoffRow]) -> None:
+    table = Table(title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for name, _ in columns:
+        table.add_column(name, justify="left" if name in _LEFT else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*(cell(row) for _, cell in columns))
+    console().print(title, style="bold", markup=False)
+    console().print(table)
+    print()
+
+
+def _short(value: float | None) -> str:
+    """At most five characters below 100 000, never with an exponent."""
+    if value is None:
+        return "-"
+    return f"{value:.{3 if value < 9.9995 else 1 if value < 999.95 else 0}f}"
+
+
+def _times(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"

@@ -95,6 +95,11 @@ class WorldConfig(KindConfig):
     command_grid: CommandGridConfig | None = None
     """Columns in which the flux is held, for use without an application that says `hold_columns`."""
 
+    @property
+    def holds_board(self) -> bool:
+        """Whether there is a calibration board in the scene. DeviceError where the scene cannot be read."""
+        return bool(load_scene(self.scene)[0].boards)
+
 
 class SimulatedWorld:
     """One scene, one rig, one bench. Reading is safe from any thread."""

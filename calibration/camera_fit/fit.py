@@ -62,6 +62,16 @@ class CameraFit:
     coverage: Coverage
 
     @property
+    def kept(self) -> tuple[str, ...]:
+        """Names of the views that are in the fit, if only with a part of their corners."""
+        return tuple(name for name, mask in zip(self.views, self.used, strict=True) if mask.any())
+
+    @property
+    def dropped(self) -> tuple[str, ...]:
+        """Names of the views of which no corner is in the fit."""
+        return tuple(name for name, mask in zip(self.views, self.used, strict=True) if not mask.any())
+
+    @property
     def sd(self) -> dict[str, float]:
         """Of every parameter, by name: fx fy cx cy in pixels, the distortion's in its own units."""
         spread = np.sqrt(np.diag(self.covariance.matrix))

@@ -5,19 +5,19 @@ error of a pixel is what is left of J C J' when the best common rotation of all 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
 from calibration.camera_fit.fit import CameraFit
-from calibration.judging.data_lack import data_lack, drowned
+from calibration.judging.data_lack import data_lack, hiding
 from calibration.judging.evidence import pose_evidence, view_evidence
 from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
 from calibration.model.parameters import changed_camera
-from calibration.verdict import WORST_TIMES, Verdict, more_poses
+from calibration.verdict import WORST_TIMES, Verdict, more_poses, unguided
 from calibration.views import View
 
 Array = NDArray[np.float64]
@@ -30,11 +30,14 @@ _STEP = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedCamera:
-    """A verdict and what it was made of: sd_px, worst_px: of a pixel's place along the row, median and 95 %."""
+    """A verdict and what it was made of: sd_px, worst_px: of a pixel's place along the row, median and 95 %. coverage:
+    share of the picture within the outline of all corners.
+    """
 
     verdict: Verdict
     sd_px: float
     worst_px: float
+    coverage: float
 
     def line(self) -> str:
         """One line."""
@@ -47,13 +50,15 @@ def judge_camera(fit: CameraFit, views: Sequence[View], board: Board, *, photons
     sd = ray_sd_px(camera, fit.covariance)
     median, worst = float(np.median(sd)), float(np.percentile(sd, 95))
     imprecise = not (median <= ACCURACY_PX and worst <= WORST_TIMES * ACCURACY_PX)
-    evidence = view_evidence(views, (camera.width, camera.height))
-    lacking = data_lack(evidence, pose_evidence(fit.poses, board), imprecise=imprecise, photons=photons)
-    reasons = [*drowned(evidence, photons=photons), *lacking]
+    pairs = zip(fit.views, fit.poses, strict=True)
+    evidence = view_evidence(views, (camera.width, camera.height), len(fit.kept), fit.dropped)
+    poses = pose_evidence([pose for name, pose in pairs if name in fit.kept], board)
+    lacking = data_lack(evidence, poses, imprecise=imprecise, photons=photons)
+    reasons = [*hiding(evidence, poses, photons=photons), *lacking]
     if imprecise and not reasons:
-        too_few = more_poses(len(fit.views), "rays are known to", (median, worst), ACCURACY_PX, "{:.2g} px".format)
-        reasons = [replace(too_few, next_step="show the board in more poses")]
-    return JudgedCamera(Verdict(not reasons, tuple(reasons)), median, worst)
+        found = median, worst
+        reasons = [more_poses(len(fit.kept), "rays are known to", found, ACCURACY_PX, "{:.2g} px".format)]
+    return JudgedCamera(unguided(Verdict(not reasons, tuple(reasons))), median, worst, evidence.coverage)
 
 
 def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:

@@ -35,7 +35,8 @@ def judge_check(
                 f"the angle between the boards is scanned as {math.degrees(angle.angle_rad):.2f} degrees, stated are "
                 f"{math.degrees(stated_angle_rad):.2f}; the limit is {math.degrees(limit):.2f} off"
             )
-            found.append(Reason("wrong-angle", text, error, limit, f"measure the angle once more, then {_AGAIN}"))
+            step = f"measure the angle and check with it once more; where it stays so, {_AGAIN}"
+            found.append(Reason("wrong-angle", text, error, limit, step))
     return Verdict(not found, tuple(found))
 
 

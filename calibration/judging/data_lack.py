@@ -1,7 +1,7 @@
 """What views of a board lack to make a calibration: light of the line only, poses, tilts, size, coverage."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from calibration.judging.evidence import PoseEvidence, ViewEvidence
@@ -9,6 +9,7 @@ from calibration.verdict import Reason, reason_for
 
 _FEWEST_TO_JUDGE = 3
 """Of fewer poses neither tilt nor coverage can be asked."""
+_MEND_VIEWS = "mend what is said of the other views, then show more"
 FEWEST_POSES: Final = 6
 """With fewer, a single bad view bends the fit to it, so that nothing shows that it was bad."""
 
@@ -40,16 +41,18 @@ on room light costs more than half of what a frame can tell of the line."""
 def data_lack(
     views: ViewEvidence, poses: PoseEvidence | None, *, imprecise: bool, photons: bool = True
 ) -> list[Reason]:
-    """What the data lack, but for those that are `drowned`: more counts where the result is not precise enough.
+    """What the data lack, but for what is `hiding` the rest: more counts where the result is not precise enough.
 
     poses: None where nothing tells. photons: whether pictures count photons; those from files do not.
     """
     found = []
-    if views.shown < FEWEST_POSES:
-        were = "pose was" if views.shown == 1 else "poses were"
-        text = f"{views.shown} {were} shown, {FEWEST_POSES} are the fewest that can be checked against each other"
-        found.append(reason_for("too-few-poses", text, views.shown, FEWEST_POSES))
-    if views.shown < _FEWEST_TO_JUDGE:
+    bright = photons and MOST_ROOM_FLUX.at(imprecise) < views.room_flux <= MOST_ROOM_FLUX.always
+    light = [_room_light(views.room_flux, MOST_ROOM_FLUX.at(imprecise))] if bright else []
+    if views.used < FEWEST_POSES <= views.shown:
+        found, light = light, []  # what hides board and line goes before the views that lack them
+    if views.used < FEWEST_POSES:
+        found.append(_too_few(views))
+    if views.used < _FEWEST_TO_JUDGE:
         return found
     if poses is not None:
         found += _poses_lack(poses, imprecise)
@@ -57,16 +60,28 @@ def data_lack(
     if views.coverage < least:
         text = f"corners reach {views.coverage:.0%} of the picture, {least:.0%} are needed"
         found.append(reason_for("poor-coverage", text, views.coverage, least))
-    if photons and MOST_ROOM_FLUX.at(imprecise) < views.room_flux <= MOST_ROOM_FLUX.always:
-        found.append(_room_light(views.room_flux, MOST_ROOM_FLUX.at(imprecise)))
+    return found + light
+
+
+def hiding(views: ViewEvidence, poses: PoseEvidence | None, *, photons: bool = True) -> list[Reason]:
+    """What makes up other faults: room light in which frames hold little else, and boards so far away that their
+    corners do not say where they are. As for `data_lack`.
+    """
+    found = []
+    if photons and views.room_flux > MOST_ROOM_FLUX.always:
+        found.append(_room_light(views.room_flux, MOST_ROOM_FLUX.always))
+    if views.used >= _FEWEST_TO_JUDGE and poses is not None and poses.board_rad < LEAST_BOARD_RAD.always:
+        found.append(_too_far(poses, LEAST_BOARD_RAD.always))
     return found
 
 
-def drowned(views: ViewEvidence, *, photons: bool = True) -> list[Reason]:
-    """Room light so bright that frames hold little else, whatever seems to be found in them. photons: `data_lack`."""
-    if photons and views.room_flux > MOST_ROOM_FLUX.always:
-        return [_room_light(views.room_flux, MOST_ROOM_FLUX.always)]
-    return []
+def _too_few(views: ViewEvidence) -> Reason:
+    shown = f"{views.shown} {'pose was' if views.shown == 1 else 'poses were'} shown"
+    limit = f"{FEWEST_POSES} are the fewest that can be checked against each other"
+    if views.used == views.shown:
+        return reason_for("too-few-poses", f"{shown}, {limit}", views.shown, FEWEST_POSES)
+    text = f"{shown}, {views.used or 'none'} of them could be used, {limit}"
+    return replace(reason_for("too-few-poses", text, views.used, FEWEST_POSES), next_step=_MEND_VIEWS)
 
 
 def _poses_lack(poses: PoseEvidence, imprecise: bool) -> list[Reason]:
@@ -78,14 +93,17 @@ def _poses_lack(poses: PoseEvidence, imprecise: bool) -> list[Reason]:
             f"{math.degrees(least):.0f} are needed"
         )
         found.append(reason_for("no-tilt", text, poses.tilt_rad, least))
-    least = LEAST_BOARD_RAD.at(imprecise)
-    if poses.board_rad < least:
-        text = (
-            f"boards stood {poses.distance_m:.2g} m away (median) and were seen under "
-            f"{math.degrees(poses.board_rad):.1f} degrees, {math.degrees(least):.1f} are needed"
-        )
-        found.append(reason_for("board-too-far", text, poses.board_rad, least))
+    if LEAST_BOARD_RAD.always <= poses.board_rad < LEAST_BOARD_RAD.at(imprecise):
+        found.append(_too_far(poses, LEAST_BOARD_RAD.at(imprecise)))
     return found
+
+
+def _too_far(poses: PoseEvidence, least: float) -> Reason:
+    text = (
+        f"boards stood {poses.distance_m:.2g} m away (median) and were seen under "
+        f"{math.degrees(poses.board_rad):.1f} degrees, {math.degrees(least):.1f} are needed"
+    )
+    return reason_for("board-too-far", text, poses.board_rad, least)
 
 
 def _room_light(flux: float, limit: float) -> Reason:

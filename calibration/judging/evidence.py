@@ -4,7 +4,7 @@ Each number speaks for one way to go wrong: how many poses there were, how far t
 seen, how much of the picture it reached, how bright the room was, what the baseline came out as.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -27,11 +27,14 @@ _WHITE_PERCENT = 75
 class ViewEvidence:
     """What is seen before anything is fitted; NaN where nothing tells.
 
-    shown: poses. coverage: share of the picture within the outline of all corners. room_flux: photons per pixel and
-    exposure of white on the board (of the bright parts of the picture where there is no board), median over the views.
+    shown: poses. used: those of them that a fit can be checked by: with corners, and where a line is asked for with
+    the line on the board too. coverage: share of the picture within the outline of all corners. room_flux: photons per
+    pixel and exposure of white on the board (of the bright parts of the picture where there is no board), median over
+    the views.
     """
 
     shown: int
+    used: int
     coverage: float
     room_flux: float
 
@@ -48,13 +51,19 @@ class PoseEvidence:
     board_rad: float
 
 
-def view_evidence(views: Sequence[View], size: tuple[int, int]) -> ViewEvidence:
-    """Look at the views alone; size: (width, height) of the picture."""
-    found = [view.corners for view in views if view.corners is not None and len(view.corners.ids) > 2]
+def view_evidence(
+    views: Sequence[View], size: tuple[int, int], used: int, left_out: Collection[str] = ()
+) -> ViewEvidence:
+    """Look at the views alone; size: (width, height) of the picture. used: as in the evidence. left_out: names of those
+    whose corners had no say.
+    """
+    counted = [view.corners for view in views if view.name not in left_out and view.corners is not None]
+    found = [corners for corners in counted if len(corners.ids) > 2]
     area = float(size[0] * size[1])
     fluxes = [_room_flux(view) for view in views if view.picture is not None]
     return ViewEvidence(
         shown=len(views),
+        used=used,
         coverage=_outline_area(np.concatenate([corners.px for corners in found])) / area if found else 0.0,
         room_flux=float(np.median(fluxes)) if fluxes else np.nan,
     )

@@ -15,11 +15,12 @@ from calibration.guide.poses import rough_camera
 from calibration.judging.evidence import baseline_m, pose_evidence, rough_poses, view_evidence
 from calibration.judging.rules import FitEvidence, judge, judge_refusal
 from calibration.judging.sweep_waves import SweepResidual, SweepWaves, sweep_waves
-from calibration.judging.view_shifts import ViewShift, common_shift, counted, last_before_move, view_shifts
+from calibration.judging.view_shifts import ViewShift, common_shift, counted, last_before_move, shift_noise, view_shifts
 from calibration.model.lag_speeds import SWEPT
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.fit import RigFit
-from calibration.verdict import AT_M, Asked, Verdict
+from calibration.rig_fit.sightings import shows_line, usable
+from calibration.verdict import AT_M, Asked, Verdict, unguided
 from calibration.views import View
 
 ACCURACY_PX: Final = 0.1
@@ -75,30 +76,42 @@ def judge_fit(
     uncertainty = depth_uncertainty(model, at_m)
     baseline, baseline_sd = _baseline(model)
     known = uncertainty.sd_m[np.isfinite(uncertainty.sd_m)]
+    said = [pose for name, pose in zip(fit.views, fit.poses, strict=True) if name not in fit.outliers]
     evidence = FitEvidence(
-        poses=pose_evidence(fit.poses, fit.board),
+        poses=pose_evidence(said, fit.board),
         expected_m=float(np.median(known)) if known.size else np.nan,
         worst_m=float(np.percentile(known, _WORST_PERCENT)) if known.size else np.nan,
         wave_m=waves.rms * worth.per_command_m,
         wave_noise_m=waves.noise * worth.per_command_m,
         shift_m=common_shift(agreeing, waves.rms, sweeps) * worth.per_command_m,
+        shift_noise_m=shift_noise(agreeing, waves.rms, sweeps) * worth.per_command_m,
         moved_after=last_before_move(agreeing),
         misfit=fit.misfit,
         baseline_m=baseline,
         baseline_sd_m=baseline_sd,
         velocities_per_s=tuple(model.provenance[SWEPT]),
     )
-    seen = view_evidence(views, (model.camera.width, model.camera.height))
+    seen = view_evidence(views, (model.camera.width, model.camera.height), len(fit.used), fit.outliers)
     return Judged(judge(seen, evidence, asked), asked, evidence, waves, residuals, shifts, uncertainty, worth)
 
 
 def judge_refused(
-    refused: Degenerate, views: Sequence[View], board: Board, size: tuple[int, int], *, photons: bool = True
+    refused: Degenerate,
+    views: Sequence[View],
+    board: Board,
+    size: tuple[int, int],
+    *,
+    photons: bool = True,
+    line: bool = True,
 ) -> Verdict:
-    """Judge views of a picture of `size` (width, height) from which no model could be made; photons: `data_lack`."""
+    """Judge views of a picture of `size` (width, height) from which no model could be made. photons: `data_lack`. line:
+    whether the line was to be seen in them, or a camera alone was asked for.
+    """
     poses = rough_poses(views, board, rough_camera(size))
     evidence = pose_evidence(poses, board) if poses else None
-    return judge_refusal(refused, view_evidence(views, size), evidence, photons=photons)
+    used = sum(not line or shows_line(view) for view in usable(views))
+    verdict = judge_refusal(refused, view_evidence(views, size, used), evidence, photons=photons)
+    return verdict if line else unguided(verdict)
 
 
 def _baseline(model: RigModel) -> tuple[float, float]:

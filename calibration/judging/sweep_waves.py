@@ -26,7 +26,7 @@ _MEDIAN_VARIANCE = np.pi / 2
 """Of a median in units of the mean's variance, normal distribution."""
 _MEDIAN_TAKES = 0.8
 """Of n values: their robust scatter around their own median is (n - 0.8) / n of the true (Croux, Rousseeuw, 1992)."""
-SIGMAS = 4.0
+NOISE_SIGMAS = 4.0
 """Standard deviations of a mean square up to which it may be noise."""
 
 
@@ -72,7 +72,7 @@ def sweep_waves(sweeps: Sequence[SweepResidual]) -> SweepWaves:
         square, sd = _off_lines(left, variance)
     return SweepWaves(
         rms=float(np.sqrt(max(square, 0.0))) if np.isfinite(square) else np.nan,
-        noise=float(np.sqrt(SIGMAS * sd)),
+        noise=float(np.sqrt(NOISE_SIGMAS * sd)),
         command=(edges[1:] + edges[:-1]) / 2,
         sweeps=middle,
     )

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.judging.sweep_waves import NOISE_SIGMAS
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.fit import RigFit
 from calibration.rig_fit.normal import corner_weights
@@ -58,9 +59,21 @@ def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> flo
     """
     if len(shifts) < 2:
         return np.nan
-    square = float(np.mean([one.shift**2 - one.sd**2 for one in shifts]))
-    square -= wave**2 / max(sweeps, 1) if np.isfinite(wave) else 0.0
+    square = float(np.mean([one.shift**2 for one in shifts])) - float(np.mean(_variances(shifts, wave, sweeps)))
     return math.sqrt(max(square, 0.0))
+
+
+def shift_noise(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> float:
+    """Up to where a `common_shift` of these may be noise of poses and waves; NaN for fewer than two views."""
+    if len(shifts) < 2:
+        return np.nan
+    chance = float(np.sqrt(2 * np.sum(_variances(shifts, wave, sweeps) ** 2))) / len(shifts)
+    return math.sqrt(NOISE_SIGMAS * chance)
+
+
+def _variances(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> Array:
+    """Of the views' shifts (views,), as far as noise of poses and waves makes them."""
+    return np.array([one.sd**2 for one in shifts]) + (wave**2 / max(sweeps, 1) if np.isfinite(wave) else 0.0)
 
 
 def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...], misfit: float = 1.0) -> tuple[ViewShift, ...]:

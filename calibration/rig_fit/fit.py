@@ -67,6 +67,17 @@ class RigFit:
     information: Array
 
     @property
+    def used(self) -> tuple[str, ...]:
+        """Names of the views whose passages had a say."""
+        pairs = zip(self.views, self.sweeps, strict=True)
+        return tuple(name for name, sweeps in pairs if sweeps and name not in self.outliers)
+
+    @property
+    def without_line(self) -> tuple[str, ...]:
+        """Names of the views with corners, but too few passages on the board."""
+        return tuple(name for name, sweeps in zip(self.views, self.sweeps, strict=True) if not sweeps)
+
+    @property
     def corner_rms_px(self) -> float:
         """Root mean square of all corners' distances."""
         squares = np.concatenate([np.sum(left**2, axis=1) for left in self.corner_residual_px])

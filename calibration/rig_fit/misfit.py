@@ -18,6 +18,8 @@ ODD_CHI2 = 60.0
 """By which chi2 must fall when a view has its own place of the scanner: 20 is one in a thousand."""
 ODD_TIMES = 8.0
 """And more than so many times what it falls by for most views, should the model fit none of them well."""
+FEWEST_TO_TELL = 4
+"""Views with passages: of fewer none is the usual one."""
 UNDECIDED_SD = 2.5
 """From here on a term that was not taken in widens the covariance by what it would change."""
 MISFIT_SD = 3.0
@@ -27,15 +29,21 @@ MISFIT_SD = 3.0
 def odd_view(problem: Problem, solution: Solution) -> int | None:
     """The view that would most like a scanner elsewhere, if it stands out; None where none does.
 
-    Each view's equations say how far chi2 would fall if the scanner had a place of its own for this view alone.
+    Each view's equations say how far chi2 would fall if the scanner had a place of its own for this view alone. Views
+    without passages say nothing of it: with their zeros any other would stand out.
     """
-    counted = np.flatnonzero(problem.counted)
+    counted = np.flatnonzero(problem.counted & with_passages(problem))
     gains = np.array([_own_place(problem, solution, int(view)) for view in counted])
-    if len(gains) < 4:
+    if len(gains) < FEWEST_TO_TELL:
         return None
     worst = int(np.argmax(gains))
     usual = float(np.median(np.delete(gains, worst)))
     return int(counted[worst]) if gains[worst] > max(ODD_CHI2, ODD_TIMES * usual) else None
+
+
+def with_passages(problem: Problem) -> NDArray[np.bool_]:
+    """(views,) True where the line was seen on the board."""
+    return np.array([seen.command.size > 0 for seen in problem.sightings])
 
 
 def _own_place(problem: Problem, solution: Solution, view: int) -> float:

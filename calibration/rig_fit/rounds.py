@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calibration.errors import Degenerate
-from calibration.rig_fit.misfit import misfit, odd_view
+from calibration.rig_fit.misfit import misfit, odd_view, with_passages
 from calibration.rig_fit.noise import Noise, passage_noise
 from calibration.rig_fit.select import Decision, best, candidates, corner_noise, tried, with_free
 from calibration.rig_fit.solve import Problem, Solution, solved
@@ -22,7 +22,7 @@ MOST_IDLE_ROUNDS = 4
 SETTLED_SHARE = 0.02
 """By which the noise may still change in the last round."""
 MOST_ODD_SHARE = 1 / 3
-"""Of the views may be dropped as outliers; more, and it is not they who are wrong."""
+"""Of the views with passages may be dropped as outliers; more, and it is not they who are wrong."""
 
 
 @dataclass
@@ -67,7 +67,7 @@ class Rounds:
 
     def _without_odd_view(self) -> bool:
         assert self.solution is not None
-        if np.count_nonzero(~self.problem.counted) + 1 > MOST_ODD_SHARE * len(self.problem.counted):
+        if np.count_nonzero(~self.problem.counted) + 1 > MOST_ODD_SHARE * np.count_nonzero(with_passages(self.problem)):
             return False
         odd = odd_view(self.problem, self.solution)
         if odd is None:

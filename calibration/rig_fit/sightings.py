@@ -95,6 +95,11 @@ def usable(views: Sequence[View]) -> list[View]:
     return found
 
 
+def shows_line(view: View) -> bool:
+    """Whether a sweep of a view has passages enough to be looked at."""
+    return any(sweep.x_px.size >= FEWEST_PASSAGES for sweep in view.passages)
+
+
 def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose) -> Passages:
     """The passages of a sweep within the board's outline, sorted by command."""
     x, y, command, sd = (np.asarray(values, np.float64) for values in (sweep.x_px, sweep.y_px, sweep.command, sweep.sd))

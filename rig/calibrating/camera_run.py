@@ -22,6 +22,8 @@ from rig.calibrating.taking import Live, Taken, good_poses, take_kept, take_live
 from rig.run import OutFolder, versions
 
 CAMERA_FILE = "camera.yaml"
+FEWEST_VIEWS = 3
+"""Of a camera: of fewer the second takes up whatever is wrong with the first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,21 +55,33 @@ def run_camera(
         taken = Taken(session, tell)
         take_kept(taken, sources, board)
         if live is not None:
-            choose = good_poses(live, board, asked.poses, AT_M, asked.seed)
-            take_live(taken, Live(live, asked.poses, choose, ask, seed=asked.seed, arm=asked.arm), board)
+            choose = good_poses(live, board, asked.poses, AT_M, asked.seed, len(taken.views))
+            take_live(taken, Live(live, asked.poses, choose, ask, seed=asked.seed, arm=asked.arm, line=False), board)
         try:
-            fit = fit_camera(taken.views, board, taken.size, distortion_terms=asked.terms)
+            fit = _fitted(taken, board, asked.terms)
         except Degenerate as refused:
-            raise refusal(refused, taken, board, photons=photons) from refused
+            raise refusal(refused, taken, board, photons=photons, line=False) from refused
         judged = judge_camera(fit, taken.views, board, photons=photons)
         summary = {"command": "camera", **_summary(fit, judged, taken), "versions": versions()}
-        figures = tuple(_figures(fit, judged))
+        figures = tuple(_figures(fit, judged, taken))
         used = [view for view in taken.views if view.name in fit.views]
         report = camera_report(fit, used, judged, board, figures)
-        digests = [corners_digest(view) for view in used if view.name not in fit.outliers]
+        digests = [corners_digest(view) for view in used if view.name in fit.kept]
         session.write_text(CAMERA_FILE, camera_file_text(fit.camera, fit.covariance, digests))
         session.finish(summary, report, None)
         return CalibrationResult(judged.verdict, judged.line(), figures, summary, None, session.path)
+
+
+def _fitted(taken: Taken, board: Board, terms: int) -> CameraFit:
+    """The camera; Degenerate where it would hang on so few views that they cannot contradict each other."""
+    fit = fit_camera(taken.views, board, taken.size, distortion_terms=terms)
+    if len(fit.kept) < FEWEST_VIEWS:
+        raise Degenerate(
+            "too-few-poses",
+            f"{len(fit.kept)} of {len(taken.views)} views could be used (condition number {fit.condition:.1e}): a "
+            f"camera takes {FEWEST_VIEWS} poses or more; show the board tilted to both sides, near and far",
+        )
+    return fit
 
 
 def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, Any]:
@@ -75,7 +89,7 @@ def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, An
         "verdict": judged.verdict.as_json(),
         "views": {
             "shown": len(taken.views),
-            "used": len(fit.views) - len(fit.outliers),
+            "used": len(fit.kept),
             "outliers": list(fit.outliers),
             "refused": {name: str(why) for name, why in taken.refused.items()},
             "rms_px": dict(zip(fit.views, fit.view_rms_px.tolist(), strict=True)),
@@ -84,22 +98,24 @@ def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, An
         "sd": fit.sd,
         "rms_px": fit.rms_px,
         "ray_sd_px": {"median": judged.sd_px, "worst": judged.worst_px, "asked": ACCURACY_PX, "line": judged.line()},
-        "coverage": fit.coverage.share,
+        "coverage": judged.coverage,
         "condition": fit.condition,
     }
 
 
-def _figures(fit: CameraFit, judged: JudgedCamera) -> list[tuple[str, str]]:
-    matrix, sd = fit.camera.matrix, fit.sd
+def _figures(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> list[tuple[str, str]]:
+    matrix, sd, refused = fit.camera.matrix, fit.sd, tuple(taken.refused)
     terms = ", ".join(f"{term:.4g}" for term in fit.camera.distortion) or "none"
     return [
-        ("views", f"{len(fit.views) - len(fit.outliers)} used, {named(fit.outliers)} outliers"),
-        ("rays", f"{judged.sd_px:.2g} px, at the worst 5 % of the picture {judged.worst_px:.2g} px"),
+        ("views", f"{len(fit.kept)} of {len(taken.views)} used, {named(fit.outliers)} outliers, {named(refused)} "
+                  "refused"),
+        ("rays", f"{judged.sd_px:.2g} px, at the worst 5 % of the picture {judged.worst_px:.2g} px, asked "
+                 f"{ACCURACY_PX:g} px"),
         ("focal length", f"{matrix[0, 0]:.2f}, {matrix[1, 1]:.2f} px, sd {sd['fx']:.2g}, {sd['fy']:.2g}"),
         ("centre", f"{matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px, sd {sd['cx']:.2g}, {sd['cy']:.2g}"),
         ("distortion", terms),
         ("residuals", f"{fit.rms_px:.3f} px rms"),
-        ("coverage", f"{fit.coverage.share:.0%} of the picture's cells, boards up to "
+        ("coverage", f"{judged.coverage:.0%} of the picture within the outline of all corners, boards up to "
                      f"{np.degrees(fit.coverage.spread_rad):.0f} degrees apart"),
         ("condition", f"{fit.condition:.3g}"),
     ]  # fmt: skip

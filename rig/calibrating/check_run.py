@@ -91,10 +91,11 @@ def run_check(
         summary = {
             "command": "check",
             **_summary(verdict, boards, angle, asked, wanted, uncertainty, file),
+            "scans_refuse_it": bool(_consequence(verdict, model, file)),
             "truth": None if truth is None else truth_content(truth),
             "versions": versions(),
         }
-        figures = tuple(_figures(boards, angle))
+        figures = tuple(_figures(boards, angle) + _consequence(verdict, model, file))
         session.finish(summary, check_report(boards, uncertainty, verdict, line, figures), None)
         if model.identity is not None:
             note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
@@ -162,6 +163,17 @@ def _summary(
             "line": None if uncertainty is None else uncertainty.line(),
         },
     }
+
+
+def _consequence(verdict: Verdict, model: RigModel, file: Path) -> list[tuple[str, str]]:
+    """What a check that failed means from now on, and how that is taken back; nothing without an identity."""
+    if verdict.passed or model.identity is None:
+        return []
+    said = (
+        f"scan, replay and reconstruct refuse {file} (or take it with --accept-calibration); a check of it that "
+        "passes, with the right angle or board, takes that back"
+    )
+    return [("from now on", said)]
 
 
 def _figures(boards: Sequence[CheckedBoard], angle: CheckedAngle | None) -> list[tuple[str, str]]:

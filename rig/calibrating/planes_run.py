@@ -29,9 +29,10 @@ from rig.errors import UsageError
 from rig.run import OutFolder, versions
 
 POSES = 12
-SPEEDS = (1.0, 0.3, 2.0)
-"""Exposures per column by turns, in units of the config's: the lags of both directions need several speeds, and hold
-between the lowest and the highest of them."""
+SPEEDS = ((1.0, 1), (0.3, 2), (2.0, 4))
+"""Exposures per column by turns, in units of the config's, and at least so many: the lags of both directions need
+several speeds, and hold between the lowest and the highest of them. One exposure shows the line in bright light only,
+so that it is tried where it is the config's own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +76,7 @@ def run_planes(
         defects = None if base is None else base.defects
         take_kept(taken, sources, board, defects)
         if live is not None:
-            start = good_poses(live, board, asked.poses, asked.at_m, asked.seed)
+            start = good_poses(live, board, asked.poses, asked.at_m, asked.seed, len(taken.views))
             fit_and_judge = partial(_fit, taken, board, base, camera), partial(_judged, taken, asked)
             guide = Guide(start, board, live.scan.depth_range, taken, *fit_and_judge, tell)
             exposures = asked.exposures or speeds_of(live)
@@ -102,7 +103,7 @@ def run_planes(
 
 def speeds_of(live: RigConfig) -> tuple[int, ...]:
     """Exposures per column at which a rig is looked at by turns."""
-    return tuple(dict.fromkeys(max(1, round(times * live.scan.exposures)) for times in SPEEDS))
+    return tuple(dict.fromkeys(max(least, round(times * live.scan.exposures)) for times, least in SPEEDS))
 
 
 def _fit(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
@@ -167,8 +168,9 @@ def _summary(fit: RigFit, judged: Judged, taken: Taken) -> dict[str, Any]:
         "verdict": judged.verdict.as_json(),
         "views": {
             "shown": len(taken.views),
-            "used": len(fit.views) - len(fit.outliers),
+            "used": len(fit.used),
             "without_board": list(fit.left_out),
+            "without_line": list(fit.without_line),
             "outliers": list(fit.outliers),
             "refused": {name: str(why) for name, why in taken.refused.items()},
         },
@@ -203,8 +205,8 @@ def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None) -> list[tup
     lag = fit.model.lag_s
     asked = judged.asked
     rows = [
-        ("views", f"{len(fit.views) - len(fit.outliers)} used, {named(fit.outliers)} outliers, "
-                  f"{named(fit.left_out)} without board"),
+        ("views", f"{len(fit.used)} used, {named(fit.outliers)} outliers, {named(fit.left_out)} without board, "
+                  f"{named(fit.without_line)} without passages"),
         ("depth error", f"{evidence.expected_m * 1e3:.3g} mm at {asked.at_m:g} m (95 % of the picture: "
                         f"{evidence.worst_m * 1e3:.3g} mm), asked {asked.accuracy_m * 1e3:.3g} mm"),
         ("camera", f"f {matrix[0, 0]:.2f}, {matrix[1, 1]:.2f} px, centre {matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px"),

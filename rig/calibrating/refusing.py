@@ -8,20 +8,22 @@ from calibration.judging.rig import judge_refused
 from rig.calibrating.taking import Taken
 
 
-def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = True) -> Degenerate:
-    """The root cause; as notes what the fit said, the other reasons, and what was wrong with single views.
+def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = True, line: bool = True) -> Degenerate:
+    """The root cause; as notes what the fit said, the other reasons, and what was wrong with single views unless that
+    was told when they were taken.
 
-    photons: whether the pictures count photons; those from files do not.
+    photons: whether the pictures count photons; those from files do not. line: whether it was to be seen, or a camera
+    alone was asked for.
     """
     refused = _of_views(refused, taken)
-    reasons = judge_refused(refused, taken.views, board, taken.size, photons=photons).reasons
+    reasons = judge_refused(refused, taken.views, board, taken.size, photons=photons, line=line).reasons
     error = Degenerate(reasons[0].code, str(reasons[0]))
     if str(refused) not in str(error):
         error.add_note(f"{refused.reason}: {refused}")
     for reason in reasons[1:]:
         if reason.text != str(refused):
             error.add_note(str(reason))
-    for name, why in taken.refused.items():
+    for name, why in taken.refused.items() if taken.tell is None else ():
         error.add_note(f"view {name}: {why}")
     return error
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -13,18 +14,23 @@ from numpy.typing import NDArray
 from calibration.board.board import Board
 from calibration.board.detection import find_corners
 from calibration.errors import CalibrationError, Degenerate
+from calibration.files.camera_file import corners_digest
 from calibration.files.rig_file import load_rig_model
 from calibration.guide.poses import Advice, candidates, rough_camera, sequence
 from calibration.model.camera import Camera
 from calibration.model.rig_model import Identity
+from calibration.rig_fit.sightings import shows_line
 from calibration.views import View
 from rig.calibrating.capture import Capture, capture_recorded, capture_view
 from rig.calibrating.session import BOARD_FILE, Session, session_board, session_rig
 from rig.calibrating.showing import Ask, Tell, shown
 from rig.calibrating.sources import VIEWS, Sources
+from rig.calibrating.speed_turns import SpeedTurns
 from rig.calibrating.view_files import load_views
+from rig.calibrating.view_text import told
+from rig.calibration_identity import same_rig
 from rig.config import RigConfig
-from rig.errors import PlanError, UsageError
+from rig.errors import UsageError
 from rig.session import open_rig
 
 MISSED_SHARE = 0.5
@@ -54,9 +60,19 @@ class Taken:
         self.identity: Identity | None = None
         self._session = session
         self.tell = tell
+        self._seen: dict[str, str] = {}
 
-    def add(self, view: View, refused: Degenerate | None = None, identity: Identity | None = None) -> None:
-        """One more; a name that there is already gets a number."""
+    def add(
+        self,
+        view: View,
+        refused: Degenerate | None = None,
+        identity: Identity | None = None,
+        source: Path | None = None,
+    ) -> None:
+        """One more; a name that there is already gets a number. source: the file or run that it is from. UsageError for
+        one that there is already: it would count twice.
+        """
+        self._require_new(view, str(source or view.name))
         if view.name in [known.name for known in self.views]:
             view = replace(view, name=f"{view.name}-{len(self.views)}")
         self.views.append(view)
@@ -64,24 +80,39 @@ class Taken:
             self.refused[view.name] = refused
         self._of_rig(identity)
         self._session.add(view)
+        self.say(told(view, refused))
+
+    def say(self, line: str) -> None:
+        """Tell whoever listens."""
         if self.tell is not None:
-            self.tell(_told(view, refused))
+            self.tell(line)
+
+    def _require_new(self, view: View, where: str) -> None:
+        if view.corners is None:
+            return
+        digest = corners_digest(view)
+        if digest in self._seen:
+            raise UsageError(
+                f"{where} holds the very corners of {self._seen[digest]}; a view must not count twice: name it once, "
+                "or show the board again"
+            )
+        self._seen[digest] = where
 
     def _of_rig(self, identity: Identity | None) -> None:
         if identity is None:
             return
         if self.identity is None:
             self._session.note_rig(identity)
-        elif (self.identity.rig, self.identity.serials) != (identity.rig, identity.serials):
+        elif not same_rig(self.identity, identity):
             raise UsageError(
                 f"views are of two rigs: {self.identity.name} ({_devices(self.identity)}) and {identity.name} "
                 f"({_devices(identity)}); calibrate each with its own"
             )
         self.identity = identity
 
-    def add_capture(self, capture: Capture) -> None:
-        """The view of a scan."""
-        self.add(capture.view, capture.refused, capture.identity)
+    def add_capture(self, capture: Capture, source: Path | None = None) -> None:
+        """The view of a scan, of a recorded one where a source is named."""
+        self.add(capture.view, capture.refused, capture.identity, source)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -105,14 +136,17 @@ class FixedPoses:
         return self.poses[len(views)] if len(views) < len(self.poses) else None
 
 
-def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int) -> FixedPoses:
-    """Poses that tell most about any rig, and a few more for those in which the board is missed."""
+def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> FixedPoses:
+    """Poses that tell most about any rig, and a few more for those in which the board is missed.
+
+    behind: so many of the sequence were shown before, by an earlier session: the next tell more than the same again.
+    """
     choices = candidates(first_camera(config), board, config.scan.depth_range)
     if not choices:
         raise UsageError(f"no pose of a board of {board.size_m[0]:g} x {board.size_m[1]:g} m fits the picture within "
                          f"scan.depth_range; use a smaller board or widen the range")  # fmt: skip
-    chosen = sequence(choices, poses + math.ceil(MISSED_SHARE * poses), seed)
-    return FixedPoses([Advice(candidate, at_m) for candidate in chosen])
+    chosen = sequence(choices, behind + poses + math.ceil(MISSED_SHARE * poses), seed)
+    return FixedPoses([Advice(candidate, at_m) for candidate in chosen[behind:]])
 
 
 def first_camera(config: RigConfig) -> Camera:
@@ -128,23 +162,26 @@ def first_camera(config: RigConfig) -> Camera:
 
 def take_kept(taken: Taken, sources: Sources, board: Board | None, defects: Defects = None) -> None:
     """Take the views that need no live rig. board: None where nothing moves and none is looked for."""
+    for note in sources.notes:
+        taken.say(note)
     for folder in sources.sessions:
         _require_alike(folder, board)
         identity = session_rig(folder)
         for view in load_views(folder / VIEWS):
-            taken.add(view, None, identity)
+            taken.add(view, None, identity, folder / VIEWS / view.name)
     for run in sources.recorded:
-        taken.add_capture(capture_recorded(run, run.name, board, defects=defects))
+        taken.add_capture(capture_recorded(run, run.name, board, defects=defects), run)
     for file in sources.pictures:
-        taken.add(*_pictured(file, board))
+        taken.add(*_pictured(file, board), source=file)
 
 
 @dataclass(frozen=True, slots=True)
 class Live:
     """How a live rig takes views. poses: good ones wanted; choose: which. ask: gets a person to move the board.
 
-    exposures: per column, by turns, so that the mirror is seen at several speeds; those that it cannot do are left out;
-    none: as the config says. seed: of everything simulated.
+    exposures: per column, by turns, so that the mirror is seen at several speeds; those that it cannot do are left out,
+    and those that never show the line where more exposures do; none: as the config says. line: whether it is to be seen
+    on the board. seed: of everything simulated.
     """
 
     config: RigConfig
@@ -155,12 +192,17 @@ class Live:
     seed: int = 0
     arm: bool = False
     defects: Defects = None
+    line: bool = True
+
+    def sees(self, capture: Capture) -> bool:
+        """Whether a capture has what it was taken for."""
+        return capture.refused is None and (not self.line or shows_line(capture.view))
 
 
 def take_live(taken: Taken, live: Live, board: Board) -> None:
     """Take views of a board that is moved from pose to pose."""
     good, seen = 0, list[View]()
-    speeds = list(live.exposures)
+    speeds = SpeedTurns(live.exposures, live.sees, taken.tell)
     while good < live.poses and len(seen) < live.poses + math.ceil(MISSED_SHARE * live.poses):
         advice = live.choose.next(seen)
         if advice is None:
@@ -168,25 +210,18 @@ def take_live(taken: Taken, live: Live, board: Board) -> None:
         config = shown(
             live.config, f"pose {good + 1} of {live.poses}: {advice}", advice.candidate, live.ask, taken.tell
         )
-        capture = _captured(taken, live, config, board, good, speeds)
+        capture = speeds.capture(good, partial(_scan, taken, live, config, board))
         taken.add_capture(capture)
         seen.append(capture.view)
-        good += capture.refused is None
+        good += live.sees(capture)
 
 
-def _captured(taken: Taken, live: Live, config: RigConfig, board: Board, good: int, speeds: list[int]) -> Capture:
-    """One view, at the speed whose turn it is; speeds that the rig cannot do are taken out of the list."""
+def _scan(taken: Taken, live: Live, config: RigConfig, board: Board, exposures: int | None) -> Capture:
+    """One view of the board as it stands."""
     at = len(taken.views)
-    while True:
-        exposures = speeds[good % len(speeds)] if speeds else None
-        try:
-            return capture_view(
-                config, f"{at:03d}", board, seed=live.seed + at, exposures=exposures, arm=live.arm, defects=live.defects
-            )
-        except PlanError:
-            if exposures is None or len(speeds) < 2:
-                raise
-            speeds.remove(exposures)
+    return capture_view(
+        config, f"{at:03d}", board, seed=live.seed + at, exposures=exposures, arm=live.arm, defects=live.defects
+    )
 
 
 def _require_alike(folder: Path, board: Board | None) -> None:
@@ -228,12 +263,3 @@ def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]
 
 def _devices(identity: Identity) -> str:
     return ", ".join([*identity.kinds.values(), *identity.serials.values()])
-
-
-def _told(view: View, refused: Degenerate | None) -> str:
-    if refused is not None:
-        return f"view {view.name}: {refused}"
-    parts = [] if view.corners is None else [f"{len(view.corners.ids)} corners"]
-    if view.passages:
-        parts.append(f"{', '.join(str(len(sweep.command)) for sweep in view.passages)} passages of the line")
-    return f"view {view.name}: {', '.join(parts) or 'nothing'}"

@@ -4,18 +4,21 @@ import dataclasses
 import itertools
 import math
 from fractions import Fraction
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from calibration import CalibrationError, RigModel
 from drivers.interfaces import LEVEL_BACKWARD, ScanWaveform
 from drivers.mirror_ramps import brake, ramp
 from rig.blanking_search import PatternSearch, PatternShape, detection_probability
 from rig.errors import PlanError
 from rig.mirror_path import Motion, mirrored, sweep_path
 from rig.path_search import narrowed
+from rig.plan import require_speed
 from rig.scan_plan import ScanPlan, rounded
 from sim_backend.mirror_motion import Playing, Resting
 from tests.stability.inventory import EXAMPLES, covers
@@ -114,6 +117,26 @@ def plans(draw):
     except PlanError:
         assume(False)
         raise
+
+
+@covers("rig.plan:require_speed")
+@EXAMPLES
+@given(
+    speed=st.floats(0, 1e6), ends=st.lists(st.floats(0, 1e6), min_size=2, max_size=2), exposures=st.integers(1, 10**6)
+)
+def test_a_speed_that_was_not_calibrated_comes_with_exposures_that_can_be_scanned(speed, ends, exposures) -> None:
+    low, high = sorted(ends)
+    model = SimpleNamespace(speed_range_per_s=(low, high))
+    model.check_speed = lambda asked: RigModel.check_speed(model, asked)
+    if low <= speed <= high:
+        require_speed(model, speed, exposures)
+        return
+    with pytest.raises(CalibrationError, match="rig calibrate sync") as refused:
+        require_speed(model, speed, exposures)
+    advised = [int(number) for number in str(refused.value).rsplit(" ", 1)[1].split(",")]
+    assert len(advised) == 2
+    assert exposures in advised
+    assert 1 <= min(advised) < max(advised) <= 1000 * exposures + 1
 
 
 @covers(

@@ -68,6 +68,13 @@ def test_what_does_not_fit_is_said_before_anything_moves(rig: Rig, foggy: Path) 
     assert ran.code == 2
     assert ran.problems[0].startswith("error: scan.adaptive: the first pass takes")
     assert "raise time_budget or lower first_exposures" in ran.err
+    for options, next_step in (
+        (["--exposures", "3"], "raise scan.exposures"),
+        (["--time-budget", "6.5 ms"], "raise time_budget"),
+    ):
+        ran = rig("scan", foggy, *options)
+        assert (ran.code, len(ran.problems)) == (2, 1)
+        assert "would be a plain sweep; " + next_step in ran.problems[0]
     text = foggy.read_text()
     foggy.write_text(text.replace("command_range:", "bidirectional: true\n  command_range:"))
     ran = rig("scan", foggy)
@@ -77,3 +84,12 @@ def test_what_does_not_fit_is_said_before_anything_moves(rig: Rig, foggy: Path) 
     ran = rig("scan", foggy)
     assert ran.code == 2
     assert "first_exposures" in ran.err
+
+
+def test_a_dry_run_says_what_passes_there_will_be(rig: Rig, foggy: Path) -> None:
+    ran = rig("scan", foggy, "--time-budget", "9 ms", "--dry-run")
+    assert ran.code == 0, ran.err
+    assert "passes      at most 3 a map in 9.0 ms of sensor time; first 3 exposures of all columns" in ran.out
+    told = json.loads(rig("scan", foggy, "--dry-run", "--json").out)
+    assert told["adaptive"]["most_passes"] == told["adaptive"]["first_exposures"] == 3
+    assert told["adaptive"]["time_budget_s"] == told["plan"]["sweep_s"]

@@ -1,5 +1,6 @@
 """A calibration of another rig: exit code 2 and one line, or `--accept-calibration` and a line in the table."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,3 +39,17 @@ def test_scan_replay_and_reconstruct_refuse_it_and_accept_it_where_told_to(rig: 
     assert again.code == 0
     assert "accepted in spite of other-spad" in again.out
     assert rig("replay", "run", "--clock", "max", "--accept-calibration", "--out", "replayed").code == 0
+
+
+def test_a_tradeoff_asks_for_it_as_the_scan_of_its_answer_will(rig: Rig, foreign: Path) -> None:
+    asked = ["tradeoff", foreign, "--exposures", 4, "--estimators", "argmax", "--filters", "none", "--no-limits"]
+    refused = rig(*asked, "--out", "none")
+    assert (refused.code, len(refused.problems)) == (2, 1)
+    assert "'SPB-0042', this rig has 'SIM-0001'; calibrate again, or add --accept-calibration" in refused.problems[0]
+    assert not Path("none").exists()
+    accepted = rig(*asked, "--lines", 2, "--error", "100 px", "--accept-calibration", "--out", "tried")
+    assert accepted.code == 0, accepted.err
+    assert "calibration accepted in spite of other-spad" in accepted.out
+    (noted,) = json.loads(Path("tried/tradeoff.json").read_text())["accepted_calibration"]
+    assert noted.startswith("other-spad: ")
+    assert "scan with --accept-calibration" in Path("tried/setting.yaml").read_text()

@@ -11,6 +11,7 @@ import yaml
 from calibration.board.board import load_board
 from calibration.files.rig_file import load_rig_model
 from rig import api
+from rig.calibration_identity import refusals
 from rig.errors import UsageError
 from tests.system.board_rig import write_board_rig
 from tests.system.conftest import Rig
@@ -67,6 +68,24 @@ def test_views_kept_earlier_are_a_source_and_a_wrong_baseline_fails(calibrated: 
     assert model.provenance["verdict"] == "failed"
     assert model.identity is not None
     assert (model.identity.name, model.identity.verdict) == ("board-rig", "failed")
+
+
+def test_a_view_that_is_named_twice_counts_for_neither(calibrated: Path, rig: Rig) -> None:
+    out, board = calibrated / "out", ("--board", calibrated / "board.yaml")
+    ran = rig("calibrate", "planes", out, out, *board, "--out", "twice")
+    assert ran.code == 2
+    assert ran.problems == [f"error: {out} is named twice; what is in it must count once: name it once"]
+    Path("copy/views").mkdir(parents=True)
+    Path("copy/views/007.npz").write_bytes((out / "views" / "001.npz").read_bytes())
+    ran = rig("calibrate", "planes", out, "copy", *board, "--out", "copied")
+    assert ran.code == 2
+    assert ran.problems[0].startswith(f"error: copy/views/001 holds the very corners of {out / 'views' / '001'}; ")
+    assert not Path("copied/calibration.yaml").exists()
+    board_file = _draw_pictures(1)
+    Path("pictures/copy.png").write_bytes(Path("pictures/0.png").read_bytes())
+    ran = rig("calibrate", "camera", "pictures", "--board", board_file, "--out", "camera")
+    assert ran.code == 2
+    assert ran.problems[0].startswith("error: pictures/copy.png holds the very corners of pictures/0.png; ")
 
 
 def test_one_view_is_refused_with_its_reason_and_only_the_view_stays(calibrated: Path, rig: Rig) -> None:
@@ -127,6 +146,31 @@ def test_a_check_scans_the_board_anew_and_says_how_flat_and_large_it_is(calibrat
     assert board["scale"] == pytest.approx(1, abs=0.01)
     assert summary["depth_error"]["line"].startswith("at 3 m: ")
     assert (Path("check") / "report.html").is_file()
+    assert summary["scans_refuse_it"] is False
+
+
+def test_a_check_that_fails_says_that_scans_refuse_the_calibration_now_and_what_takes_that_back(
+    calibrated: Path, rig: Rig
+) -> None:
+    text, file = (calibrated / "board.yaml").read_text(), calibrated / "out" / "calibration.yaml"
+    board = yaml.safe_load(text)
+    side_mm = float(board["square"].removesuffix(" mm"))
+    Path("mistyped.yaml").write_text(yaml.safe_dump(board | {"square": f"{1.2 * side_mm:g} mm"}))
+    asked = ["--calibration", file, "--at", "3 m", "--accuracy", "20 mm"]
+    shown = [calibrated / "board-rig.yaml", "--scene", calibrated / "scene.yaml", "--seed", "6"]
+    ran = rig("calibrate", "check", *shown, "--board", "mistyped.yaml", *asked, "--out", "failed")
+    assert ran.code == 1, ran.err
+    assert f"from now on  scan, replay and reconstruct refuse {file} " in ran.out
+    assert "a check of it that passes, with the right angle or board, takes that back" in ran.out
+    assert "rig calibrate check" in _against(file)
+    ran = rig("calibrate", "check", "failed", "--board", calibrated / "board.yaml", *asked, "--out", "passed")
+    assert ran.code == 0, ran.err
+    assert "from now on" not in ran.out
+    assert not _against(file)
+
+
+def _against(calibration: Path) -> str:
+    return "; ".join(each.text for each in refusals(load_rig_model(calibration), calibration, None))
 
 
 def test_views_that_a_calibration_was_made_of_are_no_check_of_it(calibrated: Path, rig: Rig) -> None:
@@ -150,7 +194,8 @@ def test_lags_are_found_from_one_unmoved_scene(calibrated: Path, rig: Rig) -> No
     assert load_rig_model(Path("sync/calibration.yaml")).speed_range_per_s is not None
 
 
-def test_a_camera_comes_from_pictures_too(rig: Rig) -> None:
+def _draw_pictures(shown: int, blank: int = 0) -> Path:
+    """Pictures of a chessboard and of nothing in the folder `pictures`; the board's file."""
     board_file = Path("board.yaml")
     board_file.write_text(yaml.safe_dump({"kind": "chessboard", "squares": [8, 6], "square": "30 mm"}))
     board = load_board(board_file)
@@ -158,13 +203,20 @@ def test_a_camera_comes_from_pictures_too(rig: Rig) -> None:
     Path("pictures").mkdir()
     rng = np.random.default_rng(2)
     matrix = np.array([[500, 0, 320.0], [0, 500, 240], [0, 0, 1]])
-    for i in range(8):
+    for i in range(shown):
         turn = cv2.Rodrigues(np.array([*rng.uniform(-0.5, 0.5, 2), 0.1]))[0]
         shift = np.array([*rng.uniform(-0.06, 0.06, 2), 0.45]) - turn @ [0.12, 0.09, 0]
         to_board = np.array([[0.03 / 40, 0, -0.015], [0, 0.03 / 40, -0.015], [0, 0, 1]])
         seen = matrix @ np.column_stack([turn[:, 0], turn[:, 1], shift]) @ to_board
         picture = cv2.warpPerspective(drawn, seen, (640, 480), flags=cv2.INTER_AREA, borderValue=128)
         cv2.imwrite(f"pictures/{i}.png", picture)
+    for i in range(blank):
+        cv2.imwrite(f"pictures/blank-{i}.png", np.full((480, 640), 128, np.uint8))
+    return board_file
+
+
+def test_a_camera_comes_from_pictures_too(rig: Rig) -> None:
+    board_file = _draw_pictures(8)
     ran = rig("calibrate", "camera", "pictures", "--board", board_file, "--terms", "4", "--out", "camera", "--json")
     assert ran.code in (0, 1), ran.err
     summary = json.loads(ran.out)
@@ -172,6 +224,16 @@ def test_a_camera_comes_from_pictures_too(rig: Rig) -> None:
     assert summary["views"]["shown"] == 8
     assert yaml.safe_load(Path("camera/camera.yaml").read_text())["camera"]["width"] == 640
     assert Path("camera/report.html").is_file()
+
+
+def test_two_pictures_that_show_the_board_are_no_camera_however_many_are_named(rig: Rig) -> None:
+    board_file = _draw_pictures(2, blank=6)
+    ran = rig("calibrate", "camera", "pictures", "--board", board_file, "--terms", "4", "--out", "camera")
+    assert ran.code == 2
+    assert ran.problems[0].startswith("error: too-few-poses: 8 poses were shown, 2 of them could be used, 6 are ")
+    assert "a camera takes 3 poses or more" in ran.err
+    assert "condition number" in ran.err
+    assert not Path("camera/camera.yaml").exists()
 
 
 @pytest.fixture(scope="module")

@@ -42,6 +42,13 @@ def test_help_names_the_commands_and_options(rig: Rig) -> None:
         assert option in told
 
 
+def test_the_package_runs_as_the_command_does() -> None:
+    ran = subprocess.run(
+        [sys.executable, "-m", "rig", "--version"], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert ran.stdout.startswith("spadrig ")
+
+
 def test_version_and_no_command(rig: Rig) -> None:
     assert rig("--version").out.startswith("spadrig ")
     ran = rig()

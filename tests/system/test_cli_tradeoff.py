@@ -10,13 +10,18 @@ from tests.system.conftest import Rig
 
 ASKED = {
     "scene", "fog", "estimator", "filter", "exposures", "lines", "sensor_ms", "compute_ms", "mean_abs_px",
-    "within_1px", "depth_mm", "ci95", "times_limit", "pareto",
+    "within_1px", "depth_mm", "ci95", "times_limit", "exponent_nats", "times_wrong_limit", "local_sd_px",
+    "position_sd_px", "times_position_limit", "pareto",
 }  # fmt: skip
 
 
-def test_rows_files_and_the_setting_to_use(rig: Rig, small: Path, tmp_path: Path) -> None:
+def test_rows_files_and_the_setting_to_use(
+    rig: Rig, small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    named = Path("..", small.parent.name, small.name)
+    assert named.is_file()
     ran = rig(
-        "tradeoff", small, "--fog", "60m,clear", "--exposures", "2,8", "--estimators", "argmax,edge", "--filters",
+        "tradeoff", named, "--fog", "60m,clear", "--exposures", "2,8", "--estimators", "argmax,edge", "--filters",
         "none,median", "--no-limits", "--error", "30 px", "--out", tmp_path / "out", "--json",
     )  # fmt: skip
     assert ran.code == 0, ran.err
@@ -38,6 +43,7 @@ def test_rows_files_and_the_setting_to_use(rig: Rig, small: Path, tmp_path: Path
     }  # fmt: skip
     answer = told["answer"]
     assert answer["fits"]
+    monkeypatch.chdir("/")
     again = rig("scan", tmp_path / "out" / "setting.yaml", "--out", tmp_path / "scan", "--json")
     assert again.code == 0, again.err
     scanned = json.loads(again.out)
@@ -57,6 +63,9 @@ def test_repeats_differ_and_what_cannot_be_had_ends_with_1_and_the_nearest(rig: 
     (row,) = json.loads(Path("out/tradeoff.json").read_text())["rows"]
     assert row["ci95"][0] < row["mean_abs_px"] < row["ci95"][1]
     assert row["times_limit"] > 0.7
+    assert row["exponent_nats"] > 0
+    assert 0 < row["position_sd_px"] < 1
+    assert "beside what its light allows" in ran.out
     assert not Path("out/setting.yaml").exists()
 
 

@@ -1,6 +1,8 @@
 """A whole rig from corners and passages, against rigs of a second simulator."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from calibration.errors import CalibrationError, Degenerate
 from calibration.guide.forecast import Forecast
 from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
+from calibration.rig_fit import misfit
 from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import Passages, View
 from tests.reference.calibration_data import (
@@ -209,6 +212,37 @@ def test_a_view_of_a_moved_rig_is_named_and_left_out() -> None:
     assert all(np.isfinite(sweep.residual).all() for view in fit.sweeps for sweep in view)
     error, sd = depth_errors(fit.model, RIG, 5.0, 35.2)
     assert np.sqrt(np.mean((error / sd) ** 2)) < 2.5
+
+
+@pytest.mark.parametrize(
+    ("gains", "odd"),
+    [
+        ((9.0, None, 24.0, 86.0, 98.0, None), None),  # as on a board rig: light on four boards, no model fits them well
+        ((9.0, None, 24.0, 30.0, 400.0, None), 4),
+        ((9.0, 24.0, 30.0, 160.0), None),
+        ((1.0, 2.0, 1.0, 50.0), None),
+        ((None, 2.0, None, 1.0, 500.0), None),
+    ],
+)
+def test_views_without_passages_make_no_other_odd(
+    monkeypatch: pytest.MonkeyPatch, gains: tuple[float | None, ...], odd: int | None
+) -> None:
+    monkeypatch.setattr(misfit, "_own_place", lambda problem, solution, view: gains[view] or 0.0)
+    sightings = [SimpleNamespace(command=np.zeros(0 if gain is None else 50)) for gain in gains]
+    problem: Any = SimpleNamespace(counted=np.ones(len(gains), bool), sightings=sightings)
+    found: Any = None
+    assert misfit.odd_view(problem, found) == odd
+
+
+def test_no_more_than_a_third_of_the_views_with_passages_is_left_out() -> None:
+    """Of ten, four were each taken with the scanner elsewhere; three more show no line."""
+    rng = np.random.default_rng(12)
+    places = [RIG.moved(np.array([0.003 * far, 0, 0]), np.radians([0, 0.3 * far, 0])) for far in (10, 3, 1, 0.3)]
+    rigs = [*places, *[RIG] * 9]
+    views = [seen_view(rng, at, *random_pose(rng, RIG), SEEN, name=f"view {i}") for i, at in enumerate(rigs)]
+    views[10:] = [replace(view, passages=()) for view in views[10:]]
+    fit = fit_rig(views, BOARD, SIZE, camera=true_camera(RIG), hold_camera=True)
+    assert fit.outliers == ("view 0", "view 1", "view 2")
 
 
 def test_a_rig_moved_half_way_shows_as_misfit() -> None:

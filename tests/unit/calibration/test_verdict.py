@@ -9,14 +9,17 @@ import pytest
 from calibration.board.board import Board
 from calibration.errors import Degenerate
 from calibration.judging.evidence import PoseEvidence, ViewEvidence, pose_evidence, view_evidence
+from calibration.judging.rig import judge_fit
 from calibration.judging.rules import FitEvidence, judge, judge_refusal
 from calibration.judging.sweep_waves import SweepResidual, sweep_waves
 from calibration.judging.view_shifts import ViewShift, common_shift, counted, last_before_move
+from calibration.rig_fit.fit import fit_rig
 from calibration.verdict import Asked
 from calibration.views import BoardPose, Corners, View
+from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_views
 
 ASKED = Asked(accuracy_m=0.014, at_m=5.0, stated_baseline_m=0.3)
-VIEWS = ViewEvidence(shown=12, coverage=0.8, room_flux=0.2)
+VIEWS = ViewEvidence(shown=12, used=12, coverage=0.8, room_flux=0.2)
 FIT = FitEvidence(
     PoseEvidence(tilt_rad=radians(60), distance_m=1.6, board_rad=0.35),
     expected_m=0.004,
@@ -33,6 +36,7 @@ def test_a_sound_calibration_passes() -> None:
     verdict = judge(VIEWS, FIT, ASKED)
     assert verdict.passed
     assert verdict.codes == ()
+    assert judge(VIEWS, replace(FIT, shift_m=0.005, shift_noise_m=0.006), ASKED).passed
 
 
 @pytest.mark.parametrize(
@@ -42,16 +46,22 @@ def test_a_sound_calibration_passes() -> None:
         ("moved-rig", VIEWS, replace(IMPRECISE, wave_m=0.002, shift_m=0.1)),
         ("moved-rig", VIEWS, replace(FIT, wave_m=0.02, shift_m=0.3)),
         ("moved-rig", VIEWS, replace(FIT, expected_m=0.02, misfit=21.0, shift_m=0.005)),
+        ("moved-rig", VIEWS, replace(FIT, shift_m=0.005, shift_noise_m=0.002)),
         ("wrong-square-size", VIEWS, replace(FIT, baseline_m=0.309)),
         ("room-light", replace(VIEWS, room_flux=8.0), IMPRECISE),
         ("room-light", replace(VIEWS, room_flux=8.0), FIT),
         ("room-light", replace(VIEWS, room_flux=1.5), IMPRECISE),
         ("room-light", replace(VIEWS, room_flux=5.3), replace(IMPRECISE, wave_m=0.1)),
         ("room-light", replace(VIEWS, room_flux=1.5), replace(IMPRECISE, wave_m=0.02, wave_noise_m=0.04)),
-        ("too-few-poses", replace(VIEWS, shown=3, coverage=0.3), IMPRECISE),
-        ("too-few-poses", replace(VIEWS, shown=3), FIT),
+        ("too-few-poses", replace(VIEWS, shown=3, used=3, coverage=0.3), IMPRECISE),
+        ("too-few-poses", replace(VIEWS, shown=3, used=3), FIT),
+        ("too-few-poses", replace(VIEWS, used=5), FIT),
+        ("too-few-poses", replace(VIEWS, used=2, coverage=0.2), IMPRECISE),
+        ("room-light", replace(VIEWS, used=2, room_flux=1.5), IMPRECISE),
         ("no-tilt", VIEWS, replace(IMPRECISE, poses=replace(FIT.poses, tilt_rad=radians(3)))),
         ("board-too-far", VIEWS, replace(IMPRECISE, poses=replace(FIT.poses, board_rad=0.08))),
+        ("board-too-far", VIEWS, replace(IMPRECISE, shift_m=0.3, poses=replace(FIT.poses, board_rad=0.08))),
+        ("exposure-not-locked", VIEWS, replace(IMPRECISE, wave_m=0.22, shift_m=0.3)),
         ("poor-coverage", replace(VIEWS, coverage=0.2), IMPRECISE),
         ("too-few-poses", VIEWS, IMPRECISE),  # nothing wrong with the data but their number
     ],
@@ -99,10 +109,28 @@ def test_unknown_errors_do_not_pass() -> None:
 )
 def test_a_refusal_names_the_cause(reason: str, room_flux: float, code: str) -> None:
     shown = 1 if reason == "one-pose" else 10
-    views = replace(VIEWS, shown=shown, room_flux=room_flux)
+    views = replace(VIEWS, shown=shown, used=0 if reason == "no-board" else shown, room_flux=room_flux)
     verdict = judge_refusal(Degenerate(reason, "all boards lie in one plane"), views)
     assert not verdict.passed
     assert verdict.codes[0] == code
+
+
+def test_views_that_cannot_be_used_do_not_count_as_poses() -> None:
+    (reason,) = judge(replace(VIEWS, shown=8, used=4), FIT, ASKED).reasons
+    assert str(reason).startswith("too-few-poses: 8 poses were shown, 4 of them could be used, 6 are the fewest")
+    assert (reason.value, reason.limit) == (4, 6)
+    refused = judge_refusal(Degenerate("no-line", "0 of 8 views show both"), replace(VIEWS, shown=8, used=0))
+    assert refused.codes[0] == "no-line"  # which is why none of them could be
+
+
+def test_views_without_board_or_line_are_no_poses_of_a_fit() -> None:
+    seen = random_views(np.random.default_rng(4), TrueRig(), 7, Seen(passages=60))
+    views = [*seen[:4], View("a", None), View("b", None), replace(seen[5], passages=()), replace(seen[6], passages=())]
+    fit = fit_rig(views, BOARD, (512, 512))
+    assert (len(fit.used), fit.left_out, fit.without_line) == (4, ("a", "b"), ("005", "006"))
+    verdict = judge_fit(fit, views, accuracy_m=1.0).verdict
+    assert verdict.codes[0] == "too-few-poses"
+    assert "8 poses were shown, 4 of them could be used" in verdict.reasons[0].text
 
 
 def test_views_tell_coverage_and_room_light() -> None:
@@ -112,8 +140,8 @@ def test_views_tell_coverage_and_room_light() -> None:
     picture[130:230, 130:270] = 2.0
     seen = View("a", Corners(np.arange(len(px), dtype=np.int32), px), picture=picture)
     unseen = View("b", None, picture=np.full((300, 400), 2.0, np.float32))
-    evidence = view_evidence([seen, unseen], (400, 300))
-    assert evidence.shown == 2
+    evidence = view_evidence([seen, unseen], (400, 300), 1)
+    assert (evidence.shown, evidence.used) == (2, 1)
     assert evidence.coverage == pytest.approx(120 * 80 / (400 * 300))
     assert evidence.room_flux == pytest.approx(2.0)
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from calibration.judging.rig import judge_fit
 from calibration.rig_fit.fit import fit_rig
-from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_pose, seen_view
+from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_pose, random_rig, seen_view
+from tests.reference.fitted_depth import depth_errors
 
 SIZE = (512, 512)
 RIG = TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0), angle=(0.09, 0.53))
@@ -26,6 +27,19 @@ def test_views_with_poor_corners_and_single_wrong_ones_are_no_moved_rig() -> Non
     judged = judge_fit(fit_rig(views, BOARD, SIZE), views)
     assert judged.verdict.passed, judged.verdict
     assert max(abs(one.shift) / one.sd for one in judged.shifts) < 4
+
+
+def test_a_knock_is_named_that_the_fit_has_nearly_made_up_for() -> None:
+    """What views contradict each other by is less than the accuracy asked, and depth off by three times as much."""
+    rng = np.random.default_rng(34)
+    rig, seen = random_rig(rng), Seen(passages=200, corner_px=0.02, passage=5e-4)
+    moved = rig.moved(np.array([0.001, 0, 0.002]), np.zeros(3))
+    views = [seen_view(rng, moved if i >= 4 else rig, *random_pose(rng, rig), seen, name=str(i)) for i in range(9)]
+    fit = fit_rig(views, BOARD, SIZE)
+    judged = judge_fit(fit, views)
+    assert judged.verdict.codes == ("moved-rig",)
+    assert judged.evidence.shift_m < 0.6 * judged.asked.accuracy_m
+    assert np.median(np.abs(depth_errors(fit.model, moved, 5.0, 35.2)[0])) > 2 * judged.asked.accuracy_m
 
 
 def test_a_rig_that_moved_is_named_with_the_last_view_before() -> None:

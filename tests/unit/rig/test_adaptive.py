@@ -59,6 +59,25 @@ def test_gain_is_that_of_errors_that_fall_as_one_over_the_frames() -> None:
         np.testing.assert_allclose(unsettled(120.0 / half - wrong, n).gain(6), wrong - 120.0 / (n + 6))
 
 
+def test_gaps_are_scanned_where_another_pass_would_cost_more_travel_than_they_take() -> None:
+    moved = np.full(COLUMNS, 3.0)
+    moved[np.arange(COLUMNS) // 20 % 2 == 0] = 30.0
+    found = next_pass(unsettled(moved), pass_time, 12e-3, 3)
+    assert found is not None
+    assert (found.first_column, found.exposures) == (0, 4)
+    assert found.columns > 180
+
+
+def test_moved_rows_of_a_column_are_those_of_it_and_its_neighbours() -> None:
+    moved = np.zeros(COLUMNS)
+    moved[100] = 150.0
+    gain = unsettled(moved).gain(2)  # as many frames again decide half of the 10 rows that each of 15 columns has
+    np.testing.assert_allclose(gain[93:108], 5.0)
+    assert np.all(gain[:93] == 0)
+    assert np.all(gain[108:] == 0)
+    np.testing.assert_allclose(unsettled(30.0).gain(2), 15.0)  # fewer neighbours at the ends
+
+
 def test_rows_that_were_not_searched_do_not_move() -> None:
     here, there = StripeTable.empty(2, 3), StripeTable.empty(2, 3)
     here.x_px[:] = [[5, 5, 5], [9, np.nan, 9]]

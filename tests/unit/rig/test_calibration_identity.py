@@ -12,7 +12,7 @@ import pytest
 from calibration.files.rig_file import load_rig_model, save_rig_model
 from calibration.model.rig_model import Identity, RigModel
 from rig import api
-from rig.calibration_identity import carry_notes, identity_of, note_check, recorded_identity, refusals
+from rig.calibration_identity import carry_notes, identity_of, note_check, recorded_identity, refusals, same_rig
 from rig.config import CubePlan
 from rig.doctor import examine
 from rig.errors import UsageError
@@ -117,6 +117,49 @@ def test_a_foreign_or_stale_calibration_is_refused_and_can_be_accepted(
     assert noted["check"] == "accepted"
     assert [each[0] for each in noted["accepted"]] == [code]
     assert [line.split(":")[0] for line in result.summary.as_json()["accepted_calibration"]] == [code]
+
+
+def old(identity: Identity) -> Identity:
+    """As made before a simulated rig was told by more than the name of its geometry's file."""
+    return replace(identity, kinds={slot: kind for slot, kind in identity.kinds.items() if slot != "geometry"})
+
+
+def test_a_simulated_rig_is_told_by_what_its_geometry_holds_and_not_by_its_file_s_name(tmp_path: Path) -> None:
+    rig, geometry, elsewhere = calibrated(tmp_path), tmp_path / "rig.yaml", tmp_path / "elsewhere.yaml"
+    text = geometry.read_text()
+    elsewhere.write_text(f"# the same rig by another name\n{text}")
+    config = api.configure(rig)
+    assert config.world is not None
+    renamed = config.model_copy(update={"world": config.world.model_copy(update={"geometry": str(elsewhere)})})
+    api.plan_scan(renamed)
+    moved = text.replace("-0.3", "-0.28")
+    assert moved != text
+    geometry.write_text(moved)
+    said = r"made.yaml: is of the rig 'small' with world 'rig.yaml \(\w{16}\)', this rig has 'rig.yaml .*--accept-cal"
+    with pytest.raises(UsageError, match=said):
+        api.plan_scan(rig)
+    api.plan_scan(rig, accept_calibration=True)
+    api.plan_scan(renamed)
+
+
+def test_a_calibration_that_knows_no_more_of_a_geometry_than_its_name_is_compared_by_that(tmp_path: Path) -> None:
+    rig = calibrated(tmp_path, old)
+    api.plan_scan(rig)
+    (tmp_path / "rig.yaml").rename(tmp_path / "elsewhere.yaml")
+    rig.write_text(rig.read_text().replace("./rig.yaml", "./elsewhere.yaml"))
+    with pytest.raises(UsageError, match=r"with world 'rig\.yaml', this rig has 'elsewhere\.yaml'"):
+        api.plan_scan(rig)
+
+
+def test_views_of_one_rig_are_told_from_those_of_another() -> None:
+    mine = Identity(
+        "0", "2026-11-22T10:00:00+00:00", kinds={"world": "rig.yaml", "geometry": "ab"}, serials={"spad": "1"}
+    )
+    assert same_rig(mine, old(mine))
+    assert same_rig(mine, replace(mine, kinds={"world": "renamed.yaml", "geometry": "ab"}))
+    assert not same_rig(mine, replace(mine, kinds={"world": "rig.yaml", "geometry": "cd"}))
+    assert not same_rig(old(mine), replace(mine, kinds={"world": "other.yaml"}))
+    assert not same_rig(mine, replace(mine, serials={}))
 
 
 def test_a_calibration_within_its_age_is_used(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from rig.config_files import (
     load_config,
     load_cube_plan,
     parse_config,
+    portable_content,
 )
 from rig.errors import UsageError
 from rig.estimators import ESTIMATORS, FILTERS
@@ -180,6 +181,30 @@ def test_paths_are_relative_to_the_config(write, tmp_path, monkeypatch):
     dumped = config.world.model_dump()
     assert dumped["scene"] == str(tmp_path / "scenes" / "hall.yaml")
     assert dumped["geometry"] == str(tmp_path / "rig-model.yaml")
+
+
+def test_a_config_named_by_a_relative_path_is_written_out_for_any_folder(write, tmp_path, monkeypatch):
+    for name in ("rig", "rig/scenes", "art", "street", "elsewhere"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "rig" / "scenes" / "hall.yaml").write_text("surfaces: street\n", encoding="utf-8")
+    text = RIG.replace("name: test", "name: test\ncalibration: cal.yaml")
+    write(
+        text.replace("kind: simulated}", "kind: simulated, scene: scenes/hall.yaml, geometry: ./m.yaml}", 1),
+        "rig/r.yaml",
+    )
+    monkeypatch.chdir(tmp_path / "art")
+    for scene, meant in (
+        (None, "rig/scenes/hall.yaml"),
+        ("../art", "art"),
+        ("../rig/scenes/hall.yaml", "rig/scenes/hall.yaml"),
+    ):
+        content = portable_content(load_config("../rig/r.yaml", {"world.scene": scene}))
+        assert content["calibration"] == str(tmp_path / "rig" / "cal.yaml")
+        assert content["world"]["geometry"] == str(tmp_path / "rig" / "m.yaml")
+        assert content["world"]["scene"] == str(tmp_path / meant)
+    monkeypatch.chdir(tmp_path)
+    for scene, meant in (("street", "street"), ("art", str(tmp_path / "art"))):
+        assert portable_content(load_config("rig/r.yaml", {"world.scene": scene}))["world"]["scene"] == meant
 
 
 def test_a_config_written_out_reads_back_to_the_same(write):

@@ -109,14 +109,19 @@ def test_clear_air_has_ambient_light_and_nothing_else() -> None:
     assert fog.brief() == ""
 
 
-def test_under_a_halo_only_dark_frames_tell_anything() -> None:
-    """A halo falls off on both sides of stripes as haze would, so that neither extinction nor veil can be told."""
+@pytest.mark.parametrize("cause", ["halo", "lines"])
+def test_light_that_is_no_haze_of_the_line_leaves_only_what_dark_frames_tell(cause) -> None:
+    """A halo falls off on both sides of stripes as haze would; where the haze of other lines ends is not known."""
     sweep = swept(Light(haze=0.3, ambient=0.02, extinction_per_m=0.2), 20)
-    halo = replace(state_of(sweep, 1.2), halo=np.full_like(state_of(sweep).halo, 0.1))
-    assert read_fog(sweep.volume, stripes_of(sweep), sweep.geometry, halo) == FogEstimate()
+    state, geometry = state_of(sweep, 1.2), sweep.geometry
+    if cause == "halo":
+        state = replace(state, halo=np.full_like(state.halo, 0.1))
+    else:
+        geometry = replace(geometry, others=np.roll(geometry.plane, COLUMNS // 2, axis=0)[:, None])
+    assert read_fog(sweep.volume, stripes_of(sweep), geometry, state) == FogEstimate()
     dark = np.random.default_rng(1).binomial(500, -np.expm1(-0.02), (ROWS, 512)).astype(np.uint32)
     volume = volume_of(sweep.counts, sweep.geometry, 20, dark_counts=dark, n_dark=500)
-    fog = read_fog(volume, stripes_of(sweep), sweep.geometry, halo)
+    fog = read_fog(volume, stripes_of(sweep), geometry, state)
     assert fog.ambient_per_exposure == pytest.approx(0.02, rel=0.05)
     assert fog == FogEstimate(
         ambient_per_exposure=fog.ambient_per_exposure, ambient_sd_per_exposure=fog.ambient_sd_per_exposure

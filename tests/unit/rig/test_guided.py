@@ -2,6 +2,7 @@
 
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from calibration.guide.poses import Advice, candidates
 from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
 from calibration.rig_fit.fit import fit_rig
-from rig.calibrating import planes_run
+from rig.calibrating import planes_run, taking
 from rig.calibrating.guided import Guide
 from rig.calibrating.taking import FixedPoses
 from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_views
@@ -38,6 +39,17 @@ def test_a_camera_that_is_known_counts_in_what_the_guide_expects() -> None:
     told = fit_rig(views, BOARD, SIZE, camera=lens, known=known)
     assert before[1] == planes_run._judged(taken, asked, told).evidence.expected_m
     assert before[1] < 0.8 * before[0]
+
+
+def test_a_later_session_shows_the_poses_that_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    lens = Camera(*SIZE, np.array([[600, 0, 255.5], [0, 600, 255.5], [0, 0, 1.0]]), np.zeros(5))
+    monkeypatch.setattr(taking, "first_camera", lambda config: lens)
+    config: Any = SimpleNamespace(scan=SimpleNamespace(depth_range=(0.5, 4.0)))
+    first, later = (taking.good_poses(config, BOARD, 4, 5.0, 0, behind) for behind in (0, 4))
+    whole = taking.good_poses(config, BOARD, 8, 5.0, 0)
+    shown = [str(later.next([None] * live)) for live in range(4)]  # type: ignore[list-item]
+    assert shown == [str(advice) for advice in whole.poses[4:8]]
+    assert not set(shown) & {str(advice) for advice in first.poses[:4]}
 
 
 def test_a_fit_whose_line_misses_the_distance_asked_does_not_end_the_session() -> None:

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from calibration.errors import CalibrationError
 from calibration.model.rig_model import Lag
 from drivers.interfaces import (
     LEVEL_BACKWARD,
@@ -19,7 +20,7 @@ from drivers.interfaces import (
 )
 from drivers.interfaces.scanner import check_waveform
 from rig.errors import PlanError
-from rig.plan import compile_plan, spad_request
+from rig.plan import compile_plan, require_speed, spad_request
 from tests.unit.rig.streams import SPAD, plan_of, rig_model, scan, scanner_limits, timer_clock
 
 GALVO = scanner_limits(
@@ -197,6 +198,20 @@ def test_everything_that_does_not_fit_is_listed_at_once():
     assert len(lines) == 4
     for words in ("50 kHz", "64 x 4 pixels", "calibrated at", "it can do"):
         assert sum(words in line for line in lines) == 1, words
+
+
+@pytest.mark.parametrize(
+    ("exposures", "shown"), [(1, "1,10"), (4, "3,4"), (30, "3,30")], ids=["faster", "between", "slower"]
+)
+def test_a_speed_that_was_not_calibrated_names_the_command_that_measures_the_lag_there(exposures, shown):
+    """Calibrated with 3 and 10 exposures, or with 3 alone; a sweep of one exposure takes 600 /s."""
+    slowest = 3 if exposures == 4 else 10
+    model = rig_model(speed_range_per_s=(0.95 * 600 / slowest, 1.05 * 600 / 3))
+    with pytest.raises(CalibrationError, match=f"rig calibrate sync CONFIG --calibration FILE --exposures {shown}$"):
+        require_speed(model, 600 / exposures, exposures)
+    require_speed(model, 600 / 3, 3)
+    with pytest.raises(PlanError, match=r"rig calibrate sync CONFIG --calibration FILE --exposures \d+,\d+"):
+        compile_plan(scan(), GALVO, timer_clock, rig_model(speed_range_per_s=(1e-3, 2e-3)), SPAD)
 
 
 def test_more_points_than_the_scanner_holds_lower_the_point_clock():

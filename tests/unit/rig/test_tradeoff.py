@@ -15,14 +15,17 @@ from rig.config_files import load_config
 from rig.counting import BIN_DARK, SweepCounter, SweepLayout
 from rig.errors import UsageError
 from rig.reconstruction import FogEstimate, MapResult
+from rig.row_light import RowLight
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
-from rig.tradeoff import Trials, run_tradeoff
+from rig.tradeoff import Tradeoff, Trials, run_tradeoff
 from rig.tradeoff_choice import Wish, choose, wish_of
 from rig.tradeoff_figure import tradeoff_svg
 from rig.tradeoff_files import csv_text
+from rig.tradeoff_limits import LEAST_WRONG, SceneLimits
 from rig.tradeoff_rows import MOST_MISSING, MapScore, Setting, TradeoffRow, row_of, score_map, with_fronts
 from rig.tradeoff_scan import FrameKeeper
+from rig.tradeoff_text import tradeoff_table
 
 ROW = TradeoffRow(
     scene="street", fog=None, estimator="edge", filter="none", exposures=10, lines=1, sensor_ms=50.0, compute_ms=20.0,
@@ -132,6 +135,7 @@ def test_missing_answers_are_charged_and_repeats_averaged():
     assert score.mean_abs_px == pytest.approx((0.5 + 25 + 10) / 3)
     assert (score.within_1px, score.missing) == (pytest.approx(1 / 3), pytest.approx(1 / 3))
     assert score.depth_mm == pytest.approx(20, rel=1e-4)
+    assert score.local_sd_px == pytest.approx(1.4826 * 0.5)
     better = replace(score, mean_abs_px=score.mean_abs_px - 1, compute_ms=22.0)
     row = row_of("street", "clear", Setting("edge", "none", 10), [score, better])
     assert row.mean_abs_px == pytest.approx(score.mean_abs_px - 0.5)
@@ -208,3 +212,49 @@ def test_the_table_for_programs_has_a_column_for_each_figure():
     (line,) = csv.DictReader(io.StringIO(csv_text([ROW])))
     assert (line["mean_abs_px"], line["ci95_low"], line["ci95_high"]) == ("0.5", "0.4", "0.6")
     assert set(ROW.as_json()) - {"ci95"} < set(line)
+
+
+def lights(stripe: float) -> list[RowLight]:
+    before = 0.005 + 0.1 * np.exp(-np.arange(90) / 60)
+    return [RowLight(before, np.full(90, 0.005), np.ones(90), at, stripe, 0.6, 10, 79) for at in (35.2, 50.4)]
+
+
+def test_errors_stand_beside_the_limit_of_the_rows_that_an_estimator_sees_together(monkeypatch):
+    monkeypatch.setattr("rig.tradeoff_limits.scene_lights", lambda config, rows: lights(1.0))
+    row = replace(ROW, exposures=2, within_1px=0.4, local_sd_px=0.1)
+    rows = [row, replace(row, estimator="joint"), replace(row, filter="median")]
+    alone, joint, median = SceneLimits([2, 10]).beside(rows, load_config("simulated"))
+    assert joint.times_limit == median.times_limit > 3 * alone.times_limit > 0
+    assert joint.position_sd_px == pytest.approx(alone.position_sd_px / 5)
+    assert joint.exponent_nats == pytest.approx(25 * alone.exponent_nats)
+    assert joint.times_position_limit == pytest.approx(0.1 / joint.position_sd_px)
+    assert alone.times_wrong_limit > 1
+    assert joint.times_wrong_limit is None  # the ideal is never wrong
+
+
+def test_what_cannot_be_held_against_a_limit_has_none(monkeypatch):
+    monkeypatch.setattr("rig.tradeoff_limits.scene_lights", lambda config, rows: lights(0.05))
+    row = replace(ROW, exposures=2, local_sd_px=0.5)
+    (dim,) = SceneLimits([2]).beside([row], load_config("simulated"))
+    assert dim.position_sd_px > 1 / 3  # answers within 1 px are then only some of those that found the stripe
+    assert dim.times_position_limit is None
+    assert dim.times_wrong_limit > 0
+    several = load_config("simulated", {"line_offsets": [-0.3, 0.3], "scan.command_range": [-0.3, 0.3]})
+    assert SceneLimits([2]).beside([row], several) == [row]
+    assert 0 < LEAST_WRONG < 0.05
+
+
+def test_the_tables_fit_into_80_characters(capsys):
+    rows = [
+        replace(ROW, exposures=k, filter=filter, lines=lines, estimator="likelihood", mean_abs_px=48.36,
+                ci95=(30.0, 99.0), sensor_ms=5123.0, compute_ms=81234.0, missing=missing, depth_mm=15123.4, fog="20 m",
+                pareto=True, times_limit=123.4, exponent_nats=25.0, local_sd_px=0.1, position_sd_px=0.2,
+                pareto_compute=True)
+        for k in (1, 100) for filter in ("none", "median") for lines in (1, 4) for missing in (0.0, 0.123)
+    ]  # fmt: skip
+    tradeoff_table(Tradeoff(tuple(rows), "blocks of a map", None, None, "complete"))
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert sum(line.endswith("*+") for line in lines) == len(rows)
+    assert sum("(48.4)" in line for line in lines) == len(rows) / 2
+    assert {"street, visibility 20 m", "street, visibility 20 m, 4 lines at once"} < set(lines)
