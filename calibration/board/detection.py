@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
+from calibration.board.chessboard import find_chessboard
 from calibration.board.drawing import Drawing
 from calibration.board.hot_pixels import repaired
 from calibration.board.marker_layout import contradiction
 from calibration.board.picture_map import BoardMap, fit_map
 from calibration.board.registration import OWN, SUBPIXELS, WIDE, register, sides_px
-from calibration.board.search import Sighting, find_chessboard, find_markers, gray
+from calibration.board.search import Sighting, find_markers, gray
 from calibration.errors import Degenerate
 from calibration.views import Corners
 
@@ -47,7 +48,7 @@ def find_corners(picture: NDArray[np.generic], board: Board, defects: NDArray[np
     values = repaired(picture, defects)
     shown = gray(values)
     sighting = find_chessboard(shown, board) if board.kind == "chessboard" else find_markers(shown, board)
-    wrong = None if sighting.markers is None else contradiction(sighting.markers, board, shown)
+    wrong = sighting.other if sighting.markers is None else contradiction(sighting.markers, board, shown)
     if wrong is not None:
         raise _wrong(wrong)
     board_map = _map_of(sighting, board)
@@ -141,14 +142,11 @@ def _not_found(sighting: Sighting, board: Board) -> Degenerate:
     whole = len(board.charuco().getIds()) if board.kind == "charuco" else len(board.corners_m)
     what = "markers" if board.kind == "charuco" else "corners"
     if sighting.part is not None:
-        seen, whole_grid = sorted(sighting.part), sorted(board.grid)
-        shows = f"{seen[1]} x {seen[0]}", f"{whole_grid[1]} x {whole_grid[0]} corners"
-        if seen[0] > whole_grid[0] or seen[1] > whole_grid[1]:
-            return _wrong(f"a chessboard of {shows[0]}, not {shows[1]}")
+        seen, all_of_them = (f"{max(grid)} x {min(grid)}" for grid in (sighting.part, board.grid))
         return Degenerate(
             "board-half-out",
-            f"the picture shows {shows[0]} of the chessboard's {shows[1]}; all of them must be in it, with white "
-            "around: move the board in, name the board that is shown (--board), or print one with markers",
+            f"the picture shows {seen} of the chessboard's {all_of_them} corners; all of them must be in it, with "
+            "white around: move the board in, name the board that is shown (--board), or print one with markers",
         )
     return Degenerate(
         "no-board",

@@ -1,4 +1,4 @@
-"""Where a board is, roughly: OpenCV's markers and chessboards, on every form of the picture that may show them.
+"""Where a board is, roughly: OpenCV's markers, on every form of the picture that may show them.
 
 Under few photons the picture is tried enlarged (small markers are read when their modules have a few pixels) and
 smoothed (shot noise breaks their outline).
@@ -16,22 +16,21 @@ from calibration.board.marker_layout import Markers
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-_FORMS = ((1, 0.0), (2, 0.8), (3, 0.8), (2, 1.5), (4, 1.2))
+FORMS = ((1, 0.0), (2, 0.8), (3, 0.8), (2, 1.5), (4, 1.2))
 """(enlargement, smoothing in pixels of the picture), in the order they are tried; measured in docs/calibration.md."""
 _ENOUGH = 0.9
 """Share of the markers at which no further form is tried."""
 _DARKEST, _BRIGHTEST = 0.5, 99.5
 """Percentiles that become black and white: a hot pixel or a lamp is neither."""
-_SMALLEST_PART = (3, 3)
-"""Inner corners of a chessboard that count as a part of one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
     """Points of the board (n, 2) in metres and where they are seen, (n, 2) raw pixels, about half a pixel.
 
-    count: markers or corners read. chessboards: how many are in the picture. part: inner corners of a chessboard that
-    is smaller than the board. markers: all that were read, the board's and others.
+    count: markers or corners read. chessboards: how many are in the picture. part: corners along (x, y) of what may be
+    a part of the chessboard. other: how the chessboard that is seen differs from the board. markers: all that were
+    read, the board's and others.
     """
 
     points_m: Array
@@ -40,6 +39,7 @@ class Sighting:
     mirrored: bool = False
     chessboards: int = 1
     part: tuple[int, int] | None = None
+    other: str | None = None
     markers: Markers | None = None
 
     def square_px(self, board: Board) -> float:
@@ -65,30 +65,8 @@ def find_markers(shown: Gray, board: Board) -> Sighting:
     return best
 
 
-def find_chessboard(shown: Gray, board: Board) -> Sighting:
-    """The chessboard's inner corners, the first one at the board's top left as far as that can be told."""
-    nothing = np.zeros((0, 2))
-    for scale, smooth in _FORMS:
-        form = _form(shown, scale, smooth)
-        px = _whole_chessboard(form, board.grid)
-        if px is None:
-            continue
-        px = (px + 0.5) / scale - 0.5
-        px, mirrored = _from_top_left(px, shown, board)
-        hidden = shown.copy()
-        cv2.fillConvexPoly(hidden, _outline(px.reshape(-1, 2), board), int(np.median(shown)))
-        again = _whole_chessboard(_form(hidden, scale, smooth), board.grid) is not None
-        points = board.corners_m[:, :2]
-        return Sighting(points, px.reshape(-1, 2), len(points), mirrored, 1 + again)
-    for scale, smooth in _FORMS[:2]:
-        flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
-        found, corners, meta = cv2.findChessboardCornersSBWithMeta(_form(shown, scale, smooth), _SMALLEST_PART, flags)
-        if found:
-            return Sighting(nothing, nothing, len(corners), part=(meta.shape[1], meta.shape[0]))
-    return Sighting(nothing, nothing, 0)
-
-
-def _form(shown: Gray, scale: int, smooth: float) -> Gray:
+def as_form(shown: Gray, scale: int, smooth: float) -> Gray:
+    """One of the forms; a pixel of it lies at (x + 0.5) / scale - 0.5 of the picture."""
     smoothed = cv2.GaussianBlur(shown, (0, 0), smooth) if smooth else shown
     if scale == 1:
         return np.asarray(smoothed, np.uint8)
@@ -103,8 +81,8 @@ def _most_markers(shown: Gray, board: Board) -> Sighting:
     }
     detector = cv2.aruco.ArucoDetector(charuco.getDictionary())
     best, most = Sighting(np.zeros((0, 2)), np.zeros((0, 2)), 0), (0, 0)
-    for scale, smooth in _FORMS:
-        corners, found, _ = detector.detectMarkers(_form(shown, scale, smooth))
+    for scale, smooth in FORMS:
+        corners, found, _ = detector.detectMarkers(as_form(shown, scale, smooth))
         if found is None:
             continue
         ids = found.ravel().astype(np.int64)
@@ -117,52 +95,3 @@ def _most_markers(shown: Gray, board: Board) -> Sighting:
         if best.count >= _ENOUGH * len(places):
             break
     return best
-
-
-def _whole_chessboard(form: Gray, grid: tuple[int, int]) -> Array | None:
-    """(down, across, 2) inner corners in pixels of the form, or None."""
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-    found, corners = cv2.findChessboardCorners(form, grid, flags=flags)
-    if not found:
-        found, corners = cv2.findChessboardCornersSB(form, grid, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-    return np.asarray(corners, np.float64).reshape(grid[1], grid[0], 2) if found else None
-
-
-def _from_top_left(px: Array, shown: Gray, board: Board) -> tuple[Array, bool]:
-    """The grid numbered as the board is, and whether it is the board's mirror image.
-
-    The numbering is turned so that x to y is clockwise in the picture, as it is from in front of the board, then by
-    half a turn where the top left square would be white. With both sides even, or both odd, a half turn changes no
-    colour: then x runs to the right.
-    """
-    along, below = px[:, -1] - px[:, 0], px[-1] - px[0]
-    if np.mean(along, axis=0)[0] * np.mean(below, axis=0)[1] < np.mean(along, axis=0)[1] * np.mean(below, axis=0)[0]:
-        px = px[::-1]
-    across, down = board.squares
-    if (across + down) % 2:
-        return (px if _top_left_is_black(px, shown) else px[::-1, ::-1]), False
-    if np.mean(px[:, -1] - px[:, 0], axis=0)[0] < 0:
-        px = px[::-1, ::-1]
-    chiral = across % 2 == 0 and across != down
-    return px, chiral and not _top_left_is_black(px, shown)
-
-
-def _top_left_is_black(px: Array, shown: Gray) -> bool:
-    """Of the squares between the corners: those of the top left one's colour are the darker ones."""
-    middles = (px[:-1, :-1] + px[:-1, 1:] + px[1:, :-1] + px[1:, 1:]) / 4
-    height, width = shown.shape
-    x = np.clip(np.round(middles[..., 0]).astype(int), 0, width - 1)
-    y = np.clip(np.round(middles[..., 1]).astype(int), 0, height - 1)
-    # The first square between corners is the second along both sides: of the top left one's colour.
-    same = np.add.outer(np.arange(middles.shape[0]), np.arange(middles.shape[1])) % 2 == 0
-    light = shown[y, x].astype(np.float64)
-    return bool(light[same].mean() < light[~same].mean())
-
-
-def _outline(px: Array, board: Board) -> NDArray[np.int32]:
-    """The board's four outer corners in the picture."""
-    homography, _ = cv2.findHomography(board.corners_m[:, :2], px)
-    width, height = board.size_m
-    ends = np.array([[[0, 0], [width, 0], [width, height], [0, height]]], np.float64)
-    seen = np.asarray(cv2.perspectiveTransform(ends, homography), np.float64)
-    return np.asarray(np.round(seen[0]), np.int32)

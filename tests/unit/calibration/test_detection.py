@@ -10,6 +10,7 @@ from calibration.board.hot_pixels import repaired
 from calibration.errors import Degenerate
 from calibration.views import BoardPose
 from tests.reference.board_pictures import CHARUCO, CHESSBOARD, SIZE, albedo, corners_px, exposed, pose
+from tests.reference.chessboards import FOLDER
 
 TURNED = pose(CHARUCO, 0.9, (0.03, -0.02), (0.35, -0.3, 0.1))
 FRAMES = 5000
@@ -147,11 +148,65 @@ def test_a_board_whose_lower_rows_are_hidden_is_no_other_board(light):
     assert len(find_corners(exposed(hidden, 0.05, FRAMES, 1), CHARUCO).ids) > 24
 
 
-def test_a_chessboard_with_more_corners_is_another_board():
-    larger = Board("chessboard", (10, 7), 0.06)
-    with pytest.raises(Degenerate, match="9 x 6, not 8 x 5") as refused:
-        find_corners(exposed(albedo(larger, pose(larger, 1.1, (0, 0), (0, 0.1, 0))), 0.05, FRAMES, 1), CHESSBOARD)
+@pytest.mark.parametrize(
+    ("shown", "stated", "said"),
+    [
+        ((10, 7), (9, 6), "9 x 6, not 8 x 5 corners"),
+        ((10, 6), (9, 6), "9 x 5, not 8 x 5 corners"),
+        ((9, 6), (9, 8), "8 x 5, not 8 x 7 corners, unless something hides the rest"),
+        ((9, 6), (10, 6), "8 x 5, not 9 x 5 corners, unless"),
+    ],
+)
+def test_a_chessboard_with_more_or_fewer_corners_is_another_board(shown, stated, said):
+    printed = Board("chessboard", shown, 0.06)
+    light = albedo(printed, pose(printed, 1.1, (0, 0), (0.2, -0.3, 0.1)))
+    with pytest.raises(Degenerate, match=said) as refused:
+        find_corners(exposed(light, 0.004, FRAMES, 1), Board("chessboard", stated, 0.06))
     assert refused.value.reason == "wrong-board"
+
+
+def test_a_chessboard_with_white_corner_squares_is_another_board():
+    board = Board("chessboard", (9, 7), 0.06)
+    light = albedo(board, pose(board, 1.1, (0, 0), (0, 0.2, 0.1)))
+    assert len(find_corners(exposed(light, 0.05, FRAMES, 1), board).ids) == 48
+    inverted = np.where(np.abs(light - 0.4) < 1e-9, 0.4, WHITE + BLACK - light)
+    with pytest.raises(Degenerate, match="corner squares are white") as refused:
+        find_corners(exposed(inverted, 0.05, FRAMES, 1), board)
+    assert refused.value.reason == "wrong-board"
+
+
+@pytest.mark.parametrize("turn", [0.1, 1.7])
+def test_a_chessboard_with_the_same_number_both_ways_starts_at_a_black_square(turn):
+    board = Board("chessboard", (8, 8), 0.05)
+    stands = pose(board, 1.0, (0, 0), (0, 0, turn))
+    found = find_corners(exposed(albedo(board, stands), 0.05, FRAMES, 1), board)
+    truth = corners_px(board, stands)
+    assert min(np.abs(found.px - at[found.ids]).max() for at in (truth, truth[::-1])) < 0.1
+
+
+@pytest.mark.parametrize("fall", [5, 20])
+def test_a_lamp_on_one_side_does_not_hide_a_chessboards_rows(fall):
+    light = albedo(CHESSBOARD, pose(CHESSBOARD, 0.9, (0, 0), (0.2, 0.2, 0)))
+    darker = light * np.geomspace(1, 1 / fall, light.shape[1])
+    assert len(find_corners(exposed(darker, 0.1, FRAMES, 1), CHESSBOARD).ids) == 40
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_alone_is_no_chessboard(seed):
+    with pytest.raises(Degenerate) as refused:
+        find_corners(exposed(np.full(SIZE[::-1], 0.4), 0.05, FRAMES, seed), CHESSBOARD)
+    assert refused.value.reason == "no-board"
+
+
+@pytest.mark.skipif(not FOLDER.is_dir(), reason="OpenCV's chessboard pictures are not here")
+@pytest.mark.parametrize(("name", "others"), [("left02", ((9, 7), (10, 8))), ("right08", ((10, 6),))])
+def test_a_real_chessboard_is_told_from_smaller_and_larger_ones(name, others):
+    picture = cv2.imread(str(FOLDER / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
+    assert len(find_corners(picture, Board("chessboard", (10, 7), 0.025)).ids) > 45
+    for squares in others:
+        with pytest.raises(Degenerate, match="a chessboard of 9 x 6") as refused:
+            find_corners(picture, Board("chessboard", squares, 0.025))
+        assert refused.value.reason == "wrong-board"
 
 
 @pytest.mark.parametrize("upside_down", [False, True])
