@@ -1,7 +1,7 @@
 """Accuracy of `joint` on scenes that need no data: few exposures, thin objects, a smooth wall, honest confidence.
 
-Limits are a little beyond the worst that these maps gave with seeds 1 to 9, closer than what is asked of prepared ones.
-The full account, beside what is asked: `python -m tests.reference.joint_accuracy`.
+Limits are a little beyond the worst that these maps gave with seeds 1 to 9, closer than what is asked of prepared
+scenes. The full account, beside what is asked: `python -m tests.reference.joint_accuracy`.
 """
 
 from __future__ import annotations
