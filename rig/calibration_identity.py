@@ -211,10 +211,15 @@ def _aged(made: Identity, here: Identity, max_age_s: float | None) -> list[Refus
     age_s = (now - begun).total_seconds()
     if age_s <= max_age_s:
         return []
-    said = (
-        f"was made {age_s / DAY_S:.3g} days ago ({made.created}), calibration_max_age is {max_age_s / DAY_S:.3g} days"
-    )
+    said = f"was made {_span(age_s)} ago ({made.created}), calibration_max_age is {_span(max_age_s)}"
     return [Refusal("too-old", said)]
+
+
+def _span(time_s: float) -> str:
+    """In the largest unit that the config takes and of which there is one."""
+    units = (("days", DAY_S), ("hours", 3600.0))
+    unit, size = next((of for of in units if time_s >= of[1]), ("seconds", 1.0))
+    return f"{time_s / size:.4g} {unit}"
 
 
 def _date(text: str) -> datetime | None:

@@ -69,7 +69,8 @@ class DepthUncertainty:
         sd = float(np.nanmedian(self.sd_m))
         group, part = max(((name, float(np.nanmedian(m))) for name, m in self.part_m.items()), key=lambda item: item[1])
         unit, scale = ("mm", 1e3) if sd >= 1e-3 or sd == 0 else ("um", 1e6)
-        return f"{at}: {sd * scale:.2g} {unit}, {part * scale:.2g} of them from {_SAID[group]}"
+        whole, of_them = (f"{float(f'{value * scale:.2g}'):.15g}" for value in (sd, part))  # no 4.8e+02
+        return f"{at}: {whole} {unit}, {of_them} of them from {_SAID[group]}"
 
 
 def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | None = None) -> DepthUncertainty:

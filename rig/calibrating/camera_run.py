@@ -1,6 +1,7 @@
 """`rig calibrate camera`: the camera alone, from views of a board or from picture files."""
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from calibration.verdict import AT_M
 from rig.calibrating.planes_run import POSES
 from rig.calibrating.refusing import refusal
 from rig.calibrating.report import camera_report
+from rig.calibrating.report_subject import subject
 from rig.calibrating.result import CalibrationResult, named
 from rig.calibrating.session import Session
 from rig.calibrating.showing import Ask, Tell, require_live
@@ -65,7 +67,8 @@ def run_camera(
         summary = {"command": "camera", **_summary(fit, judged, taken), "versions": versions()}
         figures = tuple(_figures(fit, judged, taken))
         used = [view for view in taken.views if view.name in fit.views]
-        report = camera_report(fit, used, judged, board, figures)
+        about = subject(taken.identity, board, summary["versions"], datetime.now(UTC))
+        report = camera_report(fit, used, judged, board, figures, about)
         digests = [corners_digest(view) for view in used if view.name in fit.kept]
         session.write_text(CAMERA_FILE, camera_file_text(fit.camera, fit.covariance, digests))
         session.finish(summary, report, None)

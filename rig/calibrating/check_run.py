@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from calibration.model.rig_model import RigModel
 from calibration.verdict import AT_M, Asked, Verdict
 from calibration.views import View
 from rig.calibrating.report import check_report
+from rig.calibrating.report_subject import subject
 from rig.calibrating.result import CalibrationResult
 from rig.calibrating.session import Session
 from rig.calibrating.showing import Ask, Tell, require_live
@@ -96,7 +98,8 @@ def run_check(
             "versions": versions(),
         }
         figures = tuple(_figures(boards, angle) + _consequence(verdict, model, file))
-        session.finish(summary, check_report(boards, uncertainty, verdict, line, figures), None)
+        about = subject(taken.identity or model.identity, board, summary["versions"], datetime.now(UTC))
+        session.finish(summary, check_report(boards, uncertainty, verdict, line, figures, about), None)
         if model.identity is not None:
             note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
         return CalibrationResult(verdict, line, figures, summary, model, session.path)

@@ -18,6 +18,8 @@ from calibration.verdict import AT_M
 from rig.calibrating.guided import Guide
 from rig.calibrating.refusing import refusal
 from rig.calibrating.report import planes_report
+from rig.calibrating.report_numbers import mm
+from rig.calibrating.report_subject import subject
 from rig.calibrating.result import CalibrationResult, named
 from rig.calibrating.session import Session
 from rig.calibrating.showing import Ask, Tell, require_live
@@ -96,7 +98,8 @@ def run_planes(
             "versions": versions(),
         }
         figures = tuple(_figures(fit, judged, truth))
-        report = planes_report(fit, taken.views, judged, line, figures)
+        about = subject(taken.identity, board, summary["versions"], datetime.now(UTC))
+        report = planes_report(fit, taken.views, judged, line, figures, about)
         calibration = session.finish(summary, report, model)
         return CalibrationResult(judged.verdict, line, figures, summary, model, session.path, calibration)
 
@@ -207,8 +210,8 @@ def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None) -> list[tup
     rows = [
         ("views", f"{len(fit.used)} used, {named(fit.outliers)} outliers, {named(fit.left_out)} without board, "
                   f"{named(fit.without_line)} without passages"),
-        ("depth error", f"{evidence.expected_m * 1e3:.3g} mm at {asked.at_m:g} m (95 % of the picture: "
-                        f"{evidence.worst_m * 1e3:.3g} mm), asked {asked.accuracy_m * 1e3:.3g} mm"),
+        ("depth error", f"{mm(evidence.expected_m)} mm at {asked.at_m:g} m (95 % of the picture: "
+                        f"{mm(evidence.worst_m)} mm), asked {mm(asked.accuracy_m)} mm"),
         ("camera", f"f {matrix[0, 0]:.2f}, {matrix[1, 1]:.2f} px, centre {matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px"),
         ("baseline", f"{evidence.baseline_m * 1e3:.2f} mm, sd {evidence.baseline_sd_m * 1e3:.2g} mm"),
         ("lag", f"{lag.forward * 1e6:.1f} us forward, {lag.backward * 1e6:.1f} us backward"),
@@ -217,6 +220,6 @@ def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None) -> list[tup
         ("condition", f"{fit.condition:.3g}" + ("" if fit.converged else "; the fit did not come to rest")),
     ]  # fmt: skip
     if truth is not None:
-        rows.append(("truth", f"median {truth.median_m * 1e3:.3g} mm, worst {truth.worst_m * 1e3:.3g} mm at "
+        rows.append(("truth", f"median {mm(truth.median_m)} mm, worst {mm(truth.worst_m)} mm at "
                               f"{truth.depth_m:g} m, {truth.ratio:.2f} of the expected sd"))  # fmt: skip
     return rows

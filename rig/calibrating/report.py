@@ -17,6 +17,7 @@ from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import Verdict
 from calibration.views import BoardPose, View
 from rig.calibrating.report_charts import plane_residuals
+from rig.calibrating.report_numbers import measured, mm
 from rig.calibrating.report_page import Section, page, paragraph, picture, table
 from rig.calibrating.report_pictures import cells_picture, coverage_picture, error_picture, residual_picture
 
@@ -24,8 +25,10 @@ Array = NDArray[np.float64]
 Figures = Sequence[tuple[str, str]]
 
 
-def planes_report(fit: RigFit, views: Sequence[View], judged: Judged, line: str, figures: Figures) -> str:
-    """Of a whole rig."""
+def planes_report(
+    fit: RigFit, views: Sequence[View], judged: Judged, line: str, figures: Figures, about: Figures = ()
+) -> str:
+    """Of a whole rig. about: `subject`, as for the others."""
     by_name = {view.name: view for view in views}
     used = [by_name[name] for name in fit.views]
     sections = [
@@ -35,7 +38,7 @@ def planes_report(fit: RigFit, views: Sequence[View], judged: Judged, line: str,
         _views_section(fit, judged),
         _decisions_section(fit),
     ]
-    return page("Calibration of camera and planes", judged.verdict, line, figures, sections)
+    return page("Calibration of camera and planes", judged.verdict, line, figures, sections, about)
 
 
 def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequence[Array]) -> list[Section]:
@@ -61,12 +64,19 @@ def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
     if not np.isfinite(uncertainty.sd_m).any():
         return Section("Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m."))
     caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
-    rows = [(name, f"{np.nanmedian(part) * 1e3:.3g}") for name, part in uncertainty.part_m.items()]
+    rows = [(name, mm(float(np.nanmedian(part)))) for name, part in uncertainty.part_m.items()]
     said = paragraph("Its parts, each the median over the picture:") + table(("from", "mm"), rows)
     return Section("Expected depth error", picture(error_picture(uncertainty), caption) + said)
 
 
-def camera_report(fit: CameraFit, views: Sequence[View], judged: JudgedCamera, board: Board, figures: Figures) -> str:
+def camera_report(
+    fit: CameraFit,
+    views: Sequence[View],
+    judged: JudgedCamera,
+    board: Board,
+    figures: Figures,
+    about: Figures = (),
+) -> str:
     """Of a camera alone; views: those of the fit."""
     seen = [corners_px(view) for view in views]
     rows = [
@@ -81,19 +91,24 @@ def camera_report(fit: CameraFit, views: Sequence[View], judged: JudgedCamera, b
     head = ("view", "distance, m", "tilt, degrees", "corners used", "rms, px")
     shown = [view for view, px in zip(views, seen, strict=True) if len(px)]
     sections = [*camera_sections(fit.camera, shown, fit.residual_px), Section("Views", table(head, rows))]
-    return page("Calibration of the camera", judged.verdict, judged.line(), figures, sections)
+    return page("Calibration of the camera", judged.verdict, judged.line(), figures, sections, about)
 
 
 def check_report(
-    boards: Sequence[CheckedBoard], uncertainty: DepthUncertainty | None, verdict: Verdict, line: str, figures: Figures
+    boards: Sequence[CheckedBoard],
+    uncertainty: DepthUncertainty | None,
+    verdict: Verdict,
+    line: str,
+    figures: Figures,
+    about: Figures = (),
 ) -> str:
     """Of a check."""
     sections = []
     for board in boards:
         caption = "How far the board's squares lie off their plane, negative and red: in front; black: not scanned."
         rows = [
-            ("flatness", f"rms {board.flatness_rms_m * 1e3:.3g} mm, expected {board.expected_m * 1e3:.3g} mm; peak "
-                         f"{board.flatness_peak_m * 1e3:.3g} mm"),
+            ("flatness", f"rms {mm(board.flatness_rms_m)} mm, expected {mm(board.expected_m)} mm; peak "
+                         f"{mm(board.flatness_peak_m)} mm"),
             ("chi2", f"{board.chi2:.1f} of {board.freedom}"),
             ("scale", f"{board.scale:.5f}, sd {board.scale_sd:.2g}"),
             ("distance", f"{board.distance_m:.3f} m"),
@@ -102,10 +117,10 @@ def check_report(
         sections.append(Section(f"View {board.name}", table(("", ""), rows) + shown))
     if uncertainty is not None:
         sections.append(uncertainty_section(uncertainty))
-    return page("Check of a calibration", verdict, line, figures, sections)
+    return page("Check of a calibration", verdict, line, figures, sections, about)
 
 
-def sync_report(fit: SyncFit, verdict: Verdict, line: str, figures: Figures) -> str:
+def sync_report(fit: SyncFit, verdict: Verdict, line: str, figures: Figures, about: Figures = ()) -> str:
     """Of lags and delays."""
     rows = [
         (
@@ -118,7 +133,8 @@ def sync_report(fit: SyncFit, verdict: Verdict, line: str, figures: Figures) -> 
         for sweep in fit.sweeps
     ]
     head = ("sweep", "speed, 1/s", "lag, us", "sd, us", "passages")
-    return page("Calibration of lag and delays", verdict, line, figures, [Section("Sweeps", table(head, rows))])
+    sections = [Section("Sweeps", table(head, rows))]
+    return page("Calibration of lag and delays", verdict, line, figures, sections, about)
 
 
 def corners_px(view: View) -> Array:
@@ -161,7 +177,8 @@ def _views_section(fit: RigFit, judged: Judged) -> Section:
 
 def _decisions_section(fit: RigFit) -> Section:
     rows = [
-        (one.name, "kept" if one.kept else "left out", f"{one.value:.3g}", f"{one.sd:.2g}", one.reason)
+        (one.name, "kept" if one.kept else "left out", *measured(one.name, one.value, one.sd), one.reason)
         for one in fit.decisions
     ]
-    return Section("Terms of the model", table(("term", "", "value", "sd", "why"), rows))
+    note = paragraph("The mirror command has no unit; terms are those of calibration.yaml.", small=True)
+    return Section("Terms of the model", table(("term", "", "value", "sd", "unit", "why"), rows) + note)

@@ -36,14 +36,19 @@ class Section:
 
 
 def page(
-    title: str, verdict: Verdict, line: str, figures: Sequence[tuple[str, str]], sections: Sequence[Section]
+    title: str,
+    verdict: Verdict,
+    line: str,
+    figures: Sequence[tuple[str, str]],
+    sections: Sequence[Section],
+    about: Sequence[tuple[str, str]] = (),
 ) -> str:
-    """The whole file: verdict with its reasons, the one line that matters, the figures, then the sections."""
+    """The whole file: verdict with its reasons, the one line that matters, the figures, what it is of, the sections."""
     parts = [
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>',
         f"<style>{_STYLE}</style></head><body><h1>{escape(title)}</h1>",
         _verdict(verdict, line),
-        table(("", ""), figures) if figures else "",
+        table(("", ""), [*figures, *about]) if figures or about else "",
         *(f"<h2>{escape(section.title)}</h2>\n{section.body}" for section in sections),
         "</body></html>\n",
     ]

@@ -20,6 +20,7 @@ from rig.calibrating.capture import capture_view
 from rig.calibrating.gate_times import GateDelay, gate_delay
 from rig.calibrating.planes_run import speeds_of
 from rig.calibrating.report import sync_report
+from rig.calibrating.report_subject import subject
 from rig.calibrating.result import CalibrationResult
 from rig.calibrating.session import Session
 from rig.calibrating.showing import Tell
@@ -71,7 +72,8 @@ def run_sync(
         line = _line(fit)
         summary = {"command": "sync", **_summary(fit, gate, verdict, truth), "versions": versions()}
         figures = tuple(_figures(fit, gate, truth))
-        calibration = session.finish(summary, sync_report(fit, verdict, line, figures), model)
+        about = subject(taken.identity, None, summary["versions"], datetime.now(UTC))
+        calibration = session.finish(summary, sync_report(fit, verdict, line, figures, about), model)
         return CalibrationResult(verdict, line, figures, summary, model, session.path, calibration)
 
 

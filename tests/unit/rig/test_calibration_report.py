@@ -2,18 +2,23 @@
 
 import re
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import cache
 from html import escape
 
 import numpy as np
 import pytest
 
+from calibration.board.board import Board
 from calibration.judging.rig import Judged, judge_fit
+from calibration.model.rig_model import Identity
 from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.verdict import Reason, Verdict
 from calibration.views import View
 from rig.calibrating.report import planes_report
+from rig.calibrating.report_numbers import measured, mm
 from rig.calibrating.report_page import Section, page, paragraph, table
+from rig.calibrating.report_subject import subject
 from tests.reference import calibration_data as data
 
 
@@ -53,6 +58,45 @@ def test_a_failed_verdict_leads_with_its_root_cause(judged: Judged) -> None:
     )
     html = planes_report(fit, views, replace(judged, verdict=Verdict(False, reasons)), "", [])
     assert html.index("FAILED") < html.index("moved-rig") < html.index("poor-coverage") < html.index("<img")
+
+
+def test_a_report_says_what_it_is_of(judged: Judged) -> None:
+    views, fit = _fitted()
+    rig = Identity("1f", "", "lab", {"spad": "spb-usb", "scanner": "helios"}, {"spad": "SN-0042"})
+    board = Board("charuco", (9, 7), 0.06, 0.047, "DICT_4X4_50")
+    about = subject(rig, board, {"spadrig": "1.2"}, datetime(2026, 11, 22, 9, 5, tzinfo=UTC))
+    html = planes_report(fit, views, judged, "", [], about)
+    text = html[: html.index("<h2>")]
+    for said in (
+        "lab",
+        "spad spb-usb SN-0042, scanner helios",
+        "ChArUco, 9 x 7 squares of 60 mm, markers of 47 mm, DICT_4X4_50",
+        "2026-11-22 09:05 UTC",
+        "spadrig 1.2",
+    ):
+        assert said in text
+    assert subject(None, Board("chessboard", (10, 7), 0.0251), {}, datetime.now(UTC))[0] == (
+        "board",
+        "chessboard, 10 x 7 squares of 25.1 mm",
+    )
+
+
+def test_terms_of_the_model_have_units_and_the_digits_that_are_known() -> None:
+    assert measured("lag_forward/lag_backward", 2.0012e-4, 4.7e-7) == ("200.12", "0.47", "us")
+    assert measured("row_delay", -1.234e-8, 2.2e-9) == ("-12.3", "2.2", "ns/row")
+    assert measured("angle_3", 1.23e-3, 2e-5) == ("1.230", "0.020", "mrad")
+    assert measured("offset_1", 1e-4, 2e-4) == ("0.10", "0.20", "mm/rad^1")
+    assert measured("bow", np.nan, np.nan) == ("-", "-", "mrad/rad^2")
+    assert measured("lag", 1e-4, np.nan) == ("100", "-", "us")
+    views, fit = _fitted()
+    html = planes_report(fit, views, judge_fit(fit, views, stated_baseline_m=0.3), "", [])
+    terms = html[html.index("Terms of the model") :]
+    assert '<th class="number">value</th>' in terms
+    assert "<td>us</td>" in terms
+
+
+def test_lengths_are_no_powers_of_ten() -> None:
+    assert [mm(length) for length in (1.4812, 0.0123456, 150.0, np.nan)] == ["1480", "12.3", "150000", "-"]
 
 
 def test_whatever_users_name_is_escaped() -> None:
