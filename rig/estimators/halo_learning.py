@@ -67,7 +67,12 @@ def learn_first_halo(
     places: Places,
     workers: RowWorkers,
 ) -> RowModel:
-    """What `learn_halo` gives for the first map; to be called again with the map that is made under it."""
+    """What `learn_halo` gives for the first map; to be called again with the map that is made under it.
+
+    Of several lines at once the model stays as it is: what the others bring would be taken for a halo.
+    """
+    if geometry.others is not None:
+        return model
     number = 2 * LATTICE_LINES if model.halo.any() else FIRST_LINES
     seen, dark = bright_lines(volume, geometry, stripes, places, number), volume.dark_counts is not None
     return learn_halo(seen, geometry, model, ambient, workers, dark=dark)
@@ -80,7 +85,7 @@ def learn_next_halo(setting: Setting, seen: BrightLines, workers: RowWorkers) ->
     behind stripes shift among each other: over eight maps in steady fog errors grew by 10 to 25 %.
     """
     model = setting.model
-    if not model.halo.any() and np.isnan(model.extinction_per_m):
+    if setting.geometry.others is not None or (not model.halo.any() and np.isnan(model.extinction_per_m)):
         return model
     found = learn_halo(seen, setting.geometry, model, model.ambient, workers, dark=setting.dark)
     return model if found.halo.any() == model.halo.any() else found

@@ -107,6 +107,8 @@ def test_later_maps_tell_whether_there_is_a_halo(light, other):
     assert learn_next_halo(setting, seen, WORKERS) is joint.used
     wrong = first_map(other)[1].used
     assert learn_next_halo(replace(setting, model=wrong), seen, WORKERS).halo.any() == (light == "halo")
+    several = replace(setting.geometry, others=setting.geometry.plane[:, None])
+    assert learn_next_halo(replace(setting, model=wrong, geometry=several), seen, WORKERS) is wrong
     clear = replace(first_map("halo-less")[1].used, extinction_per_m=np.nan)
     assert learn_next_halo(replace(setting, model=clear), seen, WORKERS) is clear, "without haze there is no halo"
 
