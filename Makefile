@@ -1,14 +1,19 @@
-# Two commands a newcomer needs: `make demo` and `make test`. Each sets itself up in .venv.
+# Two commands a newcomer needs: `make demo` and `make test`. Each sets itself up in .venv. `make help` lists the others.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: demo test lint types layers unit accuracy campaign clean
+.PHONY: demo help test lint types layers unit clean
+.PHONY: accuracy accuracy-rows accuracy-joint accuracy-calibration
+.PHONY: campaign campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration campaign-kernel
 .DELETE_ON_ERROR:
 
-demo: .venv/.installed
+demo: .venv/.installed  ## scan the simulated rig in a foggy street
 	$(BIN)/rig scan --out runs/demo-$$(date +%Y%m%d-%H%M%S)
 
-test: lint types layers unit
+help:  ## this list
+	@awk -F' *## ' '/^[a-z-]+:.*## / { sub(/:.*/, "", $$1); printf "%-21s %s\n", $$1, $$2 }' Makefile
+
+test: lint types layers unit  ## lint, types, import layers and all tests
 
 lint: .venv/.installed-tests
 	$(BIN)/ruff check .
@@ -22,23 +27,50 @@ WORKERS ?= 4
 unit: .venv/.installed-tests
 	$(BIN)/pytest -n $(WORKERS) --dist loadfile
 
-# The accuracy tables of docs/results.md over the scenes of ../shared/scenes (minutes).
-accuracy: .venv/.installed-tests
-	$(BIN)/python -m tests.reference.accuracy
+# Over the scenes of ../shared/scenes or, where there are none, the built-in one.
+accuracy: accuracy-rows accuracy-joint accuracy-calibration  ## the three below: tables of docs/results.md (hours)
 
-# Random faults of every driver, and blows against the laser's guard (hours).
+accuracy-rows: .venv/.installed-tests  ## argmax, edge and likelihood beside the genie
+	$(BIN)/python -m tests.reference.accuracy
+accuracy-joint: .venv/.installed-tests  ## joint beside what is asked, its prior and passes; fog meter's error bars
+	$(BIN)/python -m tests.reference.joint_accuracy --estimators joint
+	$(BIN)/python -m tests.reference.moving --rows 128
+	$(BIN)/python -m tests.reference.adaptive --estimators joint --budget 0.8 --passes 3
+	$(BIN)/python -m tests.reference.fog_coverage
+PICTURES := ../shared/calibration-images
+accuracy-calibration: .venv/.installed-tests  ## corners of drawn boards; cameras from real chessboards, where there are any
+	$(BIN)/python -m tests.reference.corner_accuracy
+	@test -d $(PICTURES) || echo "no chessboards in $(PICTURES): left out"
+	@test ! -d $(PICTURES) || $(BIN)/python -m tests.reference.chessboards --folder $(PICTURES)
+
+# Without tests.campaigns.guard_false_trips, which burns all processors: nothing else could be measured beside it.
+campaign: campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration campaign-kernel
+campaign:  ## the six below: what is tried at random (many hours)
+
 SEQUENCES ?= 10000
-campaign: .venv/.installed-tests
+campaign-devices: .venv/.installed-tests  ## SEQUENCES of faults on the wire of every driver; sweeps without markers
 	for driver in cobolt obis prawndo helios lasercube spb_usb spad512s; do \
 		$(BIN)/python -m tests.campaigns.$${driver}_faults --sequences $(SEQUENCES) || exit; \
 	done
-	$(BIN)/python -m tests.campaigns.guard_kill
 	$(BIN)/python -m tests.campaigns.blanking
+campaign-guard: .venv/.installed-tests  ## blows to scans: how long the laser shines after them
+	$(BIN)/python -m tests.campaigns.guard_kill
+campaign-recording: .venv/.installed-tests  ## recordings killed and damaged, and depth from them
 	$(BIN)/python -m tests.campaigns.recording_kill
 	$(BIN)/python -m tests.campaigns.recording_corruptions --sequences 100000
 	$(BIN)/python -m tests.campaigns.recording_depth --sequences 1000
+campaign-simulation: .venv/.installed-tests  ## effects left out against the full model; statistics of photon bits
 	$(BIN)/python -m tests.campaigns.effect_ablation
 	$(BIN)/python -m tests.campaigns.photon_bits
+# A rig takes some 20 s of CPU, a trial, which makes all mistakes, 180 s.
+RIGS ?= 500
+TRIALS ?= 30
+campaign-calibration: .venv/.installed-tests  ## RIGS calibrated, TRIALS of deliberate mistakes; a second simulator; the guide
+	$(BIN)/python -m tests.campaigns.calibration_rigs --rigs $(RIGS)
+	$(BIN)/python -m tests.campaigns.calibration_mistakes --trials $(TRIALS)
+	$(BIN)/python -m tests.campaigns.calibration_fits
+	$(BIN)/python -m tests.campaigns.calibration_guided
+campaign-kernel: .venv/.installed-tests  ## drivers through real kernels; hardware in the loop, on an idle machine
 	$(BIN)/python -m tests.campaigns.kernel_usb
 	$(BIN)/python -m tests.campaigns.kernel_serial
 	$(BIN)/python -m tests.campaigns.hil_swaps
@@ -55,5 +87,5 @@ campaign: .venv/.installed-tests
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[tests]'
 	touch $@ .venv/.installed
 
-clean:
+clean:  ## remove .venv, caches and runs
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache runs

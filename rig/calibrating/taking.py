@@ -36,6 +36,9 @@ from rig.session import open_rig
 MISSED_SHARE = 0.5
 """So many more poses than asked for are shown where the board is not found in some."""
 
+LASTING = (["wrong-board"] * 3, ["mirrored"] * 3)
+"""Why the first views of a session are refused where no pose of the board will change that."""
+
 Defects = NDArray[np.bool_] | None
 """(rows, width), pixels not to be used."""
 
@@ -201,7 +204,7 @@ class Live:
 
 def take_live(taken: Taken, live: Live, board: Board) -> None:
     """Take views of a board that is moved from pose to pose."""
-    good, seen = 0, list[View]()
+    good, seen, reasons = 0, list[View](), list[str]()
     speeds = SpeedTurns(live.exposures, live.sees, taken.tell)
     while good < live.poses and len(seen) < live.poses + math.ceil(MISSED_SHARE * live.poses):
         advice = live.choose.next(seen)
@@ -214,6 +217,10 @@ def take_live(taken: Taken, live: Live, board: Board) -> None:
         taken.add_capture(capture)
         seen.append(capture.view)
         good += live.sees(capture)
+        reasons.append("" if capture.refused is None else capture.refused.reason)
+        if reasons in LASTING:
+            taken.say(f"{len(reasons)} views are {reasons[0]}, which no other pose will change: no more are taken")
+            return
 
 
 def _scan(taken: Taken, live: Live, config: RigConfig, board: Board, exposures: int | None) -> Capture:

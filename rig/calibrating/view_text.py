@@ -13,7 +13,7 @@ def told(view: View, refused: Degenerate | None) -> str:
     if view.passages:
         counts = ", ".join(str(len(sweep.command)) for sweep in view.passages)
         parts.append(f"{counts} passages of the line" + ("" if shows_line(view) else _too_few(view)))
-    return f"view {view.name}: {', '.join(parts) or 'nothing'}"
+    return f"view {view.name}: {', '.join(parts) or 'neither corners nor passages'}"
 
 
 def _too_few(view: View) -> str:

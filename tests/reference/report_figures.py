@@ -181,7 +181,7 @@ def figure_9(figures: Sequence[Figure]) -> str:
         Panel("answers within 1 px", label, "share", curves(SHARE), y_log=False),
     ]
     notes = [
-        *_notes(figures),
+        f"Mean over the scenes {_scenes(figures)}. One map each.",
         "Time of columns only: dark frames and fly-back take another tenth and more ('rig tradeoff').",
     ]
     return chart_svg(panels, title="Error over map rate in the fog of the report", notes=notes)
@@ -228,8 +228,11 @@ def _curves(figures: Sequence[Figure], value: str = "mean_px") -> Iterator[Serie
 
 
 def _notes(figures: Sequence[Figure]) -> list[str]:
-    scenes = sorted({figure.scene for figure in figures})
-    return [f"Mean over the scenes {', '.join(scenes)}; bars: best and worst of them. One map each."]
+    return [f"Mean over the scenes {_scenes(figures)}; bars: best and worst of them. One map each."]
+
+
+def _scenes(figures: Sequence[Figure]) -> str:
+    return ", ".join(sorted({figure.scene for figure in figures}))
 
 
 def _points(shown: slice, values: np.ndarray) -> list[tuple[float, float]]:

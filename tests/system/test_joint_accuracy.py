@@ -1,7 +1,7 @@
 """Accuracy of `joint` on scenes that need no data: few exposures, thin objects, a smooth wall, honest confidence.
 
-Limits leave room over what is measured today; the full account, beside what is asked:
-`python -m tests.reference.joint_accuracy`.
+Limits are a little beyond the worst that these maps gave with seeds 1 to 9, closer than what is asked of prepared
+scenes. The full account, beside what is asked: `python -m tests.reference.joint_accuracy`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from rig.stripes import StripeTable
 from tests.reference.adapter import reconstructor_of, volume_of
 from tests.reference.answers import Answers, calibration_error
 from tests.reference.made_scenes import smooth_scene, thin_scene
@@ -23,43 +24,57 @@ SCENES = {
     "smooth": lambda: smooth_scene(ROWS, WIDTH),
     "thin": lambda: thin_scene(ROWS, WIDTH)[0],
 }
-LIMITS = {("procedural", 1): (0.5, 0.93), ("thin", 3): (0.25, 0.98), ("smooth", 10): (0.1, 0.999)}
-"""Most mean error in px and least share within 1 px, by scene and exposures."""
-BIAS_PX = 0.15
-CALIBRATION = 0.08  # of answers on stripes; asked of all points together, over the prepared scenes: 0.03
-THIN = 0.9
+LIMITS = {
+    ("procedural", 1): (0.205, 0.985, 0.13),  # seeds 1 to 9: up to 0.192, down to 0.992, up to 0.105
+    ("thin", 3): (0.1, 0.998, 0.09),  # 0.084, 1.000, 0.068
+    ("smooth", 10): (0.065, 0.999, 0.06),  # 0.052, 1.000, 0.040
+}
+"""Most mean error in px, least share within 1 px and most bias in px, by scene and exposures."""
+CALIBRATION = 0.025
+"""Of all maps together; 0.013 to 0.016 on stripes, 0.015 to 0.018 with answers where there are none."""
+THIN = 0.995  # 0.999
+FALSE_SECONDS = 1e-3
+"""Mean confidence of second returns where there are none; up to 0.0006."""
 
 
 @cache
-def measured(scene: str, exposures: int) -> tuple[WorkingPoint, Answers]:
+def measured(scene: str, exposures: int) -> tuple[WorkingPoint, Answers, StripeTable]:
     """The working point and what `joint` answered, a missing answer as 10 px."""
     point = WorkingPoint(SCENES[scene](), POINTS["report"])
     reconstructor = reconstructor_of(point, "joint")
     geometry = reconstructor.geometry
     counts = point.counts_in(geometry.x0, geometry.window, exposures, seed=1)
     result = reconstructor.map(volume_of(reconstructor, counts, exposures))
-    return point, Answers.of(point, result, slice(None))
+    return point, Answers.of(point, result, slice(None)), result.stripe
 
 
 @pytest.mark.parametrize(("scene", "exposures"), list(LIMITS))
 def test_few_exposures_are_enough(scene: str, exposures: int) -> None:
-    _, answers = measured(scene, exposures)
-    most_px, least_within = LIMITS[scene, exposures]
+    _, answers, _ = measured(scene, exposures)
+    most_px, least_within, most_bias_px = LIMITS[scene, exposures]
     assert answers.mean_px <= most_px
     assert answers.within >= least_within
-    assert abs(answers.bias_px) <= BIAS_PX
+    assert abs(answers.bias_px) <= most_bias_px
     assert answers.missing <= 0.05
 
 
 def test_a_pole_and_a_fence_are_still_there_at_three_exposures() -> None:
-    point, answers = measured("thin", 3)
+    point, answers, _ = measured("thin", 3)
     for name, mask in thin_scene(ROWS, WIDTH)[1].items():
         on = answers.over(at_stripe(mask, point.x_true).ravel())
         assert on.scored.sum() > 100
         assert on.within >= THIN, name
 
 
-def test_confidence_is_the_share_within_a_pixel() -> None:
-    claims = [measured(scene, exposures)[1].claims() for scene, exposures in LIMITS]
+@pytest.mark.parametrize("empty", [False, True], ids=["stripes", "all answers"])
+def test_confidence_is_the_share_within_a_pixel(empty: bool) -> None:
+    claims = [measured(scene, exposures)[1].claims(empty=empty) for scene, exposures in LIMITS]
     claimed, right = (np.concatenate(part) for part in zip(*claims, strict=True))
     assert calibration_error(claimed, right) <= CALIBRATION
+
+
+@pytest.mark.parametrize(("scene", "exposures"), list(LIMITS))
+def test_a_scene_of_single_surfaces_has_no_second_returns(scene: str, exposures: int) -> None:
+    _, _, table = measured(scene, exposures)
+    assert table.confidence2 is not None
+    assert table.confidence2[np.isfinite(table.x_px)].mean() < FALSE_SECONDS

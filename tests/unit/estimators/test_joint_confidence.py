@@ -1,5 +1,7 @@
 """How sure answers of `joint` are: neighbours are counted as they are; surfaces, light and margin have a say."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -111,6 +113,23 @@ def test_haze_that_only_ends_is_no_stripe():
     ends = judged(wall(), light=2.5 * haze, haze=haze, exposures=10).confidence
     shines = judged(wall(), light=2.5 * haze + 0.5, haze=haze, exposures=10).confidence
     assert ends.max() < shines.min()
+
+
+def test_no_agreement_around_makes_up_for_a_hole_where_light_should_be():
+    """Less light than haze alone brings: a little by chance, but not far more than chance explains."""
+    seen = {"haze": 0.14, "margin": 14}
+    assert judged(wall(), light=0.0, exposures=10, **seen).confidence.min() > 0.9
+    assert judged(wall(), light=0.0, exposures=200, **seen).confidence.max() < 0.1
+    assert judged(wall(), light=0.25, exposures=200, **seen).confidence.min() > 0.9
+
+
+@pytest.mark.parametrize("sd", [0.4, 0.6, 1.0])
+def test_a_stripe_is_taken_to_be_half_as_far_off_again_as_counts_alone_say(sd):
+    """Nothing else is in doubt, so the confidence is the chance of a normal error to stay within a pixel."""
+    found = judged(wall(), light=5.0, haze=0.0, exposures=100, margin=30, sd=sd).confidence
+    least, most = (math.erf(1 / (times * sd * math.sqrt(2))) for times in (1.65, 1.45))
+    assert least < found.min()
+    assert found.max() < most
 
 
 @pytest.mark.parametrize(("better", "worse"), [({"sd": 0.1}, {"sd": 0.9}), ({"margin": 12}, {"margin": 2})])

@@ -1,0 +1,56 @@
+"""A live rig is shown poses until enough of them have told something."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibration.errors import Degenerate
+from calibration.guide.poses import Advice
+from calibration.views import Corners, Passages, View
+from rig.calibrating import taking
+from rig.calibrating.session import Session
+from rig.calibrating.taking import FixedPoses, Live, Taken, take_live
+
+
+def shown(
+    monkeypatch: pytest.MonkeyPatch, passages: int = 50, refused: str | None = None, *, line: bool = True
+) -> tuple[Taken, list[str]]:
+    """What was taken of four poses wanted, and said of them."""
+    rng = np.random.default_rng(1)
+
+    def capture(config: Any, name: str, board: Any, **given: Any) -> Any:
+        if refused is not None:
+            return SimpleNamespace(view=View(name, None), refused=Degenerate(refused, refused), identity=None)
+        line = np.zeros(passages)
+        sweep = Passages(line, line, line, line, 1, 30.0)
+        corners = Corners(np.arange(9, dtype=np.int32), rng.normal(size=(9, 2)))
+        return SimpleNamespace(view=View(name, corners, (sweep, sweep)), refused=None, identity=None)
+
+    monkeypatch.setattr(taking, "capture_view", capture)
+    monkeypatch.setattr(taking, "shown", lambda config, *given: config)
+    told: list[str] = []
+    config: Any = None
+    candidate: Any = None
+    taken = Taken(Session(None), told.append)
+    choose = FixedPoses([Advice(candidate, 5.0)] * 9)
+    board: Any = None
+    take_live(taken, Live(config, 4, choose, exposures=(3, 6), line=line), board)
+    return taken, told
+
+
+def test_as_many_poses_as_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len(shown(monkeypatch)[0].views) == 4
+
+
+def test_a_pose_that_does_not_show_the_line_does_not_count_where_it_is_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken, told = shown(monkeypatch, passages=5)
+    assert len(taken.views) == 6
+    assert "9 corners, 5, 5 passages of the line, too few to count (limit 30 a sweep)" in told[-1]
+    assert len(shown(monkeypatch, passages=5, line=False)[0].views) == 4
+
+
+@pytest.mark.parametrize(("reason", "views"), [("wrong-board", 3), ("mirrored", 3), ("no-board", 6)])
+def test_no_more_poses_are_shown_where_none_will_help(monkeypatch: pytest.MonkeyPatch, reason: str, views: int) -> None:
+    assert len(shown(monkeypatch, refused=reason)[0].views) == views
