@@ -1,7 +1,9 @@
 """A smooth map from board to picture: a homography and, with points enough, what a lens bends on top of it.
 
-It needs no camera: the bend is a polynomial over the board, fitted to points whose board positions are known. It says
-where corners should be and how the board is drawn around one.
+It needs no camera: the bend is a polynomial over the picture, fitted to points whose board positions are known. It says
+where corners should be and how the board is drawn around one. Not over the board: a lens bends the picture, by terms
+that are a polynomial there, whatever the board's tilt; over tilted boards they are none, and what was left of them drew
+corners off by less than 0.002 px, but alike in all pictures, which made focal lengths wrong by 0.025 % at k1 = 0.2.
 """
 
 from dataclasses import dataclass
@@ -23,20 +25,21 @@ _LEAST_OUTLIER_PX = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardMap:
-    """Board positions (metres) to raw pixels. homography: (3, 3) float64. bend_px: (terms, 2) float64, x^i y^j."""
+    """Board positions (metres) to raw pixels. homography: (3, 3) float64, of positions from -1 to 1 over the board.
+    bend_px: (terms, 2) float64, x^i y^j of what it gives, from -1 to 1 over the board's picture.
+    """
 
     homography: Array
     bend_px: Array
     degree: int
-    centre_m: Array
     half_m: Array
+    centre_px: Array
+    half_px: float
 
     def to_px(self, points_m: ArrayLike) -> Array:
         """Raw pixels (..., 2) of board positions (..., 2)."""
-        points = np.asarray(points_m, np.float64)
-        at = (points - self.centre_m) / self.half_m
-        seen = np.concatenate([at, np.ones((*at.shape[:-1], 1))], axis=-1) @ self.homography.T
-        mapped: Array = seen[..., :2] / seen[..., 2:] + _terms(at, self.degree) @ self.bend_px
+        flat = _projected(self.homography, (np.asarray(points_m, np.float64) - self.half_m) / self.half_m)
+        mapped: Array = flat + _terms((flat - self.centre_px) / self.half_px, self.degree) @ self.bend_px
         return mapped
 
 
@@ -51,25 +54,34 @@ def fit_map(
         return None
     half = np.array(size_m) / 2
     at = (points_m - half) / half
-    homography, mask = cv2.findHomography(at, px, cv2.RANSAC, outlier_px, maxIters=2000, confidence=0.9999)
-    if homography is None or not np.isfinite(homography).all():
+    first, mask = cv2.findHomography(at, px, cv2.RANSAC, outlier_px, maxIters=2000, confidence=0.9999)
+    if first is None or not np.isfinite(first).all():
         return None
+    homography = np.asarray(first, np.float64)
     inside: NDArray[np.bool_] = mask.ravel() > 0
     if inside.sum() < _FEWEST_POINTS:
         return None
     degree = next((degree for fewest, degree in _BENDS if inside.sum() >= fewest), 0)
-    flat = BoardMap(np.asarray(homography, np.float64), np.zeros((len(_powers(degree)), 2)), degree, half, half)
-    if degree == 0:
-        return flat, inside
-    terms, missed = _terms(at, degree), px - flat.to_px(points_m)
-    for share in _KEPT_SHARES:
-        bend, *_ = np.linalg.lstsq(terms[inside], missed[inside], rcond=1e-6)
+    flat = _projected(homography, at)
+    centre = flat[inside].mean(axis=0)
+    reach = max(float(np.abs(flat[inside] - centre).max()), 1e-9)
+    terms, missed = _terms((flat - centre) / reach, degree), px - flat
+    bend: Array = np.zeros((terms.shape[1], 2))
+    for share in _KEPT_SHARES if degree else ():
+        bend = np.asarray(np.linalg.lstsq(terms[inside], missed[inside], rcond=1e-6)[0], np.float64)
         off = np.hypot(*(missed - terms @ bend).T)
         usual = float(np.median(off[inside]))
         close = max(_OUTLIER_MEDIANS * usual, _LEAST_OUTLIER_PX)
         inside = off <= (close if share == 1 else max(float(np.quantile(off[inside], share)), _LEAST_OUTLIER_PX))
-    bend, *_ = np.linalg.lstsq(terms[inside], missed[inside], rcond=1e-6)
-    return BoardMap(flat.homography, np.asarray(bend, np.float64), degree, half, half), inside
+    if degree:
+        bend = np.asarray(np.linalg.lstsq(terms[inside], missed[inside], rcond=1e-6)[0], np.float64)
+    return BoardMap(homography, bend, degree, half, centre, reach), inside
+
+
+def _projected(homography: Array, at: Array) -> Array:
+    seen = np.concatenate([at, np.ones((*at.shape[:-1], 1))], axis=-1) @ homography.T
+    flat: Array = seen[..., :2] / seen[..., 2:]
+    return flat
 
 
 def _powers(degree: int) -> list[tuple[int, int]]:
