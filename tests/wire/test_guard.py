@@ -152,7 +152,7 @@ def test_a_program_that_ends_by_itself_is_no_hang_and_its_laser_rests(at_work: b
         guard.laser.arm(POWER_W)
         guard.sync.run()
         guard.beat(1)
-        assert guard.laser.status.emission
+        assert True in rig.emission.levels  # on a busy machine its two sweeps may be over by now
         ends_at = time.monotonic() + EMISSION_S  # no more frames: the program's two sweeps are over
         while rig.emission.levels[-1] and time.monotonic() < ends_at:
             if not at_work:
