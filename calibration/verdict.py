@@ -3,8 +3,10 @@
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, Literal
 
+VerdictWord = Literal["passed", "failed"]
+"""A verdict as files have it."""
 SIGMAS: Final = 4.0
 """By how many standard deviations a baseline must differ from the stated one."""
 WORST_TIMES: Final = 4.0
@@ -45,6 +47,11 @@ class Verdict:
 
     passed: bool
     reasons: tuple[Reason, ...] = ()
+
+    @property
+    def word(self) -> VerdictWord:
+        """It, in a word."""
+        return "passed" if self.passed else "failed"
 
     @property
     def codes(self) -> tuple[str, ...]:

@@ -70,7 +70,7 @@ def run_camera(
         about = subject(taken.identity, board, summary["versions"], datetime.now(UTC))
         report = camera_report(fit, used, judged, board, figures, about)
         digests = [corners_digest(view) for view in used if view.name in fit.kept]
-        session.write_text(CAMERA_FILE, camera_file_text(fit.camera, fit.covariance, digests))
+        session.write_text(CAMERA_FILE, camera_file_text(fit.camera, fit.covariance, digests, judged.verdict))
         session.finish(summary, report, None)
         return CalibrationResult(judged.verdict, judged.line(), figures, summary, None, session.path)
 

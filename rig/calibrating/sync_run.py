@@ -117,7 +117,7 @@ def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigMod
         "sync": {
             "by": "rig calibrate sync",
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "verdict": "passed" if verdict.passed else "failed",
+            "verdict": verdict.word,
         },
     }
     return replace(
