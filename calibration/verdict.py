@@ -108,8 +108,3 @@ def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, 
         return reason_for("too-few-poses", text, shown)
     needed = math.ceil(shown * over[worst] ** 2)
     return reason_for("too-few-poses", f"{text}: about {needed} poses would do", shown, needed)
-
-
-def mm(length_m: float) -> str:
-    """A length in a reason's text, in millimetres."""
-    return f"{length_m * 1e3:.3g} mm"

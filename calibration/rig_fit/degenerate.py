@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.depth.uncertainty import command_at, depth_sd_m
+from calibration.digits import digits
 from calibration.errors import Degenerate
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.sightings import Sighting
@@ -102,7 +103,7 @@ def check_depth(
     if usual > MOST_DEPTH_SD_SHARE * at_m:
         raise Degenerate(
             reason_of(poses),
-            f"depth at {at_m:.3g} m would be known to {usual:.3g} m from {len(poses)} poses, limit "
+            f"depth at {at_m:.3g} m would be known to {digits(usual)} m from {len(poses)} poses, limit "
             f"{MOST_DEPTH_SD_SHARE * at_m:.3g} m (condition number {condition:.3g}); show the board at more poses, at "
             "other distances and tilted differently",
         )

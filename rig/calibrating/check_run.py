@@ -13,6 +13,7 @@ from calibration.board.board import Board
 from calibration.check.boards import CheckedAngle, CheckedBoard, check_angle, check_boards
 from calibration.depth.sensitivity import sensitivity
 from calibration.depth.uncertainty import DepthUncertainty, depth_uncertainty
+from calibration.digits import mm
 from calibration.errors import Degenerate
 from calibration.files.camera_file import CORNERS, corners_digest
 from calibration.files.rig_file import load_rig_model
@@ -185,8 +186,8 @@ def _figures(boards: Sequence[CheckedBoard], angle: CheckedAngle | None) -> list
         rows.append(
             (
                 f"view {board.name}",
-                f"{board.distance_m:.2f} m away, flat to {board.flatness_rms_m * 1e3:.2g} mm rms "
-                f"({board.expected_m * 1e3:.2g} expected), {board.flatness_peak_m * 1e3:.2g} mm peak, scale "
+                f"{board.distance_m:.2f} m away, flat to {mm(board.flatness_rms_m)} rms "
+                f"({mm(board.expected_m)} expected), {mm(board.flatness_peak_m)} peak, scale "
                 f"{board.scale - 1:+.3%} (sd {board.scale_sd:.2%})",
             )
         )

@@ -9,6 +9,7 @@ import numpy as np
 
 from calibration.board.board import Board
 from calibration.depth.against_truth import DepthErrors
+from calibration.digits import mm
 from calibration.errors import CalibrationError, Degenerate
 from calibration.files.camera_file import CORNERS, KnownCamera, corners_digest
 from calibration.judging.rig import Judged, judge_fit
@@ -19,7 +20,6 @@ from rig.calibrating.camera_use import CameraUse
 from rig.calibrating.guided import Guide
 from rig.calibrating.refusing import refusal
 from rig.calibrating.report import planes_report
-from rig.calibrating.report_numbers import mm
 from rig.calibrating.report_subject import subject
 from rig.calibrating.result import CalibrationResult, named
 from rig.calibrating.session import Session
@@ -220,18 +220,18 @@ def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None, camera: Cam
     rows = [
         ("views", f"{len(fit.used)} used, {named(fit.outliers)} outliers, {named(fit.left_out)} without board, "
                   f"{named(fit.without_line)} without passages"),
-        ("depth error", f"{mm(evidence.expected_m)} mm at {asked.at_m:g} m (95 % of the picture: "
-                        f"{mm(evidence.worst_m)} mm), asked {mm(asked.accuracy_m)} mm"),
+        ("depth error", f"{mm(evidence.expected_m)} at {asked.at_m:g} m (95 % of the picture: "
+                        f"{mm(evidence.worst_m)}), asked {mm(asked.accuracy_m)}"),
         ("camera", f"f {matrix[0, 0]:.2f}, {matrix[1, 1]:.2f} px, centre {matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px"),
-        ("baseline", f"{evidence.baseline_m * 1e3:.2f} mm, sd {evidence.baseline_sd_m * 1e3:.2g} mm"),
+        ("baseline", f"{evidence.baseline_m * 1e3:.2f} mm, sd {mm(evidence.baseline_sd_m)}"),
         ("lag", f"{lag.forward * 1e6:.1f} us forward, {lag.backward * 1e6:.1f} us backward"),
-        ("residuals", f"corners {fit.corner_rms_px:.3f} px, planes wave by {evidence.wave_m * 1e3:.2g} mm and views "
-                      f"differ by {evidence.shift_m * 1e3:.2g} mm at {asked.at_m:g} m"),
+        ("residuals", f"corners {fit.corner_rms_px:.3f} px, planes wave by {mm(evidence.wave_m)} and views "
+                      f"differ by {mm(evidence.shift_m)} at {asked.at_m:g} m"),
         ("condition", f"{fit.condition:.3g}" + ("" if fit.converged else "; the fit did not come to rest")),
     ]  # fmt: skip
     if camera is not None:
         rows += [("camera file", f"accepted in spite of {each}") for each in camera.accepted]
     if truth is not None:
-        rows.append(("truth", f"median {mm(truth.median_m)} mm, worst {mm(truth.worst_m)} mm at "
+        rows.append(("truth", f"median {mm(truth.median_m)}, worst {mm(truth.worst_m)} at "
                               f"{truth.depth_m:g} m, {truth.ratio:.2f} of the expected sd"))  # fmt: skip
     return rows
