@@ -22,6 +22,7 @@ from calibration.judging.rig import goal
 from calibration.model.rig_model import RigModel
 from calibration.verdict import AT_M, Asked, Verdict
 from calibration.views import View
+from rig.calibrating.refusing import note_views
 from rig.calibrating.report import check_report
 from rig.calibrating.report_subject import subject
 from rig.calibrating.result import CalibrationResult
@@ -124,8 +125,7 @@ def _with_board(taken: Taken, least: int) -> list[View]:
         reason = next((why.reason for why in taken.refused.values()), "no-board")
         few = "1 view shows" if len(views) == 1 else f"{len(views)} views show"
         error = Degenerate(reason, f"{reason}: {few} the board, at least {least} must; show it again")
-        for name, why in taken.refused.items():
-            error.add_note(f"view {name}: {why}")
+        note_views(error, taken)
         raise error
     return views
 
