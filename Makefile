@@ -66,10 +66,12 @@ campaign-simulation: .venv/.installed-tests  ## effects left out against the ful
 RIGS ?= 500
 TRIALS ?= 30
 campaign-calibration: .venv/.installed-tests  ## RIGS calibrated, TRIALS of deliberate mistakes; a second simulator; the guide
-	$(BIN)/python -m tests.campaigns.calibration_rigs --rigs $(RIGS)
-	$(BIN)/python -m tests.campaigns.calibration_mistakes --trials $(TRIALS)
-	$(BIN)/python -m tests.campaigns.calibration_fits
-	$(BIN)/python -m tests.campaigns.calibration_guided
+	short=0; \
+	$(BIN)/python -m tests.campaigns.calibration_rigs --rigs $(RIGS) || short=1; \
+	$(BIN)/python -m tests.campaigns.calibration_mistakes --trials $(TRIALS) || short=1; \
+	$(BIN)/python -m tests.campaigns.calibration_fits || short=1; \
+	$(BIN)/python -m tests.campaigns.calibration_guided || short=1; \
+	exit $$short
 campaign-kernel: .venv/.installed-tests  ## drivers through real kernels; hardware in the loop, on an idle machine
 	$(BIN)/python -m tests.campaigns.kernel_usb
 	$(BIN)/python -m tests.campaigns.kernel_serial

@@ -3,8 +3,12 @@
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, Literal
 
+from calibration.digits import digits
+
+VerdictWord = Literal["passed", "failed"]
+"""A verdict as files have it."""
 SIGMAS: Final = 4.0
 """By how many standard deviations a baseline must differ from the stated one."""
 WORST_TIMES: Final = 4.0
@@ -47,6 +51,11 @@ class Verdict:
     reasons: tuple[Reason, ...] = ()
 
     @property
+    def word(self) -> VerdictWord:
+        """It, in a word."""
+        return "passed" if self.passed else "failed"
+
+    @property
     def codes(self) -> tuple[str, ...]:
         """The reasons' codes."""
         return tuple(reason.code for reason in self.reasons)
@@ -56,7 +65,11 @@ class Verdict:
         return {"passed": self.passed, "reasons": [asdict(reason) for reason in self.reasons]}
 
 
+MOST_POSES: Final = 50
+"""That anybody shows: four times those of a usual session."""
+
 _GUIDED = " ('--guided' says which)"
+_TELL_MORE = f"make each pose tell more, with more light, the board nearer and tilted more{_GUIDED}"
 _NEXT_STEP = {
     "exposure-not-locked": "lock the exposures to the scan (shared clock, markers in the stream) and check for a loose "
     "marker cable",
@@ -100,9 +113,7 @@ def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, 
     if not math.isfinite(over[worst]):
         return reason_for("too-few-poses", text, shown)
     needed = math.ceil(shown * over[worst] ** 2)
+    if needed > MOST_POSES:
+        text = f"{text}, {digits(over[worst], 2)} times less: more poses like these {shown} will not do"
+        return replace(reason_for("too-few-poses", text, shown, needed), next_step=_TELL_MORE)
     return reason_for("too-few-poses", f"{text}: about {needed} poses would do", shown, needed)
-
-
-def mm(length_m: float) -> str:
-    """A length in a reason's text, in millimetres."""
-    return f"{length_m * 1e3:.3g} mm"

@@ -43,6 +43,7 @@ def calibrate_planes(
     exposures: Sequence[int] = (),
     seed: int = 0,
     arm: bool = False,
+    accept_calibration: bool = False,
     out: OutFolder = None,
     ask: "Ask | None" = None,
     tell: "Tell | None" = None,
@@ -54,11 +55,12 @@ def calibrate_planes(
     whose defects are kept. camera: the camera.yaml of `calibrate_camera`, made of other views. stated_baseline: of
     mirror and camera as measured, such as '300 mm'. accuracy: sd of the depth that is good enough, such as '10 mm', at
     the distance `at`, such as '5 m'; None: what a tenth of a pixel costs there. scene: of a simulated rig. exposures:
-    per column, by turns. arm: must be True where laser or gate are real. ask: has the board of a real rig moved and
-    returns once it is. tell: takes a line for each view. out: a folder to write, None: nothing.
+    per column, by turns. arm: must be True where laser or gate are real. accept_calibration: take a `camera` whose
+    verdict failed all the same (else UsageError). ask: has the board of a real rig moved and returns once it is. tell:
+    takes a line for each view. out: a folder to write, None: nothing.
     """
-    from calibration.files.camera_file import load_camera
     from calibration.verdict import AT_M
+    from rig.calibrating.camera_use import camera_use
     from rig.calibrating.planes_run import POSES, PlanesAsked, run_planes
 
     problems = _problems(poses, seed, exposures)
@@ -80,7 +82,7 @@ def calibrate_planes(
     from rig.calibrating.sources import sort_sources
 
     found = sort_sources(_listed(sources), scene=scene)
-    known = None if camera is None else load_camera(Path(camera))
+    known = None if camera is None else camera_use(Path(camera), accept=accept_calibration)
     return run_planes(found, _board(board), asked, base=_base(calibration), camera=known, out=out, ask=ask, tell=tell)
 
 

@@ -20,12 +20,12 @@ from typing import Any, Final
 from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import Identity, RigModel
 from rig.calibrating.result import KnowsRig
+from rig.calibration_refusals import Refusal, check_content, failed_verdict, require_accepted
 from rig.errors import UsageError
 from rig.recording.manifest import read_manifest
 from rig.replaying import PlaysRecording
 from rig.session import OpenRig
 
-NEXT: Final = "calibrate again, or add --accept-calibration to use it all the same"
 DAY_S: Final = 86400.0
 _SLOTS: Final = ("spad", "scanner")
 """Devices that depth depends on: laser and sync source only let the light out."""
@@ -33,15 +33,6 @@ _NO_SERIAL: Final = ("", "none")
 _GEOMETRY: Final = "geometry"
 """What a simulated rig really is like, by its numbers; `world` is the name of its file, which says less."""
 _CHECKS: Final = {"check": "rig calibrate check", "pixels": "rig calibrate pixels"}
-
-
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """Why a calibration is not to be used. code: other-spad, other-scanner, other-world, other-lines, failed-verdict,
-    failed-check or too-old."""
-
-    code: str
-    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +45,11 @@ class CalibrationUse:
 
     def content(self) -> dict[str, Any]:
         """For the manifest."""
-        content: dict[str, Any] = {
+        return {
             "id": self.model.fingerprint(),
             "provenance": dict(self.model.provenance),
-            "check": "matches" if self.checked else "unchecked",
+            **check_content("matches" if self.checked else "unchecked", self.accepted),
         }
-        if self.accepted:
-            content |= {"check": "accepted", "accepted": [[each.code, each.text] for each in self.accepted]}
-        return content
 
 
 def identity_of(rig: OpenRig, created: datetime | None = None) -> Identity:
@@ -138,9 +126,7 @@ def refusals(
         if here is not None:
             found += _foreign(identity, here)
             found += _aged(identity, here, max_age_s)
-        if identity.verdict == "failed":
-            why = ", ".join(identity.reasons) or "no reason noted"
-            found.append(Refusal("failed-verdict", f"its verdict is 'failed' ({why}), 'passed' is needed"))
+        found += failed_verdict(identity.verdict, identity.reasons)
     for what, note in _checks(file, model).items():
         if not note.get("passed", True):
             why = ", ".join(note.get("reasons") or ()) or "no reason noted"
@@ -176,9 +162,7 @@ def _identity(name: str, kinds: Mapping[str, str], serials: Mapping[str, str], c
 
 
 def _used(model: RigModel, file: Path | None, found: tuple[Refusal, ...], accepted: frozenset[str]) -> CalibrationUse:
-    if refused := [each for each in found if each.code not in accepted]:
-        name = "calibration" if file is None else f"calibration {file}"
-        raise UsageError.of(f"{name}: {each.text}; {NEXT}" for each in refused)
+    require_accepted("calibration" if file is None else f"calibration {file}", found, accepted)
     return CalibrationUse(model, model.identity is not None, found)
 
 
@@ -266,4 +250,4 @@ def _read_notes(file: Path) -> dict[str, dict[str, Any]]:
 
 def accepted_by(use: CalibrationUse | None) -> tuple[str, ...]:
     """What a run's calibration was used in spite of, for its summary."""
-    return () if use is None else tuple(f"{each.code}: {each.text}" for each in use.accepted)
+    return () if use is None else tuple(map(str, use.accepted))

@@ -175,6 +175,9 @@ def planes_command(
     exposures: ExposuresOption = None,
     seed: SeedOption = 0,
     arm: ArmOption = False,
+    accept_calibration: Annotated[
+        bool, typer.Option("--accept-calibration", help="use a --camera whose verdict failed all the same")
+    ] = False,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> int:
@@ -195,6 +198,7 @@ def planes_command(
         exposures=whole_numbers("--exposures", exposures),
         seed=seed,
         arm=arm,
+        accept_calibration=accept_calibration,
         out=default_out() if out is None else out,
         ask=_ask_at_terminal(),
         tell=say,

@@ -38,8 +38,15 @@ def tradeoff_command(
     ] = None,
     exposures: Annotated[Some, typer.Option("--exposures", help="frames per column (K)", show_default="1,3,10")] = None,
     lines: Annotated[Some, typer.Option("--lines", help="lines at once", show_default="the config's")] = None,
-    estimators: Annotated[Some, typer.Option("--estimators", show_default="edge,likelihood,joint")] = None,
-    filters: Annotated[Some, typer.Option("--filters", show_default="none,median")] = None,
+    estimators: Annotated[
+        Some,
+        typer.Option(
+            "--estimators", help="of argmax, edge, likelihood, joint, by commas", show_default="edge,likelihood,joint"
+        ),
+    ] = None,
+    filters: Annotated[
+        Some, typer.Option("--filters", help="of none, median (5 x 5), by commas", show_default="none,median")
+    ] = None,
     repeat: Annotated[int, typer.Option("--repeat", help="scans of each, for the confidence intervals")] = 1,
     seed: Annotated[int, typer.Option("--seed", help="of the first of them")] = 0,
     limits: Annotated[bool, typer.Option(help="compare with the statistical limit of the scene's light")] = True,

@@ -13,7 +13,8 @@ from typing import Any
 
 from drivers.errors import DeviceError
 from rig.burst import require_memory
-from rig.calibration_identity import NEXT, identity_of, refusals
+from rig.calibration_identity import identity_of, refusals
+from rig.calibration_refusals import NEXT
 from rig.config import RigConfig
 from rig.dark_look import DarkLook, look
 from rig.errors import DevicesError, RigError

@@ -281,10 +281,14 @@ class ScanPlan:
             f"({float(self.sweep_s) * 1e3:.1f} ms of sensor time), {self.dark_fraction:.1%} of them dark",
             f"gate        {gate.gate_open_s * 1e3:.3f} to {gate.gate_close_s * 1e3:.3f} ms after the scan marker",
             f"sync        {self._describe_sync()}",
-            f"window      {self.window} of {self.width} pixels for {near:g} to {far:g} m",
+            f"window      {self._describe_window()} for {near:g} to {far:g} m",
             f"link        {self._describe_link()}",
         )
         return "\n".join(lines)
+
+    def _describe_window(self) -> str:
+        """Stored rows are padded to whole words, sensors need not be."""
+        return f"all {self.width} pixels" if self.window >= self.width else f"{self.window} of {self.width} pixels"
 
     def _describe_lines(self) -> str:
         if self.lines is None:

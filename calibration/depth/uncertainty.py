@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.depth.propagation import by_parameter
+from calibration.digits import digits
 from calibration.errors import CalibrationError
 from calibration.model.covariance import Covariance
 from calibration.model.parameters import DISTORTION, MATRIX, TIMES
@@ -69,7 +70,7 @@ class DepthUncertainty:
         sd = float(np.nanmedian(self.sd_m))
         group, part = max(((name, float(np.nanmedian(m))) for name, m in self.part_m.items()), key=lambda item: item[1])
         unit, scale = ("mm", 1e3) if sd >= 1e-3 or sd == 0 else ("um", 1e6)
-        whole, of_them = (f"{float(f'{value * scale:.2g}'):.15g}" for value in (sd, part))  # no 4.8e+02
+        whole, of_them = (digits(value * scale, 2) for value in (sd, part))
         return f"{at}: {whole} {unit}, {of_them} of them from {_SAID[group]}"
 
 

@@ -5,6 +5,8 @@ version: 1
 camera: {width, height, matrix, distortion}              # as in a calibration file
 covariance: {names: [fx, fy, ...], matrix: [[...]]}      # how well that is known
 views: [16 hexadecimal digits, ...]                      # corners it was made of: they must not count twice
+verdict: passed or failed                                # left out: nobody judged it
+reasons: [too-few-poses, ...]                            # why it failed, by their codes
 """
 
 import hashlib
@@ -19,6 +21,7 @@ from calibration.files.sections import CameraSection, Number, Section
 from calibration.files.yaml_file import read_yaml_file
 from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
+from calibration.verdict import Verdict, VerdictWord
 from calibration.views import View
 
 CAMERA_FORMAT = "spadrig-camera"
@@ -38,33 +41,44 @@ class _CameraFile(Section):
     camera: CameraSection
     covariance: _CovarianceRows
     views: tuple[str, ...] = ()
+    verdict: VerdictWord | None = None
+    reasons: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownCamera:
-    """A camera, how well it is known, and the digests of the views that told it."""
+    """A camera, how well it is known, and the digests of the views that told it.
+
+    verdict, reasons: of its calibration; None where nobody judged it.
+    """
 
     camera: Camera
     covariance: Covariance
     views: frozenset[str]
+    verdict: VerdictWord | None = None
+    reasons: tuple[str, ...] = ()
 
 
 def load_camera(path: Path) -> KnownCamera:
     """Read a camera file. Raises CalibrationError, one line."""
     parsed = read_yaml_file(path, "a camera", CAMERA_FORMAT, CAMERA_VERSION, _CameraFile)
     covariance = Covariance(tuple(parsed.covariance.names), np.array(parsed.covariance.matrix, dtype=np.float64))
-    return KnownCamera(build_camera(parsed.camera), covariance, frozenset(parsed.views))
+    camera, views = build_camera(parsed.camera), frozenset(parsed.views)
+    return KnownCamera(camera, covariance, views, parsed.verdict, parsed.reasons)
 
 
-def camera_file_text(camera: Camera, covariance: Covariance, views: list[str]) -> str:
+def camera_file_text(camera: Camera, covariance: Covariance, views: list[str], verdict: Verdict) -> str:
     """What such a file says."""
-    content = {
+    content: dict[str, Any] = {
         "format": CAMERA_FORMAT,
         "version": CAMERA_VERSION,
         "camera": camera_content(camera),
         "covariance": {"names": list(covariance.names), "matrix": covariance.matrix.tolist()},
         "views": views,
+        "verdict": verdict.word,
     }
+    if verdict.reasons:
+        content["reasons"] = list(verdict.codes)
     return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
 
 

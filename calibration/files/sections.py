@@ -4,6 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from calibration.verdict import VerdictWord
+
 FORMAT = "spadrig-calibration"
 VERSION = 1
 
@@ -84,7 +86,7 @@ class IdentitySection(Section):
     name: str = ""
     kinds: dict[str, str] = {}
     serials: dict[str, str] = {}
-    verdict: Literal["passed", "failed"] | None = None
+    verdict: VerdictWord | None = None
     reasons: list[str] = []
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
+from calibration.digits import mm
 from calibration.model.camera import Camera
-from calibration.verdict import mm
 from calibration.views import BoardPose
 
 Array = NDArray[np.float64]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calibration.board.board import Board
 from calibration.camera_fit.fit import CameraFit
+from calibration.digits import digits
 from calibration.judging.data_lack import data_lack, hiding
 from calibration.judging.evidence import pose_evidence, view_evidence
 from calibration.model.camera import Camera
@@ -41,7 +42,7 @@ class JudgedCamera:
 
     def line(self) -> str:
         """One line."""
-        return f"rays are known to {self.sd_px:.2g} px (95 % of the picture: {self.worst_px:.2g} px)"
+        return f"rays are known to {_px(self.sd_px)} (95 % of the picture: {_px(self.worst_px)})"
 
 
 def judge_camera(fit: CameraFit, views: Sequence[View], board: Board, *, photons: bool) -> JudgedCamera:
@@ -57,8 +58,12 @@ def judge_camera(fit: CameraFit, views: Sequence[View], board: Board, *, photons
     reasons = [*hiding(evidence, poses, photons=photons), *lacking]
     if imprecise and not reasons:
         found = median, worst
-        reasons = [more_poses(len(fit.kept), "rays are known to", found, ACCURACY_PX, "{:.2g} px".format)]
+        reasons = [more_poses(len(fit.kept), "rays are known to", found, ACCURACY_PX, _px)]
     return JudgedCamera(unguided(Verdict(not reasons, tuple(reasons))), median, worst, evidence.coverage)
+
+
+def _px(length_px: float) -> str:
+    return f"{digits(length_px, 2)} px"
 
 
 def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:

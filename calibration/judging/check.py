@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from calibration.check.boards import CheckedAngle, CheckedBoard
+from calibration.digits import mm
 from calibration.verdict import SIGMAS, Asked, Reason, Verdict
 
 UNLIKELY_SDS: Final = 4.0
@@ -45,8 +46,8 @@ def _flatness(board: CheckedBoard, bearable_m: float) -> list[Reason]:
     if board.chi2 <= likely or board.flatness_rms_m <= bearable_m:
         return []
     text = (
-        f"view {board.name}: the board's squares lie {board.flatness_rms_m * 1e3:.3g} mm (rms) off a plane, expected "
-        f"are {board.expected_m * 1e3:.3g} mm, the limit at {board.distance_m:.2g} m is {bearable_m * 1e3:.3g} mm"
+        f"view {board.name}: the board's squares lie {mm(board.flatness_rms_m)} (rms) off a plane, expected "
+        f"are {mm(board.expected_m)}, the limit at {board.distance_m:.2g} m is {mm(bearable_m)}"
     )
     step = f"check that the board is flat, then {_AGAIN}"
     return [Reason("not-flat", text, board.flatness_rms_m, max(bearable_m, board.expected_m), step)]

@@ -5,11 +5,13 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from calibration.judging.evidence import PoseEvidence, ViewEvidence
+from calibration.rig_fit.degenerate import unfit
 from calibration.verdict import Reason, reason_for
 
 _FEWEST_TO_JUDGE = 3
 """Of fewer poses neither tilt nor coverage can be asked."""
 _MEND_VIEWS = "mend what is said of the other views, then show more"
+_SHOW_ANEW = "show the board again for each of these, at rest until its sweeps are over"
 FEWEST_POSES: Final = 6
 """With fewer, a single bad view bends the fit to it, so that nothing shows that it was bad."""
 
@@ -80,8 +82,10 @@ def _too_few(views: ViewEvidence) -> Reason:
     limit = f"{FEWEST_POSES} are the fewest that can be checked against each other"
     if views.used == views.shown:
         return reason_for("too-few-poses", f"{shown}, {limit}", views.shown, FEWEST_POSES)
-    text = f"{shown}, {views.used or 'none'} of them could be used, {limit}"
-    return replace(reason_for("too-few-poses", text, views.used, FEWEST_POSES), next_step=_MEND_VIEWS)
+    odd = f" ({unfit(views.odd)})" if views.odd else ""
+    text = f"{shown}, {views.used or 'none'} of them could be used{odd}, {limit}"
+    step = _SHOW_ANEW if views.used + len(views.odd) == views.shown else _MEND_VIEWS
+    return replace(reason_for("too-few-poses", text, views.used, FEWEST_POSES), next_step=step)
 
 
 def _poses_lack(poses: PoseEvidence, imprecise: bool) -> list[Reason]:

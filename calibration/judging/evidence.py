@@ -30,13 +30,14 @@ class ViewEvidence:
     shown: poses. used: those of them that a fit can be checked by: with corners, and where a line is asked for with
     the line on the board too. coverage: share of the picture within the outline of all corners. room_flux: photons per
     pixel and exposure of white on the board (of the bright parts of the picture where there is no board), median over
-    the views.
+    the views. odd: names of those that do not fit the others and had no say.
     """
 
     shown: int
     used: int
     coverage: float
     room_flux: float
+    odd: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,7 @@ def view_evidence(
         used=used,
         coverage=_outline_area(np.concatenate([corners.px for corners in found])) / area if found else 0.0,
         room_flux=float(np.median(fluxes)) if fluxes else np.nan,
+        odd=tuple(left_out),
     )
 
 

@@ -18,11 +18,12 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
+from calibration.digits import mm
 from calibration.errors import Degenerate
 from calibration.judging.data_lack import data_lack, hiding
 from calibration.judging.evidence import PoseEvidence, ViewEvidence
 from calibration.judging.lags import lag_lack
-from calibration.verdict import SIGMAS, WORST_TIMES, Asked, Reason, Verdict, mm, more_poses, reason_for
+from calibration.verdict import SIGMAS, WORST_TIMES, Asked, Reason, Verdict, more_poses, reason_for
 
 LEAST_BASELINE_CHANGE: Final = 0.01
 """What a tape measure may be wrong: 3 mm in 300 mm."""

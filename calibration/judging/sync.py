@@ -1,6 +1,7 @@
 """The verdict on lag and row delay, by the depth error that their uncertainty makes."""
 
 from calibration.depth.sensitivity import sensitivity
+from calibration.digits import digits, mm
 from calibration.judging.lags import lag_lack
 from calibration.model.rig_model import RigModel
 from calibration.sync.lag_fit import SyncFit
@@ -25,8 +26,8 @@ def judge_sync(fit: SyncFit, model: RigModel | None, asked: Asked | None, change
         error_m = worth_m * float(max(fit.sd_s[:2][fit.sd_s[:2] >= 0], default=0.0))
         if not error_m <= asked.accuracy_m:
             text = (
-                f"the lags are known to {error_m / worth_m * 1e6:.2g} us, at {asked.at_m:g} m and the highest speed "
-                f"{error_m * 1e3:.3g} mm of depth, asked for are {asked.accuracy_m * 1e3:.3g} mm"
+                f"the lags are known to {digits(error_m / worth_m * 1e6, 2)} us, at {asked.at_m:g} m and the highest "
+                f"speed {mm(error_m)} of depth, asked for are {mm(asked.accuracy_m)}"
             )
             found.append(
                 Reason("imprecise-lag", text, error_m, asked.accuracy_m, "raise scan.power, or scan more sweeps")

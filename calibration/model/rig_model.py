@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
 from calibration.model.light_sheet import LightSheets, fan_origin, light_sheets
 from calibration.model.scanner import Scanner
+from calibration.verdict import VerdictWord
 
 Array = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ class Identity:
     name: str = ""
     kinds: Mapping[str, str] = field(default_factory=dict)
     serials: Mapping[str, str] = field(default_factory=dict)
-    verdict: Literal["passed", "failed"] | None = None
+    verdict: VerdictWord | None = None
     reasons: tuple[str, ...] = ()
 
 

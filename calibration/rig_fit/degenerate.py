@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.depth.uncertainty import command_at, depth_sd_m
+from calibration.digits import digits
 from calibration.errors import Degenerate
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.sightings import Sighting
@@ -80,12 +81,23 @@ def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:
     )
 
 
+def unfit(names: Sequence[str]) -> str:
+    """That these views had no say, in words."""
+    return f"view{'s' if len(names) > 1 else ''} {', '.join(names)} left out: unlike the others"
+
+
 def check_depth(
-    model: RigModel, poses: Sequence[BoardPose], condition: float, velocity_per_s: float, misfit: float = 1.0
+    model: RigModel,
+    poses: Sequence[BoardPose],
+    condition: float,
+    velocity_per_s: float,
+    misfit: float = 1.0,
+    outliers: Sequence[str] = (),
 ) -> None:
     """Raise Degenerate where the poses of a fitted model tell next to nothing of depth.
 
     misfit: by which its variances were widened since the data contradict each other; that says nothing of the poses.
+    outliers: names of the views that had no say, whose poses are none of these.
     """
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
@@ -99,10 +111,11 @@ def check_depth(
             reason_of(poses), f"line reaches nothing at {at_m:.3g} m; sweep further, or show the board at more poses"
         )
     usual = float(np.nanmedian(sd)) / math.sqrt(misfit)
+    odd = f" ({unfit(outliers)})" if outliers else ""
     if usual > MOST_DEPTH_SD_SHARE * at_m:
         raise Degenerate(
             reason_of(poses),
-            f"depth at {at_m:.3g} m would be known to {usual:.3g} m from {len(poses)} poses, limit "
+            f"depth at {at_m:.3g} m would be known to {digits(usual)} m from {len(poses)} poses{odd}, limit "
             f"{MOST_DEPTH_SD_SHARE * at_m:.3g} m (condition number {condition:.3g}); show the board at more poses, at "
             "other distances and tilted differently",
         )

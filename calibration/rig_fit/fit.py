@@ -225,7 +225,9 @@ def _result(fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigMode
     )
     counted = problem.counted
     fastest = float(velocities[np.argmax(np.abs(velocities))])
-    check_depth(model, state.poses, solution.condition, fastest, unexplained)
+    outliers = tuple(seen.name for seen, counts in zip(problem.sightings, counted, strict=True) if not counts)
+    said = [pose for pose, counts in zip(state.poses, counted, strict=True) if counts]
+    check_depth(model, said, solution.condition, fastest, unexplained, outliers)
     return RigFit(
         model=model,
         views=tuple(seen.name for seen in problem.sightings),
@@ -236,7 +238,7 @@ def _result(fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigMode
             for view, (seen, (_, rows)) in enumerate(zip(problem.sightings, solution.rows, strict=True))
         ),
         left_out=left_out,
-        outliers=tuple(seen.name for seen, counts in zip(problem.sightings, counted, strict=True) if not counts),
+        outliers=outliers,
         noise=fit.noise,
         corner_scale=float(np.median(np.concatenate([seen.corner_scale for seen in problem.sightings]))),
         misfit=unexplained,

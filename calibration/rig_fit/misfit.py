@@ -18,6 +18,12 @@ ODD_CHI2 = 60.0
 """By which chi2 must fall when a view has its own place of the scanner: 20 is one in a thousand."""
 ODD_TIMES = 8.0
 """And more than so many times what it falls by for most views, should the model fit none of them well."""
+EXPLAINED_SHARE = 0.05
+"""Or at most this of the misfit is left when the view has its own place of the scanner,"""
+OTHERS_SHARE = 0.3
+"""and at least this whichever other view had one,"""
+LEAST_EXPLAINED = 2.0
+"""where there is as much of a misfit as this factor on the variances."""
 FEWEST_TO_TELL = 4
 """Views with passages: of fewer none is the usual one."""
 UNDECIDED_SD = 2.5
@@ -26,19 +32,31 @@ MISFIT_SD = 3.0
 """By which chi2 of the slow misfit must exceed its mean before it is believed."""
 
 
-def odd_view(problem: Problem, solution: Solution) -> int | None:
-    """The view that would most like a scanner elsewhere, if it stands out; None where none does.
+def odd_view(problem: Problem, solution: Solution, left: "Misfit") -> int | None:
+    """The view that would most like a scanner elsewhere, if it stands out, else None. left: the misfit of the fit.
 
     Each view's equations say how far chi2 would fall if the scanner had a place of its own for this view alone. Views
-    without passages say nothing of it: with their zeros any other would stand out.
+    without passages say nothing of it: with their zeros any other would stand out. Where views are few, one that does
+    not belong bends the fit so far that all others want the scanner elsewhere too; but only with its own place does
+    nothing of the misfit remain.
     """
     counted = np.flatnonzero(problem.counted & with_passages(problem))
     gains = np.array([_own_place(problem, solution, int(view)) for view in counted])
     if len(gains) < FEWEST_TO_TELL:
         return None
     worst = int(np.argmax(gains))
-    usual = float(np.median(np.delete(gains, worst)))
-    return int(counted[worst]) if gains[worst] > max(ODD_CHI2, ODD_TIMES * usual) else None
+    others = np.delete(gains, worst)
+    if gains[worst] <= ODD_CHI2:
+        return None
+    stands_out = gains[worst] > ODD_TIMES * float(np.median(others))
+    return int(counted[worst]) if stands_out or _alone(left, float(gains[worst]), float(others.max())) else None
+
+
+def _alone(left: "Misfit", gain: float, next_gain: float) -> bool:
+    """Whether a view's own place explains the misfit, and no other view's."""
+    excess = left.without(0.0) - 1
+    remains, otherwise = left.without(gain) - 1, left.without(next_gain) - 1
+    return excess >= LEAST_EXPLAINED - 1 and remains <= EXPLAINED_SHARE * excess and otherwise >= OTHERS_SHARE * excess
 
 
 def with_passages(problem: Problem) -> NDArray[np.bool_]:

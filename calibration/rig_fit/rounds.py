@@ -69,7 +69,7 @@ class Rounds:
         assert self.solution is not None
         if np.count_nonzero(~self.problem.counted) + 1 > MOST_ODD_SHARE * np.count_nonzero(with_passages(self.problem)):
             return False
-        odd = odd_view(self.problem, self.solution)
+        odd = odd_view(self.problem, self.solution, misfit(self.problem, self.solution))
         if odd is None:
             return False
         counted = self.problem.counted.copy()

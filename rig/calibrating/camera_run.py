@@ -8,6 +8,7 @@ import numpy as np
 
 from calibration.board.board import Board
 from calibration.camera_fit.fit import CameraFit, fit_camera
+from calibration.digits import digits
 from calibration.errors import Degenerate
 from calibration.files.camera_file import camera_content, camera_file_text, corners_digest
 from calibration.judging.camera import ACCURACY_PX, JudgedCamera, judge_camera
@@ -70,7 +71,7 @@ def run_camera(
         about = subject(taken.identity, board, summary["versions"], datetime.now(UTC))
         report = camera_report(fit, used, judged, board, figures, about)
         digests = [corners_digest(view) for view in used if view.name in fit.kept]
-        session.write_text(CAMERA_FILE, camera_file_text(fit.camera, fit.covariance, digests))
+        session.write_text(CAMERA_FILE, camera_file_text(fit.camera, fit.covariance, digests, judged.verdict))
         session.finish(summary, report, None)
         return CalibrationResult(judged.verdict, judged.line(), figures, summary, None, session.path)
 
@@ -112,10 +113,10 @@ def _figures(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> list[tuple[s
     return [
         ("views", f"{len(fit.kept)} of {len(taken.views)} used, {named(fit.outliers)} outliers, {named(refused)} "
                   "refused"),
-        ("rays", f"{judged.sd_px:.2g} px, at the worst 5 % of the picture {judged.worst_px:.2g} px, asked "
-                 f"{ACCURACY_PX:g} px"),
-        ("focal length", f"{matrix[0, 0]:.2f}, {matrix[1, 1]:.2f} px, sd {sd['fx']:.2g}, {sd['fy']:.2g}"),
-        ("centre", f"{matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px, sd {sd['cx']:.2g}, {sd['cy']:.2g}"),
+        ("rays", f"{digits(judged.sd_px, 2)} px, at the worst 5 % of the picture {digits(judged.worst_px, 2)} px, "
+                 f"asked {ACCURACY_PX:g} px"),
+        ("focal length", f"{matrix[0, 0]:.2f}, {matrix[1, 1]:.2f} px, sd {digits(sd['fx'], 2)}, {digits(sd['fy'], 2)}"),
+        ("centre", f"{matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px, sd {digits(sd['cx'], 2)}, {digits(sd['cy'], 2)}"),
         ("distortion", terms),
         ("residuals", f"{fit.rms_px:.3f} px rms"),
         ("coverage", f"{judged.coverage:.0%} of the picture within the outline of all corners, boards up to "

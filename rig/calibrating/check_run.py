@@ -13,6 +13,7 @@ from calibration.board.board import Board
 from calibration.check.boards import CheckedAngle, CheckedBoard, check_angle, check_boards
 from calibration.depth.sensitivity import sensitivity
 from calibration.depth.uncertainty import DepthUncertainty, depth_uncertainty
+from calibration.digits import mm
 from calibration.errors import Degenerate
 from calibration.files.camera_file import CORNERS, corners_digest
 from calibration.files.rig_file import load_rig_model
@@ -21,6 +22,7 @@ from calibration.judging.rig import goal
 from calibration.model.rig_model import RigModel
 from calibration.verdict import AT_M, Asked, Verdict
 from calibration.views import View
+from rig.calibrating.refusing import note_views
 from rig.calibrating.report import check_report
 from rig.calibrating.report_subject import subject
 from rig.calibrating.result import CalibrationResult
@@ -123,8 +125,7 @@ def _with_board(taken: Taken, least: int) -> list[View]:
         reason = next((why.reason for why in taken.refused.values()), "no-board")
         few = "1 view shows" if len(views) == 1 else f"{len(views)} views show"
         error = Degenerate(reason, f"{reason}: {few} the board, at least {least} must; show it again")
-        for name, why in taken.refused.items():
-            error.add_note(f"view {name}: {why}")
+        note_views(error, taken)
         raise error
     return views
 
@@ -185,8 +186,8 @@ def _figures(boards: Sequence[CheckedBoard], angle: CheckedAngle | None) -> list
         rows.append(
             (
                 f"view {board.name}",
-                f"{board.distance_m:.2f} m away, flat to {board.flatness_rms_m * 1e3:.2g} mm rms "
-                f"({board.expected_m * 1e3:.2g} expected), {board.flatness_peak_m * 1e3:.2g} mm peak, scale "
+                f"{board.distance_m:.2f} m away, flat to {mm(board.flatness_rms_m)} rms "
+                f"({mm(board.expected_m)} expected), {mm(board.flatness_peak_m)} peak, scale "
                 f"{board.scale - 1:+.3%} (sd {board.scale_sd:.2%})",
             )
         )

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from calibration.board.board import Board
+from calibration.digits import mm
 from calibration.errors import CalibrationError
 from calibration.guide.forecast import Forecast
 from calibration.guide.poses import Advice, candidates, next_pose
@@ -44,7 +45,7 @@ class Guide:
         at_m = judged.asked.at_m
         now_m = judged.evidence.expected_m
         if self._tell is not None:
-            self._tell(f"expected error {judged.uncertainty.line()}; asked {judged.asked.accuracy_m * 1e3:.3g} mm")
+            self._tell(f"expected error {judged.uncertainty.line()}; asked {mm(judged.asked.accuracy_m)}")
         if judged.verdict.passed:
             return None
         choices = [

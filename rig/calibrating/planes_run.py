@@ -9,16 +9,17 @@ import numpy as np
 
 from calibration.board.board import Board
 from calibration.depth.against_truth import DepthErrors
+from calibration.digits import mm
 from calibration.errors import CalibrationError, Degenerate
 from calibration.files.camera_file import CORNERS, KnownCamera, corners_digest
 from calibration.judging.rig import Judged, judge_fit
 from calibration.model.rig_model import Identity, RigModel
 from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.verdict import AT_M
+from rig.calibrating.camera_use import CameraUse
 from rig.calibrating.guided import Guide
 from rig.calibrating.refusing import refusal
 from rig.calibrating.report import planes_report
-from rig.calibrating.report_numbers import mm
 from rig.calibrating.report_subject import subject
 from rig.calibrating.result import CalibrationResult, named
 from rig.calibrating.session import Session
@@ -61,7 +62,7 @@ def run_planes(
     asked: PlanesAsked,
     *,
     base: RigModel | None = None,
-    camera: KnownCamera | None = None,
+    camera: CameraUse | None = None,
     out: OutFolder = None,
     ask: Ask | None = None,
     tell: Tell | None = None,
@@ -71,7 +72,7 @@ def run_planes(
 
     Raises Degenerate where the views make no calibration; its notes say why, root cause first.
     """
-    live = sources.live
+    live, known = sources.live, None if camera is None else camera.known
     require_live(live, ask, asked.arm)
     with Session(out, board) as session:
         taken = Taken(session, tell)
@@ -79,25 +80,26 @@ def run_planes(
         take_kept(taken, sources, board, defects)
         if live is not None:
             start = good_poses(live, board, asked.poses, asked.at_m, asked.seed, len(taken.views))
-            fit_and_judge = partial(_fit, taken, board, base, camera), partial(_judged, taken, asked)
+            fit_and_judge = partial(_fit, taken, board, base, known), partial(_judged, taken, asked)
             guide = Guide(start, board, live.scan.depth_range, taken, *fit_and_judge, tell)
             exposures = asked.exposures or speeds_of(live)
             choose = guide if asked.guided else start
             take_live(taken, Live(live, asked.poses, choose, ask, exposures, asked.seed, asked.arm, defects), board)
-        fit = _fitted(taken, board, base, camera)
+        fit = _fitted(taken, board, base, known)
         judged = _judged(taken, asked, fit)
-        told = () if camera is None else camera.views
+        told = () if known is None else known.views
         digests = sorted({*told, *(corners_digest(view) for view in taken.views if view.name in fit.views)})
-        model = _signed(fit, judged, taken.identity, digests)
+        model = _signed(fit, judged, taken.identity, digests, camera)
         truth = None if live is None else true_errors(model, live, asked.at_m)
         line = judged.uncertainty.line()
         summary = {
             "command": "planes",
             **_summary(fit, judged, taken),
+            **_accepted(camera),
             "truth": None if truth is None else truth_content(truth),
             "versions": versions(),
         }
-        figures = tuple(_figures(fit, judged, truth))
+        figures = tuple(_figures(fit, judged, truth, camera))
         about = subject(taken.identity, board, summary["versions"], datetime.now(UTC))
         report = planes_report(fit, taken.views, judged, line, figures, about)
         calibration = session.finish(summary, report, model)
@@ -142,13 +144,14 @@ def _fitted(taken: Taken, board: Board, base: RigModel | None, camera: KnownCame
         raise refusal(refused, taken, board) from refused
 
 
-def _signed(fit: RigFit, judged: Judged, identity: Identity | None, digests: list[str]) -> RigModel:
+def _signed(
+    fit: RigFit, judged: Judged, identity: Identity | None, digests: list[str], camera: CameraUse | None
+) -> RigModel:
     """The model with its verdict, of which rig it is, and of which corners: those cannot check it."""
     verdict = judged.verdict
     created = datetime.now(UTC).isoformat(timespec="seconds")
     if identity is not None:
-        word = "passed" if verdict.passed else "failed"
-        identity = replace(identity, created=created, verdict=word, reasons=verdict.codes)  # type: ignore[arg-type]
+        identity = replace(identity, created=created, verdict=verdict.word, reasons=verdict.codes)
     provenance = {
         **fit.model.provenance,
         "by": "rig calibrate planes",
@@ -158,11 +161,18 @@ def _signed(fit: RigFit, judged: Judged, identity: Identity | None, digests: lis
         "depth_sd_m": judged.evidence.expected_m,
         "at_m": judged.asked.at_m,
         "asked_m": judged.asked.accuracy_m,
-        "verdict": "passed" if verdict.passed else "failed",
+        "verdict": verdict.word,
         "reasons": [str(reason) for reason in verdict.reasons],
         CORNERS: digests,
     }
+    if camera is not None:
+        provenance["camera"] = camera.content()
     return replace(fit.model, identity=identity, provenance=provenance)
+
+
+def _accepted(camera: CameraUse | None) -> dict[str, list[str]]:
+    """As the summary of a scan has it."""
+    return {"accepted_calibration": [str(each) for each in camera.accepted]} if camera and camera.accepted else {}
 
 
 def _summary(fit: RigFit, judged: Judged, taken: Taken) -> dict[str, Any]:
@@ -203,23 +213,25 @@ def _summary(fit: RigFit, judged: Judged, taken: Taken) -> dict[str, Any]:
     }
 
 
-def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None) -> list[tuple[str, str]]:
+def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None, camera: CameraUse | None) -> list[tuple[str, str]]:
     evidence, matrix = judged.evidence, fit.model.camera.matrix
     lag = fit.model.lag_s
     asked = judged.asked
     rows = [
         ("views", f"{len(fit.used)} used, {named(fit.outliers)} outliers, {named(fit.left_out)} without board, "
                   f"{named(fit.without_line)} without passages"),
-        ("depth error", f"{mm(evidence.expected_m)} mm at {asked.at_m:g} m (95 % of the picture: "
-                        f"{mm(evidence.worst_m)} mm), asked {mm(asked.accuracy_m)} mm"),
+        ("depth error", f"{mm(evidence.expected_m)} at {asked.at_m:g} m (95 % of the picture: "
+                        f"{mm(evidence.worst_m)}), asked {mm(asked.accuracy_m)}"),
         ("camera", f"f {matrix[0, 0]:.2f}, {matrix[1, 1]:.2f} px, centre {matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px"),
-        ("baseline", f"{evidence.baseline_m * 1e3:.2f} mm, sd {evidence.baseline_sd_m * 1e3:.2g} mm"),
+        ("baseline", f"{evidence.baseline_m * 1e3:.2f} mm, sd {mm(evidence.baseline_sd_m)}"),
         ("lag", f"{lag.forward * 1e6:.1f} us forward, {lag.backward * 1e6:.1f} us backward"),
-        ("residuals", f"corners {fit.corner_rms_px:.3f} px, planes wave by {evidence.wave_m * 1e3:.2g} mm and views "
-                      f"differ by {evidence.shift_m * 1e3:.2g} mm at {asked.at_m:g} m"),
+        ("residuals", f"corners {fit.corner_rms_px:.3f} px, planes wave by {mm(evidence.wave_m)} and views "
+                      f"differ by {mm(evidence.shift_m)} at {asked.at_m:g} m"),
         ("condition", f"{fit.condition:.3g}" + ("" if fit.converged else "; the fit did not come to rest")),
     ]  # fmt: skip
+    if camera is not None:
+        rows += [("camera file", f"accepted in spite of {each}") for each in camera.accepted]
     if truth is not None:
-        rows.append(("truth", f"median {mm(truth.median_m)} mm, worst {mm(truth.worst_m)} mm at "
+        rows.append(("truth", f"median {mm(truth.median_m)}, worst {mm(truth.worst_m)} at "
                               f"{truth.depth_m:g} m, {truth.ratio:.2f} of the expected sd"))  # fmt: skip
     return rows

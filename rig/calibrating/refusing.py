@@ -23,9 +23,14 @@ def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = 
     for reason in reasons[1:]:
         if reason.text != str(refused):
             error.add_note(str(reason))
+    note_views(error, taken)
+    return error
+
+
+def note_views(error: Degenerate, taken: Taken) -> None:
+    """Add what was wrong with single views, unless that was told when they were taken."""
     for name, why in taken.refused.items() if taken.tell is None else ():
         error.add_note(f"view {name}: {why}")
-    return error
 
 
 def _of_views(refused: Degenerate, taken: Taken) -> Degenerate:

@@ -9,6 +9,7 @@ from calibration.board.board import Board
 from calibration.camera_fit.fit import CameraFit
 from calibration.check.boards import CheckedBoard
 from calibration.depth.uncertainty import DepthUncertainty
+from calibration.digits import in_mm, mm
 from calibration.judging.camera import JudgedCamera
 from calibration.judging.rig import Judged
 from calibration.model.camera import Camera
@@ -17,7 +18,7 @@ from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import Verdict
 from calibration.views import BoardPose, View
 from rig.calibrating.report_charts import plane_residuals
-from rig.calibrating.report_numbers import measured, mm
+from rig.calibrating.report_numbers import measured
 from rig.calibrating.report_page import Section, page, paragraph, picture, table
 from rig.calibrating.report_pictures import cells_picture, coverage_picture, error_picture, residual_picture
 
@@ -64,7 +65,7 @@ def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
     if not np.isfinite(uncertainty.sd_m).any():
         return Section("Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m."))
     caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
-    rows = [(name, mm(float(np.nanmedian(part)))) for name, part in uncertainty.part_m.items()]
+    rows = [(name, in_mm(float(np.nanmedian(part)))) for name, part in uncertainty.part_m.items()]
     said = paragraph("Its parts, each the median over the picture:") + table(("from", "mm"), rows)
     return Section("Expected depth error", picture(error_picture(uncertainty), caption) + said)
 
@@ -107,8 +108,8 @@ def check_report(
     for board in boards:
         caption = "How far the board's squares lie off their plane, negative and red: in front; black: not scanned."
         rows = [
-            ("flatness", f"rms {mm(board.flatness_rms_m)} mm, expected {mm(board.expected_m)} mm; peak "
-                         f"{mm(board.flatness_peak_m)} mm"),
+            ("flatness", f"rms {mm(board.flatness_rms_m)}, expected {mm(board.expected_m)}; peak "
+                         f"{mm(board.flatness_peak_m)}"),
             ("chi2", f"{board.chi2:.1f} of {board.freedom}"),
             ("scale", f"{board.scale:.5f}, sd {board.scale_sd:.2g}"),
             ("distance", f"{board.distance_m:.3f} m"),
@@ -159,7 +160,7 @@ def _views_section(fit: RigFit, judged: Judged) -> Section:
     shifts = {one.name: one.shift for one in judged.shifts}
     for name, pose, residual, sweeps in zip(fit.views, fit.poses, fit.corner_residual_px, fit.sweeps, strict=True):
         rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))) if len(residual) else np.nan
-        shift = shifts.get(name, np.nan) * worth * 1e3
+        shift = shifts.get(name, np.nan) * worth
         rows.append(
             (
                 name + (" (outlier)" if name in fit.outliers else ""),
@@ -167,7 +168,7 @@ def _views_section(fit: RigFit, judged: Judged) -> Section:
                 str(len(residual)),
                 f"{rms:.3f}",
                 str(sum(len(sweep.residual) for sweep in sweeps)),
-                f"{shift:+.2g}" if np.isfinite(shift) else "-",
+                in_mm(shift),
             )
         )
     head = ("view", "distance, m", "tilt, degrees", "corners", "rms, px", "passages", "shift, mm")

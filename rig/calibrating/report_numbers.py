@@ -20,8 +20,3 @@ def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
         return (f"{value:.4g}" if np.isfinite(value) else "-"), "-", unit
     digits = max(0, 1 - int(np.floor(np.log10(sd))))
     return f"{value:.{digits}f}", f"{sd:.{digits}f}", unit
-
-
-def mm(length_m: float) -> str:
-    """Millimetres with three digits, never as a power of ten."""
-    return f"{float(f'{length_m * 1e3:.3g}'):.15g}" if np.isfinite(length_m) else "-"

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from calibration.depth.sensitivity import sensitivity
+from calibration.digits import digits
 from calibration.errors import CalibrationError, Degenerate
 from calibration.files.rig_file import load_rig_model
 from calibration.judging.rig import goal
@@ -117,7 +118,7 @@ def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigMod
         "sync": {
             "by": "rig calibrate sync",
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "verdict": "passed" if verdict.passed else "failed",
+            "verdict": verdict.word,
         },
     }
     return replace(
@@ -129,7 +130,9 @@ def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigMod
 
 
 def _line(fit: SyncFit) -> str:
-    up, down = (f"{lag * 1e6:.1f} us (sd {sd * 1e6:.1g})" for lag, sd in zip(fit.lag_s, fit.sd_s[:2], strict=True))
+    up, down = (
+        f"{lag * 1e6:.1f} us (sd {digits(sd * 1e6, 1)})" for lag, sd in zip(fit.lag_s, fit.sd_s[:2], strict=True)
+    )
     return f"lag up {up}, down {down}" + (": their mean" if fit.common else "")
 
 
@@ -165,12 +168,12 @@ def _summary(fit: SyncFit, gate: GateDelay | None, verdict: Verdict, truth: RigM
 def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Sequence[tuple[str, str]]:
     low, high = fit.speed_range_per_s
     rows = [
-        ("row delay", f"{fit.row_delay_s * 1e9:.3g} ns a row, sd {fit.sd_s[2] * 1e9:.2g}"),
+        ("row delay", f"{digits(fit.row_delay_s * 1e9)} ns a row, sd {digits(fit.sd_s[2] * 1e9, 2)}"),
         ("speeds", f"{low:.3g} to {high:.3g} per second"),
         ("sweeps", f"{len(fit.sweeps)}, chi2 {fit.chi2:.1f} of {fit.dof}"),
     ]
     if gate is not None:
-        rows.append(("gate", f"light follows it by {gate.delay_s * 1e6:.2f} us, sd {gate.sd_s * 1e6:.2g}"))
+        rows.append(("gate", f"light follows it by {gate.delay_s * 1e6:.2f} us, sd {digits(gate.sd_s * 1e6, 2)}"))
     if truth is not None:
         lag = truth.lag_s
         rows.append(("truth", f"lag {lag.forward * 1e6:.1f} us up, {lag.backward * 1e6:.1f} us down"))

@@ -9,17 +9,17 @@ compared with the true model's, for the same pixels and commands, at points 5 m 
 median and worst error, error over the stated standard deviation, whether the true depth lies in the stated 95 %
 interval, and what the model adds to a scan's error in pixels at K = 10, 1 and 20, both ways. Rigs that were refused
 are listed. Making the views takes nearly all of the time: `--views FOLDER` keeps them, and takes them from there where
-they are, with the corners found anew.
+they are, with the corners found anew. Exit code 1 where a figure is not what is asked for.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -28,58 +28,28 @@ from numpy.typing import NDArray
 
 from calibration.board.board import Board
 from calibration.board.detection import find_corners
-from calibration.depth.uncertainty import command_at, depth_sd_m
 from calibration.errors import CalibrationError, Degenerate
-from calibration.model.rig_model import RigModel
-from calibration.model.triangulation import depth_slope
 from calibration.passages.even_albedo import board_pixels, even_pixels
 from calibration.passages.even_pixels import evenly
 from calibration.passages.finding import SweepCounts, find_passages
-from calibration.rig_fit.fit import RigFit, fit_rig
+from calibration.rig_fit.fit import fit_rig
 from calibration.views import Passages, View
 from rig.calibrating.view_files import load_views, save_view
 from sim_backend.effects.dark_counts import dark_rates
 from sim_backend.optics import Sensor
 from sim_backend.scenes.board import ShownBoard
-from tests.campaigns.board_capture import FRAME_S, HOT_PER_S, Stand, SweepAsked, SweepTaken, set_up, speed, take_sweeps
+from tests.campaigns.asked import exit_code
+from tests.campaigns.board_capture import FRAME_S, HOT_PER_S, Stand, SweepAsked, SweepTaken, set_up, take_sweeps
+from tests.campaigns.rig_figures import CALIBRATED, Outcome, compare, figures, summary
 from tests.reference.random_rigs import BOARD, random_poses, random_rig
 
 Array = NDArray[np.float64]
 
-FAR_M = 5.0
-GRID = 12
-"""Points along each side of the picture."""
 PIXELS = 500
 """Of a sweep that are looked at for passages."""
-CALIBRATED, SCANNED = 10, (10, 1, 20)
 SLOW_EVERY, OTHER_SPEED = 4, 3
 OFF_LINE = 8
 """Columns on either side of the line that do not count for the picture."""
-SURE = 1.959964
-"""Standard deviations of a 95 % interval."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Compared:
-    """A fitted model against the truth, at points (n,) of the picture. error_m, sd_m: at FAR_M. added_px: by exposures
-    and direction, root mean square over the picture of what the model adds to a scan's error.
-    """
-
-    error_m: Array
-    sd_m: Array
-    added_px: dict[tuple[int, int], float]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
-    """What became of a rig. trouble: why there is no model, '' where there is one."""
-
-    seed: int
-    seconds: float
-    trouble: str
-    poses: int = 0
-    compared: Compared | None = None
-    fit: RigFit | None = None
 
 
 def view_of(name: str, stand: Stand, taken: Sequence[SweepTaken], board: Board) -> View:
@@ -126,29 +96,6 @@ def views_of(stand: Stand, board: Board, poses: int, rng: np.random.Generator) -
     return views
 
 
-def compare(fitted: RigModel, true: RigModel) -> Compared:
-    """The fitted model's depth against the true one's, for the same pixels and commands."""
-    camera = true.camera
-    x, y = np.meshgrid(*((np.arange(GRID) + 0.5) / GRID * size - 0.5 for size in (camera.width, camera.height)))
-    mirror = command_at(true, x, y, FAR_M)
-    there = np.isfinite(mirror)
-    x, y, mirror = x[there], y[there], mirror[there]
-    slope = np.abs(depth_slope(*camera.tangents_at(x, y), true.planes(mirror), camera))
-    added, error, sd = {}, np.empty(0), np.empty(0)
-    for exposures in SCANNED:
-        for direction in (1, -1):
-            velocity = direction * speed(exposures)
-            lag_s = true.lag_s.forward if direction > 0 else true.lag_s.backward
-            stands = fitted.mirror_command(mirror + velocity * lag_s, y, velocity)
-            stands = np.clip(stands, *fitted.scanner.command_range)
-            off = fitted.sheets(stands).depth(*fitted.camera.tangents_at(x, y)) - FAR_M
-            added[exposures, direction] = float(np.sqrt(np.nanmean((off / slope) ** 2)))
-            if exposures == CALIBRATED:
-                error = np.concatenate([error, off])
-                sd = np.concatenate([sd, depth_sd_m(fitted, x, y, stands, velocity)])
-    return Compared(error, sd, added)
-
-
 def found_anew(view: View, sensor: Sensor) -> View:
     """A kept view with the corners that are found in its picture today."""
     assert view.picture is not None
@@ -180,38 +127,6 @@ def calibrated(seed: int, kept: Path | None = None) -> Outcome:
     return Outcome(seed, time.perf_counter() - begun, "", len(views), compared, fit)
 
 
-def summary(outcomes: Iterable[Outcome]) -> str:
-    """The figures over all rigs."""
-    done = list(outcomes)
-    good = [(o, o.compared) for o in done if o.compared is not None]
-    said = [f"{len(done)} rigs, {len(good)} calibrated, median {np.median([o.seconds for o in done]):.1f} s a rig"]
-    said += [f"  refused, seed {o.seed}: {o.trouble}" for o in done if o.compared is None]
-    if not good:
-        return "\n".join(said)
-    z = np.concatenate([c.error_m / c.sd_m for _, c in good])
-    medians = np.array([np.median(np.abs(c.error_m)) for _, c in good])
-    worst = np.array([np.max(np.abs(c.error_m)) for _, c in good])
-    inside = np.array([np.mean(np.abs(c.error_m) < SURE * c.sd_m) for _, c in good])
-    spread = np.array([np.sqrt(np.mean((c.error_m / c.sd_m) ** 2)) for _, c in good])
-    said += [
-        f"depth error at {FAR_M:g} m, mm: median of the rigs' medians {1e3 * np.median(medians):.2f}, of their worst "
-        f"{1e3 * np.median(worst):.2f}; worst of all {1e3 * worst.max():.1f}",
-        f"error over stated sd: median {np.median(np.abs(z)) / 0.67449:.3f}, rms {np.sqrt(np.mean(z**2)):.3f}, a rig's "
-        f"rms {np.median(spread):.3f} (median), {np.percentile(spread, 95):.2f} (95 %), {spread.max():.2f} (worst)",
-        f"true depth in the stated 95 % interval: {np.mean(np.abs(z) < SURE):.1%} of points; a rig's share "
-        f"{np.percentile(inside, 5):.0%} (5 %)",
-    ]
-    for exposures in SCANNED:
-        added = np.array([[c.added_px[exposures, direction] for direction in (1, -1)] for _, c in good]).ravel()
-        said.append(
-            f"added to a scan at K = {exposures}, px: median {np.median(added):.4f}, 95 % "
-            f"{np.percentile(added, 95):.4f}, worst {added.max():.4f}, above 0.1 px {np.mean(added > 0.1):.1%}"
-        )
-    odd = Counter(name for o, _ in good if o.fit is not None for name in o.fit.outliers)
-    said.append(f"views called outliers: {sum(odd.values())} of {sum(o.poses for o, _ in good)}")
-    return "\n".join(said)
-
-
 def _keep(views: Sequence[View], folder: Path) -> None:
     part = folder.with_name(f".{folder.name}.part")
     part.mkdir(parents=True, exist_ok=True)
@@ -228,8 +143,8 @@ def _passages(taken: SweepTaken, usable: NDArray[np.bool_]) -> Passages:
     return find_passages(counts, asked.direction, asked.speed_per_s, thinned)
 
 
-def main() -> None:
-    """Run the campaign."""
+def main() -> int:
+    """Run the campaign; 1 where a figure is not what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rigs", type=int, default=500)
     parser.add_argument("--first", type=int, default=1, help="seed of the first rig")
@@ -242,6 +157,7 @@ def main() -> None:
             outcomes.append(outcome)
             print(_line(outcome), flush=True)
     print(summary(outcomes))
+    return exit_code(figures([o.compared for o in outcomes if o.compared is not None]))
 
 
 def _line(outcome: Outcome) -> str:
@@ -256,4 +172,4 @@ def _line(outcome: Outcome) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -37,6 +37,16 @@ def subpixel(picture: NDArray[np.float32], px: Array, half: int) -> Array:
     return np.asarray(moved, np.float64).reshape(-1, 2)
 
 
+def figures(off_px: Array, visible: int, in_sds: Array | None = None) -> str:
+    """The row of a method. off_px: (corners, 2) errors of those it found, of `visible`; in_sds: in stated ones."""
+    found = f"{len(off_px) / visible:6.1%}"
+    if not len(off_px):
+        return f"{found}  none found"
+    bias, rms, worst = off_px.mean(axis=0), np.sqrt(np.mean(off_px**2)), np.abs(off_px).max()
+    stated = "" if in_sds is None else f"  in sds {np.sqrt(np.mean(in_sds**2)):.2f}"
+    return f"{found}  bias {bias[0]:+.4f} {bias[1]:+.4f}  rms {rms:.4f}  worst {worst:.2f} px{stated}"
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -65,13 +75,8 @@ def main() -> None:
                 moved = subpixel(picture, found.px, half)
                 off.setdefault((flux, f"cornerSubPix {half}"), []).append(moved - truth[found.ids])
     for (flux, method), parts in off.items():
-        each = np.concatenate(parts)
-        bias, rms, worst = each.mean(axis=0), np.sqrt(np.mean(each**2)), np.abs(each).max()
-        stated = f"  in sds {np.sqrt(np.mean(np.concatenate(scaled[flux]) ** 2)):.2f}" if method == "ours" else ""
-        print(
-            f"white {flux:<6} {method:16} {len(each) / visible:6.1%}  bias {bias[0]:+.4f} {bias[1]:+.4f}  "
-            f"rms {rms:.4f}  worst {worst:.2f} px{stated}"
-        )
+        in_sds = np.concatenate(scaled[flux]) if method == "ours" else None
+        print(f"white {flux:<6} {method:16} {figures(np.concatenate(parts), visible, in_sds)}")
     print("pictures refused:", refused)
 
 

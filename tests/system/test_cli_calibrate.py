@@ -280,15 +280,34 @@ def test_a_camera_of_other_views_serves_the_planes(calibrated: Path, rig: Rig) -
             Path(folder, "views", view.name).write_bytes(view.read_bytes())
     board = ("--board", calibrated / "board.yaml")
     assert rig("calibrate", "camera", "first", *board, "--out", "camera").code == 1  # too few poses, but a camera
-    camera = ("--camera", "camera/camera.yaml")
+    camera = ("--camera", "camera/camera.yaml", "--accept-calibration")
+    refused = rig("calibrate", "planes", "second", *board, *camera[:2], "--out", "planes")
+    assert refused.code == 2
+    (line,) = refused.problems
+    assert "camera camera/camera.yaml: its verdict is 'failed' (too-few-poses" in line
+    assert line.endswith("'passed' is needed; calibrate again, or add --accept-calibration to use it all the same")
+    assert not Path("planes").exists()
     ran = rig("calibrate", "planes", "second", *board, *camera, "--at", "3 m", "--out", "planes", "--json")
     assert ran.code == 1, ran.err
     assert json.loads(ran.out)["views"]["used"] == len(views) - 4
     assert json.loads(ran.out)["depth_error"]["median_m"] < 0.03  # two views alone are refused
+    (accepted,) = json.loads(ran.out)["accepted_calibration"]
+    assert accepted.startswith("failed-verdict: its verdict is 'failed' (too-few-poses")
+    noted = load_rig_model("planes/calibration.yaml").provenance["camera"]
+    assert noted["check"] == "accepted"
+    assert [code for code, _ in noted["accepted"]] == ["failed-verdict"]
+    assert "accepted in spite of failed-verdict" in Path("planes/report.html").read_text()
     ran = rig("calibrate", "planes", "first", "second", *board, *camera, "--out", "twice")
     assert ran.code == 2
     assert "must not count twice" in ran.problems[0]
     assert not Path("twice/calibration.yaml").exists()
+    content = yaml.safe_load(Path("camera/camera.yaml").read_text())
+    for verdict, said in (("passed", "passed"), (None, "unchecked")):
+        known = {key: value for key, value in content.items() if key not in ("verdict", "reasons")}
+        Path("known.yaml").write_text(yaml.safe_dump(known | ({"verdict": verdict} if verdict else {})))
+        ran = rig("calibrate", "planes", "second", *board, "--camera", "known.yaml", "--out", said, "--json")
+        assert "accepted_calibration" not in json.loads(ran.out)
+        assert load_rig_model(Path(said, "calibration.yaml")).provenance["camera"] == {"check": said}
 
 
 def test_views_of_another_print_or_of_a_moved_board_are_refused(calibrated: Path, rig: Rig) -> None:

@@ -28,6 +28,8 @@ def test_help_names_the_commands_and_options(rig: Rig) -> None:
     for command in ("scan", "reconstruct", "effects", "config"):
         assert command in ran.out
     told = rig("scan", "--help").out
+    tradeoff = " ".join(rig("tradeoff", "--help").out.split())
+    assert "--estimators <list[str]> of argmax, edge, likelihood, joint, by commas" in tradeoff
     for option in (
         "--scene",
         "--maps",

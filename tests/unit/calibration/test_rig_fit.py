@@ -9,6 +9,7 @@ import pytest
 
 from calibration.errors import CalibrationError, Degenerate
 from calibration.guide.forecast import Forecast
+from calibration.judging.rig import judge_fit
 from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
 from calibration.rig_fit import misfit
@@ -231,7 +232,42 @@ def test_views_without_passages_make_no_other_odd(
     sightings = [SimpleNamespace(command=np.zeros(0 if gain is None else 50)) for gain in gains]
     problem: Any = SimpleNamespace(counted=np.ones(len(gains), bool), sightings=sightings)
     found: Any = None
-    assert misfit.odd_view(problem, found) == odd
+    assert misfit.odd_view(problem, found, misfit.Misfit((100.0, 100.0), (50.0, 50.0))) == odd
+
+
+@pytest.mark.parametrize(
+    ("gains", "corners", "odd"),
+    [
+        ((630.0, 270.0, 230.0, 240.0, 50.0, 220.0), 720.0, 0),  # nothing is left of 620 in all
+        ((500.0, 270.0, 230.0, 240.0, 50.0, 220.0), 720.0, None),  # a fifth is: something else is wrong
+        ((630.0, 270.0, 230.0, 600.0, 50.0, 220.0), 720.0, None),  # either of two may be it
+        ((59.0, 10.0, 10.0, 10.0, 10.0, 10.0), 140.0, None),  # which may be chance
+    ],
+)
+def test_of_few_views_the_odd_one_is_that_without_which_the_others_agree(
+    monkeypatch: pytest.MonkeyPatch, gains: tuple[float, ...], corners: float, odd: int | None
+) -> None:
+    monkeypatch.setattr(misfit, "_own_place", lambda problem, solution, view: gains[view])
+    seen = SimpleNamespace(command=np.zeros(50))
+    problem: Any = SimpleNamespace(counted=np.ones(len(gains), bool), sightings=[seen] * len(gains))
+    found: Any = None
+    assert misfit.odd_view(problem, found, misfit.Misfit((corners, 500.0), (450.0, 50.0))) == odd
+
+
+def test_of_six_views_the_one_that_does_not_fit_is_named_and_one_more_is_asked_for() -> None:
+    """Five others bend to it so far that all of them want the scanner elsewhere."""
+    rng = np.random.default_rng(34)
+    knocked = RIG.moved(np.array([0.004, 0, 0.003]), np.zeros(3))
+    views = [seen_view(rng, knocked if i == 2 else RIG, *random_pose(rng, RIG), SEEN, name=str(i)) for i in range(6)]
+    fit = fit_rig(views, BOARD, SIZE)
+    assert fit.outliers == ("2",)
+    assert fit.misfit < 2
+    reason = judge_fit(fit, views).verdict.reasons[0]
+    assert str(reason) == (
+        "too-few-poses: 6 poses were shown, 5 of them could be used (view 2 left out: unlike the others), 6 are the "
+        "fewest that can be checked against each other; show the board again for each of these, at rest until its "
+        "sweeps are over"
+    )
 
 
 def test_no_more_than_a_third_of_the_views_with_passages_is_left_out() -> None:

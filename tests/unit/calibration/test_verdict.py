@@ -14,7 +14,7 @@ from calibration.judging.rules import FitEvidence, judge, judge_refusal
 from calibration.judging.sweep_waves import SweepResidual, sweep_waves
 from calibration.judging.view_shifts import ViewShift, common_shift, counted, last_before_move
 from calibration.rig_fit.fit import fit_rig
-from calibration.verdict import Asked
+from calibration.verdict import Asked, Verdict, unguided
 from calibration.views import BoardPose, Corners, View
 from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_views
 
@@ -97,6 +97,17 @@ def test_what_is_too_large_is_what_is_named() -> None:
     )
     usual = judge(VIEWS, replace(FIT, expected_m=0.02, worst_m=0.06), ASKED).reasons[0]
     assert usual.text == "the expected depth error at 5 m is 20 mm, asked for are 14 mm: about 25 poses would do"
+
+
+def test_poses_that_tell_next_to_nothing_are_not_to_be_shown_eight_hundred_times() -> None:
+    dim = judge(VIEWS, replace(FIT, expected_m=0.115, worst_m=0.2), ASKED).reasons[0]
+    assert dim.text == (
+        "the expected depth error at 5 m is 115 mm, asked for are 14 mm, 8.2 times less: more poses like these 12 will "
+        "not do"
+    )
+    assert dim.next_step.startswith("make each pose tell more, with more light")
+    camera = unguided(Verdict(False, (dim,))).reasons[0]
+    assert camera.next_step == "make each pose tell more, with more light, the board nearer and tilted more"
 
 
 def test_unknown_errors_do_not_pass() -> None:

@@ -16,7 +16,7 @@ from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.verdict import Reason, Verdict
 from calibration.views import View
 from rig.calibrating.report import planes_report
-from rig.calibrating.report_numbers import measured, mm
+from rig.calibrating.report_numbers import measured
 from rig.calibrating.report_page import Section, page, paragraph, table
 from rig.calibrating.report_subject import subject
 from tests.reference import calibration_data as data
@@ -93,10 +93,6 @@ def test_terms_of_the_model_have_units_and_the_digits_that_are_known() -> None:
     terms = html[html.index("Terms of the model") :]
     assert '<th class="number">value</th>' in terms
     assert "<td>us</td>" in terms
-
-
-def test_lengths_are_no_powers_of_ten() -> None:
-    assert [mm(length) for length in (1.4812, 0.0123456, 150.0, np.nan)] == ["1480", "12.3", "150000", "-"]
 
 
 def test_whatever_users_name_is_escaped() -> None:

@@ -262,6 +262,7 @@ def test_a_block_holds_five_milliseconds_of_frames_and_at_most_sixteen_mebibytes
 def test_without_a_calibration_the_window_is_the_whole_row():
     plan = compile_plan(scan(), scanner_limits(), timer_clock, None, dataclasses.replace(SPAD, width=100))
     assert plan.window == 128
+    assert "window      all 100 pixels for" in plan.describe()
     assert not plan.x0.any()
     assert plan.legs[0].lag_s == 0
 

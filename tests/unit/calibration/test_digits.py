@@ -1,0 +1,21 @@
+"""Numbers that people read have no powers of ten, however large or small."""
+
+from math import inf, nan
+
+import pytest
+
+from calibration.digits import digits, in_mm, mm
+
+
+@pytest.mark.parametrize(
+    ("length_m", "said"),
+    [(1.4812, "1480"), (0.0123456, "12.3"), (150.0, "150000"), (1.2345e-8, "0.0000123"), (-0.2, "-200"), (0.0, "0"),
+     (nan, "-"), (inf, "inf")],
+)  # fmt: skip
+def test_lengths_are_no_powers_of_ten(length_m: float, said: str) -> None:
+    assert in_mm(length_m) == said
+    assert mm(length_m) == f"{said} mm"
+
+
+def test_as_many_digits_as_are_asked_for_count() -> None:
+    assert [digits(1234.5, count) for count in (1, 2, 3)] == ["1000", "1200", "1230"]
