@@ -12,9 +12,12 @@ from calibration.guide.forecast import Forecast
 from calibration.judging.rig import judge_fit
 from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PivotScanner
 from calibration.rig_fit import misfit
+from calibration.rig_fit.degenerate import check_depth
 from calibration.rig_fit.fit import RigFit, fit_rig
-from calibration.views import Passages, View
+from calibration.views import BoardPose, Passages, View
 from tests.reference.calibration_data import (
     BOARD,
     Seen,
@@ -391,6 +394,17 @@ def test_two_poses_are_a_model_that_knows_little_or_none() -> None:
         error, sd = depth_errors(fit.model, RIG, 5.0, 35.2)
         assert np.median(sd) > 0.01
         assert np.median(np.abs(error)) < 5 * np.median(sd)
+
+
+def test_depth_that_is_next_to_unknown_names_the_views_that_had_no_say() -> None:
+    lens = Camera(*SIZE, np.array([[600, 0, 255.5], [0, 600, 255.5], [0, 0, 1.0]]), np.zeros(5))
+    across = np.array([1.0, 0, 0])
+    mirror = PivotScanner(np.array([-0.3, 0, 0]), np.array([0, 1.0, 0]), across, np.array([0.0872, 0.5315]))
+    model = RigModel(lens, mirror, covariance=Covariance(("angle_0",), np.array([[0.1**2]])))
+    poses = [BoardPose(np.array([tilt, 0, 0]), np.array([0, 0, 1.5])) for tilt in (-0.4, 0, 0.2, 0.3, 0.5)]
+    with pytest.raises(Degenerate, match=r"from 5 poses \(view 3 left out: unlike the others\)") as refused:
+        check_depth(model, poses, 1e6, 35.2, outliers=("3",))
+    assert refused.value.reason == "too-few-poses"
 
 
 def test_what_is_no_number_does_not_count() -> None:
