@@ -61,8 +61,8 @@ class DecidedPasses:
         now = self._scout.estimate(counts, self._geometry)
         if float(now.confidence[self._searched].mean()) >= self._settings.target_share:
             return None
-        halved = self._scout.estimate(thinned(counts), self._geometry)
-        unsettled = Unsettled(moved_rows(halved, now, self._searched), counts.n_frames)
+        before = self._scout.estimate(thinned(counts), self._geometry)
+        unsettled = Unsettled(moved_rows(before, now, self._searched), counts.n_frames)
         return next_pass(unsettled, self._pass_time, left_s, self._settings.passes - taken)
 
     def prepare(self, one: Pass) -> tuple[ScanPlan, SpadTiming]:
