@@ -131,7 +131,9 @@ def fill_costs(
                     write_int32(b.here, r, i)
                     write_int32(b.fitted, r, i if usual else np.int32(variant))
                 if in_bytes and times >= 1.0:
-                    read_bytes(counts_at, (c * rows + y) * window, places, stored, ways.side, pixels, int(times), b, batch)
+                    read_bytes(
+                        counts_at, (c * rows + y) * window, places, stored, ways.side, pixels, int(times), b, batch
+                    )
                 else:
                     _read_any(counts, c, y, places, stored[0], ways.side, pixels, times, b, batch)
                 mend_rows(at, places, y, per_nat, ways.side, b, batch)
