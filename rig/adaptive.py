@@ -18,15 +18,15 @@ gain per time, one by one, in place of a plan for all the time that is left.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.adaptive_thinning import frames_left
 from rig.config import ScanConfig
-from rig.counting import CountVolume
 from rig.scan_plan import column_command
 from rig.stripes import StripeTable
 
@@ -90,7 +90,7 @@ class Unsettled:
     def gain(self, exposures: int) -> Array:
         """Rows that so many further exposures are expected to decide in each column, (columns,)."""
         n = np.maximum(self.n_frames, 2).astype(np.float64)
-        fewer = _fewer(n)
+        fewer = frames_left(n)
         moved = (1.0 - ALIKE) * _smooth(self.moved) + ALIKE * self.moved.mean()
         return np.asarray(moved * fewer / (n - fewer) * exposures / (n + exposures))
 
@@ -186,51 +186,6 @@ def moved_rows(before: StripeTable, now: StripeTable, searched: NDArray[np.bool_
     with np.errstate(invalid="ignore"):
         moved = np.abs(now.x_px - before.x_px) > MOVED_PX
     return np.asarray((moved & searched & (now.confidence > LEAST_SURE)).sum(axis=0), np.float64)
-
-
-def thinned(volume: CountVolume, seed: int = 0) -> CountVolume:
-    """The counts of three quarters of the frames of each column, drawn at random: ones without replacement.
-
-    Columns need at least 2 frames.
-    """
-    rng = np.random.default_rng(seed)
-    counts = np.empty_like(volume.counts)
-    tables: dict[int, NDArray[np.unsignedinteger]] = {}
-    for c, n in enumerate(volume.n_frames.tolist()):
-        if n not in tables:
-            tables[n] = _thinning(n).astype(counts.dtype)
-        draw = rng.integers(0, _DRAWS, counts[c].shape, np.uint8)
-        counts[c] = tables[n][volume.counts[c], draw]
-    return replace(volume, counts=counts, n_frames=_fewer(volume.n_frames), exposures=None)
-
-
-_DRAWS = 256
-
-
-def _fewer(n: Any) -> Any:
-    """Frames that are left of n; at least one is left out."""
-    return np.maximum(n - np.maximum(n // 4, 1), 0)
-
-
-def _thinning(n: int) -> NDArray[np.int64]:
-    """How many of k ones among n frames are among those that are drawn, (n + 1, 256): its quantiles.
-
-    Hypergeometric: P(j) = C(k, j) C(n - k, m - j) / C(n, m), m the frames that are drawn.
-    """
-    m = int(_fewer(n))
-    level = (np.arange(_DRAWS) + 0.5) / _DRAWS
-    log_factorial: Array = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, n + 1)))])
-    table = np.zeros((n + 1, _DRAWS), np.int64)
-    for k in range(n + 1):
-        j = np.arange(max(0, m - (n - k)), min(k, m) + 1)
-        log_p = (
-            log_factorial[k] - log_factorial[j] - log_factorial[k - j]
-            + log_factorial[n - k] - log_factorial[m - j] - log_factorial[n - k - m + j]
-        )  # fmt: skip
-        p = np.exp(log_p - log_p.max())
-        below = np.cumsum(p / p.sum())
-        table[k] = j[np.minimum(np.searchsorted(below, level), len(j) - 1)]
-    return table
 
 
 def _smooth(values: Array) -> Array:

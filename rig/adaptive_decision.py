@@ -8,7 +8,8 @@ import numpy as np
 
 from calibration.errors import CalibrationError
 from drivers.interfaces import SpadTiming
-from rig.adaptive import BLOCKS, EXPOSURES, Pass, Unsettled, moved_rows, next_pass, thinned
+from rig.adaptive import BLOCKS, EXPOSURES, Pass, Unsettled, moved_rows, next_pass
+from rig.adaptive_thinning import thinned
 from rig.config import AdaptiveConfig
 from rig.counting import CountVolume
 from rig.errors import PlanError

@@ -131,9 +131,8 @@ def fill_costs(
                     write_int32(b.here, r, i)
                     write_int32(b.fitted, r, i if usual else np.int32(variant))
                 if in_bytes and times >= 1.0:
-                    read_bytes(
-                        counts_at, (c * rows + y) * window, places, stored, ways.side, pixels, int(times), b, batch
-                    )
+                    at_row = (c * rows + y) * window
+                    read_bytes(counts_at, at_row, places, stored, ways.side, pixels, int(times), b, batch)
                 else:
                     _read_any(counts, c, y, places, stored[0], ways.side, pixels, times, b, batch)
                 mend_rows(at, places, y, per_nat, ways.side, b, batch)
@@ -221,8 +220,8 @@ def _rounded(a):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _read_any(
-    counts: NDArray[np.unsignedinteger[Any]], c: int, y: int, places: int, x0: int, side: int, pixels: int, times: float,
-    b: Buffers, batch: int,
+    counts: NDArray[np.unsignedinteger[Any]], c: int, y: int, places: int, x0: int, side: int, pixels: int,
+    times: float, b: Buffers, batch: int,
 ) -> None:  # fmt: skip
     """The same as `read_bytes` of counts of any size."""
     for r in range(batch):

@@ -123,7 +123,8 @@ def study(
     seed: int, rows: slice,
 ) -> Rescan:  # fmt: skip
     """Plain sweeps and passes over one scene. budget: of the sensor time of a plain sweep at K = 10."""
-    from rig.adaptive import Pass, Unsettled, moved_rows, next_pass, thinned
+    from rig.adaptive import Pass, Unsettled, moved_rows, next_pass
+    from rig.adaptive_thinning import thinned
 
     it = Study(scene, point, rows)
     stripes = it.trusted.sum()

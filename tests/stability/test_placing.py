@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.adaptive import EXPOSURES, Pass, Unsettled, moved_rows, next_pass, thinned
+from rig.adaptive import EXPOSURES, Pass, Unsettled, moved_rows, next_pass
 from rig.adaptive_counts import add_pass
+from rig.adaptive_thinning import thinned
 from rig.errors import UsageError
 from rig.estimators.label_grid import far_ends, label_grid
 from rig.estimators.placing import amplitudes_of, line_width, new_places, place, profile_table
@@ -132,7 +133,7 @@ def test_passes_lie_within_their_map_and_its_time(columns, moved, frames, passes
     assert not moved_rows(nothing, nothing, np.ones((3, columns), bool)).any()
 
 
-@covers("rig.adaptive:thinned")
+@covers("rig.adaptive_thinning:thinned")
 @pytest.mark.parametrize("level", [0, 1])
 def test_counts_without_contrast_are_thinned_and_added_exactly(level) -> None:
     geometry = GEOMETRIES["left"]

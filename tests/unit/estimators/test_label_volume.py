@@ -99,9 +99,8 @@ def differences(model, geometry, volume, exposures, columns=(0, 3, 17, 30, 47), 
             if geometry.x_lo[y, c] > geometry.x_hi[y, c]:
                 continue
             scores = exact(model, geometry, volume, y, c)
-            worth = (SHARP + exposures) / (
-                SHARP + volume.n_frames[c]
-            )  # columns of other lengths have units of their own
+            # Columns of other lengths have units of their own.
+            worth = (SHARP + exposures) / (SHARP + volume.n_frames[c])
             wanted = worth * costs.units_per_nat * (np.nanmax(scores, initial=-np.inf) - scores)
             given = out[y, c, : grid.stripes].astype(float)
             alone += int((np.isnan(wanted) != (given == EXCLUDED)).sum())

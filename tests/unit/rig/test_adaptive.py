@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rig.adaptive import EXPOSURES, Pass, Unsettled, moved_rows, next_pass, thinned
+from rig.adaptive import EXPOSURES, Pass, Unsettled, moved_rows, next_pass
 from rig.adaptive_counts import add_pass
+from rig.adaptive_thinning import thinned
 from rig.config import ScanConfig
 from rig.counting import CountVolume
 from rig.stripes import StripeTable
