@@ -1,26 +1,32 @@
 """Which columns of a map deserve more exposures: the passes that are expected to decide most rows in the time left.
 
 A line lights all rows at once, so what can be chosen is columns, by all their rows together. What is asked of the data
-is how many rows a column's light still moves: those whose answer from all n frames lies more than 1 px from that of
-half of them, drawn at random (`thinned`). Wrong answers fall about as 1/n, u(n) = u m / n from m frames on, so that
-moved = u(n) (n - m) / m, and e further exposures decide u(n) e / (n + e) of them. Nothing has to be known of the scene,
-nor how well a confidence is calibrated. Where all columns wait for photons alike the best pass is a plain one over all.
+is how many rows a column's light still moves: those whose answer from all n frames lies more than 1 px from that of m,
+three quarters of them drawn at random (`thinned`). Wrong answers fall about as 1/n, u(n) = u m / n from m frames on, so
+that moved = u(n) (n - m) / m, and e further exposures decide u(n) e / (n + e) of them. Nothing has to be known of the
+scene. Where all columns wait for photons alike the best pass is a plain one over all.
+
+Where there is no stripe, as in shadows, answers move for ever: up to five of six rows that moved. They have next to no
+confidence, so those below LEAST_SURE are left out. Without that, and with half of the frames in place of three
+quarters, passes went where no light comes back. In dense fog at 4 exposures moved rows then foretold the errors
+that 4 more would mend, column by column, with a correlation of 0.14 (aloe) and 0.61 (cones); now 0.83 and 0.75.
 
 Tried besides, on counts of the yardstick: 1 - confidence in place of `moved`, with the power of n from half and all
-frames; both together; the pass of most gain per time, one by one, in place of a plan for all the time that is left.
+frames; what confidence gains from half to all; both together; rows that moved weighted by confidence; the pass of most
+gain per time, one by one, in place of a plan for all the time that is left.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.adaptive_thinning import frames_left
 from rig.config import ScanConfig
-from rig.counting import CountVolume
 from rig.scan_plan import column_command
 from rig.stripes import StripeTable
 
@@ -37,10 +43,15 @@ PRICES = 1.0, 1e7
 HALVINGS = 20
 TRAVEL_FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """The more travel counts, the fewer passes a plan has."""
+ALIKE = 1.0 / 3.0
+"""Share of a column's rows that is taken from the mean column: wrong answers that do not move lie anywhere."""
 SMOOTH_COLUMNS = 15
 """Columns over which moved rows are averaged: of one column they are known to a tenth."""
 MOVED_PX = 1.0
 """An answer that is further from another is another one."""
+LEAST_SURE = 0.1
+"""Confidence below which an answer that moves hardly ever has a stripe: of stripes that moved it leaves out a tenth, of
+other rows it leaves in a tenth (random scenes and prepared ones, dense fog, 4 exposures)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +82,7 @@ class Pass:
 
 @dataclass(frozen=True, slots=True)
 class Unsettled:
-    """Rows of each column that `moved` (columns,) from half of its n_frames (columns,) to all of them."""
+    """Rows of each column that `moved` (columns,) from `thinned` counts to those of all its n_frames (columns,)."""
 
     moved: Array
     n_frames: NDArray[np.int32]
@@ -79,8 +90,9 @@ class Unsettled:
     def gain(self, exposures: int) -> Array:
         """Rows that so many further exposures are expected to decide in each column, (columns,)."""
         n = np.maximum(self.n_frames, 2).astype(np.float64)
-        half = n // 2
-        return np.asarray(_smooth(self.moved) * half / (n - half) * exposures / (n + exposures))
+        fewer = frames_left(n)
+        moved = (1.0 - ALIKE) * _smooth(self.moved) + ALIKE * self.moved.mean()
+        return np.asarray(moved * fewer / (n - fewer) * exposures / (n + exposures))
 
 
 def next_pass(unsettled: Unsettled, pass_time: PassTime, left_s: float, passes: int) -> Pass | None:
@@ -166,51 +178,14 @@ def _plan(levels: _Levels, edges: NDArray[np.int_], price: float, travel: float)
     return found
 
 
-def moved_rows(halved: StripeTable, now: StripeTable, searched: NDArray[np.bool_]) -> Array:
-    """Rows of each column (columns,) whose answer moved, out of those that were searched (rows, columns)."""
+def moved_rows(before: StripeTable, now: StripeTable, searched: NDArray[np.bool_]) -> Array:
+    """Rows of each column (columns,) whose answer moved and may be a stripe, of those searched (rows, columns).
+
+    before: of `thinned` counts.
+    """
     with np.errstate(invalid="ignore"):
-        moved = np.abs(now.x_px - halved.x_px) > MOVED_PX
-    return np.asarray((moved & searched).sum(axis=0), np.float64)
-
-
-def thinned(volume: CountVolume, seed: int = 0) -> CountVolume:
-    """The counts of half the frames of each column, drawn at random out of all of them: ones without replacement.
-
-    Columns need at least 2 frames.
-    """
-    rng = np.random.default_rng(seed)
-    counts = np.empty_like(volume.counts)
-    tables: dict[int, NDArray[np.unsignedinteger]] = {}
-    for c, n in enumerate(volume.n_frames.tolist()):
-        if n not in tables:
-            tables[n] = _thinning(n).astype(counts.dtype)
-        draw = rng.integers(0, _DRAWS, counts[c].shape, np.uint8)
-        counts[c] = tables[n][volume.counts[c], draw]
-    return replace(volume, counts=counts, n_frames=volume.n_frames // 2, exposures=None)
-
-
-_DRAWS = 256
-
-
-def _thinning(n: int) -> NDArray[np.int64]:
-    """How many of k ones among n frames are among the half that is drawn, (n + 1, 256): its quantiles.
-
-    Hypergeometric: P(j) = C(k, j) C(n - k, m - j) / C(n, m) with m = n // 2.
-    """
-    m = n // 2
-    level = (np.arange(_DRAWS) + 0.5) / _DRAWS
-    log_factorial: Array = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, n + 1)))])
-    table = np.zeros((n + 1, _DRAWS), np.int64)
-    for k in range(n + 1):
-        j = np.arange(max(0, m - (n - k)), min(k, m) + 1)
-        log_p = (
-            log_factorial[k] - log_factorial[j] - log_factorial[k - j]
-            + log_factorial[n - k] - log_factorial[m - j] - log_factorial[n - k - m + j]
-        )  # fmt: skip
-        p = np.exp(log_p - log_p.max())
-        below = np.cumsum(p / p.sum())
-        table[k] = j[np.minimum(np.searchsorted(below, level), len(j) - 1)]
-    return table
+        moved = np.abs(now.x_px - before.x_px) > MOVED_PX
+    return np.asarray((moved & searched & (now.confidence > LEAST_SURE)).sum(axis=0), np.float64)
 
 
 def _smooth(values: Array) -> Array:

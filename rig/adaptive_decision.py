@@ -8,7 +8,8 @@ import numpy as np
 
 from calibration.errors import CalibrationError
 from drivers.interfaces import SpadTiming
-from rig.adaptive import BLOCKS, EXPOSURES, Pass, Unsettled, moved_rows, next_pass, thinned
+from rig.adaptive import BLOCKS, EXPOSURES, Pass, Unsettled, moved_rows, next_pass
+from rig.adaptive_thinning import thinned
 from rig.config import AdaptiveConfig
 from rig.counting import CountVolume
 from rig.errors import PlanError
@@ -61,8 +62,8 @@ class DecidedPasses:
         now = self._scout.estimate(counts, self._geometry)
         if float(now.confidence[self._searched].mean()) >= self._settings.target_share:
             return None
-        halved = self._scout.estimate(thinned(counts), self._geometry)
-        unsettled = Unsettled(moved_rows(halved, now, self._searched), counts.n_frames)
+        before = self._scout.estimate(thinned(counts), self._geometry)
+        unsettled = Unsettled(moved_rows(before, now, self._searched), counts.n_frames)
         return next_pass(unsettled, self._pass_time, left_s, self._settings.passes - taken)
 
     def prepare(self, one: Pass) -> tuple[ScanPlan, SpadTiming]:

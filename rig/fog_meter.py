@@ -69,9 +69,10 @@ FLUX_MAX: Final = 50.0
 class FogEstimate:
     """What a map says of fog and light, each with its standard deviation; None where it is not resolved.
 
-    visibility_m: 3.912 / extinction. ambient_per_exposure: photons per pixel and exposure that are not the laser's:
-    surfaces, airlight and dark counts, mean over the pixels read. veil_per_exposure: the laser's light that the medium
-    sends back, per pixel just before the stripe, mean over the rows read; veil_to_signal: over their stripes' light.
+    visibility_m: 3.912 / extinction; two of its deviations more are what two of the extinction's less would be.
+    ambient_per_exposure: photons per pixel and exposure that are not the laser's: surfaces, airlight and dark counts,
+    mean over the pixels read. veil_per_exposure: the laser's light that the medium sends back, per pixel just before
+    the stripe, mean over the rows read; veil_to_signal: over their stripes' light.
     """
 
     extinction_per_m: float | None = None
@@ -177,9 +178,10 @@ def _stated(
     extinction_sd = math.hypot(sd[1], MODEL_SHARE * extinction, REST_SHARE * max(rest, 0.0) * extinction)
     found: dict[str, float] = {}
     if extinction > RESOLVED_SIGMAS * extinction_sd:
-        visibility_m = VISIBILITY_CONTRAST / float(extinction)
+        visibility_m, farther_m = (VISIBILITY_CONTRAST / float(extinction - n * extinction_sd) for n in (0.0, 2.0))
         found |= {"extinction_per_m": float(extinction), "extinction_sd_per_m": extinction_sd}
-        found |= {"visibility_m": visibility_m, "visibility_sd_m": visibility_m * extinction_sd / extinction}
+        # As far as the extinction's bar reaches on the side of clear air: the other side's is shorter.
+        found |= {"visibility_m": visibility_m, "visibility_sd_m": (farther_m - visibility_m) / 2.0}
     found |= _ambient(ambient, ambient_sd)
     if len(at_stripe):
         off_m, gain = at_stripe[:, 0] - fit.at_m, at_stripe[:, 1]

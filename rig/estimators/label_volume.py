@@ -32,7 +32,8 @@ from rig.lanes import LANES
 from rig.row_threads import RowWorkers
 
 SHARP: Final = 8.0
-"""Exposures at which a nat is worth half as many: with sharp rows the labels beside the best one must still count."""
+"""Exposures at which a nat is worth half as many: with sharp rows the labels beside the best one must still count. In
+maps taken in passes that goes by each column's own."""
 BAND_ROWS: Final = 64
 """Rows that share tables."""
 FINEST: Final = 64.0
@@ -44,7 +45,7 @@ RISE_LIMIT: Final = 22000
 TAPS_LIMIT: Final = 28000
 """Most that the pixels around a position may add to its score."""
 SPARE_FRAMES: Final = 4
-"""A column may have half of its nominal frames and so many more; the counts of one with more are halved."""
+"""Half more than the nominal exposures and so many on top is the most that the counts of a column may say."""
 LOOKED_AT: Final = 32
 """Columns, and rows, whose rise says in which units to keep those of all."""
 QUARTILES: Final = (0.25, 0.75)
@@ -149,8 +150,8 @@ def _ways(
     down = max(int(np.floor(np.log2(finest / wanted))), 0)
     units_per_nat = min(wanted, finest)
     ways = Ways(
-        units=units_per_nat * 2.0**down, bits=bits, exposures=exposures, most=most, down=down, reach=reach,
-        side=grid.side, stripes=grid.stripes, band_rows=BAND_ROWS,
+        units=units_per_nat * 2.0**down, bits=bits, exposures=exposures, most=most, sharp=SHARP, down=down,
+        reach=reach, side=grid.side, stripes=grid.stripes, band_rows=BAND_ROWS,
     )  # fmt: skip
     return ways, units_per_nat
 

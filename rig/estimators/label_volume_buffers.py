@@ -20,15 +20,17 @@ POSITION: Final = PHASES * LIGHTS * LANES
 class Ways(NamedTuple):
     """How scores and costs are counted.
 
-    units: of scores per nat; bits: of the largest count; exposures: usual number of a column; most: exposures up to
-    which counts are not halved; down: power of two that scores are divided by to be costs; reach: taps on either
-    side; side, stripes: as in `LabelGrid`; band_rows: rows that share tables.
+    units: of scores per nat, of columns with the usual number of `exposures`; bits: of the largest count; most: what a
+    column's exposures may count as; sharp: exposures at which a nat is worth half as many units; down: power of two
+    that scores are divided by to be costs; reach: taps on either side; side, stripes: as in `LabelGrid`; band_rows:
+    rows that share tables.
     """
 
     units: float
     bits: int
     exposures: int
     most: int
+    sharp: float
     down: int
     reach: int
     side: int

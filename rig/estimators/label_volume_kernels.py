@@ -100,12 +100,10 @@ def fill_costs(
     for band in range(first_row // band_rows, -(-last_row // band_rows)):
         top, end = max(first_row, band * band_rows), min(last_row, (band + 1) * band_rows)
         for c in range(columns):
-            exposures, halved = int(n_frames[c]), 0
-            while exposures >> halved > ways.most:
-                halved += 1
+            exposures = int(n_frames[c])
             stored = int(x0[c]), window, counts.size, window * rows
-            shift = COUNT_BITS - ways.bits - halved
-            per_nat = ways.units * exposures / (1 << halved)
+            times = _times(exposures, ways)
+            per_nat = ways.units * exposures * times / 2.0 ** (COUNT_BITS - ways.bits)
             usual = exposures == ways.exposures
             fitted = usually if usual else room
             for variant in range(VARIANTS):
@@ -132,10 +130,11 @@ def fill_costs(
                     i = read_int32(b.table, 1 + variant)
                     write_int32(b.here, r, i)
                     write_int32(b.fitted, r, i if usual else np.int32(variant))
-                if in_bytes:
-                    read_bytes(counts_at, (c * rows + y) * window, places, stored, ways.side, pixels, shift, b, batch)
+                if in_bytes and times >= 1.0:
+                    at_row = (c * rows + y) * window
+                    read_bytes(counts_at, at_row, places, stored, ways.side, pixels, int(times), b, batch)
                 else:
-                    _read_any(counts, c, y, places, stored[0], ways.side, pixels, shift, b, batch)
+                    _read_any(counts, c, y, places, stored[0], ways.side, pixels, times, b, batch)
                 mend_rows(at, places, y, per_nat, ways.side, b, batch)
                 sum_edges(at, fitted, b, batch)
                 if halo.weight.size > 0:
@@ -145,6 +144,19 @@ def fill_costs(
                     score_rows(at, fitted.constant, b.fitted, 2 * ways.reach + 1, b, batch)
                 cost_rows(at, ways, b, batch)
                 write_rows(places, ways, b, batch, to, columns * labels)
+
+
+@numba.njit(cache=True, nogil=True)
+def _times(exposures: int, ways: Ways) -> float:
+    """What counts of a column are multiplied with, a whole number where it is not below 1.
+
+    A nat of more exposures is worth fewer units, as it would be in a map where all columns had so many: else columns
+    with few would count for less beside others with many, and the penalties between neighbours for more.
+    """
+    full = 2.0 ** (COUNT_BITS - ways.bits)
+    worth = (ways.sharp + ways.exposures) / (ways.sharp + exposures)
+    times = full * min(worth, ways.most / max(exposures, 1))
+    return np.rint(times) if times >= 1.0 else times
 
 
 @numba.njit(forceinline=True)
@@ -208,8 +220,8 @@ def _rounded(a):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _read_any(
-    counts: NDArray[np.unsignedinteger[Any]], c: int, y: int, places: int, x0: int, side: int, pixels: int, shift: int,
-    b: Buffers, batch: int,
+    counts: NDArray[np.unsignedinteger[Any]], c: int, y: int, places: int, x0: int, side: int, pixels: int,
+    times: float, b: Buffers, batch: int,
 ) -> None:  # fmt: skip
     """The same as `read_bytes` of counts of any size."""
     for r in range(batch):
@@ -217,4 +229,4 @@ def _read_any(
         for p in range(pixels):
             x = start - side * p
             count = np.int64(counts[c, y + r, x]) if 0 <= x < counts.shape[2] else np.int64(0)
-            write_int16(b.n + 2 * r * b.n_row, p, np.int16(count << shift if shift >= 0 else count >> -shift))
+            write_int16(b.n + 2 * r * b.n_row, p, np.int16(count * times))

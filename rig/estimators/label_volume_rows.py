@@ -58,37 +58,37 @@ COUNT_BITS: Final = 15
 
 @numba.njit(cache=True, nogil=True)
 def read_bytes(
-    counts: int, begin: int, places: int, stored: tuple[int, int, int, int], side: int, pixels: int, shift: int,
+    counts: int, begin: int, places: int, stored: tuple[int, int, int, int], side: int, pixels: int, times: int,
     b: Buffers, batch: int,
 ) -> None:  # fmt: skip
     """Fill n, from far to near; what lies outside the stored pixels is of any value.
 
     counts: address of the first of all, begin: place of the first row's. stored: first pixel, pixels of a row, all
-    counts, counts of a column. shift: power of two that counts are multiplied with.
+    counts, counts of a column. times: what counts are multiplied with.
     """
     x0, window, size, column = stored
-    times = np.int16(1 << shift) if shift >= 0 else np.int16(0)
+    factor = np.int16(times)
     for r in range(batch):
         if read_int32(b.here, r) < 0:
             continue
         n, start = b.n + 2 * r * b.n_row, read_int16(places, PLACES * r + START) - x0
         first = begin + r * window + start
         low = first - pixels if side > 0 else first
-        if shift < 0 or low < 0 or low + pixels + LANES > size:
+        if low < 0 or low + pixels + LANES > size:
             for p in range(pixels):
                 x = start - side * p
                 count = np.int64(read_byte(counts + begin + r * window, x)) if 0 <= x < window else np.int64(0)
-                write_int16(n, p, np.int16(count << shift if shift >= 0 else count >> -shift))
+                write_int16(n, p, np.int16(count * times))
             continue
         # The next column's counts will be wanted when this one's last row has been read.
         for line in range(0, pixels + LANES, CACHE_LINE):
             prefetch(counts + low + column + line)
         if side > 0:
             for p in range(0, pixels, LANES):
-                store_int16(n, p, reversed_lanes(load_widened(counts + first - p, 1 - LANES)) * times)
+                store_int16(n, p, reversed_lanes(load_widened(counts + first - p, 1 - LANES)) * factor)
         else:
             for p in range(0, pixels, LANES):
-                store_int16(n, p, load_widened(counts + first, p) * times)
+                store_int16(n, p, load_widened(counts + first, p) * factor)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,10 +1,12 @@
 """The search along rows over the counts of a whole sweep."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import CountVolume
-from rig.estimators.judging import nothing_found, quiet_of, stripes_of
+from rig.estimators.judging import SPARE_FRAMES, nothing_found, quiet_of, stripes_of
 from rig.estimators.search_buffers import search_memory
 from rig.estimators.search_desk import Judge
 from rig.estimators.stream_kernels import search_counts
@@ -29,8 +31,15 @@ def search_volume(
 
 
 def nominal_exposures(volume: CountVolume) -> int:
-    """Frames nominally taken per column; where only the counts are known, the median of those with any."""
+    """Frames nominally taken per column; where only the counts are known, the median of those with any.
+
+    Or more than that, as after passes over a small part of the columns: so many that those of all but a hundredth of
+    them need not be halved.
+    """
     if volume.exposures is not None:
         return volume.exposures
     frames = volume.n_frames[volume.n_frames > 0]
-    return int(np.median(frames)) if len(frames) else 1
+    if not len(frames):
+        return 1
+    most = float(np.percentile(frames, 99.0, method="higher"))
+    return max(int(np.median(frames)), math.ceil((most - SPARE_FRAMES) / 2))

@@ -123,7 +123,8 @@ def study(
     seed: int, rows: slice,
 ) -> Rescan:  # fmt: skip
     """Plain sweeps and passes over one scene. budget: of the sensor time of a plain sweep at K = 10."""
-    from rig.adaptive import Pass, Unsettled, moved_rows, next_pass, thinned
+    from rig.adaptive import Pass, Unsettled, moved_rows, next_pass
+    from rig.adaptive_thinning import thinned
 
     it = Study(scene, point, rows)
     stripes = it.trusted.sum()
@@ -154,8 +155,8 @@ def study(
         print(f"  {one}: {spent / total:.3f} {track[-1][1]:.4f}", file=sys.stderr, flush=True)
         if len(taken) == passes:
             break
-        now, halved = (scout.estimator.estimate(seen, scout.geometry) for seen in (volume, thinned(volume)))
-        unsettled = Unsettled(moved_rows(halved, now, searched), n_frames)
+        now, fewer = (scout.estimator.estimate(seen, scout.geometry) for seen in (volume, thinned(volume)))
+        unsettled = Unsettled(moved_rows(fewer, now, searched), n_frames)
         one = next_pass(unsettled, sweep_s, budget * total - spent, passes - len(taken))
     oracle = best_possible(np.stack(wrong), sorted({*fixed, 10}))
     return Rescan(scene.name, point, estimator, shares, track, taken, oracle)

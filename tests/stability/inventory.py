@@ -26,7 +26,7 @@ SCOPE = (
     "rig/bent_light*.py",
     "rig/windows.py",
     *(f"rig/{name}.py" for name in ("error_bounds", "fog_kernels", "fog_meter", "limits", "row_light", "scene_limits")),
-    *(f"rig/{name}.py" for name in ("adaptive", "intervals", "multi_line*", "tradeoff_rows")),
+    *(f"rig/{name}.py" for name in ("adaptive", "adaptive_thinning", "intervals", "multi_line*", "tradeoff_rows")),
     "rig/estimators/*.py",
     *(
         f"sim_backend/{name}.py"

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.adaptive import EXPOSURES, Pass, Unsettled, moved_rows, next_pass, thinned
+from rig.adaptive import EXPOSURES, Pass, Unsettled, moved_rows, next_pass
 from rig.adaptive_counts import add_pass
+from rig.adaptive_thinning import thinned
 from rig.errors import UsageError
 from rig.estimators.label_grid import far_ends, label_grid
 from rig.estimators.placing import amplitudes_of, line_width, new_places, place, profile_table
@@ -132,18 +133,20 @@ def test_passes_lie_within_their_map_and_its_time(columns, moved, frames, passes
     assert not moved_rows(nothing, nothing, np.ones((3, columns), bool)).any()
 
 
-@covers("rig.adaptive:thinned")
+@covers("rig.adaptive_thinning:thinned")
 @pytest.mark.parametrize("level", [0, 1])
-def test_counts_without_contrast_are_halved_and_added_exactly(level) -> None:
+def test_counts_without_contrast_are_thinned_and_added_exactly(level) -> None:
     geometry = GEOMETRIES["left"]
-    frames = np.array([0, 1, 2, 3, 10, 255, 400, 400, 7, 7], np.int32)
+    frames = np.array([0, 1, 2, 3, 10, 255, 340, 340, 7, 7], np.int32)
     volume = volume_of(np.full((COLUMNS, ROWS, WIDTH), level) * frames[:, None, None], geometry, frames)
     volume = replace(volume, counts=volume.counts.astype(np.uint16))
-    half = thinned(volume)
-    np.testing.assert_array_equal(half.counts, np.broadcast_to(level * (frames // 2)[:, None, None], half.counts.shape))
-    few = replace(half, counts=half.counts.astype(np.uint8), n_frames=half.n_frames)
+    fewer = thinned(volume)
+    left = np.array([0, 0, 1, 2, 8, 192, 255, 255, 6, 6])
+    np.testing.assert_array_equal(fewer.n_frames, left)
+    np.testing.assert_array_equal(fewer.counts, np.broadcast_to(level * left[:, None, None], fewer.counts.shape))
+    few = replace(fewer, counts=fewer.counts.astype(np.uint8), n_frames=fewer.n_frames)
     total = few
     for _ in range(400):
         total = add_pass(total, Pass(0, COLUMNS, 1), few)
-    np.testing.assert_array_equal(total.counts, 401 * half.counts.astype(np.uint32))
+    np.testing.assert_array_equal(total.counts, 401 * fewer.counts.astype(np.uint32))
     np.testing.assert_array_equal(np.isfinite(total.column), total.n_frames > 0)

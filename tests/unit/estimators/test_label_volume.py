@@ -99,7 +99,9 @@ def differences(model, geometry, volume, exposures, columns=(0, 3, 17, 30, 47), 
             if geometry.x_lo[y, c] > geometry.x_hi[y, c]:
                 continue
             scores = exact(model, geometry, volume, y, c)
-            wanted = costs.units_per_nat * (np.nanmax(scores, initial=-np.inf) - scores)
+            # Columns of other lengths have units of their own.
+            worth = (SHARP + exposures) / (SHARP + volume.n_frames[c])
+            wanted = worth * costs.units_per_nat * (np.nanmax(scores, initial=-np.inf) - scores)
             given = out[y, c, : grid.stripes].astype(float)
             alone += int((np.isnan(wanted) != (given == EXCLUDED)).sum())
             both = np.isfinite(wanted) & (given != EXCLUDED)
@@ -174,6 +176,20 @@ def test_a_column_with_many_more_frames_than_usual():
     usual, costs = filled(known_model(s.geometry), s.geometry, volume, 100)
     best = [a[:, :, : costs.grid.stripes].argmin(axis=2) for a in (few, usual)]
     assert np.mean(np.abs(best[0] - best[1]) <= 1) > 0.9
+
+
+@pytest.mark.parametrize("frames", [2, 40])
+def test_a_column_of_another_length_costs_what_it_would_among_its_like(frames):
+    s = sweep("left", frames)
+    model, exposures = known_model(s.geometry), np.full(COLUMNS, 10, np.int32)
+    alike, costs = filled(model, s.geometry, s.volume, frames)
+    exposures[20] = frames
+    among, _ = filled(model, s.geometry, volume_of(s.counts, s.geometry, exposures), 10)
+    stripes = costs.grid.stripes
+    own, other = (a[:, 20, :stripes].astype(float) for a in (alike, among))
+    compared = (np.minimum(own, other) < SEEN) & (own != EXCLUDED)
+    assert np.count_nonzero(compared) > 100
+    assert np.abs(other[compared] - own[compared]).max() <= 3.0
 
 
 def test_counts_of_any_width_give_the_same():

@@ -8,23 +8,23 @@ import numpy as np
 import pytest
 
 from rig.estimators import judging
-from rig.estimators.judging import SCORE_LIMIT, judge_of, nothing_found, stripes_of
+from rig.estimators.judging import SCORE_LIMIT, SPARE_FRAMES, judge_of, nothing_found, stripes_of
 from rig.estimators.learning import lines_of
 from rig.estimators.likelihood import Likelihood
 from rig.estimators.row_input import judge_line, row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimators.row_kernels import mode_of
 from rig.estimators.row_model import RowModel, line_profile, stripe_scale
-from rig.estimators.row_search import table_for
+from rig.estimators.row_search import halvings, table_for
 from rig.estimators.search_buffers import BATCH, search_in, search_memory
 from rig.estimators.search_desk import desk_of
 from rig.estimators.search_kernels import START, score_rows
 from rig.estimators.stream_kernels import search_counts
-from rig.estimators.volume_search import search_volume
+from rig.estimators.volume_search import nominal_exposures, search_volume
 from rig.lane_memory import read_int16
 from rig.lane_order import STEPS, padded_lanes, read_counts
 from rig.row_threads import RowWorkers
 from tests.reference.geometry import Geometry
-from tests.unit.small_maps import geometry_of, simulated, volume_of
+from tests.unit.small_maps import geometry_of, rows_of, simulated, volume_of
 
 RIGS = ("left", "right", "turned")
 LIGHTS = ("report", "dense", "clear")
@@ -386,3 +386,17 @@ def test_halved_counts_keep_their_light(exposures):
     judge = judge_of(estimator.used, sweep.geometry, exposures, WORKERS, dark=False)
     ones, lit = search_volume(sweep.volume, sweep.geometry, judge, WORKERS)[1]
     assert ones.sum() / lit.sum() == pytest.approx(-np.expm1(-sweep.point.light.ambient), rel=0.006)
+
+
+def test_after_passes_over_some_columns_their_counts_are_whole() -> None:
+    frames = np.full(200, 4, np.int32)
+    counts = np.zeros((200, 2, 64), np.uint16)
+    frames[40:50] = 36
+    nominal = nominal_exposures(rows_of(counts, frames)[0])
+    assert halvings(36, 2 * nominal + SPARE_FRAMES) == 0
+    frames[40:50] = 5
+    assert nominal_exposures(rows_of(counts, frames)[0]) == 4
+    frames[0] = 3000  # where a mirror stood still: one column does not say what is usual
+    assert nominal_exposures(rows_of(counts, frames)[0]) == 4
+    assert nominal_exposures(rows_of(counts, 0)[0]) == 1
+    assert nominal_exposures(replace(rows_of(counts, frames)[0], exposures=7)) == 7
