@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.label_volume_buffers import signed_address
-from rig.estimators.placing_pools import MARGIN, SAME_PX, with_margin
+from rig.estimators.placing_pools import COPIED_ROWS, MARGIN, SAME_PX, with_margin
 from rig.lane_memory import load_float32, load_int16, store_float32, store_int16
 from rig.lanes import LANES, to_float32, to_int16, where_small, zero_float32, zero_int16
 
@@ -23,9 +23,6 @@ NEIGHBOURS: Final = 2
 """Rows and columns to either side in which neighbours are counted."""
 AROUND: Final = 3
 """The same of the answers whose neighbours are counted."""
-
-COPIED_ROWS: Final = 32
-"""Rows that are copied at once: their copies stay in the cache."""
 
 
 class Neighbours(NamedTuple):

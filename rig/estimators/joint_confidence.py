@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.aggregation_answer import UNITS, Answer
-from rig.estimators.joint_agreement import COPIED_ROWS, Neighbours, agreement_row, light_row
+from rig.estimators.joint_agreement import Neighbours, agreement_row, light_row
 from rig.estimators.label_volume_buffers import signed_address
 from rig.estimators.placing_kernels import LIGHT_PX, Places
-from rig.estimators.placing_pools import MARGIN, with_margin
+from rig.estimators.placing_pools import COPIED_ROWS, MARGIN, with_margin
 from rig.lane_memory import copy_floats, load_float32, store_float32
 from rig.lane_powers import error_function, exponential, logarithm
 from rig.lanes import LANES, larger_float, smaller_float, square_root, zero_float32
