@@ -28,7 +28,10 @@ LIGHT = 3.0
 
 @cache
 def wall(rig="left", exposures=10, sigma_px=0.6, light=LIGHT, haze=0.14, slope=0.0):
-    """Counts of a wall, `slope` px nearer from row to row and from column to column, their geometry, and x_px (rows, columns) of its stripe, NaN where it is not searched."""
+    """Counts of a wall, its geometry, and x_px (rows, columns) of its stripe, NaN where it is not searched.
+
+    slope: px by which it comes nearer from row to row and from column to column.
+    """
     geometry = geometry_of(Geometry.build(width=384, height=ROWS, columns=COLUMNS, **RIGS[rig]))
     model, grid = known_model(geometry, haze=haze, sigma_px=sigma_px), label_grid(geometry)
     sweep, state, row = sweep_of(geometry), state_of(model), row_buffers(geometry.window, 1)
