@@ -66,26 +66,30 @@ def place(
 
     Returns its standard deviation in px; light and haze are left in `places`, with all that was found on the way.
     """
-    placed, sd = (np.empty_like(x_px) for _ in range(2))
+    sd = np.empty_like(x_px)
     around = weigh_light(volume, sweep, state, x_px, places, workers)
     seen = volume.n_frames, sweep, state, shares, around, x_px
+    distance, placed, joined, joined_sd = places.distance, places.placed, places.joined, places.joined_sd
+    (near, near_share), (far, far_share) = PAIRS
 
     def pool(first: int, last: int) -> None:
         pool_places(places, REACHES, ENOUGH, first, last, placed, sd)
-        placed[first:last] += places.distance[first:last]
-
-    (near, near_share), (far, far_share) = PAIRS
+        placed[first:last] += distance[first:last]
 
     def join_near(first: int, last: int) -> None:
-        join_pairs(placed, sd, near, near_share, ENOUGH, first, last, places.joined, places.joined_sd)
+        join_pairs(placed, sd, near, near_share, ENOUGH, first, last, joined, joined_sd)
 
     def join_far(first: int, last: int) -> None:
-        join_pairs(places.joined, places.joined_sd, far, far_share, ENOUGH, first, last, placed, sd)
-        x_px[first:last] += placed[first:last] - places.distance[first:last]
+        join_pairs(joined, joined_sd, far, far_share, ENOUGH, first, last, placed, sd)
+        x_px[first:last] += placed[first:last] - distance[first:last]
 
-    workers.over(len(x_px), lambda first, last: score_places(*seen, first, last, places))
-    for work in (pool, join_near, join_far):
-        workers.over(len(x_px), work)
+    rows = len(x_px)
+    workers.over(rows, lambda first, last: score_places(*seen, first, last, places))
+    workers.over(rows, pool)
+    workers.over(
+        rows, lambda first, last: join_pairs(placed, sd, near, near_share, ENOUGH, first, last, joined, joined_sd)
+    )
+    workers.over(rows, join_far)
     return sd
 
 
