@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from rig.counting import CountVolume
 from rig.estimators.placing_kernels import REACH_PX, Places, add_moments
 from rig.estimators.placing_light import measure_light
+from rig.estimators.placing_pairs import join_pairs
 from rig.estimators.placing_pools import pool_amplitude, pool_places
 from rig.estimators.placing_scores import FRACTIONS, score_places
 from rig.estimators.placing_taps import TAPS, Counts, fetch_counts
@@ -19,10 +20,14 @@ from rig.stripes import StripeTable
 
 LIGHT_REACH = 3
 """Rows and columns to either side that a stripe's brightness is pooled over."""
-REACHES = (1, 2, 3, 4)
+REACHES = (1, 2)
 """The same of its place: as many as it takes to know it."""
 ENOUGH = 1 / 0.06**2
 """Information, 1/px^2, from which a place is known well enough: surfaces bend over more neighbours."""
+PAIRS = ((4, 0.576), (6, 0.280))
+"""Rows and columns to the pairs of neighbours that place a stripe further where that is not enough, round by round, and
+the share that they know of what each knows: 5 x 5 neighbours count as 25 stripes, joined with eight such as 140, and
+with eight of those as 454, since these overlap."""
 BEYOND = 3.0
 """Brightness may exceed the learned amplitudes by this factor either way."""
 DARKEST = 300.0
@@ -61,16 +66,30 @@ def place(
 
     Returns its standard deviation in px; light and haze are left in `places`, with all that was found on the way.
     """
-    moved, sd = (np.empty_like(x_px) for _ in range(2))
+    sd = np.empty_like(x_px)
     around = weigh_light(volume, sweep, state, x_px, places, workers)
     seen = volume.n_frames, sweep, state, shares, around, x_px
+    distance, placed, joined, joined_sd = places.distance, places.placed, places.joined, places.joined_sd
+    (near, near_share), (far, far_share) = PAIRS
 
-    def move(first: int, last: int) -> None:
-        pool_places(places, REACHES, ENOUGH, first, last, moved, sd)
-        x_px[first:last] += moved[first:last]
+    def pool(first: int, last: int) -> None:
+        pool_places(places, REACHES, ENOUGH, first, last, placed, sd)
+        placed[first:last] += distance[first:last]
 
-    workers.over(len(x_px), lambda first, last: score_places(*seen, first, last, places))
-    workers.over(len(x_px), move)
+    def join_near(first: int, last: int) -> None:
+        join_pairs(placed, sd, near, near_share, ENOUGH, first, last, joined, joined_sd)
+
+    def join_far(first: int, last: int) -> None:
+        join_pairs(joined, joined_sd, far, far_share, ENOUGH, first, last, placed, sd)
+        x_px[first:last] += placed[first:last] - distance[first:last]
+
+    rows = len(x_px)
+    workers.over(rows, lambda first, last: score_places(*seen, first, last, places))
+    workers.over(rows, pool)
+    workers.over(
+        rows, lambda first, last: join_pairs(placed, sd, near, near_share, ENOUGH, first, last, joined, joined_sd)
+    )
+    workers.over(rows, join_far)
     return sd
 
 

@@ -39,7 +39,8 @@ class Places(NamedTuple):
 
     distance: x from the far end in px, NaN where there is none; light: photons per exposure above haze and ambient;
     scale: those of amplitude 1; haze, rest: before and behind it; glow: of the halo at the stripe, photons per pixel
-    over those of the stripe; known: h of the module; score: h times distance, plus g.
+    over those of the stripe; known: h of the module; score: h times distance, plus g; placed: the final distance;
+    joined, joined_sd: distance and its standard deviation on the way there.
     """
 
     distance: Float32
@@ -51,6 +52,9 @@ class Places(NamedTuple):
     glow: Float32
     score: Float32
     known: Float32
+    placed: Float32
+    joined: Float32
+    joined_sd: Float32
 
 
 @numba.njit(cache=True, nogil=True)

@@ -28,8 +28,10 @@ Float32 = NDArray[np.float32]
 
 SAME_PX: Final = np.float32(1.0)
 """Neighbours whose distances from the far end differ by no more lie on the same surface."""
-MARGIN: Final = 4
+MARGIN: Final = 6
 """Rows above and below that copies have more, as far as anything is pooled; to both sides they have LANES columns."""
+COPIED_ROWS: Final = 32
+"""Rows that are copied at once where that leaves the copies in the cache."""
 _LEAST: Final = np.float32(1e-12)
 
 

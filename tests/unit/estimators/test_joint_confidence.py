@@ -33,6 +33,7 @@ def judged(distance, *, light=0.7, haze=0.1, exposures=3, margin=10.0, sd=0.1, w
     answer, places = new_answer(rows, columns), new_places(rows, columns)
     answer.margin[:] = round(margin * UNITS)
     places.distance[:], places.light[:], places.scale[:], places.haze[:] = distance, light, 1.0, haze
+    places.placed[:] = distance
     x_px = np.where(np.isnan(distance), np.nan, 100.0).astype(np.float32)
     frames = np.broadcast_to(np.asarray(exposures, np.int32), columns).copy()
     sds = np.full(distance.shape, sd, np.float32)
@@ -135,6 +136,21 @@ def test_a_stripe_is_taken_to_be_half_as_far_off_again_as_counts_alone_say(sd):
 @pytest.mark.parametrize(("better", "worse"), [({"sd": 0.1}, {"sd": 0.9}), ({"margin": 12}, {"margin": 2})])
 def test_well_placed_answers_without_rivals_are_surer(better, worse):
     assert judged(wall(), **better).confidence.min() > judged(wall(), **worse).confidence.max()
+
+
+def test_an_answer_is_sure_where_opposite_neighbours_put_it_whatever_the_slope():
+    y, c = np.mgrid[:ROWS, :COLUMNS].astype(np.float32)
+    slanted = 20 + 0.2 * y - 0.4 * c
+    clear = {"haze": 0.0, "margin": 3, "light": 2.0, "exposures": 10}
+    alone = judged(slanted, **clear).confidence
+    np.testing.assert_allclose(alone, judged(wall(), **clear).confidence, rtol=0.05)
+    off = slanted.copy()
+    off[20, 18] += 3.0
+    found = judged(off, **clear).confidence
+    assert 1 - found[20, 18] > 2 * (1 - alone[20, 18])
+    # Two and four rows and columns away it is one of eight pairs that say otherwise.
+    assert alone[22, 18] > found[22, 18] > found[20, 18]
+    np.testing.assert_array_equal(found[:, 30:], alone[:, 30:])
 
 
 def test_a_pole_is_surer_than_single_answers():
