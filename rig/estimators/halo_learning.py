@@ -2,8 +2,9 @@
 
 What is counted beside a stripe is haze, pedestal, halo and ambient light: each of them a sum of known shapes, so that
 one linear fit tells them apart where averages behind and before the stripe cannot: the halo follows the brightness of
-each stripe, haze does not. On its own a row cannot tell a stripe's brightness: neighbours' is used (`placing`). Later
-maps are asked whether there still is a halo, or one now.
+each stripe, haze does not. On its own a row cannot tell a stripe's brightness: neighbours are asked too, and stripes
+that do not agree with theirs teach nothing (`halo_light`). Later maps are asked whether there still is a halo, or one
+now.
 """
 
 from dataclasses import dataclass, replace
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 from rig.counting import CountVolume
 from rig.estimators.halo import halo_shares, over_bins
 from rig.estimators.halo_kernels import add_equations, solve
+from rig.estimators.halo_light import likeliest_light
+from rig.estimators.joint_tables import Tables
 from rig.estimators.learning import LATTICE_LINES, PIECES, lattice, lines_of
 from rig.estimators.lessons import Setting
 from rig.estimators.placing_kernels import Places
@@ -48,14 +51,32 @@ class BrightLines:
 
 
 def bright_lines(
-    volume: CountVolume, geometry: SweepGeometry, stripes: StripeTable, places: Places, number: int = FIRST_LINES
+    volume: CountVolume,
+    geometry: SweepGeometry,
+    tables: Tables,
+    stripes: StripeTable,
+    places: Places,
+    workers: RowWorkers,
+    number: int = FIRST_LINES,
 ) -> BrightLines:
-    """The clear ones of about so many lines of a map; places: of its stripes."""
+    """Those of about so many lines of a map whose light is known; tables: it was made with, places: of its stripes."""
     rows, columns = lattice(geometry, number)
     clear = stripes.confidence[rows, columns] > CLEAR
     rows, columns = rows[clear], columns[clear]
-    light = places.amplitude[rows, columns] * places.scale[rows, columns]
-    return BrightLines(lines_of(volume, (rows, columns), stripes), light)
+    light, known = np.empty(len(rows), np.float32), np.empty(len(rows), np.bool_)
+    seen = (
+        volume.counts,
+        volume.n_frames,
+        tables.sweep,
+        tables.state,
+        tables.shares,
+        stripes.x_px,
+        places,
+        rows,
+        columns,
+    )
+    workers.over(len(rows), lambda first, last: likeliest_light(*seen, first, last, light, known))
+    return BrightLines(lines_of(volume, (rows[known], columns[known]), stripes), light[known])
 
 
 def learn_first_halo(
@@ -63,6 +84,7 @@ def learn_first_halo(
     geometry: SweepGeometry,
     model: RowModel,
     ambient: NDArray[np.float32],
+    tables: Tables,
     stripes: StripeTable,
     places: Places,
     workers: RowWorkers,
@@ -74,8 +96,8 @@ def learn_first_halo(
     if geometry.others is not None:
         return model
     number = 2 * LATTICE_LINES if model.halo.any() else FIRST_LINES
-    seen, dark = bright_lines(volume, geometry, stripes, places, number), volume.dark_counts is not None
-    return learn_halo(seen, geometry, model, ambient, workers, dark=dark)
+    seen = bright_lines(volume, geometry, tables, stripes, places, workers, number)
+    return learn_halo(seen, geometry, model, ambient, workers, dark=volume.dark_counts is not None)
 
 
 def learn_next_halo(setting: Setting, seen: BrightLines, workers: RowWorkers) -> RowModel:

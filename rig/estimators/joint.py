@@ -114,7 +114,7 @@ class Joint:
             model = learn_again(volume, geometry, model, ambient, stripes, self._workers)
             assert self._memory is not None, "a map has been estimated"
             places = self._memory.places
-            model = learn_first_halo(volume, geometry, model, ambient, stripes, places, self._workers)
+            model = learn_first_halo(volume, geometry, model, ambient, tables, stripes, places, self._workers)
             # Amplitudes are relative to the scale of the model that they are written into.
             weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
             self._workers.settle()
@@ -189,18 +189,19 @@ class Joint:
         assert self._memory is not None, "a map has been estimated"
         quiet = self._quiet(volume, geometry, tables, stripes)
         lines = lines_of(volume, next_lattice(geometry), stripes)
-        bright = bright_lines(volume, geometry, stripes, self._memory.places)
+        bright = bright_lines(volume, geometry, tables, stripes, self._memory.places, self._workers)
         return Seen(volume, volume.intensity(), quiet, lines, bright)
 
     def _quiet(
         self, volume: CountVolume, geometry: SweepGeometry, tables: Tables, stripes: StripeTable
     ) -> NDArray[np.float64]:
         quiet = np.zeros((2, geometry.rows, geometry.width))
+        most_light = float(np.median(tables.state.ambient))
 
         def work(first: int, last: int) -> None:
             add_quiet(
                 volume.counts, volume.n_frames, tables.sweep, tables.state, tables.halo, stripes.x_px, stripes.signal,
-                stripes.confidence, QUIET_COLUMNS if tables.dark else 1, first, last, quiet,
+                stripes.confidence, QUIET_COLUMNS if tables.dark else 1, most_light, first, last, quiet,
             )  # fmt: skip
 
         self._workers.over(geometry.rows, work)

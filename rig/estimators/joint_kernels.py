@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rig.estimators.aggregation_answer import Answer
 from rig.estimators.label_grid import PER_PX
+from rig.estimators.placing_kernels import most_shown
 from rig.estimators.row_input import State, Sweep, fluxes_at, line_light, with_rays
 
 QUIET_REACH_PX: Final = 8
@@ -45,6 +46,7 @@ def add_quiet(
     signal: NDArray[np.float32],
     confidence: NDArray[np.float32],
     column_step: int,
+    most_light: float,
     first_row: int,
     last_row: int,
     quiet: NDArray[np.float64],
@@ -52,12 +54,16 @@ def add_quiet(
     """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, of some columns.
 
     Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels where there is none: with
-    one it is not dark behind a stripe of `signal` photons, and what is expected of halo and pedestal is taken off.
+    one it is not dark behind a stripe of `signal` photons, and what is expected of halo and pedestal is taken off. That
+    must not be more than `most_light`, photons per exposure, nor of a stripe that fills its pixels, whose halo is
+    brighter than it seems: what is not taken off would pass for ambient light of pixels that few other stripes show.
     """
     width = sweep.u.shape[1]
     for y in range(first_row, last_row):
         for c in range(0, x_px.shape[1], column_step):
             if not confidence[y, c] > QUIET or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
+                continue
+            if halo.shape[1] > 0 and signal[y, c] * state.psi[0] > most_shown(n_frames[c]):
                 continue
             x, x0 = int(np.rint(x_px[y, c])), sweep.x0[c]
             begin, end = x0, min(x0 + sweep.window, width)
@@ -69,10 +75,10 @@ def add_quiet(
                 continue
             begin, last = with_rays(sweep.u, y, begin, end - 1)
             end = last + 1 if not np.isnan(sweep.u[y, last]) else begin
-            for t in range(begin, end):
-                quiet[0, y, t] += counts[c, y, t - x0]
-                quiet[1, y, t] += n_frames[c]
             if halo.shape[1] == 0 or begin == end:
+                for t in range(begin, end):
+                    quiet[0, y, t] += counts[c, y, t - x0]
+                    quiet[1, y, t] += n_frames[c]
                 continue
             at = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, at)
@@ -81,4 +87,7 @@ def add_quiet(
                 _, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, t, c, path_p, strength)
                 ambient = state.ambient[y, t]
                 total = behind + signal[y, c] * halo[cell, min(abs(t - x), halo.shape[1] - 1)]
-                quiet[0, y, t] -= n_frames[c] * (np.exp(-ambient) - np.exp(-total))
+                if total - ambient > most_light:
+                    continue
+                quiet[0, y, t] += counts[c, y, t - x0] - n_frames[c] * (np.exp(-ambient) - np.exp(-total))
+                quiet[1, y, t] += n_frames[c]

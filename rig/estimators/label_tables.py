@@ -93,6 +93,7 @@ def fill_tables(
     hot: NDArray[np.bool_],
     light: NDArray[np.float32],
     shares: NDArray[np.float32],
+    beside: NDArray[np.float32],
     per_nat: float,
     most: float,
     band_rows: int,
@@ -111,7 +112,7 @@ def fill_tables(
     row, middle_light = row_buffers(sweep.window, 1), np.sqrt(light[0] * light[-1])
     mean, number = np.empty(pixels, np.float32), np.empty(pixels, np.int32)
     flux, level = np.empty((2, pixels), np.float32), np.empty((4, pixels), np.float32)
-    glow = np.empty(pixels, np.float32)
+    glow, near_glow = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     for b in range(first_band, last_band):
         rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
         for c in range(place.shape[0]):
@@ -132,6 +133,7 @@ def fill_tables(
                 for p in range(span[0], span[1]):
                     # Around its middle the halo is level; `halo_tables` tell what it is elsewhere.
                     glow[p] = state.glow[row.cell[to_t - p]]
+                    near_glow[p] = beside[row.cell[to_t - p]]
                     for near in (_NEAR, _FAR):
                         light_there = row.before[to_t - p] if near == _NEAR else row.behind[to_t - p]
                         light_there += middle_light * row.scale[to_t - p] * glow[p]
@@ -140,7 +142,7 @@ def fill_tables(
                         level[near, p], level[2 + near, p] = state.table[0, cell], state.table[1, cell]
                 _fill_edges(level, span, per_nat, out.edge[i], out.edge_sum[i])
                 _fill_taps(
-                    state.table, row.scale, glow, to_t, span, flux, level, light, shares, variant, per_nat, most,
+                    state.table, row.scale, glow, near_glow, to_t, span, flux, light, shares, variant, per_nat, most,
                     (label, label_end), out.tap[i], out.constant[i],
                 )  # fmt: skip
 
@@ -218,10 +220,10 @@ def _fill_edges(
 
 @numba.njit(cache=True, nogil=True)
 def _fill_taps(
-    table: NDArray[np.float32], scale: NDArray[np.float32], glow: NDArray[np.float32], to_t: int, span: tuple[int, int],
-    flux: NDArray[np.float32], level: NDArray[np.float32], light: NDArray[np.float32], shares: NDArray[np.float32],
-    variant: int, per_nat: float, most: float, labels: tuple[int, int], tap: NDArray[np.int16],
-    constant: NDArray[np.float32],
+    table: NDArray[np.float32], scale: NDArray[np.float32], glow: NDArray[np.float32], near_glow: NDArray[np.float32],
+    to_t: int, span: tuple[int, int], flux: NDArray[np.float32], light: NDArray[np.float32],
+    shares: NDArray[np.float32], variant: int, per_nat: float, most: float, labels: tuple[int, int],
+    tap: NDArray[np.int16], constant: NDArray[np.float32],
 ) -> None:  # fmt: skip
     reach = shares.shape[1] // 2
     half, middle_light = np.float32(0.5), np.sqrt(light[0] * light[-1])
@@ -248,10 +250,13 @@ def _fill_taps(
                         base = flux[_FAR, at] + nearer * (flux[_NEAR, at] - flux[_FAR, at])
                     extra = light[m] * scale[to_t - p] * shares[off + VARIANTS, d + reach] + halo
                     cell = cell_of(min(max(base + extra, FLUX_MIN), FLUX_MAX))
-                    weight = _weight((table[0, cell] - level[own, at]) * per_nat)
+                    # `halo_tables` tell the light around of a pixel that holds the line too: as if it had none of it.
+                    around = light[m] * scale[to_t - p] * near_glow[p] - middle_light * scale[to_t - at] * glow[at]
+                    told = cell_of(min(max(flux[own, at] + around, FLUX_MIN), FLUX_MAX))
+                    weight = _weight((table[0, cell] - table[0, told]) * per_nat)
                     tap[vector, d + reach, phase, m, lane] = weight
                     largest += abs(weight)
-                    total += table[1, cell] - level[2 + own, at]
+                    total += table[1, cell] - table[1, told]
                 constant[vector, phase, m, lane] = total
                 if largest > most:
                     for d in range(2 * reach + 1):

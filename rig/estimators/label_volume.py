@@ -17,7 +17,7 @@ from rig.aligned import aligned_zeros
 from rig.counting import CountVolume
 from rig.estimators.aggregation_answer import UNITS
 from rig.estimators.halo import halo_shares
-from rig.estimators.halo_tables import HaloTables, fill_halo, halo_tables
+from rig.estimators.halo_tables import BLOCK_PX, HaloTables, fill_halo, halo_tables
 from rig.estimators.judging import HOT_FACTOR, HOT_FLUX
 from rig.estimators.label_grid import LabelGrid
 from rig.estimators.label_places import FAR_PX, FRACTIONS, PHASES, VARIANTS, label_pixels, places_of
@@ -94,6 +94,7 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
     ambient, hot = model.ambient, hot_in_bands(model.ambient)
     distance = np.arange(-reach, reach + 1) - (np.arange(FRACTIONS)[:, None] - FRACTIONS // 2) / FRACTIONS
     shares = pixel_shares(model.line_sigma_px, distance)
+    beside = np.ascontiguousarray(halo_shares(model, BLOCK_PX // 2 + 1)[:, -1])
     dark = state._replace(ambient=np.zeros_like(ambient), row_gain=_band_means(state.row_gain))
     scale = 2.0**ways.bits
 
@@ -106,6 +107,7 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
             hot,
             light,
             shares,
+            beside,
             ways.units * scale,
             TAPS_LIMIT * scale / ways.most,
             BAND_ROWS,

@@ -119,7 +119,8 @@ def line_width(
 ) -> float | None:
     """Standard deviation of the line in px, from the light of clear stripes around their places; None: too little."""
     sums = np.zeros((stripes.x_px.shape[0], 2))
-    seen = volume.counts, volume.n_frames, sweep, state, stripes.x_px, stripes.x_sd_px, stripes.confidence
+    clear = stripes.x_px, stripes.x_sd_px, stripes.confidence, stripes.signal
+    seen = volume.counts, volume.n_frames, sweep, state, *clear
     workers.over(len(sums), lambda first, last: add_moments(*seen, first, last, sums))
     light, moment = sums.sum(axis=0)
     if light < LEAST_PHOTONS:

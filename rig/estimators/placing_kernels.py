@@ -32,6 +32,9 @@ BLIND_FLUX: Final = np.float32(3.0)
 """A pixel with so much ambient light fires in 95 % of all frames and shows no more; so does one not to be used."""
 FEW_FRAMES: Final = 3.0
 """Up to so many frames counts are taken as they are: the flux of a full pixel would be a guess."""
+DARK_FRAMES: Final = 1.5
+FEW_FRAMES_FLUX: Final = 0.5
+"""A pixel of FEW_FRAMES is taken to be full from here on."""
 
 
 class Places(NamedTuple):
@@ -57,6 +60,12 @@ class Places(NamedTuple):
     joined_sd: Float32
 
 
+@numba.njit(inline="always")
+def most_shown(frames):  # type: ignore[no-untyped-def]
+    """Flux up to which the counts of so many frames tell well how bright a pixel is: DARK_FRAMES of them stay dark."""
+    return np.log(frames / DARK_FRAMES) if frames > FEW_FRAMES else FEW_FRAMES_FLUX
+
+
 @numba.njit(cache=True, nogil=True)
 def add_moments(
     counts: NDArray[np.unsignedinteger],
@@ -66,6 +75,7 @@ def add_moments(
     x_px: Float32,
     sd_px: Float32,
     confidence: Float32,
+    signal: Float32,
     first_row: int,
     last_row: int,
     sums: NDArray[np.float64],
@@ -73,6 +83,7 @@ def add_moments(
     """Add to sums (rows, 2) the light of clear stripes within REACH_PX, and that times its squared distance less sd^2.
 
     Light above haze, halo and ambient, photons; what is added to a row of sums comes from that row of the picture.
+    Where there is a halo stripes that fill their pixels are left out: it would pass for the flanks that they lack.
     """
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):
@@ -89,9 +100,12 @@ def add_moments(
                 continue
             path_p, strength = line_light(sweep, state, y, c, x)
             before, behind, _, _, _, cell, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)
-            reach = BESIDE_PX[1] if state.glow[cell] > 0.0 else REACH_PX
+            reach, frames = REACH_PX, np.float64(n_frames[c])
+            if state.glow[cell] > 0.0:
+                reach = BESIDE_PX[1]
+                if signal[y, c] * state.psi[0] > most_shown(frames):
+                    continue
             side = 1 if sweep.near_is_left else -1
-            frames = np.float64(n_frames[c])
             halo, level, wide = 0.0, 0.0, 0.0
             for t in range(x - reach, x + reach + 1):
                 if REACH_PX < abs(t - x) < BESIDE_PX[0]:
