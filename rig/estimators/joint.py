@@ -106,7 +106,7 @@ class Joint:
         exposures, dark = nominal_exposures(volume), volume.dark_counts is not None
         for _ in range(FIRST_ROUNDS):
             tables = tables_of(Setting(model, geometry, exposures, dark), self._workers)
-            stripes = self._teaching(volume, tables, self._stripes(volume, tables))
+            stripes = self._teaching(volume, tables, self._stripes(volume, tables, lesson=True))
             quiet = self._quiet(volume, geometry, tables, stripes)
             ambient = ambient_map(volume, volume.intensity(), geometry, quiet)
             width = line_width(volume, tables.sweep, tables.state, stripes, self._workers)
@@ -134,7 +134,7 @@ class Joint:
         )  # fmt: skip
         return replace(stripes, confidence=trust)
 
-    def _stripes(self, volume: CountVolume, tables: Tables) -> StripeTable:
+    def _stripes(self, volume: CountVolume, tables: Tables, *, lesson: bool = False) -> StripeTable:
         grid, workers = tables.grid, self._workers
         rows, columns = grid.x_far.shape
         memory = self._room(grid)
@@ -167,7 +167,8 @@ class Joint:
         if neighbours:
             workers.over(rows, lambda first, last: collect(memory.answer, first, last, memory.ballots))
         workers.post(rows, read)  # what is placed next is of the same rows
-        sd = place(volume, tables.sweep, tables.state, tables.shares, x_px, memory.places, workers)
+        seen = volume, tables.sweep, tables.state
+        sd = place(*seen, tables.shares, x_px, memory.places, workers, lesson=lesson)
         lit = volume.n_frames > 0
         pairs = tables.pairs if lit.all() else pairs_to_ask(np.isfinite(grid.x_far) & lit)
         return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, pairs, tables.bright, workers)

@@ -7,8 +7,17 @@ import numpy as np
 import pytest
 
 from rig.estimators.label_grid import label_grid
-from rig.estimators.placing import amplitudes_of, line_width, new_places, place, profile_table
+from rig.estimators.placing import (
+    ENOUGH,
+    LESSON_REACHES,
+    amplitudes_of,
+    line_width,
+    new_places,
+    place,
+    profile_table,
+)
 from rig.estimators.placing_kernels import BESIDE_PX, REACH_PX
+from rig.estimators.placing_pools import pool_places
 from rig.estimators.placing_taps import TAPS
 from rig.estimators.row_input import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimators.row_model import pixel_shares
@@ -53,13 +62,13 @@ def wall(rig="left", exposures=10, sigma_px=0.6, light=LIGHT, haze=0.14, slope=0
     return volume_of(counts, geometry, exposures), geometry, x_px
 
 
-def placed(volume, geometry, x_px, model, off_px=0.1):
+def placed(volume, geometry, x_px, model, off_px=0.1, *, lesson=False):
     """x_px and its standard deviation after placing, from places so far off."""
     grid, places = label_grid(geometry), new_places(ROWS, COLUMNS)
     places.distance[:] = x_px - grid.x_far + np.random.default_rng(2).normal(0, off_px, x_px.shape)
     x = (grid.x_far + places.distance).astype(np.float32)
     shares = profile_table(model.line_sigma_px)
-    sd = place(volume, sweep_of(geometry), state_of(model), shares, x, places, WORKERS)
+    sd = place(volume, sweep_of(geometry), state_of(model), shares, x, places, WORKERS, lesson=lesson)
     return x, sd, places
 
 
@@ -100,6 +109,18 @@ def test_neighbours_far_off_place_a_wall_of_few_photons_whatever_its_slope(slope
     # 5 x 5 stripes alone: 0.33 px.
     assert np.sqrt(np.mean(error**2)) < 0.26
     assert 0.6 < np.sqrt(np.mean((error / sd[there]) ** 2)) < 1.6
+
+
+def test_lessons_go_by_places_that_no_pairs_join():
+    volume, geometry, x_px = wall(exposures=1)
+    found, sd, places = placed(volume, geometry, x_px, known_model(geometry), lesson=True)
+    moved, alone = np.empty_like(found), np.empty_like(sd)
+    pool_places(places, LESSON_REACHES, ENOUGH, 0, ROWS, moved, alone)
+    there = np.isfinite(x_px)
+    np.testing.assert_array_equal(sd[there], alone[there])
+    np.testing.assert_allclose(places.placed[there], (places.distance + moved)[there], rtol=1e-6)
+    joined = placed(volume, geometry, x_px, known_model(geometry))[1]
+    assert joined[there].mean() < 0.9 * sd[there].mean()
 
 
 def test_a_map_without_stripes_or_frames_stays_one():
