@@ -13,10 +13,12 @@ from rig.estimators.halo_learning import bright_lines, learn_next_halo
 from rig.estimators.halo_tables import BLOCK_PX
 from rig.estimators.joint import Joint
 from rig.estimators.joint_kernels import add_quiet
+from rig.estimators.joint_tables import tables_of
 from rig.estimators.label_grid import PER_PX, label_grid
 from rig.estimators.label_volume import _lights, costs_of
 from rig.estimators.label_volume_rows import EXCLUDED
 from rig.estimators.lessons import Setting
+from rig.estimators.placing_kernels import most_shown
 from rig.estimators.row_input import row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimators.row_kernels import FLOOR
 from rig.estimators.row_model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, pixel_shares
@@ -46,9 +48,12 @@ def flux_of(label, model, geometry, row, y, c, light):
     return base + s * (pixel_shares(model.line_sigma_px, pixels - t) + around)
 
 
-def test_costs_are_those_of_a_stripe_with_its_halo():
+@pytest.mark.parametrize("apart", [1, 4])
+def test_costs_are_those_of_a_stripe_with_its_halo(apart):
     swept, y = simulated("halo", 10, rows=20, columns=48), 7
     model, geometry, volume = replace(known_model(swept.geometry), halo=HALO), swept.geometry, swept.volume
+    # However far apart the brightnesses are that stripes can have.
+    model = replace(model, amplitude=model.amplitude * np.array([1 / apart, 1 / apart, apart, apart], np.float32))
     costs = costs_of(model, geometry, label_grid(geometry), 10, WORKERS)
     out = np.zeros((geometry.rows, geometry.columns, costs.grid.labels), np.uint8)
     costs.fill(volume, 0, geometry.rows, out)
@@ -102,8 +107,9 @@ def test_a_halo_is_found_where_there_is_one(light):
 @pytest.mark.parametrize(("light", "other"), [("halo", "halo-less"), ("halo-less", "halo")])
 def test_later_maps_tell_whether_there_is_a_halo(light, other):
     swept, joint, stripes = first_map(light)
-    seen = bright_lines(swept.volume, swept.geometry, stripes, joint._memory.places)
     setting = Setting(joint.used, swept.geometry, 5, False)
+    tables = tables_of(setting, WORKERS)
+    seen = bright_lines(swept.volume, swept.geometry, tables, stripes, joint._memory.places, WORKERS)
     assert learn_next_halo(setting, seen, WORKERS) is joint.used
     wrong = first_map(other)[1].used
     assert learn_next_halo(replace(setting, model=wrong), seen, WORKERS).halo.any() == (light == "halo")
@@ -129,13 +135,38 @@ def test_pixels_without_a_ray_are_not_quiet():
     for name, halo in (("halo", shares), ("none", shares[:, :0])):
         quiet = found[name] = np.zeros((2, g.rows, g.width))
         add_quiet(
-            volume.counts, volume.n_frames, sweep_of(g), state_of(model), halo, x_px, signal, confidence, 1, 0, g.rows,
-            quiet,
+            volume.counts, volume.n_frames, sweep_of(g), state_of(model), halo, x_px, signal, confidence, 1, np.inf, 0,
+            g.rows, quiet,
         )  # fmt: skip
         assert not quiet[:, :, cut:].any()
         assert quiet[1, :, :cut].any()
     assert np.isfinite(found["halo"]).all()
     np.testing.assert_array_equal(found["halo"][1], found["none"][1])
+
+
+def test_pixels_are_not_quiet_in_the_halo_of_a_stripe_whose_light_is_not_known():
+    swept = simulated("halo", 10, rows=20, columns=48)
+    g, volume = swept.geometry, swept.volume
+    state = state_of(replace(known_model(g), halo=HALO))
+    x_px = swept.point.x_true.astype(np.float32)
+    there = np.isfinite(x_px)
+    shown, confidence = most_shown(10) / state.psi[0], there.astype(np.float32)
+
+    def exposures(signal, most_light, halo):
+        quiet, light = np.zeros((2, g.rows, g.width)), np.where(there, signal, 0).astype(np.float32)
+        add_quiet(
+            volume.counts, volume.n_frames, sweep_of(g), state, halo, x_px, light, confidence, 1, most_light, 0, g.rows,
+            quiet,
+        )  # fmt: skip
+        return quiet[1].sum()
+
+    halo = halo_shares(replace(known_model(g), halo=HALO), g.width)
+    everything = exposures(0.3, np.inf, halo)
+    assert exposures(0.99 * shown, np.inf, halo) == everything > 0
+    assert exposures(1.01 * shown, np.inf, halo) == 0, "full pixels do not tell how bright the halo is"
+    assert exposures(1.01 * shown, np.inf, halo[:, :0]) == everything, "where there is none that does not matter"
+    assert 0 < exposures(0.3, 0.004, halo) < 0.8 * everything, "near a stripe its halo is too bright"
+    assert exposures(0.3, 0.0, halo) == 0
 
 
 def test_shares_add_up_to_the_halos_light():

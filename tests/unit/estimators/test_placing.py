@@ -142,6 +142,22 @@ def test_the_width_of_the_line_is_found_whatever_was_thought_before(sigma_px, ex
     assert found == pytest.approx(sigma_px, rel=0.12)
 
 
+def test_stripes_that_fill_their_pixels_do_not_tell_the_width_in_a_halo():
+    volume, geometry, x_px = wall("left", 5, 0.6, 8.0, 0.01)
+    bright = np.arange(ROWS) % 2 == 0
+    volume.counts[:, bright] = wall("left", 5, 0.6, 100.0, 0.01)[0].counts[:, bright]
+    state = state_of(known_model(geometry, haze=0.01, sigma_px=0.6))
+    seen = volume, sweep_of(geometry), state._replace(glow=np.full_like(state.glow, 0.01))
+    stripes = stripes_at(x_px)
+    taken_for_wide = line_width(*seen, stripes, WORKERS)
+    stripes.signal[bright] = 10.0
+    found = line_width(*seen, stripes, WORKERS)
+    assert taken_for_wide > 0.7
+    assert found == pytest.approx(0.6, rel=0.12)
+    stripes.confidence[bright] = 0.0
+    assert found == line_width(*seen, stripes, WORKERS)
+
+
 def test_stripes_at_the_end_of_a_row_do_not_tell_the_width():
     volume, geometry, x_px = wall("left", 20, 0.6, 8.0, 0.01)
     state = state_of(known_model(geometry, haze=0.01, sigma_px=0.7))
