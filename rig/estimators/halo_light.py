@@ -41,7 +41,7 @@ limits under 1 %, and 0.8 to 0.9 (random scenes 45 and 50, five exposures)."""
 MOST_STEPS: Final = 8
 MOST_GROWTH: Final = 4.0
 """By so much an amplitude may grow or shrink in a step."""
-SETTLED: Final = 1e-3
+SETTLED: Final = 1e-2
 LEAST_FLUX: Final = 1e-4
 MOST_FLUX: Final = 20.0
 
