@@ -92,8 +92,8 @@ class Rounds:
             if value < -5 * sd:
                 raise Degenerate(
                     "negative-lag",
-                    f"mirror would run {digits(-value * 1e6)} us +- {digits(sd * 1e6, 2)} us ahead of its command, limit "
-                    "0; check the polarity and the delay of the scan marker",
+                    f"mirror would run {digits(-value * 1e6)} us +- {digits(sd * 1e6, 2)} us ahead of its command, "
+                    "limit 0; check the polarity and the delay of the scan marker",
                 )
             timing = self.state.timing.copy()
             timing[[self.problem.terms.at([name])[0] - len(self.problem.terms.names) for name in group]] = 0.0
