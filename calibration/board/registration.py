@@ -24,7 +24,8 @@ from calibration.board.picture_map import BoardMap
 Array = NDArray[np.float64]
 
 SUBPIXELS = 12
-"""Drawn per pixel and axis before they are averaged over the pixel's area; even. Drawings are as fine.
+"""Drawn per pixel and axis before they are averaged over the pixel's area; even. Drawings are as fine, within their
+limits (`drawing`): of squares wider than 21 pixels they are coarser, and interpolated.
 
 With 6 corners are off by 0.0020 px without noise, alike enough in all pictures to move focal lengths by 60 ppm; with 12
 by 0.0012 px, most of it the pictures' own drawing, and 30 ppm.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from calibration.digits import digits
 from calibration.errors import Degenerate
 from calibration.rig_fit.misfit import misfit, odd_view, with_passages
 from calibration.rig_fit.noise import Noise, passage_noise
@@ -91,8 +92,8 @@ class Rounds:
             if value < -5 * sd:
                 raise Degenerate(
                     "negative-lag",
-                    f"mirror would run {-value * 1e6:.3g} us +- {sd * 1e6:.2g} us ahead of its command, limit 0; check "
-                    "the polarity and the delay of the scan marker",
+                    f"mirror would run {digits(-value * 1e6)} us +- {digits(sd * 1e6, 2)} us ahead of its command, "
+                    "limit 0; check the polarity and the delay of the scan marker",
                 )
             timing = self.state.timing.copy()
             timing[[self.problem.terms.at([name])[0] - len(self.problem.terms.names) for name in group]] = 0.0

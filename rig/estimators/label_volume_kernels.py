@@ -148,7 +148,7 @@ def fill_costs(
 
 @numba.njit(cache=True, nogil=True)
 def _times(exposures: int, ways: Ways) -> float:
-    """What counts of a column are multiplied with, a whole number where it is not below 1.
+    """What counts of a column are multiplied with, a whole number where it is not below 1; products fit 16 bits.
 
     A nat of more exposures is worth fewer units, as it would be in a map where all columns had so many: else columns
     with few would count for less beside others with many, and the penalties between neighbours for more.
@@ -156,7 +156,8 @@ def _times(exposures: int, ways: Ways) -> float:
     full = 2.0 ** (COUNT_BITS - ways.bits)
     worth = (ways.sharp + ways.exposures) / (ways.sharp + exposures)
     times = full * min(worth, ways.most / max(exposures, 1))
-    return np.rint(times) if times >= 1.0 else times
+    # Rounded down: a product must not exceed that of `most` exposures.
+    return np.floor(times) if times >= 1.0 else times
 
 
 @numba.njit(forceinline=True)

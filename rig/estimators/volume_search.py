@@ -41,5 +41,5 @@ def nominal_exposures(volume: CountVolume) -> int:
     frames = volume.n_frames[volume.n_frames > 0]
     if not len(frames):
         return 1
-    most = float(np.percentile(frames, 99.0, method="higher"))
+    most = float(np.percentile(frames, 99.0, method="lower"))
     return max(int(np.median(frames)), math.ceil((most - SPARE_FRAMES) / 2))

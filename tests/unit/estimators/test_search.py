@@ -398,5 +398,7 @@ def test_after_passes_over_some_columns_their_counts_are_whole() -> None:
     assert nominal_exposures(rows_of(counts, frames)[0]) == 4
     frames[0] = 3000  # where a mirror stood still: one column does not say what is usual
     assert nominal_exposures(rows_of(counts, frames)[0]) == 4
+    few = frames[:60]  # of which one is more than a hundredth
+    assert nominal_exposures(rows_of(counts[:60], few)[0]) == 4
     assert nominal_exposures(rows_of(counts, 0)[0]) == 1
     assert nominal_exposures(replace(rows_of(counts, frames)[0], exposures=7)) == 7
