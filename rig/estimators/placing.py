@@ -31,6 +31,9 @@ PAIRS = ((4, 0.576), (6, 0.280))
 """Rows and columns to the pairs of neighbours that place a stripe further where that is not enough, round by round, and
 the share that they know of what each knows: 5 x 5 neighbours count as 25 stripes, joined with eight such as 140, and
 with eight of those as 454, since these overlap."""
+MOST_MOVED_PX = 0.9
+"""By which a stripe moves, all rounds together: labels, half a pixel apart, end a pixel beyond what is searched, and
+answers 2 px beyond it. Pictures with full pixels alone were moved by more."""
 BEYOND = 3.0
 """Brightness may exceed the learned amplitudes by this factor either way."""
 DARKEST = 300.0
@@ -89,7 +92,8 @@ def place(
         join_pairs(joined, joined_sd, far, far_share, ENOUGH, first, last, placed, sd)
 
     def move(first: int, last: int) -> None:
-        x_px[first:last] += placed[first:last] - distance[first:last]
+        moved = placed[first:last] - distance[first:last]
+        x_px[first:last] += np.clip(moved, -MOST_MOVED_PX, MOST_MOVED_PX, out=moved)
 
     rows = len(x_px)
     workers.over(rows, lambda first, last: score_places(*seen, first, last, places))
