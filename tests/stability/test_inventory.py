@@ -88,6 +88,7 @@ ELSEWHERE = {
         "tests/unit/calibration/test_pixels.py", "calibration.pixels.pixel_map:*", "calibration.pixels.dark_tally:*",
         "calibration.robust:*",
     ),
+    "numbers in words": ("tests/unit/calibration/test_digits.py", "calibration.digits:*"),
     "words of a file": ("tests/unit/calibration/test_model_files.py", "calibration.files.yaml_file:*"),
     "rays and surfaces put together; their light in test_light.py": (
         "tests/unit/sim/test_scene.py", "sim_backend.view:make_view",
