@@ -1,4 +1,4 @@
-"""Counts as they would be of fewer frames: three quarters of those of each column, drawn at random.
+"""Counts as they would be of fewer frames: three quarters of those of each column, or one less, drawn at random.
 
 Half of them would tell less of what further frames will change: where few answers are wrong at four exposures, many are
 at two.
@@ -17,9 +17,9 @@ Numbers = TypeVar("Numbers", bound=NDArray[Any])
 
 
 def thinned(volume: CountVolume, seed: int = 0) -> CountVolume:
-    """The counts of three quarters of the frames of each column, drawn at random: ones without replacement.
+    """The counts of `frames_left` of the frames of each column, drawn at random: ones without replacement.
 
-    Columns need at least 2 frames.
+    Of a single frame nothing is left.
     """
     rng = np.random.default_rng(seed)
     counts = np.empty_like(volume.counts)
@@ -36,7 +36,10 @@ _DRAWS = 256
 
 
 def frames_left(n: Numbers) -> Numbers:
-    """Frames that are left of n, whole numbers of any type; at least one is left out."""
+    """Frames that are left of n, whole numbers of any type: a quarter is left out, rounded down, and one at least.
+
+    Of 1, 2 and 3 frames 0, 1 and 2 are left, of 10 eight.
+    """
     left: Numbers = np.maximum(n - np.maximum(n // 4, 1), 0)
     return left
 

@@ -18,7 +18,7 @@ from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import Verdict
 from calibration.views import BoardPose, View
 from rig.calibrating.report_charts import plane_residuals
-from rig.calibrating.report_numbers import measured
+from rig.calibrating.report_numbers import in_mm_with_sign, measured
 from rig.calibrating.report_page import Section, page, paragraph, picture, table
 from rig.calibrating.report_pictures import cells_picture, coverage_picture, error_picture, residual_picture
 
@@ -168,7 +168,7 @@ def _views_section(fit: RigFit, judged: Judged) -> Section:
                 str(len(residual)),
                 f"{rms:.3f}",
                 str(sum(len(sweep.residual) for sweep in sweeps)),
-                in_mm(shift),
+                in_mm_with_sign(shift),
             )
         )
     head = ("view", "distance, m", "tilt, degrees", "corners", "rms, px", "passages", "shift, mm")

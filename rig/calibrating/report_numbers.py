@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from calibration.digits import in_mm
+
 _UNITS = {
     "angle": ("mrad", 1e3), "cone": ("mrad", 1e3), "bow": ("mrad/rad^2", 1e3),
     "offset_0": ("mm", 1e3), "offset": ("mm/rad^{order}", 1e3),
@@ -20,3 +22,8 @@ def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
         return (f"{value:.4g}" if np.isfinite(value) else "-"), "-", unit
     digits = max(0, 1 - int(np.floor(np.log10(sd))))
     return f"{value:.{digits}f}", f"{sd:.{digits}f}", unit
+
+
+def in_mm_with_sign(length_m: float) -> str:
+    """A length that goes one way or the other, in millimetres: '+3.1'. For a table whose head says so."""
+    return f"+{in_mm(length_m)}" if length_m > 0 else in_mm(length_m)

@@ -36,7 +36,7 @@ ROUGH_UNITS = 4.0
 """Units per octave in which no weight reaches its limit: a logit lies within 11 octaves of 0 either way."""
 CUT = 1.25
 """By so much the largest weights may exceed their limit, where they are cut."""
-SPARE_FRAMES = 8
+FRAMES_OVER_TWICE = 8
 """A column may have this many frames more than twice the nominal number before its counts are halved."""
 HOT_FACTOR, HOT_FLUX = 4.0, 0.02
 """A pixel is hot for the search from this many times its neighbours' ambient light, and so much more, on."""
@@ -56,7 +56,7 @@ def judge_of(model: RowModel, geometry: SweepGeometry, exposures: int, workers: 
     bands, columns = state.ambient.shape[0], geometry.columns
     veil = geometry.others is not None and model.profile[:, 0].max() > LEAST_VEIL * np.median(model.ambient)
     tables = _empty_tables(columns, bands, padded_lanes(geometry.window), reach, others=bool(veil))
-    most = min(2 * exposures + SPARE_FRAMES, COUNT_LIMIT)
+    most = min(2 * exposures + FRAMES_OVER_TWICE, COUNT_LIMIT)
     nominal = exposures / 2.0 ** halvings(exposures, most)
     largest_sum, largest = _largest(sweep, state, light, reach)
     for shift in range(MOST_HALVINGS + 1):

@@ -44,7 +44,7 @@ RISE_LIMIT: Final = 22000
 """Most that the score of a change may rise along a row, of a range of 40000."""
 TAPS_LIMIT: Final = 28000
 """Most that the pixels around a position may add to its score."""
-SPARE_FRAMES: Final = 4
+FRAMES_OVER_HALF_MORE: Final = 4
 """Half more than the nominal exposures and so many on top is the most that the counts of a column may say."""
 LOOKED_AT: Final = 32
 """Columns, and rows, whose rise says in which units to keep those of all."""
@@ -142,7 +142,7 @@ def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposure
 def _ways(
     sweep: Sweep, state: State, grid: LabelGrid, exposures: int, light: NDArray[np.float32], reach: int
 ) -> tuple[Ways, float]:
-    most = exposures + exposures // 2 + SPARE_FRAMES
+    most = exposures + exposures // 2 + FRAMES_OVER_HALF_MORE
     bits = most.bit_length()
     rise, gain = _largest(sweep, state, row_buffers(sweep.window, 1), light[-1])
     # Where pixels say nothing at all, any unit will do.

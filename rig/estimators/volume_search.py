@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.counting import CountVolume
-from rig.estimators.judging import SPARE_FRAMES, nothing_found, quiet_of, stripes_of
+from rig.estimators.judging import FRAMES_OVER_TWICE, nothing_found, quiet_of, stripes_of
 from rig.estimators.search_buffers import search_memory
 from rig.estimators.search_desk import Judge
 from rig.estimators.stream_kernels import search_counts
@@ -42,4 +42,4 @@ def nominal_exposures(volume: CountVolume) -> int:
     if not len(frames):
         return 1
     most = float(np.percentile(frames, 99.0, method="lower"))
-    return max(int(np.median(frames)), math.ceil((most - SPARE_FRAMES) / 2))
+    return max(int(np.median(frames)), math.ceil((most - FRAMES_OVER_TWICE) / 2))

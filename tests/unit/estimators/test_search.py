@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rig.estimators import judging
-from rig.estimators.judging import SCORE_LIMIT, SPARE_FRAMES, judge_of, nothing_found, stripes_of
+from rig.estimators.judging import FRAMES_OVER_TWICE, SCORE_LIMIT, judge_of, nothing_found, stripes_of
 from rig.estimators.learning import lines_of
 from rig.estimators.likelihood import Likelihood
 from rig.estimators.row_input import judge_line, row_buffers, row_fluxes, state_of, sweep_of
@@ -393,7 +393,7 @@ def test_after_passes_over_some_columns_their_counts_are_whole() -> None:
     counts = np.zeros((200, 2, 64), np.uint16)
     frames[40:50] = 36
     nominal = nominal_exposures(rows_of(counts, frames)[0])
-    assert halvings(36, 2 * nominal + SPARE_FRAMES) == 0
+    assert halvings(36, 2 * nominal + FRAMES_OVER_TWICE) == 0
     frames[40:50] = 5
     assert nominal_exposures(rows_of(counts, frames)[0]) == 4
     frames[0] = 3000  # where a mirror stood still: one column does not say what is usual

@@ -16,7 +16,7 @@ from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.verdict import Reason, Verdict
 from calibration.views import View
 from rig.calibrating.report import planes_report
-from rig.calibrating.report_numbers import measured
+from rig.calibrating.report_numbers import in_mm_with_sign, measured
 from rig.calibrating.report_page import Section, page, paragraph, table
 from rig.calibrating.report_subject import subject
 from tests.reference import calibration_data as data
@@ -93,6 +93,18 @@ def test_terms_of_the_model_have_units_and_the_digits_that_are_known() -> None:
     terms = html[html.index("Terms of the model") :]
     assert '<th class="number">value</th>' in terms
     assert "<td>us</td>" in terms
+
+
+def test_the_shift_of_a_view_says_which_way_it_goes(judged: Judged) -> None:
+    assert [in_mm_with_sign(length_m) for length_m in (0.00314, -0.00314, 0.0, np.nan)] == ["+3.14", "-3.14", "0", "-"]
+    views, fit = _fitted()
+    first, second, *others = judged.shifts
+    either_way = (replace(first, shift=1e-3), replace(second, shift=-1e-3), *others)
+    html = planes_report(fit, views, replace(judged, shifts=either_way), "", [])
+    rows = html[html.index("shift, mm") :].split("<tr>")[1:3]
+    said = [re.findall(r"<td[^>]*>([^<]*)</td>", row)[-1] for row in rows]
+    assert [one[0] for one in said] == ["+", "-"]
+    assert said[0][1:] == said[1][1:]
 
 
 def test_whatever_users_name_is_escaped() -> None:
