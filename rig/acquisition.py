@@ -19,6 +19,7 @@ from rig.burst import lead_s, require_memory, spare_lead_s
 from rig.counting import SweepLayout
 from rig.errors import DevicesError
 from rig.fog_meter import FogEstimate
+from rig.gate_pulses import sync_program
 from rig.map_queue import AcquiredMap
 from rig.mapping import MakesMaps
 from rig.monitor import Watch
@@ -163,7 +164,7 @@ class Acquisition:
     def _most_sweeps(self) -> int:
         """Sweeps that one program of the sync source can hold; at least 1, which it may still refuse."""
         legs = self._plan.sweeps_per_period
-        most = self._rig.sync.most_repeats(self._plan.sync_program(legs)[0])
+        most = self._rig.sync.most_repeats(sync_program(self._plan, legs)[0])
         return self._maps if most is None else max(1, most * legs)
 
     def _burst_frames(self, sweeps: int) -> int | None:
@@ -180,7 +181,7 @@ class Acquisition:
                 f"{rig.scanner.name} runs at {float(clock):g} points a second, planned were "
                 f"{float(plan.point_rate_hz):g}; compile the plan anew"
             )
-        rig.sync.program(*plan.sync_program(sweeps))
+        rig.sync.program(*sync_program(plan, sweeps))
         pipeline = Pipeline(
             rig.spad,
             ring_for(self._policy, rig.spad.info, plan, self._timing, keeps_time=self._groups is not None),

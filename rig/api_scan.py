@@ -167,7 +167,7 @@ def replay(
 
 def _problems(settings: RigConfig, arm: bool, out: OutFolder, record: bool) -> list[str]:
     """What there is against letting light out and recording."""
-    from rig.scanning import require_simulated_or_armed
+    from rig.arming import require_simulated_or_armed
 
     problems = require_simulated_or_armed(settings, arm)
     if record and out is None:

@@ -116,14 +116,13 @@ def _passes(adaptive: bool, time_budget: str | None) -> dict[str, str] | None:
 
 def _show_plan(plan: "ScanPlan", adaptive: "AdaptiveConfig | None", as_json: bool) -> int:
     from rig.adaptive_decision import describe_passes, passes_content
+    from rig.plan_figures import plan_content, plan_text
 
     if as_json:
-        from rig.scanning import plan_content
-
         passes = {} if adaptive is None else {"adaptive": passes_content(adaptive, plan)}
         print_json({"plan": plan_content(plan), **passes})
     else:
-        print(plan.describe())
+        print(plan_text(plan))
         if adaptive is not None:
             print(describe_passes(adaptive, plan))
     return 0

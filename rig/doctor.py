@@ -18,6 +18,7 @@ from rig.calibration_refusals import NEXT
 from rig.config import RigConfig
 from rig.dark_look import DarkLook, look
 from rig.errors import DevicesError, RigError
+from rig.gate_pulses import sync_program
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, open_rig, prepare
 
@@ -50,7 +51,7 @@ def examine(config: RigConfig, folder: Path) -> list[Finding]:
             findings += [*_devices(rig), _calibration(rig)]
             plan, timing = prepare(rig)
             require_memory(rig, plan)
-            rig.sync.program(*plan.sync_program(plan.sweeps_per_period))
+            rig.sync.program(*sync_program(plan, plan.sweeps_per_period))
             findings.append(_plan(plan))
             findings += _frames(look(rig, plan, timing.stride), plan)
             findings += _memory(rig)

@@ -36,7 +36,8 @@ from rig.errors import PlanError, UsageError
 from rig.mirror_path import SweepPath, mirrored
 from rig.multi_line import LineGrid, line_grid, window_overlap
 from rig.path_search import PathDemand, find_path, remedy
-from rig.scan_plan import Leg, ScanPlan, column_command, rounded
+from rig.plan_figures import rounded
+from rig.scan_plan import Leg, ScanPlan, column_command
 from rig.windows import LEAST_MARKER_FRAMES, LEAST_MARKER_POINTS, moving_windows, window_widths
 
 __all__ = ["Leg", "ScanPlan", "compile_plan", "spad_request"]

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.frames import frame_bytes
-from drivers.interfaces import OUT_GATE, Pulse, ScanWaveform, SpadMode, WindowTable
-from rig.blanking import CODE, Blanking
+from drivers.interfaces import ScanWaveform, SpadMode, WindowTable
+from rig.blanking import Blanking
 from rig.mirror_path import SweepPath
 from rig.multi_line import LineGrid
 
@@ -224,19 +224,6 @@ class ScanPlan:
         known_s = max(leg.gate_open_s for leg in self.legs) + self.blanking.tolerance_s
         return frames + known_s * float(self.frame_rate_hz)
 
-    def sync_program(self, maps: int) -> tuple[tuple[Pulse, ...], int]:
-        """Pulses and repeats that open the gate once in each of `maps` sweeps and then leave it low.
-
-        With a blanking pattern there is one in each of them, in the pilots before them and in the sweep behind them.
-        """
-        if self.blanking is not None:
-            lit = range(self.pilots, self.pilots + maps)
-            sweeps = range(lit.stop + 1)
-            return tuple(p for sweep in sweeps for p in self._pulses(sweep, sweep in lit)), 1
-        whole, rest = divmod(maps, len(self.legs))
-        sweeps, repeats = (range(len(self.legs)), whole) if rest == 0 else (range(maps), 1)
-        return tuple(p for sweep in sweeps for p in self._pulses(sweep, True)), repeats
-
     def scanner_repeats(self, maps: int) -> int:
         """Repetitions of the waveform that hold pilots, `maps` sweeps and what closes the last one."""
         return -(-(self.pilots + maps + 1) // len(self.legs))
@@ -245,90 +232,9 @@ class ScanPlan:
         """Seconds to read `frames` out after a burst; 0 for a stream, which sends them as it goes."""
         return frames * self.frame_bytes / self.readout_bytes_per_s if self.readout_bytes_per_s else 0.0
 
-    def _gate_s(self, sweep: int, lit: bool) -> list[tuple[float, float]]:
-        """(open, close) of the gate from the scan marker of a sweep, ascending."""
-        leg = self.leg(sweep)
-        flashes = () if self.blanking is None else self.blanking.flashes_s(sweep % len(self.legs))
-        begin_s = self.pattern_s(leg)
-        times = [(begin_s + opened, begin_s + closed) for opened, closed in flashes]
-        return [*times, (leg.gate_open_s, leg.gate_close_s)] if lit else times
-
-    def _pulses(self, sweep: int, lit: bool) -> list[Pulse]:
-        pulses = [Pulse(0, None)]  # gate low while waiting: a scanner that stands still is never lit
-        at_s = 0.0
-        for opened, closed in self._gate_s(sweep, lit):
-            pulses += [Pulse(0, opened - at_s), Pulse(OUT_GATE, closed - opened, held=True)]
-            at_s = closed
-        # Low until this sweep's scan marker has fallen, which it does just before the gate closes.
-        return [*pulses, Pulse(0, self.leg(sweep).gate_close_s - at_s + float(1 / self.frame_rate_hz))]
-
-    def describe(self) -> str:
-        """The plan for people, a few lines."""
-        low, high = self.command_range
-        rate = float(self.frame_rate_hz)
-        sides = "both ways" if len(self.legs) == 2 else "one way"
-        lag = ", ".join(f"{leg.lag_s * 1e6:.0f} us {'up' if leg.direction > 0 else 'down'}" for leg in self.legs)
-        near, far = self.depth_range_m
-        gate = self.legs[0]
-        step = f"{self.columns_per_marker} columns" if self.columns_per_marker > 1 else "column"
-        lines = (
-            f"columns     {self.places} x {self.exposures} frames at {rate / 1e3:g} kHz, "
-            f"{float(self.column_s) * 1e6:g} us each" + self._describe_lines(),
-            f"mirror      command {low:g} to {high:g}, {sides}, {self.speed_per_s:.3g} /s, lag {lag}",
-            f"sweep       {float(self.sweep_s) * 1e3:.2f} ms, {self.sweep_points} points at "
-            f"{float(self.point_rate_hz):g} Hz, a line marker every {step}",
-            f"maps        {self.map_rate_hz:.2f} a second from {float(self.frames_per_sweep):.1f} frames "
-            f"({float(self.sweep_s) * 1e3:.1f} ms of sensor time), {self.dark_fraction:.1%} of them dark",
-            f"gate        {gate.gate_open_s * 1e3:.3f} to {gate.gate_close_s * 1e3:.3f} ms after the scan marker",
-            f"sync        {self._describe_sync()}",
-            f"window      {self._describe_window()} for {near:g} to {far:g} m",
-            f"link        {self._describe_link()}",
-        )
-        return "\n".join(lines)
-
-    def _describe_window(self) -> str:
-        """Stored rows are padded to whole words, sensors need not be."""
-        return f"all {self.width} pixels" if self.window >= self.width else f"{self.window} of {self.width} pixels"
-
-    def _describe_lines(self) -> str:
-        if self.lines is None:
-            return ""
-        return (
-            f", for {self.lines.lines} lines at once: {self.columns} columns\n"
-            f"ambiguity   {self.lines.overlap:.0%} of a column's window is other lines' too"
-        )
-
-    def _describe_sync(self) -> str:
-        if self.blanking is None:
-            return "by the scanner's markers in the frames"
-        leg, frames = self.legs[0], self.blanking.chip_s * float(self.frame_rate_hz)
-        begin_s = self.pattern_s(leg)
-        return (
-            f"by a blanking pattern in the run-in, {len(CODE)} chips of {frames:.3f} frames, {begin_s * 1e3:.3f} to "
-            f"{(begin_s + self.blanking.length_s) * 1e3:.3f} ms; {self.pilots} pilot "
-            f"{'sweep' if self.pilots == 1 else 'sweeps'} before the first map of a burst"
-        )
-
-    def _describe_link(self) -> str:
-        sent = "full frames"
-        if self.windowed:
-            sent = f"moving windows of {self.frame_width} pixels"
-        text = f"{self.mode} of {sent}, {rounded(self.bytes_per_s / 1e6)} MB/s"
-        if self.full_frames_hz is None:
-            return text
-        text += f"; the link carries full frames up to {rounded(self.full_frames_hz / 1e3)} kHz"
-        if self.windows is None or self.windows_hz is None:
-            return text
-        return f"{text}, windows of {self.windows.width_px} pixels up to {rounded(self.windows_hz / 1e3)} kHz"
-
 
 def column_command(column: ArrayLike, command_range: tuple[float, float], columns: int) -> Array:
     """Mirror command of fractional columns, any shape, where `columns` of them share the range evenly."""
     first, last = command_range
     result: Array = first + (np.asarray(column, np.float64) + 0.5) * ((last - first) / columns)
     return result
-
-
-def rounded(value: float) -> str:
-    """A figure for people, four digits and no exponent."""
-    return f"{float(f'{value:.4g}'):g}"

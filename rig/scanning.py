@@ -7,23 +7,21 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from calibration.model.rig_model import RigModel
 from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
-from drivers.registry import KindConfig
-from drivers.transports.endpoints import EMULATED_PREFIX
 from rig.acquisition import SILENCE_S, Acquisition, ScanProgress
 from rig.adaptive_decision import ChoosesPasses, DecidedPasses
 from rig.adaptive_recording import PassNotes, RecordedPasses
 from rig.adaptive_scan import AdaptiveAcquisition
 from rig.calibration_identity import accepted_by, calibration_use, identity_of, rig_content
-from rig.config import RigConfig, ScanConfig
+from rig.config import ScanConfig
 from rig.errors import RigError
 from rig.estimators import LEARNING, Learned
 from rig.geometry import SweepGeometry
 from rig.monitor import Watch
 from rig.overload import Overload, require_policy
 from rig.plan import spad_request
+from rig.plan_figures import plan_content
 from rig.reconstruction import Reconstructor
 from rig.recording.devices import devices_content
 from rig.recording.inputs import write_inputs
@@ -31,9 +29,9 @@ from rig.recording.space import map_bytes, recording_bytes
 from rig.recording.writer import Recording
 from rig.replaying import Replayed
 from rig.run import Run, RunResult
+from rig.scan_account import frames_of, sweep_content, synchronisation_of, verdict_of
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, prepare
-from rig.summary import RunFrames, Synchronisation, Verdict
 from rig.sweeps import SweepAccount, SweepData
 from rig.warm_up import warm_binding, warm_up
 
@@ -127,19 +125,19 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         ended_by = error
     del of_maps[run.tally.maps :]
     sweeps = [sweep for passes_of_map in of_maps for sweep in passes_of_map]
-    frames = _frames(sweeps, acquisition.counters.crc_errors)
+    frames = frames_of(sweeps, acquisition.counters.crc_errors)
     result = run.finish(
         frames,
         frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
-        _verdict(sweeps, rig.model, aborted=ended_by is not None),
+        verdict_of(sweeps, rig.model, aborted=ended_by is not None),
         {
             **manifest,
-            "sweeps": [_sweep_content(sweep) for sweep in sweeps],
+            "sweeps": [sweep_content(sweep) for sweep in sweeps],
             "gaps": [list(gap) for sweep in sweeps for gap in sweep.gaps],
             "counters": asdict(acquisition.counters),
         },
         acquisition.stages,
-        _synchronisation(sweeps),
+        synchronisation_of(sweeps),
         None if replayed is None else replayed.report,
         acquisition.figures(frames.lit) if isinstance(acquisition, AdaptiveAcquisition) else None,
         accepted_by(calibration),
@@ -184,57 +182,6 @@ def _recording(
     )
 
 
-def require_simulated_or_armed(config: RigConfig, arm: bool) -> list[str]:
-    """Problems with letting light out: every real laser and gate needs the user's word."""
-    real = [slot for slot in ("laser", "sync") if not _made_here(getattr(config, slot))]
-    if arm or not real:
-        return []
-    kinds = ", ".join(f"{slot} {getattr(config, slot).kind}" for slot in real)
-    return [f"{config.name} has real light ({kinds}); clear the beam path, then add --arm"]
-
-
-def _made_here(device: KindConfig) -> bool:
-    """Whether a device shines no real light: simulated, or at a port that this process emulates."""
-    return not device.real_time or str(getattr(device, "port", "")).startswith(EMULATED_PREFIX)
-
-
-def plan_content(plan: ScanPlan) -> dict[str, Any]:
-    """A plan's figures for the manifest and for programs."""
-    return {
-        "columns": plan.columns,
-        "exposures": plan.exposures,
-        "frame_rate_hz": plan.frame_rate_hz,
-        "exposure_s": plan.exposure_s,
-        "point_rate_hz": plan.point_rate_hz,
-        "sweep_s": plan.sweep_s,
-        "frames_per_sweep": plan.frames_per_sweep,
-        "dark_fraction": plan.dark_fraction,
-        "map_rate_hz": plan.map_rate_hz,
-        "command_range": plan.command_range,
-        "speed_per_s": plan.speed_per_s,
-        "depth_range_m": plan.depth_range_m,
-        "columns_per_marker": plan.columns_per_marker,
-        "window_px": plan.window,
-        "mode": plan.mode,
-        "windowed": plan.windowed,
-        "frame_width_px": plan.frame_width,
-        "bytes_per_s": plan.bytes_per_s,
-        "link_bytes_per_s": plan.link_bytes_per_s,
-        "full_frames_hz": plan.full_frames_hz,
-        "windows_px": None if plan.windows is None else plan.windows.width_px,
-        "windows_hz": plan.windows_hz,
-        "legs": [
-            {
-                "direction": leg.direction,
-                "lag_s": leg.lag_s,
-                "gate_open_s": leg.gate_open_s,
-                "gate_close_s": leg.gate_close_s,
-            }
-            for leg in plan.legs
-        ],
-    }
-
-
 def make_reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned] = ()) -> Reconstructor:
     """What makes the maps of a plan, as the config says."""
     estimate = rig.config.estimate
@@ -272,55 +219,3 @@ def _collect(
                 truth = rig.world.truth(plan.line_commands(found.column), velocity_per_s)
             of_maps.append(found.sweeps)  # before its map: whatever ends the run, no map is without its account
             run.add(found.result, found.compute_s, truth)
-
-
-def _frames(sweeps: list[SweepAccount], crc_errors: int | None) -> RunFrames:
-    return RunFrames(
-        expected=sum(sweep.frames.expected for sweep in sweeps),
-        received=sum(sweep.frames.received for sweep in sweeps),
-        lost=sum(sweep.frames.lost for sweep in sweeps),
-        crc_errors=crc_errors,
-        lit=sum(sweep.frames.lit for sweep in sweeps),
-    )
-
-
-def _synchronisation(sweeps: list[SweepAccount]) -> Synchronisation | None:
-    if not sweeps:
-        return None
-    residuals = [sweep.residual_columns for sweep in sweeps]
-    found = [sweep.detection for sweep in sweeps if sweep.detection is not None]
-    return Synchronisation(
-        by="blanking pattern" if found else "markers",
-        residual_columns=None if any(map(math.isnan, residuals)) else max(residuals),
-        clock_error=max((sweep.clock_error for sweep in sweeps), key=abs),
-        detection_probability=min(found) if found else None,
-    )
-
-
-def _verdict(sweeps: list[SweepAccount], model: RigModel | None, *, aborted: bool) -> Verdict:
-    """The gravest that applies."""
-    if aborted:
-        return Verdict.ABORTED
-    if not all(sweep.synchronised or _markers_lost(sweep) for sweep in sweeps):
-        return Verdict.UNSYNCHRONISED
-    if any(sweep.frames.lost for sweep in sweeps):
-        return Verdict.GAPS
-    return Verdict.COMPLETE if model is not None else Verdict.UNCALIBRATED
-
-
-def _markers_lost(sweep: SweepAccount) -> bool:
-    """Whether so many frames were lost that too few markers are left to judge the sweep's clock."""
-    return sweep.frames.lost > 0 and math.isnan(sweep.residual_columns)
-
-
-def _sweep_content(sweep: SweepAccount) -> dict[str, Any]:
-    return {
-        "direction": sweep.direction,
-        "first_frame": sweep.first_frame,
-        "end_frame": sweep.end_frame,
-        "lost": sweep.frames.lost,
-        "dark": sweep.frames.dark,
-        "clock_error": sweep.clock_error,
-        "residual_columns": sweep.residual_columns,
-        "detection_probability": sweep.detection,
-    }

@@ -24,6 +24,7 @@ from calibration.passages.even_albedo import board_pixels, even_pixels
 from calibration.passages.finding import SweepCounts, find_passages
 from calibration.passages.flux_picture import flux_picture
 from calibration.views import Corners, Passages, View
+from rig.arming import require_simulated_or_armed
 from rig.calibration_identity import identity_of
 from rig.config import RigConfig
 from rig.counting import CountVolume
@@ -33,7 +34,7 @@ from rig.recording.manifest import read_manifest
 from rig.replaying import ReplayOptions, replay_config
 from rig.run import OutFolder, Run
 from rig.scan_plan import Leg, ScanPlan
-from rig.scanning import ScanOptions, require_simulated_or_armed, run_scan
+from rig.scanning import ScanOptions, run_scan
 from rig.session import OpenRig, open_rig, prepare
 from rig.summary import MapTally, Verdict
 from rig.sweeps import SweepData

@@ -23,6 +23,7 @@ from calibration.pixels.pixel_file import PixelVersion, load_pixels, save_pixels
 from calibration.pixels.pixel_map import SIGNAL, PixelMap, frames_for, hot_flux, judge_pixels, light_leak
 from drivers.recorded.segments import segment_files
 from rig.api_config import SIMULATED, Config, PathLike, configure
+from rig.arming import require_simulated_or_armed
 from rig.calibrating.dark_frames import SPREAD_S, Sums, recorded_exposure_s, take_dark, take_sweeps
 from rig.calibrating.pixel_report import dark_rate_picture, pixel_page
 from rig.calibrating.pixel_result import PixelResult, pixel_verdict
@@ -33,7 +34,6 @@ from rig.outputs import RunFolder
 from rig.pictures import png_bytes
 from rig.replaying import ReplayOptions, replay_config
 from rig.run import Progress
-from rig.scanning import require_simulated_or_armed
 from rig.session import OpenRig, open_rig
 
 _log = logging.getLogger(__name__)

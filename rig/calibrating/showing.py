@@ -5,10 +5,10 @@ from collections.abc import Callable
 from calibration.guide.poses import Candidate
 from calibration.views import BoardPose
 from drivers.units import format_quantity
+from rig.arming import require_simulated_or_armed
 from rig.config import RigConfig
 from rig.config_files import parse_config
 from rig.errors import UsageError
-from rig.scanning import require_simulated_or_armed
 
 Tell = Callable[[str], None]
 """Takes a line for people."""

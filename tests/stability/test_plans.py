@@ -16,10 +16,12 @@ from drivers.interfaces import LEVEL_BACKWARD, ScanWaveform
 from drivers.mirror_ramps import brake, ramp
 from rig.blanking_search import PatternSearch, PatternShape, detection_probability
 from rig.errors import PlanError
+from rig.gate_pulses import sync_program
 from rig.mirror_path import Motion, mirrored, sweep_path
 from rig.path_search import narrowed
 from rig.plan import require_speed
-from rig.scan_plan import ScanPlan, rounded
+from rig.plan_figures import rounded
+from rig.scan_plan import ScanPlan
 from sim_backend.mirror_motion import Playing, Resting
 from tests.stability.inventory import EXAMPLES, covers
 from tests.unit.rig.light import blanked_plan
@@ -172,7 +174,7 @@ def test_plans_are_exact_in_time_and_finite_in_all_their_figures(plan) -> None:
     for maps in (1, 2, 10**9):
         assert plan.frames_for(maps) >= maps * float(plan.frames_per_sweep)
         assert plan.scanner_repeats(maps) * len(plan.legs) > maps
-    pulses, repeats = plan.sync_program(3)
+    pulses, repeats = sync_program(plan, 3)
     assert repeats >= 1
     assert all(pulse.duration_s is None or pulse.duration_s > 0 for pulse in pulses)
     assert plan.readout_s(10) >= 0

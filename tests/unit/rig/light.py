@@ -16,6 +16,7 @@ from calibration.model.rig_model import Lag, RigModel
 from calibration.model.scanner import PivotScanner
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_SCAN, OUT_GATE, BurstMode
+from rig.gate_pulses import sync_program
 from rig.plan import compile_plan
 from rig.scan_plan import ScanPlan
 from tests.unit.rig.streams import SPAD, TICK_HZ, scan, scanner_limits, timer_clock
@@ -108,7 +109,7 @@ def see(
     command, words = np.tile(plan.waveform.command, repeats), np.tile(plan.waveform.markers, repeats)
     high = np.concatenate([[False], (words & MARKER_SCAN) != 0])
     scan_s = latency_s + np.flatnonzero(high[1:] & ~high[:-1]) / rate
-    pulses, times = plan.sync_program(maps)
+    pulses, times = sync_program(plan, maps)
     lit: list[tuple[float, float]] = []
     now, sweep = 0.0, 0
     for pulse in pulses * times:

@@ -21,6 +21,7 @@ from drivers.interfaces import (
     StreamMode,
 )
 from rig.config import ScanConfig
+from rig.gate_pulses import sync_program
 from rig.plan import compile_plan
 from rig.scan_plan import ScanPlan
 
@@ -188,7 +189,7 @@ def stream_of(
     lines_before = np.concatenate([[0], np.searchsorted(line_s, scan_s)])
     records["line"] = np.searchsorted(line_frames, np.arange(n), side="right") - lines_before[records["sweep"]]
     marks[falls] |= np.uint32(Mark.BACKWARD)
-    pulses, times = plan.sync_program(maps)
+    pulses, times = sync_program(plan, maps)
     sequence = [pulse for _ in range(times) for pulse in pulses]
     now, sweep = 0.0, 0
     end_s = start_s + exposure / float(TICK_HZ)

@@ -14,6 +14,7 @@ from rig.blanking import CODE, Blanking
 from rig.blanking_search import PatternSearch, PatternShape, detection_probability
 from rig.counting import BIN_DARK
 from rig.errors import PlanError
+from rig.gate_pulses import sync_program
 from tests.unit.rig.light import blanked_plan, see
 from tests.unit.rig.streams import SPAD, plan_of, scan
 
@@ -205,7 +206,7 @@ def test_the_chance_of_detection_is_even_at_the_limit_and_grows_with_the_light()
 @pytest.mark.parametrize("bidirectional", [False, True])
 def test_light_leaves_in_the_pattern_and_on_columns_only_and_never_at_rest(bidirectional):
     plan = blanked_plan(bidirectional=bidirectional)
-    pulses, repeats = plan.sync_program(2)
+    pulses, repeats = sync_program(plan, 2)
     assert repeats == 1
     sweeps: list[list[tuple[float, float]]] = []
     for pulse in pulses:

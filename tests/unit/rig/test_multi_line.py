@@ -15,6 +15,7 @@ from rig.multi_line import LineGrid, line_grid, window_overlap
 from rig.multi_line_claims import share_claims
 from rig.multi_line_counter import LineCounter
 from rig.plan import compile_plan
+from rig.plan_figures import plan_text
 from rig.recalibrated import recalibrated
 from rig.recording.plain import from_plain, to_plain
 from rig.row_threads import RowWorkers
@@ -98,10 +99,10 @@ def test_lines_outside_the_calibration_are_refused():
 
 
 def test_the_plan_says_how_many_lines_there_are_and_how_far_they_can_be_taken_for_one_another():
-    text = plan_with(OFFSETS, command_range=[-0.1, 0.1], columns=40).describe()
+    text = plan_text(plan_with(OFFSETS, command_range=[-0.1, 0.1], columns=40))
     assert "10 x 4 frames at 100 kHz, 40 us each, for 4 lines at once: 40 columns" in text
     assert "of a column's window is other lines' too" in text
-    assert "lines" not in plan_of(scan()).describe()
+    assert "lines" not in plan_text(plan_of(scan()))
 
 
 def test_a_plan_with_lines_is_kept_and_read_back_and_one_without_is_written_as_before():

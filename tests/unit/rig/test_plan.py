@@ -20,7 +20,9 @@ from drivers.interfaces import (
 )
 from drivers.interfaces.scanner import check_waveform
 from rig.errors import PlanError
+from rig.gate_pulses import sync_program
 from rig.plan import compile_plan, require_speed, spad_request
+from rig.plan_figures import plan_text
 from tests.unit.rig.streams import SPAD, plan_of, rig_model, scan, scanner_limits, timer_clock
 
 GALVO = scanner_limits(
@@ -157,7 +159,7 @@ def test_the_plan_follows_the_exact_timing_that_the_spad_answered():
 @pytest.mark.parametrize(("bidirectional", "maps"), [(False, 3), (True, 4), (True, 3), (True, 1)])
 def test_the_gate_program_opens_once_per_map_and_waits_with_the_gate_low(bidirectional, maps):
     plan = plan_of(scan(bidirectional=bidirectional), Lag(1e-4, 3e-4))
-    pulses, repeats = plan.sync_program(maps)
+    pulses, repeats = sync_program(plan, maps)
     played = [pulse for _ in range(repeats) for pulse in pulses]
     waits = [pulse for pulse in played if pulse.duration_s is None]
     gates = [pulse for pulse in played if pulse.outputs & OUT_GATE]
@@ -262,12 +264,12 @@ def test_a_block_holds_five_milliseconds_of_frames_and_at_most_sixteen_mebibytes
 def test_without_a_calibration_the_window_is_the_whole_row():
     plan = compile_plan(scan(), scanner_limits(), timer_clock, None, dataclasses.replace(SPAD, width=100))
     assert plan.window == 128
-    assert "window      all 100 pixels for" in plan.describe()
+    assert "window      all 100 pixels for" in plan_text(plan)
     assert not plan.x0.any()
     assert plan.legs[0].lag_s == 0
 
 
 def test_the_description_names_columns_map_rate_sensor_time_dark_share_window_and_megabytes():
-    text = plan_of(scan(columns=500, exposures=10), limits=GALVO).describe()
+    text = plan_text(plan_of(scan(columns=500, exposures=10), limits=GALVO))
     for words in ("500 x 10 frames at 100 kHz", "maps ", "ms of sensor time", "% of them dark", "pixels", "MB/s"):
         assert words in text

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from drivers.interfaces import SweepTruth
+from rig.arming import require_simulated_or_armed
 from rig.errors import UsageError
 from rig.outputs import json_text
 from rig.reconstruction import FogEstimate, MapResult
 from rig.saving import SavePolicy
-from rig.scanning import require_simulated_or_armed
 from rig.stripes import StripeTable
 from rig.summary import MapTally, RunFrames, Verdict
 

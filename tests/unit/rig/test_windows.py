@@ -20,6 +20,7 @@ from rig.config_files import load_config
 from rig.counting import BIN_DARK, BIN_UNUSABLE
 from rig.errors import PlanError
 from rig.plan import compile_plan, spad_request
+from rig.plan_figures import plan_text
 from rig.session import open_rig, prepare
 from rig.sweeps import SweepAssembler
 from tests.unit.rig.streams import NO_LAG, SPAD, scan, scanner_limits, stream_of, timer_clock
@@ -194,12 +195,12 @@ def test_the_refusal_names_frames_windows_and_link():
 
 
 def test_the_description_names_the_window_its_rate_and_what_the_link_carries():
-    text = plan_of(scan(depth_range=["2 m", "4 m"]), spad=linked(12e6)).describe()
+    text = plan_text(plan_of(scan(depth_range=["2 m", "4 m"]), spad=linked(12e6)))
     assert "window      128 of 512 pixels for 2 to 4 m" in text
     # 192 pixels are 112 bytes with the record, full rows 272.
     assert "stream of moving windows of 192 pixels, 11.2 MB/s; the link carries full frames up to 44.12 kHz" in text
     assert "windows of 192 pixels up to 107.1 kHz" in text
-    assert "burst of full frames" in plan_of(scan(), spad=linked(1e5, burst=BurstMode(1000, 1e6))).describe()
+    assert "burst of full frames" in plan_text(plan_of(scan(), spad=linked(1e5, burst=BurstMode(1000, 1e6))))
 
 
 class Counter:
