@@ -59,4 +59,4 @@ def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
     for key, value in options.items():
         section, name = key.split(".")
         content[section][name] = value
-    return parse_config(content)
+    return parse_config(content, options=options)

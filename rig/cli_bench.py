@@ -42,6 +42,10 @@ def bench_command(
     """How fast this machine counts and estimates, beside how fast it reads its memory."""
     from rig import api
 
+    _require_used(
+        [simulator, disk is not None, soak is not None],
+        of_soak=window or slow_consumer != 0 or on_overload != "abort",
+    )
     if simulator:
         return _bench_simulator(as_json)
     if disk is not None:
@@ -65,6 +69,19 @@ def bench_command(
             print()
             soak_table(stream)
     return 0 if stream is None else stream.exit_code
+
+
+def _require_used(measured: list[bool], *, of_soak: bool) -> None:
+    """UsageError for options without effect, since a minute's measurement would be of something else.
+
+    measured: whether simulator, disk and a soak are asked for; of_soak: whether something is that only a soak has.
+    """
+    from rig.errors import UsageError
+
+    if sum(measured) > 1:
+        raise UsageError("--simulator and --disk measure nothing else; give one of --simulator, --disk and --soak")
+    if of_soak and not measured[-1]:
+        raise UsageError("--window, --slow-consumer and --on-overload are of a soak; add --soak 30, or leave them out")
 
 
 def _bench_disk(folder: Path, as_json: bool) -> int:

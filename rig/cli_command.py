@@ -140,17 +140,22 @@ def live_progress() -> Iterator["Callable[[ScanProgress], None] | None"]:
         yield None if bar is None else tell
 
 
-def split_option(given: list[str] | None) -> list[str]:
-    """The parts of an option that may be given several times and with commas."""
+def split_option(option: str, given: list[str] | None) -> list[str]:
+    """The parts of an option that may be given several times and with commas; UsageError where it names nothing."""
+    from rig.errors import UsageError
+
     parts = (part.strip() for value in given or () for part in value.split(","))
-    return list(dict.fromkeys(part for part in parts if part))
+    named = list(dict.fromkeys(part for part in parts if part))
+    if given and not named:
+        raise UsageError(f"{option} is empty; name one or several with commas between them, or leave {option} out")
+    return named
 
 
 def whole_numbers(option: str, given: list[str] | None) -> list[int]:
     """The same of an option that takes whole numbers."""
     from rig.errors import UsageError
 
-    parts = split_option(given)
+    parts = split_option(option, given)
     wrong = [part for part in parts if not part.isdecimal()]
     if wrong:
         raise UsageError(f"{option} has {wrong[0]!r}, which is no whole number; write e.g. {option} 1,3,10")

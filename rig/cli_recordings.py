@@ -90,8 +90,9 @@ def cut_command(
     if as_json:
         print_json({"out": str(out), "recording": content["recording"], "cut": content["cut"]})
     else:
-        print(f"{out}: {content['recording']['blocks']} blocks, maps {content['cut']['maps'][0]} to before "
-              f"{content['cut']['maps'][1]}")  # fmt: skip
+        first, end = content["cut"]["maps"]
+        held = f"maps {first} to before {end}" if end > first else "no whole map"
+        print(f"{out}: {content['recording']['blocks']} blocks, {held}")
     return 0
 
 

@@ -68,12 +68,12 @@ def tradeoff_command(
     with progress("frames") as bar:
         done = api.tradeoff(
             config,
-            scenes=split_option(scene),
-            fogs=split_option(fog),
+            scenes=split_option("--scene", scene),
+            fogs=split_option("--fog", fog),
             exposures=whole_numbers("--exposures", exposures),
             lines=whole_numbers("--lines", lines),
-            estimators=split_option(estimators),
-            filters=split_option(filters),
+            estimators=split_option("--estimators", estimators),
+            filters=split_option("--filters", filters),
             repeat=repeat,
             seed=seed,
             limits=limits,

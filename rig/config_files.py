@@ -3,7 +3,7 @@
 import copy
 import difflib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,7 +38,7 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
     given = {key: value for key, value in (overrides or {}).items() if value is not None}
     for key, value in given.items():
         _lay_over(content, key, value)
-    sources = Sources(_shown(path), lines, frozenset(tuple(key.split(".")) for key in given))
+    sources = Sources(_shown(path), lines, _keys(given))
     return _validated(RigConfig, content, sources, path.parent)
 
 
@@ -48,9 +48,16 @@ def load_cube_plan(path: str | Path) -> CubePlan:
     return _validated(CubePlan, content, Sources(_shown(Path(path)), lines), Path(path).parent)
 
 
-def parse_config(content: Mapping[str, object], folder: Path | None = None) -> RigConfig:
-    """A config from a mapping, such as a notebook's or a manifest's. Raises UsageError with one line per problem."""
-    return _validated(RigConfig, dict(content), Sources("config", {}), folder)
+def parse_config(content: Mapping[str, object], folder: Path | None = None, options: Iterable[str] = ()) -> RigConfig:
+    """A config from a mapping, such as a notebook's or a manifest's. Raises UsageError with one line per problem.
+
+    options: dotted keys whose values were given as options, for these problems.
+    """
+    return _validated(RigConfig, dict(content), Sources("config", {}, _keys(options)), folder)
+
+
+def _keys(dotted: Iterable[str]) -> frozenset[Key]:
+    return frozenset(tuple(key.split(".")) for key in dotted)
 
 
 def portable_content(config: RigConfig) -> dict[str, Any]:

@@ -44,6 +44,8 @@ FLAGS: Mapping[Key, str] = {
     ("estimate", "filter"): "--filter",
     ("estimate", "min_confidence"): "--min-confidence",
     ("estimate", "temporal_prior"): "--temporal-prior",
+    ("estimate", "threads"): "--threads",
+    ("scan", "adaptive", "time_budget"): "--time-budget",
 }
 """Keys that the command line has an option for."""
 _READS_ON = ("is ", "has ", "runs ", "begins ")
@@ -62,9 +64,13 @@ class Sources:
         """Line of a key, or of the nearest one that contains it."""
         return next((self.lines[key[:n]] for n in range(len(key), 0, -1) if key[:n] in self.lines), None)
 
+    def is_option(self, key: Key) -> bool:
+        """Whether a key, or one that contains it, was given as an option."""
+        return any(key[: len(option)] == option for option in self.options)
+
     def place(self, key: Key) -> str:
         """What a message begins with: the option, or the file with the line."""
-        if any(key[: len(option)] == option for option in self.options):
+        if self.is_option(key):
             return "option:"
         line = self.line(key)
         return f"{self.file}:" if line is None else f"{self.file}:{line}:"
@@ -77,7 +83,7 @@ def explain(
     found = []
     for problem in error.errors():
         key = _key(problem)
-        flag = FLAGS.get(key) if key in sources.options else None
+        flag = FLAGS.get(key) if sources.is_option(key) else None
         text = _text(problem, key, _Schema(model, content), flag)
         found.append((sources.line(key) or 0, text if flag else f"{sources.place(key)} {text}"))
     for _, text in sorted(found, key=lambda item: item[0]):

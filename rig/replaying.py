@@ -102,6 +102,7 @@ def replay_config(
     require_inputs(run, manifest)
     recorded = manifest.get("config") or {}
     calibration = run / CALIBRATION_FILE
+    given = {key: value for key, value in estimate.items() if value is not None}
     scan = recorded.get("scan") or _scan_of(plan)
     content: dict[str, Any] = {
         "name": f"replay of {recorded.get('name') or run.name}",
@@ -117,7 +118,7 @@ def replay_config(
         },
         **{slot: {"kind": "replay"} for slot in RECORDED},
         "scan": scan,
-        "estimate": {**(recorded.get("estimate") or {}), **{k: v for k, v in estimate.items() if v is not None}},
+        "estimate": {**(recorded.get("estimate") or {}), **given},
     }
     if content["estimate"].get("estimator") != "joint":  # another estimator than that of the scan, which had a prior
         content["estimate"].pop("temporal_prior", None)
@@ -125,7 +126,7 @@ def replay_config(
         content |= {slot: part for slot, part in others.model_dump(mode="json").items() if slot in (*RECORDED, "world")}
     elif against_recording:
         content |= _own_drivers(run, recorded)
-    return parse_config(content)
+    return parse_config(content, options=[f"estimate.{key}" for key in given])
 
 
 def replay_plan(

@@ -80,9 +80,9 @@ def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
             problems.append(f"--error {error!r} is no number of pixels; write e.g. '0.1 px'")
         else:
             error_px = float(match[1])
-    for name, value in (("--time-budget", time_ms), ("--error", error_px)):
+    for name, text, value in (("--time-budget", time_budget, time_ms), ("--error", error, error_px)):
         if value is not None and value <= 0:
-            problems.append(f"{name} is {value:g}; it must be more than 0")
+            problems.append(f"{name} is {text}; it must be more than 0")
     if problems:
         raise UsageError.of(problems)
     if time_ms is None and error_px is None:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.digits import digits
 from calibration.pixels.drift import PixelDrift
 from calibration.pixels.pixel_file import PixelVersion
 from calibration.pixels.pixel_map import PixelMap
@@ -37,7 +38,7 @@ def pixel_sections(
     """Parts of a report: the map, the distribution of the rates beside the older one, and what changed."""
     middle = pixels.ordinary_per_s
     fastest = float(np.nanmax(pixels.rate_per_s))
-    caption = f"Dark rate of each pixel, {middle / 3:.3g} to {fastest:.3g} counts/s on a logarithmic scale."
+    caption = f"Dark rate of each pixel, {digits(middle / 3)} to {digits(fastest)} counts/s on a logarithmic scale."
     sections = [
         Section("Dark rate", picture(dark_rate_picture(pixels), caption)),
         Section("Distribution", rate_chart(pixels, None if against is None else against.pixels)),

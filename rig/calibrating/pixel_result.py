@@ -6,6 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from calibration.digits import digits
 from calibration.pixels.drift import LEAST_ALIKE, MOST_NEW_DEFECTS, MOST_RATIO, PixelDrift
 from calibration.pixels.pixel_file import PixelVersion
 from calibration.pixels.pixel_map import PixelMap, frames_for, hot_flux
@@ -47,8 +48,8 @@ class PixelResult:
             ("sensor", self.found.sensor),
             ("map", f"version {self.found.version}, id {self.found.id}, {self.found.created}"),
             ("frames", f"{pixels.frames} dark, {pixels.exposure_s * 1e6:.4g} us each"),
-            ("dark rate", f"{pixels.ordinary_per_s:.3g} counts/s, of ordinary pixels"),
-            ("hot", f"{int(pixels.hot.sum())} above {float(np.nanmedian(pixels.limit_per_s)):.3g} counts/s"),
+            ("dark rate", f"{digits(pixels.ordinary_per_s)} counts/s, of ordinary pixels"),
+            ("hot", f"{int(pixels.hot.sum())} above {digits(float(np.nanmedian(pixels.limit_per_s)))} counts/s"),
             ("noisy", f"{int(pixels.noisy.sum())} jump; {pixels.judged:.1%} fire often enough to be judged"),
             ("dead", dead),
             ("defects", f"{int(pixels.defects.sum())} pixels, {share}"),

@@ -24,6 +24,8 @@ from rig.run import Progress
 
 ExportKind = Literal["npy", "hdf5", "ply", "png", "mp4"]
 EXPORT_KINDS: Final[tuple[ExportKind, ...]] = get_args(ExportKind)
+PICTURE_KINDS: Final = ("png", "mp4")
+"""Those that have a view."""
 FILMS_PER_S: Final = 25.0
 FRAMES_PER_PICTURE: Final = 100
 _NO_MAPS: Final = "make them first: rig reconstruct {run} --out DIR, and export that folder"
@@ -208,6 +210,8 @@ def _check(run: Path, kind: str, options: ExportOptions) -> None:
         problems.append(f"{run} does not exist; name the folder of a run")
     if options.view is not None and options.view not in VIEWS:
         problems.append(f"view {options.view!r} is unknown; choose one of {', '.join(VIEWS)}")
+    elif options.view is not None and kind in EXPORT_KINDS and kind not in PICTURE_KINDS:
+        problems.append(f"view {options.view!r} is of pictures, {kind} has none; export png or mp4, or leave it out")
     if options.frames_per_picture < 1:
         problems.append(f"{options.frames_per_picture} frames make no picture; sum at least 1")
     if not 0 < options.pictures_per_s <= 1000:

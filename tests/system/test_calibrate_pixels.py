@@ -1,6 +1,7 @@
 """`rig calibrate pixels` on a simulated sensor whose faults are known: found, written, compared and used."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,7 @@ def test_the_folder_holds_the_map_the_calibration_and_the_report(mapped: tuple[P
     assert "<svg" in page
     assert "data:image/png" in page
     assert {name for name, _ in result.rows()} >= {"hot", "dead", "noisy", "dark rate"}
+    assert not any(re.search(r"\de[+-]\d", told) for _, told in result.rows()), "powers of ten"
 
 
 def test_the_next_map_knows_the_last_one_and_says_what_changed(mapped: tuple[Path, PixelResult]) -> None:

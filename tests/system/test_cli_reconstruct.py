@@ -150,7 +150,7 @@ def test_a_plan_or_option_that_does_not_fit_is_one_line(
         (np.zeros((COLUMNS * EXPOSURES, ROWS, 13), np.int8), "holds int8; a cube holds uint8"),
         (b"columns: 3", "is no whole .npy file"),
         (b"", "is no whole .npy file"),
-        (None, "No such file"),
+        (None, "does not exist"),
     ],
     ids=["empty", "narrow", "flat", "signed", "text", "nothing", "absent"],
 )
@@ -178,6 +178,7 @@ def test_a_calibration_of_mirror_commands_does_not_fit_a_bare_cube(rig: Rig, wal
 
 def test_missing_options_are_one_line(rig: Rig, wall: Path) -> None:
     refused(rig("reconstruct", wall / "cube.npy"), "--out")
+    refused(rig("reconstruct", "cubes.npy", "--out", "r"), "cubes.npy does not exist")
 
 
 def refused(ran: Ran, said: str) -> None:

@@ -46,6 +46,7 @@ def test_parts_and_compressed_recordings_are_recordings(rig: Rig, run: Path, tmp
         assert (told["maps"], told["verdict"], told["problems"]) == (maps, "complete", [])
         assert rig("verify", folder).code == 0
     assert "start 0: frames " in rig("info", tmp_path / "part").out
+    assert rig("cut", run, "--frames", "0:9", "--out", tmp_path / "few").out.rstrip().endswith("blocks, no whole map")
 
 
 @pytest.mark.parametrize("estimator", ["argmax", "likelihood", "joint"])

@@ -82,6 +82,9 @@ def test_repeats_differ_and_what_cannot_be_had_ends_with_1_and_the_nearest(rig: 
         (["--repeat", "0"], "repeat is 0"),
         (["--exposures", "60000"], "exposures above"),
         (["--error", "1"], "write e.g. '0.1 px'"),
+        (["--time-budget", "-5 ms"], "--time-budget is -5 ms; it must be more than 0"),
+        (["--estimators", ""], "--estimators is empty"),
+        (["--exposures", ","], "--exposures is empty"),
     ],
 )
 def test_bad_options_are_one_line_each_and_leave_nothing(rig: Rig, small: Path, options: list[str], named: str) -> None:

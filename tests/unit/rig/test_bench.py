@@ -273,6 +273,19 @@ def test_the_command_prints_one_json_object_or_a_table_of_100_columns(report, mo
     assert any("GB/s" in line for line in told)
 
 
+@pytest.mark.parametrize(
+    "options",
+    [["--slow-consumer", "5"], ["--window"], ["--on-overload", "drop"], ["--simulator", "--disk", "."],
+     ["--soak", "1", "--disk", "."]],
+)  # fmt: skip
+def test_options_without_effect_are_refused_before_a_minute_has_passed(options, monkeypatch, capsys):
+    monkeypatch.setattr(speed, "measure_speed", lambda threads, progress: pytest.fail("measured"))
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["bench", *options])
+    assert caught.value.code == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
 def test_what_cannot_be_asked_for_is_refused():
     with pytest.raises(UsageError, match="threads is 0"):
         api.bench(threads=0)

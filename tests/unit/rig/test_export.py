@@ -245,6 +245,7 @@ def test_runs_of_two_sizes_make_no_array(tmp_path: Path) -> None:
         ("npy", {}, "holds no recording"),
         ("png", {"view": "frames"}, "holds no frames"),
         ("png", {"view": "x"}, "choose one of depth"),
+        ("ply", {"view": "depth"}, "ply has none; export png or mp4"),
         ("mp4", {"pictures_per_s": 0.0}, "a second"),
         ("png", {"frames_per_picture": 0}, "at least 1"),
     ],
