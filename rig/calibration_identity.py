@@ -6,7 +6,7 @@ kinds and serial numbers of sensor and scanner, how they are mounted, the laser 
 geometry. Settings of a scan are not. A recording is compared with the devices that it was taken with, at the date on
 which it was taken.
 
-A check that fails later is noted in a file beside the calibration (`note_check`), which itself stays as it is.
+A check that fails later is noted in a file beside the calibration (`calibration_notes`), which itself stays as it is.
 """
 
 import hashlib
@@ -20,8 +20,8 @@ from typing import Any, Final
 from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import Identity, RigModel
 from rig.calibrating.result import KnowsRig
+from rig.calibration_notes import notes_on
 from rig.calibration_refusals import Refusal, check_content, failed_verdict, require_accepted
-from rig.errors import UsageError
 from rig.recording.manifest import read_manifest
 from rig.replaying import PlaysRecording
 from rig.session import OpenRig
@@ -127,32 +127,12 @@ def refusals(
             found += _foreign(identity, here)
             found += _aged(identity, here, max_age_s)
         found += failed_verdict(identity.verdict, identity.reasons)
-    for what, note in _checks(file, model).items():
+    for what, note in notes_on(file, model).items():
         if not note.get("passed", True):
             why = ", ".join(note.get("reasons") or ()) or "no reason noted"
             said = f"'{_CHECKS.get(what, what)}' of {note.get('date', 'unknown date')} failed ({why}) since it was made"
             found.append(Refusal("failed-check", said))
     return tuple(found)
-
-
-def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons: tuple[str, ...] = ()) -> Path:
-    """Note beside a calibration file how a check of it ended; `what`: check or pixels. Raises OSError."""
-    beside = _beside(file)
-    notes = _read_notes(beside)
-    date = datetime.now(UTC).isoformat(timespec="seconds")
-    notes[what] = {"calibration": model.fingerprint(), "date": date, "passed": passed, "reasons": list(reasons)}
-    scratch = beside.with_name(f".{beside.name}.part")
-    scratch.write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
-    scratch.replace(beside)
-    return beside
-
-
-def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel) -> None:
-    """Have what failed on a calibration speak against the one that was made from it. Raises OSError."""
-    failed = {what: note for what, note in _checks(old, before).items() if not note.get("passed", True)}
-    failed.pop("pixels", None)  # of which there are new ones now
-    for what, note in failed.items():
-        note_check(new, after, what, passed=False, reasons=tuple(note.get("reasons") or ()))
 
 
 def _identity(name: str, kinds: Mapping[str, str], serials: Mapping[str, str], created: str) -> Identity:
@@ -222,30 +202,6 @@ def _accepted_before(rig: OpenRig) -> frozenset[str]:
         return frozenset()
     noted = (read_manifest(run) or {}).get("calibration") or {}
     return frozenset(str(code) for code, _ in noted.get("accepted") or ())
-
-
-def _beside(file: Path) -> Path:
-    return file.with_name(f"{file.stem}-checks.json")
-
-
-def _checks(file: Path | None, model: RigModel) -> dict[str, dict[str, Any]]:
-    """Notes on this very calibration, by what was checked."""
-    if file is None:
-        return {}
-    notes = _read_notes(_beside(file))
-    return {what: note for what, note in notes.items() if note.get("calibration") == model.fingerprint()}
-
-
-def _read_notes(file: Path) -> dict[str, dict[str, Any]]:
-    try:
-        notes = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{file} cannot be read ({error}); remove it and check the calibration again") from error
-    if not isinstance(notes, dict) or not all(isinstance(note, dict) for note in notes.values()):
-        raise UsageError(f"{file} holds no notes on a calibration; remove it and check the calibration again")
-    return notes
 
 
 def accepted_by(use: CalibrationUse | None) -> tuple[str, ...]:

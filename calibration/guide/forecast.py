@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from calibration.depth.uncertainty import command_at, depth_jacobian
 from calibration.errors import CalibrationError, Degenerate
 from calibration.model.rig_model import RigModel
-from calibration.rig_fit.fit import RigFit
 from calibration.rig_fit.noise import bin_starts
 from calibration.rig_fit.normal import view_normal
+from calibration.rig_fit.result import RigFit
 from calibration.rig_fit.rows import Terms
 from calibration.rig_fit.sightings import Sighting
 from calibration.rig_fit.solve import scaled_inverse

@@ -18,7 +18,7 @@ from calibration.judging.sweep_waves import SweepResidual, SweepWaves, sweep_wav
 from calibration.judging.view_shifts import ViewShift, common_shift, counted, last_before_move, shift_noise, view_shifts
 from calibration.model.lag_speeds import SWEPT
 from calibration.model.rig_model import RigModel
-from calibration.rig_fit.fit import RigFit
+from calibration.rig_fit.result import RigFit
 from calibration.rig_fit.sightings import shows_line, usable
 from calibration.verdict import AT_M, Asked, Verdict, unguided
 from calibration.views import View

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from calibration.judging.sweep_waves import NOISE_SIGMAS
 from calibration.model.rig_model import RigModel
-from calibration.rig_fit.fit import RigFit
 from calibration.rig_fit.normal import corner_weights
+from calibration.rig_fit.result import RigFit
 from calibration.rig_fit.sightings import corner_scale
 from calibration.rig_fit.sweeps import SweepFit
 from calibration.views import FEWEST_CORNERS, BoardPose, View

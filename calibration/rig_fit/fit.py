@@ -6,7 +6,7 @@ told from the residuals themselves (`rig_noise`). Terms of the mirror that the d
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,72 +16,24 @@ from calibration.camera_fit.fit import CameraFit, fit_camera
 from calibration.errors import CalibrationError, Degenerate
 from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
-from calibration.model.lag_speeds import SWEPT, lag_groups, speed_range
-from calibration.model.rig_model import Lag, RigModel
+from calibration.model.lag_speeds import lag_groups
+from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner
-from calibration.rig_fit.degenerate import check_depth, check_poses, check_views, no_start
-from calibration.rig_fit.misfit import misfit, widening
+from calibration.rig_fit.degenerate import check_poses, check_views, no_start
 from calibration.rig_fit.noise import Noise, passage_noise, restated
 from calibration.rig_fit.normal import all_rows
+from calibration.rig_fit.result import RigFit, result_of
 from calibration.rig_fit.rounds import Rounds
 from calibration.rig_fit.rows import ANGLE_TERMS, LENS_TERMS, OFFSET_TERMS, Terms
-from calibration.rig_fit.select import Decision, lag_decisions, with_free
+from calibration.rig_fit.select import with_free
 from calibration.rig_fit.sightings import Sighting, sighting, usable
 from calibration.rig_fit.solve import Problem, camera_prior
 from calibration.rig_fit.start import board_points, first_pose, first_scanner
 from calibration.rig_fit.state import RigState, first_state, with_terms_of
-from calibration.rig_fit.sweeps import SweepFit, sweep_fits
 from calibration.robust import robust_sd
 from calibration.views import BoardPose, View
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RigFit:
-    """A fitted rig. Per view, in the order of `views`: poses, corner_residual_px (n, 2) predicted less seen, sweeps.
-
-    left_out: names of views without corners; outliers: of views that do not fit the others, which had no say.
-    noise: what the residuals speak for; corner_scale: of the usual corner, by which its sd is the noise's. misfit: by
-    which variances were multiplied, 1 where the model describes all. condition: of the scaled equations of the shared
-    parameters. converged: False where data that contradict each other keep the fit from coming to rest. decisions:
-    about terms and lags. free: what was fitted, names of one group having one value; information: (free, free) about
-    it, the inverse of its covariance.
-    """
-
-    model: RigModel
-    views: tuple[str, ...]
-    poses: tuple[BoardPose, ...]
-    corner_residual_px: tuple[Array, ...]
-    sweeps: tuple[tuple[SweepFit, ...], ...]
-    left_out: tuple[str, ...]
-    outliers: tuple[str, ...]
-    noise: Noise
-    corner_scale: float
-    misfit: float
-    condition: float
-    converged: bool
-    decisions: tuple[Decision, ...]
-    board: Board
-    free: tuple[tuple[str, ...], ...]
-    information: Array
-
-    @property
-    def used(self) -> tuple[str, ...]:
-        """Names of the views whose passages had a say."""
-        pairs = zip(self.views, self.sweeps, strict=True)
-        return tuple(name for name, sweeps in pairs if sweeps and name not in self.outliers)
-
-    @property
-    def without_line(self) -> tuple[str, ...]:
-        """Names of the views with corners, but too few passages on the board."""
-        return tuple(name for name, sweeps in zip(self.views, self.sweeps, strict=True) if not sweeps)
-
-    @property
-    def corner_rms_px(self) -> float:
-        """Root mean square of all corners' distances."""
-        squares = np.concatenate([np.sum(left**2, axis=1) for left in self.corner_residual_px])
-        return float(np.sqrt(squares.mean()))
 
 
 def fit_rig(
@@ -134,7 +86,7 @@ def fit_rig(
     except np.linalg.LinAlgError as error:
         raise no_start(error, poses) from error
     left_out = tuple(view.name for view in views if view.name not in {used.name for used in shown})
-    return _result(fit, left_out, board, start, velocities)
+    return result_of(fit, left_out, board, start, velocities)
 
 
 def _first_camera(
@@ -201,64 +153,3 @@ def _first_noise(problem: Problem, state: RigState) -> tuple[Problem, Noise]:
     problem = replace(problem, sightings=restated(passages, problem.sightings))
     factor, jitter, reach = passage_noise(passages, problem.sightings)
     return problem, Noise(max(robust_sd(np.concatenate(corners)), 1e-4), factor, jitter, reach)
-
-
-def _result(fit: Rounds, left_out: tuple[str, ...], board: Board, start: RigModel | None, velocities: Array) -> RigFit:
-    assert fit.solution is not None
-    problem, solution, state = fit.problem, fit.solution, fit.state
-    names = np.array(problem.terms.names)
-    unexplained = misfit(problem, solution).factor
-    matrix = unexplained * solution.covariance(problem.tie) + widening(problem, solution, fit.decisions)
-    fitted = np.flatnonzero(np.diag(matrix) > 0)
-    covariance = Covariance(tuple(names[fitted].tolist()), matrix[np.ix_(fitted, fitted)])
-    scanner = state.scanner
-    scanner = replace(scanner, angle_rad=_trimmed(scanner.angle_rad, 2), offset_m=_trimmed(scanner.offset_m, 0))
-    model = replace(
-        RigModel(state.model.camera, scanner) if start is None else start,
-        camera=state.model.camera,
-        scanner=scanner,
-        covariance=covariance,
-        lag_s=Lag(*(max(float(lag), 0.0) for lag in state.timing[:2])),
-        row_delay_s=float(state.timing[2]),
-        provenance={SWEPT: _swept(problem)},
-        speed_range_per_s=speed_range(np.abs(velocities)),
-    )
-    counted = problem.counted
-    fastest = float(velocities[np.argmax(np.abs(velocities))])
-    outliers = tuple(seen.name for seen, counts in zip(problem.sightings, counted, strict=True) if not counts)
-    said = [pose for pose, counts in zip(state.poses, counted, strict=True) if counts]
-    check_depth(model, said, solution.condition, fastest, unexplained, outliers)
-    return RigFit(
-        model=model,
-        views=tuple(seen.name for seen in problem.sightings),
-        poses=state.poses,
-        corner_residual_px=tuple(rows.residual.reshape(2, -1).T for rows, _ in solution.rows),
-        sweeps=tuple(
-            sweep_fits(seen, rows.residual, state, view)
-            for view, (seen, (_, rows)) in enumerate(zip(problem.sightings, solution.rows, strict=True))
-        ),
-        left_out=left_out,
-        outliers=outliers,
-        noise=fit.noise,
-        corner_scale=float(np.median(np.concatenate([seen.corner_scale for seen in problem.sightings]))),
-        misfit=unexplained,
-        condition=solution.condition,
-        converged=solution.converged,
-        decisions=(*fit.kept, *fit.decisions, *lag_decisions(solution, problem, fit.free, state.timing)),
-        board=board,
-        free=tuple(fit.free),
-        information=problem.tie.T @ solution.matrix @ problem.tie / unexplained,
-    )
-
-
-def _swept(problem: Problem) -> list[float]:
-    """Signed velocities of the sweeps that had a say."""
-    shown = [seen.velocity_per_s for seen, counts in zip(problem.sightings, problem.counted, strict=True) if counts]
-    swept: list[float] = np.unique(np.concatenate(shown)).tolist()
-    return swept
-
-
-def _trimmed(terms: Array, least: int) -> Array:
-    """Without the zeros at the end."""
-    used = np.flatnonzero(terms)
-    return terms[: max(least, int(used[-1]) + 1 if used.size else 0)]

@@ -13,6 +13,7 @@ from calibration.errors import Degenerate
 from calibration.files.camera_file import camera_content, camera_file_text, corners_digest
 from calibration.judging.camera import ACCURACY_PX, JudgedCamera, judge_camera
 from calibration.verdict import AT_M
+from rig.calibrating.kept_views import take_kept
 from rig.calibrating.planes_run import POSES
 from rig.calibrating.refusing import refusal
 from rig.calibrating.report import camera_report
@@ -21,7 +22,8 @@ from rig.calibrating.result import CalibrationResult, named
 from rig.calibrating.session import Session
 from rig.calibrating.showing import Ask, Tell, require_live
 from rig.calibrating.sources import Sources
-from rig.calibrating.taking import Live, Taken, good_poses, take_kept, take_live
+from rig.calibrating.taken import Taken
+from rig.calibrating.taking import Live, good_poses, take_live
 from rig.run import OutFolder, versions
 
 CAMERA_FILE = "camera.yaml"

@@ -22,6 +22,7 @@ from calibration.judging.rig import goal
 from calibration.model.rig_model import RigModel
 from calibration.verdict import AT_M, Asked, Verdict
 from calibration.views import View
+from rig.calibrating.kept_views import take_kept
 from rig.calibrating.refusing import note_views
 from rig.calibrating.report import check_report
 from rig.calibrating.report_subject import subject
@@ -29,9 +30,10 @@ from rig.calibrating.result import CalibrationResult
 from rig.calibrating.session import Session
 from rig.calibrating.showing import Ask, Tell, require_live
 from rig.calibrating.sources import Sources
-from rig.calibrating.taking import Live, Taken, good_poses, take_kept, take_live
+from rig.calibrating.taken import Taken
+from rig.calibrating.taking import Live, good_poses, take_live
 from rig.calibrating.truth import true_errors, truth_content
-from rig.calibration_identity import note_check
+from rig.calibration_notes import note_check
 from rig.errors import UsageError
 from rig.run import OutFolder, versions
 

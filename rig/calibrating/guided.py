@@ -8,10 +8,11 @@ from calibration.errors import CalibrationError
 from calibration.guide.forecast import Forecast
 from calibration.guide.poses import Advice, candidates, next_pose
 from calibration.judging.rig import Judged
-from calibration.rig_fit.fit import RigFit
+from calibration.rig_fit.result import RigFit
 from calibration.views import View
 from rig.calibrating.showing import Tell
-from rig.calibrating.taking import FixedPoses, Taken
+from rig.calibrating.taken import Taken
+from rig.calibrating.taking import FixedPoses
 
 START_POSES = 3
 """Before anything is fitted."""

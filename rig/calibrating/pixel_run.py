@@ -27,7 +27,7 @@ from rig.arming import require_simulated_or_armed
 from rig.calibrating.dark_frames import SPREAD_S, Sums, recorded_exposure_s, take_dark, take_sweeps
 from rig.calibrating.pixel_report import dark_rate_picture, pixel_page
 from rig.calibrating.pixel_result import PixelResult, pixel_verdict
-from rig.calibration_identity import carry_notes, note_check
+from rig.calibration_notes import carry_notes, note_check
 from rig.config import RigConfig
 from rig.errors import UsageError
 from rig.outputs import RunFolder

@@ -14,10 +14,12 @@ from calibration.errors import CalibrationError, Degenerate
 from calibration.files.camera_file import CORNERS, KnownCamera, corners_digest
 from calibration.judging.rig import Judged, judge_fit
 from calibration.model.rig_model import Identity, RigModel
-from calibration.rig_fit.fit import RigFit, fit_rig
+from calibration.rig_fit.fit import fit_rig
+from calibration.rig_fit.result import RigFit
 from calibration.verdict import AT_M
 from rig.calibrating.camera_use import CameraUse
 from rig.calibrating.guided import Guide
+from rig.calibrating.kept_views import take_kept
 from rig.calibrating.refusing import refusal
 from rig.calibrating.report import planes_report
 from rig.calibrating.report_subject import subject
@@ -25,7 +27,8 @@ from rig.calibrating.result import CalibrationResult, named
 from rig.calibrating.session import Session
 from rig.calibrating.showing import Ask, Tell, require_live
 from rig.calibrating.sources import Sources
-from rig.calibrating.taking import Live, Taken, good_poses, take_kept, take_live
+from rig.calibrating.taken import Taken
+from rig.calibrating.taking import Live, good_poses, take_live
 from rig.calibrating.truth import true_errors, truth_content
 from rig.config import RigConfig
 from rig.errors import UsageError

@@ -5,7 +5,7 @@ from collections import Counter
 from calibration.board.board import Board
 from calibration.errors import Degenerate
 from calibration.judging.rig import judge_refused
-from rig.calibrating.taking import Taken
+from rig.calibrating.taken import Taken
 
 
 def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = True, line: bool = True) -> Degenerate:

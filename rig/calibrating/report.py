@@ -13,7 +13,7 @@ from calibration.digits import in_mm, mm
 from calibration.judging.camera import JudgedCamera
 from calibration.judging.rig import Judged
 from calibration.model.camera import Camera
-from calibration.rig_fit.fit import RigFit
+from calibration.rig_fit.result import RigFit
 from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import Verdict
 from calibration.views import BoardPose, View

@@ -19,6 +19,7 @@ from calibration.sync.transfer import known_row_delay, with_lags
 from calibration.verdict import AT_M, Verdict
 from rig.calibrating.capture import capture_view
 from rig.calibrating.gate_times import GateDelay, gate_delay
+from rig.calibrating.kept_views import take_kept
 from rig.calibrating.planes_run import speeds_of
 from rig.calibrating.report import sync_report
 from rig.calibrating.report_subject import subject
@@ -26,7 +27,7 @@ from rig.calibrating.result import CalibrationResult
 from rig.calibrating.session import Session
 from rig.calibrating.showing import Tell
 from rig.calibrating.sources import Sources
-from rig.calibrating.taking import Taken, take_kept
+from rig.calibrating.taken import Taken
 from rig.calibrating.truth import true_model
 from rig.config import RigConfig
 from rig.run import OutFolder, versions

@@ -1,34 +1,25 @@
-"""Views from all sources of a calibration: those kept earlier, recorded runs, then the live rig, pose by pose."""
+"""Views of a live rig, pose by pose: which poses, and until when."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
-from calibration.board.detection import find_corners
-from calibration.errors import CalibrationError, Degenerate
-from calibration.files.camera_file import corners_digest
+from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
 from calibration.guide.poses import Advice, candidates, rough_camera, sequence
 from calibration.model.camera import Camera
-from calibration.model.rig_model import Identity
 from calibration.rig_fit.sightings import shows_line
 from calibration.views import View
-from rig.calibrating.capture import Capture, capture_recorded, capture_view
-from rig.calibrating.session import BOARD_FILE, Session, session_board, session_rig
-from rig.calibrating.showing import Ask, Tell, shown
-from rig.calibrating.sources import VIEWS, Sources
+from rig.calibrating.capture import Capture, capture_view
+from rig.calibrating.showing import Ask, shown
 from rig.calibrating.speed_turns import SpeedTurns
-from rig.calibrating.view_files import load_views
-from rig.calibrating.view_text import told
-from rig.calibration_identity import same_rig
+from rig.calibrating.taken import Taken
 from rig.config import RigConfig
 from rig.errors import UsageError
 from rig.session import open_rig
@@ -39,9 +30,6 @@ MISSED_SHARE = 0.5
 LASTING = (["wrong-board"] * 3, ["mirrored"] * 3)
 """Why the first views of a session are refused where no pose of the board will change that."""
 
-Defects = NDArray[np.bool_] | None
-"""(rows, width), pixels not to be used."""
-
 
 class ChoosesPoses(Protocol):
     """Says which pose to show next."""
@@ -49,83 +37,6 @@ class ChoosesPoses(Protocol):
     def next(self, views: Sequence[View]) -> Advice | None:
         """After these views; None: no more are needed."""
         ...
-
-
-class Taken:
-    """What was taken. views: all of them. refused: why some have no corners, by the view's name. identity: of the rig,
-    None: not known.
-    """
-
-    def __init__(self, session: Session, tell: Tell | None = None) -> None:
-        """session: where views are kept; tell: is told of each."""
-        self.views: list[View] = []
-        self.refused: dict[str, Degenerate] = {}
-        self.identity: Identity | None = None
-        self._session = session
-        self.tell = tell
-        self._seen: dict[str, str] = {}
-
-    def add(
-        self,
-        view: View,
-        refused: Degenerate | None = None,
-        identity: Identity | None = None,
-        source: Path | None = None,
-    ) -> None:
-        """One more; a name that there is already gets a number. source: the file or run that it is from. UsageError for
-        one that there is already: it would count twice.
-        """
-        self._require_new(view, str(source or view.name))
-        if view.name in [known.name for known in self.views]:
-            view = replace(view, name=f"{view.name}-{len(self.views)}")
-        self.views.append(view)
-        if refused is not None:
-            self.refused[view.name] = refused
-        self._of_rig(identity)
-        self._session.add(view)
-        self.say(told(view, refused))
-
-    def say(self, line: str) -> None:
-        """Tell whoever listens."""
-        if self.tell is not None:
-            self.tell(line)
-
-    def _require_new(self, view: View, where: str) -> None:
-        if view.corners is None:
-            return
-        digest = corners_digest(view)
-        if digest in self._seen:
-            raise UsageError(
-                f"{where} holds the very corners of {self._seen[digest]}; a view must not count twice: name it once, "
-                "or show the board again"
-            )
-        self._seen[digest] = where
-
-    def _of_rig(self, identity: Identity | None) -> None:
-        if identity is None:
-            return
-        if self.identity is None:
-            self._session.note_rig(identity)
-        elif not same_rig(self.identity, identity):
-            raise UsageError(
-                f"views are of two rigs: {self.identity.name} ({_devices(self.identity)}) and {identity.name} "
-                f"({_devices(identity)}); calibrate each with its own"
-            )
-        self.identity = identity
-
-    def add_capture(self, capture: Capture, source: Path | None = None) -> None:
-        """The view of a scan, of a recorded one where a source is named."""
-        self.add(capture.view, capture.refused, capture.identity, source)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) of the pictures. UsageError where views are of different sizes."""
-        sizes = {view.picture.shape[::-1] for view in self.views if view.picture is not None}
-        if len(sizes) != 1:
-            named = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)) or "none"
-            raise UsageError(f"pictures of the views have sizes {named}; views of one sensor make a calibration")
-        width, height = sizes.pop()
-        return width, height
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,28 +74,13 @@ def first_camera(config: RigConfig) -> Camera:
         return rough_camera((rig.spad.info.width, rig.spad.info.height))
 
 
-def take_kept(taken: Taken, sources: Sources, board: Board | None, defects: Defects = None) -> None:
-    """Take the views that need no live rig. board: None where nothing moves and none is looked for."""
-    for note in sources.notes:
-        taken.say(note)
-    for folder in sources.sessions:
-        _require_alike(folder, board)
-        identity = session_rig(folder)
-        for view in load_views(folder / VIEWS):
-            taken.add(view, None, identity, folder / VIEWS / view.name)
-    for run in sources.recorded:
-        taken.add_capture(capture_recorded(run, run.name, board, defects=defects), run)
-    for file in sources.pictures:
-        taken.add(*_pictured(file, board), source=file)
-
-
 @dataclass(frozen=True, slots=True)
 class Live:
     """How a live rig takes views. poses: good ones wanted; choose: which. ask: gets a person to move the board.
 
     exposures: per column, by turns, so that the mirror is seen at several speeds; those that it cannot do are left out,
     and those that never show the line where more exposures do; none: as the config says. line: whether it is to be seen
-    on the board. seed: of everything simulated.
+    on the board. defects: (rows, width), pixels not to be used. seed: of everything simulated.
     """
 
     config: RigConfig
@@ -194,7 +90,7 @@ class Live:
     exposures: Sequence[int] = ()
     seed: int = 0
     arm: bool = False
-    defects: Defects = None
+    defects: NDArray[np.bool_] | None = None
     line: bool = True
 
     def sees(self, capture: Capture) -> bool:
@@ -229,44 +125,3 @@ def _scan(taken: Taken, live: Live, config: RigConfig, board: Board, exposures: 
     return capture_view(
         config, f"{at:03d}", board, seed=live.seed + at, exposures=exposures, arm=live.arm, defects=live.defects
     )
-
-
-def _require_alike(folder: Path, board: Board | None) -> None:
-    """UsageError where a session's views do not show what is looked for. The squares' side may be another now: it is
-    what is corrected where it was measured wrong.
-    """
-    known = session_board(folder)
-    if known is None:
-        return
-    if board is None:
-        raise UsageError(
-            f"{folder} holds views of a board that was moved, lags are told by what stands still; name a rig, runs of "
-            "one unmoved scene, or the folder of an earlier 'rig calibrate sync'"
-        )
-    if _print(known) != _print(board):
-        raise UsageError(
-            f"{folder} holds views of a {_print(known)}, looked for is a {_print(board)}; name the board that was "
-            f"shown: --board {folder / BOARD_FILE}"
-        )
-
-
-def _print(board: Board) -> str:
-    of = "" if board.dictionary is None else f" of {board.dictionary}"
-    return f"{board.kind} board of {board.squares[0]} x {board.squares[1]} squares{of}"
-
-
-def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]:
-    """A picture of the board, taken with anything."""
-    pixels = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    if pixels is None:
-        raise UsageError(f"{file} cannot be read as a picture; convert it to PNG")
-    picture = np.asarray(pixels, np.float32)
-    try:
-        corners = None if board is None else find_corners(np.asarray(pixels), board)
-        return View(file.name, corners, (), picture), None
-    except Degenerate as error:
-        return View(file.name, None, (), picture), error
-
-
-def _devices(identity: Identity) -> str:
-    return ", ".join([*identity.kinds.values(), *identity.serials.values()])

@@ -17,7 +17,8 @@ from calibration.errors import CalibrationError
 from calibration.guide.forecast import Forecast
 from calibration.guide.poses import candidates, next_pose, rough_camera, sequence
 from calibration.judging.rig import judge_fit
-from calibration.rig_fit.fit import RigFit, fit_rig
+from calibration.rig_fit.fit import fit_rig
+from calibration.rig_fit.result import RigFit
 from calibration.views import View
 from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_rig, seen_view
 

@@ -25,7 +25,8 @@ SCOPE = (
     *(f"rig/{name}.py" for name in ("mirror_path", "path_search", "plan", "scan_plan", "scoring", "stripes", "sweeps")),
     "rig/bent_light*.py",
     "rig/windows.py",
-    *(f"rig/{name}.py" for name in ("error_bounds", "fog_kernels", "fog_meter", "limits", "row_light", "scene_limits")),
+    *(f"rig/{name}.py" for name in ("error_bounds", "limits", "row_light", "scene_limits")),
+    "rig/fog_*.py",
     *(f"rig/{name}.py" for name in ("adaptive", "adaptive_thinning", "intervals", "multi_line*", "tradeoff_rows")),
     "rig/estimators/*.py",
     *(

@@ -163,8 +163,8 @@ def test_a_wrong_clock_and_a_wrong_folder_are_the_users(learned: Path, rig: Rig,
     ran = rig("replay", learned, "--clock", "fast")
     assert ran.code == 2
     assert "realtime, max, step" in ran.problems[0]
-    assert rig("replay", learned, "--threads", 0).problems[0].startswith("error: --threads is 0, it must be at least 1")
-    assert rig("replay", learned, "--estimator", "x").problems[0].startswith("error: --estimator is 'x'; choose 'argmax'")
+    assert rig("replay", learned, "--threads", 0).problems[0].startswith("error: --threads is 0, it must be")
+    assert rig("replay", learned, "--estimator", "x").problems[0].startswith("error: --estimator is 'x'; choose")
     for folder in (tmp_path, tmp_path / "none", tmp_path / "work"):
         assert rig("replay", folder).code == 2
     assert not list(Path().iterdir())

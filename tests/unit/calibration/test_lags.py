@@ -13,7 +13,8 @@ from calibration.judging.sync import judge_sync
 from calibration.model.covariance import Covariance
 from calibration.model.lag_speeds import SWEPT, alike_speeds, lag_groups, untold
 from calibration.model.rig_model import Lag
-from calibration.rig_fit.fit import RigFit, fit_rig
+from calibration.rig_fit.fit import fit_rig
+from calibration.rig_fit.result import RigFit
 from calibration.sync.lag_fit import SyncFit, fit_sync
 from calibration.sync.transfer import known_row_delay, with_lags
 from calibration.verdict import Asked

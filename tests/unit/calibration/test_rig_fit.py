@@ -16,7 +16,8 @@ from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.rig_fit import misfit
 from calibration.rig_fit.degenerate import check_depth
-from calibration.rig_fit.fit import RigFit, fit_rig
+from calibration.rig_fit.fit import fit_rig
+from calibration.rig_fit.result import RigFit
 from calibration.views import BoardPose, Passages, View
 from tests.reference.calibration_data import (
     BOARD,

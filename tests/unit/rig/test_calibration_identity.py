@@ -12,7 +12,8 @@ import pytest
 from calibration.files.rig_file import load_rig_model, save_rig_model
 from calibration.model.rig_model import Identity, RigModel
 from rig import api
-from rig.calibration_identity import carry_notes, identity_of, note_check, recorded_identity, refusals, same_rig
+from rig.calibration_identity import identity_of, recorded_identity, refusals, same_rig
+from rig.calibration_notes import carry_notes, note_check
 from rig.config import CubePlan
 from rig.doctor import examine
 from rig.errors import UsageError

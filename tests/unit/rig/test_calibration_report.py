@@ -12,7 +12,8 @@ import pytest
 from calibration.board.board import Board
 from calibration.judging.rig import Judged, judge_fit
 from calibration.model.rig_model import Identity
-from calibration.rig_fit.fit import RigFit, fit_rig
+from calibration.rig_fit.fit import fit_rig
+from calibration.rig_fit.result import RigFit
 from calibration.verdict import Reason, Verdict
 from calibration.views import View
 from rig.calibrating.report import planes_report

@@ -9,7 +9,8 @@ import pytest
 
 from rig.estimators.learning import lines_of, next_lattice
 from rig.estimators.row_model import BINS, RowModel
-from rig.fog_meter import CLEAR, FogEstimate, fit_fog, read_fog
+from rig.fog_fit import fit_fog
+from rig.fog_meter import CLEAR, FogEstimate, read_fog
 from rig.stripes import StripeTable
 from tests.reference.fog_coverage import veil
 from tests.reference.geometry import Geometry

@@ -11,7 +11,8 @@ from calibration.guide.poses import Advice
 from calibration.views import Corners, Passages, View
 from rig.calibrating import taking
 from rig.calibrating.session import Session
-from rig.calibrating.taking import FixedPoses, Live, Taken, take_live
+from rig.calibrating.taken import Taken
+from rig.calibrating.taking import FixedPoses, Live, take_live
 
 
 def shown(
