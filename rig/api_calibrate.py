@@ -6,26 +6,19 @@ board. All raise CalibrationError (Degenerate, with `.reason`) where the views m
 cannot be, DeviceError or DevicesError where devices fail; views that were taken by then are in `out`.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.units import parse_quantity
 from rig.api_config import SIMULATED, Config, PathLike
-from rig.api_scan import seed_problems
-from rig.config import RigConfig
+from rig.calibrating.arguments import SourcesLike, length_m, listed, problems_of, quantity, read_base, read_board
 from rig.errors import UsageError
 from rig.run import OutFolder, Progress
 
 if TYPE_CHECKING:
-    from calibration.board.board import Board
-    from calibration.model.rig_model import RigModel
     from rig.calibrating.pixel_result import PixelResult
     from rig.calibrating.result import CalibrationResult
     from rig.calibrating.showing import Ask, Tell
-
-SourcesLike = Config | Sequence[Config]
 
 
 def calibrate_planes(
@@ -63,10 +56,10 @@ def calibrate_planes(
     from rig.calibrating.camera_use import camera_use
     from rig.calibrating.planes_run import POSES, PlanesAsked, run_planes
 
-    problems = _problems(poses, seed, exposures)
-    accuracy_m = _length(problems, "accuracy", accuracy)
-    at_m = _length(problems, "at", at)
-    baseline_m = _length(problems, "stated_baseline", stated_baseline)
+    problems = problems_of(poses, seed, exposures)
+    accuracy_m = length_m(problems, "accuracy", accuracy)
+    at_m = length_m(problems, "at", at)
+    baseline_m = length_m(problems, "stated_baseline", stated_baseline)
     if problems:
         raise UsageError.of(problems)
     asked = PlanesAsked(
@@ -81,9 +74,11 @@ def calibrate_planes(
     )
     from rig.calibrating.sources import sort_sources
 
-    found = sort_sources(_listed(sources), scene=scene)
+    found = sort_sources(listed(sources), scene=scene)
     known = None if camera is None else camera_use(Path(camera), accept=accept_calibration)
-    return run_planes(found, _board(board), asked, base=_base(calibration), camera=known, out=out, ask=ask, tell=tell)
+    return run_planes(
+        found, read_board(board), asked, base=read_base(calibration), camera=known, out=out, ask=ask, tell=tell
+    )
 
 
 def calibrate_camera(
@@ -108,14 +103,14 @@ def calibrate_camera(
     from rig.calibrating.planes_run import POSES
     from rig.calibrating.sources import sort_sources
 
-    problems = _problems(poses, seed)
+    problems = problems_of(poses, seed)
     if terms not in (0, *TERM_COUNTS):
         problems.append(f"terms is {terms}; OpenCV's lens models have 0, {', '.join(map(str, TERM_COUNTS))}")
     if problems:
         raise UsageError.of(problems)
     asked = CameraAsked(poses or POSES, terms, seed, arm)
-    found = sort_sources(_listed(sources), pictures=True, scene=scene)
-    return run_camera(found, _board(board), asked, out=out, ask=ask, tell=tell)
+    found = sort_sources(listed(sources), pictures=True, scene=scene)
+    return run_camera(found, read_board(board), asked, out=out, ask=ask, tell=tell)
 
 
 def calibrate_pixels(
@@ -167,14 +162,14 @@ def calibrate_sync(
     from rig.calibrating.sources import sort_sources
     from rig.calibrating.sync_run import SyncAsked, run_sync
 
-    problems = _problems(None, seed, exposures)
-    accuracy_m = _length(problems, "accuracy", accuracy)
-    at_m = _length(problems, "at", at)
+    problems = problems_of(None, seed, exposures)
+    accuracy_m = length_m(problems, "accuracy", accuracy)
+    at_m = length_m(problems, "at", at)
     if problems:
         raise UsageError.of(problems)
     asked = SyncAsked(tuple(exposures), accuracy_m, at_m or AT_M, seed, arm)
-    found = sort_sources(_listed(sources), scene=scene)
-    return run_sync(found, asked, base=_base(calibration), out=out, tell=tell)
+    found = sort_sources(listed(sources), scene=scene)
+    return run_sync(found, asked, base=read_base(calibration), out=out, tell=tell)
 
 
 def calibrate_check(
@@ -202,54 +197,13 @@ def calibrate_check(
     from rig.calibrating.check_run import CheckAsked, run_check
     from rig.calibrating.sources import sort_sources
 
-    problems = _problems(poses, seed)
-    accuracy_m = _length(problems, "accuracy", accuracy)
-    at_m = _length(problems, "at", at)
-    angle_rad = _quantity(problems, "angle", angle, "angle")
+    problems = problems_of(poses, seed)
+    accuracy_m = length_m(problems, "accuracy", accuracy)
+    at_m = length_m(problems, "at", at)
+    angle_rad = quantity(problems, "angle", angle, "angle")
     if problems:
         raise UsageError.of(problems)
     asked = CheckAsked(poses or 1, accuracy_m, at_m or AT_M, angle_rad, seed, arm)
     file = None if calibration is None else Path(calibration)
-    found = sort_sources(_listed(sources), scene=scene)
-    return run_check(found, _board(board), file, asked, out=out, ask=ask, tell=tell)
-
-
-def _listed(sources: SourcesLike) -> Sequence[Config]:
-    return [sources] if isinstance(sources, RigConfig | str | os.PathLike) else list(sources)
-
-
-def _board(file: PathLike | None) -> "Board":
-    from calibration.board.board import BUNDLED_BOARD, load_board
-
-    return load_board(BUNDLED_BOARD if file is None else file)
-
-
-def _base(file: PathLike | None) -> "RigModel | None":
-    from calibration.files.rig_file import load_rig_model
-
-    return None if file is None else load_rig_model(file)
-
-
-def _problems(poses: int | None, seed: int, exposures: Sequence[int] = ()) -> list[str]:
-    problems = [f"exposures has {k}; it must be at least 1" for k in exposures if k < 1]
-    if poses is not None and poses < 1:
-        problems.append(f"poses is {poses}; it must be at least 1")
-    return problems + seed_problems(seed)
-
-
-def _length(problems: list[str], name: str, text: str | None) -> float | None:
-    return _quantity(problems, name, text, "length")
-
-
-def _quantity(problems: list[str], name: str, text: str | None, dimension: str) -> float | None:
-    """The number that a text means, above 0; what is wrong with it goes to the problems."""
-    if text is None:
-        return None
-    try:
-        value = parse_quantity(text, dimension)
-    except ValueError as error:
-        problems.append(f"{name}: {error}")
-        return None
-    if not value > 0:
-        problems.append(f"{name} is {text}; it must be above 0")
-    return value
+    found = sort_sources(listed(sources), scene=scene)
+    return run_check(found, read_board(board), file, asked, out=out, ask=ask, tell=tell)

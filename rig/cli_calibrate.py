@@ -1,11 +1,23 @@
 """The rig model estimated and judged: `rig calibrate pixels`, `camera`, `planes`, `sync`, `check`."""
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from rig.cli_calibrate_options import (
+    AccuracyOption,
+    AtOption,
+    BoardOption,
+    CalibrationScene,
+    CheckPosesOption,
+    ExposuresOption,
+    PosesOption,
+    SeedOption,
+    SourcesArgument,
+    ask_at_terminal,
+    print_report,
+)
 from rig.cli_command import (
     ArmOption,
     JsonOption,
@@ -17,44 +29,6 @@ from rig.cli_command import (
     say,
     whole_numbers,
 )
-
-if TYPE_CHECKING:
-    from rig.calibrating.result import CalibrationResult
-    from rig.calibrating.showing import Ask
-
-SourcesArgument = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="[SOURCE]...",
-        help="a rig (config), runs taken with --record, folders of earlier calibrations",
-        show_default="simulated",
-    ),
-]
-BoardOption = Annotated[
-    Path | None, typer.Option("--board", help="what is printed on the board: its YAML file", show_default="the bundled")
-]
-PosesOption = Annotated[
-    int | None,
-    typer.Option("--poses", help="of the board, shown to a live rig", show_default="12"),
-]
-CheckPosesOption = Annotated[
-    int | None,
-    typer.Option("--poses", help="of the board, shown to a live rig", show_default="1, or 2 for an angle"),
-]
-AccuracyOption = Annotated[
-    str | None,
-    typer.Option("--accuracy", help="depth error that is good enough: '10 mm'", show_default="that of 0.1 pixels"),
-]
-AtOption = Annotated[str | None, typer.Option("--at", help="distance at which it counts", show_default="5 m")]
-CalibrationScene = Annotated[
-    str | None,
-    typer.Option("--scene", help="of a simulated rig, with a board", show_default="its own, else board"),
-]
-ExposuresOption = Annotated[
-    list[str] | None,
-    typer.Option("--exposures", help="frames per column, by turns: 3,10,20", show_default="0.3 to 2 x the config's"),
-]
-SeedOption = Annotated[int, typer.Option("--seed", help="of everything simulated")]
 
 
 def register(app: typer.Typer) -> None:
@@ -92,7 +66,7 @@ def pixels_command(
     from rig import api
     from rig.calibrating.printed import print_result
 
-    ask = _ask_at_terminal()
+    ask = ask_at_terminal()
     with progress("frames") as bar:
         result = api.calibrate_pixels(
             source,
@@ -144,10 +118,10 @@ def camera_command(
         seed=seed,
         arm=arm,
         out=default_out() if out is None else out,
-        ask=_ask_at_terminal(),
+        ask=ask_at_terminal(),
         tell=say,
     )
-    return _report(result, as_json)
+    return print_report(result, as_json)
 
 
 @command
@@ -200,10 +174,10 @@ def planes_command(
         arm=arm,
         accept_calibration=accept_calibration,
         out=default_out() if out is None else out,
-        ask=_ask_at_terminal(),
+        ask=ask_at_terminal(),
         tell=say,
     )
-    return _report(result, as_json)
+    return print_report(result, as_json)
 
 
 @command
@@ -236,7 +210,7 @@ def sync_command(
         out=default_out() if out is None else out,
         tell=say,
     )
-    return _report(result, as_json)
+    return print_report(result, as_json)
 
 
 @command
@@ -274,32 +248,7 @@ def check_command(
         seed=seed,
         arm=arm,
         out=default_out() if out is None else out,
-        ask=_ask_at_terminal(),
+        ask=ask_at_terminal(),
         tell=say,
     )
-    return _report(result, as_json)
-
-
-def _ask_at_terminal() -> "Ask | None":
-    """Asks the person at the terminal; None where nobody is there."""
-    if not sys.stdin.isatty():
-        return None
-
-    def ask(what: str) -> None:
-        say(what)
-        sys.stderr.write("then press Enter (Ctrl-C ends the session; its views are kept) ")
-        sys.stderr.flush()
-        sys.stdin.readline()
-
-    return ask
-
-
-def _report(result: "CalibrationResult", as_json: bool) -> int:
-    """Print a result, for programs or people; its exit code."""
-    if as_json:
-        print_json(result.as_json())
-    else:
-        from rig.calibrating.printed import print_result
-
-        print_result(result, result.line)
-    return result.exit_code
+    return print_report(result, as_json)

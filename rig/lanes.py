@@ -155,7 +155,9 @@ for _operator, _operation in (
     overload(_operator)(_overload(_operation))
 
 
-def _conversion(to: Lanes, emit: Callable[[Any, Any], Any]) -> Any:
+def conversion(to: Lanes, emit: Callable[[Any, Any], Any]) -> Any:
+    """An operation of lanes that gives lanes of another kind."""
+
     @intrinsic_of
     def convert(typing: Any, a: Any) -> VectorCode:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -166,41 +168,16 @@ def _conversion(to: Lanes, emit: Callable[[Any, Any], Any]) -> Any:
     return convert
 
 
-UNPACKED: Final = (0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15)
-"""Which lane stands where after `from_bfloat16_unpacked`: the order that costs an x86 processor one instruction."""
 _WIDE = ir.VectorType(_INT32, LANES)
 
 
-def _unpacked(builder: Any, bits: Any) -> Any:
-    # A zero in front of each number (at the lower address) is the lower half of a float32.
-    zeros = ir.Constant(bits.type, [0] * LANES)
-    pairs = [index for lane in UNPACKED for index in (LANES, lane)]
-    wide = builder.shuffle_vector(bits, zeros, place_list(pairs))
-    return builder.bitcast(wide, FLOAT32.llvm)
-
-
-def _as_float(builder: Any, bits: Any) -> Any:
-    wide = builder.shl(builder.zext(bits, _WIDE), ir.Constant(_WIDE, [16] * LANES))
-    return builder.bitcast(wide, FLOAT32.llvm)
-
-
-def _upper_half(builder: Any, a: Any) -> Any:
-    return builder.trunc(builder.lshr(builder.bitcast(a, _WIDE), ir.Constant(_WIDE, [16] * LANES)), INT16.llvm)
-
-
-as_bytes = _conversion(BYTES, lambda builder, a: builder.bitcast(a, BYTES.llvm))
+as_bytes = conversion(BYTES, lambda builder, a: builder.bitcast(a, BYTES.llvm))
 """as_bytes(a): the two bytes of each 16-bit lane."""
-from_bfloat16 = _conversion(FLOAT32, _as_float)
-"""from_bfloat16(a): 16-bit patterns, the upper halves of float32 numbers, as those numbers."""
-from_bfloat16_unpacked = _conversion(FLOAT32, _unpacked)
-"""from_bfloat16_unpacked(a): the same in the order UNPACKED."""
-to_bfloat16 = _conversion(INT16, _upper_half)
-"""to_bfloat16(a): upper halves of float32 lanes as 16-bit patterns."""
-to_int16 = _conversion(INT16, lambda b, a: b.trunc(b.fptosi(a, _WIDE), INT16.llvm))
+to_int16 = conversion(INT16, lambda b, a: b.trunc(b.fptosi(a, _WIDE), INT16.llvm))
 """to_int16(a): float32 lanes, which must fit, without their fraction."""
-to_float32 = _conversion(FLOAT32, lambda b, a: b.sitofp(b.sext(a, _WIDE), FLOAT32.llvm))
+to_float32 = conversion(FLOAT32, lambda b, a: b.sitofp(b.sext(a, _WIDE), FLOAT32.llvm))
 """to_float32(a): 16-bit lanes as numbers."""
-square_root = _conversion(FLOAT32, lambda b, a: called(b, f"llvm.sqrt.{vector_name(a.type)}", a.type, a))
+square_root = conversion(FLOAT32, lambda b, a: called(b, f"llvm.sqrt.{vector_name(a.type)}", a.type, a))
 """square_root(a): of float32 lanes."""
 
 

@@ -15,10 +15,10 @@ from rig.aligned import aligned_zeros
 from rig.estimators.row_kernels import FLUX_MAX, FLUX_MIN, LABEL_PX, LABELS, cell_of
 from rig.estimators.screen_tables import LN2, WEIGHT_LIMIT
 from rig.estimators.search_buffers import count_place
+from rig.lane_bfloat16 import UNPACKED, to_bfloat16
 from rig.lane_memory import load_bytes, load_float32, read_int16
 from rig.lanes import (
     LANES,
-    UNPACKED,
     add_saturated,
     as_bytes,
     dot_pairs,
@@ -26,7 +26,6 @@ from rig.lanes import (
     larger_float,
     smaller,
     square_root,
-    to_bfloat16,
     to_int16,
     zero_int16,
 )

@@ -9,7 +9,8 @@ from typing import Final
 import numba
 import numpy as np
 
-from rig.lanes import add_saturated, from_bfloat16, from_bfloat16_unpacked, larger, sub_saturated, zero_int16
+from rig.lane_bfloat16 import from_bfloat16, from_bfloat16_unpacked
+from rig.lanes import add_saturated, larger, sub_saturated, zero_int16
 
 BIAS: Final = np.int16(127 << 7)
 """Exponent of 1.0 as a bfloat16."""

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from rig.estimators.powers import BIAS, MEAN_EXCESS, lift_to_powers, powers, powers_in_order
+from rig.lane_bfloat16 import UNPACKED
 from rig.lane_memory import address_of, load_int16, read_int16, store_float32, store_int16
-from rig.lanes import LANES, UNPACKED
+from rig.lanes import LANES
 
 
 @numba.njit

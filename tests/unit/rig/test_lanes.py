@@ -4,7 +4,8 @@ import numba
 import numpy as np
 import pytest
 
-from rig import lane_shuffles, lanes
+from rig import lane_bfloat16, lane_shuffles, lanes
+from rig.lane_bfloat16 import UNPACKED
 from rig.lane_memory import (
     add_bytes,
     address_of,
@@ -27,7 +28,7 @@ from rig.lane_memory import (
     write_int16,
     write_int32,
 )
-from rig.lanes import LANES, UNPACKED
+from rig.lanes import LANES
 
 EDGES = np.array([-32768, -32767, -20000, -256, -1, 0, 1, 2, 127, 128, 255, 256, 12345, 32000, 32766, 32767], np.int16)
 
@@ -267,7 +268,7 @@ FLOATS = {
     "quotient": (numba.njit(lambda a, b: a / (b * b + np.float32(1.0))), lambda a, b: a / (b * b + 1.0)),
     "root": (numba.njit(lambda a, b: lanes.square_root(a * a)), lambda a, b: np.abs(a)),
     "halves and back": (
-        numba.njit(lambda a, b: lanes.from_bfloat16(lanes.to_bfloat16(a))),
+        numba.njit(lambda a, b: lane_bfloat16.from_bfloat16(lane_bfloat16.to_bfloat16(a))),
         lambda a, b: (a.astype(np.float32).view(np.uint32) & 0xFFFF0000).view(np.float32),
     ),
     "whole numbers and back": (numba.njit(lambda a, b: lanes.to_float32(lanes.to_int16(a))), lambda a, b: np.trunc(a)),
@@ -295,8 +296,8 @@ def test_bfloat16_patterns_become_numbers_in_the_order_that_is_said():
     @numba.njit
     def numbers_of(a, out, unpacked):
         patterns = load_int16(address_of(a), 0)
-        store_float32(address_of(out), 0, lanes.from_bfloat16(patterns))
-        store_float32(address_of(unpacked), 0, lanes.from_bfloat16_unpacked(patterns))
+        store_float32(address_of(out), 0, lane_bfloat16.from_bfloat16(patterns))
+        store_float32(address_of(unpacked), 0, lane_bfloat16.from_bfloat16_unpacked(patterns))
 
     numbers = np.array([0, 1, 2, 0.5, -3, 1e30, 1e-30, 7, 1.5, 2.5, 100, -0.25, 3e5, 1e-5, 96, 12], np.float32)
     patterns = (numbers.view(np.uint32) >> 16).astype(np.uint16).view(np.int16)
