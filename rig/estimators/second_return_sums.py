@@ -45,6 +45,7 @@ from rig.lane_memory import (
     prefetch,
     read_float32,
     read_int16,
+    read_int32,
     write_float32,
     write_int64,
 )
@@ -69,6 +70,27 @@ class Blocks(NamedTuple):
     expected: Float32
 
 
+class _Map(NamedTuple):
+    """What the lines of all blocks are looked up in, by address: every use of an array in the loop would count
+    references to all of its tuple.
+
+    x_px, place, x0, n_frames, counts: of their first elements; still: of pixel 0 of the first row.
+    """
+
+    x_px: int
+    place: int
+    x0: int
+    n_frames: int
+    counts: int
+    still: int
+    rows: int
+    columns: int
+    window: int
+    width: int
+    count_bytes: int
+    pixels: int
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def sum_blocks(
     counts: NDArray[np.unsignedinteger],
@@ -90,29 +112,25 @@ def sum_blocks(
     still: see `SecondLight`; place: of `line_places`.
     """
     rows, columns = x_px.shape
-    width, pixels, window = sweep.u.shape[1], out.ones.shape[2], counts.shape[2]
-    across, aside, x0 = out.ones.shape[1], np.float32(apart), sweep.x0
+    pixels, across, aside, x0 = out.ones.shape[2], out.ones.shape[1], np.float32(apart), sweep.x0
     clear, spare = np.zeros((across, 2, pixels + 1), np.float32), np.zeros((2, BLOCK**2, pixels), np.float32)
     lines, limits = np.zeros((BLOCK**2, FIELDS), np.int64), np.zeros((BLOCK**2, LIMITS), np.float32)
     ends, frames, order = np.zeros(BLOCK, np.int64), np.zeros(BLOCK, np.float32), _IN_ORDER
-    # Addresses: every use of an array in the loop would count references to all of its tuple.
-    at_x, places, clear_at = signed_address(x_px), signed_address(place), signed_address(clear)
-    counts_at, still_at = signed_address(counts), signed_address(still) + 4 * LANES
+    seen = _Map(
+        signed_address(x_px), signed_address(place), signed_address(x0), signed_address(n_frames),
+        signed_address(counts), signed_address(still) + 4 * LANES, rows, columns, counts.shape[2], sweep.u.shape[1],
+        counts.itemsize, pixels,
+    )  # fmt: skip
     table = Table(signed_address(lines), signed_address(limits), signed_address(ends), signed_address(frames),
-                   signed_address(order))  # fmt: skip
-    to_ones, to_expected, group = signed_address(out.ones), signed_address(out.expected), -1
-    zero, all_pixels = np.float32(0.0), np.float32(pixels)
-    in_bytes, row_bytes, size, pad = counts.itemsize == 1, window * counts.itemsize, counts.size, still.size - LANES
+                  signed_address(order))  # fmt: skip
+    clear_at, to_ones, to_expected = signed_address(clear), signed_address(out.ones), signed_address(out.expected)
+    group = -1
     for by in range(first_block, last_block):
         known, group = group == by // HAZE_BLOCKS, by // HAZE_BLOCKS
         together = min(group * HAZE_BLOCKS * BLOCK + HAZE_BLOCKS * BLOCK // 2, rows - 1)
-        top, bottom = by * BLOCK, min(by * BLOCK + BLOCK, rows)
         for bx in range(across):
-            my, mc = min(top + BLOCK // 2, rows - 1), min(bx * BLOCK + BLOCK // 2, columns - 1)
-            # Asked for one block early: counts of one column after the other are not what a processor foresees.
-            for c in range((bx + 1) * BLOCK, min((bx + 2) * BLOCK, columns)):
-                for ahead in range(0, BLOCK * row_bytes, CACHE_LINE):
-                    prefetch(counts_at + (c * rows + top) * row_bytes + ahead)
+            my, mc = min(by * BLOCK + BLOCK // 2, rows - 1), min(bx * BLOCK + BLOCK // 2, columns - 1)
+            _ask_for_counts(seen, by, bx + 1)
             alone = place[together, mc, PLACE_X] == NOWHERE
             if alone and place[my, mc, PLACE_X] == NOWHERE:
                 out.ones[by, bx] = 0.0
@@ -121,47 +139,88 @@ def sum_blocks(
             if alone or not known:
                 y = my if alone else together
                 _clear_beside(sweep, state, y, mc, int(place[y, mc, PLACE_X]), side, clear[bx])
-            number, safe, inner = 0, in_bytes, (zero, all_pixels, zero, all_pixels)
-            for k in range(BLOCK):
-                c = min(bx * BLOCK + k, columns - 1)
-                column = c * rows * window - int(x0[c])
-                for y in range(top, bottom if bx * BLOCK + k < columns else top):
-                    here = y * columns + c
-                    x, begin = read_float32(at_x, here), read_int16(places, PLACES * here + PLACE_BEGIN)
-                    end = read_int16(places, PLACES * here + PLACE_END)
-                    if np.isnan(x) or begin == end:
-                        continue
-                    start = int(read_int16(places, PLACES * here + PLACE_X))
-                    stored, level = column + y * window + start, y * width + start
-                    safe &= stored >= 0 and stored + pixels <= size and level >= -LANES and level + pixels <= pad
-                    write_int64(table.lines, FIELDS * number + SEEN, counts_at + stored)
-                    write_int64(table.lines, FIELDS * number + STILL, still_at + 4 * level)
-                    write_int64(table.lines, FIELDS * number + HERE, here)
-                    low, high, off = np.float32(begin), np.float32(end), x - np.float32(start)
-                    left_end, right = off - aside, off + aside
-                    write_float32(table.limits, LIMITS * number + BEGIN, low)
-                    write_float32(table.limits, LIMITS * number + LEFT_END, left_end)
-                    write_float32(table.limits, LIMITS * number + RIGHT, right)
-                    write_float32(table.limits, LIMITS * number + END, high)
-                    inner = max(inner[0], low), min(inner[1], left_end), max(inner[2], right), min(inner[3], high)
-                    number += 1
-                write_int64(table.ends, k, number)
-                write_float32(table.frames, k, np.float32(n_frames[c]))
-            if not safe:
-                for i in range(number):
-                    y, c = lines[i, HERE] // columns, lines[i, HERE] % columns
-                    start = place[y, c, PLACE_X]
-                    for p in range(place[y, c, PLACE_BEGIN], place[y, c, PLACE_END]):
-                        spare[0, i, p], spare[1, i, p] = (
-                            counts[c, y, start + p - x0[c]],
-                            still[LANES + y * width + start + p],
-                        )
-                    lines[i, SEEN], lines[i, STILL] = signed_address(spare[0, i]), signed_address(spare[1, i])
+            number, readable, inner = _list_lines(seen, table, by, bx, aside, counts.size, still.size - LANES)
+            if not readable:
+                _copy_lines(counts, still, place, x0, sweep.u.shape[1], number, lines, spare)
             at = 4 * pixels * (by * across + bx)
-            sum_lines(table, inner, safe, clear_at + 4 * clear[0].size * bx, pixels, to_ones + at, to_expected + at)
+            sum_lines(table, inner, readable, clear_at + 4 * clear[0].size * bx, pixels, to_ones + at, to_expected + at)
     # They live until here: what is known by its address alone would be freed.
     lines[0, 0] = ends[0] = 0
     limits[0, 0] = spare[0, 0, 0] = frames[0] = 0.0
+
+
+@numba.njit(forceinline=True)
+def _ask_for_counts(seen: _Map, by: int, bx: int) -> None:
+    """Prefetch the counts of a block: those of one column after the other are not what a processor foresees."""
+    row_bytes = seen.window * seen.count_bytes
+    for c in range(bx * BLOCK, min((bx + 1) * BLOCK, seen.columns)):
+        for ahead in range(0, BLOCK * row_bytes, CACHE_LINE):
+            prefetch(seen.counts + (c * seen.rows + by * BLOCK) * row_bytes + ahead)
+
+
+@numba.njit(forceinline=True)
+def _list_lines(
+    seen: _Map, table: Table, by: int, bx: int, aside: np.float32, counts_size: int, still_size: int
+) -> tuple[int, bool, tuple[np.float32, np.float32, np.float32, np.float32]]:
+    """Write the lines of a block into the table, those without pixels left out.
+
+    Their number, whether all vectors of theirs may be read where they are, and `inner` of `sum_lines`. Sizes: of
+    counts, and of `still` from pixel 0 on.
+    """
+    number, readable, all_pixels = 0, seen.count_bytes == 1, np.float32(seen.pixels)
+    inner = np.float32(0.0), all_pixels, np.float32(0.0), all_pixels
+    top, bottom = by * BLOCK, min(by * BLOCK + BLOCK, seen.rows)
+    for k in range(BLOCK):
+        c = min(bx * BLOCK + k, seen.columns - 1)
+        column = c * seen.rows * seen.window - read_int32(seen.x0, c)
+        for y in range(top, bottom if bx * BLOCK + k < seen.columns else top):
+            here = y * seen.columns + c
+            x, begin = read_float32(seen.x_px, here), read_int16(seen.place, PLACES * here + PLACE_BEGIN)
+            end = read_int16(seen.place, PLACES * here + PLACE_END)
+            if np.isnan(x) or begin == end:
+                continue
+            start = int(read_int16(seen.place, PLACES * here + PLACE_X))
+            stored, level = column + y * seen.window + start, y * seen.width + start
+            readable &= stored >= 0 and stored + seen.pixels <= counts_size
+            readable &= level >= -LANES and level + seen.pixels <= still_size
+            write_int64(table.lines, FIELDS * number + SEEN, seen.counts + stored)
+            write_int64(table.lines, FIELDS * number + STILL, seen.still + 4 * level)
+            write_int64(table.lines, FIELDS * number + HERE, here)
+            low, high, off = np.float32(begin), np.float32(end), x - np.float32(start)
+            left_end, right = off - aside, off + aside
+            write_float32(table.limits, LIMITS * number + BEGIN, low)
+            write_float32(table.limits, LIMITS * number + LEFT_END, left_end)
+            write_float32(table.limits, LIMITS * number + RIGHT, right)
+            write_float32(table.limits, LIMITS * number + END, high)
+            inner = max(inner[0], low), min(inner[1], left_end), max(inner[2], right), min(inner[3], high)
+            number += 1
+        write_int64(table.ends, k, number)
+        write_float32(table.frames, k, np.float32(read_int32(seen.n_frames, c)))
+    return number, readable, inner
+
+
+@numba.njit(cache=True, nogil=True)
+def _copy_lines(
+    counts: NDArray[np.unsignedinteger],
+    still: Float32,
+    place: NDArray[np.int16],
+    x0: NDArray[np.int32],
+    width: int,
+    number: int,
+    lines: NDArray[np.int64],
+    spare: Float32,
+) -> None:
+    """Copy what lines show to `spare`, counts as float32, and have them point there: at the ends of an array, and of
+    counts that are no bytes, vectors cannot be read where they are.
+    """
+    columns = place.shape[1]
+    for i in range(number):
+        y, c = lines[i, HERE] // columns, lines[i, HERE] % columns
+        start = place[y, c, PLACE_X]
+        for p in range(place[y, c, PLACE_BEGIN], place[y, c, PLACE_END]):
+            spare[0, i, p] = counts[c, y, start + p - x0[c]]
+            spare[1, i, p] = still[LANES + y * width + start + p]
+        lines[i, SEEN], lines[i, STILL] = signed_address(spare[0, i]), signed_address(spare[1, i])
 
 
 @numba.njit(cache=True, nogil=True)
