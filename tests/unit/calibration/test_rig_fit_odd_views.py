@@ -1,0 +1,147 @@
+"""Views that do not fit the others, and passages that are not of the board: named, and left out of a fit."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibration.judging.rig import judge_fit
+from calibration.rig_fit import misfit
+from calibration.rig_fit.fit import fit_rig
+from calibration.views import Passages
+from tests.reference.calibration_data import (
+    BOARD,
+    points_at,
+    random_pose,
+    rotation,
+    seen_view,
+)
+from tests.reference.fitted_depth import depth_errors
+from tests.unit.calibration.fitted_rigs import EXACT, RIG, SEEN, SIZE, fitted, true_camera
+
+
+def test_a_view_of_a_moved_rig_is_named_and_left_out() -> None:
+    rng = np.random.default_rng(12)
+    moved = RIG.moved(np.array([0.003, 0, 0]), np.radians([0, 0.3, 0]))
+    views = [
+        seen_view(rng, moved if i == 4 else RIG, *random_pose(rng, RIG), SEEN, name=f"view {i}") for i in range(10)
+    ]
+    fit = fit_rig(views, BOARD, SIZE)
+    assert fit.outliers == ("view 4",)
+    assert all(np.isfinite(sweep.residual).all() for view in fit.sweeps for sweep in view)
+    error, sd = depth_errors(fit.model, RIG, 5.0, 35.2)
+    assert np.sqrt(np.mean((error / sd) ** 2)) < 2.5
+
+
+@pytest.mark.parametrize(
+    ("gains", "odd"),
+    [
+        ((9.0, None, 24.0, 86.0, 98.0, None), None),  # as on a board rig: light on four boards, no model fits them well
+        ((9.0, None, 24.0, 30.0, 400.0, None), 4),
+        ((9.0, 24.0, 30.0, 160.0), None),
+        ((1.0, 2.0, 1.0, 50.0), None),
+        ((None, 2.0, None, 1.0, 500.0), None),
+    ],
+)
+def test_views_without_passages_make_no_other_odd(
+    monkeypatch: pytest.MonkeyPatch, gains: tuple[float | None, ...], odd: int | None
+) -> None:
+    monkeypatch.setattr(misfit, "_own_place", lambda problem, solution, view: gains[view] or 0.0)
+    sightings = [SimpleNamespace(command=np.zeros(0 if gain is None else 50)) for gain in gains]
+    problem: Any = SimpleNamespace(counted=np.ones(len(gains), bool), sightings=sightings)
+    found: Any = None
+    assert misfit.odd_view(problem, found, misfit.Misfit((100.0, 100.0), (50.0, 50.0))) == odd
+
+
+@pytest.mark.parametrize(
+    ("gains", "corners", "odd"),
+    [
+        ((630.0, 270.0, 230.0, 240.0, 50.0, 220.0), 720.0, 0),  # nothing is left of 620 in all
+        ((500.0, 270.0, 230.0, 240.0, 50.0, 220.0), 720.0, None),  # a fifth is: something else is wrong
+        ((630.0, 270.0, 230.0, 600.0, 50.0, 220.0), 720.0, None),  # either of two may be it
+        ((59.0, 10.0, 10.0, 10.0, 10.0, 10.0), 140.0, None),  # which may be chance
+    ],
+)
+def test_of_few_views_the_odd_one_is_that_without_which_the_others_agree(
+    monkeypatch: pytest.MonkeyPatch, gains: tuple[float, ...], corners: float, odd: int | None
+) -> None:
+    monkeypatch.setattr(misfit, "_own_place", lambda problem, solution, view: gains[view])
+    seen = SimpleNamespace(command=np.zeros(50))
+    problem: Any = SimpleNamespace(counted=np.ones(len(gains), bool), sightings=[seen] * len(gains))
+    found: Any = None
+    assert misfit.odd_view(problem, found, misfit.Misfit((corners, 500.0), (450.0, 50.0))) == odd
+
+
+def test_of_six_views_the_one_that_does_not_fit_is_named_and_one_more_is_asked_for() -> None:
+    """Five others bend to it so far that all of them want the scanner elsewhere."""
+    rng = np.random.default_rng(34)
+    knocked = RIG.moved(np.array([0.004, 0, 0.003]), np.zeros(3))
+    views = [seen_view(rng, knocked if i == 2 else RIG, *random_pose(rng, RIG), SEEN, name=str(i)) for i in range(6)]
+    fit = fit_rig(views, BOARD, SIZE)
+    assert fit.outliers == ("2",)
+    assert fit.misfit < 2
+    reason = judge_fit(fit, views).verdict.reasons[0]
+    assert str(reason) == (
+        "too-few-poses: 6 poses were shown, 5 of them could be used (view 2 left out: unlike the others), 6 are the "
+        "fewest that can be checked against each other; show the board again for each of these, at rest until its "
+        "sweeps are over"
+    )
+
+
+def test_no_more_than_a_third_of_the_views_with_passages_is_left_out() -> None:
+    """Of ten, four were each taken with the scanner elsewhere; three more show no line."""
+    rng = np.random.default_rng(12)
+    places = [RIG.moved(np.array([0.003 * far, 0, 0]), np.radians([0, 0.3 * far, 0])) for far in (10, 3, 1, 0.3)]
+    rigs = [*places, *[RIG] * 9]
+    views = [seen_view(rng, at, *random_pose(rng, RIG), SEEN, name=f"view {i}") for i, at in enumerate(rigs)]
+    views[10:] = [replace(view, passages=()) for view in views[10:]]
+    fit = fit_rig(views, BOARD, SIZE, camera=true_camera(RIG), hold_camera=True)
+    assert fit.outliers == ("view 0", "view 1", "view 2")
+
+
+def test_a_rig_moved_half_way_shows_as_misfit() -> None:
+    rng = np.random.default_rng(13)
+    moved = RIG.moved(np.array([0.003, 0, 0]), np.radians([0, 0.3, 0]))
+    views = [seen_view(rng, moved if i >= 5 else RIG, *random_pose(rng, RIG), SEEN, name=str(i)) for i in range(10)]
+    fit = fit_rig(views, BOARD, SIZE)
+    assert fit.misfit > 10
+    assert abs(fit.noise.corner_sd_px / SEEN.corner_px - 1) < 0.5  # corners are not blamed for it
+
+
+def test_exposures_that_drift_are_no_fault_of_the_poses() -> None:
+    fit = fitted(RIG, 1, replace(SEEN, wave=(0.05, 2.0), passages=200))
+    assert fit.misfit > 100
+    _, sd = depth_errors(fit.model, RIG, 5.0, 35.2)
+    assert np.median(sd) > 1.0  # said by the verdict, with the cause
+
+
+def test_passages_on_the_wall_behind_the_board_are_left_out() -> None:
+    rng = np.random.default_rng(14)
+    wall = points_at(rng, RIG, 4.0, 400)
+    wall_px = np.stack(RIG.project(wall), axis=-1)
+    views = []
+    for i in range(6):
+        turn, position = random_pose(rng, RIG)
+        view = seen_view(rng, RIG, turn, position, EXACT, name=str(i))
+        outline = np.array([(x, y, 0.0) for x in (-0.05, 0.59) for y in (-0.05, 0.47)]) @ rotation(turn).T + position
+        board_px = np.stack(RIG.project(outline), axis=-1)
+        behind = np.any((wall_px < board_px.min(axis=0)) | (wall_px > board_px.max(axis=0)), axis=1)
+        sweeps = [with_more(sweep, wall[behind], wall_px[behind]) for sweep in view.passages]
+        views.append(replace(view, passages=tuple(sweeps)))
+    fit = fit_rig(views, BOARD, SIZE)
+    assert np.abs(depth_errors(fit.model, RIG, 5.0, 35.2)[0]).max() < 1e-4
+    assert sum(sweep.x_px.size for view in fit.sweeps for sweep in view) <= 12 * EXACT.passages
+
+
+def with_more(sweep: Passages, points: np.ndarray, px: np.ndarray) -> Passages:
+    """The sweep with the exact passages of more points."""
+    command = RIG.command_at(points, sweep.direction * sweep.speed_per_s)
+    return replace(
+        sweep,
+        x_px=np.append(sweep.x_px, px[:, 0]),
+        y_px=np.append(sweep.y_px, px[:, 1]),
+        command=np.append(sweep.command, command),
+        sd=np.append(sweep.sd, np.full(len(points), EXACT.passage)),
+    )
