@@ -47,7 +47,7 @@ def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> 
     try:
         frames = np.load(file, mmap_mode="r", allow_pickle=False)
     except OSError as error:
-        raise UsageError(f"cannot read {file}: {error.strerror or error}") from error
+        raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
     except (ValueError, EOFError) as error:
         raise UsageError(f"{file} is no whole .npy file of numbers; write it with numpy.save") from error
     if not isinstance(frames, np.ndarray):

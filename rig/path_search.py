@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
+from calibration.digits import digits
 from drivers.interfaces import ScannerLimits
 from rig.mirror_path import Motion, SweepPath, sweep_path
 
@@ -77,7 +78,9 @@ def find_path(demand: PathDemand, limits: ScannerLimits, point_clock: Callable[[
         rate = point_clock(asked)
         speed_limit = min(limits.velocity_per_s, limits.step * float(rate)) * HEADROOM
         if demand.speed_per_s > speed_limit:
-            text = f"the mirror would sweep at {demand.speed_per_s:.4g} /s, it can do {speed_limit:.4g} /s"
+            text = (
+                f"the mirror would sweep at {digits(demand.speed_per_s, 4)} /s, it can do {digits(speed_limit, 4)} /s"
+            )
             return PathFound(None, rate, (text,))
         path, problems = _within_limits(demand, limits, rate, speed_limit)
         points = sweeps * path.points
@@ -107,11 +110,13 @@ def _within_limits(
         acceleration *= GENTLER
     problems = []
     if heat > heat_limit:
-        problems.append(f"the mirror's RMS acceleration would be {heat:.4g} /s2, its limit is {heat_limit:.4g} /s2")
+        problems.append(
+            f"the mirror's RMS acceleration would be {digits(heat, 4)} /s2, its limit is {digits(heat_limit, 4)} /s2"
+        )
     if path.low < low or path.high > high:
         problems.append(
-            f"with run-in and run-out the command runs from {path.low:.4g} to {path.high:.4g}, the scanner's range is "
-            f"{low:g} to {high:g}"
+            f"with run-in and run-out the command runs from {digits(path.low, 4)} to {digits(path.high, 4)}, "
+            f"the scanner's range is {low:g} to {high:g}"
         )
     return path, problems
 
@@ -159,7 +164,7 @@ def remedy(demand: PathDemand, exposures: int, limits: ScannerLimits, point_cloc
         lowest, highest = (share, highest) if works(with_range(share)) else (lowest, share)
     if lowest > 0.05:
         first, last = narrowed(demand.edges, math.floor(lowest * 100) / 100, limits.command_range)
-        advice.append(f"narrow scan.command_range to [{first:.3g}, {last:.3g}]")
+        advice.append(f"narrow scan.command_range to [{digits(first)}, {digits(last)}]")
     if not advice:
         return "lower scan.frame_rate or the number of columns, or use a faster scanner"
     return " or ".join(advice)

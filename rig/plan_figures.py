@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from calibration.digits import digits
 from rig.blanking import CODE
 from rig.scan_plan import ScanPlan
 
@@ -18,7 +19,7 @@ def plan_text(plan: ScanPlan) -> str:
     lines = (
         f"columns     {plan.places} x {plan.exposures} frames at {rate / 1e3:g} kHz, "
         f"{float(plan.column_s) * 1e6:g} us each" + _lines(plan),
-        f"mirror      command {low:g} to {high:g}, {sides}, {plan.speed_per_s:.3g} /s, lag {lag}",
+        f"mirror      command {low:g} to {high:g}, {sides}, {digits(plan.speed_per_s)} /s, lag {lag}",
         f"sweep       {float(plan.sweep_s) * 1e3:.2f} ms, {plan.sweep_points} points at "
         f"{float(plan.point_rate_hz):g} Hz, a line marker every {step}",
         f"maps        {plan.map_rate_hz:.2f} a second from {float(plan.frames_per_sweep):.1f} frames "

@@ -5,6 +5,7 @@ import sys
 from rich.console import Console
 from rich.table import Table
 
+from calibration.digits import digits
 from drivers.replay_pace import PaceReport
 from rig.effects import Effect, Flux, SceneEffects
 from rig.run import RunResult
@@ -56,14 +57,14 @@ def effects_table(scene: SceneEffects) -> None:
             "on" if effect.on else "off",
             f"{effect.share:.1%}" if effect.on else "-",
             _error_change(effect),
-            "-" if bound is None or not (effect.on or bound) else f"<= {bound:.2g}",
+            "-" if bound is None or not (effect.on or bound) else f"<= {digits(bound, 2)}",
             "-" if effect.cost_us_per_frame is None or not effect.on else f"{effect.cost_us_per_frame:.1f}",
             effect.why,
         )
     console().print(table)
     most = scene.planned_for
     print(
-        f"left out together: <= {scene.changed_decisions_bound:.2g} of decisions changed, for columns of up to "
+        f"left out together: <= {digits(scene.changed_decisions_bound, 2)} of decisions changed, for columns of up to "
         f"{most['exposures']:g} frames, {most['exposure_s'] * 1e3:g} ms and {most['power_w'] * 1e3:g} mW"
     )
 
@@ -79,7 +80,7 @@ def _error_change(effect: Effect) -> str:
     if effect.stripe_error_change_px is None:
         return "-"
     if effect.basis == "bound":
-        return f"<= {effect.stripe_error_change_px:.2g} px" if effect.stripe_error_change_px else "-"
+        return f"<= {digits(effect.stripe_error_change_px, 2)} px" if effect.stripe_error_change_px else "-"
     return f"{effect.stripe_error_change_px:+.3f} +- {effect.stripe_error_change_sd_px or 0.0:.3f} px"
 
 
@@ -91,8 +92,8 @@ def console() -> Console:
 
 def _passes(adaptive: AdaptiveFigures) -> str:
     return (
-        f"{adaptive.passes} in all; between those of a map the rig rested for {adaptive.rest_s:.3g} s of the "
-        f"{adaptive.wall_s:.3g} s of wall time that maps took"
+        f"{adaptive.passes} in all; between those of a map the rig rested for {digits(adaptive.rest_s)} s of the "
+        f"{digits(adaptive.wall_s)} s of wall time that maps took"
     )
 
 
@@ -103,7 +104,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         ("frames", f"{frames.received} received, {frames.lost} lost, {frames.lit} on columns"),
         (
             "time",
-            f"{summary.sensor_time_s:.3g} s of sensor, {summary.compute_time_s:.3g} s of computing "
+            f"{digits(summary.sensor_time_s)} s of sensor, {digits(summary.compute_time_s)} s of computing "
             f"(real time x {_number(summary.realtime_factor)})",
         ),
         *(() if summary.adaptive is None else (("passes", _passes(summary.adaptive)),)),
@@ -115,11 +116,11 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
     ]
     fog = summary.fog
     if fog.extinction_per_m is not None:
-        density = f"extinction {fog.extinction_per_m:.3g} +- {_number(fog.extinction_sd_per_m, 2)} /m"
+        density = f"extinction {digits(fog.extinction_per_m)} +- {_number(fog.extinction_sd_per_m, 2)} /m"
         rows.append(("fog", f"{density}, {fog.brief()}"))
     if fog.ambient_per_exposure is not None:
-        veil = "" if fog.veil_per_exposure is None else f", veil {fog.veil_per_exposure:.3g}"
-        rows.append(("light", f"ambient {fog.ambient_per_exposure:.3g}{veil} photons per pixel and exposure"))
+        veil = "" if fog.veil_per_exposure is None else f", veil {digits(fog.veil_per_exposure)}"
+        rows.append(("light", f"ambient {digits(fog.ambient_per_exposure)}{veil} photons per pixel and exposure"))
     if summary.truth is not None:
         stripe, depth = summary.truth.stripe_error_px, summary.truth.depth_error_m
         rows += [
@@ -134,37 +135,38 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
 
 
 def _sync(sync: Synchronisation) -> str:
-    found = "" if sync.detection_probability is None else f", detected with p = {sync.detection_probability:.6g}"
-    return f"by {sync.by}{found}, residual {_number(sync.residual_columns, 2)} columns, clock {sync.clock_error:+.2g}"
+    found = "" if sync.detection_probability is None else f", detected with p = {digits(sync.detection_probability, 6)}"
+    clock_ppm = digits(1e6 * sync.clock_error, 2)
+    return f"by {sync.by}{found}, residual {_number(sync.residual_columns, 2)} columns, clock {clock_ppm} ppm"
 
 
 def _clock(report: PaceReport) -> str:
-    held = "" if report.held_s < LEAST_WAIT_S else f"; held up for {report.held_s:.3g} s by a full ring"
+    held = "" if report.held_s < LEAST_WAIT_S else f"; held up for {digits(report.held_s)} s by a full ring"
     return (
-        f"blocks late by {report.late_mean_s * 1e3:.2g} +- {report.late_sd_s * 1e3:.2g} ms, at most "
-        f"{report.late_max_s * 1e3:.2g} ms{held}"
+        f"blocks late by {digits(report.late_mean_s * 1e3, 2)} +- {digits(report.late_sd_s * 1e3, 2)} ms, at most "
+        f"{digits(report.late_max_s * 1e3, 2)} ms{held}"
     )
 
 
 def _stages(stages: PipelineStats) -> str:
-    source = f"source {stages.source_fill_s:.3g} s" + (
-        f" and {stages.source_wait_s:.3g} s of waiting" if stages.source_wait_s >= LEAST_WAIT_S else ""
+    source = f"source {digits(stages.source_fill_s)} s" + (
+        f" and {digits(stages.source_wait_s)} s of waiting" if stages.source_wait_s >= LEAST_WAIT_S else ""
     )
     parts = [
         source,
         f"ring {stages.ring_high_water} of {stages.ring_slots} slots",
-        f"counting {stages.counting_s:.3g} s",
-        f"estimation {stages.estimation_s:.3g} s",
+        f"counting {digits(stages.counting_s)} s",
+        f"estimation {digits(stages.estimation_s)} s",
     ]
     if stages.dropped_blocks:
         parts.insert(2, f"{stages.dropped_blocks} blocks of {stages.dropped_frames} frames dropped")
     if stages.recorder_s is not None:
-        parts.append(f"recorder {stages.recorder_s:.3g} s for {(stages.recorder_bytes or 0) / 1e6:.0f} MB")
+        parts.append(f"recorder {digits(stages.recorder_s)} s for {(stages.recorder_bytes or 0) / 1e6:.0f} MB")
     return ", ".join(parts)
 
 
-def _number(value: float | None, digits: int = 3) -> str:
-    return "-" if value is None else f"{value:.{digits}g}"
+def _number(value: float | None, count: int = 3) -> str:
+    return "-" if value is None else digits(value, count)
 
 
 def _percent(value: float | None) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from calibration.digits import digits
 from drivers.units import parse_quantity
 from rig.errors import UsageError
 from rig.tradeoff_rows import Clock, Setting, TradeoffRow
@@ -45,8 +46,8 @@ class Answer:
     def __str__(self) -> str:
         """In words."""
         figures = (
-            f"{self.setting}: {self.mean_abs_px:.3g} px in {self.sensor_ms:.3g} ms of sensor and "
-            f"{self.compute_ms:.3g} ms of computing a map"
+            f"{self.setting}: {digits(self.mean_abs_px)} px in {digits(self.sensor_ms)} ms of sensor and "
+            f"{digits(self.compute_ms)} ms of computing a map"
         )
         if self.fits:
             return f"for {self.wish}: {figures}"

@@ -17,7 +17,9 @@ def read_yaml(file: Path, what: str) -> dict[str, Any]:
     try:
         content: Any = yaml.load(file.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except OSError as error:
-        raise CalibrationError(f"cannot read {what.split()[-1]} {file}: {error.strerror or error}") from error
+        raise CalibrationError(
+            f"cannot read {what.split()[-1]} {file}: {error.strerror or error}; check the path"
+        ) from error
     except UnicodeDecodeError as error:
         raise CalibrationError(f"{file} is not text; {what} is a YAML file") from error
     except yaml.YAMLError as error:

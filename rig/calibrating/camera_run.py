@@ -84,8 +84,8 @@ def _fitted(taken: Taken, board: Board, terms: int) -> CameraFit:
     if len(fit.kept) < FEWEST_VIEWS:
         raise Degenerate(
             "too-few-poses",
-            f"{len(fit.kept)} of {len(taken.views)} views could be used (condition number {fit.condition:.1e}): a "
-            f"camera takes {FEWEST_VIEWS} poses or more; show the board tilted to both sides, near and far",
+            f"{len(fit.kept)} of {len(taken.views)} views could be used (condition number {digits(fit.condition, 2)}): "
+            f"a camera takes {FEWEST_VIEWS} poses or more; show the board tilted to both sides, near and far",
         )
     return fit
 
@@ -111,7 +111,7 @@ def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, An
 
 def _figures(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> list[tuple[str, str]]:
     matrix, sd, refused = fit.camera.matrix, fit.sd, tuple(taken.refused)
-    terms = ", ".join(f"{term:.4g}" for term in fit.camera.distortion) or "none"
+    terms = ", ".join(f"{digits(term, 4)}" for term in fit.camera.distortion) or "none"
     return [
         ("views", f"{len(fit.kept)} of {len(taken.views)} used, {named(fit.outliers)} outliers, {named(refused)} "
                   "refused"),
@@ -123,5 +123,5 @@ def _figures(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> list[tuple[s
         ("residuals", f"{fit.rms_px:.3f} px rms"),
         ("coverage", f"{judged.coverage:.0%} of the picture within the outline of all corners, boards up to "
                      f"{np.degrees(fit.coverage.spread_rad):.0f} degrees apart"),
-        ("condition", f"{fit.condition:.3g}"),
+        ("condition", f"{digits(fit.condition)}"),
     ]  # fmt: skip

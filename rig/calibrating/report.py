@@ -9,7 +9,7 @@ from calibration.board.board import Board
 from calibration.camera_fit.fit import CameraFit
 from calibration.check.boards import CheckedBoard
 from calibration.depth.uncertainty import DepthUncertainty
-from calibration.digits import in_mm, mm
+from calibration.digits import digits, in_mm, mm
 from calibration.judging.camera import JudgedCamera
 from calibration.judging.rig import Judged
 from calibration.model.camera import Camera
@@ -111,7 +111,7 @@ def check_report(
             ("flatness", f"rms {mm(board.flatness_rms_m)}, expected {mm(board.expected_m)}; peak "
                          f"{mm(board.flatness_peak_m)}"),
             ("chi2", f"{board.chi2:.1f} of {board.freedom}"),
-            ("scale", f"{board.scale:.5f}, sd {board.scale_sd:.2g}"),
+            ("scale", f"{board.scale:.5f}, sd {digits(board.scale_sd, 2)}"),
             ("distance", f"{board.distance_m:.3f} m"),
         ]  # fmt: skip
         shown = picture(cells_picture(board.cells_m), caption)
@@ -126,9 +126,9 @@ def sync_report(fit: SyncFit, verdict: Verdict, line: str, figures: Figures, abo
     rows = [
         (
             "up" if sweep.direction > 0 else "down",
-            f"{sweep.speed_per_s:.4g}",
+            f"{digits(sweep.speed_per_s, 4)}",
             f"{sweep.lag_s * 1e6:.2f}",
-            f"{sweep.sd_s * 1e6:.2g}",
+            f"{digits(sweep.sd_s * 1e6, 2)}",
             str(sweep.passages),
         )
         for sweep in fit.sweeps

@@ -170,7 +170,7 @@ def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Se
     low, high = fit.speed_range_per_s
     rows = [
         ("row delay", f"{digits(fit.row_delay_s * 1e9)} ns a row, sd {digits(fit.sd_s[2] * 1e9, 2)}"),
-        ("speeds", f"{low:.3g} to {high:.3g} per second"),
+        ("speeds", f"{digits(low)} to {digits(high)} per second"),
         ("sweeps", f"{len(fit.sweeps)}, chi2 {fit.chi2:.1f} of {fit.dof}"),
     ]
     if gate is not None:

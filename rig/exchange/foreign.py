@@ -63,7 +63,7 @@ def bytes_of(file: Path) -> NDArray[np.uint8]:
     try:
         return np.memmap(file, np.uint8, mode="r") if file.stat().st_size else np.zeros(0, np.uint8)
     except OSError as error:
-        raise UsageError(f"cannot read {file}: {error.strerror or error}") from error
+        raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
 
 
 def chunks_of(frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:

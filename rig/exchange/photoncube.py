@@ -72,7 +72,7 @@ def _open(file: Path) -> _Cube:
     try:
         loaded = np.load(file, mmap_mode="r", allow_pickle=False)
     except OSError as error:
-        raise UsageError(f"cannot read {file}: {error.strerror or error}") from error
+        raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
     except (ValueError, EOFError) as error:
         raise UsageError(f"{file} is no whole .npy file of numbers; write it with photoncube or numpy.save") from error
     if not isinstance(loaded, np.ndarray):

@@ -1,5 +1,6 @@
 """`rig scan` on a small simulated rig: what it prints and what it writes."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,8 @@ def test_the_same_seed_gives_the_same_depth_and_another_one_another(rig: Rig, sm
 
 def test_people_are_told_the_errors_the_verdict_and_where_the_pictures_lie(rig: Rig, small: Path) -> None:
     ran = rig("scan", small, "--out", "run")
+    assert re.search(r"clock -?[0-9.]+ ppm", ran.out)
+    assert not re.search(r"\de[+-]\d", ran.out), "a power of ten"
     assert "stripe error" in ran.out
     assert "complete" in ran.out
     assert str(Path("run/depth/000000.png").absolute()) in ran.out
