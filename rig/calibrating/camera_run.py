@@ -111,7 +111,7 @@ def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, An
 
 def _figures(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> list[tuple[str, str]]:
     matrix, sd, refused = fit.camera.matrix, fit.sd, tuple(taken.refused)
-    terms = ", ".join(f"{digits(term, 4)}" for term in fit.camera.distortion) or "none"
+    terms = ", ".join(digits(term, 4) for term in fit.camera.distortion) or "none"
     return [
         ("views", f"{len(fit.kept)} of {len(taken.views)} used, {named(fit.outliers)} outliers, {named(refused)} "
                   "refused"),
@@ -123,5 +123,5 @@ def _figures(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> list[tuple[s
         ("residuals", f"{fit.rms_px:.3f} px rms"),
         ("coverage", f"{judged.coverage:.0%} of the picture within the outline of all corners, boards up to "
                      f"{np.degrees(fit.coverage.spread_rad):.0f} degrees apart"),
-        ("condition", f"{digits(fit.condition)}"),
+        ("condition", digits(fit.condition)),
     ]  # fmt: skip

@@ -230,7 +230,7 @@ def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None, camera: Cam
         ("lag", f"{lag.forward * 1e6:.1f} us forward, {lag.backward * 1e6:.1f} us backward"),
         ("residuals", f"corners {fit.corner_rms_px:.3f} px, planes wave by {mm(evidence.wave_m)} and views "
                       f"differ by {mm(evidence.shift_m)} at {asked.at_m:g} m"),
-        ("condition", f"{digits(fit.condition)}" + ("" if fit.converged else "; the fit did not come to rest")),
+        ("condition", digits(fit.condition) + ("" if fit.converged else "; the fit did not come to rest")),
     ]  # fmt: skip
     if camera is not None:
         rows += [("camera file", f"accepted in spite of {each}") for each in camera.accepted]

@@ -126,9 +126,9 @@ def sync_report(fit: SyncFit, verdict: Verdict, line: str, figures: Figures, abo
     rows = [
         (
             "up" if sweep.direction > 0 else "down",
-            f"{digits(sweep.speed_per_s, 4)}",
+            digits(sweep.speed_per_s, 4),
             f"{sweep.lag_s * 1e6:.2f}",
-            f"{digits(sweep.sd_s * 1e6, 2)}",
+            digits(sweep.sd_s * 1e6, 2),
             str(sweep.passages),
         )
         for sweep in fit.sweeps
