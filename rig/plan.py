@@ -4,43 +4,35 @@
 timing that the SPAD answers the plan is compiled once more.
 """
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import CalibrationError
 from calibration.model.rig_model import Lag, RigModel
 from drivers.errors import LimitExceeded
-from drivers.frames import frame_bytes
 from drivers.interfaces import (
-    LEVEL_BACKWARD,
-    MARKER_LINE,
-    MARKER_SCAN,
     BurstMode,
     ScannerLimits,
-    ScanWaveform,
     SpadInfo,
     SpadRequest,
     SpadTiming,
-    slices,
 )
 from drivers.interfaces.scanner import check_waveform
 from rig.blanking import MARGIN_FRAMES, MAX_CLOCK_ERROR, Blanking, blanking_for
 from rig.blanking_view import unseen_pattern
+from rig.calibration_reach import model_problems
 from rig.config import ScanConfig
 from rig.errors import PlanError, UsageError
-from rig.mirror_path import SweepPath, mirrored
+from rig.frame_rates import beyond_link, beyond_sensor
+from rig.mirror_path import SweepPath
 from rig.multi_line import LineGrid, line_grid, window_overlap
 from rig.path_search import PathDemand, find_path, remedy
-from rig.plan_figures import rounded
-from rig.scan_plan import Leg, ScanPlan, column_command
-from rig.windows import LEAST_MARKER_FRAMES, LEAST_MARKER_POINTS, moving_windows, window_widths
-
-__all__ = ["Leg", "ScanPlan", "compile_plan", "spad_request"]
+from rig.scan_plan import ScanPlan, column_command
+from rig.waveform import legs_of, line_markers, waveform_of
+from rig.windows import moving_windows
 
 CLOCK_TOLERANCE = 2e-4
 """Relative difference allowed for between SPAD, scanner and sync clocks: three crystals of +-50 ppm, and margin."""
@@ -51,9 +43,6 @@ BLOCK_S = 5e-3
 waits for its block to fill."""
 BLOCK_BYTES = 16 << 20
 """Most bytes of a block's frames: 512 whole frames of 512 x 512 pixels."""
-MOST_TIMES = 1000.0
-"""As many exposures as a scan that a calibration at its speed is advised to look at: more say nothing of a mirror."""
-
 ColumnWindows = tuple[NDArray[np.int32], int]
 """First pixel of each column's window (columns,), and their width."""
 PointClock = Callable[[float], Fraction]
@@ -92,9 +81,9 @@ def compile_plan(
         return _draft(scan, limits, point_clock, model, info, timing, line_offsets, windows)
 
     plan, problems = draft(scan)
-    too_fast = [*_beyond_sensor(scan, info)]
+    too_fast = [*beyond_sensor(scan, info)]
     if plan is not None and plan.mode == "stream" and plan.bytes_per_s > (plan.link_bytes_per_s or 0.0):
-        too_fast.append(_beyond_link(plan, info, lambda rate: draft(scan.model_copy(update={"frame_rate": rate}))[0]))
+        too_fast.append(beyond_link(plan, info, lambda rate: draft(scan.model_copy(update={"frame_rate": rate}))[0]))
     spad_problems = [min(too_fast)[1]] if too_fast else []  # the stricter limit: the other remedy would not be enough
     problems = [*spad_problems, *problems]
     if problems or plan is None:
@@ -106,48 +95,6 @@ def compile_plan(
             "lower scan.exposures or scan.columns"
         )
     return plan
-
-
-def _beyond_sensor(scan: ScanConfig, info: SpadInfo) -> Iterator[tuple[float, str]]:
-    """The highest frame rate of the sensor and the problem with the asked one, where there is one."""
-    if scan.frame_rate > info.max_frame_rate_hz:
-        most = float(info.max_frame_rate_hz)
-        yield (
-            most,
-            f"scan.frame_rate is {float(scan.frame_rate) / 1e3:g} kHz, the most the {info.model} SPAD does is "
-            f"{most / 1e3:g} kHz; lower frame_rate",
-        )
-
-
-def _beyond_link(plan: ScanPlan, info: SpadInfo, draft_at: Callable[[Fraction], ScanPlan | None]) -> tuple[float, str]:
-    """The highest frame rate that the link carries, whole hertz, and the problem with the asked one."""
-    rate, have = float(plan.frame_rate_hz), plan.link_bytes_per_s or 0.0
-    made = f"{rounded(rate * frame_bytes(plan.width, plan.rows) / 1e6)} MB/s of full frames"
-    if plan.windows is not None:
-        width = plan.windows.width_px
-        made += f", {rounded(rate * frame_bytes(width, plan.rows) / 1e6)} MB/s of moving windows of {width} pixels"
-    carried = _carried_hz(plan, info.roi_step_px, draft_at)
-    remedy = (
-        f"lower frame_rate to {carried / 1e3:g} kHz or narrow depth_range" if carried else "use a SPAD that streams"
-    )
-    return carried, (
-        f"scan.frame_rate {rate / 1e3:g} kHz makes {made}; the link of the {info.model} SPAD carries "
-        f"{rounded(have / 1e6)} MB/s; {remedy}"
-    )
-
-
-def _carried_hz(plan: ScanPlan, step_px: int, draft_at: Callable[[Fraction], ScanPlan | None]) -> int:
-    """The highest frame rate of this scan that the link carries, in whole hertz.
-
-    The slower the scan, the closer its markers and the narrower its windows may be: tried from the narrowest ones,
-    which are carried fastest, to full frames.
-    """
-    for width in range(*window_widths(plan, step_px)):
-        rate = math.floor((plan.link_bytes_per_s or 0.0) / frame_bytes(width, plan.rows))
-        slower = draft_at(Fraction(rate)) if 0 < rate < plan.frame_rate_hz else None
-        if slower is not None and slower.windows is not None and slower.windows.width_px <= width:
-            return rate
-    return math.floor(plan.full_frames_hz or 0.0)
 
 
 def _draft(
@@ -168,7 +115,7 @@ def _draft(
     frame_rate = scan.frame_rate if timing is None else timing.tick_hz / timing.frame_period_ticks
     blanking = None if info.markers else blanking_for(places, scan.exposures, frame_rate)
     demand = path_demand(scan, places, frame_rate, model, markers=info.markers)
-    wrong_model = _model_problems(scan, model, info, demand.speed_per_s, line_offsets)
+    wrong_model = model_problems(scan, model, info, demand.speed_per_s, line_offsets)
     found = find_path(demand, limits, point_clock)
     advice = remedy(demand, scan.exposures, limits, point_clock) if found.problems else ""
     first, last = scan.command_range
@@ -220,8 +167,8 @@ def _plan(
     windows: ColumnWindows | None,
 ) -> ScanPlan:
     """The plan along a mirror path; whether the SPAD's link carries it is for the caller to judge."""
-    legs = _legs(path, scan, model.lag_s if model is not None else Lag(), demand.gate_margin_s, rate)
-    step, markers = _markers(path, demand.columns, scan.exposures)
+    legs = legs_of(path, scan, model.lag_s if model is not None else Lag(), demand.gate_margin_s, rate)
+    step, markers = line_markers(path, demand.columns, scan.exposures)
     x0, window, lines = (*windows, lines) if windows is not None else _windows(model, commands, scan, info, lines)
     plan = ScanPlan(
         columns=scan.columns,
@@ -231,7 +178,7 @@ def _plan(
         point_rate_hz=rate,
         sweep_points=path.points,
         legs=legs,
-        waveform=_waveform(legs, markers, rate),
+        waveform=waveform_of(legs, markers, rate),
         columns_per_marker=step,
         marker_points=markers,
         commands=commands,
@@ -262,7 +209,7 @@ def _with_windows(plan: ScanPlan, step_px: int) -> ScanPlan:
         return plan
     windows, dark_points = moving
     markers = np.append(plan.marker_points, dark_points)
-    waveform = _waveform(plan.legs, markers, plan.point_rate_hz)
+    waveform = waveform_of(plan.legs, markers, plan.point_rate_hz)
     return replace(plan, windows=windows, marker_points=markers, waveform=waveform)
 
 
@@ -278,86 +225,6 @@ def _transported(plan: ScanPlan, burst: BurstMode | None) -> ScanPlan:
     return replace(
         plan, mode="burst", burst_frames=burst.capacity_frames, readout_bytes_per_s=burst.readout_bytes_per_s
     )
-
-
-def _model_problems(
-    scan: ScanConfig, model: RigModel | None, info: SpadInfo, speed_per_s: float, line_offsets: Sequence[float]
-) -> list[str]:
-    if model is None:
-        return []
-    problems = []
-    checks: tuple[Callable[[], object], ...] = (
-        lambda: model.check_sensor(info.width, info.height),
-        lambda: require_speed(model, speed_per_s, scan.exposures),
-        lambda: model.planes(np.add.outer(np.array(scan.command_range), np.array(line_offsets))),
-    )
-    for check in checks:
-        try:
-            check()
-        except CalibrationError as error:
-            problems.append(f"calibration: {error}")
-    return problems
-
-
-def require_speed(model: RigModel, speed_per_s: float, exposures: int) -> None:
-    """CalibrationError where the lag was not measured around this speed, with the command that measures it here too.
-
-    A sweep is as many times faster as it has fewer exposures: named are this scan's, and those of the end of the old
-    range that is farther off, so that what was scanned before still can be.
-    """
-    try:
-        model.check_speed(speed_per_s)
-    except CalibrationError as error:
-        low, high = model.speed_range_per_s or (speed_per_s, speed_per_s)
-        end = low if speed_per_s > high else high
-        times = exposures * (min(speed_per_s / end, MOST_TIMES) if end > 0 else MOST_TIMES)
-        other = max(1, math.floor(times) if speed_per_s > high else math.ceil(times))
-        shown = ",".join(map(str, sorted({exposures, other if other != exposures else 2 * exposures})))
-        raise CalibrationError(f"{error}: rig calibrate sync CONFIG --calibration FILE --exposures {shown}") from error
-
-
-def _legs(path: SweepPath, scan: ScanConfig, lag: Lag, margin_s: float, rate: Fraction) -> tuple[Leg, ...]:
-    rising = scan.command_range[1] > scan.command_range[0]
-
-    def leg(path: SweepPath, rises: bool, columns_rise: bool) -> Leg:
-        lag_s = lag.forward if rises else lag.backward
-        enter_s = float(path.lit_start / rate) + lag_s
-        leave_s = enter_s + float(path.lit_points / rate)
-        return Leg(path, 1 if rises else -1, columns_rise, lag_s, enter_s - margin_s, leave_s + margin_s)
-
-    out = leg(path, rising, True)
-    return (out, leg(mirrored(path), not rising, False)) if scan.bidirectional else (out,)
-
-
-def _markers(path: SweepPath, columns: int, exposures: int) -> tuple[int, NDArray[np.int64]]:
-    """Columns per line marker, and the point of each marker within a sweep."""
-    points_per_column = path.lit_points / columns
-    step = max(
-        math.ceil(LEAST_MARKER_POINTS / points_per_column),
-        math.ceil(LEAST_MARKER_FRAMES / Fraction(exposures)),
-    )
-    points = [math.floor(path.lit_start + j * step * points_per_column) for j in range(columns // step + 1)]
-    return step, np.array(points, np.int64)
-
-
-def _scan_marker_points(leg: Leg, rate: Fraction) -> int:
-    """How long the scan marker, which holds the gate, stays high: until the middle of the gate's last slice.
-
-    So neither the scanner's clock nor the sync source's decides when the gate closes, while they differ by less.
-    """
-    lit_s = leg.gate_close_s - leg.gate_open_s
-    return max(1, math.floor((leg.gate_close_s - lit_s / slices(lit_s) / 2) * rate))
-
-
-def _waveform(legs: tuple[Leg, ...], marker_points: NDArray[np.int64], rate: Fraction) -> ScanWaveform:
-    commands, words = [], []
-    for leg in legs:
-        commands.append(leg.path.command(np.arange(leg.path.points, dtype=np.float64)))
-        markers = np.full(leg.path.points, LEVEL_BACKWARD if leg.direction < 0 else 0, np.uint8)
-        markers[: _scan_marker_points(leg, rate)] |= MARKER_SCAN
-        markers[marker_points] |= MARKER_LINE
-        words.append(markers)
-    return ScanWaveform(np.concatenate(commands), np.concatenate(words), rate)
 
 
 def _windows(

@@ -6,10 +6,10 @@ import numpy as np
 
 from calibration.errors import CalibrationError
 from calibration.model.rig_model import RigModel
+from rig.calibration_reach import require_speed
 from rig.errors import UsageError
 from rig.geometry import WORD_PX, sweep_geometry
 from rig.multi_line import window_overlap
-from rig.plan import require_speed
 from rig.scan_plan import ScanPlan
 
 

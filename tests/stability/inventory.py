@@ -23,6 +23,7 @@ SCOPE = (
         for name in ("binding*", "blanking*", "counting*", "cube", "depth*", "geometry*", "marker_line")
     ),
     *(f"rig/{name}.py" for name in ("mirror_path", "path_search", "plan", "scan_plan", "scoring", "stripes", "sweeps")),
+    *(f"rig/{name}.py" for name in ("calibration_reach", "frame_rates", "gate_pulses", "plan_figures", "waveform")),
     "rig/bent_light*.py",
     "rig/windows.py",
     *(f"rig/{name}.py" for name in ("error_bounds", "limits", "row_light", "scene_limits")),

@@ -51,6 +51,12 @@ ELSEWHERE = {
     "columns of several lines, counted as of each alone": (
         "tests/unit/rig/test_multi_line.py", "rig.multi_line:*", "rig.multi_line_counter:*", "rig.multi_line_kernels:*",
     ),
+    "what a link carries, and what is said of a scan that asks for more": (
+        "tests/unit/rig/test_windows.py", "rig.frame_rates:*",
+    ),
+    "which calibrations a plan refuses; those of any speed in test_plans.py": (
+        "tests/unit/rig/test_plan.py", "rig.calibration_reach:model_problems",
+    ),
     "lines by the number, as the config says": ("tests/unit/rig/test_multi_line_config.py", "rig.multi_line_config:*"),
     "sheets, in one kernel; those of any numbers in test_calibration_model.py": (
         "tests/unit/rig/test_bent_light.py", "rig.bent_light:*", "rig.bent_light_kernels:*",

@@ -15,11 +15,11 @@ from calibration import CalibrationError, RigModel
 from drivers.interfaces import LEVEL_BACKWARD, ScanWaveform
 from drivers.mirror_ramps import brake, ramp
 from rig.blanking_search import PatternSearch, PatternShape, detection_probability
+from rig.calibration_reach import require_speed
 from rig.errors import PlanError
 from rig.gate_pulses import sync_program
 from rig.mirror_path import Motion, mirrored, sweep_path
 from rig.path_search import narrowed
-from rig.plan import require_speed
 from rig.plan_figures import rounded
 from rig.scan_plan import ScanPlan
 from sim_backend.mirror_motion import Playing, Resting
@@ -121,7 +121,7 @@ def plans(draw):
         raise
 
 
-@covers("rig.plan:require_speed")
+@covers("rig.calibration_reach:require_speed")
 @EXAMPLES
 @given(
     speed=st.floats(0, 1e6), ends=st.lists(st.floats(0, 1e6), min_size=2, max_size=2), exposures=st.integers(1, 10**6)
@@ -146,8 +146,10 @@ def test_a_speed_that_was_not_calibrated_comes_with_exposures_that_can_be_scanne
     "rig.scan_plan:column_command",
     "rig.path_search:PathDemand.*",
     "rig.path_search:find_path",
+    "rig.gate_pulses:sync_program",
     "rig.plan:compile_plan",
     "rig.plan:path_demand",
+    "rig.waveform:*",
     "rig.windows:window_widths",
 )
 @EXAMPLES
@@ -182,7 +184,7 @@ def test_plans_are_exact_in_time_and_finite_in_all_their_figures(plan) -> None:
     assert not plan.window_x0(np.zeros(2, np.uint32), np.zeros(2, np.int64), np.array([-1, 0])).any() or plan.windows
 
 
-@covers("rig.scan_plan:rounded")
+@covers("rig.plan_figures:rounded")
 @EXAMPLES
 @given(value=st.floats(1e-12, 1e12))
 def test_figures_for_people_keep_four_digits(value) -> None:

@@ -19,9 +19,10 @@ from drivers.interfaces import (
     slices,
 )
 from drivers.interfaces.scanner import check_waveform
+from rig.calibration_reach import require_speed
 from rig.errors import PlanError
 from rig.gate_pulses import sync_program
-from rig.plan import compile_plan, require_speed, spad_request
+from rig.plan import compile_plan, spad_request
 from rig.plan_figures import plan_text
 from tests.unit.rig.streams import SPAD, plan_of, rig_model, scan, scanner_limits, timer_clock
 
