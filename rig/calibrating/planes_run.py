@@ -31,7 +31,6 @@ from rig.calibrating.taken import Taken
 from rig.calibrating.taking import Live, good_poses, take_live
 from rig.calibrating.truth import true_errors, truth_content
 from rig.config import RigConfig
-from rig.errors import UsageError
 from rig.run import OutFolder, versions
 
 POSES = 12
@@ -78,7 +77,7 @@ def run_planes(
     live, known = sources.live, None if camera is None else camera.known
     require_live(live, ask, asked.arm)
     with Session(out, board) as session:
-        taken = Taken(session, tell)
+        taken = Taken(session, tell, () if known is None else known.views)
         defects = None if base is None else base.defects
         take_kept(taken, sources, board, defects)
         if live is not None:
@@ -133,13 +132,6 @@ def _judged(taken: Taken, asked: PlanesAsked, fit: RigFit) -> Judged:
 
 
 def _fitted(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
-    if camera is not None:
-        twice = [view.name for view in taken.views if corners_digest(view) in camera.views]
-        if twice:
-            raise UsageError(
-                f"view {twice[0]} is one of those the camera was made of, and must not count twice; give other views, "
-                "or leave the camera out"
-            )
     try:
         return _fit(taken, board, base, camera)
     except CalibrationError as error:

@@ -1,5 +1,6 @@
 """Views that were taken, of whichever source: kept as they come, none of them twice, all of one rig."""
 
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,14 +21,17 @@ class Taken:
     None: not known.
     """
 
-    def __init__(self, session: Session, tell: Tell | None = None) -> None:
-        """session: where views are kept; tell: is told of each."""
+    def __init__(self, session: Session, tell: Tell | None = None, of_camera: Collection[str] = ()) -> None:
+        """session: where views are kept; tell: is told of each; of_camera: `corners_digest` of the views that a camera
+        known from elsewhere was made of.
+        """
         self.views: list[View] = []
         self.refused: dict[str, Degenerate] = {}
         self.identity: Identity | None = None
         self._session = session
         self.tell = tell
         self._seen: dict[str, str] = {}
+        self._of_camera = of_camera
 
     def add(
         self,
@@ -58,6 +62,11 @@ class Taken:
         if view.corners is None:
             return
         digest = corners_digest(view)
+        if digest in self._of_camera:
+            raise UsageError(
+                f"view {view.name} is one of those the camera was made of, and must not count twice; give other views "
+                "(of a simulated rig: another --seed), or leave the camera out"
+            )
         if digest in self._seen:
             raise UsageError(
                 f"{where} holds the very corners of {self._seen[digest]}; a view must not count twice: name it once, "

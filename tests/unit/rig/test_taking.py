@@ -1,5 +1,6 @@
 """A live rig is shown poses until enough of them have told something."""
 
+from collections.abc import Collection
 from types import SimpleNamespace
 from typing import Any
 
@@ -7,16 +8,23 @@ import numpy as np
 import pytest
 
 from calibration.errors import Degenerate
+from calibration.files.camera_file import corners_digest
 from calibration.guide.poses import Advice
 from calibration.views import Corners, Passages, View
 from rig.calibrating import taking
 from rig.calibrating.session import Session
 from rig.calibrating.taken import Taken
 from rig.calibrating.taking import FixedPoses, Live, take_live
+from rig.errors import UsageError
 
 
 def shown(
-    monkeypatch: pytest.MonkeyPatch, passages: int = 50, refused: str | None = None, *, line: bool = True
+    monkeypatch: pytest.MonkeyPatch,
+    passages: int = 50,
+    refused: str | None = None,
+    *,
+    line: bool = True,
+    of_camera: Collection[str] = (),
 ) -> tuple[Taken, list[str]]:
     """What was taken of four poses wanted, and said of them."""
     rng = np.random.default_rng(1)
@@ -34,7 +42,7 @@ def shown(
     told: list[str] = []
     config: Any = None
     candidate: Any = None
-    taken = Taken(Session(None), told.append)
+    taken = Taken(Session(None), told.append, of_camera)
     choose = FixedPoses([Advice(candidate, 5.0)] * 9)
     board: Any = None
     take_live(taken, Live(config, 4, choose, exposures=(3, 6), line=line), board)
@@ -50,6 +58,19 @@ def test_a_pose_that_does_not_show_the_line_does_not_count_where_it_is_wanted(mo
     assert len(taken.views) == 6
     assert "9 corners, 5, 5 passages of the line, too few to count (limit 30 a sweep)" in told[-1]
     assert len(shown(monkeypatch, passages=5, line=False)[0].views) == 4
+
+
+def test_a_view_that_the_camera_was_made_of_is_refused_before_the_next_is_shown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    first, second, *_ = shown(monkeypatch)[0].views
+    told: list[str] = []
+    monkeypatch.setattr(Taken, "say", lambda self, line: told.append(line))
+    with pytest.raises(UsageError, match=r"view 001 is one of those .* another --seed"):
+        shown(monkeypatch, of_camera={corners_digest(second)})
+    assert len(told) == 1
+    with pytest.raises(UsageError, match="view 000"):
+        shown(monkeypatch, of_camera={corners_digest(first)})
 
 
 @pytest.mark.parametrize(("reason", "views"), [("wrong-board", 3), ("mirrored", 3), ("no-board", 6)])
