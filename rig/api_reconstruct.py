@@ -55,9 +55,10 @@ def reconstruct(
     from rig.cube import open_cube
     from rig.cube_depth import reconstruct_cube
 
-    if not Path(source).exists():
-        raise UsageError(f"{source} does not exist; name the folder of a run taken with --record, or an .npy of frames")
     if plan is None or calibration is None:
+        if not Path(source).exists():
+            said = "does not exist; name the folder of a run taken with --record, or an .npy of frames"
+            raise UsageError(f"{source} {said}")
         missing = [name for name, given in (("--plan", plan), ("--calibration", calibration)) if given is None]
         raise UsageError(f"{source} is no folder of a recording; a cube of frames needs {' and '.join(missing)} too")
     estimate = _estimate(

@@ -150,7 +150,7 @@ def test_a_plan_or_option_that_does_not_fit_is_one_line(
         (np.zeros((COLUMNS * EXPOSURES, ROWS, 13), np.int8), "holds int8; a cube holds uint8"),
         (b"columns: 3", "is no whole .npy file"),
         (b"", "is no whole .npy file"),
-        (None, "does not exist"),
+        (None, "No such file or directory; check the path"),
     ],
     ids=["empty", "narrow", "flat", "signed", "text", "nothing", "absent"],
 )
