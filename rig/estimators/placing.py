@@ -73,7 +73,7 @@ def place(
     """Move x_px, whose distances from the far end are in `places`, to where neighbours together put it.
 
     lesson: whether they are to teach the first map. Returns its standard deviation in px; light and haze are left in
-    `places`, with all that was found on the way.
+    `places`, with all that was found on the way. The last steps are only posted, see `weigh_light`.
     """
     sd = np.empty_like(x_px)
     around = weigh_light(volume, sweep, state, x_px, places, workers)
@@ -101,7 +101,7 @@ def place(
     if not lesson:
         workers.over(rows, join_near)
         workers.post(rows, join_far)
-    workers.over(rows, move)
+    workers.post(rows, move)
     return sd
 
 
