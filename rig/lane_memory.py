@@ -87,13 +87,9 @@ write_float32 = _writer(types.float32, _F32, _F32, 4)
 
 @numba.njit(cache=True, nogil=True)
 def copy_floats(source: int, to: int, number: int) -> None:
-    """Copy so many float32 from one address to another: numba copies slices number by number.
-
-    What lies behind them is asked for, since lines of one map after the other, each on other pages, are not foreseen.
-    """
+    """Copy so many float32 from one address to another: numba copies slices number by number."""
     whole = number - number % LANES
     for i in range(0, whole, LANES):
-        prefetch(source + 4 * (number + i))
         store_float32(to, i, load_float32(source, i))
     for i in range(whole, number):
         write_float32(to, i, read_float32(source, i))

@@ -26,10 +26,12 @@ from rig.estimators.label_volume_buffers import signed_address
 from rig.lane_memory import (
     load_float32,
     load_int16,
+    load_widened,
     prefetch,
     read_byte,
     read_float32,
     read_int16,
+    store_float32,
     store_int16,
     write_byte,
     write_float32,
@@ -49,7 +51,8 @@ FAR: Final = 16
 SAME: Final = 2
 """Labels no farther apart speak for one another: a pixel."""
 REACH: Final = 2
-_SHARE: Final = 4
+_SHARE_BITS: Final = 2
+_SHARE: Final = 1 << _SHARE_BITS
 """Units of margin to a vote: so 16 bits hold what all neighbours say."""
 _CANDIDATES: Final = 5
 _NOWHERE: Final = 30000
@@ -78,11 +81,20 @@ def collect(answer: Answer, first_column: int, last_column: int, out: Ballots) -
     """The ballots of columns first_column..last_column-1."""
     # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
     labels, margins, label, whole, votes = answer.label, answer.margin, out.label, out.whole, out.votes
-    for y in range(labels.shape[0]):
-        for c in range(first_column, last_column):
+    at_label, at_margin, to_label = signed_address(labels), signed_address(margins), signed_address(label)
+    to_whole, to_votes, half = signed_address(whole), signed_address(votes), np.float32(0.5)
+    (rows, columns), width = labels.shape, label.shape[1]
+    for y in range(rows):
+        for c in range(first_column, last_column - LANES + 1, LANES):
+            here, there = y * columns + c, (y + REACH) * width + REACH + c
+            own = load_float32(at_label, here)
+            store_float32(to_label, there, own)
+            store_int16(to_whole, there, to_int16(own + half))
+            store_int16(to_votes, there, load_widened(at_margin, here) >> np.int16(_SHARE_BITS))
+        for c in range(last_column - (last_column - first_column) % LANES, last_column):
             label[y + REACH, c + REACH] = labels[y, c]
-            whole[y + REACH, c + REACH] = np.int16(labels[y, c] + np.float32(0.5))
-            votes[y + REACH, c + REACH] = margins[y, c] // np.uint8(_SHARE)
+            whole[y + REACH, c + REACH] = np.int16(labels[y, c] + half)
+            votes[y + REACH, c + REACH] = margins[y, c] >> _SHARE_BITS
 
 
 class _Hall(NamedTuple):
