@@ -17,6 +17,7 @@ from rig.estimators.halo_rows import fit_halo, halo_at, halo_rows
 from rig.estimators.halo_tables import HaloTables
 from rig.estimators.label_places import (
     FAR_PX,
+    MEND,
     PLACES,
     START,
     VARIANT,
@@ -130,7 +131,9 @@ def fill_costs(
                     for line in range(0, labels, CACHE_LINE):
                         prefetch_to_write(to + r * columns * labels + line)
                 _fetch(places + 2 * PLACES * rows, 2 * PLACES * batch)
+                mend = 0
                 for r in range(batch):
+                    mend |= read_int16(places, PLACES * r + MEND)
                     variant = read_int16(places, PLACES * r + VARIANT)
                     i = read_int32(b.table, 1 + variant)
                     write_int32(b.here, r, i)
@@ -140,7 +143,8 @@ def fill_costs(
                     read_bytes(counts_at, at_row, places, stored, ways.side, read, int(times), b, batch)
                 else:
                     _read_any(counts, c, y, places, stored[0], ways.side, read, times, b, batch)
-                mend_rows(at, places, y, per_nat, ways.side, b, batch)
+                if mend:
+                    mend_rows(at, places, y, per_nat, ways.side, b, batch)
                 sum_edges(at, fitted, b, batch)
                 if halo.weight.size > 0:
                     halo_rows(around, column, at, fitted, b, batch)

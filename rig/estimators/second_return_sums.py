@@ -109,7 +109,12 @@ def sum_blocks(
         top, bottom = by * BLOCK, min(by * BLOCK + BLOCK, rows)
         for bx in range(across):
             my, mc = min(top + BLOCK // 2, rows - 1), min(bx * BLOCK + BLOCK // 2, columns - 1)
-            # Asked for one block early: counts of one column after the other are not what a processor foresees.
+            # Asked for early: counts of one column after the other are not what a processor foresees, nor are places
+            # and stripes of four rows at once.
+            for y in range(top, bottom):
+                there = y * columns + (bx + 4) * BLOCK
+                prefetch(places + 2 * PLACES * there)
+                prefetch(at_x + 4 * there)
             for c in range((bx + 1) * BLOCK, min((bx + 2) * BLOCK, columns)):
                 for ahead in range(0, BLOCK * row_bytes, CACHE_LINE):
                     prefetch(counts_at + (c * rows + top) * row_bytes + ahead)
