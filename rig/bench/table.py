@@ -20,7 +20,7 @@ _TITLES = {
     "likelihood-sweep": "the same with what is done once a sweep",
     "count-full": "counting alone, whole frames",
     "likelihood-full": "counting + likelihood in a window of whole frames",
-    "joint": "joint from counts, whole maps of 512 x 500",
+    "joint": "joint from counts, whole maps of 512 x 500; x sgbm: its time over that of sgbm, by turns",
     "joint-sweep": "counting + joint, one after the other",
     "sgbm": "OpenCV's StereoSGBM, MODE_HH4, as many disparities and pixels, two pictures",
     "disk": "counting + likelihood from a recording (page cache), header checksums",
@@ -137,6 +137,7 @@ def _table(rows: Iterable[Row]) -> Table:
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for name in (
         "window", "K", "threads", "kframes/s", "real time", "of memory", "x numpy", "error px", "median px", "ms/map",
+        "x sgbm",
     ):  # fmt: skip
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
@@ -151,6 +152,7 @@ def _table(rows: Iterable[Row]) -> Table:
             _number(row.error_px),
             _number(row.median_error_px),
             _number(row.ms_per_map),
+            _number(row.times_sgbm, 2),
         )
     return table
 

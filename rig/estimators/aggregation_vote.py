@@ -24,17 +24,21 @@ from numpy.typing import NDArray
 from rig.estimators.aggregation_answer import Answer
 from rig.estimators.label_volume_buffers import signed_address
 from rig.lane_memory import (
+    load_float32,
     load_int16,
+    load_widened,
     prefetch,
     read_byte,
     read_float32,
     read_int16,
+    store_float32,
     store_int16,
     write_byte,
     write_float32,
     write_int16,
 )
-from rig.lanes import LANES, larger, smaller, zero_int16
+from rig.lane_shuffles import equal_mask, lowest_bit
+from rig.lanes import LANES, larger, smaller, to_float32, to_int16, zero_int16
 
 NEIGHBOURS_PX: Final = 3.0
 """Columns farther apart have no vote: at 5 px, in dense fog, they know too little of one another (0.34 to 0.42 px)."""
@@ -47,7 +51,8 @@ FAR: Final = 16
 SAME: Final = 2
 """Labels no farther apart speak for one another: a pixel."""
 REACH: Final = 2
-_SHARE: Final = 4
+_SHARE_BITS: Final = 2
+_SHARE: Final = 1 << _SHARE_BITS
 """Units of margin to a vote: so 16 bits hold what all neighbours say."""
 _CANDIDATES: Final = 5
 _NOWHERE: Final = 30000
@@ -72,19 +77,31 @@ def new_ballots(rows: int, columns: int) -> Ballots:
 
 
 @numba.njit(cache=True, nogil=True)
-def collect(answer: Answer, first_row: int, last_row: int, out: Ballots) -> None:
-    """The ballots of rows first_row..last_row-1."""
-    inner = slice(REACH, REACH + answer.label.shape[1])
-    for y in range(first_row, last_row):
-        out.label[y + REACH, inner] = answer.label[y]
-        out.whole[y + REACH, inner] = (answer.label[y] + np.float32(0.5)).astype(np.int16)
-        out.votes[y + REACH, inner] = answer.margin[y] // _SHARE
+def collect(answer: Answer, first_column: int, last_column: int, out: Ballots) -> None:
+    """The ballots of columns first_column..last_column-1."""
+    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
+    labels, margins, label, whole, votes = answer.label, answer.margin, out.label, out.whole, out.votes
+    at_label, at_margin, to_label = signed_address(labels), signed_address(margins), signed_address(label)
+    to_whole, to_votes, half = signed_address(whole), signed_address(votes), np.float32(0.5)
+    (rows, columns), width = labels.shape, label.shape[1]
+    for y in range(rows):
+        for c in range(first_column, last_column - LANES + 1, LANES):
+            here, there = y * columns + c, (y + REACH) * width + REACH + c
+            own = load_float32(at_label, here)
+            store_float32(to_label, there, own)
+            store_int16(to_whole, there, to_int16(own + half))
+            store_int16(to_votes, there, load_widened(at_margin, here) >> np.int16(_SHARE_BITS))
+        for c in range(last_column - (last_column - first_column) % LANES, last_column):
+            label[y + REACH, c + REACH] = labels[y, c]
+            whole[y + REACH, c + REACH] = np.int16(labels[y, c] + half)
+            votes[y + REACH, c + REACH] = margins[y, c] >> _SHARE_BITS
 
 
 class _Hall(NamedTuple):
     """Addresses of what a vote reads and writes, and the elements from row to row.
 
     elected: int16 (width,), of a row's answers first the candidate, then the label. against: int16 (candidates, LANES).
+    share: float32 (width,), 1 over the columns that vote.
     """
 
     label: int
@@ -98,26 +115,30 @@ class _Hall(NamedTuple):
     columns: int
     elected: int
     against: int
+    share: int
 
 
 @numba.njit(cache=True, nogil=True)
 def vote(ballots: Ballots, cost: NDArray[np.uint8], first_row: int, last_row: int, answer: Answer) -> None:
     """Mend the answers of rows first_row..last_row-1; cost: (rows, columns, labels), C-contiguous.
 
-    The ballots of all rows must have been collected before.
+    The ballots of all columns must have been collected before.
     """
     rows, columns, labels = cost.shape
     width = ballots.label.shape[1]
     memory, elected = np.zeros((_CANDIDATES, LANES), np.int16), np.zeros(width, np.int16)
+    share = np.zeros(width, np.float32)
     hall = _Hall(
         signed_address(ballots.label), signed_address(ballots.whole), signed_address(ballots.votes), width,
         signed_address(cost), labels, signed_address(answer.label), signed_address(answer.margin), columns,
-        signed_address(elected), signed_address(memory),
+        signed_address(elected), signed_address(memory), signed_address(share),
     )  # fmt: skip
+    for c in range(columns):
+        share[c] = 1.0 / (min(c + REACH, columns - 1) - max(c - REACH, 0) + 1)
     for y in range(first_row, last_row):
         _elect_row(hall, y)
         _settle_row(hall, y, min(y + REACH, rows - 1) - max(y - REACH, 0) + 1)
-    memory[0, 0] = elected[0] = 0  # they live until here
+    memory[0, 0] = elected[0] = share[0] = 0  # they live until here
 
 
 @numba.njit(cache=True, nogil=True)
@@ -125,50 +146,59 @@ def _elect_row(hall: _Hall, y: int) -> None:
     """Which candidate the neighbours of each answer of row y are for."""
     line = (y + REACH) * hall.width + REACH
     for c in range(0, hall.columns, LANES):
-        pixel, end = y * hall.columns + c, min(LANES, hall.columns - c)
-        if not _any_weak(hall.to_margin + pixel, end):
+        weak = _weak_lanes(hall.votes, line + c, hall.columns - c)
+        if weak == 0:
             continue
         _count_votes(hall.whole, hall.votes, line + c, hall.width, hall.against)
-        for i in range(end):
-            best = _elect(hall.against, i)
-            write_int16(hall.elected, c + i, best)
-            if best > 0:
-                own = hall.cost + (pixel + i) * hall.labels
-                prefetch(own + read_int16(hall.whole, line + c + i))
-                prefetch(own + read_int16(hall.whole, line + c + i + _step(hall.width, best)))
+        best = _elect(hall.against)
+        store_int16(hall.elected, c, best)
+        moved = weak & ~np.int64(equal_mask(best, np.int16(0)))
+        while moved != 0:
+            i = np.int64(lowest_bit(np.uint32(moved)))
+            moved &= moved - 1
+            own = hall.cost + (y * hall.columns + c + i) * hall.labels
+            other = line + c + i + _step(hall.width, read_int16(hall.elected, c + i))
+            prefetch(own + read_int16(hall.whole, line + c + i))
+            prefetch(own + read_int16(hall.whole, other))
 
 
 @numba.njit(cache=True, nogil=True)
 def _settle_row(hall: _Hall, y: int, high: int) -> None:
     """Let the counts of row y object, and write its answers; high: rows that vote."""
-    line = (y + REACH) * hall.width + REACH
+    line, down = (y + REACH) * hall.width + REACH, np.float32(1.0 / high)
     for c in range(0, hall.columns, LANES):
-        pixel, end = y * hall.columns + c, min(LANES, hall.columns - c)
-        if not _any_weak(hall.to_margin + pixel, end):
+        pixel, at = y * hall.columns + c, line + c
+        weak = _weak_lanes(hall.votes, at, hall.columns - c)
+        if weak == 0:
             continue
-        for i in range(end):
-            at, own = line + c + i, hall.cost + (pixel + i) * hall.labels
-            other = at + _step(hall.width, read_int16(hall.elected, c + i))
-            least = read_byte(own, read_int16(hall.whole, at))
-            if np.int64(read_byte(own, read_int16(hall.whole, other))) <= np.int64(least) + OBJECTION:
-                at = other
-            write_int16(hall.elected, c + i, read_int16(hall.whole, at))
-            if read_byte(hall.to_margin, pixel + i) < WEAK:
-                write_float32(hall.to_label, pixel + i, read_float32(hall.label, at))
-        _count_support(hall.whole, hall.votes, line + c, hall.width, hall.elected + 2 * c, hall.against)
-        for i in range(end):
-            if read_byte(hall.to_margin, pixel + i) < WEAK:
-                wide = min(c + i + REACH, hall.columns - 1) - max(c + i - REACH, 0) + 1
-                support = max(int(read_int16(hall.against, i)), 0) * _SHARE // (high * wide)
-                write_byte(hall.to_margin, pixel + i, np.uint8(support))
+        best = load_int16(hall.elected, c)
+        moved = weak & ~np.int64(equal_mask(best, np.int16(0)))
+        store_int16(hall.against, 0, best)
+        store_int16(hall.elected, c, load_int16(hall.whole, at))
+        while moved != 0:
+            i = np.int64(lowest_bit(np.uint32(moved)))
+            moved &= moved - 1
+            own, other = hall.cost + (pixel + i) * hall.labels, at + i + _step(hall.width, read_int16(hall.against, i))
+            label, least = read_int16(hall.whole, other), read_byte(own, read_int16(hall.whole, at + i))
+            if np.int64(read_byte(own, label)) <= np.int64(least) + OBJECTION:
+                write_int16(hall.elected, c + i, label)
+                write_float32(hall.to_label, pixel + i, read_float32(hall.label, other))
+        _count_support(hall.whole, hall.votes, at, hall.width, hall.elected + 2 * c, hall.against)
+        support = to_float32(larger(load_int16(hall.against, 0), np.int16(0)) * np.int16(_SHARE))
+        # Half a unit more: a whole quotient stays one, whatever the rounding.
+        share = (support + np.float32(0.5)) * (load_float32(hall.share, c) * down)
+        store_int16(hall.against, 0, to_int16(share))
+        while weak != 0:
+            i = np.int64(lowest_bit(np.uint32(weak)))
+            weak &= weak - 1
+            write_byte(hall.to_margin, pixel + i, np.uint8(read_int16(hall.against, i)))
 
 
 @numba.njit(forceinline=True)
-def _any_weak(margins, end):  # type: ignore[no-untyped-def]
-    weak = False
-    for i in range(end):
-        weak |= read_byte(margins, i) < WEAK
-    return weak
+def _weak_lanes(votes, at, end):  # type: ignore[no-untyped-def]
+    """Which of LANES answers, as bits, are weak; there are none from `end` on."""
+    strong = equal_mask(smaller(load_int16(votes, at), np.int16(WEAK // _SHARE)), np.int16(WEAK // _SHARE))
+    return ~np.int64(strong) & ((1 << min(LANES, end)) - 1)
 
 
 @numba.njit(forceinline=True)
@@ -191,11 +221,15 @@ def _count_votes(whole: int, votes: int, at: int, width: int, room: int) -> None
 
 
 @numba.njit(forceinline=True)
-def _elect(against, i):  # type: ignore[no-untyped-def]
-    best = 0
+def _elect(against):  # type: ignore[no-untyped-def]
+    """The first candidate of each lane that least speaks against."""
+    none, least = zero_int16(), load_int16(against, 0)
+    best = none
     for k in range(1, _CANDIDATES):
-        if read_int16(against, k * LANES + i) < read_int16(against, best * LANES + i):
-            best = k
+        here = load_int16(against, k * LANES)
+        fewer = smaller(larger(least - here, none), np.int16(1))
+        best = best + fewer * (none + np.int16(k) - best)
+        least = smaller(least, here)
     return best
 
 

@@ -163,9 +163,10 @@ class Joint:
             )
 
         workers.over(rows, tie_rows)
-        workers.over(columns, tie_columns)
+        workers.post(columns, tie_columns)
         if neighbours:
-            workers.over(rows, lambda first, last: collect(memory.answer, first, last, memory.ballots))
+            workers.post(columns, lambda first, last: collect(memory.answer, first, last, memory.ballots))
+        workers.settle()
         workers.post(rows, read)  # what is placed next is of the same rows
         seen = volume, tables.sweep, tables.state
         sd = place(*seen, tables.shares, x_px, memory.places, workers, lesson=lesson)

@@ -29,9 +29,10 @@ def read_positions(
     distance: NDArray[np.float32],
 ) -> None:
     """x_px (rows, columns) of the answers' labels, and its distance from x_far; NaN where there are no data."""
+    label = answer.label
     for y in range(first_row, last_row):
         for c in range(x_far.shape[1]):
-            off = -side * answer.label[y, c] / PER_PX if n_frames[c] > 0 else np.float32(np.nan)
+            off = -side * label[y, c] / PER_PX if n_frames[c] > 0 else np.float32(np.nan)
             x_px[y, c], distance[y, c] = x_far[y, c] + off, off if np.isfinite(x_far[y, c]) else np.float32(np.nan)
 
 

@@ -16,6 +16,8 @@ from rig.aligned import CACHE_LINE
 from rig.estimators.halo_rows import fit_halo, halo_at, halo_rows
 from rig.estimators.halo_tables import HaloTables
 from rig.estimators.label_places import (
+    FAR_PX,
+    MEND,
     PLACES,
     START,
     VARIANT,
@@ -95,6 +97,10 @@ def fill_costs(
     room = Fitted(b.constant, b.edge)
     place_at, out_at, counts_at = signed_address(place), signed_address(out), signed_address(counts)
     window, in_bytes = counts.shape[2], counts.itemsize == 1
+    # Of no label are pixels beyond the last vector of any table, and the taps of that; halos weigh all.
+    read = pixels
+    if halo.weight.size == 0 and tables.used.size > 0:
+        read = min(pixels, -(-(FAR_PX + LANES * int(tables.used.max()) + ways.reach) // LANES) * LANES)
     write_int32(b.table, 0, np.int32(-1))
     write_int32(b.shown, 0, np.int32(-1))
     for band in range(first_row // band_rows, -(-last_row // band_rows)):
@@ -125,17 +131,20 @@ def fill_costs(
                     for line in range(0, labels, CACHE_LINE):
                         prefetch_to_write(to + r * columns * labels + line)
                 _fetch(places + 2 * PLACES * rows, 2 * PLACES * batch)
+                mend = 0
                 for r in range(batch):
+                    mend |= read_int16(places, PLACES * r + MEND)
                     variant = read_int16(places, PLACES * r + VARIANT)
                     i = read_int32(b.table, 1 + variant)
                     write_int32(b.here, r, i)
                     write_int32(b.fitted, r, i if usual else np.int32(variant))
                 if in_bytes and times >= 1.0:
                     at_row = (c * rows + y) * window
-                    read_bytes(counts_at, at_row, places, stored, ways.side, pixels, int(times), b, batch)
+                    read_bytes(counts_at, at_row, places, stored, ways.side, read, int(times), b, batch)
                 else:
-                    _read_any(counts, c, y, places, stored[0], ways.side, pixels, times, b, batch)
-                mend_rows(at, places, y, per_nat, ways.side, b, batch)
+                    _read_any(counts, c, y, places, stored[0], ways.side, read, times, b, batch)
+                if mend:
+                    mend_rows(at, places, y, per_nat, ways.side, b, batch)
                 sum_edges(at, fitted, b, batch)
                 if halo.weight.size > 0:
                     halo_rows(around, column, at, fitted, b, batch)

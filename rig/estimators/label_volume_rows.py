@@ -80,8 +80,9 @@ def read_bytes(
                 count = np.int64(read_byte(counts + begin + r * window, x)) if 0 <= x < window else np.int64(0)
                 write_int16(n, p, np.int16(count * times))
             continue
-        # The next column's counts will be wanted when this one's last row has been read.
-        for line in range(0, pixels + LANES, CACHE_LINE):
+        # The next column's counts will be wanted when this one's last row has been read; the rest the next row asks
+        # for.
+        for line in range(0, min(pixels + LANES, window), CACHE_LINE):
             prefetch(counts + low + column + line)
         if side > 0:
             for p in range(0, pixels, LANES):
@@ -103,9 +104,10 @@ def mend_rows(at: At, places: int, y: int, per_nat: float, side: int, b: Buffers
             continue
         n, start = b.n + 2 * r * b.n_row, read_int16(place, START)
         begin, end = read_int16(at.span, 2 * i), read_int16(at.span, 2 * i + 1)
-        for p in range(begin, end):
-            if not read_int16(place, VALID) <= p < read_int16(place, VALID_END):
-                write_int16(n, p, _neutral(at, i, p, per_nat))
+        for p in range(begin, min(read_int16(place, VALID), end)):
+            write_int16(n, p, _neutral(at, i, p, per_nat))
+        for p in range(max(read_int16(place, VALID_END), begin), end):
+            write_int16(n, p, _neutral(at, i, p, per_nat))
         for h in range(read_int32(at.hot_start, y + r), read_int32(at.hot_start, y + r + 1)):
             p = side * (start - read_int16(at.hot_x, h))
             if begin <= p < end:

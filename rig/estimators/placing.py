@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.aligned import aligned_zeros
 from rig.counting import CountVolume
 from rig.estimators.placing_kernels import REACH_PX, Places, add_moments
 from rig.estimators.placing_light import measure_light
@@ -56,7 +57,8 @@ def profile_table(sigma_px: float) -> NDArray[np.float32]:
 
 def new_places(rows: int, columns: int) -> Places:
     """Room for the places of a map."""
-    return Places(*(np.zeros((rows, columns), np.float32) for _ in Places._fields))
+    # One piece of memory: the system gives large ones large pages.
+    return Places(*aligned_zeros((len(Places._fields), rows, columns), np.float32))
 
 
 def place(
@@ -73,7 +75,7 @@ def place(
     """Move x_px, whose distances from the far end are in `places`, to where neighbours together put it.
 
     lesson: whether they are to teach the first map. Returns its standard deviation in px; light and haze are left in
-    `places`, with all that was found on the way.
+    `places`, with all that was found on the way. The last steps are only posted, see `weigh_light`.
     """
     sd = np.empty_like(x_px)
     around = weigh_light(volume, sweep, state, x_px, places, workers)
@@ -101,7 +103,7 @@ def place(
     if not lesson:
         workers.over(rows, join_near)
         workers.post(rows, join_far)
-    workers.over(rows, move)
+    workers.post(rows, move)
     return sd
 
 

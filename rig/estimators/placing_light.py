@@ -10,6 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.aligned import CACHE_LINE
 from rig.estimators.label_volume_buffers import signed_address
 from rig.estimators.placing_kernels import BLIND_FLUX, LIGHT_PX, REACH_PX, Places
 from rig.estimators.placing_taps import MOST_FLUX, Counts, ambient_place, counts_of, nearest_pixel
@@ -19,6 +20,7 @@ from rig.lane_eights import EIGHT, fetch_eights
 from rig.lane_memory import (
     copy_floats,
     load_float32,
+    prefetch,
     read_float32,
     read_int32,
     store_float32,
@@ -80,6 +82,11 @@ def measure_light(
         lines[_PX, c], lines[_PY, c], lines[_PZ, c] = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]
         lines[_GAIN, c] = state.column_gain[c]
     for y in range(first_row, last_row):
+        # The next row's, which lies on other pages: not foreseen.
+        for line in range(4 * pixels * (y + 1), 4 * pixels * (y + 2), CACHE_LINE):
+            prefetch(at_u + line)
+            prefetch(at_v + line)
+            prefetch(ambient + line)
         for c in range(columns):
             x_line, frames = read_float32(at_x, y * columns + c), n_frames[c]
             if np.isnan(x_line) or frames == 0:

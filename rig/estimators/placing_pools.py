@@ -103,16 +103,18 @@ def pool_amplitude(
 ) -> None:
     """Fill amplitude: brightness of each stripe over that of its scale, pooled over neighbours, between two limits."""
     amplitude, columns = signed_address(places.amplitude), places.amplitude.shape[1]
-    distance = with_margin(places.distance, first_row, last_row)
-    light, scale = with_margin(places.light, first_row, last_row), with_margin(places.scale, first_row, last_row)
-    sums = np.empty((2, distance.shape[1] - 2 * LANES), np.float32)
+    sums = np.empty((2, -(-columns // LANES) * LANES), np.float32)
     at, width = signed_address(sums), sums.shape[1]
-    for y in range(first_row, last_row):
-        pool_row(distance, light, scale, y - first_row, reach, sums)
-        for c in range(0, width, LANES):
-            own = load_float32(at, c) / larger_float(load_float32(at, width + c), _LEAST)
-            store_float32(at, c, smaller_float(larger_float(own, faintest), brightest))
-        copy_floats(at, amplitude + 4 * columns * y, columns)
+    for band in range(first_row, last_row, COPIED_ROWS):
+        end = min(band + COPIED_ROWS, last_row)
+        distance = with_margin(places.distance, band, end)
+        light, scale = with_margin(places.light, band, end), with_margin(places.scale, band, end)
+        for y in range(band, end):
+            pool_row(distance, light, scale, y - band, reach, sums)
+            for c in range(0, width, LANES):
+                own = load_float32(at, c) / larger_float(load_float32(at, width + c), _LEAST)
+                store_float32(at, c, smaller_float(larger_float(own, faintest), brightest))
+            copy_floats(at, amplitude + 4 * columns * y, columns)
     sums[:1] = 0.0  # it lives until here: what is known by its address alone would be freed
 
 
@@ -124,25 +126,29 @@ def pool_places(
 
     reaches: sizes of the neighbourhood, smallest first; the first one that knows `enough` (1/px^2) is taken.
     """
-    columns, distance = moved.shape[1], with_margin(places.distance, first_row, last_row)
-    score, known = with_margin(places.score, first_row, last_row), with_margin(places.known, first_row, last_row)
+    columns = moved.shape[1]
     # Two sums, by how far to move, and the standard deviation, negative where it is not known yet.
-    lines = np.empty((4, distance.shape[1] - 2 * LANES), np.float32)
-    at = signed_address(distance), signed_address(score), signed_address(known)
-    to, width, to_moved, to_sd = signed_address(lines), distance.shape[1], signed_address(moved), signed_address(sd)
-    for y in range(first_row, last_row):
-        lines[:3], lines[3] = 0.0, -1.0
-        lines[1, columns:] = np.inf  # nothing to look for beyond the last column
-        own = at[0] + 4 * ((y - first_row + MARGIN) * width + LANES)
-        for i in range(len(reaches)):
-            inner, last = reaches[i - 1] if i > 0 else -1, i == len(reaches) - 1
-            widen_row(at, width, y - first_row, inner, reaches[i], enough, to)
-            if not _settle(to, width - 2 * LANES, own, -np.inf if last else enough):
-                break
-        copy_floats(to + 8 * (width - 2 * LANES), to_moved + 4 * columns * y, columns)
-        copy_floats(to + 12 * (width - 2 * LANES), to_sd + 4 * columns * y, columns)
-    # They live until here: what is known by its address alone would be freed.
-    distance[:1] = score[:1] = known[:1] = lines[:1] = 0.0
+    lines = np.empty((4, -(-columns // LANES) * LANES), np.float32)
+    to, to_moved, to_sd = signed_address(lines), signed_address(moved), signed_address(sd)
+    for band in range(first_row, last_row, COPIED_ROWS):
+        end = min(band + COPIED_ROWS, last_row)
+        distance = with_margin(places.distance, band, end)
+        score, known = with_margin(places.score, band, end), with_margin(places.known, band, end)
+        at, width = (signed_address(distance), signed_address(score), signed_address(known)), distance.shape[1]
+        for y in range(band, end):
+            lines[:3], lines[3] = 0.0, -1.0
+            lines[1, columns:] = np.inf  # nothing to look for beyond the last column
+            own = at[0] + 4 * ((y - band + MARGIN) * width + LANES)
+            for i in range(len(reaches)):
+                inner, last = reaches[i - 1] if i > 0 else -1, i == len(reaches) - 1
+                widen_row(at, width, y - band, inner, reaches[i], enough, to)
+                if not _settle(to, width - 2 * LANES, own, -np.inf if last else enough):
+                    break
+            copy_floats(to + 8 * (width - 2 * LANES), to_moved + 4 * columns * y, columns)
+            copy_floats(to + 12 * (width - 2 * LANES), to_sd + 4 * columns * y, columns)
+        # They live until here: what is known by its address alone would be freed.
+        distance[:1] = score[:1] = known[:1] = 0.0
+    lines[:1] = 0.0
 
 
 @numba.njit(cache=True, nogil=True)

@@ -100,8 +100,9 @@ def sum_lines(
                 while i < end:
                     alone = load_float32(read_int64(table.lines, FIELDS * i + STILL), v)
                     seen = read_int64(table.lines, FIELDS * i + SEEN)
-                    alone = where_below(none, alone, here, read_float32(table.limits, LIMITS * i + BEGIN))
-                    alone = where_below(alone, none, here, read_float32(table.limits, LIMITS * i + END))
+                    if not whole:
+                        alone = where_below(none, alone, here, read_float32(table.limits, LIMITS * i + BEGIN))
+                        alone = where_below(alone, none, here, read_float32(table.limits, LIMITS * i + END))
                     before = where_below(alone, none, here, read_float32(table.limits, LIMITS * i + LEFT_END))
                     behind = where_below(none, alone, here, read_float32(table.limits, LIMITS * i + RIGHT))
                     left, right = left + before, right + behind

@@ -9,8 +9,8 @@ import time
 
 import numpy as np
 
+from rig.bench.cases import learn
 from rig.bench.frames import COLUMNS, window_frames
-from rig.bench.speed import learn
 from rig.estimators.stream import ColumnJudge
 from rig.row_threads import RowWorkers
 

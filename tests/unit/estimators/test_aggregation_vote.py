@@ -14,7 +14,7 @@ def voted(answer, cost, threads=1):
     rows, columns = answer.label.shape
     out, ballots = Answer(answer.label.copy(), answer.margin.copy()), new_ballots(rows, columns)
     with RowWorkers(threads) as workers:
-        workers.over(rows, lambda a, b: collect(out, a, b, ballots))
+        workers.over(columns, lambda a, b: collect(out, a, b, ballots))
         workers.over(rows, lambda a, b: vote(ballots, cost, a, b, out))
     return out
 

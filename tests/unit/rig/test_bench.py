@@ -16,14 +16,15 @@ from drivers.interfaces import SpadRequest, SpadTiming
 from drivers.ring import BlockRing, OnFull
 from drivers.spb1 import walk_blocks
 from rig import api, cli
-from rig.bench import looped_spad, speed, stages
+from rig.bench import looped_spad, map_stages, speed, stages
 from rig.bench.bench_kernels import count_columns, draw_frames, read_all
+from rig.bench.cases import Extent, learn
 from rig.bench.frames import BLOCK_FRAMES, COLUMNS, EDGE_PX, PLACE_FRAMES, ROWS, WIDTH, full_frames, window_frames
 from rig.bench.looped_spad import LEAD_FRAMES, Loop, LoopedSpad
 from rig.bench.map_stages import sgbm_stage
 from rig.bench.recorded import recording_of
 from rig.bench.soak import SoakOptions, soak
-from rig.bench.speed import Extent, measure_speed
+from rig.bench.speed import measure_speed
 from rig.bench.stages import Walk, search_stage
 from rig.bench.surface import WINDOW, bench_surface, count_surface
 from rig.counting import SweepCounter, SweepLayout
@@ -40,7 +41,7 @@ SMALL = Extent(
 )  # fmt: skip
 KEYS = {
     "stage", "window", "exposures", "threads", "frames_per_s", "times_real_time", "of_memory_bandwidth", "times_numpy",
-    "error_px", "median_error_px", "missing", "ms_per_map",
+    "error_px", "median_error_px", "missing", "ms_per_map", "times_sgbm",
 }  # fmt: skip
 
 
@@ -52,7 +53,7 @@ def frames():
 
 @pytest.fixture(scope="module")
 def learned(frames):
-    return speed.learn(frames, 1)
+    return learn(frames, 1)
 
 
 @pytest.fixture(scope="module")
@@ -243,6 +244,32 @@ def test_rows_of_whole_maps_tell_the_time_of_one(report):
         assert row.missing >= WINDOW / SMALL.map_columns
         assert (row.frames_per_s, row.times_real_time, row.times_numpy, row.of_memory_bandwidth) == (None,) * 4
     assert all((row.ms_per_map is None) == (not row.stage.startswith(("joint", "sgbm"))) for row in report.rows)
+
+
+def test_the_quotient_with_sgbm_is_of_maps_made_by_turns(monkeypatch):
+    made = []
+
+    def beside():
+        made.append("sgbm")
+        clock[0] += 4.0
+
+    def make():
+        made.append("joint")
+        clock[0] += 1.0 if len(made) < 4 else 3.0  # the machine is busier later, but for both
+
+    clock = [0.0]
+    monkeypatch.setattr(map_stages.time, "perf_counter", lambda: clock[0])
+    found = map_stages._timed(make, 0.0, 10, None, beside)
+    assert made == ["joint", "sgbm"] * map_stages.PAIRS
+    assert (found.maps, found.frames, found.seconds) == (5, 50, 11.0)
+    assert found.times_sgbm == 0.75
+    assert map_stages._timed(make, 0.0, 10, None).times_sgbm is None
+
+
+def test_only_joint_has_a_quotient_with_sgbm(report):
+    for row in report.rows:
+        assert (row.times_sgbm is None) == (row.stage != "joint")
+        assert row.times_sgbm is None or 0 < row.times_sgbm < 100
 
 
 def test_opencv_keeps_the_threads_it_had():
