@@ -12,6 +12,7 @@ from rig.api_recordings import compress, cut, export_run, import_frames, recordi
 from rig.api_rig import bench, bench_disk, bench_simulator, devices, doctor, effects, flux_row, laser_off, soak, warm_up
 from rig.api_scan import MAX_SEED, plan_scan, replay, scan
 from rig.api_tradeoff import tradeoff
+from rig.plan_figures import plan_text
 from rig.run import RunResult
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "import_frames",
     "laser_off",
     "plan_scan",
+    "plan_text",
     "reconstruct",
     "recording_info",
     "repair",

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.api import configure, effects, plan_scan, scan
+from rig.api import configure, effects, plan_scan, plan_text, scan
 from rig.errors import UsageError
 from tests.system.small_rig import HEIGHT, WIDTH
 
@@ -37,7 +37,9 @@ def test_a_config_object_and_its_file_give_the_same_scan(small: Path) -> None:
 
 
 def test_plan_and_effects_are_one_call_each(small: Path) -> None:
-    assert plan_scan(small, exposures=3).exposures == 3
+    plan = plan_scan(small, exposures=3)
+    assert plan.exposures == 3
+    assert " x 3 frames at 100 kHz" in plan_text(plan)
     assert {effect.effect for effect in effects(small)} >= {"stripe", "fog"}
 
 
