@@ -40,8 +40,11 @@ def _store(builder: Any, vector: Any, to: Any, number: int) -> None:
 
 
 @intrinsic_of
-def fetch_eights(typing: Any, places: Any, to: Any) -> VectorCode:
-    """fetch_eights(places, to): write eight vectors; places: address of sixteen addresses of eight float32 each."""
+def fetch_eights(typing: Any, places: Any, behind: Any, to: Any) -> VectorCode:
+    """fetch_eights(places, behind, to): write eight vectors; places: address of sixteen addresses.
+
+    Eight float32 each, `behind` bytes from there on.
+    """
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         addresses = builder.inttoptr(args[0], _I64.as_pointer())
@@ -49,14 +52,14 @@ def fetch_eights(typing: Any, places: Any, to: Any) -> VectorCode:
             rows = []
             for i in range(EIGHT):
                 at = builder.load(builder.gep(addresses, [ir.Constant(_I64, half * EIGHT + i)]))
-                row = builder.load(builder.inttoptr(at, _EIGHT_FLOATS.as_pointer()))
+                row = builder.load(builder.inttoptr(builder.add(at, args[1]), _EIGHT_FLOATS.as_pointer()))
                 row.align = 4
                 rows.append(row)
             for d, column in enumerate(_turned(builder, rows)):
-                _store(builder, column, args[1], 2 * d + half)
+                _store(builder, column, args[2], 2 * d + half)
         return context.get_dummy_value()
 
-    return types.void(types.intp, types.intp), code
+    return types.void(types.intp, types.intp, types.intp), code
 
 
 @intrinsic_of

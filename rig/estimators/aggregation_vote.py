@@ -22,16 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimators.aggregation_answer import Answer
+from rig.estimators.aggregation_ballots import REACH, SHARE, Ballots
 from rig.estimators.label_volume_buffers import signed_address
 from rig.lane_memory import (
     load_float32,
     load_int16,
-    load_widened,
     prefetch,
     read_byte,
     read_float32,
     read_int16,
-    store_float32,
     store_int16,
     write_byte,
     write_float32,
@@ -50,51 +49,7 @@ FAR: Final = 16
 """Labels from which on all are equally far off."""
 SAME: Final = 2
 """Labels no farther apart speak for one another: a pixel."""
-REACH: Final = 2
-_SHARE_BITS: Final = 2
-_SHARE: Final = 1 << _SHARE_BITS
-"""Units of margin to a vote: so 16 bits hold what all neighbours say."""
 _CANDIDATES: Final = 5
-_NOWHERE: Final = 30000
-"""Label of what lies outside the picture: farther than FAR from all others, so that it is never elected."""
-
-
-class Ballots(NamedTuple):
-    """Labels and votes of a map with REACH rows and columns without votes around, as long as a vote lasts.
-
-    label: float32 as answered; whole: int16, the nearest whole one; votes: int16, the margin over _SHARE.
-    """
-
-    label: NDArray[np.float32]
-    whole: NDArray[np.int16]
-    votes: NDArray[np.int16]
-
-
-def new_ballots(rows: int, columns: int) -> Ballots:
-    """Room for the ballots of a map."""
-    shape = rows + 2 * REACH, -(-columns // LANES) * LANES + LANES
-    return Ballots(np.zeros(shape, np.float32), np.full(shape, _NOWHERE, np.int16), np.zeros(shape, np.int16))
-
-
-@numba.njit(cache=True, nogil=True)
-def collect(answer: Answer, first_column: int, last_column: int, out: Ballots) -> None:
-    """The ballots of columns first_column..last_column-1."""
-    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
-    labels, margins, label, whole, votes = answer.label, answer.margin, out.label, out.whole, out.votes
-    at_label, at_margin, to_label = signed_address(labels), signed_address(margins), signed_address(label)
-    to_whole, to_votes, half = signed_address(whole), signed_address(votes), np.float32(0.5)
-    (rows, columns), width = labels.shape, label.shape[1]
-    for y in range(rows):
-        for c in range(first_column, last_column - LANES + 1, LANES):
-            here, there = y * columns + c, (y + REACH) * width + REACH + c
-            own = load_float32(at_label, here)
-            store_float32(to_label, there, own)
-            store_int16(to_whole, there, to_int16(own + half))
-            store_int16(to_votes, there, load_widened(at_margin, here) >> np.int16(_SHARE_BITS))
-        for c in range(last_column - (last_column - first_column) % LANES, last_column):
-            label[y + REACH, c + REACH] = labels[y, c]
-            whole[y + REACH, c + REACH] = np.int16(labels[y, c] + half)
-            votes[y + REACH, c + REACH] = margins[y, c] >> _SHARE_BITS
 
 
 class _Hall(NamedTuple):
@@ -184,7 +139,7 @@ def _settle_row(hall: _Hall, y: int, high: int) -> None:
                 write_int16(hall.elected, c + i, label)
                 write_float32(hall.to_label, pixel + i, read_float32(hall.label, other))
         _count_support(hall.whole, hall.votes, at, hall.width, hall.elected + 2 * c, hall.against)
-        support = to_float32(larger(load_int16(hall.against, 0), np.int16(0)) * np.int16(_SHARE))
+        support = to_float32(larger(load_int16(hall.against, 0), np.int16(0)) * np.int16(SHARE))
         # Half a unit more: a whole quotient stays one, whatever the rounding.
         share = (support + np.float32(0.5)) * (load_float32(hall.share, c) * down)
         store_int16(hall.against, 0, to_int16(share))
@@ -197,7 +152,7 @@ def _settle_row(hall: _Hall, y: int, high: int) -> None:
 @numba.njit(forceinline=True)
 def _weak_lanes(votes, at, end):  # type: ignore[no-untyped-def]
     """Which of LANES answers, as bits, are weak; there are none from `end` on."""
-    strong = equal_mask(smaller(load_int16(votes, at), np.int16(WEAK // _SHARE)), np.int16(WEAK // _SHARE))
+    strong = equal_mask(smaller(load_int16(votes, at), np.int16(WEAK // SHARE)), np.int16(WEAK // SHARE))
     return ~np.int64(strong) & ((1 << min(LANES, end)) - 1)
 
 
@@ -210,14 +165,25 @@ def _step(width, k):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _count_votes(whole: int, votes: int, at: int, width: int, room: int) -> None:
     """How much speaks against each candidate of LANES answers, to room (candidates, LANES); all addresses."""
-    none = zero_int16()
-    for k in range(_CANDIDATES):
-        own, against = load_int16(whole, at + _step(width, k)), none
-        for line in range(at - REACH * width, at + REACH * width + 1, width):
-            for i in range(line - REACH, line + REACH + 1):
-                off = load_int16(whole, i) - own
-                against = against + load_int16(votes, i) * smaller(larger(off, none - off), np.int16(FAR))
-        store_int16(room, k * LANES, against)
+    own, left, right = load_int16(whole, at), load_int16(whole, at - 1), load_int16(whole, at + 1)
+    above, below = load_int16(whole, at - width), load_int16(whole, at + width)
+    a = b = c = d = e = zero_int16()
+    for line in range(at - REACH * width, at + REACH * width + 1, width):
+        for i in range(line - REACH, line + REACH + 1):
+            label, cast = load_int16(whole, i), load_int16(votes, i)
+            a, b, c = a + cast * _apart(label, own), b + cast * _apart(label, left), c + cast * _apart(label, right)
+            d, e = d + cast * _apart(label, above), e + cast * _apart(label, below)
+    store_int16(room, 0, a)
+    store_int16(room, LANES, b)
+    store_int16(room, 2 * LANES, c)
+    store_int16(room, 3 * LANES, d)
+    store_int16(room, 4 * LANES, e)
+
+
+@numba.njit(forceinline=True)
+def _apart(label, other):  # type: ignore[no-untyped-def]
+    off = label - other
+    return smaller(larger(off, zero_int16() - off), np.int16(FAR))
 
 
 @numba.njit(forceinline=True)

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from rig.counting import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimators.aggregation_answer import answer_settings
+from rig.estimators.aggregation_ballots import collect
 from rig.estimators.aggregation_kernels import Penalties, along_columns, along_rows
-from rig.estimators.aggregation_vote import NEIGHBOURS_PX, collect, vote
+from rig.estimators.aggregation_vote import NEIGHBOURS_PX, vote
 from rig.estimators.ambient import ambient_map
 from rig.estimators.halo_learning import bright_lines, learn_first_halo, learn_next_halo
 from rig.estimators.joint_agreement import pairs_to_ask

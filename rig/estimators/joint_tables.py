@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from rig.aligned import aligned_zeros
 from rig.errors import UsageError
 from rig.estimators.aggregation_answer import Answer, new_answer
-from rig.estimators.aggregation_vote import Ballots, new_ballots
+from rig.estimators.aggregation_ballots import Ballots, new_ballots
 from rig.estimators.halo import halo_shares
 from rig.estimators.joint_agreement import pairs_to_ask
 from rig.estimators.joint_answer import brightness_of

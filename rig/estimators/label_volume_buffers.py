@@ -13,6 +13,8 @@ from rig.lanes import LANES
 
 BATCH: Final = LANES
 """Rows that go through each part of the work together: what one waits for, the others fill."""
+SUMS_FROM: Final = LANES - 1
+"""Sums up to and including a pixel belong to the next one: so they are written at whole vectors."""
 POSITION: Final = PHASES * LIGHTS * LANES
 """Numbers that a vector of pixels has in a table."""
 
@@ -64,8 +66,8 @@ class Fitted(NamedTuple):
 class Buffers(NamedTuple):
     """Addresses; of BATCH rows, int16 unless said, with the elements from row to row.
 
-    n: counts of pixels from far to near; sums: score of a change at each pixel, the first one BASE; score: of pixel
-    and phase; top: largest ones of some lanes each, later of all.
+    n: counts of pixels from far to near; sums: score of a change at each pixel from SUMS_FROM on, the first one BASE;
+    score: of pixel and phase; top: largest ones of some lanes each, later of all.
     cost: bytes of labels, from that of the first pixel's phase 0 on. Of all rows: mask: bytes, EXCLUDED or 0 for each
     label; constant: of positions, edge: of pixels, for each variant; through: room for sums. As
     int32, table: of variants from -1 on, -1 where there is none; here: of each row of the batch, fitted: place of it in

@@ -22,7 +22,7 @@ from rig.estimators.label_places import (
     VALID,
     VALID_END,
 )
-from rig.estimators.label_volume_buffers import POSITION, At, Buffers, Fitted, Ways
+from rig.estimators.label_volume_buffers import POSITION, SUMS_FROM, At, Buffers, Fitted, Ways
 from rig.lane_memory import (
     load_bytes,
     load_int16,
@@ -138,10 +138,10 @@ def sum_edges(at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
         n, sums = b.n + 2 * r * b.n_row, b.sums + 2 * r * b.n_row
         edge, constant = at.edge + 2 * pixels * i, fitted.edge + 2 * pixels * read_int32(b.fitted, r)
         carry = zero_int16() + np.int16(BASE)
-        write_int16(sums, 0, np.int16(BASE))
+        write_int16(sums, SUMS_FROM, np.int16(BASE))
         for p in range(0, min(pixels, FAR_PX + LANES * read_int16(at.used, i)), LANES):
             rise = running_sum(add_saturated(scaled(load_int16(n, p), load_int16(edge, p)), load_int16(constant, p)))
-            store_int16(sums, p + 1, add_saturated(rise, carry))
+            store_int16(sums, p + LANES, add_saturated(rise, carry))
             carry = add_saturated(carry, last_everywhere(rise))
 
 
@@ -179,7 +179,7 @@ def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch:
         i = read_int32(b.here, r)
         if i < 0:
             continue
-        sums, score = b.sums + 2 * (r * b.n_row + FAR_PX), b.score + 2 * r * b.score_row
+        sums, score = b.sums + 2 * (r * b.n_row + SUMS_FROM + FAR_PX), b.score + 2 * r * b.score_row
         n, tap = b.n + 2 * (r * b.n_row + FAR_PX - taps // 2), at.tap + 2 * at.taps * i
         constant = constants + 2 * at.constants * read_int32(which, r)
         vectors = read_int16(at.used, i)

@@ -56,8 +56,10 @@ def profile_table(sigma_px: float) -> NDArray[np.float32]:
 
 
 def new_places(rows: int, columns: int) -> Places:
-    """Room for the places of a map."""
-    # One piece of memory: the system gives large ones large pages.
+    """Room for the places of a map: one piece, so that the system gives it large pages.
+
+    Kernels may read a vector that goes beyond the end of any field but the last.
+    """
     return Places(*aligned_zeros((len(Places._fields), rows, columns), np.float32))
 
 

@@ -148,7 +148,7 @@ def _measure(at: int, width: int, taps: int, ambient: int, bins: int) -> None:
     """Light of LANES stripes and all that is wanted of haze; taps: address of their counts, and room behind them."""
     near = taps + 4 * EIGHT * LANES
     one, none, half = zero_float32() + np.float32(1.0), zero_float32(), np.float32(0.5)
-    fetch_eights(ambient, near)
+    fetch_eights(ambient, 0, near)
     frames = load_float32(at, _FRAMES * width)
     inverse = one / (frames + half)
     dark, shown, light = one, none, none
@@ -162,7 +162,7 @@ def _measure(at: int, width: int, taps: int, ambient: int, bins: int) -> None:
         shown, light = shown + shows, light - where_small(own, own, _SHOWS)
     own = load_float32(near, REACH_PX * LANES)
     own = where_small(own, own, _SHOWS)
-    fetch_eights(bins, near)
+    fetch_eights(bins, 0, near)
     part, paths, others = (
         load_float32(at, _PART * width),
         load_float32(at, _PATHS * width),

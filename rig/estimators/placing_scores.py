@@ -19,7 +19,6 @@ from rig.lane_memory import (
     load_float32,
     read_float32,
     read_int32,
-    read_int64,
     store_float32,
     write_float32,
     write_int64,
@@ -33,7 +32,8 @@ FRACTIONS: Final = 16
 LEAST_FLUX: Final = np.float32(1e-5)
 _SHOWS: Final = np.nextafter(MOST_FLUX, np.float32(0.0))
 """Most ambient light of a pixel that shows anything at all."""
-_AMPLITUDE, _SCALE, _GLOW, _HAZE, _REST, _DISTANCE, _LIT, _FRAMES, _SCORE, _KNOWN, _FIELDS = range(11)
+_AMPLITUDE, _SCALE, _GLOW, _HAZE, _REST, _DISTANCE = range(6)
+_LIT, _FRAMES, _SCORE, _KNOWN, _FIELDS = range(5)
 _EIGHTS: Final = EIGHT * LANES
 _DOUBLINGS: Final = 6
 
@@ -80,8 +80,6 @@ def score_places(
              signed_address(out.haze), signed_address(out.rest), signed_address(out.distance))  # fmt: skip
     ambient_places[:], share_places[:] = spare_at + 4 * EIGHT * (width - 1), all_shares
     for y in range(first_row, last_row):
-        for i in range(len(known)):
-            copy_floats(known[i] + 4 * columns * y, at + 4 * width * (_AMPLITUDE + i), columns)
         for c in range(columns):
             x_line, frames = read_float32(at_x, y * columns + c), n_frames[c]
             if np.isnan(x_line) or frames == 0:
@@ -97,7 +95,7 @@ def score_places(
             write_int64(ambient_at, c, ambient_place(ambient, pixels, y, x, x0, window, own))
         for c in range(0, columns, LANES):
             counts_of(around, around_at, y, c, taps_at)
-            _score(at + 4 * c, width, taps_at, ambient_at + 8 * c, shares_at + 8 * c, side)
+            _score(at + 4 * c, width, known, y * columns + c, taps_at, ambient_at + 8 * c, shares_at + 8 * c, side)
         copy_floats(at + 4 * width * _SCORE, to_score + 4 * columns * y, columns)
         copy_floats(at + 4 * width * _KNOWN, to_known + 4 * columns * y, columns)
     # They live until here: what is known by its address alone would be freed.
@@ -106,22 +104,26 @@ def score_places(
 
 
 @numba.njit(cache=True, nogil=True)
-def _score(at: int, width: int, seen: int, ambient: int, shares: int, side: int) -> None:
-    """Fill score and known of LANES stripes; seen: address of their counts, and room behind them."""
+def _score(
+    at: int, width: int, of: tuple[int, int, int, int, int, int], here: int, seen: int, ambient: int, shares: int,
+    side: int,
+) -> None:  # fmt: skip
+    """Fill score and known of LANES stripes.
+
+    of: addresses of what is known of stripes before, here: number of the first. seen: address of their counts, and room
+    behind them.
+    """
     share, growth, own = seen + 4 * _EIGHTS, seen + 8 * _EIGHTS, seen + 12 * _EIGHTS
-    fetch_eights(ambient, own)
-    fetch_eights(shares, share)
-    for i in range(LANES):
-        # The growth lies behind the share.
-        write_int64(shares, i, read_int64(shares, i) + 4 * EIGHT)
-    fetch_eights(shares, growth)
+    fetch_eights(ambient, 0, own)
+    fetch_eights(shares, 0, share)
+    fetch_eights(shares, 4 * EIGHT, growth)
     frames, light = (
         load_float32(at, _FRAMES * width),
-        load_float32(at, _AMPLITUDE * width) * load_float32(at, _SCALE * width),
+        load_float32(of[_AMPLITUDE], here) * load_float32(of[_SCALE], here),
     )
     # Around its middle the halo is level.
-    halo = light * load_float32(at, _GLOW * width)
-    before, behind = load_float32(at, _HAZE * width) + halo, load_float32(at, _REST * width) + halo
+    halo = light * load_float32(of[_GLOW], here)
+    before, behind = load_float32(of[_HAZE], here) + halo, load_float32(of[_REST], here) + halo
     edge = before - behind
     middle = behind + load_float32(at, _LIT * width) * edge
     score, known, none = zero_float32(), zero_float32(), zero_float32()
@@ -137,7 +139,7 @@ def _score(at: int, width: int, seen: int, ambient: int, shares: int, side: int)
         dark = _dark_over_lit(base + shine + light * load_float32(share, tap))
         score = score + slope * ((frames - unlit) * dark - unlit)
         known = known + frames * slope * slope * dark
-    score = known * load_float32(at, _DISTANCE * width) + score
+    score = known * load_float32(of[_DISTANCE], here) + score
     store_float32(at, _SCORE * width, where_below(score, none, none, frames))
     store_float32(at, _KNOWN * width, known)
 

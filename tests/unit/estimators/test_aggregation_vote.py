@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from rig.estimators.aggregation_answer import UNITS, Answer
-from rig.estimators.aggregation_vote import FAR, OBJECTION, REACH, SAME, WEAK, collect, new_ballots, vote
+from rig.estimators.aggregation_ballots import REACH, collect, new_ballots
+from rig.estimators.aggregation_vote import FAR, OBJECTION, SAME, WEAK, vote
 from rig.row_threads import RowWorkers
 
 LABELS = 64

@@ -37,18 +37,20 @@ def test_powers_of_lanes_are_those_of_numbers():
 
 
 @numba.njit
-def eights(places, counts, fetched, spread):
-    fetch_eights(address_of(places), address_of(fetched))
+def eights(places, counts, fetched, behind, spread):
+    fetch_eights(address_of(places), 0, address_of(fetched))
+    fetch_eights(address_of(places), 4 * 3, address_of(behind))
     spread_eights(address_of(counts), address_of(spread))
 
 
 def test_eight_numbers_of_each_place_are_turned_into_lanes():
     rng = np.random.default_rng(1)
     numbers, counts = rng.random(200).astype(np.float32), rng.integers(0, 256, (LANES, EIGHT), np.uint8)
-    at = rng.integers(0, 192, LANES)
-    fetched, spread = np.empty((2, EIGHT, LANES), np.float32)
-    eights(numbers.ctypes.data + 4 * at, counts, fetched, spread)
+    at = rng.integers(0, 189, LANES)
+    fetched, behind, spread = np.empty((3, EIGHT, LANES), np.float32)
+    eights(numbers.ctypes.data + 4 * at, counts, fetched, behind, spread)
     np.testing.assert_array_equal(fetched, [numbers[at + d] for d in range(EIGHT)])
+    np.testing.assert_array_equal(behind, [numbers[at + 3 + d] for d in range(EIGHT)])
     np.testing.assert_array_equal(spread, counts.T)
 
 
