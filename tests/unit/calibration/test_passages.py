@@ -5,7 +5,7 @@ import pytest
 
 from calibration.passages.even_pixels import evenly
 from calibration.passages.finding import SweepCounts, find_passages
-from calibration.passages.light import light
+from calibration.passages.light import LineShape, light
 from tests.unit.calibration.passed_lines import Light, passed, true_at
 
 CASES = {
@@ -123,13 +123,16 @@ def test_every_beginning_of_the_order_is_spread_evenly():
         assert len(np.unique(cells, axis=0)) == first
 
 
-@pytest.mark.parametrize(("box", "after"), [(0.0, 0.02), (2.5, 0.1)])
-def test_slopes_are_the_derivatives_of_the_light(box, after):
+@pytest.mark.parametrize(
+    ("shape", "after"),
+    [(LineShape(), 0.02), (LineShape(2.5), 0.1), (LineShape(0.0, True), 0.1), (LineShape(2.5, True), 0.1)],
+)
+def test_slopes_are_the_derivatives_of_the_light(shape, after):
     theta = np.array([[0.1, after, 2.0, 0.3, np.log(0.8)], [0.1, after, 5.0, -0.4, np.log(1.5)]])
     at = np.tile(np.arange(-6.0, 7.0), (2, 1))
-    _, slopes = light(theta, at, box)
+    _, slopes = light(theta, at, shape)
     for which in range(5):
         step = np.zeros(5)
         step[which] = 1e-6
-        numeric = (light(theta + step, at, box)[0] - light(theta - step, at, box)[0]) / 2e-6
+        numeric = (light(theta + step, at, shape)[0] - light(theta - step, at, shape)[0]) / 2e-6
         assert np.allclose(numeric, slopes[:, which], atol=2e-4)  # the normal integral is one to 2e-4
