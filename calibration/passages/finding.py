@@ -35,10 +35,11 @@ NEAR_SIGMAS = 4.5
 REACH = 14
 """Columns on either side of the line that tell of the levels, and at least twice as many as it has itself."""
 FAR = 1e4
-BOXES = (0.0, 1.5, 2.5, 4.0)
-"""Widths of the pixel, and of what else is no Gaussian, that are tried, in sigmas of the line,"""
-SHAPES = tuple(LineShape(box, travels) for travels in (False, True) for box in BOXES)
-"""each with a line that stands still while a column's frames are taken, as that of a DAC's stairs, and one that moves."""
+SHAPES = (*(LineShape(box) for box in (0.0, 1.5, 2.5, 4.0)), LineShape(1.5, travels=True))
+"""That are tried: lines whose light is the same in all frames of a column, as on a DAC's stairs, and one that moves, of
+which the pixel's width hardly matters."""
+MOST_LOSS = 2.0
+"""Of a pixel's log-likelihood against its best shape: a single one whose fit went astray would choose for all."""
 LEAST_SAMPLE, SAMPLE = 50, 300
 """Pixels that tell of the passage's shape: fewer than the first find one for themselves alone, more are not asked."""
 LEAST_SIGNIFICANCE = 5.0
@@ -162,7 +163,9 @@ def _passages(
     if shape is None:
         sigma = float(np.median(fit(_Shape(REACH, LineShape()), SAMPLE, exact=False).sigma))
         shapes = [_Shape(int(np.ceil(NEAR_SIGMAS * sigma + 1)), line) for line in SHAPES]
-        shape = max(shapes, key=lambda one: float(fit(one, SAMPLE, exact=False).likelihood.sum()))
+        likelihood = np.array([fit(one, SAMPLE, exact=False).likelihood for one in shapes])
+        loss = np.minimum(likelihood.max(axis=0) - likelihood, MOST_LOSS)
+        shape = shapes[int(loss.sum(axis=1).argmin())]
     found = fit(shape)
     good = found.settled & (found.sd < MOST_SD) & (found.significance > LEAST_SIGNIFICANCE)
     good &= (found.misfit < MOST_MISFIT) & (np.abs(found.centre - start) < np.maximum(2, 2 * found.sigma))

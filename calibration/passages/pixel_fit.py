@@ -75,21 +75,15 @@ class PassageFit:
 
 
 def fit_passages(
-    ones: Array,
-    frames: Array,
-    at: Array,
-    start: Array,
-    group: NDArray[np.int64],
-    shape: LineShape,
-    *,
+    ones: Array, frames: Array, at: Array, start: Array, group: NDArray[np.int64], shape: LineShape, *,
     exact: bool = True,
-) -> PassageFit:
+) -> PassageFit:  # fmt: skip
     """Fit the passages of pixels from their counts around them.
 
     ones, frames, at: (pixels, columns) float64, 1s, frames and position of each column; frames 0 where there are none.
     The first and the last one stand for all that is far away on their side. start: (pixels,) first guess of the
-    passage. group: (pixels,) part of the picture, from 0 on. shape: of the line's light. exact: not the parabola's width
-    at the top for `sd`, but that of the whole likelihood.
+    passage. group: (pixels,) part of the picture, from 0 on. shape: of the line's light. exact: not the parabola's
+    width at the top for `sd`, but that of the whole likelihood.
     """
     theta = _start(ones, frames, at, start)
     damping = np.full(len(start), DAMPING)
@@ -115,8 +109,7 @@ def fit_passages(
     flux, slopes = light(theta, at, shape)
     _, information = score_of(ones, frames, flux, slopes, theta)
     covariance = np.linalg.inv(regular(information[:, :SIGMA, :SIGMA]))
-    # Of next to no light the inverse is rounding, and may come out negative.
-    known = covariance[:, CENTRE, CENTRE] > 0
+    known = covariance[:, CENTRE, CENTRE] > 0  # of next to no light the inverse is rounding, and may be negative
     sd = np.sqrt(np.where(known, covariance[:, CENTRE, CENTRE], UNKNOWN_SD**2))
     settled = known
     # What not knowing the pixel's other parameters adds: by the information, and where photons are few.
