@@ -7,6 +7,7 @@ def digits(value: float, count: int = 3) -> str:
     """A number with so many digits that count: 1234.5 is '1230', 0.000012345 is '0.0000123'; '-' for nan."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else f"{value:g}"
+    value = value + 0.0  # -0 is 0
     return np.format_float_positional(value, precision=count, unique=False, fractional=False, trim="-")
 
 

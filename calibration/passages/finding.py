@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.passages.even_pixels import evenly
+from calibration.passages.light import LineShape
 from calibration.passages.line_search import ColumnSums, brightest
 from calibration.passages.pixel_fit import PassageFit, fit_passages
 from calibration.views import Passages
@@ -34,8 +35,11 @@ NEAR_SIGMAS = 4.5
 REACH = 14
 """Columns on either side of the line that tell of the levels, and at least twice as many as it has itself."""
 FAR = 1e4
-BOXES = (0.0, 1.5, 2.5, 4.0)
-"""Widths of pixel and column that are tried, in sigmas of the line."""
+SHAPES = (*(LineShape(box) for box in (0.0, 1.5, 2.5, 4.0)), LineShape(1.5, travels=True))
+"""That are tried: lines whose light is the same in all frames of a column, as on a DAC's stairs, and one that moves, of
+which the pixel's width hardly matters."""
+MOST_LOSS = 2.0
+"""Of a pixel's log-likelihood against its best shape: a single one whose fit went astray would choose for all."""
 LEAST_SAMPLE, SAMPLE = 50, 300
 """Pixels that tell of the passage's shape: fewer than the first find one for themselves alone, more are not asked."""
 LEAST_SIGNIFICANCE = 5.0
@@ -132,10 +136,10 @@ def find_passages(
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """Of the passages of a sweep. near: columns on either side of a line that it reaches. box: as of `fit_passages`."""
+    """Of the passages of a sweep. near: columns on either side of a line that it reaches."""
 
     near: int
-    box: float
+    line: LineShape
 
 
 def _passages(
@@ -153,13 +157,15 @@ def _passages(
     def fit(shape: _Shape, first: int | None = None, *, exact: bool = True) -> PassageFit:
         some = slice(None, first)
         data = _around(sums.some(some), sweep.position, start[some], shape.near)
-        return fit_passages(*data, start[some], group[some], shape.box, exact=exact)
+        return fit_passages(*data, start[some], group[some], shape.line, exact=exact)
 
     sure = shape is not None or len(pixels) >= LEAST_SAMPLE
     if shape is None:
-        sigma = float(np.median(fit(_Shape(REACH, 0.0), SAMPLE, exact=False).sigma))
-        shapes = [_Shape(int(np.ceil(NEAR_SIGMAS * sigma + 1)), box) for box in BOXES]
-        shape = max(shapes, key=lambda one: float(fit(one, SAMPLE, exact=False).likelihood.sum()))
+        sigma = float(np.median(fit(_Shape(REACH, LineShape()), SAMPLE, exact=False).sigma))
+        shapes = [_Shape(int(np.ceil(NEAR_SIGMAS * sigma + 1)), line) for line in SHAPES]
+        likelihood = np.array([fit(one, SAMPLE, exact=False).likelihood for one in shapes])
+        loss = np.minimum(likelihood.max(axis=0) - likelihood, MOST_LOSS)
+        shape = shapes[int(loss.sum(axis=1).argmin())]
     found = fit(shape)
     good = found.settled & (found.sd < MOST_SD) & (found.significance > LEAST_SIGNIFICANCE)
     good &= (found.misfit < MOST_MISFIT) & (np.abs(found.centre - start) < np.maximum(2, 2 * found.sigma))

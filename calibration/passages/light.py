@@ -6,10 +6,17 @@ Of n frames in column t, y have a 1: y ~ Binomial(n, 1 - exp(-flux)), and around
 
 with phi and Phi the normal density and its integral: the level of the haze before the line and behind it, and the line.
 Line, pixel and the line's travel within a column all blur the passage symmetrically; sigma stands for them together,
-and `box`, the width of the latter two in widths of the line, for how flat that makes it.
+and `LineShape.box`, the width of the latter two in widths of the line, for how flat that makes it. That is all there is
+to it where few frames are lit. Where many are, frames of one column differ: a line that moves on by a column while they
+are taken lights those of which it is near, and what is counted is the mean of their p, not that of their flux. With
+`LineShape.travels` sigma is of line and pixel alone, and with frames at places u of the column
+
+    flux(t) = levels - log mean over u of exp(-area line(t + u)),    |u| < 1/2
 
 theta: (pixels, 5): BEFORE, AFTER, AREA, CENTRE and the logarithm of SIGMA.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,30 +24,67 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _NODES = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(3), strict=True))
+_TRAVEL = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(4), strict=True))
 LEAST_FLUX = 1e-7
 LEVEL_COUNTS = 0.5
 """What a level is held up by, in counts: one without a single 1 is then half a count over all its frames, not 0."""
 BEFORE, AFTER, AREA, CENTRE, SIGMA = range(5)
 
 
-def light(theta: Array, at: Array, box: float) -> tuple[Array, Array]:
+@dataclass(frozen=True, slots=True)
+class LineShape:
+    """Of the line's light over the columns. box: width of what is no Gaussian in it, in the Gaussian's sigmas. travels:
+    whether the line moves while a column's frames are taken.
+    """
+
+    box: float = 0.0
+    travels: bool = False
+
+
+def light(theta: Array, at: Array, shape: LineShape) -> tuple[Array, Array]:
     """Flux (pixels, columns), and its derivatives (pixels, 5, columns), by the logarithm of sigma the last one."""
     before, after, area, centre, log_sigma = (theta[:, i, None] for i in range(5))
-    sigma = np.exp(log_sigma)
+    sigma, away = np.exp(log_sigma), at - centre
+    if shape.travels:
+        shone, line, slope, widens = _travelled(area, sigma, away, shape.box)
+        blur = np.sqrt(sigma * sigma + 1 / 12)
+    else:
+        line, slope = _line(sigma, away, shape.box)
+        shone, widens, blur = area * line, slope * away - line, sigma
+    passed = _normal_integral(away / blur)  # its shape hardly matters
+    flux = np.maximum(before + (after - before) * passed + shone, LEAST_FLUX)
+    edge = (after - before) * line
+    widened = area * widens - edge * away * (sigma / blur) ** 2
+    slopes = np.stack([1 - passed, passed, line, area * slope - edge, widened], axis=1)
+    return flux, slopes
+
+
+def _line(sigma: Array, away: Array, box: float) -> tuple[Array, Array]:
+    """Share of the line's light per column, so far away from its centre, and how much more of it there is nearer by."""
     narrow = sigma / np.sqrt(1 + box * box / 12)
-    line, slope = np.zeros(at.shape), np.zeros(at.shape)
+    line, slope = np.zeros(away.shape), np.zeros(away.shape)
     for node, weight in _NODES if box else ((0.0, 1.0),):
-        z = (at - centre) / narrow - node * box
+        z = away / narrow - node * box
         part = weight * np.exp(-0.5 * z * z) / (np.sqrt(2 * np.pi) * narrow)
         line += part
         slope += part * z / narrow
-    passed = _normal_integral((at - centre) / sigma)  # its shape hardly matters
-    flux = np.maximum(before + (after - before) * passed + area * line, LEAST_FLUX)
-    moves = area * slope - (after - before) * line
-    # Both line and edge are functions of (at - centre) / sigma, the line with 1 / sigma before it.
-    widens = moves * (at - centre) - area * line
-    slopes = np.stack([1 - passed, passed, line, moves, widens], axis=1)
-    return flux, slopes
+    return line, slope
+
+
+def _travelled(area: Array, sigma: Array, away: Array, box: float) -> tuple[Array, Array, Array, Array]:
+    """Flux that makes as many 1s as the line's light over the column does; its slopes by area, centre, log sigma, the
+    latter two for an area of 1.
+    """
+    places = np.array([place for place, _ in _TRAVEL])[:, None, None]
+    moved = away + places
+    line, slope = _line(sigma, moved, box)
+    shone = area * line
+    least = shone.min(axis=0)
+    dark = np.array([weight for _, weight in _TRAVEL])[:, None, None] * np.exp(least - shone)
+    total = dark.sum(axis=0)
+    dark /= total
+    mean_line, mean_slope = (dark * line).sum(axis=0), (dark * slope).sum(axis=0)
+    return least - np.log(total), mean_line, mean_slope, (dark * slope * moved).sum(axis=0) - mean_line
 
 
 def _normal_integral(z: Array) -> Array:

@@ -18,6 +18,7 @@ from calibration.passages.light import (
     LEAST_FLUX,
     LEVEL_COUNTS,
     SIGMA,
+    LineShape,
     light,
     log_likelihood,
     regular,
@@ -74,18 +75,19 @@ class PassageFit:
 
 
 def fit_passages(
-    ones: Array, frames: Array, at: Array, start: Array, group: NDArray[np.int64], box: float, *, exact: bool = True
-) -> PassageFit:
+    ones: Array, frames: Array, at: Array, start: Array, group: NDArray[np.int64], shape: LineShape, *,
+    exact: bool = True,
+) -> PassageFit:  # fmt: skip
     """Fit the passages of pixels from their counts around them.
 
     ones, frames, at: (pixels, columns) float64, 1s, frames and position of each column; frames 0 where there are none.
     The first and the last one stand for all that is far away on their side. start: (pixels,) first guess of the
-    passage. group: (pixels,) part of the picture, from 0 on. box: width of pixel and travel together, in widths of the
-    line. exact: not the parabola's width at the top for `sd`, but that of the whole likelihood.
+    passage. group: (pixels,) part of the picture, from 0 on. shape: of the line's light. exact: not the parabola's
+    width at the top for `sd`, but that of the whole likelihood.
     """
     theta = _start(ones, frames, at, start)
     damping = np.full(len(start), DAMPING)
-    flux, slopes = light(theta, at, box)
+    flux, slopes = light(theta, at, shape)
     likelihood = log_likelihood(ones, frames, flux)
     for iteration in range(ITERATIONS):
         score, information = score_of(ones, frames, flux, slopes, theta)
@@ -94,7 +96,7 @@ def fit_passages(
         if iteration < WIDTH_ITERATIONS:
             wanted[:, SIGMA] += _width_step(theta[:, SIGMA], score, information, group)
             worse_by = MOST_WORSE  # what is better for the group may be worse for a pixel of it
-        new_flux, new_slopes = light(wanted, at, box)
+        new_flux, new_slopes = light(wanted, at, shape)
         new_likelihood = log_likelihood(ones, frames, new_flux)
         better = new_likelihood >= likelihood - worse_by
         step = np.abs(wanted[:, CENTRE] - theta[:, CENTRE])
@@ -104,17 +106,16 @@ def fit_passages(
         if iteration >= WIDTH_ITERATIONS and np.percentile(step, 99) < LEAST_STEP:
             break
     theta[:, SIGMA] = (np.bincount(group, theta[:, SIGMA]) / np.maximum(np.bincount(group), 1))[group]
-    flux, slopes = light(theta, at, box)
+    flux, slopes = light(theta, at, shape)
     _, information = score_of(ones, frames, flux, slopes, theta)
     covariance = np.linalg.inv(regular(information[:, :SIGMA, :SIGMA]))
-    # Of next to no light the inverse is rounding, and may come out negative.
-    known = covariance[:, CENTRE, CENTRE] > 0
+    known = covariance[:, CENTRE, CENTRE] > 0  # of next to no light the inverse is rounding, and may be negative
     sd = np.sqrt(np.where(known, covariance[:, CENTRE, CENTRE], UNKNOWN_SD**2))
     settled = known
     # What not knowing the pixel's other parameters adds: by the information, and where photons are few.
     unknown = sd * np.sqrt(information[:, CENTRE, CENTRE]) * np.sqrt(_few(frames, flux, slopes, theta))
     if exact:
-        sd, settled = _centred(ones, frames, at, box, theta, sd)
+        sd, settled = _centred(ones, frames, at, shape, theta, sd)
         settled &= known
     return PassageFit(
         centre=theta[:, CENTRE], sd=sd * unknown, sigma=np.exp(theta[:, SIGMA]),
@@ -163,13 +164,13 @@ def _few(frames: Array, flux: Array, slopes: Array, theta: Array) -> Array:
 
 
 def _centred(
-    ones: Array, frames: Array, at: Array, box: float, theta: Array, sd: Array
+    ones: Array, frames: Array, at: Array, shape: LineShape, theta: Array, sd: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Move the centres of `theta` to their means; gives back sd and `settled`. Looked at twice where first too near."""
     sd, settled, again = sd.copy(), np.ones(len(sd), np.bool_), np.arange(len(sd))
     for _ in range(2):
         look = np.clip(sd[again], LEAST_LOOK, MOST_LOOK)
-        mean, spread, within = _posterior(ones[again], frames[again], at[again], box, theta[again], look)
+        mean, spread, within = _posterior(ones[again], frames[again], at[again], shape, theta[again], look)
         theta[again, CENTRE], sd[again], settled[again] = mean, spread, within
         again = again[~within | (spread < look / ALIKE) | (spread > look * ALIKE)]
         if not len(again):
@@ -178,7 +179,7 @@ def _centred(
 
 
 def _posterior(
-    ones: Array, frames: Array, at: Array, box: float, theta: Array, sd: Array
+    ones: Array, frames: Array, at: Array, shape: LineShape, theta: Array, sd: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Mean and standard deviation of the centre (pixels,) where all else is known; whether both lie within the look.
 
@@ -190,16 +191,17 @@ def _posterior(
         moved = theta.copy()
         for j in side:
             moved[:, CENTRE] = theta[:, CENTRE] + shifts[:, j]
-            flux, slopes = light(moved, at, box)
-            own = slopes[:, :CENTRE]  # flux is linear in these
+            flux, slopes = light(moved, at, shape)
+            own = slopes[:, :CENTRE]  # flux is linear in these, or all but where the line travels
             residual, weight = residual_of(ones, frames, flux)
             score = (own * residual[:, None]).sum(axis=2)
             information = (own * own * weight[:, None]).sum(axis=2)
             score[:, :AREA] += LEVEL_COUNTS / moved[:, :AREA]
             information[:, :AREA] += LEVEL_COUNTS / moved[:, :AREA] ** 2
             here = moved[:, :CENTRE]
-            moved[:, :CENTRE] = np.clip(here + score / np.maximum(information, 1e-12), 0.5 * here, 2 * here)
-            flux = np.maximum((moved[:, :CENTRE, None] * own).sum(axis=1), LEAST_FLUX)
+            step = np.clip(score / np.maximum(information, 1e-12), -0.5 * here, here)
+            flux = np.maximum(flux + (step[:, :, None] * own).sum(axis=1), LEAST_FLUX)
+            moved[:, :CENTRE] += step
             gain[:, j] = log_likelihood(ones, frames, flux)
     chance = np.exp(gain - gain.max(axis=1, keepdims=True))
     chance /= chance.sum(axis=1, keepdims=True)

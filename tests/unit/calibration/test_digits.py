@@ -10,7 +10,7 @@ from calibration.digits import digits, in_mm, mm
 @pytest.mark.parametrize(
     ("length_m", "said"),
     [(1.4812, "1480"), (0.0123456, "12.3"), (150.0, "150000"), (1.2345e-8, "0.0000123"), (-0.2, "-200"), (0.0, "0"),
-     (nan, "-"), (inf, "inf")],
+     (-0.0, "0"), (nan, "-"), (inf, "inf"), (-inf, "-inf")],
 )  # fmt: skip
 def test_lengths_are_no_powers_of_ten(length_m: float, said: str) -> None:
     assert in_mm(length_m) == said

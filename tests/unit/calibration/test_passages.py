@@ -1,11 +1,12 @@
 """Passages of the line over pixels: no bias, honest standard deviations, and nothing where nothing is to be told."""
 
+import mpmath
 import numpy as np
 import pytest
 
 from calibration.passages.even_pixels import evenly
 from calibration.passages.finding import SweepCounts, find_passages
-from calibration.passages.light import light
+from calibration.passages.light import LineShape, light
 from tests.unit.calibration.passed_lines import Light, passed, true_at
 
 CASES = {
@@ -47,6 +48,17 @@ def test_passages_do_not_lock_to_columns():
     phase = ((true % 1) * 8).astype(int)
     bias = np.bincount(phase, found.command - true) / np.bincount(phase)
     assert np.abs(bias).max() < 0.02
+
+
+@pytest.mark.parametrize("line", [Light(0.4, 4.0, travels=True), Light(0.6, 20.0, travels=True)])
+def test_passages_do_not_lean_where_a_narrow_bright_line_moves_on(line):
+    """By 0.019 column did those of a fit for which all frames of a column have the same light."""
+    counts, centre = passed(np.random.default_rng(4), line, 10, pixels=9000)
+    found = find_passages(_sweep(counts, 10), 1, 1.0, most=9000)
+    true = true_at(centre, found)
+    phase = ((true % 1) * 8).astype(int)
+    bias = np.bincount(phase, found.command - true) / np.bincount(phase)
+    assert np.abs(bias).max() < 0.012
 
 
 def test_commands_follow_the_columns_either_way():
@@ -123,13 +135,31 @@ def test_every_beginning_of_the_order_is_spread_evenly():
         assert len(np.unique(cells, axis=0)) == first
 
 
-@pytest.mark.parametrize(("box", "after"), [(0.0, 0.02), (2.5, 0.1)])
-def test_slopes_are_the_derivatives_of_the_light(box, after):
+@pytest.mark.parametrize(
+    ("shape", "after"),
+    [(LineShape(), 0.02), (LineShape(2.5), 0.1), (LineShape(0.0, True), 0.1), (LineShape(2.5, True), 0.1)],
+)
+def test_slopes_are_the_derivatives_of_the_light(shape, after):
     theta = np.array([[0.1, after, 2.0, 0.3, np.log(0.8)], [0.1, after, 5.0, -0.4, np.log(1.5)]])
     at = np.tile(np.arange(-6.0, 7.0), (2, 1))
-    _, slopes = light(theta, at, box)
+    _, slopes = light(theta, at, shape)
     for which in range(5):
         step = np.zeros(5)
         step[which] = 1e-6
-        numeric = (light(theta + step, at, box)[0] - light(theta - step, at, box)[0]) / 2e-6
+        numeric = (light(theta + step, at, shape)[0] - light(theta - step, at, shape)[0]) / 2e-6
         assert np.allclose(numeric, slopes[:, which], atol=2e-4)  # the normal integral is one to 2e-4
+
+
+@pytest.mark.parametrize(
+    ("sigma", "area", "within"), [(0.3, 4.0, 4e-3), (0.6, 20.0, 3e-4), (3.0, 100.0, 1e-6), (0.25, 3e3, 0.04)]
+)
+def test_a_line_that_moves_lights_the_mean_of_a_columns_frames(sigma, area, within):
+    at = np.linspace(-3.0, 3.0, 13)[None]
+    flux, slopes = light(np.array([[0.02, 0.02, area, 0.0, np.log(sigma)]]), at, LineShape(travels=True))
+
+    def dark(away):
+        return mpmath.quad(lambda u: mpmath.exp(-area * mpmath.npdf(away + u, 0, sigma)), mpmath.linspace(-0.5, 0.5, 9))
+
+    lit = [float(1 - mpmath.exp(mpmath.mpf("-0.02")) * dark(away)) for away in at[0].tolist()]
+    assert np.abs(-np.expm1(-flux[0]) - lit).max() < within
+    assert np.isfinite(slopes).all()

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from calibration.board.board import Board
 from calibration.board.detection import find_corners
+from calibration.board.drawing import Drawing
 from sim_backend.scenes.board import ShownBoard, board_scene
 from tests.reference.random_rigs import BOARD, random_poses, random_rig
 
@@ -25,3 +27,10 @@ def test_corners_without_noise_lie_within_a_thousandth_of_a_pixel(seed: int) -> 
         off.append(found.px - np.stack(camera.project(pose.to_camera(BOARD.corners_m[found.ids])), axis=-1))
     rms_px = np.sqrt(np.mean(np.concatenate(off) ** 2))
     assert rms_px < MOST_RMS_PX, rms_px
+
+
+def test_drawings_of_many_squares_stay_small() -> None:
+    assert Drawing.of(BOARD, 1e6).px_per_square == 256
+    many = Drawing.of(Board("chessboard", (100, 100), 0.01), 1e6)
+    assert many.px_per_square >= 32
+    assert many.picture.nbytes <= 128 << 20
