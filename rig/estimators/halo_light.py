@@ -68,17 +68,18 @@ def likeliest_light(
     """
     for i in range(first_line, last_line):
         y, c = rows[i], columns[i]
-        a, information, misfit, asked = np.float64(places.amplitude[y, c]), 0.0, 0.0, 0
+        a, information, misfit, asked, settled = np.float64(places.amplitude[y, c]), 0.0, 0.0, 0, False
         for _ in range(MOST_STEPS):
             score, information, misfit, asked = _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a)
             if asked < LEAST_ASKED or information <= 0.0:
                 break
             before = a
             a = min(max(a + score / information, a / MOST_GROWTH), a * MOST_GROWTH)
-            if abs(a - before) < SETTLED * before:
+            settled = abs(a - before) < SETTLED * before
+            if settled:
                 break
         light[i] = a * places.scale[y, c]
-        known[i] = asked >= LEAST_ASKED and a * math.sqrt(information) > LEAST_SURE
+        known[i] = settled and asked >= LEAST_ASKED and a * math.sqrt(information) > LEAST_SURE
         known[i] = known[i] and misfit < asked + DISAGREED * math.sqrt(2.0 * asked)
 
 

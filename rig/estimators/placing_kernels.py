@@ -30,6 +30,8 @@ BESIDE_PX: Final = 5, 6
 """Pixels to either side, from and to, that show how much of a halo is under a line, and nothing of the line."""
 BLIND_FLUX: Final = np.float32(3.0)
 """A pixel with so much ambient light fires in 95 % of all frames and shows no more; so does one not to be used."""
+LEAST_FRAMES: Final = 2.0
+"""With fewer, light beside a line in a halo is told so badly that the line seems far too narrow."""
 FEW_FRAMES: Final = 3.0
 """Up to so many frames counts are taken as they are: the flux of a full pixel would be a guess."""
 DARK_FRAMES: Final = 1.5
@@ -103,7 +105,7 @@ def add_moments(
             reach, frames = REACH_PX, np.float64(n_frames[c])
             if state.glow[cell] > 0.0:
                 reach = BESIDE_PX[1]
-                if signal[y, c] * state.psi[0] > most_shown(frames):
+                if frames < LEAST_FRAMES or signal[y, c] * state.psi[0] > most_shown(frames):
                     continue
             side = 1 if sweep.near_is_left else -1
             halo, level, wide = 0.0, 0.0, 0.0

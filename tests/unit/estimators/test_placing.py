@@ -161,6 +161,14 @@ def test_stripes_that_fill_their_pixels_do_not_tell_the_width_in_a_halo():
     assert found == line_width(*seen, stripes, WORKERS)
 
 
+def test_one_exposure_does_not_tell_the_width_in_a_halo():
+    volume, geometry, x_px = wall("left", 1, 0.6, 8.0, 0.01)
+    state = state_of(known_model(geometry, haze=0.01, sigma_px=0.6))
+    seen, stripes = (volume, sweep_of(geometry)), stripes_at(x_px)
+    assert line_width(*seen, state, stripes, WORKERS) is not None
+    assert line_width(*seen, state._replace(glow=np.full_like(state.glow, 0.01)), stripes, WORKERS) is None
+
+
 def test_stripes_at_the_end_of_a_row_do_not_tell_the_width():
     volume, geometry, x_px = wall("left", 20, 0.6, 8.0, 0.01)
     state = state_of(known_model(geometry, haze=0.01, sigma_px=0.7))
