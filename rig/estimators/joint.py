@@ -160,8 +160,9 @@ class Joint:
             if neighbours:
                 vote(memory.ballots, memory.cost, first, last, memory.answer)
             read_positions(
-                grid.x_far, volume.n_frames, grid.side, memory.answer, first, last, x_px, memory.places.distance
-            )
+                grid.x_far, volume.n_frames, grid.side, tables.sweep.u.shape[1], memory.answer, first, last, x_px,
+                memory.places.distance,
+            )  # fmt: skip
 
         workers.over(rows, tie_rows)
         workers.post(columns, tie_columns)

@@ -22,18 +22,26 @@ def read_positions(
     x_far: NDArray[np.float64],
     n_frames: NDArray[np.int32],
     side: int,
+    width: int,
     answer: Answer,
     first_row: int,
     last_row: int,
     x_px: NDArray[np.float32],
     distance: NDArray[np.float32],
 ) -> None:
-    """x_px (rows, columns) of the answers' labels, and its distance from x_far; NaN where there are no data."""
-    label = answer.label
+    """x_px (rows, columns) of the answers' labels, and its distance from x_far; NaN where there are no data.
+
+    An answer in the outer half of the last of `width` pixels has no margin: beyond it a stripe is as dark as one that
+    is not there, no label says so, and darkness makes the outermost one the best by far.
+    """
+    label, margin, nothing = answer.label, answer.margin, np.float32(np.nan)
     for y in range(first_row, last_row):
         for c in range(x_far.shape[1]):
-            off = -side * label[y, c] / PER_PX if n_frames[c] > 0 else np.float32(np.nan)
-            x_px[y, c], distance[y, c] = x_far[y, c] + off, off if np.isfinite(x_far[y, c]) else np.float32(np.nan)
+            off = -side * label[y, c] / PER_PX if n_frames[c] > 0 else nothing
+            x = x_far[y, c] + off
+            x_px[y, c], distance[y, c] = x, off if np.isfinite(x_far[y, c]) else nothing
+            if x < 0.0 or x > width - 1.0:
+                margin[y, c] = 0
 
 
 @numba.njit(cache=True, nogil=True)

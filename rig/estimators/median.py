@@ -44,16 +44,18 @@ def _median_rows(
             median = values[m // 2] if m % 2 else np.float32(0.5) * (values[m // 2 - 1] + values[m // 2])
             total = 0.0
             agreeing = 0.0
+            surest = np.float32(0.0)
             number = 0
             spread = 0.0
             for i in range(m):
                 total += weights[i]
                 if abs(values[i] - median) <= 1.0:
                     agreeing += weights[i]
+                    surest = max(surest, weights[i])
                     number += 1
                     spread += (values[i] - median) ** 2
             out[0, y, c] = median
-            out[1, y, c] = agreeing / total if total > 0.0 else 0.0
+            out[1, y, c] = surest * agreeing / total if total > 0.0 else 0.0
             out[2, y, c] = MEDIAN_EFFICIENCY * np.sqrt((spread / max(number, 1) + 1.0 / 12.0) / max(number, 1))
 
 
@@ -61,8 +63,9 @@ def median_filter(stripes: StripeTable, reference_px: NDArray[np.float64]) -> St
     """Stripe table with x_px replaced by the 5x5 median of its disparity; reference_px (rows, columns), NaN allowed.
 
     The reference is where the column's line stands at a fixed depth: smooth over rows and columns. Confidence becomes
-    the share of the neighbours' confidence that lies within 1 px of the median, x_sd_px the standard deviation of a
-    median of those neighbours; signal and haze stay.
+    the share of the neighbours' confidence that lies within 1 px of the median, times the highest of it: answers that
+    agree make each other surer, but where nobody believes his own, as `joint` where nothing is lit, agreement is no
+    evidence. x_sd_px becomes the standard deviation of a median of those neighbours; signal and haze stay.
     """
     reference = reference_px.astype(np.float32)
     out = np.full((3, *stripes.x_px.shape), np.nan, np.float32)

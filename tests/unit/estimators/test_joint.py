@@ -13,8 +13,8 @@ from rig.estimators.row_model import RowModel
 from rig.stripes import StripeTable
 from tests.reference.geometry import Geometry
 from tests.reference.scene import Scene
-from tests.reference.working_point import WorkingPoint
-from tests.unit.small_maps import geometry_of, simulated, volume_of
+from tests.reference.working_point import POINTS, WorkingPoint
+from tests.unit.small_maps import geometry_of, simulated, street, volume_of
 
 
 @cache
@@ -99,6 +99,19 @@ def test_counts_of_nothing_or_all_ones_are_answered_without_confidence(level):
     found = create_estimator("joint").estimate(blank, sweep.geometry)
     np.testing.assert_array_equal(np.isfinite(found.x_px), asked)
     assert np.median(found.confidence[asked]) < 0.5
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_lines_that_leave_the_picture_are_not_believed_at_its_edge(side, monkeypatch):
+    # Planes to both sides of what the camera sees: most of their search lies beside the sensor, the rest is dark.
+    monkeypatch.setattr("tests.reference.geometry.TANGENTS", (-0.6, 0.9))
+    g = Geometry.build(height=32, columns=96, side=side)
+    point = WorkingPoint(street(32), POINTS["clear"], g)
+    sweep = volume_of(point.counts(5, 1), geometry_of(g), 5)
+    found = Joint(2).estimate(sweep, geometry_of(g))
+    at_edge = ~np.isfinite(point.truth()) & ((found.x_px < 1.0) | (found.x_px > 510.0))
+    assert at_edge.mean() > 0.05
+    assert np.mean(found.confidence[at_edge] > 0.5) < 0.02
 
 
 def test_room_of_a_map_is_not_carried_to_one_of_another_size():
