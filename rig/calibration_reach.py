@@ -7,9 +7,7 @@ import numpy as np
 
 from calibration.errors import CalibrationError
 from calibration.model.rig_model import RigModel
-from drivers.interfaces import (
-    SpadInfo,
-)
+from drivers.interfaces import SpadInfo
 from rig.config import ScanConfig
 
 MOST_TIMES = 1000.0

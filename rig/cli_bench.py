@@ -44,6 +44,7 @@ def bench_command(
 
     _require_used(
         [simulator, disk is not None, soak is not None],
+        of_rows=threads is not None,
         of_soak=window or slow_consumer != 0 or on_overload != "abort",
     )
     if simulator:
@@ -71,15 +72,18 @@ def bench_command(
     return 0 if stream is None else stream.exit_code
 
 
-def _require_used(measured: list[bool], *, of_soak: bool) -> None:
+def _require_used(measured: list[bool], *, of_rows: bool, of_soak: bool) -> None:
     """UsageError for options without effect, since a minute's measurement would be of something else.
 
-    measured: whether simulator, disk and a soak are asked for; of_soak: whether something is that only a soak has.
+    measured: whether simulator, disk and a soak are asked for; of_rows: whether something is that the first two have
+    not; of_soak: whether something is that only a soak has.
     """
     from rig.errors import UsageError
 
     if sum(measured) > 1:
         raise UsageError("--simulator and --disk measure nothing else; give one of --simulator, --disk and --soak")
+    if of_rows and (measured[0] or measured[1]):
+        raise UsageError("--simulator and --disk choose their threads themselves; leave --threads out")
     if of_soak and not measured[-1]:
         raise UsageError("--window, --slow-consumer and --on-overload are of a soak; add --soak 30, or leave them out")
 

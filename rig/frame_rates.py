@@ -5,9 +5,7 @@ from collections.abc import Callable, Iterator
 from fractions import Fraction
 
 from drivers.frames import frame_bytes
-from drivers.interfaces import (
-    SpadInfo,
-)
+from drivers.interfaces import SpadInfo
 from rig.config import ScanConfig
 from rig.plan_figures import rounded
 from rig.scan_plan import ScanPlan

@@ -43,6 +43,7 @@ BLOCK_S = 5e-3
 waits for its block to fill."""
 BLOCK_BYTES = 16 << 20
 """Most bytes of a block's frames: 512 whole frames of 512 x 512 pixels."""
+
 ColumnWindows = tuple[NDArray[np.int32], int]
 """First pixel of each column's window (columns,), and their width."""
 PointClock = Callable[[float], Fraction]

@@ -64,7 +64,7 @@ class Taken:
         digest = corners_digest(view)
         if digest in self._of_camera:
             raise UsageError(
-                f"view {view.name} is one of those the camera was made of, and must not count twice; give other views "
+                f"{where} holds a view that the camera was made of; a view must not count twice: give other views "
                 "(of a simulated rig: another --seed), or leave the camera out"
             )
         if digest in self._seen:

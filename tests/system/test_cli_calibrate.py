@@ -299,6 +299,7 @@ def test_a_camera_of_other_views_serves_the_planes(calibrated: Path, rig: Rig) -
     assert "accepted in spite of failed-verdict" in Path("planes/report.html").read_text()
     ran = rig("calibrate", "planes", "first", "second", *board, *camera, "--out", "twice")
     assert ran.code == 2
+    assert str(Path("first", "views")) in ran.problems[0]
     assert "must not count twice" in ran.problems[0]
     assert not Path("twice/calibration.yaml").exists()
     content = yaml.safe_load(Path("camera/camera.yaml").read_text())

@@ -4,9 +4,11 @@ import mpmath
 import numpy as np
 import pytest
 
+from calibration.passages import finding
 from calibration.passages.even_pixels import evenly
 from calibration.passages.finding import SweepCounts, find_passages
 from calibration.passages.light import LineShape, light
+from calibration.passages.pixel_fit import fit_passages
 from tests.unit.calibration.passed_lines import Light, passed, true_at
 
 CASES = {
@@ -59,6 +61,24 @@ def test_passages_do_not_lean_where_a_narrow_bright_line_moves_on(line):
     phase = ((true % 1) * 8).astype(int)
     bias = np.bincount(phase, found.command - true) / np.bincount(phase)
     assert np.abs(bias).max() < 0.012
+
+
+@pytest.mark.parametrize("lost", [0.0, 1e6])
+def test_one_pixel_whose_fit_went_astray_does_not_choose_the_shape_for_all(lost, monkeypatch):
+    chosen: list[LineShape] = []
+
+    def astray(*args, exact=True):
+        fit, shape = fit_passages(*args, exact=exact), args[-1]
+        if exact:
+            chosen.append(shape)
+        elif shape.travels:
+            fit.likelihood[0] -= lost
+        return fit
+
+    monkeypatch.setattr(finding, "fit_passages", astray)
+    counts, _ = passed(np.random.default_rng(4), Light(0.6, 20.0, travels=True), 10, pixels=900)
+    find_passages(_sweep(counts, 10), 1, 1.0)
+    assert [shape.travels for shape in chosen] == [True]
 
 
 def test_commands_follow_the_columns_either_way():
