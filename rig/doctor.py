@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from calibration.digits import digits
 from drivers.errors import DeviceError
 from rig.burst import require_memory
 from rig.calibration_identity import identity_of, refusals
@@ -122,7 +123,7 @@ def _plan(plan: ScanPlan) -> Finding:
         link = f"read out at {plan.readout_bytes_per_s / 1e6:.0f} MB/s"
     elif plan.link_bytes_per_s is not None:
         link += f" of the link's {plan.link_bytes_per_s / 1e6:.0f} MB/s"
-    sweep = f"{plan.columns} columns x {plan.exposures} exposures in {plan.sweep_s * 1e3:.3g} ms"
+    sweep = f"{plan.columns} columns x {plan.exposures} exposures in {digits(1e3 * float(plan.sweep_s))} ms"
     return Finding("plan", True, f"{sweep}, {link}")
 
 
@@ -166,7 +167,7 @@ def _trigger(seen: DarkLook) -> Finding:
 
 def _memory(rig: OpenRig) -> list[Finding]:
     most = rig.spad.health.memory_high_water_bytes
-    return [] if most is None else [Finding("memory", True, f"at most {most / 1e6:.3g} MB waited in the SPAD")]
+    return [] if most is None else [Finding("memory", True, f"at most {digits(most / 1e6)} MB waited in the SPAD")]
 
 
 def _disk(folder: Path) -> Finding:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.digits import digits
 from rig.counting import CountVolume
 from rig.fog_fit import FLUX_MIN, FogFit, fit_fog
 from rig.geometry import SweepGeometry
@@ -70,7 +71,7 @@ class FogEstimate:
         """The visibility in three words, nothing where it is not resolved."""
         if self.visibility_m is None or self.visibility_sd_m is None:
             return ""
-        return f"visibility {self.visibility_m:.3g} +- {self.visibility_sd_m:.2g} m"
+        return f"visibility {digits(self.visibility_m)} +- {digits(self.visibility_sd_m, 2)} m"
 
 
 def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: Any) -> FogEstimate:

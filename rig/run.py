@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from calibration.digits import digits
 from drivers.interfaces import SweepTruth
 from drivers.replay_pace import PaceReport
 from drivers.transports.tap import CONTROL_FILE, TapFile
@@ -207,9 +208,9 @@ def _require_space(folder: Path, recording_bytes: int, map_bytes: int) -> None:
     free = shutil.disk_usage(folder).free
     if recording_bytes + map_bytes > free:
         raise UsageError(
-            f"the recording will take {recording_bytes / 1e9:.3g} GB and the maps {map_bytes / 1e9:.3g} GB, the disk "
-            f"of {folder} has {free / 1e9:.3g} GB free; free some, name a folder on another disk with --out, or lower "
-            "--maps"
+            f"the recording will take {digits(recording_bytes / 1e9)} GB and the maps {digits(map_bytes / 1e9)} GB, "
+            f"the disk of {folder} has {digits(free / 1e9)} GB free; free some, name a folder on another disk with "
+            "--out, or lower --maps"
         )
 
 

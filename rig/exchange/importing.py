@@ -16,6 +16,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.digits import digits
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock, frame_bytes, packed_row_bytes
 from drivers.orientation import QuarterTurn, turn_packed, turned_size
 from drivers.spb1 import BlockLayout, frames_per_block
@@ -251,6 +252,6 @@ def _require_space(folder: Path, size: int) -> None:
     free = shutil.disk_usage(folder).free
     if size > free:
         raise UsageError(
-            f"the recording will take {size / 1e9:.3g} GB, the disk of {folder.parent} has {free / 1e9:.3g} GB free; "
-            "free some or name a folder on another disk with --out"
+            f"the recording will take {digits(size / 1e9)} GB, the disk of {folder.parent} has {digits(free / 1e9)} GB "
+            "free; free some or name a folder on another disk with --out"
         )

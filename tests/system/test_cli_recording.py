@@ -111,7 +111,7 @@ def test_a_disk_with_too_little_room_is_refused_before_the_start(
     ran = rig("scan", small, "--record", "--maps", 50, "--out", "deep/run")
     assert (ran.code, len(ran.problems)) == (2, 1)
     assert "the recording will take" in ran.problems[0]
-    assert "free some" in ran.problems[0]
+    assert "has 0.000001 GB free; free some" in ran.problems[0]
     assert not Path("deep").exists()
 
 

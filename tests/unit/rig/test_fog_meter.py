@@ -100,6 +100,7 @@ def test_a_reading_says_what_there_is(rig) -> None:
     signal = sweep.point.stripe[seen].mean()
     assert fog.veil_to_signal == pytest.approx(fog.veil_per_exposure / signal, rel=0.2)
     assert fog.brief().startswith("visibility ")
+    assert FogEstimate(visibility_m=1234.0, visibility_sd_m=120.0).brief() == "visibility 1230 +- 120 m"
 
 
 def test_clear_air_has_ambient_light_and_nothing_else() -> None:
