@@ -169,7 +169,8 @@ def calibrate_sync(
         raise UsageError.of(problems)
     asked = SyncAsked(tuple(exposures), accuracy_m, at_m or AT_M, seed, arm)
     found = sort_sources(listed(sources), scene=scene)
-    return run_sync(found, asked, base=read_base(calibration), out=out, tell=tell)
+    base = None if calibration is None else Path(calibration)
+    return run_sync(found, asked, calibration=base, out=out, tell=tell)
 
 
 def calibrate_check(

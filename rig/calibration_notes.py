@@ -21,10 +21,14 @@ def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons:
     return beside
 
 
-def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel) -> None:
-    """Have what failed on a calibration speak against the one that was made from it. Raises OSError."""
+def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:
+    """Have what failed on a calibration speak against the one that was made from it. Raises OSError.
+
+    new_pixels: what was said of the old ones is no longer so.
+    """
     failed = {what: note for what, note in notes_on(old, before).items() if not note.get("passed", True)}
-    failed.pop("pixels", None)  # of which there are new ones now
+    if new_pixels:
+        failed.pop("pixels", None)
     for what, note in failed.items():
         note_check(new, after, what, passed=False, reasons=tuple(note.get("reasons") or ()))
 

@@ -199,4 +199,4 @@ def _save_calibration(old: Path, pixels: PixelMap, file: Path) -> None:
     rate = np.nan_to_num(pixels.rate_per_s, nan=pixels.ordinary_per_s).astype(np.float32)
     after = replace(before, defects=pixels.defects, dark_rate_per_s=rate)
     save_rig_model(after, file)
-    carry_notes(old, before, file, after)
+    carry_notes(old, before, file, after, new_pixels=True)

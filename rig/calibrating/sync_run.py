@@ -48,16 +48,16 @@ def run_sync(
     sources: Sources,
     asked: SyncAsked,
     *,
-    base: RigModel | None = None,
+    calibration: Path | None = None,
     out: OutFolder = None,
     tell: Tell | None = None,
 ) -> CalibrationResult:
-    """Measure the lags. base: the model they go into, by default that of the live rig; without one nothing but the
-    figures is written. Raises Degenerate where the sweeps cannot tell, CalibrationError where the model's line does not
-    reach the distance asked.
+    """Measure the lags. calibration: the file they go into, by default that of the live rig; without one nothing but
+    the figures is written. Raises Degenerate where the sweeps cannot tell, CalibrationError where the file cannot be
+    read or its line does not reach the distance asked.
     """
     live = sources.live
-    base = base or _own(live)
+    file, base = (calibration, load_rig_model(calibration)) if calibration is not None else _own(live)
     wanted = None if base is None else goal(sensitivity(base, asked.at_m), asked.accuracy_m, asked.at_m)
     with Session(out) as session:
         taken = Taken(session, tell)
@@ -75,8 +75,8 @@ def run_sync(
         summary = {"command": "sync", **_summary(fit, gate, verdict, truth), "versions": versions()}
         figures = tuple(_figures(fit, gate, truth))
         about = subject(taken.identity, None, summary["versions"], datetime.now(UTC))
-        calibration = session.finish(summary, sync_report(fit, verdict, line, figures, about), model)
-        return CalibrationResult(verdict, line, figures, summary, model, session.path, calibration)
+        written = session.finish(summary, sync_report(fit, verdict, line, figures, about), model, file)
+        return CalibrationResult(verdict, line, figures, summary, model, session.path, written)
 
 
 def _scanned(live: RigConfig, asked: SyncAsked, taken: Taken) -> GateDelay | None:
@@ -100,13 +100,13 @@ def _fitted(taken: Taken, base: RigModel | None) -> SyncFit:
         raise Degenerate(refused.reason, f"{refused.reason}: {refused}") from refused
 
 
-def _own(live: RigConfig | None) -> RigModel | None:
+def _own(live: RigConfig | None) -> tuple[Path | None, RigModel | None]:
     if live is None or live.calibration is None:
-        return None
+        return None, None
     try:
-        return load_rig_model(live.calibration)
+        return live.calibration, load_rig_model(live.calibration)
     except CalibrationError:
-        return None  # what is wrong with it says the command that needs it
+        return None, None  # what is wrong with it says the command that needs it
 
 
 def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigModel:

@@ -1,6 +1,7 @@
 """`rig calibrate` from its options to its files and exit codes, on a small simulated rig that moves its own board."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from calibration.board.board import load_board
 from calibration.files.rig_file import load_rig_model
 from rig import api
 from rig.calibration_identity import refusals
+from rig.calibration_notes import note_check
 from rig.errors import UsageError
 from tests.system.board_rig import write_board_rig
 from tests.system.conftest import Rig
@@ -253,6 +255,13 @@ def test_recorded_runs_are_sources_of_every_command(calibrated: Path, bright: Pa
         ran = rig("scan", bright, "--maps", "2", "--exposures", exposures, "--record", "--out", run)
         assert ran.code == 0, ran.err
     board, file = calibrated / "board.yaml", calibrated / "out" / "calibration.yaml"
+    doubted = Path("doubted") / "calibration.yaml"
+    shutil.copytree(file.parent, doubted.parent)
+    note_check(doubted, load_rig_model(doubted), "check", passed=False, reasons=("moved-rig",))
+    ran = rig("calibrate", "sync", "run-3", "run-6", "--calibration", doubted, "--out", "again")
+    assert ran.code == 0, ran.err
+    made = Path("again/calibration.yaml")
+    assert [each.code for each in refusals(load_rig_model(made), made, None)] == ["failed-check"]
     ran = rig("calibrate", "sync", "run-3", "run-6", "--calibration", file, "--out", "sync", "--json")
     assert ran.code == 0, ran.err  # light that is held at the middle of columns makes lags that change with the speed
     assert json.loads(ran.out)["lag_s"]["forward"] == pytest.approx(2e-4, abs=5e-6)

@@ -70,6 +70,7 @@ def test_a_recording_can_be_reconstructed_otherwise(rig: Rig, small: Path) -> No
 def test_what_does_not_fit_a_recording_is_refused(rig: Rig, small: Path) -> None:
     assert rig("scan", small, "--record", "--out", "run").code == 0
     (Path("run") / "plan.yaml").rename("plan.yaml")
+    np.save("cube.npy", np.zeros((4, 8, 2), np.uint8))
     for arguments, said in (
         (("run",), "plan.yaml"),
         (("run", "--plan", "plan.yaml"), "leave --plan out"),

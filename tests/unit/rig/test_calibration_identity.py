@@ -200,8 +200,10 @@ def test_notes_are_on_one_calibration_and_go_with_what_is_made_from_it(tmp_path:
     anew: RigModel = replace(model, lag_s=model.lag_s._replace(forward=1e-4))
     assert refusals(anew, file, None) == ()
     save_rig_model(anew, other)
-    carry_notes(file, model, other, anew)
+    carry_notes(file, model, other, anew, new_pixels=True)
     assert [each.code for each in refusals(anew, other, None)] == ["failed-check"]
+    carry_notes(file, model, other, anew)
+    assert [each.code for each in refusals(anew, other, None)] == ["failed-check", "failed-check"]
     (tmp_path / "made-checks.json").write_text("nonsense")
     with pytest.raises(UsageError, match="remove it and check the calibration again"):
         refusals(model, file, None)
