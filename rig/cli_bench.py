@@ -44,6 +44,7 @@ def bench_command(
 
     _require_used(
         [simulator, disk is not None, soak is not None],
+        threads=threads is not None,
         of_soak=window or slow_consumer != 0 or on_overload != "abort",
     )
     if simulator:
@@ -71,15 +72,18 @@ def bench_command(
     return 0 if stream is None else stream.exit_code
 
 
-def _require_used(measured: list[bool], *, of_soak: bool) -> None:
+def _require_used(measured: list[bool], *, threads: bool, of_soak: bool) -> None:
     """UsageError for options without effect, since a minute's measurement would be of something else.
 
-    measured: whether simulator, disk and a soak are asked for; of_soak: whether something is that only a soak has.
+    measured: whether simulator, disk and a soak are asked for; threads: whether a number of them is; of_soak: whether
+    something is that only a soak has.
     """
     from rig.errors import UsageError
 
     if sum(measured) > 1:
         raise UsageError("--simulator and --disk measure nothing else; give one of --simulator, --disk and --soak")
+    if threads and any(measured[:-1]):
+        raise UsageError("--threads is of counting and estimation; leave it out with --simulator and --disk")
     if of_soak and not measured[-1]:
         raise UsageError("--window, --slow-consumer and --on-overload are of a soak; add --soak 30, or leave them out")
 

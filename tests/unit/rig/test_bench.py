@@ -303,7 +303,7 @@ def test_the_command_prints_one_json_object_or_a_table_of_100_columns(report, mo
 @pytest.mark.parametrize(
     "options",
     [["--slow-consumer", "5"], ["--window"], ["--on-overload", "drop"], ["--simulator", "--disk", "."],
-     ["--soak", "1", "--disk", "."]],
+     ["--soak", "1", "--disk", "."], ["--simulator", "--threads", "1"], ["--disk", ".", "--threads", "1"]],
 )  # fmt: skip
 def test_options_without_effect_are_refused_before_a_minute_has_passed(options, monkeypatch, capsys):
     monkeypatch.setattr(speed, "measure_speed", lambda threads, progress: pytest.fail("measured"))
