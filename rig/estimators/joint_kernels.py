@@ -31,8 +31,8 @@ def read_positions(
 ) -> None:
     """x_px (rows, columns) of the answers' labels, and its distance from x_far; NaN where there are no data.
 
-    An answer in the outer half of the last of `width` pixels has no margin: beyond it a stripe is as dark as one that
-    is not there, no label says so, and darkness makes the outermost one the best by far.
+    An answer in the outer half of the first or last of `width` pixels loses its margin in `answer`: beyond it a stripe
+    is as dark as one that is not there, no label says so, and darkness makes the outermost one the best by far.
     """
     label, margin, nothing = answer.label, answer.margin, np.float32(np.nan)
     for y in range(first_row, last_row):
