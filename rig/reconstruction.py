@@ -12,7 +12,7 @@ from calibration.model.rig_model import RigModel
 from rig.counting import Counter, FrameTally, SweepLayout
 from rig.depth import depth_map
 from rig.errors import UsageError
-from rig.estimators import ESTIMATORS, FILTERS, Learned, create_estimator, recalling
+from rig.estimators import COUPLED, ESTIMATORS, FILTERS, Learned, create_estimator, recalling
 from rig.fog_meter import FogEstimate, read_fog
 from rig.geometry import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from rig.multi_line import LineGrid
@@ -68,6 +68,7 @@ class Reconstructor:
         self._commands = np.asarray(column_commands, dtype=np.float64)
         self._min_confidence = min_confidence
         self._filter = filter
+        self._coupled = estimator in COUPLED
         self._lines = lines
         self._workers = RowWorkers(threads)
         if learned:
@@ -107,7 +108,7 @@ class Reconstructor:
         if filter == "median":
             from rig.estimators.median import median_filter
 
-            stripe = median_filter(stripe, geometry.reference_px())
+            stripe = median_filter(stripe, geometry.reference_px(), coupled=self._coupled)
         if self._model is None:
             depth = np.full((geometry.rows, geometry.width), np.nan, np.float32)
         else:

@@ -5,7 +5,7 @@ import numpy as np
 from rig.binding import FrameBinder
 from rig.counting import BIN_DARK, SweepLayout
 from rig.depth import depth_map
-from rig.estimators import create_estimator
+from rig.estimators import COUPLED, create_estimator
 from rig.fog_meter import read_fog
 from rig.geometry import WORD_PX, uncalibrated_geometry
 from rig.scan_plan import ScanPlan
@@ -45,7 +45,7 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
     if filter == "median":
         from rig.estimators.median import median_filter
 
-        stripe = median_filter(stripe, geometry.reference_px())
+        stripe = median_filter(stripe, geometry.reference_px(), coupled=estimator in COUPLED)
     depth_map(stripe, geometry, 0.5)
 
 

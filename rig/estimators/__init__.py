@@ -14,6 +14,8 @@ ESTIMATORS = ("argmax", "edge", "likelihood", "joint")
 FILTERS = ("none", "median")
 LEARNING = frozenset({"likelihood", "joint"})
 """Estimators that learn from the stream, for which the first map takes much longer than those after it."""
+COUPLED = frozenset({"joint"})
+"""Estimators whose answers already go by their neighbours', so that neighbours who agree are no further evidence."""
 
 
 class Learned(Protocol):

@@ -18,10 +18,6 @@ DEFECT_FLUX = float(FLUX_MAX)
 """Ambient given to pixels not to be used: one that is always lit says the same of every hypothesis, nothing."""
 HOT_SIGMA = 6.0
 """Excess over the neighbours, in standard deviations, that makes a pixel hot: 1e-9 of good pixels pass."""
-CROSSED_COLUMNS = 3
-"""Columns in a row whose stripe one pixel sees."""
-USUAL_COLUMNS = 1.5
-"""Columns with more exposures than so many times the median are long ones."""
 
 
 def ambient_map(
@@ -48,7 +44,7 @@ def ambient_map(
         base = np.full(ones.shape, level)
     else:
         base = _shrunk(ones, exposures)
-    ambient: NDArray[np.float32] = np.maximum(base, hot_pixels(totals, _long_columns(tally))).astype(np.float32)
+    ambient: NDArray[np.float32] = np.maximum(base, hot_pixels(totals)).astype(np.float32)
     ambient[geometry.defects] = DEFECT_FLUX
     return ambient
 
@@ -60,19 +56,6 @@ def _window_exposures(tally: FrameTally, geometry: SweepGeometry) -> NDArray[np.
     np.add.at(change, geometry.x0, tally.n_frames)
     np.add.at(change, geometry.x0 + geometry.window, -tally.n_frames)
     return np.cumsum(change)[: geometry.width].astype(np.uint32)
-
-
-def _long_columns(tally: FrameTally) -> float:
-    """Exposures that a stripe may cross a pixel for beyond those of usual columns; 0 where none are long.
-
-    Where one column has hundreds of times the exposures of those beside it, as after passes, the pixels that its stripe
-    crosses are far brighter than their neighbours over the sweep: they would all be taken for hot.
-    """
-    frames = tally.n_frames[tally.n_frames > 0].astype(np.int64)
-    if not len(frames):
-        return 0.0
-    crossed = np.convolve(tally.n_frames.astype(np.int64), np.ones(CROSSED_COLUMNS, np.int64))
-    return float(max(crossed.max() - CROSSED_COLUMNS * USUAL_COLUMNS * np.median(frames), 0.0))
 
 
 def _lowest_level(totals: NDArray[np.uint32]) -> float:
@@ -109,11 +92,10 @@ def _shrunk(ones: NDArray[np.float64], exposures: NDArray[np.float64]) -> NDArra
     return np.asarray(-np.log1p(-np.minimum(rate, 0.9999)))
 
 
-def hot_pixels(totals: NDArray[np.uint32], long_columns: float = 0.0) -> NDArray[np.float64]:
+def hot_pixels(totals: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Flux (rows, width) of pixels far above their neighbours over the whole sweep, 0 elsewhere.
 
-    totals: (2, rows, width), ones and exposures of each pixel while inside the stored window. long_columns: ones that a
-    pixel may have more than its neighbours since its stripe was seen in columns with more exposures than theirs.
+    totals: (2, rows, width), ones and exposures of each pixel while inside the stored window.
     """
     ones, exposures = totals[0].astype(np.float64), totals[1].astype(np.float64)
     rate = np.minimum(ones / np.maximum(exposures, 1.0), 1.0).astype(np.float32)
@@ -121,7 +103,6 @@ def hot_pixels(totals: NDArray[np.uint32], long_columns: float = 0.0) -> NDArray
     expected = around * exposures
     excess = ones - expected
     # A stripe brighter than its neighbours' may cross the pixel once: allow it as much light again as the median pixel.
-    allowed = 0.5 * expected.clip(max=np.median(expected)) + long_columns
-    hot = excess > HOT_SIGMA * np.sqrt(expected + 1.0) + allowed
+    hot = excess > HOT_SIGMA * np.sqrt(expected + 1.0) + 0.5 * expected.clip(max=np.median(expected))
     excess_rate = np.clip(excess / np.maximum(exposures, 1.0), 0.0, 0.9999)
     return np.where(hot & (exposures > 0), -np.log1p(-excess_rate), 0.0)

@@ -101,7 +101,9 @@ def second_returns(
     """x2_px and confidence2 (rows, columns) beside stripes at x_px: NaN and 0 where nothing stands out."""
     rows, columns = x_px.shape
     blocks, candidates, seconds, moved = room
-    seen = volume.counts, volume.n_frames, sweep, light.state, light.still
+    # Read by address: another kind of number would be read as nonsense.
+    n_frames = np.ascontiguousarray(volume.n_frames, np.int32)
+    seen = volume.counts, n_frames, sweep, light.state, light.still
     reach, side, apart, block_rows = light.reach, grid.side, light.apart, len(candidates.distance)
 
     x2_px, confidence2 = (np.empty((rows, columns), np.float32) for _ in range(2))

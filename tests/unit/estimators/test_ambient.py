@@ -137,22 +137,3 @@ def test_windows_that_leave_out_part_of_the_picture_still_give_all_of_it_a_level
     result = ambient_of(volume_of(counts, geometry, 10), geometry, None)
     assert result.shape == (ROWS, WIDTH)
     assert np.all(np.isfinite(result) & (result > 0))
-
-
-def test_pixels_that_the_stripe_of_a_far_longer_column_crosses_are_not_hot():
-    few, many = simulated(exposures=4), simulated(exposures=2000)
-    long = np.arange(len(few.counts)) % 7 == 3
-    counts = np.where(long[:, None, None], many.counts, few.counts)
-    bright = np.zeros((32, 512), bool)
-    rows, columns = np.nonzero(np.isfinite(few.point.x_true) & long & (few.point.stripe > 0.5))
-    bright[rows, np.rint(few.point.x_true[rows, columns]).astype(int)] = True
-    hot = np.zeros_like(bright)
-    hot[5:30:8, 180:330:25] = True
-    hot &= ~bright
-    exposures = np.where(long, 2000, 4)
-    lit = np.random.default_rng(6).binomial(exposures[:, None, None], 0.5, counts.shape)
-    counts = np.where(hot, np.maximum(counts, lit), counts).astype(np.uint16)
-    found = ambient_of(volume_of(counts, few.geometry, exposures), few.geometry, None)
-    assert bright.sum() > 150
-    assert np.mean(found[bright] > 0.1) < 0.02
-    assert np.mean(found[hot] > 0.3) > 0.95

@@ -71,20 +71,24 @@ def test_light_stays_and_confidence_is_the_agreement_of_the_neighbours():
     for name in ("signal", "haze"):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
     window = before.x_px[2:7, 2:7]
-    assert after.confidence[4, 4] == pytest.approx(0.7 * np.mean(np.abs(window - np.median(window)) <= 1.0))
+    agree = np.abs(window - np.median(window)) <= 1.0
+    assert after.confidence[4, 4] == pytest.approx(np.mean(agree) * (1 - 0.3 ** agree.sum()), rel=1e-5)
     even = median_filter(table(np.full((9, 9), 7.0)), np.zeros((9, 9)))
-    np.testing.assert_allclose(even.confidence, 0.7, rtol=1e-6)
+    np.testing.assert_allclose(even.confidence, 1.0, atol=1e-4)
     assert np.all(even.x_sd_px < before.x_sd_px)
     np.testing.assert_array_equal(before.x_px, x)
     assert not np.array_equal(after.x_px, x)
 
 
-def test_answers_that_agree_are_as_sure_as_the_surest_of_them():
+def test_answers_that_go_by_each_other_are_no_surer_because_they_agree():
     before = table(np.full((9, 9), 7.0))
-    before.confidence[3, 5] = 0.9
-    after = median_filter(before, np.zeros((9, 9)))
-    assert after.confidence[4, 4] == pytest.approx(0.9)
-    assert after.confidence[8, 0] == pytest.approx(0.7)
+    before.confidence[:] = 0.1
+    np.testing.assert_allclose(median_filter(before, np.zeros((9, 9)), coupled=True).confidence, 0.1, rtol=1e-5)
+    before.confidence[4, 4] = 1.0
+    alone = median_filter(before, np.zeros((9, 9)))
+    assert alone.confidence[4, 4] == pytest.approx(1.0, abs=1e-4)
+    assert alone.confidence[0, 0] == pytest.approx(1 - 0.9**9, rel=1e-5)
+    assert median_filter(before, np.zeros((9, 9)), coupled=True).confidence[4, 4] == pytest.approx(3.4 / 25, rel=1e-5)
 
 
 def test_an_empty_table_stays_empty():
