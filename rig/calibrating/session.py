@@ -15,7 +15,7 @@ from typing import Any, Self
 import yaml
 
 from calibration.board.board import Board, load_board
-from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
+from calibration.files.rig_file import CALIBRATION_FILE, save_rig_model
 from calibration.model.rig_model import Identity, RigModel
 from calibration.views import View
 from rig.calibrating.sources import VIEWS
@@ -24,6 +24,9 @@ from rig.calibration_notes import carry_notes
 from rig.errors import UsageError
 from rig.outputs import RunFolder
 from rig.run import OutFolder
+
+Made = tuple[Path, RigModel]
+"""A calibration: its file, and what it holds."""
 
 RIG_FILE = "rig.json"
 BOARD_FILE = "board.yaml"
@@ -98,11 +101,11 @@ class Session:
             self._folder.write_text(name, text)
 
     def finish(
-        self, summary: dict[str, Any], report: str, model: RigModel | None, made_from: Path | None = None
+        self, summary: dict[str, Any], report: str, model: RigModel | None, made_from: Made | None = None
     ) -> Path | None:
         """Write what was made of the views; the calibration's file, None where there is none.
 
-        made_from: the calibration that the model is a change of; what failed on it goes with it.
+        made_from: file and content of the calibration that the model is a change of; what failed on it goes with it.
         """
         if self._folder is None:
             return None
@@ -111,7 +114,7 @@ class Session:
             file = self._folder.place(CALIBRATION_FILE)
             save_rig_model(model, file)
             if made_from is not None:
-                carry_notes(made_from, load_rig_model(made_from), file, model)
+                carry_notes(*made_from, file, model)
         self._folder.write_text("report.html", report)
         self._folder.write_json("summary.json", summary)
         self._folder.publish()

@@ -24,7 +24,7 @@ from rig.calibrating.planes_run import speeds_of
 from rig.calibrating.report import sync_report
 from rig.calibrating.report_subject import subject
 from rig.calibrating.result import CalibrationResult
-from rig.calibrating.session import Session
+from rig.calibrating.session import Made, Session
 from rig.calibrating.showing import Tell
 from rig.calibrating.sources import Sources
 from rig.calibrating.taken import Taken
@@ -57,7 +57,8 @@ def run_sync(
     read or its line does not reach the distance asked.
     """
     live = sources.live
-    file, base = (calibration, load_rig_model(calibration)) if calibration is not None else _own(live)
+    made_from = _own(live) if calibration is None else (calibration, load_rig_model(calibration))
+    base = None if made_from is None else made_from[1]
     wanted = None if base is None else goal(sensitivity(base, asked.at_m), asked.accuracy_m, asked.at_m)
     with Session(out) as session:
         taken = Taken(session, tell)
@@ -75,7 +76,7 @@ def run_sync(
         summary = {"command": "sync", **_summary(fit, gate, verdict, truth), "versions": versions()}
         figures = tuple(_figures(fit, gate, truth))
         about = subject(taken.identity, None, summary["versions"], datetime.now(UTC))
-        written = session.finish(summary, sync_report(fit, verdict, line, figures, about), model, file)
+        written = session.finish(summary, sync_report(fit, verdict, line, figures, about), model, made_from)
         return CalibrationResult(verdict, line, figures, summary, model, session.path, written)
 
 
@@ -100,13 +101,13 @@ def _fitted(taken: Taken, base: RigModel | None) -> SyncFit:
         raise Degenerate(refused.reason, f"{refused.reason}: {refused}") from refused
 
 
-def _own(live: RigConfig | None) -> tuple[Path | None, RigModel | None]:
+def _own(live: RigConfig | None) -> Made | None:
     if live is None or live.calibration is None:
-        return None, None
+        return None
     try:
         return live.calibration, load_rig_model(live.calibration)
     except CalibrationError:
-        return None, None  # what is wrong with it says the command that needs it
+        return None  # what is wrong with it says the command that needs it
 
 
 def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigModel:
