@@ -11,6 +11,11 @@ def digits(value: float, count: int = 3) -> str:
     return np.format_float_positional(value, precision=count, unique=False, fractional=False, trim="-")
 
 
+def condition_text(condition: float) -> str:
+    """A condition number, which matters by its powers of ten: '3.1e+07'; 'inf' where nothing is determined."""
+    return f"{condition:.1e}" if np.isfinite(condition) else "inf"
+
+
 def in_mm(length_m: float) -> str:
     """A length in millimetres, for a table whose head says so."""
     return digits(1e3 * length_m)

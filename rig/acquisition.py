@@ -289,13 +289,13 @@ class Acquisition:
         _wait_until_warm(self._rig, self._rig.clock)
 
     def _make_safe(self, pipeline: Pipeline) -> list[str]:
-        """Gate low, laser paused, mirror parked, SPAD stopped, in this order and each one whatever the others did."""
+        """Gate low, no more frames taken, laser paused, mirror parked, SPAD stopped: in this order, each one always."""
         rig = self._rig
-        pipeline.end_source()
         trouble: list[str] = []
         interrupted: BaseException | None = None
         steps: tuple[tuple[str, Callable[[], None]], ...] = (
             ("gate", rig.sync.abort),
+            ("frames", pipeline.end_source),
             ("laser", rig.laser.pause),
             ("scanner", rig.scanner.park),
             ("spad", rig.spad.stop),

@@ -112,6 +112,4 @@ def export_run(
     from rig.exchange.exporting import ExportOptions
     from rig.exchange.exporting import export_run as write
 
-    given = {"view": view, "frames_per_picture": frames_per_picture, "pictures_per_s": pictures_per_s}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    return write(run, kind, out, ExportOptions(**options), progress)
+    return write(run, kind, out, ExportOptions(view, frames_per_picture, pictures_per_s), progress)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from calibration.board.board import Board
 from calibration.board.coverage import spread_rad
 from calibration.camera_fit.normal import Normal, camera_normal
+from calibration.digits import condition_text
 from calibration.errors import Degenerate
 from calibration.views import NO_POSE, BoardPose, Corners
 
@@ -75,7 +76,8 @@ class Problem:
         raise Degenerate(
             "one-pose",
             f"{len(kept)} view{'s' * (len(kept) > 1)} of the board, all at one pose (condition number "
-            f"{condition:.1e}): a camera takes three poses or more; show the board tilted to both sides, near and far",
+            f"{condition_text(condition)}): a camera takes three poses or more; show the board tilted to both sides, "
+            "near and far",
         )
 
     def solve(self, used: Sequence[Mask]) -> Solution:
@@ -110,7 +112,8 @@ class Problem:
                 raise Degenerate(
                     "too-few-poses",
                     f"{self.terms} terms of distortion are more than these views determine (condition "
-                    f"number {normal.condition:.1e}, {_MOST_CONDITION:.0e} at most); take 5, or fill the picture",
+                    f"number {condition_text(normal.condition)}, {condition_text(_MOST_CONDITION)} at most); take 5, "
+                    "or fill the picture",
                 )
             raise self._refusal(used, solution.poses, normal, "the focal length cannot be told from the distance")
         sd = np.sqrt(np.diag(normal.covariance(variance).matrix))[:2] / np.diag(solution.matrix)[:2]
@@ -175,7 +178,7 @@ class Problem:
     def _refusal(self, used: Sequence[Mask], poses: Sequence[BoardPose], normal: Normal, why: str) -> Degenerate:
         shown = [pose for pose, mask in zip(poses, used, strict=True) if mask.any()]
         spread = spread_rad(shown)
-        said = f"{why} (condition number {normal.condition:.1e}) from {len(shown)} views, turned by up to "
+        said = f"{why} (condition number {condition_text(normal.condition)}) from {len(shown)} views, turned by up to "
         said += f"{np.degrees(spread):.1f} degrees against each other"
         if spread < 3 * _PARALLEL_RAD:
             return Degenerate("coplanar", f"the boards are parallel: {said}; tilt the board by 30 degrees to all sides")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.depth.uncertainty import command_at, depth_sd_m
-from calibration.digits import digits
+from calibration.digits import condition_text, digits
 from calibration.errors import Degenerate
 from calibration.model.rig_model import RigModel
 from calibration.rig_fit.sightings import Sighting
@@ -60,8 +60,9 @@ def check_poses(points_m: Array, poses: Sequence[BoardPose]) -> None:
         raise Degenerate(
             "coplanar",
             f"boards of all {len(poses)} views lie in one plane: the light's points leave it by {thickness:.2g} of "
-            f"their distance, limit {LEAST_THICKNESS:g} (condition number {sizes[0] / max(sizes[2], 1e-300):.3g}); "
-            "show the board at other distances and tilted differently",
+            f"their distance, limit {LEAST_THICKNESS:g} (condition number "
+            f"{condition_text(sizes[0] / max(sizes[2], 1e-300))}); show the board at other distances and tilted "
+            "differently",
         )
 
 
@@ -116,6 +117,6 @@ def check_depth(
         raise Degenerate(
             reason_of(poses),
             f"depth at {at_m:.3g} m would be known to {digits(usual)} m from {len(poses)} poses{odd}, limit "
-            f"{MOST_DEPTH_SD_SHARE * at_m:.3g} m (condition number {condition:.3g}); show the board at more poses, at "
-            "other distances and tilted differently",
+            f"{MOST_DEPTH_SD_SHARE * at_m:.3g} m (condition number {condition_text(condition)}); show the board at "
+            "more poses, at other distances and tilted differently",
         )

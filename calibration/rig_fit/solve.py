@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.digits import digits
+from calibration.digits import condition_text
 from calibration.errors import CalibrationError, Degenerate
 from calibration.model.camera import Camera
 from calibration.model.covariance import Covariance
@@ -139,8 +139,9 @@ def scaled_inverse(matrix: Array) -> tuple[Array, float]:
     if condition > MOST_CONDITION:
         raise Degenerate(
             "coplanar",
-            f"views do not fix all parameters of the rig: condition number {digits(condition)}, limit "
-            f"{digits(MOST_CONDITION, 1)}; show the board at more poses, at other distances and tilted differently",
+            f"views do not fix all parameters of the rig: condition number {condition_text(condition)}, limit "
+            f"{condition_text(MOST_CONDITION)}; show the board at more poses, at other distances and tilted "
+            "differently",
         )
     inverse: Array = (vectors / values) @ vectors.T * scale[:, None] * scale
     return inverse, condition

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.board.board import Board
 from calibration.camera_fit.fit import CameraFit, fit_camera
-from calibration.digits import digits
+from calibration.digits import condition_text, digits
 from calibration.errors import Degenerate
 from calibration.files.camera_file import camera_content, camera_file_text, corners_digest
 from calibration.judging.camera import ACCURACY_PX, JudgedCamera, judge_camera
@@ -84,8 +84,9 @@ def _fitted(taken: Taken, board: Board, terms: int) -> CameraFit:
     if len(fit.kept) < FEWEST_VIEWS:
         raise Degenerate(
             "too-few-poses",
-            f"{len(fit.kept)} of {len(taken.views)} views could be used (condition number {digits(fit.condition, 2)}): "
-            f"a camera takes {FEWEST_VIEWS} poses or more; show the board tilted to both sides, near and far",
+            f"{len(fit.kept)} of {len(taken.views)} views could be used (condition number "
+            f"{condition_text(fit.condition)}): a camera takes {FEWEST_VIEWS} poses or more; show the board tilted to "
+            "both sides, near and far",
         )
     return fit
 
@@ -123,5 +124,5 @@ def _figures(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> list[tuple[s
         ("residuals", f"{fit.rms_px:.3f} px rms"),
         ("coverage", f"{judged.coverage:.0%} of the picture within the outline of all corners, boards up to "
                      f"{np.degrees(fit.coverage.spread_rad):.0f} degrees apart"),
-        ("condition", digits(fit.condition)),
+        ("condition", condition_text(fit.condition)),
     ]  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.board.board import Board
 from calibration.depth.against_truth import DepthErrors
-from calibration.digits import digits, mm
+from calibration.digits import condition_text, mm
 from calibration.errors import CalibrationError, Degenerate
 from calibration.files.camera_file import CORNERS, KnownCamera, corners_digest
 from calibration.judging.rig import Judged, judge_fit
@@ -222,7 +222,7 @@ def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None, camera: Cam
         ("lag", f"{lag.forward * 1e6:.1f} us forward, {lag.backward * 1e6:.1f} us backward"),
         ("residuals", f"corners {fit.corner_rms_px:.3f} px, planes wave by {mm(evidence.wave_m)} and views "
                       f"differ by {mm(evidence.shift_m)} at {asked.at_m:g} m"),
-        ("condition", digits(fit.condition) + ("" if fit.converged else "; the fit did not come to rest")),
+        ("condition", condition_text(fit.condition) + ("" if fit.converged else "; the fit did not come to rest")),
     ]  # fmt: skip
     if camera is not None:
         rows += [("camera file", f"accepted in spite of {each}") for each in camera.accepted]

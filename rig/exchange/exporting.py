@@ -36,12 +36,12 @@ class ExportOptions:
     """What is shown (png, mp4) and how.
 
     view: depth, intensity or frames; None: the first of them that there is. frames_per_picture: frames summed for one
-    picture of view frames. pictures_per_s: of a film.
+    picture of view frames, None: FRAMES_PER_PICTURE. pictures_per_s: of a film, None: FILMS_PER_S.
     """
 
     view: str | None = None
-    frames_per_picture: int = FRAMES_PER_PICTURE
-    pictures_per_s: float = FILMS_PER_S
+    frames_per_picture: int | None = None
+    pictures_per_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +102,7 @@ class _Export:
 
     def __init__(self, run: Path, folder: RunFolder, options: ExportOptions, progress: Progress | None) -> None:
         self._run, self._folder, self._options, self._progress = run, folder, options, progress
+        self._frames_per_picture = options.frames_per_picture or FRAMES_PER_PICTURE
         self._maps = MapFiles(run)
         self.log: FrameLog | None = None
         self.n_maps = self.n_frames = 0
@@ -142,7 +143,7 @@ class _Export:
         """A film."""
         view = self._view()
         film = self._folder.place(f"{view}.mp4")
-        self._count(view, pictures.write_mp4(self._pictures(view), film, self._options.pictures_per_s))
+        self._count(view, pictures.write_mp4(self._pictures(view), film, self._options.pictures_per_s or FILMS_PER_S))
 
     @property
     def _recorded(self) -> bool:
@@ -184,21 +185,23 @@ class _Export:
         if view is None or not there[view]:
             what = f"no {view}" if view else "nothing to show"
             raise UsageError(f"{self._run} holds {what}; {_NO_MAPS.format(run=self._run)}")
+        if self._options.frames_per_picture and view != "frames":
+            raise UsageError(f"pictures of {view} sum no frames; add --view frames, or leave --frames out")
         return view
 
     def _pictures(self, view: View) -> Iterator[Picture]:
         if view == "frames":
-            return pictures.frame_pictures(self._blocks(), self._options.frames_per_picture)
+            return pictures.frame_pictures(self._blocks(), self._frames_per_picture)
         return pictures.map_pictures(self._maps, view)
 
     def _count(self, view: View, n: int) -> None:
         if view != "frames":
             self.n_maps = n
             return
-        self.n_frames = n * self._options.frames_per_picture
+        self.n_frames = n * self._frames_per_picture
         if n == 0:
             raise UsageError(
-                f"{self._run} holds fewer than {self._options.frames_per_picture} frames, one picture's; lower --frames"
+                f"{self._run} holds fewer than {self._frames_per_picture} frames, one picture's; lower --frames"
             )
 
 
@@ -212,10 +215,17 @@ def _check(run: Path, kind: str, options: ExportOptions) -> None:
         problems.append(f"view {options.view!r} is unknown; choose one of {', '.join(VIEWS)}")
     elif options.view is not None and kind in EXPORT_KINDS and kind not in PICTURE_KINDS:
         problems.append(f"view {options.view!r} is of pictures, {kind} has none; export png or mp4, or leave it out")
-    if options.frames_per_picture < 1:
-        problems.append(f"{options.frames_per_picture} frames make no picture; sum at least 1")
-    if not 0 < options.pictures_per_s <= 1000:
-        problems.append(f"a film of {options.pictures_per_s:g} pictures a second; choose 1000 or less, above 0")
+    summed, per_s = options.frames_per_picture, options.pictures_per_s
+    if summed is not None and kind in EXPORT_KINDS and kind not in PICTURE_KINDS:
+        problems.append(
+            f"--frames {summed} are summed for pictures, {kind} has none; export png or mp4, or leave it out"
+        )
+    elif summed is not None and summed < 1:
+        problems.append(f"{summed} frames make no picture; sum at least 1")
+    if per_s is not None and kind in EXPORT_KINDS and kind != "mp4":
+        problems.append(f"--fps {per_s:g} is of a film, {kind} is none; export mp4, or leave it out")
+    elif per_s is not None and not 0 < per_s <= 1000:
+        problems.append(f"a film of {per_s:g} pictures a second; choose 1000 or less, above 0")
     if problems:
         raise UsageError.of(problems)
     if kind == "hdf5":

@@ -1,10 +1,10 @@
-"""Numbers that people read have no powers of ten, however large or small."""
+"""Numbers that people read have no powers of ten, however large or small; but for condition numbers."""
 
 from math import inf, nan
 
 import pytest
 
-from calibration.digits import digits, in_mm, mm
+from calibration.digits import condition_text, digits, in_mm, mm
 
 
 @pytest.mark.parametrize(
@@ -19,3 +19,13 @@ def test_lengths_are_no_powers_of_ten(length_m: float, said: str) -> None:
 
 def test_as_many_digits_as_are_asked_for_count() -> None:
     assert [digits(1234.5, count) for count in (1, 2, 3)] == ["1000", "1200", "1230"]
+
+
+def test_a_condition_number_is_a_power_of_ten() -> None:
+    assert [condition_text(value) for value in (1.0, 3.14e7, 2e18, inf, nan)] == [
+        "1.0e+00",
+        "3.1e+07",
+        "2.0e+18",
+        "inf",
+        "inf",
+    ]

@@ -13,6 +13,7 @@ from drivers.errors import DeviceDisconnected, DeviceFault, DeviceTimeout, Proto
 from drivers.interfaces import BurstMode
 from rig.counting import SweepCounter, SweepLayout
 from rig.errors import DevicesError
+from rig.pipeline import Pipeline
 from rig.row_threads import RowWorkers
 from rig.sweeps import SweepAssembler
 from tests.unit.rig.fakes import PATIENCE_S, START, STOP, acquisition, fake_rig
@@ -87,6 +88,21 @@ def test_a_device_that_fails_to_start_leaves_all_of_them_safe(verb):
     with pytest.raises(DeviceFault, match="broken"):
         list(acquisition(rig, PLAN, 1).run())
     assert log == [*START[: START.index(f"{device}.{name}") + 1], *STOP]
+
+
+def test_the_gate_goes_low_before_anything_else_ends(monkeypatch):
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
+    end = Pipeline.end_source
+
+    def told(pipeline, why=None):
+        log.append("frames")
+        end(pipeline, why)
+
+    monkeypatch.setattr(Pipeline, "end_source", told)
+    run = acquisition(rig, PLAN, 5).run()
+    next(run)
+    run.close()
+    assert log == [*START, STOP[0], "frames", *STOP[1:]]
 
 
 def test_a_step_that_fails_does_not_keep_the_others_from_running():

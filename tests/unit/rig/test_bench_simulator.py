@@ -33,7 +33,6 @@ def test_every_row_has_its_figures_and_is_compared_with_numpy(capsys: pytest.Cap
         assert row["times_real_time"] == pytest.approx(row["frames_per_s"] / 1e5)
         slow = rows[f"simulator-numpy-{name.rpartition('-')[2]}"]["frames_per_s"]
         assert row["times_numpy"] == pytest.approx(row["frames_per_s"] / slow)
-    assert rows["simulator-ready"]["times_numpy"] > 3
     simulator_table(report)
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 100
