@@ -1,8 +1,9 @@
 """Compiled: how probably an answer of `joint` lies within a pixel of a stripe, from three things that can be wrong.
 
-    confidence = erf(1 / (sqrt 2 WIDER sd))                               the stripe is farther off than it should be
-               / (1 + exp(A - B margin + G apart))                        another position is the right one
-               / (1 + exp(C - D ln contrast' + hole + g (E - F ln odds))) there is no stripe: haze ends, nothing shines
+    confidence = erf(1 / (sqrt 2 WIDER sd))                    the stripe is farther off than it should be
+               / (1 + exp(A - B margin + G apart))             another position is the right one
+               / (1 + exp(C - D ln contrast' + hole            there is no stripe: haze ends, nothing shines
+                          + g (E - F ln odds) + (1 - g)^2 H missing))
 
 margin: by how much the next best place is worse, or what neighbours say for it where there was a vote, over UNITS of
 cost. apart: share of the pairs of opposite neighbours that put the answer elsewhere (`joint_agreement`). contrast' =
@@ -12,10 +13,16 @@ pass for light. hole: by how much contrast is below -6, 30 at most. odds: of ans
 not. They count as far as there is haze, g = k / (k + SOME_HAZE), k photons of it in all exposures: in clear air nothing
 but a stripe makes a margin, and small things, whose surroundings do not agree, are as sure as others.
 
+missing: max(ln((1 + usual) / (1 + light)) - EVEN_DARK - CLEARLY max(contrast, 0), 0), both photons of all that contrast
+sums, usual those of the brightest amplitude: where a dark stripe would still shine, no light is no stripe, which light
+over its noise cannot tell. It counts in clear air, and at the far end of the depth range, where haze that goes on ends
+for want of places, and so evenly that answers agree: there odds make none surer.
+
 A and G are chosen, on random scenes 50 to 57 of the tests' simulator beside the five prepared ones: fitted (1.9 and
 1.5, B 0.66) they believe stripes too little where there is no doubt about haze. The others are fitted (maximum
 likelihood) to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, all answers counted, also
-those where there is no stripe.
+those where there is no stripe; H and EVEN_DARK, then, to scenes 120 to 160 with and without gaps that are open to the
+sky, the amplitude that they ask for and CLEARLY chosen among a few so that no dark thing beside bright ones is lost.
 """
 
 import math
@@ -32,7 +39,7 @@ from rig.estimators.placing_kernels import LIGHT_PX, Places
 from rig.estimators.placing_pools import COPIED_ROWS, MARGIN, with_margin
 from rig.lane_memory import copy_floats, load_float32, store_float32
 from rig.lane_powers import error_function, exponential, logarithm
-from rig.lanes import LANES, larger_float, smaller_float, square_root, zero_float32
+from rig.lanes import LANES, larger_float, smaller_float, square_root, where_small, zero_float32
 
 Float32 = NDArray[np.float32]
 
@@ -45,6 +52,13 @@ C: Final = -1.539
 D: Final = 1.569
 E: Final = 5.871
 F: Final = 2.585
+H: Final = 4.0
+EVEN_DARK: Final = 2.0
+"""Natural logarithm of how much less light than the usual even a dark stripe may bring."""
+CLEARLY: Final = 1.2
+"""The same for every standard deviation by which there is light at all."""
+AT_END_PX: Final = 1.5
+"""Answers no farther from the far end of the depth range may be the end of the range."""
 SOME_HAZE: Final = 0.05
 """Photons of haze per pixel, over all exposures, from which on its end can be taken for a stripe."""
 FAR_BELOW: Final = 6.0
@@ -55,8 +69,10 @@ _HALF_PX: Final = LIGHT_PX + 0.5
 _LEAST_ODDS: Final = 1e-3
 _MOST_AGREE: Final = 1.02
 """Odds of agreement stay between 0.001 and 50."""
-_PAIRS, _LIT, _LIGHT_SUM, _SD, _SCALE, _LIGHT, _HAZE, _REST, _MARGIN, _FRAMES, _ALL, _APART, _CONFIDENCE = range(13)
-_LINES: Final = 13
+(
+    _PAIRS, _LIT, _LIGHT_SUM, _SD, _SCALE, _LIGHT, _HAZE, _REST, _MARGIN, _FRAMES, _ALL, _APART, _OFF, _CONFIDENCE
+) = range(14)  # fmt: skip
+_LINES: Final = 14
 
 
 class Brightness(NamedTuple):
@@ -114,6 +130,7 @@ def confidences(
             here = (y - band + MARGIN) * wide + LANES
             light_row(around, wide, here, at + 4 * _LIT * width, width)
             apart_row(signed_address(placed), wide, here, at + 4 * _APART * width)
+            copy_floats(around[0] + 4 * here, at + 4 * _OFF * width, columns)
             for source, line in sources:
                 copy_floats(source + 4 * columns * y, at + 4 * line * width, columns)
             for c in range(columns):
@@ -145,7 +162,12 @@ def _judge(at: int, width: int, bright: Brightness) -> None:
         agree = load_float32(at, _PAIRS * width + c) / pairs
         agree = logarithm(agree / (none + _MOST_AGREE - agree) + _LEAST_ODDS)
         haze = load_float32(at, _FRAMES * width + c) * _ending(at, width, c)
-        dark = exponential(none + C - shines * D + hole + haze / (haze + SOME_HAZE) * (none + E - agree * F))
+        hazy, strange = haze / (haze + SOME_HAZE), none + E - agree * F
+        inside = one - where_small(one, load_float32(at, _OFF * width + c), AT_END_PX)
+        clear = one - hazy * inside
+        missing = _missing(at, width, c, contrast, bright.brightest) * clear * clear
+        strange = larger_float(strange, strange * inside)
+        dark = exponential(none + C - shines * D + hole + hazy * strange + missing * H)
         margin = load_float32(at, _MARGIN * width + c)
         apart = load_float32(at, _APART * width + c)
         rival = exponential(none + A - margin * (B / UNITS) + apart * (G / ASKED))
@@ -159,6 +181,17 @@ def _ending(at, width, c):  # type: ignore[no-untyped-def]
     """Haze that ends at a stripe: what is before it less what is behind."""
     ends = load_float32(at, _HAZE * width + c) - load_float32(at, _REST * width + c)
     return larger_float(ends, zero_float32())
+
+
+@numba.njit(forceinline=True)
+def _missing(at, width, c, contrast, brightest):  # type: ignore[no-untyped-def]
+    """Light that there is less of than a stripe would bring, as a logarithm; 0 where there may be enough."""
+    one, none = zero_float32() + 1.0, zero_float32()
+    exposures, number = load_float32(at, _FRAMES * width + c), larger_float(load_float32(at, _LIT * width + c), one)
+    light = load_float32(at, _LIGHT_SUM * width + c) - _ending(at, width, c) * _HALF_PX * number
+    usual = load_float32(at, _SCALE * width + c) * brightest * number
+    less = logarithm((usual * exposures + one) / (larger_float(light, none) * exposures + one))
+    return larger_float(less - EVEN_DARK - larger_float(contrast, none) * CLEARLY, none)
 
 
 @numba.njit(forceinline=True)

@@ -27,12 +27,12 @@ ONE, TWO, THREE = RowWorkers(1), RowWorkers(2), RowWorkers(3)
 BRIGHT = Brightness(0.1, 10.0, 0.005)
 
 
-def judged(distance, *, light=0.7, haze=0.1, exposures=3, margin=10.0, sd=0.1, workers=ONE, searched=True):
+def judged(distance, *, light=0.7, haze=0.1, scale=1.0, exposures=3, margin=10.0, sd=0.1, workers=ONE, searched=True):
     """The table of answers at `distance` (rows, columns) from the far end, all of one light and margin."""
     rows, columns = distance.shape
     answer, places = new_answer(rows, columns), new_places(rows, columns)
     answer.margin[:] = round(margin * UNITS)
-    places.distance[:], places.light[:], places.scale[:], places.haze[:] = distance, light, 1.0, haze
+    places.distance[:], places.light[:], places.scale[:], places.haze[:] = distance, light, scale, haze
     places.placed[:] = distance
     x_px = np.where(np.isnan(distance), np.nan, 100.0).astype(np.float32)
     frames = np.broadcast_to(np.asarray(exposures, np.int32), columns).copy()
@@ -114,6 +114,29 @@ def test_haze_that_only_ends_is_no_stripe():
     ends = judged(wall(), light=2.5 * haze, haze=haze, exposures=10).confidence
     shines = judged(wall(), light=2.5 * haze + 0.5, haze=haze, exposures=10).confidence
     assert ends.max() < shines.min()
+
+
+def test_no_light_in_clear_air_is_no_stripe_where_stripes_bring_much():
+    """Brightest amplitude 10: at 10 exposures stripes bring hundreds of photons to nine answers, at one far fewer."""
+    clear = {"haze": 0.0, "margin": 10.0}
+    assert judged(wall(), light=0.0, exposures=10, **clear).confidence.max() < 0.1
+    assert judged(wall(), light=0.3, exposures=10, **clear).confidence.min() > 0.95
+    dim = judged(wall(), light=0.0, scale=0.01, exposures=1, **clear).confidence
+    assert dim.min() > 0.8, "no photon is what most stripes bring there"
+
+
+def test_a_dark_thing_beside_bright_ones_is_believed_in_clear_air():
+    """Three photons an answer stand out by themselves, though others bring hundreds of times as many."""
+    assert judged(wall(), light=0.3, scale=10.0, exposures=10, haze=0.0).confidence.min() > 0.9
+
+
+def test_haze_that_reaches_the_far_end_of_the_range_is_no_stripe():
+    settings = {"light": 0.0, "haze": 0.1, "exposures": 10}
+    inside = judged(wall(), **settings).confidence
+    at_end = judged(np.zeros((ROWS, COLUMNS), np.float32), **settings).confidence
+    assert at_end.max() < 0.3 < inside.min()
+    shines = judged(np.zeros((ROWS, COLUMNS), np.float32), **{**settings, "light": 3.0}).confidence
+    assert shines.min() > 0.9
 
 
 def test_no_agreement_around_makes_up_for_a_hole_where_light_should_be():
