@@ -3,7 +3,7 @@
     confidence = erf(1 / (sqrt 2 WIDER sd))                    the stripe is farther off than it should be
                / (1 + exp(A - B margin + G apart))             another position is the right one
                / (1 + exp(C - D ln contrast' + hole            there is no stripe: haze ends, nothing shines
-                          + g (E - F ln odds) + (1 - g)^2 H missing))
+                          + g (E - F ln odds) + H ((1 - g)^2 missing + e none)))
 
 margin: by how much the next best place is worse, or what neighbours say for it where there was a vote, over UNITS of
 cost. apart: share of the pairs of opposite neighbours that put the answer elsewhere (`joint_agreement`). contrast' =
@@ -13,16 +13,18 @@ pass for light. hole: by how much contrast is below -6, 30 at most. odds: of ans
 not. They count as far as there is haze, g = k / (k + SOME_HAZE), k photons of it in all exposures: in clear air nothing
 but a stripe makes a margin, and small things, whose surroundings do not agree, are as sure as others.
 
-missing: max(ln((1 + usual) / (1 + light)) - EVEN_DARK - CLEARLY max(contrast, 0), 0), both photons of all that contrast
-sums, usual those of the brightest amplitude: where a dark stripe would still shine, no light is no stripe, which light
-over its noise cannot tell. It counts in clear air, and at the far end of the depth range, where haze that goes on ends
-for want of places, and so evenly that answers agree: there odds make none surer.
+missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), light: photons of all that contrast
+sums, bright: what the model's largest amplitude would bring. Where a dark stripe would still shine, no light is no
+stripe, which light over its noise cannot tell. none: max(AT_END - CLEARLY max(contrast, 0), 0), with e = 1 up to 1 px
+from the far end of the depth range and 0 from 3 px on: haze that goes on ends there for want of places, so evenly that
+answers agree; a stripe so far away has to shine by itself.
 
 A and G are chosen, on random scenes 50 to 57 of the tests' simulator beside the five prepared ones: fitted (1.9 and
 1.5, B 0.66) they believe stripes too little where there is no doubt about haze. The others are fitted (maximum
 likelihood) to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, all answers counted, also
-those where there is no stripe; H and EVEN_DARK, then, to scenes 120 to 160 with and without gaps that are open to the
-sky, the amplitude that they ask for and CLEARLY chosen among a few so that no dark thing beside bright ones is lost.
+those where there is no stripe. H, DARKER, CLEARLY and AT_END are of a few that were tried: by the likelihood of random
+scenes 120 to 160 of the tests' simulator, most of them open to the sky in part (`tests.reference.open_scenes`); larger
+ones took too much from dim stripes of the prepared scenes in clear air, or lost what is dark beside what is bright.
 """
 
 import math
@@ -39,7 +41,7 @@ from rig.estimators.placing_kernels import LIGHT_PX, Places
 from rig.estimators.placing_pools import COPIED_ROWS, MARGIN, with_margin
 from rig.lane_memory import copy_floats, load_float32, store_float32
 from rig.lane_powers import error_function, exponential, logarithm
-from rig.lanes import LANES, larger_float, smaller_float, square_root, where_small, zero_float32
+from rig.lanes import LANES, larger_float, smaller_float, square_root, zero_float32
 
 Float32 = NDArray[np.float32]
 
@@ -53,12 +55,13 @@ D: Final = 1.569
 E: Final = 5.871
 F: Final = 2.585
 H: Final = 4.0
-EVEN_DARK: Final = 2.0
-"""Natural logarithm of how much less light than the usual even a dark stripe may bring."""
+DARKER: Final = 2.0
+"""Natural logarithm of how much less light than a bright stripe a dark one may bring."""
 CLEARLY: Final = 1.2
-"""The same for every standard deviation by which there is light at all."""
-AT_END_PX: Final = 1.5
-"""Answers no farther from the far end of the depth range may be the end of the range."""
+"""What a standard deviation of light above its noise makes up for."""
+AT_END: Final = 3.0
+"""`none` of an answer at the far end without any light."""
+NEAR_END_PX: Final = 1.0, 3.0
 SOME_HAZE: Final = 0.05
 """Photons of haze per pixel, over all exposures, from which on its end can be taken for a stripe."""
 FAR_BELOW: Final = 6.0
@@ -162,12 +165,9 @@ def _judge(at: int, width: int, bright: Brightness) -> None:
         agree = load_float32(at, _PAIRS * width + c) / pairs
         agree = logarithm(agree / (none + _MOST_AGREE - agree) + _LEAST_ODDS)
         haze = load_float32(at, _FRAMES * width + c) * _ending(at, width, c)
-        hazy, strange = haze / (haze + SOME_HAZE), none + E - agree * F
-        inside = one - where_small(one, load_float32(at, _OFF * width + c), AT_END_PX)
-        clear = one - hazy * inside
-        missing = _missing(at, width, c, contrast, bright.brightest) * clear * clear
-        strange = larger_float(strange, strange * inside)
-        dark = exponential(none + C - shines * D + hole + hazy * strange + missing * H)
+        hazy = haze / (haze + SOME_HAZE)
+        unlit = _unlit(at, width, c, larger_float(contrast, none) * CLEARLY, one - hazy, bright.brightest)
+        dark = exponential(none + C - shines * D + hole + hazy * (none + E - agree * F) + unlit * H)
         margin = load_float32(at, _MARGIN * width + c)
         apart = load_float32(at, _APART * width + c)
         rival = exponential(none + A - margin * (B / UNITS) + apart * (G / ASKED))
@@ -184,14 +184,18 @@ def _ending(at, width, c):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(forceinline=True)
-def _missing(at, width, c, contrast, brightest):  # type: ignore[no-untyped-def]
-    """Light that there is less of than a stripe would bring, as a logarithm; 0 where there may be enough."""
+def _unlit(at, width, c, shines, clear, brightest):  # type: ignore[no-untyped-def]
+    """Light that a stripe would bring and that is not there: in clear air, and at the far end of the depth range."""
     one, none = zero_float32() + 1.0, zero_float32()
     exposures, number = load_float32(at, _FRAMES * width + c), larger_float(load_float32(at, _LIT * width + c), one)
     light = load_float32(at, _LIGHT_SUM * width + c) - _ending(at, width, c) * _HALF_PX * number
-    usual = load_float32(at, _SCALE * width + c) * brightest * number
-    less = logarithm((usual * exposures + one) / (larger_float(light, none) * exposures + one))
-    return larger_float(less - EVEN_DARK - larger_float(contrast, none) * CLEARLY, none)
+    most = load_float32(at, _SCALE * width + c) * brightest * number
+    less = logarithm((most * exposures + one) / (larger_float(light, none) * exposures + one))
+    missing = larger_float(less - DARKER - shines, none)
+    off = load_float32(at, _OFF * width + c)
+    first, last = NEAR_END_PX
+    at_end = smaller_float(larger_float((larger_float(off, none - off) - last) * (1.0 / (first - last)), none), one)
+    return clear * clear * missing + at_end * larger_float(none + AT_END - shines, none)
 
 
 @numba.njit(forceinline=True)

@@ -42,7 +42,7 @@ def random_scene(number: int, height: int = 512, width: int = 512) -> Scene:
 def _background(rng: np.random.Generator, x: Array, y: Array) -> Array:
     u, v = ((a - (n - 1) / 2) / FOCAL_PX for a, n in ((x, x.shape[1]), (y, x.shape[0])))
     inverse = 1 / rng.uniform(3.5, 6.0) * (1 + rng.uniform(-0.5, 0.5) * u + rng.uniform(-0.3, 0.3) * v)
-    depth = 1 / np.clip(inverse, 1 / FARTHEST_M, 1) * (1 + rng.uniform(0, 0.03) * _noise(rng, x.shape, 64))
+    depth = 1 / np.clip(inverse, 1 / FARTHEST_M, 1) * (1 + rng.uniform(0, 0.03) * noise(rng, x.shape, 64))
     if rng.random() < 0.6:
         down = np.maximum(v, 1e-6)
         depth = np.minimum(depth, np.where(v > 0, rng.uniform(0.6, 1.4) / down, np.inf))
@@ -72,11 +72,12 @@ def _object(rng: np.random.Generator, x: Array, y: Array) -> tuple[NDArray[np.bo
 
 
 def _texture(rng: np.random.Generator, tone: float, contrast: float, shape: tuple[int, ...]) -> Array:
-    parts = sum(share * _noise(rng, shape, cell) for share, cell in ((0.6, 48), (0.5, 12), (0.3, 4)))
+    parts = sum(share * noise(rng, shape, cell) for share, cell in ((0.6, 48), (0.5, 12), (0.3, 4)))
     return np.asarray(np.exp(tone + contrast * parts))
 
 
-def _noise(rng: np.random.Generator, shape: tuple[int, ...], cell_px: int) -> Array:
+def noise(rng: np.random.Generator, shape: tuple[int, ...], cell_px: int) -> Array:
+    """Smooth normal noise (height, width) of so many pixels a cell."""
     height, width = shape
     coarse = rng.standard_normal((height // cell_px + 2, width // cell_px + 2)).astype(np.float32)
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).astype(np.float64)

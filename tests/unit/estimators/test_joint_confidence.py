@@ -15,7 +15,7 @@ from rig.estimators.joint_agreement import (
     pairs_to_ask,
 )
 from rig.estimators.joint_answer import stripe_table
-from rig.estimators.joint_confidence import Brightness
+from rig.estimators.joint_confidence import SOME_HAZE, Brightness
 from rig.estimators.label_volume_buffers import signed_address
 from rig.estimators.placing import new_places
 from rig.estimators.placing_pools import SAME_PX
@@ -116,13 +116,29 @@ def test_haze_that_only_ends_is_no_stripe():
     assert ends.max() < shines.min()
 
 
+CLEAR = {"haze": 0.0, "margin": 10.0}
+
+
 def test_no_light_in_clear_air_is_no_stripe_where_stripes_bring_much():
-    """Brightest amplitude 10: at 10 exposures stripes bring hundreds of photons to nine answers, at one far fewer."""
-    clear = {"haze": 0.0, "margin": 10.0}
-    assert judged(wall(), light=0.0, exposures=10, **clear).confidence.max() < 0.1
-    assert judged(wall(), light=0.3, exposures=10, **clear).confidence.min() > 0.95
-    dim = judged(wall(), light=0.0, scale=0.01, exposures=1, **clear).confidence
-    assert dim.min() > 0.8, "no photon is what most stripes bring there"
+    """Brightest amplitude 10: at 10 exposures bright stripes bring 900 photons to nine answers."""
+    assert judged(wall(), light=0.0, exposures=10, **CLEAR).confidence.max() < 0.1
+    assert judged(wall(), light=0.3, exposures=10, **CLEAR).confidence.min() > 0.95
+
+
+def test_no_light_says_nothing_where_bright_stripes_bring_hardly_any():
+    """0.9 photons to nine answers at one exposure: four of ten such stripes send none. At 100 exposures, all do."""
+    dim = {"light": 0.0, "scale": 0.01, **CLEAR}
+    assert judged(wall(), exposures=1, **dim).confidence.min() > 0.8
+    assert judged(wall(), exposures=100, **dim).confidence[1:-1, 1:-1].max() < 0.1
+
+
+def test_missing_light_counts_by_the_square_of_how_clear_the_air_is():
+    """With so much haze that odds have half their weight, a quarter of it is left; odds tell the rest."""
+    seen = {"light": 0.0, "margin": 10.0, "exposures": 1, "scale": 0.5}
+    alone, hazy = (judged(wall(), haze=haze, **seen).confidence[3:-3, 3:-3] for haze in (0.0, SOME_HAZE))
+    assert alone.max() < 0.05
+    assert hazy.min() > 0.7
+    assert judged(scattered(), haze=SOME_HAZE, **seen).confidence.mean() < 0.2
 
 
 def test_a_dark_thing_beside_bright_ones_is_believed_in_clear_air():
@@ -130,13 +146,20 @@ def test_a_dark_thing_beside_bright_ones_is_believed_in_clear_air():
     assert judged(wall(), light=0.3, scale=10.0, exposures=10, haze=0.0).confidence.min() > 0.9
 
 
-def test_haze_that_reaches_the_far_end_of_the_range_is_no_stripe():
-    settings = {"light": 0.0, "haze": 0.1, "exposures": 10}
-    inside = judged(wall(), **settings).confidence
-    at_end = judged(np.zeros((ROWS, COLUMNS), np.float32), **settings).confidence
-    assert at_end.max() < 0.3 < inside.min()
-    shines = judged(np.zeros((ROWS, COLUMNS), np.float32), **{**settings, "light": 3.0}).confidence
-    assert shines.min() > 0.9
+@pytest.mark.parametrize("side", [-1, 1])
+def test_haze_that_reaches_the_far_end_of_the_range_is_no_stripe(side):
+    """However many answers agree, and where bright stripes would bring hardly any light either."""
+    seen = {"light": 0.0, "haze": 0.1, "exposures": 10, "scale": 1e-3}
+
+    def at(distance_px, **other):
+        return judged(np.full((ROWS, COLUMNS), side * distance_px, np.float32), **seen | other).confidence
+
+    sure = [at(distance_px).min() for distance_px in (0.0, 1.0, 1.75, 2.5, 3.0, 20.0)]
+    assert at(0.0).max() < 0.1
+    assert sure[0] == sure[1] < sure[2] < sure[3] < sure[4]
+    assert sure[4] == pytest.approx(sure[5])
+    assert sure[5] > 0.9
+    assert at(0.0, light=3.0).min() > 0.9
 
 
 def test_no_agreement_around_makes_up_for_a_hole_where_light_should_be():
