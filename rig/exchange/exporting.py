@@ -186,7 +186,7 @@ class _Export:
             what = f"no {view}" if view else "nothing to show"
             raise UsageError(f"{self._run} holds {what}; {_NO_MAPS.format(run=self._run)}")
         if self._options.frames_per_picture and view != "frames":
-            raise UsageError(f"pictures of {view} sum no frames; add --view frames, or leave --frames out")
+            raise UsageError(f"pictures of {view} sum no frames; name --view frames, or leave --frames out")
         return view
 
     def _pictures(self, view: View) -> Iterator[Picture]:

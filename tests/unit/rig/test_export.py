@@ -250,7 +250,7 @@ def test_runs_of_two_sizes_make_no_array(tmp_path: Path) -> None:
         ("png", {"frames_per_picture": 0}, "at least 1"),
         ("png", {"pictures_per_s": 5.0}, "png is none; export mp4"),
         ("ply", {"frames_per_picture": 5}, "ply has none; export png or mp4"),
-        ("png", {"frames_per_picture": 5}, "depth sum no frames; add --view frames"),
+        ("png", {"frames_per_picture": 5}, "depth sum no frames; name --view frames"),
     ],
 )
 def test_what_a_run_has_not_is_refused(mapped: Path, kind: str, options: dict[str, Any], why: str) -> None:
