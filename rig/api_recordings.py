@@ -106,8 +106,8 @@ def export_run(
     """Write a run for other programs (`rig export`): npy, hdf5, ply, png or mp4, to `out` or to RUN-KIND beside it.
 
     view: what png and mp4 show, depth, intensity or frames; None: the first of them that there is. frames_per_picture:
-    summed where frames are shown, None: 100. pictures_per_s: of a film, None: 25. progress: called with frames done and all. Raises
-    UsageError where there is nothing of that kind.
+    summed where frames are shown, None: 100. pictures_per_s: of a film, None: 25. progress: called with frames done and
+    all. Raises UsageError where there is nothing of that kind.
     """
     from rig.exchange.exporting import ExportOptions
     from rig.exchange.exporting import export_run as write
