@@ -88,7 +88,12 @@ def judge_refusal(
     own = reason_for(code, str(refused))
     if refused.reason in _SEEN_AT_ONCE:  # but for room light, which hides boards, nothing goes before it
         return Verdict(False, (*[reason for reason in lacking if reason.code == "room-light"], own))
-    return Verdict(False, (*lacking, *([] if code in [reason.code for reason in lacking] else [own])))
+    if code not in [reason.code for reason in lacking]:
+        # That boards are parallel a fit sees better than rough poses do; of other refusals it can only guess the cause.
+        narrow = [reason.code == "poor-coverage" for reason in lacking]
+        seen = refused.reason == "coplanar" and any(narrow)
+        lacking.insert(narrow.index(True) if seen else len(lacking), own)
+    return Verdict(False, tuple(lacking))
 
 
 _REFUSED_FOR = {"one-pose": "too-few-poses", "coplanar": "no-tilt"}

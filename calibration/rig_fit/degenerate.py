@@ -67,10 +67,10 @@ def check_poses(points_m: Array, poses: Sequence[BoardPose]) -> None:
 
 
 def reason_of(poses: Sequence[BoardPose]) -> str:
-    """The likeliest reason why boards at these poses fix too little."""
+    """The likeliest reason why boards at these poses fix too little: a guess, where `coplanar` is seen."""
     normals = np.array([pose.matrix[:, 2] for pose in poses])
     tilt = float(np.arccos(np.clip(normals @ normals.T, -1, 1).min()))
-    return "no-tilt" if tilt < LEAST_TILT_RAD else "too-few-poses" if len(poses) < 6 else "coplanar"
+    return "too-few-poses" if tilt >= LEAST_TILT_RAD and len(poses) < 6 else "no-tilt"
 
 
 def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:

@@ -129,7 +129,7 @@ def scaled_inverse(matrix: Array) -> tuple[Array, float]:
     weight = np.diag(matrix)
     if not np.all(np.isfinite(matrix)) or np.any(weight <= 0):
         raise Degenerate(
-            "coplanar",
+            "no-tilt",
             "some parameters of the rig change nothing that is seen (condition number inf); show the board at more "
             "poses, tilted differently",
         )
@@ -138,7 +138,7 @@ def scaled_inverse(matrix: Array) -> tuple[Array, float]:
     condition = float(values[-1] / values[0]) if values[0] > 0 else np.inf
     if condition > MOST_CONDITION:
         raise Degenerate(
-            "coplanar",
+            "no-tilt",
             f"views do not fix all parameters of the rig: condition number {condition_text(condition)}, limit "
             f"{condition_text(MOST_CONDITION)}; show the board at more poses, at other distances and tilted "
             "differently",

@@ -126,6 +126,19 @@ def test_a_refusal_names_the_cause(reason: str, room_flux: float, code: str) -> 
     assert verdict.codes[0] == code
 
 
+@pytest.mark.parametrize(
+    ("reason", "codes"), [("coplanar", ("no-tilt", "poor-coverage")), ("no-tilt", ("poor-coverage", "no-tilt"))]
+)
+def test_boards_seen_to_be_parallel_come_before_what_they_leave_of_the_picture(
+    reason: str, codes: tuple[str, ...]
+) -> None:
+    """Rough poses may have them tilted; a guess of the fit comes last."""
+    verdict = judge_refusal(Degenerate(reason, "in one plane"), replace(VIEWS, coverage=0.15))
+    assert verdict.codes == codes
+    dark = judge_refusal(Degenerate(reason, "in one plane"), replace(VIEWS, coverage=0.15, room_flux=7.0))
+    assert dark.codes == ("room-light", *codes)
+
+
 def test_views_that_cannot_be_used_do_not_count_as_poses() -> None:
     (reason,) = judge(replace(VIEWS, shown=8, used=4), FIT, ASKED).reasons
     assert str(reason).startswith("too-few-poses: 8 poses were shown, 4 of them could be used, 6 are the fewest")
