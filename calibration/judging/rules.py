@@ -88,11 +88,11 @@ def judge_refusal(
     own = reason_for(code, str(refused))
     if refused.reason in _SEEN_AT_ONCE:  # but for room light, which hides boards, nothing goes before it
         return Verdict(False, (*[reason for reason in lacking if reason.code == "room-light"], own))
-    if code not in [reason.code for reason in lacking]:
+    codes = [reason.code for reason in lacking]
+    if code not in codes:
         # That boards are parallel a fit sees better than rough poses do; of other refusals it can only guess the cause.
-        narrow = [reason.code == "poor-coverage" for reason in lacking]
-        seen = refused.reason == "coplanar" and any(narrow)
-        lacking.insert(narrow.index(True) if seen else len(lacking), own)
+        seen = refused.reason == "coplanar" and "poor-coverage" in codes
+        lacking.insert(codes.index("poor-coverage") if seen else len(codes), own)
     return Verdict(False, tuple(lacking))
 
 

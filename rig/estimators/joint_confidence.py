@@ -3,7 +3,7 @@
     confidence = erf(1 / (sqrt 2 WIDER sd))                    the stripe is farther off than it should be
                / (1 + exp(A - B margin + G apart))             another position is the right one
                / (1 + exp(C - D ln contrast' + hole            there is no stripe: haze ends, nothing shines
-                          + g (E - F ln odds) + H ((1 - g)^2 missing + e none)))
+                          + g (E - F ln odds) + H ((1 - g)^2 missing + e unseen)))
 
 margin: by how much the next best place is worse, or what neighbours say for it where there was a vote, over UNITS of
 cost. apart: share of the pairs of opposite neighbours that put the answer elsewhere (`joint_agreement`). contrast' =
@@ -15,7 +15,7 @@ but a stripe makes a margin, and small things, whose surroundings do not agree, 
 
 missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), light: photons of all that contrast
 sums, bright: what the model's largest amplitude would bring. Where a dark stripe would still shine, no light is no
-stripe, which light over its noise cannot tell. none: max(AT_END - CLEARLY max(contrast, 0), 0), with e = 1 up to 1 px
+stripe, which light over its noise cannot tell. unseen: max(AT_END - CLEARLY max(contrast, 0), 0), with e = 1 up to 1 px
 from the far end of the depth range and 0 from 3 px on: haze that goes on ends there for want of places, so evenly that
 answers agree; a stripe so far away has to shine by itself.
 
@@ -60,7 +60,7 @@ DARKER: Final = 2.0
 CLEARLY: Final = 1.2
 """What a standard deviation of light above its noise makes up for."""
 AT_END: Final = 3.0
-"""`none` of an answer at the far end without any light."""
+"""`unseen` of an answer without any light."""
 NEAR_END_PX: Final = 1.0, 3.0
 SOME_HAZE: Final = 0.05
 """Photons of haze per pixel, over all exposures, from which on its end can be taken for a stripe."""
@@ -184,12 +184,23 @@ def _ending(at, width, c):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(forceinline=True)
+def _number(at, width, c):  # type: ignore[no-untyped-def]
+    """Of 3 x 3 answers on the surface, this one counted."""
+    return larger_float(load_float32(at, _LIT * width + c), zero_float32() + 1.0)
+
+
+@numba.njit(forceinline=True)
+def _above_haze(at, width, c):  # type: ignore[no-untyped-def]
+    """Light of these answers, photons per exposure, less the whole haze before them."""
+    return load_float32(at, _LIGHT_SUM * width + c) - _ending(at, width, c) * _HALF_PX * _number(at, width, c)
+
+
+@numba.njit(forceinline=True)
 def _unlit(at, width, c, shines, clear, brightest):  # type: ignore[no-untyped-def]
     """Light that a stripe would bring and that is not there: in clear air, and at the far end of the depth range."""
     one, none = zero_float32() + 1.0, zero_float32()
-    exposures, number = load_float32(at, _FRAMES * width + c), larger_float(load_float32(at, _LIT * width + c), one)
-    light = load_float32(at, _LIGHT_SUM * width + c) - _ending(at, width, c) * _HALF_PX * number
-    most = load_float32(at, _SCALE * width + c) * brightest * number
+    exposures, number = load_float32(at, _FRAMES * width + c), _number(at, width, c)
+    light, most = _above_haze(at, width, c), load_float32(at, _SCALE * width + c) * brightest * number
     less = logarithm((most * exposures + one) / (larger_float(light, none) * exposures + one))
     missing = larger_float(less - DARKER - shines, none)
     off = load_float32(at, _OFF * width + c)
@@ -203,8 +214,7 @@ def _contrast(at, width, c, ambient):  # type: ignore[no-untyped-def]
     """Light that stripes share with neighbours above the whole haze before them, over its noise."""
     one, none = zero_float32() + 1.0, zero_float32()
     haze, rest = load_float32(at, _HAZE * width + c), load_float32(at, _REST * width + c)
-    number = larger_float(load_float32(at, _LIT * width + c), one)
-    exposures = load_float32(at, _FRAMES * width + c)
+    number, exposures = _number(at, width, c), load_float32(at, _FRAMES * width + c)
     light = load_float32(at, _LIGHT_SUM * width + c) / number
     noise = larger_float(light, none) + (haze + rest + 2.0 * ambient) * _HALF_PX + one / (exposures * 9.0)
-    return (light - _ending(at, width, c) * _HALF_PX) * square_root(exposures * number / noise)
+    return _above_haze(at, width, c) * square_root(exposures / (number * noise))

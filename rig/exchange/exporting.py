@@ -207,22 +207,24 @@ class _Export:
 
 def _check(run: Path, kind: str, options: ExportOptions) -> None:
     problems = []
-    if kind not in EXPORT_KINDS:
+    known = kind in EXPORT_KINDS
+    pictureless, filmless = known and kind not in PICTURE_KINDS, known and kind != "mp4"
+    if not known:
         problems.append(f"export kind {kind!r} is unknown; choose one of {', '.join(EXPORT_KINDS)}")
     if not run.exists():
         problems.append(f"{run} does not exist; name the folder of a run")
     if options.view is not None and options.view not in VIEWS:
         problems.append(f"view {options.view!r} is unknown; choose one of {', '.join(VIEWS)}")
-    elif options.view is not None and kind in EXPORT_KINDS and kind not in PICTURE_KINDS:
+    elif options.view is not None and pictureless:
         problems.append(f"view {options.view!r} is of pictures, {kind} has none; export png or mp4, or leave it out")
     summed, per_s = options.frames_per_picture, options.pictures_per_s
-    if summed is not None and kind in EXPORT_KINDS and kind not in PICTURE_KINDS:
+    if summed is not None and pictureless:
         problems.append(
             f"--frames {summed} are summed for pictures, {kind} has none; export png or mp4, or leave it out"
         )
     elif summed is not None and summed < 1:
         problems.append(f"{summed} frames make no picture; sum at least 1")
-    if per_s is not None and kind in EXPORT_KINDS and kind != "mp4":
+    if per_s is not None and filmless:
         problems.append(f"--fps {per_s:g} is of a film, {kind} is none; export mp4, or leave it out")
     elif per_s is not None and not 0 < per_s <= 1000:
         problems.append(f"a film of {per_s:g} pictures a second; choose 1000 or less, above 0")

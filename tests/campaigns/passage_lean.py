@@ -12,8 +12,8 @@ import argparse
 
 import numpy as np
 
-from calibration.passages.finding import SweepCounts, find_passages
-from tests.unit.calibration.passed_lines import Light, passed, true_at
+from calibration.passages.finding import find_passages
+from tests.unit.calibration.passed_lines import Light, passed, sweep_of, true_at
 
 SIGMAS = (0.25, 0.3, 0.4, 0.6)
 STRENGTHS = (4.0, 20.0, 70.0)
@@ -23,9 +23,7 @@ EXPOSURES, PIXELS, EIGHTHS = 10, 6000, 8
 def lean(light: Light, seed: int) -> tuple[float, float]:
     """Largest mean error over eighths of a column, in columns, and in standard deviations of that mean."""
     counts, centre = passed(np.random.default_rng(seed), light, EXPOSURES, pixels=PIXELS)
-    columns, _, width = counts.shape
-    frames, x0 = np.full(columns, EXPOSURES), np.zeros(columns, np.int32)
-    found = find_passages(SweepCounts(counts, frames, np.arange(float(columns)), x0, width), 1, 1.0, most=PIXELS)
+    found = find_passages(sweep_of(counts, EXPOSURES), 1, 1.0, most=PIXELS)
     true = true_at(centre, found)
     part, error = ((true % 1) * EIGHTHS).astype(int), found.command - true
     eighths = [error[part == i] for i in range(EIGHTHS)]

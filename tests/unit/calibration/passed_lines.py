@@ -1,10 +1,13 @@
-"""Counts of pixels that a laser line passes over: own light, own pixels, own photons; shares nothing with the code."""
+"""Counts of pixels that a laser line passes over: own light, own pixels, own photons; shares nothing with the code
+but the form in which it is handed over."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from calibration.passages.finding import SweepCounts
 
 ROWS = 30
 _INTEGRAL = np.vectorize(lambda z: 0.5 * (1 + math.erf(z / math.sqrt(2))))
@@ -40,6 +43,13 @@ def passed(rng, light: Light, exposures: int, pixels: int = 1500, columns: int =
         frames = 1 if light.travels else exposures
         counts += rng.binomial(frames, -np.expm1(-flux)).astype(np.uint16)
     return counts.reshape(columns, ROWS, -1), centre.reshape(ROWS, -1)
+
+
+def sweep_of(counts, exposures, step=1.0, first=0.0) -> SweepCounts:
+    """Counts (columns, rows, width) as a sweep of columns at commands `first`, `first + step`, ..."""
+    columns, _, width = counts.shape
+    frames = np.full(columns, exposures)
+    return SweepCounts(counts, frames, first + step * np.arange(columns), np.zeros(columns, np.int32), width)
 
 
 def true_at(centre: NDArray[np.float64], passages) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from calibration.passages.even_pixels import evenly
 from calibration.passages.finding import SweepCounts, find_passages
 from calibration.passages.light import LineShape, light
 from calibration.passages.pixel_fit import fit_passages
-from tests.unit.calibration.passed_lines import Light, passed, true_at
+from tests.unit.calibration.passed_lines import Light, passed, sweep_of, true_at
 
 CASES = {
     "clear": (Light(0.6, 4.0), 10, 0.9),
@@ -23,17 +23,11 @@ CASES = {
 }
 
 
-def _sweep(counts, exposures, step=1.0, first=0.0):
-    columns, _, width = counts.shape
-    frames = np.full(columns, exposures)
-    return SweepCounts(counts, frames, first + step * np.arange(columns), np.zeros(columns, np.int32), width)
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_passages_are_unbiased_and_their_sds_honest(case):
     light, exposures, least = CASES[case]
     counts, centre = passed(np.random.default_rng(3), light, exposures)
-    found = find_passages(_sweep(counts, exposures), 1, 1.0)
+    found = find_passages(sweep_of(counts, exposures), 1, 1.0)
     error = found.command - true_at(centre, found)
     assert len(error) > least * centre.size
     of_mean = error.std() / np.sqrt(len(error))
@@ -45,7 +39,7 @@ def test_passages_are_unbiased_and_their_sds_honest(case):
 
 def test_passages_do_not_lock_to_columns():
     counts, centre = passed(np.random.default_rng(4), Light(0.4, 6.0), 20, pixels=6000)
-    found = find_passages(_sweep(counts, 20), 1, 1.0, most=6000)
+    found = find_passages(sweep_of(counts, 20), 1, 1.0, most=6000)
     true = true_at(centre, found)
     phase = ((true % 1) * 8).astype(int)
     bias = np.bincount(phase, found.command - true) / np.bincount(phase)
@@ -56,7 +50,7 @@ def test_passages_do_not_lock_to_columns():
 def test_passages_do_not_lean_where_a_narrow_bright_line_moves_on(line):
     """By 0.019 column did those of a fit for which all frames of a column have the same light."""
     counts, centre = passed(np.random.default_rng(4), line, 10, pixels=9000)
-    found = find_passages(_sweep(counts, 10), 1, 1.0, most=9000)
+    found = find_passages(sweep_of(counts, 10), 1, 1.0, most=9000)
     true = true_at(centre, found)
     phase = ((true % 1) * 8).astype(int)
     bias = np.bincount(phase, found.command - true) / np.bincount(phase)
@@ -77,13 +71,13 @@ def test_one_pixel_whose_fit_went_astray_does_not_choose_the_shape_for_all(lost,
 
     monkeypatch.setattr(finding, "fit_passages", astray)
     counts, _ = passed(np.random.default_rng(4), Light(0.6, 20.0, travels=True), 10, pixels=900)
-    find_passages(_sweep(counts, 10), 1, 1.0)
+    find_passages(sweep_of(counts, 10), 1, 1.0)
     assert [shape.travels for shape in chosen] == [True]
 
 
 def test_commands_follow_the_columns_either_way():
     counts, centre = passed(np.random.default_rng(5), Light(0.6, 6.0), 10, pixels=600)
-    found = find_passages(_sweep(counts, 10, step=-0.01, first=0.4), -1, 35.0)
+    found = find_passages(sweep_of(counts, 10, step=-0.01, first=0.4), -1, 35.0)
     assert (found.direction, found.speed_per_s) == (-1, 35.0)
     error = (found.command - (0.4 - 0.01 * true_at(centre, found))) / found.sd
     assert 0.8 < error.std() < 1.15
@@ -112,7 +106,7 @@ def test_bins_of_several_sizes_and_none_count_as_they_are():
     thinned = (
         rng.hypergeometric(counts, 12 - counts, np.maximum(frames, 1)[:, None, None]) * (frames > 0)[:, None, None]
     )
-    sweep = _sweep(thinned.astype(np.uint8), 1)
+    sweep = sweep_of(thinned.astype(np.uint8), 1)
     command = np.where(frames > 0, sweep.command, np.nan)
     found = find_passages(SweepCounts(sweep.counts, frames, command, sweep.x0, sweep.width), 1, 1.0)
     error = (found.command - true_at(centre, found)) / found.sd
@@ -124,13 +118,13 @@ def test_noise_hot_pixels_and_saturation_give_no_passages():
     rng = np.random.default_rng(8)
     for flux in (0.02, 0.3, 2.0):
         counts = rng.binomial(10, -np.expm1(-flux), (200, 30, 60)).astype(np.uint8)
-        assert len(find_passages(_sweep(counts, 10), 1, 1.0).x_px) < 0.01 * 1800
-    assert len(find_passages(_sweep(np.full((60, 8, 8), 10, np.uint8), 10), 1, 1.0).x_px) == 0
-    assert len(find_passages(_sweep(np.zeros((60, 8, 8), np.uint8), 10), 1, 1.0).x_px) == 0
+        assert len(find_passages(sweep_of(counts, 10), 1, 1.0).x_px) < 0.01 * 1800
+    assert len(find_passages(sweep_of(np.full((60, 8, 8), 10, np.uint8), 10), 1, 1.0).x_px) == 0
+    assert len(find_passages(sweep_of(np.zeros((60, 8, 8), np.uint8), 10), 1, 1.0).x_px) == 0
 
 
 def test_an_empty_mask_and_a_sweep_without_frames_give_none():
-    sweep = _sweep(np.zeros((60, 8, 8), np.uint8), 10)
+    sweep = sweep_of(np.zeros((60, 8, 8), np.uint8), 10)
     assert len(find_passages(sweep, 1, 1.0, np.zeros((8, 8), bool)).command) == 0
     nothing = SweepCounts(sweep.counts, np.zeros(60, int), np.full(60, np.nan), sweep.x0, sweep.width)
     assert len(find_passages(nothing, 1, 1.0).command) == 0
@@ -140,7 +134,7 @@ def test_only_pixels_of_the_mask_and_no_more_than_asked_for():
     counts, _ = passed(np.random.default_rng(9), Light(0.6, 8.0), 10)
     mask = np.zeros(counts.shape[1:], bool)
     mask[5:20, 10:40] = True
-    found = find_passages(_sweep(counts, 10), 1, 1.0, mask, most=100)
+    found = find_passages(sweep_of(counts, 10), 1, 1.0, mask, most=100)
     assert len(found.x_px) == 100
     assert mask[found.y_px.astype(int), found.x_px.astype(int)].all()
     assert np.ptp(found.x_px) > 25
