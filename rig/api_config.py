@@ -24,13 +24,12 @@ def configure(
     filter: Filter | None = None,
     min_confidence: float | None = None,
     temporal_prior: bool | None = None,
-    adaptive: Mapping[str, object] | None = None,
 ) -> RigConfig:
     """The validated config that `scan` would use; options that are None stay as the config says.
 
     config: a bundled rig's name, a file or a RigConfig. fog: in place of the scene's, a visibility such as '20 m', or
-    'clear'. temporal_prior: `joint` holds each map to the last one a little. adaptive: maps in passes, with these
-    settings laid over those of scan.adaptive. Raises UsageError with one line per problem.
+    'clear'. temporal_prior: `joint` holds each map to the last one a little.
+    Raises UsageError with one line per problem.
     """
     options: dict[str, object | None] = {
         "world.scene": scene,
@@ -45,9 +44,6 @@ def configure(
     for name, asked in (("scene", scene), ("fog", fog)):
         if asked is not None and loaded.world is None:
             raise UsageError(f"{name} {asked!r} was asked for, but {loaded.name} is a real rig; leave --{name} out")
-    if adaptive is not None:
-        before = loaded.scan.adaptive
-        options["scan.adaptive"] = {**({} if before is None else before.model_dump(mode="json")), **adaptive}
     given = {key: value for key, value in options.items() if value is not None}
     if not given:
         return loaded

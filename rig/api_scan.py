@@ -1,6 +1,6 @@
 """The calls that acquire: `scan`, `plan_scan`, and `replay`, which does so from a recording."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,6 @@ def scan(
     filter: Filter | None = None,
     min_confidence: float | None = None,
     temporal_prior: bool | None = None,
-    adaptive: Mapping[str, object] | None = None,
     seed: int = 0,
     save: str = "all",
     arm: bool = False,
@@ -67,7 +66,6 @@ def scan(
         filter=filter,
         min_confidence=min_confidence,
         temporal_prior=temporal_prior,
-        adaptive=adaptive,
     )
     policy, overload = _checked_policies(maps, seed, save, on_overload, _problems(settings, arm, out, record))
     options = ScanOptions(overload, record, monitor, _both(progress, live), accept_calibration=accept_calibration)
@@ -95,7 +93,6 @@ def plan_scan(
     Devices are opened, asked for their limits and closed again: nothing moves and nothing shines, so that no `arm` is
     needed. Raises DevicesError, a line per device, where real ones are not there.
     """
-    from rig.adaptive_decision import first_pass
     from rig.burst import require_memory
     from rig.calibration_identity import calibration_use
     from rig.overload import require_policy
@@ -108,8 +105,6 @@ def plan_scan(
         calibration_use(rig, accept=accept_calibration)
         plan, _ = prepare(rig)
         require_memory(rig, plan)
-        if settings.scan.adaptive is not None:
-            first_pass(rig, plan)
         return plan
 
 

@@ -120,10 +120,6 @@ def _of_rig(config: RigConfig) -> list[str]:
         return [
             f"{config.name} runs in the host's time, not as fast as it can; name a simulated rig, such as '{SIMULATED}'"
         ]
-    if config.scan.adaptive is not None:
-        return [
-            f"{config.name} has scan.adaptive, which chooses exposures itself; leave it out of the config to try some"
-        ]
     if config.calibration is None:
         return [f"{config.name} has no calibration, so no depth; name one in the config"]
     return []
