@@ -12,6 +12,8 @@ Config = RigConfig | PathLike
 
 SIMULATED = "simulated"
 """Name of the bundled rig, and kind of the devices, that need no hardware."""
+MAX_SEED = 2**63 - 1
+"""Largest seed: the largest number that other programs read from the manifest as an integer."""
 
 
 def configure(
@@ -48,6 +50,13 @@ def configure(
     if not given:
         return loaded
     return _changed(config, given) if isinstance(config, RigConfig) else load_config(os.fspath(config), given)
+
+
+def seed_problems(seed: int) -> list[str]:
+    """What is wrong with a seed."""
+    if 0 <= seed <= MAX_SEED:
+        return []
+    return [f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})"]
 
 
 def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:

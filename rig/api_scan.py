@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rig.api_config import SIMULATED, Config, PathLike, configure
+from rig.api_config import SIMULATED, Config, PathLike, configure, seed_problems
 from rig.config import Estimator, Filter, RigConfig
 from rig.errors import UsageError
 from rig.run import OutFolder, Progress, Run, RunResult
@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from rig.monitor import Watch
     from rig.overload import Overload
     from rig.scan_plan import ScanPlan
-
-MAX_SEED = 2**63 - 1
-"""Largest seed: the largest number that other programs read from the manifest as an integer."""
 
 
 def scan(
@@ -185,13 +182,6 @@ def _both(progress: Progress | None, live: "Callable[[ScanProgress], None] | Non
 def _new_run(settings: RigConfig, out: OutFolder, save: SavePolicy, record: bool) -> Run:
     scan, estimate = settings.scan, settings.estimate
     return Run(out, MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter), save, record=record)
-
-
-def seed_problems(seed: int) -> list[str]:
-    """What is wrong with a seed."""
-    if 0 <= seed <= MAX_SEED:
-        return []
-    return [f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})"]
 
 
 def _checked_policies(

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from rig.api_config import SIMULATED, Config, configure
-from rig.api_scan import MAX_SEED
+from rig.api_config import MAX_SEED, SIMULATED, Config, configure
 from rig.config import RigConfig
 from rig.errors import UsageError
 from rig.run import OutFolder, Progress

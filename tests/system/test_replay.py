@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-import rig.scanning
 from drivers.recorded import RunRecording
-from rig import api
+from rig import api, scanning
 from rig.acquisition import Acquisition
 from rig.errors import DamagedRecordingError, UsageError
 from rig.recording.manifest import read_manifest, sealed_text
@@ -42,7 +41,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Maps with gaps, from two starts of the SPAD."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rig.scanning, "Acquisition", lambda *a, **k: Acquisition(*a, **{**k, "first_alone": True}))
+        patch.setattr(scanning, "Acquisition", lambda *a, **k: Acquisition(*a, **{**k, "first_alone": True}))
         return scan_of(tmp_path_factory.mktemp("lossy"), "argmax", 3, loss_probability=0.01)
 
 
