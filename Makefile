@@ -32,10 +32,9 @@ accuracy: accuracy-rows accuracy-joint accuracy-calibration  ## the three below:
 
 accuracy-rows: .venv/.installed-tests  ## argmax, edge and likelihood beside the genie
 	$(BIN)/python -m tests.reference.accuracy
-accuracy-joint: .venv/.installed-tests  ## joint beside what is asked, its prior and passes; fog meter's error bars
+accuracy-joint: .venv/.installed-tests  ## joint beside what is asked, its prior; fog meter's error bars
 	$(BIN)/python -m tests.reference.joint_accuracy --estimators joint
 	$(BIN)/python -m tests.reference.moving --rows 128
-	$(BIN)/python -m tests.reference.adaptive --estimators joint --budget 0.8 --passes 3
 	$(BIN)/python -m tests.reference.fog_coverage
 PICTURES := ../shared/calibration-images
 accuracy-calibration: .venv/.installed-tests  ## corners of drawn boards; cameras from real chessboards, where there are any

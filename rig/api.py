@@ -6,11 +6,11 @@ result.last.depth_m, result.summary.truth
 """
 
 from rig.api_calibrate import calibrate_camera, calibrate_check, calibrate_pixels, calibrate_planes, calibrate_sync
-from rig.api_config import SIMULATED, Config, PathLike, configure
+from rig.api_config import MAX_SEED, SIMULATED, Config, PathLike, configure
 from rig.api_reconstruct import reconstruct
 from rig.api_recordings import compress, cut, export_run, import_frames, recording_info, repair, verify
 from rig.api_rig import bench, bench_disk, bench_simulator, devices, doctor, effects, flux_row, laser_off, soak, warm_up
-from rig.api_scan import MAX_SEED, plan_scan, replay, scan
+from rig.api_scan import plan_scan, replay, scan
 from rig.api_tradeoff import tradeoff
 from rig.plan_figures import plan_text
 from rig.run import RunResult

@@ -12,6 +12,8 @@ Config = RigConfig | PathLike
 
 SIMULATED = "simulated"
 """Name of the bundled rig, and kind of the devices, that need no hardware."""
+MAX_SEED = 2**63 - 1
+"""Largest seed: the largest number that other programs read from the manifest as an integer."""
 
 
 def configure(
@@ -24,13 +26,12 @@ def configure(
     filter: Filter | None = None,
     min_confidence: float | None = None,
     temporal_prior: bool | None = None,
-    adaptive: Mapping[str, object] | None = None,
 ) -> RigConfig:
     """The validated config that `scan` would use; options that are None stay as the config says.
 
     config: a bundled rig's name, a file or a RigConfig. fog: in place of the scene's, a visibility such as '20 m', or
-    'clear'. temporal_prior: `joint` holds each map to the last one a little. adaptive: maps in passes, with these
-    settings laid over those of scan.adaptive. Raises UsageError with one line per problem.
+    'clear'. temporal_prior: `joint` holds each map to the last one a little.
+    Raises UsageError with one line per problem.
     """
     options: dict[str, object | None] = {
         "world.scene": scene,
@@ -45,13 +46,17 @@ def configure(
     for name, asked in (("scene", scene), ("fog", fog)):
         if asked is not None and loaded.world is None:
             raise UsageError(f"{name} {asked!r} was asked for, but {loaded.name} is a real rig; leave --{name} out")
-    if adaptive is not None:
-        before = loaded.scan.adaptive
-        options["scan.adaptive"] = {**({} if before is None else before.model_dump(mode="json")), **adaptive}
     given = {key: value for key, value in options.items() if value is not None}
     if not given:
         return loaded
     return _changed(config, given) if isinstance(config, RigConfig) else load_config(os.fspath(config), given)
+
+
+def seed_problems(seed: int) -> list[str]:
+    """What is wrong with a seed."""
+    if 0 <= seed <= MAX_SEED:
+        return []
+    return [f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})"]
 
 
 def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:

@@ -1,10 +1,10 @@
 """The calls that acquire: `scan`, `plan_scan`, and `replay`, which does so from a recording."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rig.api_config import SIMULATED, Config, PathLike, configure
+from rig.api_config import SIMULATED, Config, PathLike, configure, seed_problems
 from rig.config import Estimator, Filter, RigConfig
 from rig.errors import UsageError
 from rig.run import OutFolder, Progress, Run, RunResult
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from rig.overload import Overload
     from rig.scan_plan import ScanPlan
 
-MAX_SEED = 2**63 - 1
-"""Largest seed: the largest number that other programs read from the manifest as an integer."""
-
 
 def scan(
     config: Config = SIMULATED,
@@ -32,7 +29,6 @@ def scan(
     filter: Filter | None = None,
     min_confidence: float | None = None,
     temporal_prior: bool | None = None,
-    adaptive: Mapping[str, object] | None = None,
     seed: int = 0,
     save: str = "all",
     arm: bool = False,
@@ -67,7 +63,6 @@ def scan(
         filter=filter,
         min_confidence=min_confidence,
         temporal_prior=temporal_prior,
-        adaptive=adaptive,
     )
     policy, overload = _checked_policies(maps, seed, save, on_overload, _problems(settings, arm, out, record))
     options = ScanOptions(overload, record, monitor, _both(progress, live), accept_calibration=accept_calibration)
@@ -95,7 +90,6 @@ def plan_scan(
     Devices are opened, asked for their limits and closed again: nothing moves and nothing shines, so that no `arm` is
     needed. Raises DevicesError, a line per device, where real ones are not there.
     """
-    from rig.adaptive_decision import first_pass
     from rig.burst import require_memory
     from rig.calibration_identity import calibration_use
     from rig.overload import require_policy
@@ -108,8 +102,6 @@ def plan_scan(
         calibration_use(rig, accept=accept_calibration)
         plan, _ = prepare(rig)
         require_memory(rig, plan)
-        if settings.scan.adaptive is not None:
-            first_pass(rig, plan)
         return plan
 
 
@@ -190,13 +182,6 @@ def _both(progress: Progress | None, live: "Callable[[ScanProgress], None] | Non
 def _new_run(settings: RigConfig, out: OutFolder, save: SavePolicy, record: bool) -> Run:
     scan, estimate = settings.scan, settings.estimate
     return Run(out, MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter), save, record=record)
-
-
-def seed_problems(seed: int) -> list[str]:
-    """What is wrong with a seed."""
-    if 0 <= seed <= MAX_SEED:
-        return []
-    return [f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})"]
 
 
 def _checked_policies(

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from rig.api_config import SIMULATED, Config, configure
-from rig.api_scan import MAX_SEED
+from rig.api_config import MAX_SEED, SIMULATED, Config, configure
 from rig.config import RigConfig
 from rig.errors import UsageError
 from rig.run import OutFolder, Progress
@@ -119,10 +118,6 @@ def _of_rig(config: RigConfig) -> list[str]:
     if config.world.real_time:
         return [
             f"{config.name} runs in the host's time, not as fast as it can; name a simulated rig, such as '{SIMULATED}'"
-        ]
-    if config.scan.adaptive is not None:
-        return [
-            f"{config.name} has scan.adaptive, which chooses exposures itself; leave it out of the config to try some"
         ]
     if config.calibration is None:
         return [f"{config.name} has no calibration, so no depth; name one in the config"]

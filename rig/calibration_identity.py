@@ -15,11 +15,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol, runtime_checkable
 
 from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import Identity, RigModel
-from rig.calibrating.result import KnowsRig
 from rig.calibration_notes import notes_on
 from rig.calibration_refusals import Refusal, check_content, failed_verdict, require_accepted
 from rig.recording.manifest import read_manifest
@@ -33,6 +32,15 @@ _NO_SERIAL: Final = ("", "none")
 _GEOMETRY: Final = "geometry"
 """What a simulated rig really is like, by its numbers; `world` is the name of its file, which says less."""
 _CHECKS: Final = {"check": "rig calibrate check", "pixels": "rig calibrate pixels"}
+
+
+@runtime_checkable
+class KnowsRig(Protocol):
+    """A world that knows the rig as it truly is."""
+
+    def true_model(self) -> RigModel:
+        """Camera, scanner and lag of the rig, as a calibration is to find them."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,6 @@ from rig.cli_command import (
 )
 
 if TYPE_CHECKING:
-    from rig.config import AdaptiveConfig
     from rig.scan_plan import ScanPlan
 
 
@@ -55,13 +54,6 @@ def scan_command(
             show_default=False,
         ),
     ] = None,
-    adaptive: Annotated[
-        bool, typer.Option("--adaptive", help="maps in passes: more exposures where rows are still undecided")
-    ] = False,
-    time_budget: Annotated[
-        str | None,
-        typer.Option("--time-budget", help="most sensor time of an adaptive map, e.g. '30 ms'", show_default=False),
-    ] = None,
     seed: Annotated[int, typer.Option("--seed", help="of everything simulated")] = 0,
     save: Annotated[str, typer.Option("--save", help="maps to write: all, last or every N")] = "all",
     out: OutOption = None,
@@ -84,12 +76,11 @@ def scan_command(
         "filter": filter,
         "min_confidence": min_confidence,
         "temporal_prior": temporal_prior,
-        "adaptive": _passes(adaptive, time_budget),
     }
     if dry_run:
         checked: dict[str, Any] = {"maps": maps, "seed": seed, "save": save, "on_overload": on_overload}
         plan = api.plan_scan(config, accept_calibration=accept_calibration, **checked, **options)
-        return _show_plan(plan, api.configure(config, **options).scan.adaptive, as_json)
+        return _show_plan(plan, as_json)
     with live_progress() as live:
         result = api.scan(
             config,
@@ -107,24 +98,13 @@ def scan_command(
     return report(result, as_json)
 
 
-def _passes(adaptive: bool, time_budget: str | None) -> dict[str, str] | None:
-    """Settings of a scan in passes, where one is asked for."""
-    if time_budget is not None:
-        return {"time_budget": time_budget}
-    return {} if adaptive else None
-
-
-def _show_plan(plan: "ScanPlan", adaptive: "AdaptiveConfig | None", as_json: bool) -> int:
-    from rig.adaptive_decision import describe_passes, passes_content
+def _show_plan(plan: "ScanPlan", as_json: bool) -> int:
     from rig.plan_figures import plan_content, plan_text
 
     if as_json:
-        passes = {} if adaptive is None else {"adaptive": passes_content(adaptive, plan)}
-        print_json({"plan": plan_content(plan), **passes})
+        print_json({"plan": plan_content(plan)})
     else:
         print(plan_text(plan))
-        if adaptive is not None:
-            print(describe_passes(adaptive, plan))
     return 0
 
 

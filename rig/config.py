@@ -61,27 +61,6 @@ FrameRate = Annotated[ExactHertz, Field(gt=0, description="SPAD frames per secon
 Command = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
 
 
-class AdaptiveConfig(Section):
-    """A map in several passes: few exposures of all columns, then more of those that are still undecided."""
-
-    first_exposures: int = Field(
-        default=4, ge=2, le=200, description="exposures of the first pass, over all columns", examples=[4]
-    )
-    passes: int = Field(default=4, ge=2, le=100, description="most passes of a map, the first included", examples=[4])
-    time_budget: Annotated[Seconds, Field(gt=0)] | None = Field(
-        default=None,
-        description="most sensor time of a map, all passes; that of one sweep at scan.exposures where not given",
-        examples=["30 ms"],
-    )
-    target_share: float = Field(
-        default=0.99,
-        gt=0,
-        lt=1,
-        description="mean confidence over rows and columns at which a map is good enough",
-        examples=[0.95],
-    )
-
-
 class ScanConfig(Section):
     """What one sweep does."""
 
@@ -113,20 +92,11 @@ class ScanConfig(Section):
     power: Annotated[Watts, Field(gt=0)] | None = Field(
         default=None, description="laser power of the scan; the laser's limit where not given", examples=["20 mW"]
     )
-    adaptive: AdaptiveConfig | None = Field(
-        default=None, description="passes over undecided columns instead of one sweep at so many exposures"
-    )
 
     @property
     def exposure_s(self) -> float:
         """Exposure of a frame; without a setting the whole frame period."""
         return float(1 / self.frame_rate) if self.exposure is None else self.exposure
-
-    @model_validator(mode="after")
-    def _passes_fit(self) -> Self:
-        if self.adaptive is not None and self.bidirectional:
-            raise ValueError("has adaptive and bidirectional, but passes are taken one way; leave one of them out")
-        return self
 
     @model_validator(mode="after")
     def _exposure_fits(self) -> Self:
@@ -233,8 +203,6 @@ class RigConfig(Section):
     @model_validator(mode="after")
     def _lines_fit(self) -> Self:
         problems = line_problems(self.line_offsets, self.scan.columns, self.scan.command_range)
-        if self.scan.adaptive is not None and len(self.line_offsets) > 1:
-            problems.append("scan.adaptive is for one line, line_offsets has several; leave one of them out")
         if problems:
             raise ValueError("; ".join(problems))
         return self

@@ -45,7 +45,6 @@ FLAGS: Mapping[Key, str] = {
     ("estimate", "min_confidence"): "--min-confidence",
     ("estimate", "temporal_prior"): "--temporal-prior",
     ("estimate", "threads"): "--threads",
-    ("scan", "adaptive", "time_budget"): "--time-budget",
 }
 """Keys that the command line has an option for."""
 _READS_ON = ("is ", "has ", "runs ", "begins ")

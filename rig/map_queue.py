@@ -17,19 +17,13 @@ class AcquiredMap:
     """A map and the account of its sweep, without the counts, which are large.
 
     column: float64 (columns,), where the frames of each column were bound. compute_s: wall time of binding, counting
-    and estimation. passes: the accounts of its passes, where it was taken in several.
+    and estimation.
     """
 
     sweep: SweepAccount
     column: NDArray[np.float64]
     result: MapResult
     compute_s: float
-    passes: tuple[SweepAccount, ...] = ()
-
-    @property
-    def sweeps(self) -> tuple[SweepAccount, ...]:
-        """The accounts of all sweeps that it was made of."""
-        return self.passes or (self.sweep,)
 
 
 class MapQueue:

@@ -25,9 +25,8 @@ from rig.errors import DamagedRecordingError, UsageError
 from rig.estimators import Learned
 from rig.plan import spad_request
 from rig.recording.inputs import read_plan
-from rig.recording.manifest import MANIFEST, is_cut_short, read_manifest, require_inputs
+from rig.recording.manifest import MANIFEST, is_cut_short, read_manifest, require_inputs, require_plain_sweeps
 from rig.recording.part import part_learned, part_starts
-from rig.recording.passes import pass_plan, recorded_passes
 from rig.scan_plan import ScanPlan
 from rig.sweeps import SweepStart
 
@@ -100,10 +99,11 @@ def replay_config(
     if manifest is None:
         raise DamagedRecordingError(f"{run / MANIFEST} is missing; 'rig repair' writes a new one")
     require_inputs(run, manifest)
+    require_plain_sweeps(run, manifest)
     recorded = manifest.get("config") or {}
     calibration = run / CALIBRATION_FILE
     given = {key: value for key, value in estimate.items() if value is not None}
-    scan = recorded.get("scan") or _scan_of(plan)
+    scan = {key: value for key, value in (recorded.get("scan") or _scan_of(plan)).items() if key != "adaptive"}
     content: dict[str, Any] = {
         "name": f"replay of {recorded.get('name') or run.name}",
         "calibration": str(calibration.absolute()) if calibration.exists() else None,
@@ -142,10 +142,7 @@ def replay_plan(
         from rig.recalibrated import whole_rows
 
         plan = whole_rows(plan)
-    first = plan
-    if (recording.path / pass_plan(0)).exists():  # taken in passes: the SPAD begins with the first of them
-        first = read_plan(recording.path, pass_plan(0))
-    request = replace(spad_request(scan, first), frame_rate_hz=plan.frame_rate_hz, exposure_s=plan.exposure_s)
+    request = replace(spad_request(scan, plan), frame_rate_hz=plan.frame_rate_hz, exposure_s=plan.exposure_s)
     return plan, spad.configure(request)
 
 
@@ -155,9 +152,7 @@ class Replayed:
     def __init__(self, spad: PlaysRecording, plan: ScanPlan, maps: int | None) -> None:
         self._spad = spad
         self._sweeps = recorded_sweeps(spad.recording, plan)
-        self.passes = recorded_passes(spad.recording.path, self._sweeps)
-        """Of each map, where they were taken in several; None: they were not."""
-        there = self._there = sum(self._sweeps) if self.passes is None else len(self.passes)
+        there = self._there = sum(self._sweeps)
         if there == 0:
             raise UsageError(f"{spad.recording.path} holds no whole sweep, so there is no map to be made of it")
         if maps is not None and maps > there and not spad.loops:

@@ -10,7 +10,7 @@ from drivers.replay_pace import PaceReport
 from rig.effects import Effect, Flux, SceneEffects
 from rig.run import RunResult
 from rig.stages import PipelineStats
-from rig.summary import AdaptiveFigures, Summary, Synchronisation, Verdict
+from rig.summary import Summary, Synchronisation, Verdict
 
 WIDE = 300
 """Characters; wider than any line here."""
@@ -90,13 +90,6 @@ def console() -> Console:
     return Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
 
 
-def _passes(adaptive: AdaptiveFigures) -> str:
-    return (
-        f"{adaptive.passes} in all; between those of a map the rig rested for {digits(adaptive.rest_s)} s of the "
-        f"{digits(adaptive.wall_s)} s of wall time that maps took"
-    )
-
-
 def _rows(summary: Summary) -> list[tuple[str, str]]:
     frames = summary.frames
     rows = [
@@ -107,7 +100,6 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
             f"{digits(summary.sensor_time_s)} s of sensor, {digits(summary.compute_time_s)} s of computing "
             f"(real time x {_number(summary.realtime_factor)})",
         ),
-        *(() if summary.adaptive is None else (("passes", _passes(summary.adaptive)),)),
         *(() if summary.sync is None else (("sync", _sync(summary.sync)),)),
         *(() if summary.stages is None else (("stages", _stages(summary.stages)),)),
         *(() if summary.replay is None or not summary.replay.blocks else (("clock", _clock(summary.replay)),)),

@@ -15,14 +15,14 @@ from drivers.interfaces import SweepTruth
 from drivers.replay_pace import PaceReport
 from drivers.transports.tap import CONTROL_FILE, TapFile
 from rig.control_check import ControlCheck
-from rig.errors import RecordingError, UsageError
+from rig.errors import UsageError
 from rig.outputs import Rays, RunFolder
 from rig.reconstruction import MapResult
 from rig.recording.manifest import UNFINISHED, file_crc32
 from rig.recording.writer import Recording
 from rig.saving import SavePolicy
 from rig.stages import PipelineStats
-from rig.summary import AdaptiveFigures, MapTally, RunFrames, Summary, Synchronisation, Verdict
+from rig.summary import MapTally, RunFrames, Summary, Synchronisation, Verdict
 
 Progress = Callable[[int, int], None]
 """Called now and then with what is done and what there is to do, in frames or maps."""
@@ -118,21 +118,6 @@ class Run:
         begun()
         return self._recording
 
-    def add_input(self, name: str, write: Callable[[Path], None]) -> None:
-        """Write one more file that has to stand beside the frames, which come with the next start of the SPAD.
-
-        RecordingError where it cannot be written.
-        """
-        assert self._folder is not None, "asked for with a recording, which needs a folder"
-        file = self._folder.place(name)
-        try:
-            write(file)
-            self._inputs[name] = file_crc32(file)
-        except OSError as error:
-            raise RecordingError(
-                f"cannot write {file}: {error.strerror or error}; free the space it needs or name another --out"
-            ) from error
-
     def __enter__(self) -> Self:
         """The run itself."""
         return self
@@ -175,11 +160,10 @@ class Run:
         stages: PipelineStats | None = None,
         sync: Synchronisation | None = None,
         replay: PaceReport | None = None,
-        adaptive: AdaptiveFigures | None = None,
         accepted_calibration: tuple[str, ...] = (),
     ) -> RunResult:
         """Write manifest and summary and make the folder appear; one without a map or a recorded block leaves none."""
-        summary = self.tally.summary(frames, sensor_time_s, verdict, stages, sync, replay, adaptive)
+        summary = self.tally.summary(frames, sensor_time_s, verdict, stages, sync, replay)
         summary = replace(summary, accepted_calibration=accepted_calibration)
         index, result, truth = self._last or (None, None, None)
         folder = None

@@ -1,6 +1,5 @@
 """A scan from open devices to its folder: sweeps in, maps out, and an account of what was lost."""
 
-import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -10,14 +9,9 @@ from typing import Any
 from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
 from rig.acquisition import SILENCE_S, Acquisition, ScanProgress
-from rig.adaptive_decision import ChoosesPasses, DecidedPasses
-from rig.adaptive_recording import PassNotes, RecordedPasses
-from rig.adaptive_scan import AdaptiveAcquisition
 from rig.calibration_identity import accepted_by, calibration_use, identity_of, rig_content
-from rig.config import ScanConfig
 from rig.errors import RigError
 from rig.estimators import LEARNING, Learned
-from rig.geometry import SweepGeometry
 from rig.monitor import Watch
 from rig.overload import Overload, require_policy
 from rig.plan import spad_request
@@ -41,8 +35,8 @@ class ScanOptions:
     """How a scan is run, apart from its config. record: keep the frames; needs a run with a folder.
 
     watch: a monitor's callback, on a thread of its own. live: told of the progress several times a second, on the
-    caller's thread. sweeps: shown each counted sweep before its map is made, on the counting thread; not those of maps
-    that are made in passes. accept_calibration: use a foreign or stale calibration too, see `calibration_identity`.
+    caller's thread. sweeps: shown each counted sweep before its map is made, on the counting thread.
+    accept_calibration: use a foreign or stale calibration too, see `calibration_identity`.
     """
 
     policy: Overload = Overload.ABORT
@@ -73,7 +67,6 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         rig, plan, threads, () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
     )
     geometry = reconstructor.geometry
-    passes = _passes(rig, plan, timing, geometry, threads, replayed)
     run.rays = geometry.rays if rig.model is not None else None
 
     estimate = rig.config.estimate
@@ -90,41 +83,32 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         "maps": maps,
         "on_overload": options.policy.value,
     }
-    settings: dict[str, Any] = {
-        "policy": options.policy,
-        "starts": None if replayed is None else replayed.starts(),
-        "recording": _recording(rig, run, plan, timing, maps, manifest) if options.record else None,
-        "watch": options.watch,
-        "on_progress": options.live,
-        "silence_s": SILENCE_S if replayed is None else replayed.silence_s,
-    }
-    acquisition: Acquisition | AdaptiveAcquisition
-    if passes is not None:
-        note = PassNotes(manifest, run if options.record else None).note
-        acquisition = AdaptiveAcquisition(rig, plan, maps, reconstructor, passes, threads, on_pass=note, **settings)
-    else:
-        acquisition = Acquisition(
-            rig,
-            plan,
-            timing,
-            maps,
-            reconstructor,
-            # Learning takes a second or more, and a live stream cannot stand still meanwhile.
-            first_alone=estimate.estimator in LEARNING and not rig.spad.info.can_wait,
-            groups=None if replayed is None else replayed.groups(),
-            on_sweep=options.sweeps,
-            **settings,
-        )
-    of_maps: list[tuple[SweepAccount, ...]] = []
+    acquisition = Acquisition(
+        rig,
+        plan,
+        timing,
+        maps,
+        reconstructor,
+        # Learning takes a second or more, and a live stream cannot stand still meanwhile.
+        first_alone=estimate.estimator in LEARNING and not rig.spad.info.can_wait,
+        groups=None if replayed is None else replayed.groups(),
+        on_sweep=options.sweeps,
+        policy=options.policy,
+        starts=None if replayed is None else replayed.starts(),
+        recording=_recording(rig, run, plan, timing, maps, manifest) if options.record else None,
+        watch=options.watch,
+        on_progress=options.live,
+        silence_s=SILENCE_S if replayed is None else replayed.silence_s,
+    )
+    sweeps: list[SweepAccount] = []
     ended_by: BaseException | None = None
     try:
-        _collect(acquisition, rig, plan, run, of_maps, replayed)
+        _collect(acquisition, rig, plan, run, sweeps, replayed)
     except (KeyboardInterrupt, DeviceError, RigError) as error:
         if not run.worth_keeping and not isinstance(error, KeyboardInterrupt):
             raise
         ended_by = error
-    del of_maps[run.tally.maps :]
-    sweeps = [sweep for passes_of_map in of_maps for sweep in passes_of_map]
+    del sweeps[run.tally.maps :]
     frames = frames_of(sweeps, acquisition.counters.crc_errors)
     result = run.finish(
         frames,
@@ -139,34 +123,13 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         acquisition.stages,
         synchronisation_of(sweeps),
         None if replayed is None else replayed.report,
-        acquisition.figures(frames.lit) if isinstance(acquisition, AdaptiveAcquisition) else None,
         accepted_by(calibration),
     )
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:
-            ended_by.add_note(f"{len(of_maps)} of {maps} maps were whole and are in {result.folder}")
+            ended_by.add_note(f"{len(sweeps)} of {maps} maps were whole and are in {result.folder}")
         raise ended_by
     return result
-
-
-def _passes(
-    rig: OpenRig,
-    plan: ScanPlan,
-    timing: SpadTiming,
-    geometry: SweepGeometry,
-    threads: int,
-    replayed: Replayed | None,
-) -> ChoosesPasses | None:
-    """What chooses the passes of a map; None where a map is one sweep."""
-    if replayed is not None:
-        return None if replayed.passes is None else RecordedPasses(rig, plan, replayed.passes, timing)
-    return None if rig.config.scan.adaptive is None else DecidedPasses(rig, plan, geometry, threads)
-
-
-def _plain_sweeps(scan: ScanConfig, plan: ScanPlan, maps: int) -> int:
-    """Sweeps of the plan that take as long as the maps may."""
-    budget_s = scan.adaptive.time_budget if scan.adaptive is not None else None
-    return maps if budget_s is None else math.ceil(maps * budget_s / float(plan.sweep_s))
 
 
 def _recording(
@@ -177,7 +140,7 @@ def _recording(
         maps,
         manifest,
         lambda folder: write_inputs(folder, plan, rig.model),
-        recording_bytes(plan, spad_request(rig.config.scan, plan), timing, _plain_sweeps(rig.config.scan, plan, maps)),
+        recording_bytes(plan, spad_request(rig.config.scan, plan), timing, maps),
         map_bytes(plan),
     )
 
@@ -201,11 +164,11 @@ def make_reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequ
 
 
 def _collect(
-    acquisition: Acquisition | AdaptiveAcquisition,
+    acquisition: Acquisition,
     rig: OpenRig,
     plan: ScanPlan,
     run: Run,
-    of_maps: list[tuple[SweepAccount, ...]],
+    sweeps: list[SweepAccount],
     replayed: Replayed | None,
 ) -> None:
     running = acquisition.run()
@@ -215,7 +178,7 @@ def _collect(
             if replayed is not None:
                 truth = replayed.truth(found.sweep.index)
             elif rig.world is not None:  # asked only now: no estimate ever sees it
-                velocity_per_s = plan.velocity_per_s(found.sweeps[0].direction)
+                velocity_per_s = plan.velocity_per_s(found.sweep.direction)
                 truth = rig.world.truth(plan.line_commands(found.column), velocity_per_s)
-            of_maps.append(found.sweeps)  # before its map: whatever ends the run, no map is without its account
+            sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
             run.add(found.result, found.compute_s, truth)

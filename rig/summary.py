@@ -62,20 +62,6 @@ class Synchronisation:
     detection_probability: float | None
 
 
-@dataclass(frozen=True, slots=True)
-class AdaptiveFigures:
-    """Of maps taken in passes. passes: of all maps. mean_exposures: frames per column of a map, over all columns.
-
-    rest_s: wall time between the passes of a map, in which the host decided and no frame was exposed. wall_s: from the
-    first pass of a map to the whole map, added up.
-    """
-
-    passes: int
-    mean_exposures: float | None
-    rest_s: float
-    wall_s: float
-
-
 Errors = Mapping[str, float | None]
 
 
@@ -94,7 +80,7 @@ class Summary:
     maps: int
     map_rate_hz: float | None
     columns: int
-    exposures: float
+    exposures: int
     estimator: str
     filter: str
     frames: RunFrames
@@ -108,7 +94,6 @@ class Summary:
     stages: PipelineStats | None = None
     sync: Synchronisation | None = None
     replay: PaceReport | None = None
-    adaptive: AdaptiveFigures | None = None
     accepted_calibration: tuple[str, ...] = ()
     """What speaks against the calibration that the run was told to use all the same."""
 
@@ -124,8 +109,6 @@ class Summary:
             del content["sync"]
         if self.replay is None:
             del content["replay"]
-        if self.adaptive is None:
-            del content["adaptive"]
         if not self.accepted_calibration:
             del content["accepted_calibration"]
         return content
@@ -171,7 +154,6 @@ class MapTally:
         stages: PipelineStats | None = None,
         sync: Synchronisation | None = None,
         replay: PaceReport | None = None,
-        adaptive: AdaptiveFigures | None = None,
     ) -> Summary:
         """The run so far."""
         errors = [each.errors for each in self._maps if each.errors is not None]
@@ -181,7 +163,7 @@ class MapTally:
             maps=self.maps,
             map_rate_hz=self.maps / sensor_time_s if sensor_time_s > 0 else None,
             columns=self.columns,
-            exposures=(adaptive and adaptive.mean_exposures) or self.exposures,
+            exposures=self.exposures,
             estimator=self.estimator,
             filter=self.filter,
             frames=frames,
@@ -195,7 +177,6 @@ class MapTally:
             stages=stages,
             sync=sync,
             replay=replay,
-            adaptive=adaptive,
         )
 
 

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from drivers.units import parse_quantity
-from rig.api_config import Config, PathLike
-from rig.api_scan import seed_problems
+from rig.api_config import Config, PathLike, seed_problems
 from rig.config import RigConfig
 
 if TYPE_CHECKING:

@@ -89,7 +89,7 @@ def capture_view(
 
 
 def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDArray[np.bool_] | None = None) -> Capture:
-    """The same from the first sweeps of a recorded run. UsageError where there is none, or it was in passes."""
+    """The same from the first sweeps of a recorded run. UsageError where there is none."""
     config = replay_config(run, ReplayOptions("max"), None, {"estimator": "argmax", "filter": "none"})
     if not read_plan(run).windowed:
         config = config.model_copy(update={"calibration": None})
@@ -105,7 +105,7 @@ def _settings(config: RigConfig, exposures: int | None, *, bidirectional: bool) 
             f"{config.name} has {len(config.line_offsets)} lines (line_offsets); a pixel cannot tell which one passed: "
             "cover all but one and set line_offsets to [0]"
         )
-    scan = config.scan.model_copy(update={"bidirectional": bidirectional, "adaptive": None})
+    scan = config.scan.model_copy(update={"bidirectional": bidirectional})
     if exposures is not None:
         try:
             scan = type(scan).model_validate({**scan.model_dump(mode="json"), "exposures": exposures})
@@ -152,8 +152,6 @@ def _sweeps(rig: OpenRig, maps: int, seed: int, out: OutFolder) -> list[SweepDat
         result = run_scan(rig, run, maps, seed, options)
     if result.summary.verdict is Verdict.ABORTED:
         raise KeyboardInterrupt
-    if not found:
-        raise UsageError(f"{rig.config.name} was scanned in passes, whose columns have several exposures; scan without")
     return found
 
 

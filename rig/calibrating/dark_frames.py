@@ -130,9 +130,7 @@ def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None
     with Run(None, MapTally(scan.columns, scan.exposures, "argmax", "none")) as run:
         run_scan(rig, run, maps, 0, options)
     if sums.tally is None:
-        raise UsageError(
-            f"{rig.spad.name} gave no sweep with dark frames in one piece; name a run that was not adaptive"
-        )
+        raise UsageError(f"{rig.spad.name} gave no sweep with dark frames in one piece; scan again")
     return sums
 
 

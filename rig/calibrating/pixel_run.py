@@ -114,8 +114,7 @@ def _recorded(source: Config) -> Path | None:
 def _quick(config: RigConfig) -> RigConfig:
     """With the estimator that leaves the counts whole."""
     estimate = config.estimate.model_copy(update={"estimator": "argmax", "filter": "none", "temporal_prior": False})
-    scan = config.scan.model_copy(update={"adaptive": None})
-    return config.model_copy(update={"estimate": estimate, "scan": scan})
+    return config.model_copy(update={"estimate": estimate})
 
 
 def _recorded_sums(run: Path, progress: Progress | None) -> tuple[DarkTally, Sums | None, str]:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from calibration.model.rig_model import RigModel
 from calibration.verdict import Verdict
@@ -40,15 +40,6 @@ class CalibrationResult:
     def as_json(self) -> Mapping[str, Any]:
         """What summary.json holds."""
         return self.summary
-
-
-@runtime_checkable
-class KnowsRig(Protocol):
-    """A world that knows the rig as it truly is."""
-
-    def true_model(self) -> RigModel:
-        """The model that a calibration is to find."""
-        ...
 
 
 def named(names: Sequence[str]) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.depth.against_truth import DepthErrors, depth_errors
 from calibration.model.rig_model import RigModel
-from rig.calibrating.result import KnowsRig
+from rig.calibration_identity import KnowsRig
 from rig.config import RigConfig
 from rig.session import open_rig
 

@@ -24,9 +24,7 @@ from numpy.typing import NDArray
 from rig.estimators.placing_kernels import BLIND_FLUX, REACH_PX, Places
 from rig.estimators.placing_pools import SAME_PX
 from rig.estimators.placing_scores import FRACTIONS
-from rig.estimators.row_input import State, Sweep
-
-Float32 = NDArray[np.float32]
+from rig.estimators.row_input import Float32, State, Sweep
 
 REACH: Final = 2
 """Rows and columns to either side whose stripes are asked."""

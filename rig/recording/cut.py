@@ -18,10 +18,9 @@ from rig.binding import MAX_RESIDUAL_COLUMNS
 from rig.blanking import MAX_CLOCK_ERROR
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
 from rig.outputs import RunFolder
-from rig.recording.manifest import MANIFEST, UNFINISHED, require_inputs
+from rig.recording.manifest import MANIFEST, UNFINISHED, require_inputs, require_plain_sweeps
 from rig.recording.maps import MapSpan, map_spans
 from rig.recording.opening import manifest_or_none, open_recording
-from rig.recording.passes import PASSES
 from rig.recording.writer import Recording
 from rig.summary import Verdict
 
@@ -64,11 +63,7 @@ def cut(
     if manifest is None:
         raise DamagedRecordingError(f"{folder}: {trouble}")
     require_inputs(folder, manifest)
-    if PASSES in manifest:
-        raise UsageError(
-            f"{folder} was scanned in passes, which make a map only together; take all of it to 'rig reconstruct' or "
-            "'rig export'"
-        )
+    require_plain_sweeps(folder, manifest)
     spans = map_spans(recording, manifest)
     parts = _parts(recording, spans, maps, frames, time, run)
     with RunFolder(out) as target:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from rig.errors import DamagedRecordingError
+from rig.errors import DamagedRecordingError, UsageError
 
 MANIFEST: Final = "manifest.json"
 SEAL: Final = "crc32"
@@ -89,3 +89,12 @@ def _crc32(content: Mapping[str, Any]) -> int:
 
 
 _NEXT: Final = "'rig repair' writes a new one"
+
+
+def require_plain_sweeps(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """UsageError for a recording whose maps spadrig 0.1 took in several passes over part of the columns each."""
+    if "passes" in manifest:
+        raise UsageError(
+            f"{folder} was scanned with --adaptive, in passes that this version cannot put together; take spadrig 0.1 "
+            "to it, or scan again"
+        )

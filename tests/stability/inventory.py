@@ -28,7 +28,7 @@ SCOPE = (
     "rig/windows.py",
     *(f"rig/{name}.py" for name in ("error_bounds", "limits", "row_light", "scene_limits")),
     "rig/fog_*.py",
-    *(f"rig/{name}.py" for name in ("adaptive", "adaptive_thinning", "intervals", "multi_line*", "tradeoff_rows")),
+    *(f"rig/{name}.py" for name in ("intervals", "multi_line*", "tradeoff_rows")),
     "rig/estimators/*.py",
     *(
         f"sim_backend/{name}.py"

@@ -1,4 +1,4 @@
-"""Labels and pooled places at the ends of their ranges, and the choice of passes for any counts so far."""
+"""Labels and pooled places at the ends of their ranges."""
 
 from dataclasses import replace
 
@@ -8,9 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.adaptive import EXPOSURES, Pass, Unsettled, moved_rows, next_pass
-from rig.adaptive_counts import add_pass
-from rig.adaptive_thinning import thinned
 from rig.errors import UsageError
 from rig.estimators.label_grid import far_ends, label_grid
 from rig.estimators.placing import amplitudes_of, line_width, new_places, place, profile_table
@@ -100,53 +97,3 @@ def test_places_of_any_counts_move_a_pixel_at_most(rig, exposures, rate, haze, a
     table.x_px[:], table.x_sd_px[:], table.confidence[:] = x_px, sd, there
     width = line_width(volume, sweep, state, table, WORKERS)
     assert width is None or 0.2 < width < 2.5
-
-
-PASS_TIMES = {
-    "free": lambda columns, exposures: 0.0,
-    "plain": lambda columns, exposures: columns * exposures * 1e-5 + 2e-3,
-    "endless": lambda columns, exposures: 1e12,
-    "some": lambda columns, exposures: None if exposures > 3 or columns < 4 else 1e-9 * columns,
-}
-
-
-@covers("rig.adaptive:Pass.*", "rig.adaptive:Unsettled.*", "rig.adaptive:next_pass", "rig.adaptive:moved_rows")
-@EXAMPLES
-@given(
-    columns=st.sampled_from([1, 2, 7, 63, 64, 500]), moved=st.sampled_from([0.0, 1e-300, 1.0, 512.0]),
-    frames=st.sampled_from([0, 1, 2, 10**9]), passes=st.sampled_from([1, 8]), left_s=st.sampled_from([1e-9, 0.1, 1e9]),
-    time=st.sampled_from(list(PASS_TIMES)), seed=st.integers(0, 99),
-)  # fmt: skip
-def test_passes_lie_within_their_map_and_its_time(columns, moved, frames, passes, left_s, time, seed) -> None:
-    rng = np.random.default_rng(seed)
-    unsettled = Unsettled(moved * rng.random(columns), rng.integers(0, frames + 1, columns).astype(np.int32))
-    for exposures in (1, 10**6):
-        gain = unsettled.gain(exposures)
-        assert np.isfinite(gain).all()
-        assert np.all(gain >= 0)
-    found = next_pass(unsettled, PASS_TIMES[time], left_s, passes)
-    if found is not None:
-        assert 0 <= found.first_column < found.end_column <= columns
-        assert found.exposures in EXPOSURES
-        assert PASS_TIMES[time](found.columns, found.exposures) <= left_s
-    nothing = StripeTable.empty(3, columns)
-    assert not moved_rows(nothing, nothing, np.ones((3, columns), bool)).any()
-
-
-@covers("rig.adaptive_thinning:thinned")
-@pytest.mark.parametrize("level", [0, 1])
-def test_counts_without_contrast_are_thinned_and_added_exactly(level) -> None:
-    geometry = GEOMETRIES["left"]
-    frames = np.array([0, 1, 2, 3, 10, 255, 340, 340, 7, 7], np.int32)
-    volume = volume_of(np.full((COLUMNS, ROWS, WIDTH), level) * frames[:, None, None], geometry, frames)
-    volume = replace(volume, counts=volume.counts.astype(np.uint16))
-    fewer = thinned(volume)
-    left = np.array([0, 0, 1, 2, 8, 192, 255, 255, 6, 6])
-    np.testing.assert_array_equal(fewer.n_frames, left)
-    np.testing.assert_array_equal(fewer.counts, np.broadcast_to(level * left[:, None, None], fewer.counts.shape))
-    few = replace(fewer, counts=fewer.counts.astype(np.uint8), n_frames=fewer.n_frames)
-    total = few
-    for _ in range(400):
-        total = add_pass(total, Pass(0, COLUMNS, 1), few)
-    np.testing.assert_array_equal(total.counts, 401 * fewer.counts.astype(np.uint32))
-    np.testing.assert_array_equal(np.isfinite(total.column), total.n_frames > 0)

@@ -7,10 +7,9 @@ from typing import Any
 import pytest
 import yaml
 
-import rig.replay_run
 from drivers.spb1.control import ACK, COMMAND
 from drivers.transports.tap import IN, OUT, read_taps
-from rig import api
+from rig import api, replay_run
 from rig.config_files import load_config
 from rig.errors import DivergedError, UsageError
 from tests.system.small_rig import config, write_rig
@@ -46,7 +45,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bytes are held against the recording, times only roughly: a busy machine is late."""
-    monkeypatch.setattr(rig.replay_run, "SWAP_TOLERANCE_S", 0.2)
+    monkeypatch.setattr(replay_run, "SWAP_TOLERANCE_S", 0.2)
 
 
 def hil(folder: Path, laser: dict[str, Any]) -> Path:

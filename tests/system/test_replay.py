@@ -6,14 +6,15 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-import rig.scanning
 from drivers.recorded import RunRecording
-from rig import api
+from rig import api, scanning
 from rig.acquisition import Acquisition
 from rig.errors import DamagedRecordingError, UsageError
 from rig.recording.manifest import read_manifest, sealed_text
@@ -40,7 +41,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Maps with gaps, from two starts of the SPAD."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rig.scanning, "Acquisition", lambda *a, **k: Acquisition(*a, **{**k, "first_alone": True}))
+        patch.setattr(scanning, "Acquisition", lambda *a, **k: Acquisition(*a, **{**k, "first_alone": True}))
         return scan_of(tmp_path_factory.mktemp("lossy"), "argmax", 3, loss_probability=0.01)
 
 
@@ -123,6 +124,27 @@ def test_a_recording_that_was_cut_short_gives_its_whole_maps(learned: Path, tmp_
     result = api.replay(run, clock="max", out=tmp_path / "again")
     assert result.summary.maps == 2
     assert arrays(tmp_path / "again").items() < arrays(learned).items()
+
+
+def with_manifest(run: Path, copy: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """A copy of a run whose manifest was changed and sealed again."""
+    shutil.copytree(run, copy)
+    manifest = read_manifest(copy)
+    assert manifest is not None
+    change(manifest)
+    (copy / "manifest.json").write_text(sealed_text(json.dumps(manifest)))
+    return copy
+
+
+def test_recordings_of_versions_that_knew_passes_are_played_or_refused_in_a_sentence(
+    lossy: Path, tmp_path: Path
+) -> None:
+    plain = with_manifest(lossy, tmp_path / "plain", lambda manifest: manifest["config"]["scan"].update(adaptive=None))
+    assert api.replay(plain, clock="max", maps=1).summary.maps == 1
+    in_passes = with_manifest(lossy, tmp_path / "passes", lambda manifest: manifest.update(passes=[]))
+    for call in (lambda: api.replay(in_passes, clock="max"), lambda: api.cut(in_passes, maps="0", out=tmp_path / "x")):
+        with pytest.raises(UsageError, match="was scanned with --adaptive"):
+            call()
 
 
 def test_a_missing_start_is_not_closed_up(lossy: Path, tmp_path: Path) -> None:
