@@ -177,10 +177,6 @@ def _recording_problems(recording: RunRecording, plan: CubePlan, camera: Camera)
         return [
             f"{path} holds {len(recording.runs)} starts of the SPAD, a cube is of one; 'rig export' its frames as npy"
         ]
-    if run.entries["sweep"].any():
-        return [
-            f"{path} has scan markers, by which only the plan it was taken with binds it; take plan.yaml from a copy"
-        ]
     size = (header.width, header.height)
     if size != (header.sensor_width, header.sensor_height) or size != (camera.width, camera.height):
         return [

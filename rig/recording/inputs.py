@@ -10,6 +10,7 @@ from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_ri
 from calibration.model.rig_model import RigModel
 from rig.errors import UsageError
 from rig.recording.manifest import read_manifest
+from rig.recording.opening import open_recording
 from rig.recording.plain import from_plain, to_plain
 from rig.scan_plan import ScanPlan
 
@@ -61,11 +62,12 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
 
 
 def holds_frames_alone(folder: Path) -> bool:
-    """Whether no plan was ever beside the frames of a recording, as of imported ones.
-
-    DamagedRecordingError where the manifest, which tells, is damaged.
+    """Whether a recording has no plan and never had one, as imported frames: neither its manifest nor a marker tells
+    of one. DamagedRecordingError where the manifest is damaged.
     """
-    return not (folder / PLAN_FILE).exists() and PLAN_FILE not in ((read_manifest(folder) or {}).get("inputs") or {})
+    if (folder / PLAN_FILE).exists() or PLAN_FILE in ((read_manifest(folder) or {}).get("inputs") or {}):
+        return False
+    return not any(run.entries["sweep"].any() for run in open_recording(folder).runs)
 
 
 def reconstruct_line(folder: Path) -> str:

@@ -42,7 +42,7 @@ def _instead(path: Path) -> str:
     if inside:
         more = "" if len(inside) == 1 else f" or another of {len(inside)} in it"
         return f"is a folder without a recording ({SEGMENTS}) of its own; name {inside[0]}{more}"
-    if (path / MANIFEST).exists():
+    if (path / MANIFEST).exists() or (path / "stripe").is_dir():
         return (
             f"holds no recording ({SEGMENTS}): the frames of this run were not recorded; take it again with "
             "'rig scan --record'"

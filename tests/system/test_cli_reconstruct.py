@@ -147,7 +147,7 @@ def test_a_plan_or_option_that_does_not_fit_is_one_line(
             "the calibration's 100 x 24 sensor needs (frames, 24, 13)",
         ),
         (np.zeros((COLUMNS * EXPOSURES, ROWS), np.uint8), "needs (frames, 24, 13)"),
-        (np.zeros((COLUMNS * EXPOSURES, ROWS, 13), np.int8), "holds int8; a cube holds uint8"),
+        (np.zeros((COLUMNS * EXPOSURES, ROWS, 13), np.int8), "make it with frames.view(numpy.uint8)"),
         (b"columns: 3", "is no whole .npy file"),
         (b"", "is no whole .npy file"),
         (None, "No such file or directory; check the path"),
