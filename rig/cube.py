@@ -189,7 +189,7 @@ def _recording_problems(recording: RunRecording, plan: CubePlan, camera: Camera)
         if abs(rate_hz / plan.frame_rate - 1) > RATE_TOLERANCE:
             problems.append(
                 f"{path} was taken at {float(rate_hz):g} Hz, the plan says {float(plan.frame_rate):g} Hz; correct "
-                " frame_rate in the plan"
+                "frame_rate in the plan"
             )
     first, n = run.first_frame, run.end_frame - run.first_frame
     per_map = plan.columns * plan.exposures

@@ -28,19 +28,24 @@ _UNREADABLE: Final = (ValueError, EOFError, SyntaxError, OverflowError, MemoryEr
 def open_array(file: Path) -> NDArray[Any]:
     """The array of a `.npy` file, mapped into memory. UsageError, one line, where it holds none."""
     try:
-        loaded = np.load(file, mmap_mode="r", allow_pickle=False)
+        if zipfile.is_zipfile(file):
+            raise UsageError(_archive(file))
+        array: NDArray[Any] = np.lib.format.open_memmap(file, mode="r")
     except OSError as error:
         raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
-    except (*_UNREADABLE, zipfile.BadZipFile) as error:
+    except _UNREADABLE as error:
         raise UsageError(f"{file} {_why_unreadable(file)}") from error
-    if isinstance(loaded, np.ndarray):
-        return loaded
-    with loaded:
-        names = loaded.files
+    return array
+
+
+def _archive(file: Path) -> str:
+    """What a file of several arrays is, and how one of them is taken out."""
+    with zipfile.ZipFile(file) as archive:
+        names = [name.removesuffix(".npy") for name in archive.namelist()]
     one = f": numpy.save('cube.npy', numpy.load('{file.name}')['{names[0]}'])" if names else ""
-    raise UsageError(
-        f"{file} is an archive of arrays ({', '.join(names) or 'none'}); a cube is one array, written with "
-        f"numpy.save{one}"
+    return (
+        f"{file} is an archive of arrays ({', '.join(names) or 'none'}); a cube is one array, written with numpy.save"
+        f"{one}"
     )
 
 

@@ -63,6 +63,7 @@ def test_counts_are_the_sums_of_the_bits(
         patch.setattr(cube_module, "CHUNK_BYTES", chunk)
         for index in range(maps):
             volume, gaps = count_map(cube, index, counter)
+            assert gaps == []
             expected = bits.reshape(maps, columns, exposures, rows, width)[index].sum(axis=1)
             assert np.array_equal(volume.counts[:, :, :width], expected)
             assert not volume.counts[:, :, width:].any()
