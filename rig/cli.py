@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _ignore_interrupts() -> None:
-    """Let this process, which has ended but for its threads, end with its exit code, however often it is interrupted."""
+    """Let this process, over but for its threads, end with its exit code, however often it is interrupted."""
     if threading.current_thread() is threading.main_thread():
         for name in ("SIGINT", *_ENDING):
             if (number := getattr(signal, name, None)) is not None:
