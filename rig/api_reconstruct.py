@@ -11,6 +11,8 @@ from rig.config import CubePlan, EstimateConfig, Estimator, Filter
 from rig.config_files import load_cube_plan
 from rig.errors import UsageError
 from rig.estimators import ESTIMATORS, FILTERS
+from rig.recording.inputs import holds_frames_alone
+from rig.recording.opening import require_recording
 from rig.run import OutFolder, Progress, RunResult
 
 
@@ -26,16 +28,20 @@ def reconstruct(
     out: OutFolder = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Depth from a recording, or from a packed `.npy` cube of frames that any program made (`rig reconstruct`).
+    """Depth from a recording, or from packed frames that any program made (`rig reconstruct`).
 
-    source: folder of a run taken with `record`, or uint8 (maps x columns x exposures, height, ceil(width/8)). plan,
-    calibration: a cube needs both; a recording has its own, but may be given a calibration file that was made since.
+    source: folder of a run taken with `record`; or frames alone: an .npy of uint8 (maps x columns x exposures, height,
+    ceil(width/8)), or the folder that `rig import` made of such. plan, calibration: frames alone need both; a run has
+    its own, but may be given a calibration file that was made since.
     Settings that are None are those of the recording; of a cube likelihood, none and 0.5. accept_calibration: as of
     `scan`. out: a folder to write, None to write nothing. progress: called with frames or maps done and all. Raises
     UsageError, a line per problem, for files that do not fit together. An interrupt ends the run after its last whole
     map, with verdict 'aborted'.
     """
-    if Path(source).is_dir():
+    source = Path(source)
+    if source.is_dir():
+        require_recording(source)
+    if source.is_dir() and not holds_frames_alone(source):
         if plan is not None:
             raise UsageError(f"{source} is a recording, which has the plan it was taken with; leave --plan out")
         if isinstance(calibration, RigModel):
@@ -56,11 +62,11 @@ def reconstruct(
     from rig.cube_depth import reconstruct_cube
 
     if plan is None or calibration is None:
-        if not Path(source).exists():
+        if not source.exists():
             said = "does not exist; name the folder of a run taken with --record, or an .npy of frames"
             raise UsageError(f"{source} {said}")
         missing = [name for name, given in (("--plan", plan), ("--calibration", calibration)) if given is None]
-        raise UsageError(f"{source} is no folder of a recording; a cube of frames needs {' and '.join(missing)} too")
+        raise UsageError(f"{source} holds frames alone; add {' and '.join(missing)}, which say how they were taken")
     estimate = _estimate(
         "likelihood" if estimator is None else estimator,
         "none" if filter is None else filter,

@@ -30,6 +30,11 @@ from rig import (
 from rig.cli_command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, say
 from rig.kernel_cache import ensure_kernel_cache
 
+_ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
+"""Signals that end a program, beside Ctrl-C; no system has all of them."""
+_TYPER_INTERRUPTED = 130
+"""What typer returns where an interrupt reaches it."""
+
 app = typer.Typer(
     name="rig",
     help="Runs a single-photon structured-light scanner and returns depth through fog, rain and snow.",
@@ -61,10 +66,23 @@ def main(argv: Sequence[str] | None = None) -> None:
         try:
             code = app(args=arguments, prog_name="rig", standalone_mode=False)
         except KeyboardInterrupt:
-            code = EXIT_ABORTED
+            code = _TYPER_INTERRUPTED
         except Exception as error:
             code = _say_why(error)
+        if code == _TYPER_INTERRUPTED:  # before a command had begun, or once more while one ended
+            say("aborted")
+            code = EXIT_ABORTED
+    if argv is None and code == EXIT_ABORTED:
+        _ignore_interrupts()
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _ignore_interrupts() -> None:
+    """Let this process, over but for its threads, end with its exit code, however often it is interrupted."""
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGINT", *_ENDING):
+            if (number := getattr(signal, name, None)) is not None:
+                signal.signal(number, signal.SIG_IGN)
 
 
 @contextmanager
@@ -79,7 +97,7 @@ def _signals_interrupt() -> Iterator[None]:
 
     before = {}
     if threading.current_thread() is threading.main_thread():
-        for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
+        for name in _ENDING:
             number = getattr(signal, name, None)
             if number is not None and signal.getsignal(number) is signal.SIG_DFL:
                 before[number] = signal.signal(number, interrupt)
@@ -93,7 +111,7 @@ def _signals_interrupt() -> Iterator[None]:
 def _say_why(error: Exception) -> int:
     """Say what ended a command that did not handle it: a usage error of click's, an interrupt or a mistake of ours."""
     if isinstance(error.__cause__, KeyboardInterrupt):
-        return EXIT_ABORTED
+        return _TYPER_INTERRUPTED
     # Typer carries click inside or beside itself, depending on its version.
     if not hasattr(error, "format_message"):
         traceback.print_exception(error)

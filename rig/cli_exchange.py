@@ -25,7 +25,7 @@ def import_command(
         str | None,
         typer.Option(
             "--form",
-            help="pi-imaging: packed or sparse; swissspad2: half or full",
+            help="pi-imaging: packed or sparse; swissspad2: half or full; photoncube: packed",
             show_default="as the file looks; half",
         ),
     ] = None,

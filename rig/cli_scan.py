@@ -112,11 +112,13 @@ def _show_plan(plan: "ScanPlan", as_json: bool) -> int:
 def reconstruct_command(
     source: Annotated[
         Path,
-        typer.Argument(metavar="RUN_OR_NPY", help="a run taken with --record, or packed frames", show_default=False),
+        typer.Argument(
+            metavar="RUN_OR_NPY", help="a run taken with --record, or imported or packed frames", show_default=False
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
     plan: Annotated[
-        Path | None, typer.Option("--plan", help="plan.yaml of a cube", show_default="the recording's own")
+        Path | None, typer.Option("--plan", help="plan.yaml of frames alone", show_default="the recording's own")
     ] = None,
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="calibration.yaml", show_default="the recording's own")
@@ -127,7 +129,7 @@ def reconstruct_command(
     accept_calibration: AcceptOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Depth from a recording or from a packed .npy cube of frames."""
+    """Depth from a recording, from imported frames or from a packed .npy cube of them."""
     from rig import api
 
     # Names that are none are refused by the call, which knows which there are.

@@ -11,14 +11,23 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 import rig
+from calibration.files.camera_file import CAMERA_FORMAT
+from calibration.files.sections import FORMAT
 from drivers.registry import SLOTS, kinds, lookup
 from rig.config import CubePlan, RigConfig
 from rig.config_problems import Key, Sources, explain
 from rig.errors import UsageError
+from rig.recording.inputs import PLAN_FORMAT
 
 BUNDLED = Path(rig.__file__).parent.parent / "config"
 """Folder of the configs that travel with the program."""
 SUFFIXES = (".yaml", ".yml")
+_OTHERS = {
+    PLAN_FORMAT: "the compiled plan of a recording, which is found beside its frames",
+    FORMAT: "a calibration",
+    CAMERA_FORMAT: "the calibration of a camera alone",
+}
+"""Files of ours that are taken for others, by their `format`."""
 NO_CONFIG = "no config"
 """Begins what is said of a name that means none."""
 
@@ -34,6 +43,7 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
     """
     path = find_config(name_or_path)
     content, lines = read_yaml(path)
+    _refuse_others(path, content, f"name the config of a rig, such as {bundled_configs()[0]}")
     _anchor_paths(content, path.parent)
     given = {key: value for key, value in (overrides or {}).items() if value is not None}
     for key, value in given.items():
@@ -45,6 +55,8 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
 def load_cube_plan(path: str | Path) -> CubePlan:
     """The `plan.yaml` of a bare cube. Raises UsageError with one line per problem."""
     content, lines = read_yaml(Path(path))
+    leave = "leave --plan out; " if content.get("format") == PLAN_FORMAT else ""
+    _refuse_others(path, content, f"{leave}the plan of frames alone has {', '.join(CubePlan.model_fields)}")
     return _validated(CubePlan, content, Sources(_shown(Path(path)), lines), Path(path).parent)
 
 
@@ -149,6 +161,12 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], dict[Key, int]]:
     if twice:
         raise UsageError.of(f"{name}:{line}: '{'.'.join(key)}' is given twice; keep one" for key, line in twice)
     return content, lines
+
+
+def _refuse_others(path: str | Path, content: Mapping[str, Any], then: str) -> None:
+    """UsageError for a file of ours that is neither a config nor the plan of a cube; then: the next step."""
+    if (what := _OTHERS.get(str(content.get("format")))) is not None:
+        raise UsageError(f"{path} is {what}; {then}")
 
 
 def _walk(node: Any, path: Key, lines: dict[Key, int]) -> list[tuple[Key, int]]:

@@ -1,61 +1,113 @@
-"""A bare cube of packed frames in a .npy file, made by any program: checked against its plan, counted map by map.
+"""A bare cube of packed frames, made by any program: checked against its plan, counted map by map.
 
-uint8 (maps x columns x exposures, height, ceil(width/8)), most significant bit first (numpy packbits). Frame f of a map
-belongs to column f // exposures, exactly; there are no dark frames.
+In a .npy file: uint8 (maps x columns x exposures, height, ceil(width/8)), most significant bit first (numpy packbits).
+Or in a recording of frames alone, as `rig import` writes it, whose frames may have gaps in their numbers. Frame f of a
+map belongs to column f // exposures, exactly; there are no dark frames.
 """
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
+from drivers.recorded import RecordedRun, RunRecording
 from rig.config import CubePlan
 from rig.counting import Counter, FrameTally
 from rig.errors import UsageError
+from rig.packed_arrays import holds_bits, numpy_line, open_array
+from rig.recording.opening import open_recording
 
 CHUNK_BYTES = 16 << 20
 """Frames are read in pieces of this size; larger ones only cost memory."""
+RATE_TOLERANCE: Final = 1e-3
+"""Relative. Rates are written with three digits or so."""
+
+Piece = tuple[int, NDArray[np.uint8]]
+"""Number of the first frame, and uint8 (n, height, ceil(width/8) or more) of it and those that follow it."""
+Gap = tuple[int, int]
+"""First and last number of frames that are not there."""
+
+
+class Frames(Protocol):
+    """Where a cube's frames lie."""
+
+    def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
+        """The frames there are from number `first` to before `end`, at most `step` at a time."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrayFrames:
+    """Frames in an array (n, height, row bytes), numbered from 0, read from disk as needed."""
+
+    array: NDArray[np.uint8]
+
+    def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
+        """The frames from `first` to before `end`."""
+        for start in range(first, end, step):
+            yield start, self.array[start : min(start + step, end)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedFrames:
+    """Frames of a recording's one run, by their own numbers. Those of damaged blocks are left out."""
+
+    recording: RunRecording
+    run: RecordedRun
+
+    def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
+        """The frames there are from `first` to before `end`, in the blocks they lie in."""
+        for block in self.recording.blocks(self.run, first, end):
+            for start in range(0, block.n_frames, step):
+                yield block.header.first_frame + start, block.bits[start : start + step]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cube:
-    """A checked cube. frames: uint8 (maps x columns x exposures, height, ceil(width/8)), read from disk as needed."""
+    """Checked frames of whole maps. first_frame: number of the first map's first one. maps: whole sweeps."""
 
     path: Path
-    frames: NDArray[np.uint8]
+    frames: Frames
     plan: CubePlan
     width: int
-
-    @property
-    def maps(self) -> int:
-        """Whole sweeps in the cube."""
-        return len(self.frames) // self.frames_per_map
+    height: int
+    maps: int
+    first_frame: int = 0
 
     @property
     def frames_per_map(self) -> int:
-        """Frames of one sweep."""
+        """Frames of one sweep, lost ones included."""
         return self.plan.columns * self.plan.exposures
 
 
 def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> Cube:
-    """Open a cube and check it against its plan and calibration; UsageError where they disagree."""
+    """Open a .npy file, or the folder of a recording, and check it against its plan and calibration.
+
+    UsageError where they disagree.
+    """
     file = Path(path)
-    try:
-        frames = np.load(file, mmap_mode="r", allow_pickle=False)
-    except OSError as error:
-        raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
-    except (ValueError, EOFError) as error:
-        raise UsageError(f"{file} is no whole .npy file of numbers; write it with numpy.save") from error
-    if not isinstance(frames, np.ndarray):
-        raise UsageError(f"{file} is an archive of arrays; a cube is one array, written with numpy.save")
-    problems = [*_frame_problems(file, frames, plan, model), *_plane_problems(plan, model)]
+    camera = model.camera
+    frames: Frames
+    if file.is_dir():
+        recording = open_recording(file)
+        run = recording.runs[0]
+        problems = _recording_problems(recording, plan, camera)
+        frames, first, n = RecordedFrames(recording, run), run.first_frame, run.end_frame - run.first_frame
+    else:
+        array = open_array(file)
+        problems = _array_problems(file, array, plan, camera)
+        frames, first, n = ArrayFrames(array), 0, len(array) if array.ndim else 0
+    problems += _plane_problems(plan, model)
     if problems:
         raise UsageError.of(problems)
-    return Cube(file, frames, plan, model.camera.width)
+    return Cube(file, frames, plan, camera.width, camera.height, n // (plan.columns * plan.exposures), first)
 
 
 def cube_columns(model: RigModel) -> int | None:
@@ -71,46 +123,93 @@ def column_commands(plan: CubePlan) -> NDArray[np.float64]:
     return np.arange(plan.columns, dtype=np.float64)
 
 
-def count_map(cube: Cube, index: int, counter: Counter) -> FrameTally:
-    """Counts of one map. `counter` is made for the cube's columns and size; it is reset first."""
+def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, list[Gap]]:
+    """Counts of one map, and its frames that are not there. `counter` is made for the cube's columns and size.
+
+    The counter is reset first.
+    """
     counter.reset()
-    first = index * cube.frames_per_map
-    exposures = cube.plan.exposures
-    _, height, row_bytes = cube.frames.shape
+    first = cube.first_frame + index * cube.frames_per_map
+    end = first + cube.frames_per_map
+    row_bytes = -(-cube.width // 8)
     padded = -(-row_bytes // 8) * 8
-    step = max(1, CHUNK_BYTES // (height * padded))
+    step = max(1, CHUNK_BYTES // (cube.height * padded))
     # Programs may leave anything in the bits past the width; they are no pixels.
     last_byte = np.uint8(0xFF << (-cube.width % 8) & 0xFF)
-    for start in range(0, cube.frames_per_map, step):
-        stop = min(start + step, cube.frames_per_map)
-        bits = np.zeros((stop - start, height, padded), np.uint8)
-        bits[:, :, :row_bytes] = cube.frames[first + start : first + stop]
+    gaps: list[Gap] = []
+    following = first
+    for start, piece in cube.frames.between(first, end, step):
+        if start > following:
+            gaps.append((following, start - 1))
+        following = start + len(piece)
+        bits = np.zeros((len(piece), cube.height, padded), np.uint8)
+        bits[:, :, :row_bytes] = piece[:, :, :row_bytes]
         bits[:, :, row_bytes - 1] &= last_byte
-        column = (np.arange(start, stop) // exposures).astype(np.int32)
+        column = (np.arange(start - first, following - first) // cube.plan.exposures).astype(np.int32)
         counter.add(bits, column, column.astype(np.float64), np.zeros(len(bits), np.int32))
         counter.settle(1)  # frames wait in memory until they are counted
-    return counter.finish()
+    if following < end:
+        gaps.append((following, end - 1))
+    return counter.finish(), gaps
 
 
-def _frame_problems(file: Path, frames: NDArray[np.generic], plan: CubePlan, model: RigModel) -> list[str]:
-    camera = model.camera
+def _array_problems(file: Path, array: NDArray[Any], plan: CubePlan, camera: Camera) -> list[str]:
     size = (camera.height, -(-camera.width // 8))
-    if frames.dtype != np.uint8:
+    if array.dtype == np.uint8 and array.ndim == 3 and array.shape[1:] == size:
+        return _length_problems(f"{file} has {len(array)} frames", len(array), plan)
+    line = numpy_line(array, camera.height, camera.width)
+    if line is None:
+        then = "use the calibration made with this sensor"
+    else:
+        then = f"make it with {line}"
+        if "packbits" in line and "unpackbits" not in line and array.dtype != bool and not holds_bits(array):
+            then += " (every value but 0 becomes 1; sums of several exposures are no frames)"
+    return [
+        f"{file} holds {array.dtype} of shape {array.shape}; the calibration's {camera.width} x {camera.height} sensor "
+        f"needs (frames, {size[0]}, {size[1]}) of uint8, eight pixels a byte; {then}"
+    ]
+
+
+def _recording_problems(recording: RunRecording, plan: CubePlan, camera: Camera) -> list[str]:
+    """Why the frames of a recording are not those of the plan."""
+    path, run, header = recording.path, recording.runs[0], recording.runs[0].header
+    if len(recording.runs) > 1:
         return [
-            f"{file} holds {frames.dtype}; a cube holds uint8, eight pixels a byte (numpy.packbits along the width)"
+            f"{path} holds {len(recording.runs)} starts of the SPAD, a cube is of one; 'rig export' its frames as npy"
         ]
-    if frames.ndim != 3 or frames.shape[1:] != size:
+    size = (header.width, header.height)
+    if size != (header.sensor_width, header.sensor_height) or size != (camera.width, camera.height):
         return [
-            f"{file} has shape {frames.shape}; the calibration's {camera.width} x {camera.height} sensor needs "
-            f"(frames, {size[0]}, {size[1]}); use the calibration made with this sensor"
+            f"{path} holds frames of {header.width} x {header.height} pixels, the calibration is of a sensor of "
+            f"{camera.width} x {camera.height}; use the calibration made with this sensor"
         ]
+    problems = []
+    if header.frame_period_ticks:
+        rate_hz = header.tick_hz / header.frame_period_ticks
+        if abs(rate_hz / plan.frame_rate - 1) > RATE_TOLERANCE:
+            problems.append(
+                f"{path} was taken at {float(rate_hz):g} Hz, the plan says {float(plan.frame_rate):g} Hz; correct "
+                "frame_rate in the plan"
+            )
+    first, n = run.first_frame, run.end_frame - run.first_frame
     per_map = plan.columns * plan.exposures
-    if len(frames) == 0 or len(frames) % per_map:
-        return [
-            f"{file} has {len(frames)} frames; {plan.columns} columns x {plan.exposures} exposures need {per_map} "
-            "a map, or a multiple of it; correct columns or exposures in the plan"
-        ]
-    return []
+    if first % per_map:
+        problems.append(
+            f"{path} begins with frame {first}, which is no first one of a map of {per_map} frames; "
+            "'rig export' it as npy where its first frame is the first of a map all the same"
+        )
+    what = f"{path} has {n} frames" if n == run.frames else f"{path} has {n} frames, {n - run.frames} of them lost"
+    return problems + _length_problems(what, n, plan)
+
+
+def _length_problems(what: str, n_frames: int, plan: CubePlan) -> list[str]:
+    per_map = plan.columns * plan.exposures
+    if n_frames and n_frames % per_map == 0:
+        return []
+    return [
+        f"{what}; {plan.columns} columns x {plan.exposures} exposures need {per_map} a map, or a multiple of it; "
+        "correct columns or exposures in the plan"
+    ]
 
 
 def _plane_problems(plan: CubePlan, model: RigModel) -> list[str]:

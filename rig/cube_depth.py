@@ -6,7 +6,7 @@ import time
 from rig.calibration_identity import CalibrationUse, accepted_by
 from rig.config import EstimateConfig
 from rig.counting import SweepLayout
-from rig.cube import Cube, column_commands, count_map
+from rig.cube import Cube, Gap, column_commands, count_map
 from rig.reconstruction import Reconstructor
 from rig.run import OutFolder, Progress, Run, RunResult
 from rig.summary import MapTally, RunFrames, Verdict
@@ -16,7 +16,10 @@ from rig.warm_up import warm_up
 def reconstruct_cube(
     cube: Cube, calibration: CalibrationUse, estimate: EstimateConfig, out: OutFolder, progress: Progress | None = None
 ) -> RunResult:
-    """All maps of a checked cube. An interrupt ends the run after its last whole map, with verdict 'aborted'."""
+    """All maps of a checked cube; those that lack frames have them noted as gaps.
+
+    An interrupt ends the run after its last whole map, with verdict 'aborted'.
+    """
     plan, model = cube.plan, calibration.model
     threads = estimate.threads or os.cpu_count() or 1
     reconstructor = Reconstructor(
@@ -36,30 +39,36 @@ def reconstruct_cube(
             plan.columns, geometry.rows, geometry.width, geometry.x0, geometry.window, plan.exposures, dark=False
         )
     )
+    gaps: list[list[Gap]] = []
     with Run(out, tally) as run:
         run.rays = geometry.rays
         verdict = Verdict.COMPLETE
         try:
             for index in range(cube.maps):
                 begun = time.perf_counter()
-                sweep = count_map(cube, index, counter)
+                sweep, missing = count_map(cube, index, counter)
                 count_s = time.perf_counter() - begun
                 result = reconstructor.map(sweep)
+                gaps.append(missing)
                 run.add(result, count_s + result.compute_s)
                 if progress is not None:
                     progress(tally.maps, cube.maps)
         except KeyboardInterrupt:
             verdict = Verdict.ABORTED
+        gaps_of_run = [gap for of_map in gaps[: tally.maps] for gap in of_map]
+        lost = sum(last - first + 1 for first, last in gaps_of_run)
         n = tally.maps * cube.frames_per_map
+        if lost and verdict is Verdict.COMPLETE:
+            verdict = Verdict.GAPS
         manifest = {
             "command": "reconstruct",
             "cube": cube.path.absolute(),
             "plan": plan.model_dump(mode="json"),
             "calibration": calibration.content(),
             "estimate": estimate.model_dump(mode="json"),
-            "gaps": [],
+            "gaps": [list(gap) for gap in gaps_of_run],
         }
-        frames = RunFrames(n, n, 0, None, n)
+        frames = RunFrames(expected=n, received=n - lost, lost=lost, crc_errors=None, lit=n - lost)
         return run.finish(
             frames, n / float(plan.frame_rate), verdict, manifest, accepted_calibration=accepted_by(calibration)
         )

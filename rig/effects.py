@@ -205,13 +205,13 @@ def _trials(
 
 
 def _trial(config: RigConfig, columns: int, names: list[str]) -> Array:
-    """Charged stripe errors of a scan with so many columns and these effects."""
+    """Charged stripe errors of a scan with so many columns and these effects. An interrupt is raised again."""
     from rig.api_scan import scan
 
     assert config.world is not None, "there was a report"
     world = config.world.model_copy(update={"effects": tuple(names)})
     short = config.scan.model_copy(update={"columns": columns})
-    result = scan(config.model_copy(update={"world": world, "scan": short}))
+    result = scan(config.model_copy(update={"world": world, "scan": short})).uninterrupted()
     last, truth = result.last, result.truth
     assert last is not None, "one map was asked for"
     assert truth is not None, "worlds know it"

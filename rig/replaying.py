@@ -17,7 +17,6 @@ from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import RigModel
 from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
 from drivers.recorded import RecordedRun, RunRecording
-from drivers.recorded.segments import NO_SEGMENT, segment_files
 from drivers.replay_pace import Pace, PaceReport, ReplayClock
 from rig.config import EstimateConfig, RigConfig, ScanConfig
 from rig.config_files import parse_config
@@ -26,6 +25,7 @@ from rig.estimators import Learned
 from rig.plan import spad_request
 from rig.recording.inputs import read_plan
 from rig.recording.manifest import MANIFEST, is_cut_short, read_manifest, require_inputs, require_plain_sweeps
+from rig.recording.opening import require_recording
 from rig.recording.part import part_learned, part_starts
 from rig.scan_plan import ScanPlan
 from rig.sweeps import SweepStart
@@ -90,10 +90,7 @@ def replay_config(
     against_recording: the recording's own drivers take part, against what their devices answered then.
     estimate: settings laid over those of the recording. UsageError where there is no recording.
     """
-    if not run.is_dir():
-        raise UsageError(f"{run} is no folder of a run; name one that was taken with --record")
-    if not segment_files(run):
-        raise UsageError(f"{run} {NO_SEGMENT}")
+    require_recording(run)
     plan = read_plan(run)
     manifest = read_manifest(run)
     if manifest is None:

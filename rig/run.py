@@ -44,6 +44,12 @@ class RunResult:
     folder: Path | None
     control: ControlCheck | None = None
 
+    def uninterrupted(self) -> Self:
+        """Itself; raises KeyboardInterrupt where an interrupt ended the run, for those that need all of it."""
+        if self.summary.verdict is Verdict.ABORTED:
+            raise KeyboardInterrupt
+        return self
+
 
 class Run:
     """Takes the maps of a run one by one, writes those to be kept, and closes with manifest and summary.

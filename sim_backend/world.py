@@ -36,6 +36,8 @@ Array = NDArray[np.float64]
 
 DARK_EFFECTS = ("dark counts",)
 """Steady detections that need no light."""
+LEAST_PIXELS = 2
+"""Of the camera each way: light is computed with the slopes of the rays from pixel to pixel."""
 DEFAULT_GEOMETRY = Path(__file__).parent.parent / "config" / "simulated-rig.yaml"
 
 
@@ -291,6 +293,12 @@ def _load_geometry(path: Path) -> RigModel:
     if model.source_m is None:
         raise DeviceError(
             f"world geometry {path} has no source_m; add where the light leaves the mirror, e.g. [-0.3, 0, 0]"
+        )
+    camera = model.camera
+    if min(camera.width, camera.height) < LEAST_PIXELS:
+        raise DeviceError(
+            f"world geometry {path} has a camera of {camera.width} x {camera.height} pixels; simulated light needs at "
+            f"least {LEAST_PIXELS} each way, give it more rows and columns"
         )
     return model
 

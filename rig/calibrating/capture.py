@@ -36,7 +36,7 @@ from rig.run import OutFolder, Run
 from rig.scan_plan import Leg, ScanPlan
 from rig.scanning import ScanOptions, run_scan
 from rig.session import OpenRig, open_rig, prepare
-from rig.summary import MapTally, Verdict
+from rig.summary import MapTally
 from rig.sweeps import SweepData
 
 MOST_LAG_S = 5e-4
@@ -150,8 +150,7 @@ def _sweeps(rig: OpenRig, maps: int, seed: int, out: OutFolder) -> list[SweepDat
     options = ScanOptions(record=out is not None, sweeps=found.append, accept_calibration=True)
     with Run(out, tally, record=out is not None) as run:
         result = run_scan(rig, run, maps, seed, options)
-    if result.summary.verdict is Verdict.ABORTED:
-        raise KeyboardInterrupt
+    result.uninterrupted()
     return found
 
 

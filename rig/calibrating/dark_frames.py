@@ -117,7 +117,10 @@ def take_dark(
 
 
 def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None = None) -> SweepSums:
-    """The frames of a scan with light, or of all sweeps of a recording, which takes the SPAD's place."""
+    """The frames of a scan with light, or of all sweeps of a recording, which takes the SPAD's place.
+
+    An interrupt is raised again, once the rig is safe.
+    """
     scan, sums = rig.config.scan, SweepSums()
 
     def tell(done: int, planned: int) -> None:
@@ -128,7 +131,7 @@ def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None
         sweeps=sums.add, accept_calibration=True, live=lambda told: tell(told.frames, told.frames_planned)
     )
     with Run(None, MapTally(scan.columns, scan.exposures, "argmax", "none")) as run:
-        run_scan(rig, run, maps, 0, options)
+        run_scan(rig, run, maps, 0, options).uninterrupted()
     if sums.tally is None:
         raise UsageError(f"{rig.spad.name} gave no sweep with dark frames in one piece; scan again")
     return sums

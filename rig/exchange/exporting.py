@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, get_args
 from drivers.errors import ProtocolError
 from drivers.frames import FrameBlock
 from drivers.recorded import RunRecording
-from drivers.recorded.segments import NO_SEGMENT, segment_files
+from drivers.recorded.segments import segment_files
 from rig.errors import DamagedRecordingError, UsageError
 from rig.exchange import hdf5, pictures
 from rig.exchange.frame_log import FrameLog
@@ -18,8 +18,9 @@ from rig.exchange.maps import MapFiles
 from rig.exchange.npy import write_npy
 from rig.exchange.pictures import VIEWS, Picture, View
 from rig.outputs import RunFolder
-from rig.recording.inputs import read_model
+from rig.recording.inputs import read_model, reconstruct_line
 from rig.recording.manifest import read_manifest
+from rig.recording.opening import SEGMENTS, require_recording
 from rig.run import Progress
 
 ExportKind = Literal["npy", "hdf5", "ply", "png", "mp4"]
@@ -28,7 +29,6 @@ PICTURE_KINDS: Final = ("png", "mp4")
 """Those that have a view."""
 FILMS_PER_S: Final = 25.0
 FRAMES_PER_PICTURE: Final = 100
-_NO_MAPS: Final = "make them first: rig reconstruct {run} --out DIR, and export that folder"
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ class _Export:
     def write_npy(self) -> None:
         """The frames as a cube."""
         if not self._recorded:
-            raise UsageError(f"{self._run} {NO_SEGMENT}")
+            require_recording(self._run)
         model = read_model(self._run)
         source = {"run": self._run.absolute().name, "manifest": self._manifest()}
         self.log = write_npy(self._blocks(), self._folder, source, None if model is None else model.camera)
@@ -119,7 +119,7 @@ class _Export:
     def write_hdf5(self) -> None:
         """Frames and maps, as far as there are any."""
         if not self._maps.indices and not self._recorded:
-            raise UsageError(f"{self._run} holds neither maps nor recorded frames; name the folder of a run")
+            require_recording(self._run)
         blocks = self._blocks() if self._recorded else iter(())
         log = hdf5.write_hdf5(blocks, self._maps, self._manifest(), self._folder.place(hdf5.FILE))
         self.log = log if self._recorded else None
@@ -129,7 +129,7 @@ class _Export:
         """The point clouds of all maps."""
         clouds = self._maps.files("cloud", ".ply")
         if not clouds:
-            raise UsageError(f"{self._run} holds no point clouds; {_NO_MAPS.format(run=self._run)}")
+            raise UsageError(f"{self._run} holds no point clouds; {self._make_maps()}")
         for file in clouds:
             shutil.copyfile(file, self._folder.place(file.name))
         self.n_maps = len(clouds)
@@ -147,7 +147,7 @@ class _Export:
 
     @property
     def _recorded(self) -> bool:
-        return bool(segment_files(self._run))
+        return bool(segment_files(self._run)) and (self._run.is_dir() or self._run.match(f"{SEGMENTS}*"))
 
     def _blocks(self) -> Iterator[FrameBlock]:
         """All sound blocks of the recording; what is not sound is noted as damage."""
@@ -182,12 +182,19 @@ class _Export:
         view = next(
             (one for one in VIEWS if one == self._options.view or (not self._options.view and there[one])), None
         )
+        if view == "frames" and not there[view]:
+            require_recording(self._run)
         if view is None or not there[view]:
             what = f"no {view}" if view else "nothing to show"
-            raise UsageError(f"{self._run} holds {what}; {_NO_MAPS.format(run=self._run)}")
+            raise UsageError(f"{self._run} holds {what}; {self._make_maps()}")
         if self._options.frames_per_picture and view != "frames":
             raise UsageError(f"pictures of {view} sum no frames; name --view frames, or leave --frames out")
         return view
+
+    def _make_maps(self) -> str:
+        """The next step where there are no maps. UsageError where there are no frames to make them of either."""
+        require_recording(self._run)
+        return f"make them first: {reconstruct_line(self._run)}, and export that folder"
 
     def _pictures(self, view: View) -> Iterator[Picture]:
         if view == "frames":

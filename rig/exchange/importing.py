@@ -32,7 +32,11 @@ ImportKind = Literal["pi-imaging", "swissspad2", "photoncube"]
 IMPORT_KINDS: Final[tuple[ImportKind, ...]] = get_args(ImportKind)
 
 _SUFFIXES: Final = {"pi-imaging": ".bin", "swissspad2": ".bin", "photoncube": ".npy"}
-_FORMS: Final[dict[str, tuple[str, ...]]] = {"pi-imaging": pi_imaging.FORMS, "swissspad2": swissspad2.FORMS}
+_FORMS: Final[dict[str, tuple[str, ...]]] = {
+    "pi-imaging": pi_imaging.FORMS,
+    "swissspad2": swissspad2.FORMS,
+    "photoncube": photoncube.FORMS,
+}
 _UPRIGHT_DEG: Final[dict[str, QuarterTurn]] = {"pi-imaging": 90}
 """Turns that make frames upright: the vendor's samples turn by 90 degrees, and so does the driver (`rotation`)."""
 _RUN_ID: Final = 1
@@ -66,7 +70,8 @@ class ImportResult:
 class ImportOptions:
     """How files are read.
 
-    form: packed or sparse (pi-imaging), half or full (swissspad2); None: as seen from the file, or half.
+    form: packed or sparse (pi-imaging), half or full (swissspad2), packed (photoncube); None: as seen from the file, or
+    half.
     frame_rate: None where it is not known. turn_deg: counter-clockwise; None: 90 for pi-imaging, else 0. rows: of the
     sensor, pi-imaging only; None: 512.
     """
@@ -150,9 +155,8 @@ def _checked_turn(kind: str, options: ImportOptions) -> QuarterTurn:
     if kind not in IMPORT_KINDS:
         raise UsageError(f"import kind {kind!r} is unknown; choose one of {', '.join(IMPORT_KINDS)}")
     problems = []
-    forms = _FORMS.get(kind, ())
-    if options.form is not None and options.form not in forms:
-        known = f"choose {' or '.join(forms)}" if forms else "leave --form out"
+    if options.form is not None and options.form not in _FORMS[kind]:
+        known = f"choose {' or '.join(_FORMS[kind])}, or leave --form out"
         problems.append(f"{kind} has no form {options.form!r}; {known}")
     turn = _UPRIGHT_DEG.get(kind, 0) if options.turn_deg is None else options.turn_deg
     turns = get_args(QuarterTurn)
@@ -173,7 +177,7 @@ def _opened(kind: str, sources: list[Path], options: ImportOptions) -> ForeignFr
         return pi_imaging.open_pi_imaging(sources, form, options.rows or pi_imaging.ROWS)
     if kind == "swissspad2":
         return swissspad2.open_swissspad2(sources, "full" if options.form == "full" else "half")
-    return photoncube.open_photoncube(sources)
+    return photoncube.open_photoncube(sources, packed=options.form == "packed")
 
 
 def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.uint8]]:

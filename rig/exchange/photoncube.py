@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from rig.errors import UsageError
 from rig.exchange.foreign import ForeignFrames, chunks_of
+from rig.packed_arrays import PACK, holds_bits, open_array
 
+FORMS: Final = ("packed",)
 SIDECAR_FORMAT: Final = "spadrig-frames"
 TRANSFORMS: Final = "transforms.json"
 _MOST_PIXELS: Final = 0xFFFF
@@ -33,13 +35,16 @@ class _Cube:
     ranges: tuple[tuple[int, int], ...]
 
 
-def open_photoncube(files: Sequence[Path]) -> ForeignFrames:
-    """Frames of all cubes, one after the other. UsageError, a line per problem, for files that are no such cubes."""
+def open_photoncube(files: Sequence[Path], *, packed: bool = False) -> ForeignFrames:
+    """Frames of all cubes, one after the other. UsageError, a line per problem, for files that are no such cubes.
+
+    packed: they are, also those of bytes 0 and 1 only, which else are refused.
+    """
     problems: list[str] = []
     cubes: list[_Cube] = []
     for file in files:
         try:
-            cubes.append(_open(file))
+            cubes.append(_open(file, packed=packed))
         except UsageError as error:
             problems += error.problems
     if not problems and len({(cube.width, cube.frames.shape[1:]) for cube in cubes}) > 1:
@@ -68,19 +73,12 @@ def open_photoncube(files: Sequence[Path]) -> ForeignFrames:
     )
 
 
-def _open(file: Path) -> _Cube:
-    try:
-        loaded = np.load(file, mmap_mode="r", allow_pickle=False)
-    except OSError as error:
-        raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
-    except (ValueError, EOFError) as error:
-        raise UsageError(f"{file} is no whole .npy file of numbers; write it with photoncube or numpy.save") from error
-    if not isinstance(loaded, np.ndarray):
-        raise UsageError(f"{file} is an archive of arrays; a photon cube is one array, written with numpy.save")
+def _open(file: Path, *, packed: bool) -> _Cube:
+    loaded = open_array(file)
     if loaded.dtype != np.uint8 or loaded.ndim not in (3, 4) or 0 in loaded.shape:
         raise UsageError(
             f"{file} holds {loaded.dtype} of shape {loaded.shape}; a photon cube is uint8 (frames, height, width / 8), "
-            "packed with numpy.packbits(axis=2)"
+            f"eight pixels a byte; make it with {_advice(loaded)}"
         )
     if loaded.ndim == 4:
         if loaded.shape[3] != 1:
@@ -92,7 +90,19 @@ def _open(file: Path) -> _Cube:
     width = _width(file, loaded, beside)
     if max(width, loaded.shape[1]) > _MOST_PIXELS:
         raise UsageError(f"{file} has frames of {width} x {loaded.shape[1]} pixels; at most {_MOST_PIXELS} each way")
+    if not (packed or beside) and holds_bits(loaded):
+        raise UsageError(
+            f"{file} of shape {loaded.shape} holds the bytes 0 and 1 only, as frames that are not packed do; pack them "
+            f"with {PACK}, or, where they are packed, import with --form packed"
+        )
     return _Cube(loaded, width, _frame_rate(beside), _ranges(beside, len(loaded)))
+
+
+def _advice(array: NDArray[Any]) -> str:
+    """What numpy may make a cube of such an array with, as far as that is seen without its size."""
+    if array.ndim != 3:
+        return f"frames.reshape(number, height, width), then {PACK}"
+    return PACK if array.dtype.kind in "biu" else PACK.replace("frames", "frames != 0")
 
 
 def _beside(file: Path) -> Mapping[str, Any]:
@@ -117,7 +127,7 @@ def _width(file: Path, frames: NDArray[np.uint8], beside: Mapping[str, Any]) -> 
         width = beside.get("width")
     elif beside:
         if not beside.get("bitpack"):
-            raise UsageError(f"{file} is not packed, says {TRANSFORMS}; pack its bits with numpy.packbits(axis=2)")
+            raise UsageError(f"{file} is not packed, says {TRANSFORMS}; pack its bits with {PACK}")
         if beside.get("bitpack_dim") != 2:
             raise UsageError(
                 f"{file} is packed along axis {beside.get('bitpack_dim')}, says {TRANSFORMS}; pack it along the width, "

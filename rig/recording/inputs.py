@@ -9,6 +9,8 @@ from calibration.errors import CalibrationError
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
 from calibration.model.rig_model import RigModel
 from rig.errors import UsageError
+from rig.recording.manifest import read_manifest
+from rig.recording.opening import open_recording
 from rig.recording.plain import from_plain, to_plain
 from rig.scan_plan import ScanPlan
 
@@ -38,9 +40,13 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
     try:
         content = yaml.load(file.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except FileNotFoundError:
+        if holds_frames_alone(folder):
+            raise UsageError(
+                f"{folder} holds frames without the plan of a scan, as imported ones are; say how they were taken: "
+                f"{reconstruct_line(folder)}"
+            ) from None
         raise UsageError(
-            f"{folder} has no {name}, by which its frames would be bound to columns; name a run taken with "
-            "--record, or 'rig export' the frames as npy and 'rig reconstruct' those with a plan and a calibration"
+            f"{folder} has no {name}, by which its frames are bound to columns; take it from a copy of the recording"
         ) from None
     except OSError as error:
         raise UsageError(f"cannot read {file}: {error.strerror or error}; take it from a copy") from error
@@ -53,6 +59,22 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
         return from_plain(ScanPlan, content.get("plan"))
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(f"{file}: {error}") from error
+
+
+def holds_frames_alone(folder: Path) -> bool:
+    """Whether a recording has no plan and never had one, as imported frames: neither its manifest nor a marker tells
+    of one. DamagedRecordingError where the manifest is damaged.
+    """
+    if (folder / PLAN_FILE).exists() or PLAN_FILE in ((read_manifest(folder) or {}).get("inputs") or {}):
+        return False
+    return not any(run.entries["sweep"].any() for run in open_recording(folder).runs)
+
+
+def reconstruct_line(folder: Path) -> str:
+    """The command that makes depth of a recording, with the options for what does not stand beside its frames."""
+    plan = " --plan PLAN" if holds_frames_alone(folder) else ""
+    calibration = "" if (folder / CALIBRATION_FILE).exists() else " --calibration CALIBRATION"
+    return f"rig reconstruct {folder}{plan}{calibration} --out DIR"
 
 
 def read_model(folder: Path) -> RigModel | None:

@@ -15,7 +15,7 @@ from drivers.recorded.segments import Segment, open_segments
 from rig.errors import DamagedRecordingError, UsageError
 from rig.recording.checking import Continuity, Gap, SoundBlock, check_segments, continuity
 from rig.recording.manifest import MANIFEST, UNFINISHED, ended_early, inputs_problems, read_manifest
-from rig.recording.opening import require_folder
+from rig.recording.opening import require_recording
 
 
 class Integrity(StrEnum):
@@ -102,7 +102,7 @@ def verify(folder: Path) -> Verification:
 
 def examine(folder: Path) -> Examined:
     """Everything that `verify` and `repair` need to know. UsageError where there is no recording."""
-    require_folder(folder)
+    require_recording(folder)
     try:
         segments = open_segments(folder)
     except DeviceNotFound as error:

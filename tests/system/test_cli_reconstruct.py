@@ -1,6 +1,7 @@
 """`rig reconstruct` on cubes that these tests write themselves: a tilted wall, a distorted camera, one bit per row."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -147,7 +148,7 @@ def test_a_plan_or_option_that_does_not_fit_is_one_line(
             "the calibration's 100 x 24 sensor needs (frames, 24, 13)",
         ),
         (np.zeros((COLUMNS * EXPOSURES, ROWS), np.uint8), "needs (frames, 24, 13)"),
-        (np.zeros((COLUMNS * EXPOSURES, ROWS, 13), np.int8), "holds int8; a cube holds uint8"),
+        (np.zeros((COLUMNS * EXPOSURES, ROWS, 13), np.int8), "make it with frames.view(numpy.uint8)"),
         (b"columns: 3", "is no whole .npy file"),
         (b"", "is no whole .npy file"),
         (None, "No such file or directory; check the path"),
@@ -181,8 +182,210 @@ def test_missing_options_are_one_line(rig: Rig, wall: Path) -> None:
     refused(rig("reconstruct", "cubes.npy", "--out", "r"), "cubes.npy does not exist")
 
 
-def refused(ran: Ran, said: str) -> None:
+def refused(ran: Ran, said: str, *kept: Path) -> None:
     assert ran.code == 2
     assert said in ran.err
     assert len(ran.err.splitlines()) == 1
-    assert not list(Path().iterdir())
+    assert sorted(Path().iterdir()) == sorted(kept)
+
+
+def imported(rig: Rig, wall: Path, frames: np.ndarray, *more: str, **beside: object) -> Path:
+    """The folder that `rig import` makes of frames; beside: what `frames.json` says of them."""
+    folder = wall / "foreign"
+    folder.mkdir()
+    np.save(folder / "frames.npy", frames)
+    content = {"format": "spadrig-frames", "width": WIDTH, **beside}
+    (folder / "frames.json").write_text(json.dumps(content))
+    ran = rig("import", "photoncube", folder / "frames.npy", "--out", wall / "imported", *more)
+    assert ran.code == 0, ran.err
+    return wall / "imported"
+
+
+def test_imported_frames_give_the_depth_of_their_cube(rig: Rig, wall: Path) -> None:
+    np.save(wall / "cube.npy", frames(2))
+    folder = imported(rig, wall, frames(2), "--frame-rate", "100 kHz")
+    assert reconstruct(rig, wall, "--estimator", "likelihood").code == 0
+    ran = reconstruct(rig, wall, "--estimator", "likelihood", "--json", "--out", "again", cube=folder.name)
+    summary = json.loads(ran.out)
+    assert (ran.code, summary["maps"], summary["verdict"]) == (0, 2, "complete")
+    for file in ("depth/000001.npy", "stripe/000001.npz", "cloud/000001.ply"):
+        assert (Path("run") / file).read_bytes() == (Path("again") / file).read_bytes()
+
+
+def test_frames_that_were_lost_are_gaps_and_the_others_stay_in_their_columns(rig: Rig, wall: Path) -> None:
+    n = COLUMNS * EXPOSURES
+    lost = [*range(41, 46), n - 1, n]
+    there = [number for number in range(2 * n) if number not in lost]
+    folder = imported(rig, wall, frames(2)[there], ranges=[[1, 0, 41], [1, 46, n - 47], [1, n + 1, n - 1]])
+    ran = reconstruct(rig, wall, "--estimator", "argmax", "--json", cube=folder.name)
+    summary = json.loads(ran.out)
+    assert (ran.code, summary["verdict"]) == (1, "gaps")
+    received = 2 * n - len(lost)
+    assert summary["frames"] == {
+        "expected": 2 * n,
+        "received": received,
+        "lost": len(lost),
+        "crc_errors": None,
+        "lit": received,
+    }
+    manifest = json.loads(Path("run/manifest.json").read_text())
+    assert manifest["gaps"] == [[41, 45], [n - 1, n - 1], [n, n]]
+    assert reconstruct(rig, wall, "--estimator", "argmax", "--out", "whole").code == 0
+    whole, gaps = (np.load(f"{run}/stripe/000000.npz")["x_px"] for run in ("whole", "run"))
+    # Every frame of a column is the same, so that one is enough: but those of column 14, 42 to 44, are all gone.
+    missing = 14
+    assert np.isnan(gaps[:, missing]).all()
+    others = np.delete(np.arange(COLUMNS), missing)
+    assert np.array_equal(whole[:, others], gaps[:, others], equal_nan=True)
+
+
+def test_a_part_of_imported_frames_is_of_the_same_columns(rig: Rig, wall: Path) -> None:
+    n = COLUMNS * EXPOSURES
+    folder = imported(rig, wall, frames(3))
+    assert rig("cut", folder, "--frames", f"{n}:{3 * n}", "--out", wall / "whole-maps").code == 0
+    assert rig("cut", folder, "--frames", f"7:{n + 7}", "--out", wall / "astride").code == 0
+    assert json.loads(reconstruct(rig, wall, "--json", cube="whole-maps").out)["maps"] == 2
+    refused(
+        reconstruct(rig, wall, "--out", "no", cube="astride"), "begins with frame 7, which is no first one", Path("run")
+    )
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        ({"exposures": 2}, "has 183 frames; 61 columns x 2 exposures need 122 a map"),
+        ({"frame_rate": "50 kHz"}, "was taken at 100000 Hz, the plan says 50000 Hz; correct frame_rate"),
+    ],
+)
+def test_imported_frames_that_are_not_the_plans_are_one_line(
+    rig: Rig, wall: Path, edit: dict[str, object], said: str
+) -> None:
+    folder = imported(rig, wall, frames(), "--frame-rate", "100 kHz")
+    plan = {"columns": COLUMNS, "exposures": EXPOSURES, "frame_rate": "100 kHz", "depth_range": ["1 m", "8 m"]}
+    write(wall / "bad.yaml", **(plan | edit))
+    refused(reconstruct(rig, wall, cube=folder.name, plan="bad.yaml"), said)
+
+
+def test_imported_frames_of_another_sensor_are_one_line(rig: Rig, wall: Path) -> None:
+    np.save(wall / "wide.npy", np.full((COLUMNS * EXPOSURES, ROWS, 20), 0x80, np.uint8))
+    assert rig("import", "photoncube", wall / "wide.npy", "--out", wall / "wide").code == 0
+    refused(
+        reconstruct(rig, wall, cube="wide"), "frames of 160 x 24 pixels, the calibration is of a sensor of 100 x 24"
+    )
+
+
+def test_every_command_for_imported_frames_names_the_one_that_works(rig: Rig, wall: Path) -> None:
+    folder = imported(rig, wall, frames())
+    works = f"rig reconstruct {folder} --plan PLAN --calibration CALIBRATION --out DIR"
+    for arguments in (["replay", folder], ["export", folder, "ply"], ["export", folder, "png", "--view", "depth"]):
+        refused(rig(*arguments), works)
+    refused(rig("reconstruct", folder, "--out", "run"), "add --plan and --calibration")
+    refused(rig("reconstruct", folder, "--plan", wall / "plan.yaml", "--out", "run"), "add --calibration")
+
+
+def unpacked() -> np.ndarray:
+    return np.unpackbits(frames(), axis=2, count=WIDTH)
+
+
+@pytest.mark.parametrize(
+    ("made", "line"),
+    [
+        (lambda: unpacked(), "numpy.packbits(frames, axis=2)"),
+        (lambda: unpacked().astype(bool), "numpy.packbits(frames, axis=2)"),
+        (lambda: unpacked().astype(np.int64), "numpy.packbits(frames, axis=2)"),
+        (lambda: unpacked().astype(np.float32), "numpy.packbits(frames != 0, axis=2)"),
+        (lambda: np.asfortranarray(unpacked()), "numpy.packbits(frames, axis=2)"),
+        (lambda: unpacked().transpose(1, 2, 0), "numpy.packbits(numpy.transpose(frames, (2, 0, 1)), axis=2)"),
+        (lambda: frames().transpose(1, 2, 0), "numpy.transpose(frames, (2, 0, 1))"),
+        (lambda: unpacked().transpose(0, 2, 1), "numpy.packbits(numpy.transpose(frames, (0, 2, 1)), axis=2)"),
+        (lambda: frames()[..., None], "frames[..., 0]"),
+        (lambda: frames().reshape(-1, ROWS * 13), "frames.reshape(-1, 24, 13)"),
+        (lambda: unpacked().reshape(-1, ROWS * WIDTH), "numpy.packbits(frames.reshape(-1, 24, 100), axis=2)"),
+        (lambda: frames().ravel(), "frames.reshape(-1, 24, 13)"),
+        (lambda: frames().astype(np.int16), "frames.astype(numpy.uint8)"),
+        (lambda: frames().view(np.int8), "frames.view(numpy.uint8)"),
+        (
+            lambda: np.packbits(unpacked(), axis=1),
+            "numpy.packbits(numpy.unpackbits(frames, axis=1, count=24), axis=2)",
+        ),
+    ],
+)
+def test_an_array_that_is_no_cube_is_told_what_makes_it_one(
+    rig: Rig, wall: Path, made: Callable[[], np.ndarray], line: str
+) -> None:
+    np.save(wall / "bad.npy", made())
+    refused(reconstruct(rig, wall, cube="bad.npy"), f"eight pixels a byte; make it with {line}\n")
+    # The line does what it says.
+    cube = eval(line, {"numpy": np, "frames": np.load(wall / "bad.npy")})
+    assert np.array_equal(cube, frames())
+
+
+def test_one_frame_alone_is_told_as_much(rig: Rig, wall: Path) -> None:
+    np.save(wall / "bad.npy", unpacked()[0])
+    refused(reconstruct(rig, wall, cube="bad.npy"), "make it with numpy.packbits(frames[None], axis=2)")
+
+
+def test_sums_are_no_frames_and_a_fortran_cube_is_one(rig: Rig, wall: Path) -> None:
+    np.save(wall / "bad.npy", 3 * unpacked())
+    refused(reconstruct(rig, wall, cube="bad.npy"), "sums of several exposures are no frames")
+    np.save(wall / "fortran.npy", np.asfortranarray(frames()))
+    for name in ("cube", "fortran"):
+        assert reconstruct(rig, wall, "--estimator", "argmax", "--out", name, cube=f"{name}.npy").code == 0
+    assert Path("cube/stripe/000000.npz").read_bytes() == Path("fortran/stripe/000000.npz").read_bytes()
+
+
+def test_files_that_numpy_does_not_load_are_told_apart(rig: Rig, wall: Path) -> None:
+    np.save(wall / "objects.npy", np.array([{}, []], object), allow_pickle=True)
+    refused(reconstruct(rig, wall, cube="objects.npy"), "holds Python objects of shape (2,)")
+    np.savez(wall / "several.npz", a=frames(), b=frames())
+    refused(reconstruct(rig, wall, cube="several.npz"), "is an archive of arrays (a, b); a cube is one array")
+    (wall / "torn.npz").write_bytes((wall / "several.npz").read_bytes()[:5000])
+    refused(reconstruct(rig, wall, cube="torn.npz"), "is no whole .npy file")
+    whole = (wall / "cube.npy").read_bytes()
+    (wall / "torn.npy").write_bytes(whole[:-100])
+    refused(reconstruct(rig, wall, cube="torn.npy"), f"takes {len(whole) - 128} bytes, {len(whole) - 228} are there")
+
+
+def test_a_file_of_ours_that_is_no_plan_of_a_cube_is_called_what_it_is(rig: Rig, wall: Path) -> None:
+    write(wall / "compiled.yaml", format="spadrig-plan", version=1, plan={"columns": 3})
+    refused(
+        reconstruct(rig, wall, plan="compiled.yaml"),
+        "compiled.yaml is the compiled plan of a recording, which is found beside its frames; leave --plan out",
+    )
+    refused(reconstruct(rig, wall, plan="calibration.yaml"), "calibration.yaml is a calibration; the plan of frames")
+    refused(rig("scan", wall / "calibration.yaml", "--dry-run"), "is a calibration; name the config of a rig")
+
+
+@pytest.mark.parametrize(
+    ("rows", "width", "columns", "exposures"),
+    [(24, 1, 5, 3), (1, 100, 5, 3), (1, 1, 5, 3), (8, 8, 5, 3), (24, 100, 1, 3), (24, 100, 5, 1), (1, 1, 1, 1)],
+)
+@pytest.mark.parametrize("estimator", ["argmax", "edge", "likelihood", "joint"])
+def test_the_smallest_cubes_give_maps_of_their_size(
+    rig: Rig, tmp_path: Path, rows: int, width: int, columns: int, exposures: int, estimator: str
+) -> None:
+    t = np.linspace(-0.05, 0.2, columns)
+    planes = np.stack([np.ones_like(t), 0 * t, -t, np.full_like(t, -BASELINE)], 1)
+    camera = {
+        "width": width,
+        "height": rows,
+        "matrix": [[FOCAL, 0, (width - 1) / 2], [0, FOCAL, (rows - 1) / 2], [0, 0, 1]],
+        "distortion": [0, 0, 0, 0, 0],
+    }
+    content = {"camera": camera, "planes": planes.tolist()}
+    write(tmp_path / "calibration.yaml", format="spadrig-calibration", version=1, **content)
+    plan = {"columns": columns, "exposures": exposures, "frame_rate": "100 kHz", "depth_range": ["1 m", "8 m"]}
+    write(tmp_path / "plan.yaml", **plan)
+    bits = np.random.default_rng(1).random((columns * exposures, rows, width)) < 0.2
+    np.save(tmp_path / "cube.npy", np.packbits(bits, axis=2))
+    ran = reconstruct(rig, tmp_path, "--estimator", estimator, "--filter", "median")
+    if ran.code == 2:
+        refused(ran, "no column meets the picture")
+    else:
+        assert ran.code == 0, ran.err
+        assert np.load("run/depth/000000.npy").shape == (rows, width)
+
+
+def test_a_depth_range_of_zero_length_is_one_line(rig: Rig, wall: Path) -> None:
+    write(wall / "bad.yaml", columns=COLUMNS, exposures=EXPOSURES, frame_rate="100 kHz", depth_range=["2 m", "2 m"])
+    refused(reconstruct(rig, wall, plan="bad.yaml"), "depth_range runs from 2 m to 2 m; it must be [near, far]")

@@ -74,3 +74,59 @@ def test_mistakes_are_one_line(rig: Rig, run: Path, tmp_path: Path) -> None:
     ):
         ran = rig(*arguments)
         assert (ran.code, len(ran.problems), ran.err.count("\n")) == (2, 1, 1)
+
+
+def commands_of(folder: Path) -> list[tuple[object, ...]]:
+    """All that take the folder of a recording."""
+    return [
+        ("reconstruct", folder, "--out", "new"),
+        ("reconstruct", folder, "--plan", folder / "plan.yaml", "--out", "new"),
+        ("replay", folder, "--out", "new"),
+        ("verify", folder),
+        ("repair", folder),
+        ("info", folder),
+        ("cut", folder, "--maps", "0:1", "--out", "new"),
+        ("export", folder, "npy", "--out", "new"),
+        ("export", folder, "ply", "--out", "new"),
+        ("export", folder, "png", "--view", "frames", "--out", "new"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ([], "is an empty folder: no frames-*.spb; name the folder of a run taken with --record"),
+        (["a/notes.txt"], "is a folder without a recording: no frames-*.spb; name"),
+        (["frames.npy"], "no frames-*.spb, but .npy files; if these are frames, 'rig import photoncube"),
+        (["RAW00000.bin"], "'rig import swissspad2 (or pi-imaging)"),
+        (["manifest.json"], "the frames of this run were not recorded; take it again with 'rig scan --record'"),
+        (["first/frames-000000.spb", "second/frames-000000.spb"], "first or another of 2 in it"),
+        (None, "does not exist; name the folder of a run"),
+    ],
+)
+def test_a_folder_without_a_recording_is_called_what_it_is(
+    rig: Rig, tmp_path: Path, files: list[str] | None, said: str
+) -> None:
+    folder = tmp_path / "some"
+    for file in files or ():
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).touch()
+    if files == []:
+        folder.mkdir()
+    for arguments in commands_of(folder):
+        if files is None and "--plan" in arguments:
+            continue  # what it is said of then is the plan
+        ran = rig(*arguments)
+        assert (ran.code, len(ran.problems), ran.err.count("\n")) == (2, 1, 1), (arguments, ran.err)
+        assert said in ran.err, arguments
+    assert not list(Path().iterdir())
+
+
+def test_a_run_without_record_says_that_its_frames_were_not_recorded(rig: Rig, small: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "unrecorded"
+    assert rig("scan", small, "--out", folder).code == 0
+    for arguments in commands_of(folder):
+        if "ply" not in arguments:
+            ran = rig(*arguments)
+            assert (ran.code, ran.err.count("\n")) == (2, 1), arguments
+            assert f"{folder} holds no recording (frames-*.spb): the frames of this run were not recorded" in ran.err

@@ -234,3 +234,41 @@ def fill_disk_after(files: int, monkeypatch: pytest.MonkeyPatch) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(Path, "write_bytes", limited)
+
+
+@pytest.mark.parametrize("at", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("command", "options"), [(["effects"], []), (["calibrate", "pixels"], ["--light", "--out", "out"])]
+)
+def test_ctrl_c_in_a_scan_within_another_command_ends_that_in_one_line(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch, at: int, command: list[str], options: list[str]
+) -> None:
+    stop_at_map(at, KeyboardInterrupt(), monkeypatch)
+    ran = rig(*command, small, *options)
+    assert (ran.code, ran.err) == (4, "aborted\n")
+    assert not list(Path().iterdir())
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_further_signals_change_nothing_of_how_an_aborted_command_ends(tmp_path: Path) -> None:
+    program = (
+        "import atexit, os, signal\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "signal.signal(signal.SIGTERM, signal.SIG_DFL)\n"
+        "atexit.register(lambda: [os.kill(os.getpid(), number) for number in (signal.SIGINT, signal.SIGTERM)])\n"
+        "from rig import api, cli\n"
+        "def interrupted(*given, **options): raise KeyboardInterrupt\n"
+        "api.effects = interrupted\n"
+        "cli.main()\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", program, "effects"], capture_output=True, text=True, timeout=60)
+    assert (ran.returncode, ran.stderr) == (4, "aborted\n")
+
+
+def test_an_interrupt_before_a_command_has_begun_is_one_too(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("typer.core.TyperGroup.resolve_command", lambda *_: interrupted())
+    ran = rig("config", "check")
+    assert (ran.code, ran.err) == (4, "aborted\n")

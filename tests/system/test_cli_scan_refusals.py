@@ -118,3 +118,26 @@ def test_an_out_folder_that_cannot_be_is_refused_before_anything_runs(rig: Rig, 
         assert (ran.code, len(ran.problems)) == (2, 1)
         assert said in ran.problems[0]
     assert files(Path()) == {"file", "full/notes.txt"}
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 40), (96, 1), (1, 1)])
+def test_a_simulated_camera_of_one_pixel_either_way_is_refused(
+    rig: Rig, tmp_path: Path, width: int, height: int
+) -> None:
+    file = write_rig(tmp_path / "tiny", width=width, height=height)
+    for command in (["scan", file], ["effects", file], ["tradeoff", file, "--exposures", 4]):
+        ran = rig(*command)
+        assert (ran.code, len(ran.problems)) == (2, 1), ran.err
+        assert f"a camera of {width} x {height} pixels; simulated light needs at least 2 each way" in ran.problems[0]
+    assert not list(Path().iterdir())
+
+
+@pytest.mark.parametrize(("width", "height"), [(2, 40), (96, 2), (2, 2), (8, 8), (65, 3)])
+def test_a_camera_of_a_few_pixels_is_scanned(rig: Rig, tmp_path: Path, width: int, height: int) -> None:
+    file = write_rig(tmp_path / "tiny", width=width, height=height)
+    for scene in ("street-everything", "board"):
+        ran = rig("scan", file, "--scene", scene, "--out", scene)
+        assert ran.code == 0, ran.err
+        assert np.load(Path(scene) / "depth" / "000000.npy").shape == (height, width)
+    ran = rig("effects", file)
+    assert ran.code == 0, ran.err

@@ -173,12 +173,12 @@ def test_a_folder_without_frames_and_frames_without_a_plan_are_told_apart(
 ) -> None:
     (tmp_path / "maps-only").mkdir()
     shutil.copyfile(learned / "plan.yaml", tmp_path / "maps-only" / "plan.yaml")
-    assert "holds no recording" in rig("replay", tmp_path / "maps-only").problems[0]
+    assert "is a folder without a recording" in rig("replay", tmp_path / "maps-only").problems[0]
     imported = tmp_path / "imported"
     imported.mkdir()
     for file in ("frames-000000.spb", "frames.idx"):
         shutil.copyfile(learned / file, imported / file)
-    assert re.search(r"has no plan.yaml, .*'rig export'", rig("replay", imported).problems[0])
+    assert "has no plan.yaml, by which its frames are bound" in rig("replay", imported).problems[0]
 
 
 def test_a_wrong_clock_and_a_wrong_folder_are_the_users(learned: Path, rig: Rig, tmp_path: Path) -> None:

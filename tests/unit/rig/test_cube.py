@@ -12,7 +12,7 @@ from calibration import Camera, PivotScanner, PlaneTable, RigModel
 from rig import cube as cube_module
 from rig.config import CubePlan
 from rig.counting import SweepCounter, SweepLayout
-from rig.cube import column_commands, count_map, open_cube
+from rig.cube import ArrayFrames, column_commands, count_map, open_cube
 from rig.errors import UsageError
 from rig.row_threads import RowWorkers
 
@@ -62,7 +62,8 @@ def test_counts_are_the_sums_of_the_bits(
         counter = SweepCounter(layout, workers)
         patch.setattr(cube_module, "CHUNK_BYTES", chunk)
         for index in range(maps):
-            volume = count_map(cube, index, counter)
+            volume, gaps = count_map(cube, index, counter)
+            assert gaps == []
             expected = bits.reshape(maps, columns, exposures, rows, width)[index].sum(axis=1)
             assert np.array_equal(volume.counts[:, :, :width], expected)
             assert not volume.counts[:, :, width:].any()
@@ -74,7 +75,8 @@ def test_counts_are_the_sums_of_the_bits(
 def test_a_cube_is_not_read_before_it_is_counted(tmp_path: Path) -> None:
     np.save(tmp_path / "cube.npy", np.zeros((6, 4, 13), np.uint8))
     cube = open_cube(tmp_path / "cube.npy", plan(2, 3), model(2, 100, 4))
-    assert isinstance(cube.frames, np.memmap)
+    assert isinstance(cube.frames, ArrayFrames)
+    assert isinstance(cube.frames.array, np.memmap)
     assert np.array_equal(column_commands(cube.plan), [0, 1])
     assert cube.plan.frame_rate == Fraction(97_700)
 

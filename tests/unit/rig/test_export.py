@@ -243,7 +243,7 @@ def test_runs_of_two_sizes_make_no_array(tmp_path: Path) -> None:
     [
         ("tiff", {}, "choose one of npy"),
         ("npy", {}, "holds no recording"),
-        ("png", {"view": "frames"}, "holds no frames"),
+        ("png", {"view": "frames"}, "frames of this run were not recorded"),
         ("png", {"view": "x"}, "choose one of depth"),
         ("ply", {"view": "depth"}, "ply has none; export png or mp4"),
         ("mp4", {"pictures_per_s": 0.0}, "a second"),

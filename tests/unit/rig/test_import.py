@@ -258,3 +258,36 @@ def test_every_file_that_was_cut_off_is_named(tmp_path: Path, kind: str) -> None
 def test_options_that_cannot_be_are_refused(tmp_path: Path, kind: str, options: dict[str, object], why: str) -> None:
     with pytest.raises(UsageError, match=why):
         import_frames(kind, [tmp_path], tmp_path / "run", **options)  # type: ignore[arg-type]
+
+
+def test_a_cube_that_looks_unpacked_is_refused_until_it_is_said_to_be_packed(tmp_path: Path) -> None:
+    frames = some_frames(40, 6, 16)
+    np.save(tmp_path / "frames.npy", frames.astype(np.uint8))
+    with pytest.raises(UsageError, match=r"0 and 1 only.*numpy\.packbits\(frames, axis=2\).*--form packed"):
+        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    result = import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run", form="packed")
+    assert result.width == 128
+    assert np.array_equal(frames_of(tmp_path / "run"), np.unpackbits(frames.astype(np.uint8), axis=2).astype(bool))
+
+
+def test_frames_of_few_photons_that_a_file_beside_them_tells_of_are_packed(tmp_path: Path) -> None:
+    np.save(tmp_path / "frames.npy", np.ones((3, 4, 2), np.uint8))
+    (tmp_path / "frames.json").write_text(json.dumps({"format": "spadrig-frames", "width": 16}))
+    assert import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run").width == 16
+
+
+def test_dark_frames_are_packed(tmp_path: Path) -> None:
+    np.save(tmp_path / "frames.npy", np.zeros((3, 4, 2), np.uint8))
+    assert import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run").width == 16
+
+
+@pytest.mark.parametrize(
+    ("dtype", "line"),
+    [(bool, "packbits(frames, axis=2)"), (np.int64, "packbits(frames, axis=2)"), (float, "packbits(frames != 0, axis")],
+)
+def test_frames_of_another_type_are_told_how_to_pack(tmp_path: Path, dtype: type, line: str) -> None:
+    np.save(tmp_path / "frames.npy", some_frames(3, 4, 16).astype(dtype))
+    with pytest.raises(UsageError) as refused:
+        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+    assert f"make it with numpy.{line}" in str(refused.value)
