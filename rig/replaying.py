@@ -25,7 +25,13 @@ from rig.errors import DamagedRecordingError, UsageError
 from rig.estimators import Learned
 from rig.plan import spad_request
 from rig.recording.inputs import read_plan
-from rig.recording.manifest import MANIFEST, is_cut_short, read_manifest, require_inputs
+from rig.recording.manifest import (
+    MANIFEST,
+    ended_before_last_map,
+    is_cut_short,
+    read_manifest,
+    require_inputs,
+)
 from rig.recording.part import part_learned, part_starts
 from rig.recording.passes import pass_plan, recorded_passes
 from rig.scan_plan import ScanPlan
@@ -205,7 +211,7 @@ def pace_of(spad: SpadArray) -> Pace:
 
 
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[int]:
-    """How many sweeps each start of the SPAD gave, as the run took them; of one that was cut short the whole ones.
+    """How many sweeps each start of the SPAD gave; of one that was cut short, by whatever, the whole ones.
 
     DamagedRecordingError where a start is missing: its maps would be taken for those of others.
     """
@@ -223,10 +229,9 @@ def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[int]:
             "take the missing segments from a copy"
         )
     planned = planned[: len(found)]
-    sweeps = manifest.get("sweeps")
-    if sweeps is None or is_cut_short(manifest):
+    if is_cut_short(manifest) or ended_before_last_map(manifest):
         planned[-1] = min(planned[-1], _whole_sweeps(recording, recording.runs[-1], plan))
-    return _limited(planned, sum(planned) if sweeps is None else len(sweeps))
+    return [sweeps for sweeps in planned if sweeps]
 
 
 def recorded_truth(folder: Path, index: int) -> SweepTruth | None:
@@ -251,15 +256,6 @@ def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> 
         return 0
     before = last.header.sweep
     return max(0, before + ((int(last.records["sweep"][-1]) - before) & 0xFFFF) - 1)
-
-
-def _limited(planned: list[int], most: int) -> list[int]:
-    """The first `most` sweeps of those planned; starts of none are left out."""
-    taken = []
-    for sweeps in planned:
-        taken.append(min(sweeps, most))
-        most -= taken[-1]
-    return [sweeps for sweeps in taken if sweeps]
 
 
 def _own_drivers(run: Path, recorded: dict[str, Any]) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from rig.recording.space import map_bytes, recording_bytes
 from rig.recording.writer import Recording
 from rig.replaying import Replayed
 from rig.run import Run, RunResult
-from rig.scan_account import frames_of, sweep_content, synchronisation_of, verdict_of
+from rig.scan_account import frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, prepare
 from rig.sweeps import SweepAccount, SweepData
@@ -126,17 +126,18 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
     del of_maps[run.tally.maps :]
     sweeps = [sweep for passes_of_map in of_maps for sweep in passes_of_map]
     frames = frames_of(sweeps, acquisition.counters.crc_errors)
+    counters, stages = acquisition.counters, acquisition.stages
     result = run.finish(
-        frames,
+        frames if ended_by is None else frames_that_came(frames, counters, stages.dropped_frames),
         frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
         verdict_of(sweeps, rig.model, aborted=ended_by is not None),
         {
             **manifest,
             "sweeps": [sweep_content(sweep) for sweep in sweeps],
             "gaps": [list(gap) for sweep in sweeps for gap in sweep.gaps],
-            "counters": asdict(acquisition.counters),
+            "counters": asdict(counters),
         },
-        acquisition.stages,
+        stages,
         synchronisation_of(sweeps),
         None if replayed is None else replayed.report,
         acquisition.figures(frames.lit) if isinstance(acquisition, AdaptiveAcquisition) else None,
