@@ -22,10 +22,12 @@ from rig.cli_command import (
     print_json,
     progress,
     report,
+    say_space,
 )
 
 if TYPE_CHECKING:
     from rig.config import AdaptiveConfig
+    from rig.recording.space import Space
     from rig.scan_plan import ScanPlan
 
 
@@ -86,10 +88,13 @@ def scan_command(
         "temporal_prior": temporal_prior,
         "adaptive": _passes(adaptive, time_budget),
     }
+    out = default_out() if out is None else out
     if dry_run:
         checked: dict[str, Any] = {"maps": maps, "seed": seed, "save": save, "on_overload": on_overload}
-        plan = api.plan_scan(config, accept_calibration=accept_calibration, **checked, **options)
-        return _show_plan(plan, api.configure(config, **options).scan.adaptive, as_json)
+        checked |= {"out": out, "record": record, "accept_calibration": accept_calibration}
+        spaces: list[Space] = []
+        plan = api.plan_scan(config, on_space=spaces.append, **checked, **options)
+        return _show_plan(plan, api.configure(config, **options).scan.adaptive, spaces[0] if spaces else None, as_json)
     with live_progress() as live:
         result = api.scan(
             config,
@@ -97,10 +102,11 @@ def scan_command(
             seed=seed,
             save=save,
             arm=arm,
-            out=default_out() if out is None else out,
+            out=out,
             record=record,
             on_overload=on_overload,
             live=live,
+            on_space=say_space,
             accept_calibration=accept_calibration,
             **options,
         )
@@ -114,17 +120,20 @@ def _passes(adaptive: bool, time_budget: str | None) -> dict[str, str] | None:
     return {} if adaptive else None
 
 
-def _show_plan(plan: "ScanPlan", adaptive: "AdaptiveConfig | None", as_json: bool) -> int:
+def _show_plan(plan: "ScanPlan", adaptive: "AdaptiveConfig | None", space: "Space | None", as_json: bool) -> int:
     from rig.adaptive_decision import describe_passes, passes_content
     from rig.plan_figures import plan_content, plan_text
 
     if as_json:
         passes = {} if adaptive is None else {"adaptive": passes_content(adaptive, plan)}
-        print_json({"plan": plan_content(plan), **passes})
+        recording = {} if space is None else {"recording": space.content()}
+        print_json({"plan": plan_content(plan), **passes, **recording})
     else:
         print(plan_text(plan))
         if adaptive is not None:
             print(describe_passes(adaptive, plan))
+        if space is not None:
+            print(f"recording   {space}")
     return 0
 
 

@@ -5,6 +5,7 @@ belongs to column f // exposures, exactly; there are no dark frames.
 """
 
 import os
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
+from calibration.npy_files import load_numpy
 from rig.config import CubePlan
 from rig.counting import Counter, FrameTally
 from rig.errors import UsageError
@@ -45,10 +47,10 @@ def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> 
     """Open a cube and check it against its plan and calibration; UsageError where they disagree."""
     file = Path(path)
     try:
-        frames = np.load(file, mmap_mode="r", allow_pickle=False)
+        frames = load_numpy(file, mmap_mode="r")
     except OSError as error:
         raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
         raise UsageError(f"{file} is no whole .npy file of numbers; write it with numpy.save") from error
     if not isinstance(frames, np.ndarray):
         raise UsageError(f"{file} is an archive of arrays; a cube is one array, written with numpy.save")

@@ -15,6 +15,7 @@ import numpy as np
 
 from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import RigModel
+from calibration.npy_files import load_numpy
 from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.recorded.segments import NO_SEGMENT, segment_files
@@ -24,7 +25,7 @@ from rig.config_files import parse_config
 from rig.errors import DamagedRecordingError, UsageError
 from rig.estimators import Learned
 from rig.plan import spad_request
-from rig.recording.inputs import read_plan
+from rig.recording.inputs import PLAN_FILE, read_plan
 from rig.recording.manifest import (
     MANIFEST,
     ended_before_last_map,
@@ -148,6 +149,7 @@ def replay_plan(
         from rig.recalibrated import whole_rows
 
         plan = whole_rows(plan)
+    _require_frames_of(plan, recording)
     first = plan
     if (recording.path / pass_plan(0)).exists():  # taken in passes: the SPAD begins with the first of them
         first = read_plan(recording.path, pass_plan(0))
@@ -155,11 +157,24 @@ def replay_plan(
     return plan, spad.configure(request)
 
 
+def _require_frames_of(plan: ScanPlan, recording: RunRecording) -> None:
+    """DamagedRecordingError where the frames are of another size than the plan's: counters are made by the plan."""
+    widths = {plan.width} if plan.windows is None else {plan.width, plan.windows.width_px}
+    for run in recording.runs:
+        header = run.header
+        if header.height != plan.rows or header.width not in widths or plan.width > header.sensor_width:
+            raise DamagedRecordingError(
+                f"{recording.path}: the frames of start {run.number} are {header.width} x {header.height} pixels of a "
+                f"sensor {header.sensor_width} wide, {PLAN_FILE} is for {plan.width} x {plan.rows}; take it from a copy"
+            )
+
+
 class Replayed:
     """What a run needs to know of the recording that its SPAD plays. maps: to take."""
 
     def __init__(self, spad: PlaysRecording, plan: ScanPlan, maps: int | None) -> None:
         self._spad = spad
+        self._shapes = (plan.rows, plan.columns), (plan.rows, plan.width)
         self._sweeps = recorded_sweeps(spad.recording, plan)
         self.passes = recorded_passes(spad.recording.path, self._sweeps)
         """Of each map, where they were taken in several; None: they were not."""
@@ -190,6 +205,10 @@ class Replayed:
         """Sweeps of one start after the other."""
         return itertools.cycle(self._sweeps) if self._spad.loops else iter(self._sweeps)
 
+    def starts_for(self, maps: int) -> int:
+        """Starts that give so many maps, at most."""
+        return -(-maps // self._there) * len(self._sweeps)
+
     def starts(self) -> Iterator[SweepStart]:
         """With which sweep each of the starts begins."""
         found = part_starts(self._spad.recording)
@@ -200,8 +219,17 @@ class Replayed:
         return part_learned(self._spad.recording.path, estimate, model)
 
     def truth(self, index: int) -> SweepTruth | None:
-        """What was known of a map when it was recorded, where that was kept."""
-        return recorded_truth(self._spad.recording.path, index % self._there)
+        """What was known of a map when it was recorded, where that was kept.
+
+        DamagedRecordingError where it is of other columns or of another sensor.
+        """
+        truth = recorded_truth(self._spad.recording.path, index % self._there)
+        if truth is not None and (truth.x_px.shape, truth.depth_m.shape) != self._shapes:
+            raise DamagedRecordingError(
+                f"{self._spad.recording.path}: the truth of map {index} is of {truth.x_px.shape} and "
+                f"{truth.depth_m.shape} pixels, not {self._shapes[0]} and {self._shapes[1]}; move it away"
+            )
+        return truth
 
 
 def pace_of(spad: SpadArray) -> Pace:
@@ -228,7 +256,7 @@ def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[int]:
             f"{recording.path}: of {len(starts)} starts of the SPAD only {len(set(found))} are there, not the first; "
             "take the missing segments from a copy"
         )
-    planned = planned[: len(found)]
+    planned = [min(sweeps, run.frames) for sweeps, run in zip(planned, recording.runs, strict=False)]
     if is_cut_short(manifest) or ended_before_last_map(manifest):
         planned[-1] = min(planned[-1], _whole_sweeps(recording, recording.runs[-1], plan))
     return [sweeps for sweeps in planned if sweeps]
@@ -240,22 +268,25 @@ def recorded_truth(folder: Path, index: int) -> SweepTruth | None:
     if not file.exists():
         return None
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with load_numpy(file) as arrays:
             return SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"])
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to go on without it") from error
 
 
 def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> int:
-    """Sweeps of a start that are there to their end: by its markers, or without such by the number of frames."""
+    """Sweeps of a start that are there to their end: by its markers, or without such by the number of frames.
+
+    Never more than its frames, whatever their headers say.
+    """
     if plan.blanking is not None:
         frames = float(plan.frames_per_sweep)
-        return max(0, int((run.end_frame - plan.frames_for(0)) / frames))
+        return min(run.frames, max(0, int((run.end_frame - plan.frames_for(0)) / frames)))
     last = next((b for e in run.entries[::-1] if (b := recording.read(run, e)) is not None and b.n_frames), None)
     if last is None:
         return 0
     before = last.header.sweep
-    return max(0, before + ((int(last.records["sweep"][-1]) - before) & 0xFFFF) - 1)
+    return min(run.frames, max(0, before + ((int(last.records["sweep"][-1]) - before) & 0xFFFF) - 1))
 
 
 def _own_drivers(run: Path, recorded: dict[str, Any]) -> dict[str, Any]:

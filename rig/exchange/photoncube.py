@@ -5,6 +5,7 @@ it may: `NAME.json` of `rig export` (width, frame rate, frame numbers) or vision
 """
 
 import json
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -14,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.npy_files import load_numpy
 from rig.errors import UsageError
 from rig.exchange.foreign import ForeignFrames, chunks_of
 
@@ -70,10 +72,10 @@ def open_photoncube(files: Sequence[Path]) -> ForeignFrames:
 
 def _open(file: Path) -> _Cube:
     try:
-        loaded = np.load(file, mmap_mode="r", allow_pickle=False)
+        loaded = load_numpy(file, mmap_mode="r")
     except OSError as error:
         raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
         raise UsageError(f"{file} is no whole .npy file of numbers; write it with photoncube or numpy.save") from error
     if not isinstance(loaded, np.ndarray):
         raise UsageError(f"{file} is an archive of arrays; a photon cube is one array, written with numpy.save")
