@@ -141,6 +141,7 @@ def replay_plan(
 ) -> tuple[ScanPlan, SpadTiming]:
     """The plan that the frames were taken with, for the calibration that there is, and the SPAD configured for it."""
     plan = read_plan(recording.path)
+    _require_frames_of(plan, recording)
     if model is not None:
         from rig.recalibrated import recalibrated
 
@@ -149,7 +150,6 @@ def replay_plan(
         from rig.recalibrated import whole_rows
 
         plan = whole_rows(plan)
-    _require_frames_of(plan, recording)
     first = plan
     if (recording.path / pass_plan(0)).exists():  # taken in passes: the SPAD begins with the first of them
         first = read_plan(recording.path, pass_plan(0))

@@ -96,7 +96,8 @@ def _require_sizes(plan: ScanPlan) -> None:
         "legs": 1 <= len(plan.legs) <= 2,
         "sweep_points": plan.waveform.command.shape == plan.waveform.markers.shape == points != (0,),
         "marker_points": plan.marker_points.ndim == 1,
-        "frame_rate_hz": plan.frame_rate_hz > 0 and plan.point_rate_hz > 0,
+        "frame_rate_hz": plan.frame_rate_hz > 0,
+        "point_rate_hz": plan.point_rate_hz > 0,
         "blanking": 0 <= blanking.chip_s * rate_hz <= MOST_CHIP_FRAMES + 1
         and max(blanking.guard_s, blanking.tolerance_s) * rate_hz <= plan.columns * plan.exposures + MOST_CHIP_FRAMES,
         "lines": lines is None
