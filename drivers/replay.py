@@ -101,7 +101,7 @@ class ReplaySpad(SpadArray):
         most = self._config.block_frames or request.block_frames
         self._block_frames = int(min(most, request.block_frames, self.pace.most_frames(1 / rate)))
         self._played = 0
-        stride = BlockLayout(self._block_frames, width, self._info.height).min_stride
+        stride = BlockLayout(self._block_frames, width, first.height).min_stride
         return SpadTiming(first.tick_hz, first.frame_period_ticks, first.exposure_ticks, stride)
 
     def _do_start(self, n_frames: int | None) -> None:

@@ -15,7 +15,7 @@ from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
 from drivers.transports.endpoints import EMULATED_PREFIX
-from rig.burst import lead_s, require_memory, spare_lead_s
+from rig.burst import lead_s, most_sweeps, require_memory, spare_lead_s
 from rig.counting import SweepLayout
 from rig.errors import DevicesError
 from rig.fog_meter import FogEstimate
@@ -152,20 +152,10 @@ class Acquisition:
         """Sweeps of the next start: as many as the SPAD's memory holds in a burst and the sync source's program."""
         if self._groups is not None:
             return min(self._maps - done, next(self._groups))
-        left = min(self._maps - done, self._most_sweeps)
         if self._first_alone and done == 0:
             return 1
-        if self._plan.burst_frames is None:
-            return left
-        spare = self._plan.burst_frames - lead_s(self._rig) * float(self._plan.frame_rate_hz) - self._plan.frames_for(0)
-        return max(1, min(left, int(spare / float(self._plan.frames_per_sweep))))
-
-    @property
-    def _most_sweeps(self) -> int:
-        """Sweeps that one program of the sync source can hold; at least 1, which it may still refuse."""
-        legs = self._plan.sweeps_per_period
-        most = self._rig.sync.most_repeats(sync_program(self._plan, legs)[0])
-        return self._maps if most is None else max(1, most * legs)
+        left, most = self._maps - done, most_sweeps(self._rig, self._plan)
+        return left if most is None else min(left, most)
 
     def _burst_frames(self, sweeps: int) -> int | None:
         if self._plan.burst_frames is None:

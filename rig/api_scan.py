@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from rig.monitor import Watch
     from rig.overload import Overload
     from rig.scan_plan import ScanPlan
+    from rig.scanning import OnSpace
+
+_NO_FOLDER = "record writes the frames into the run's folder; name one with out"
 
 
 def scan(
@@ -39,6 +42,7 @@ def scan(
     progress: Progress | None = None,
     live: "Callable[[ScanProgress], None] | None" = None,
     monitor: "Watch | None" = None,
+    on_space: "OnSpace | None" = None,
 ) -> RunResult:
     """Acquire and reconstruct `maps` depth maps (`rig scan`).
 
@@ -48,7 +52,8 @@ def scan(
     record: write the frames into it too. on_overload: 'abort', 'drop' or 'block', what to do with frames that come too
     fast. progress: called with frames done and planned; live: with a `ScanProgress`, the figures of every stage in it;
     both several times a second. monitor: called with the newest frames as a `MonitorView`, at most ten times a second,
-    on a thread of its own; the run never waits for it.
+    on a thread of its own; the run never waits for it. on_space: called with a `Space`, what the recording will take on
+    the disk at most, before anything moves.
     Raises UsageError for what cannot be, DeviceError or DevicesError where devices fail; maps that were whole by then
     are in `out`. An interrupt ends the scan after its last whole map, with verdict 'aborted'.
     """
@@ -65,7 +70,7 @@ def scan(
         temporal_prior=temporal_prior,
     )
     policy, overload = _checked_policies(maps, seed, save, on_overload, _problems(settings, arm, out, record))
-    options = ScanOptions(overload, record, monitor, _both(progress, live), accept_calibration=accept_calibration)
+    options = ScanOptions(overload, record, monitor, _both(progress, live), None, accept_calibration, on_space)
     with _new_run(settings, out, policy, record) as run:
         tap = run.start_tap() if record else None
         with open_rig(settings, seed=seed, tap=tap) as rig:
@@ -80,11 +85,15 @@ def plan_scan(
     save: str = "all",
     on_overload: str = "abort",
     accept_calibration: bool = False,
+    out: OutFolder = None,
+    record: bool = False,
+    on_space: "OnSpace | None" = None,
     **options: Any,
 ) -> "ScanPlan":
     """The compiled plan of a scan, checked against its devices' limits (`rig scan --dry-run`).
 
-    maps, seed, save, on_overload, accept_calibration: checked as `scan` would; the plan does not depend on them.
+    maps, seed, save, on_overload, accept_calibration, record: checked as `scan` would, the room on the disk of `out`
+    too; the plan does not depend on them. on_space: as of `scan`.
     options: as `configure`.
 
     Devices are opened, asked for their limits and closed again: nothing moves and nothing shines, so that no `arm` is
@@ -93,15 +102,24 @@ def plan_scan(
     from rig.burst import require_memory
     from rig.calibration_identity import calibration_use
     from rig.overload import require_policy
+    from rig.recording.space import Space
+    from rig.scanning import recorded_bytes
     from rig.session import open_rig, prepare
 
     settings = configure(config, **options)
-    _, overload = _checked_policies(maps, seed, save, on_overload)
+    problems = [_NO_FOLDER] if record and out is None else []
+    policy, overload = _checked_policies(maps, seed, save, on_overload, problems)
     with open_rig(settings) as rig:
         require_policy(overload, rig.spad.info)
         calibration_use(rig, accept=accept_calibration)
-        plan, _ = prepare(rig)
+        plan, timing = prepare(rig)
         require_memory(rig, plan)
+        if record and out is not None:
+            frames_bytes, map_bytes = recorded_bytes(rig, plan, timing, maps)
+            space = Space.on_disk_of(Path(out).absolute(), frames_bytes, map_bytes * policy.count(maps))
+            space.require()
+            if on_space is not None:
+                on_space(space)
         return plan
 
 
@@ -128,6 +146,7 @@ def replay(
     progress: Progress | None = None,
     live: "Callable[[ScanProgress], None] | None" = None,
     monitor: "Watch | None" = None,
+    on_space: "OnSpace | None" = None,
     steps: "Callable[[Pace], None] | None" = None,
 ) -> RunResult:
     """Play a recording through the live stack (`rig replay`); the same depth, bit for bit, at any clock.
@@ -152,7 +171,7 @@ def replay(
         settings = settings.model_copy(update={"calibration": Path(calibration)})
     problems = _problems(settings, arm, out, record)
     policy, overload = _checked_policies(1 if maps is None else maps, 0, save, on_overload, problems)
-    options = ScanOptions(overload, record, monitor, _both(progress, live), accept_calibration=accept_calibration)
+    options = ScanOptions(overload, record, monitor, _both(progress, live), None, accept_calibration, on_space)
     with _new_run(settings, out, policy, record) as writer:
         return play(settings, Path(run), writer, maps, options, steps)
 
@@ -163,7 +182,7 @@ def _problems(settings: RigConfig, arm: bool, out: OutFolder, record: bool) -> l
 
     problems = require_simulated_or_armed(settings, arm)
     if record and out is None:
-        problems.append("record writes the frames into the run's folder; name one with out")
+        problems.append(_NO_FOLDER)
     return problems
 
 

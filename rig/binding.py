@@ -125,16 +125,18 @@ class BlockTerms(NamedTuple):
 class FrameBinder:
     """Binds the blocks of one run, in order. Records count markers up to and including their own frame.
 
-    clock_ratio: of the scanner's clock to nominal, as of the sweep before the first, where that is known.
+    clock_ratio: of the scanner's clock to nominal, as of the sweep before the first, where that is known. end_sweep:
+    one behind the last sweep that is wanted; None: all that the frames tell of.
     """
 
-    def __init__(self, plan: ScanPlan, clock_ratio: float = 1.0) -> None:
+    def __init__(self, plan: ScanPlan, clock_ratio: float = 1.0, end_sweep: int | None = None) -> None:
         from rig.binding_kernels import walk
 
         self._walk = walk
         self._plan = plan
         self._terms = _plan_terms(plan)
         self._ratio = clock_ratio
+        self._end_sweep = end_sweep
         self._nominal = math.nan
         self._tick_hz: Fraction | None = None
         self._t0: int | None = None
@@ -145,7 +147,7 @@ class FrameBinder:
         self._carried["sweep"] = self._carried["anchor_point"] = self._carried["column"] = -1
         self._edges = np.empty((2, 2 * len(plan.marker_points) + 2), np.int64)
         self._records = np.empty(0, FRAME_RECORD)
-        self._light = None if plan.blanking is None else BlankingSync(plan)
+        self._light = None if plan.blanking is None else BlankingSync(plan, end_sweep)
 
     def bind(self, block: FrameBlock) -> tuple[BoundFrames, list[SweepClock]]:
         """Places of the block's frames, and the clocks of the sweeps whose closing scan marker lies in the block."""
@@ -253,7 +255,8 @@ class FrameBinder:
             edge = number * self._plan.sweep_points, start + (2 * position + 1) * terms.period_ticks
             self._edges[:, now["edges"]] = edge
             now["edges"] += 1
-        for missed in range(running, number) if running >= 0 else ():
+        end_sweep = number if self._end_sweep is None else min(number, self._end_sweep)
+        for missed in range(running, end_sweep) if running >= 0 else ():
             exact = received and missed + 1 == number
             end = header.first_frame + at if exact else self._boundary_frame(missed + 1, at, header, start)
             closed.append(self._close(missed, end, header.tick_hz))

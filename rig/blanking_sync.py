@@ -63,11 +63,15 @@ class SweepEnd:
 
 
 class BlankingSync:
-    """Finds the sweeps of one run, block by block. Indices count sweeps of the waveform, numbers those of the maps."""
+    """Finds the sweeps of one run, block by block. Indices count sweeps of the waveform, numbers those of the maps.
 
-    def __init__(self, plan: ScanPlan) -> None:
+    end_sweep: number of the last sweep that is marked, the one behind all that are wanted; None: all are.
+    """
+
+    def __init__(self, plan: ScanPlan, end_sweep: int | None = None) -> None:
         assert plan.blanking is not None, "only such a plan is bound by its light"
         self._plan = plan
+        self._end_sweep = end_sweep
         self._blanking: Blanking = plan.blanking
         self._rate = float(plan.frame_rate_hz)
         self._period = float(plan.frames_per_sweep)
@@ -188,6 +192,8 @@ class BlankingSync:
     def _expected(self, last: int, first: bool = False) -> SweepPlace | None:
         index = self._next
         assert index is not None, "asked for by the caller"
+        if self._end_sweep is not None and index - self._plan.pilots > self._end_sweep:
+            return None
         if first:
             expected, sd, period = self._line.place[-1] + self._period, math.nan, self._period
         else:

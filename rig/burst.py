@@ -4,6 +4,7 @@ import math
 
 from drivers.clock import VirtualClock
 from rig.errors import PlanError
+from rig.gate_pulses import sync_program
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig
 
@@ -24,6 +25,20 @@ def lead_s(rig: OpenRig) -> float:
 def spare_lead_s(rig: OpenRig) -> float:
     """More seconds, which a burst may have room for."""
     return 0.0 if isinstance(rig.clock, VirtualClock) or not rig.spad.info.markers else SPARE_LEAD_S
+
+
+def most_sweeps(rig: OpenRig, plan: ScanPlan) -> int | None:
+    """Sweeps of one start: as many as the SPAD's memory holds in a burst and the sync source's program; None: any.
+
+    At least 1, which either may still refuse.
+    """
+    legs = plan.sweeps_per_period
+    repeats = rig.sync.most_repeats(sync_program(plan, legs)[0])
+    limits = [] if repeats is None else [repeats * legs]
+    if plan.burst_frames is not None:
+        spare = plan.burst_frames - lead_s(rig) * float(plan.frame_rate_hz) - plan.frames_for(0)
+        limits.append(int(spare / float(plan.frames_per_sweep)))
+    return max(1, min(limits)) if limits else None
 
 
 def require_memory(rig: OpenRig, plan: ScanPlan) -> None:

@@ -12,6 +12,7 @@ import typer
 
 if TYPE_CHECKING:
     from rig.acquisition import ScanProgress
+    from rig.recording.space import Space
     from rig.run import RunResult
 
 EXIT_USAGE = 2
@@ -138,6 +139,11 @@ def live_progress() -> Iterator["Callable[[ScanProgress], None] | None"]:
             bar(done.frames, done.frames_planned, done.lost, "" if done.fog is None else done.fog.brief())
 
         yield None if bar is None else tell
+
+
+def say_space(space: "Space") -> None:
+    """What a recording will take on the disk, before it begins."""
+    say(f"recording: {space}")
 
 
 def split_option(option: str, given: list[str] | None) -> list[str]:

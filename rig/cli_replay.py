@@ -23,6 +23,7 @@ from rig.cli_command import (
     live_progress,
     report,
     say,
+    say_space,
 )
 
 if TYPE_CHECKING:
@@ -99,6 +100,7 @@ def replay_command(
             record=record,
             on_overload=on_overload,
             live=live,
+            on_space=say_space,
             steps=_step_by_keys if clock == "step" else None,
             **options,
         )

@@ -22,9 +22,11 @@ from rig.cli_command import (
     print_json,
     progress,
     report,
+    say_space,
 )
 
 if TYPE_CHECKING:
+    from rig.recording.space import Space
     from rig.scan_plan import ScanPlan
 
 
@@ -77,10 +79,13 @@ def scan_command(
         "min_confidence": min_confidence,
         "temporal_prior": temporal_prior,
     }
+    out = default_out() if out is None else out
     if dry_run:
         checked: dict[str, Any] = {"maps": maps, "seed": seed, "save": save, "on_overload": on_overload}
-        plan = api.plan_scan(config, accept_calibration=accept_calibration, **checked, **options)
-        return _show_plan(plan, as_json)
+        checked |= {"out": out, "record": record, "accept_calibration": accept_calibration}
+        spaces: list[Space] = []
+        plan = api.plan_scan(config, on_space=spaces.append, **checked, **options)
+        return _show_plan(plan, spaces[0] if spaces else None, as_json)
     with live_progress() as live:
         result = api.scan(
             config,
@@ -88,23 +93,27 @@ def scan_command(
             seed=seed,
             save=save,
             arm=arm,
-            out=default_out() if out is None else out,
+            out=out,
             record=record,
             on_overload=on_overload,
             live=live,
+            on_space=say_space,
             accept_calibration=accept_calibration,
             **options,
         )
     return report(result, as_json)
 
 
-def _show_plan(plan: "ScanPlan", as_json: bool) -> int:
+def _show_plan(plan: "ScanPlan", space: "Space | None", as_json: bool) -> int:
     from rig.plan_figures import plan_content, plan_text
 
     if as_json:
-        print_json({"plan": plan_content(plan)})
+        recording = {} if space is None else {"recording": space.content()}
+        print_json({"plan": plan_content(plan), **recording})
     else:
         print(plan_text(plan))
+        if space is not None:
+            print(f"recording   {space}")
     return 0
 
 

@@ -148,13 +148,15 @@ class Pipeline:
 
     def close(self) -> None:
         """End all threads, whatever they are at. Maps not taken are gone; what is left in the ring is recorded."""
-        self._source.end()
-        self._queue.close()
-        if self._monitor is not None:
-            self.monitor_lost = not self._monitor.end(MONITOR_S) or self._monitor.failed
-        self._mapping.join(LEAVE_S)
-        if self._recorder is not None:
-            self._recorder.join(DRAIN_S)
+        try:
+            self._source.end()
+            self._queue.close()
+            if self._monitor is not None:
+                self.monitor_lost = not self._monitor.end(MONITOR_S) or self._monitor.failed
+            self._mapping.join(LEAVE_S)
+        finally:  # a second Ctrl-C ends the wait for an estimate, not for what was received
+            if self._recorder is not None:
+                self._recorder.join(DRAIN_S)
 
     def _complete(self) -> None:
         """All frames are there: on a link that goes on, the ring must not fill up while the last map is estimated."""

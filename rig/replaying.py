@@ -15,6 +15,7 @@ import numpy as np
 
 from calibration.files.rig_file import CALIBRATION_FILE
 from calibration.model.rig_model import RigModel
+from calibration.npy_files import load_numpy
 from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.replay_pace import Pace, PaceReport, ReplayClock
@@ -23,8 +24,15 @@ from rig.config_files import parse_config
 from rig.errors import DamagedRecordingError, UsageError
 from rig.estimators import Learned
 from rig.plan import spad_request
-from rig.recording.inputs import read_plan
-from rig.recording.manifest import MANIFEST, is_cut_short, read_manifest, require_inputs, require_plain_sweeps
+from rig.recording.inputs import PLAN_FILE, read_plan
+from rig.recording.manifest import (
+    MANIFEST,
+    ended_before_last_map,
+    is_cut_short,
+    read_manifest,
+    require_inputs,
+    require_plain_sweeps,
+)
 from rig.recording.opening import require_recording
 from rig.recording.part import part_learned, part_starts
 from rig.scan_plan import ScanPlan
@@ -131,6 +139,7 @@ def replay_plan(
 ) -> tuple[ScanPlan, SpadTiming]:
     """The plan that the frames were taken with, for the calibration that there is, and the SPAD configured for it."""
     plan = read_plan(recording.path)
+    _require_frames_of(plan, recording)
     if model is not None:
         from rig.recalibrated import recalibrated
 
@@ -143,11 +152,24 @@ def replay_plan(
     return plan, spad.configure(request)
 
 
+def _require_frames_of(plan: ScanPlan, recording: RunRecording) -> None:
+    """DamagedRecordingError where the frames are of another size than the plan's: counters are made by the plan."""
+    widths = {plan.width} if plan.windows is None else {plan.width, plan.windows.width_px}
+    for run in recording.runs:
+        header = run.header
+        if header.height != plan.rows or header.width not in widths or plan.width > header.sensor_width:
+            raise DamagedRecordingError(
+                f"{recording.path}: the frames of start {run.number} are {header.width} x {header.height} pixels of a "
+                f"sensor {header.sensor_width} wide, {PLAN_FILE} is for {plan.width} x {plan.rows}; take it from a copy"
+            )
+
+
 class Replayed:
     """What a run needs to know of the recording that its SPAD plays. maps: to take."""
 
     def __init__(self, spad: PlaysRecording, plan: ScanPlan, maps: int | None) -> None:
         self._spad = spad
+        self._shapes = (plan.rows, plan.columns), (plan.rows, plan.width)
         self._sweeps = recorded_sweeps(spad.recording, plan)
         there = self._there = sum(self._sweeps)
         if there == 0:
@@ -176,6 +198,10 @@ class Replayed:
         """Sweeps of one start after the other."""
         return itertools.cycle(self._sweeps) if self._spad.loops else iter(self._sweeps)
 
+    def starts_for(self, maps: int) -> int:
+        """Starts that give so many maps, at most."""
+        return -(-maps // self._there) * len(self._sweeps)
+
     def starts(self) -> Iterator[SweepStart]:
         """With which sweep each of the starts begins."""
         found = part_starts(self._spad.recording)
@@ -186,8 +212,17 @@ class Replayed:
         return part_learned(self._spad.recording.path, estimate, model)
 
     def truth(self, index: int) -> SweepTruth | None:
-        """What was known of a map when it was recorded, where that was kept."""
-        return recorded_truth(self._spad.recording.path, index % self._there)
+        """What was known of a map when it was recorded, where that was kept.
+
+        DamagedRecordingError where it is of other columns or of another sensor.
+        """
+        truth = recorded_truth(self._spad.recording.path, index % self._there)
+        if truth is not None and (truth.x_px.shape, truth.depth_m.shape) != self._shapes:
+            raise DamagedRecordingError(
+                f"{self._spad.recording.path}: the truth of map {index} is of {truth.x_px.shape} and "
+                f"{truth.depth_m.shape} pixels, not {self._shapes[0]} and {self._shapes[1]}; move it away"
+            )
+        return truth
 
 
 def pace_of(spad: SpadArray) -> Pace:
@@ -197,7 +232,7 @@ def pace_of(spad: SpadArray) -> Pace:
 
 
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[int]:
-    """How many sweeps each start of the SPAD gave, as the run took them; of one that was cut short the whole ones.
+    """How many sweeps each start of the SPAD gave; of one that was cut short, by whatever, the whole ones.
 
     DamagedRecordingError where a start is missing: its maps would be taken for those of others.
     """
@@ -214,11 +249,10 @@ def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[int]:
             f"{recording.path}: of {len(starts)} starts of the SPAD only {len(set(found))} are there, not the first; "
             "take the missing segments from a copy"
         )
-    planned = planned[: len(found)]
-    sweeps = manifest.get("sweeps")
-    if sweeps is None or is_cut_short(manifest):
+    planned = [min(sweeps, run.frames) for sweeps, run in zip(planned, recording.runs, strict=False)]
+    if is_cut_short(manifest) or ended_before_last_map(manifest):
         planned[-1] = min(planned[-1], _whole_sweeps(recording, recording.runs[-1], plan))
-    return _limited(planned, sum(planned) if sweeps is None else len(sweeps))
+    return [sweeps for sweeps in planned if sweeps]
 
 
 def recorded_truth(folder: Path, index: int) -> SweepTruth | None:
@@ -227,31 +261,25 @@ def recorded_truth(folder: Path, index: int) -> SweepTruth | None:
     if not file.exists():
         return None
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with load_numpy(file) as arrays:
             return SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"])
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to go on without it") from error
 
 
 def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> int:
-    """Sweeps of a start that are there to their end: by its markers, or without such by the number of frames."""
+    """Sweeps of a start that are there to their end: by its markers, or without such by the number of frames.
+
+    Never more than its frames, whatever their headers say.
+    """
     if plan.blanking is not None:
         frames = float(plan.frames_per_sweep)
-        return max(0, int((run.end_frame - plan.frames_for(0)) / frames))
+        return min(run.frames, max(0, int((run.end_frame - plan.frames_for(0)) / frames)))
     last = next((b for e in run.entries[::-1] if (b := recording.read(run, e)) is not None and b.n_frames), None)
     if last is None:
         return 0
     before = last.header.sweep
-    return max(0, before + ((int(last.records["sweep"][-1]) - before) & 0xFFFF) - 1)
-
-
-def _limited(planned: list[int], most: int) -> list[int]:
-    """The first `most` sweeps of those planned; starts of none are left out."""
-    taken = []
-    for sweeps in planned:
-        taken.append(min(sweeps, most))
-        most -= taken[-1]
-    return [sweeps for sweeps in taken if sweeps]
+    return min(run.frames, max(0, before + ((int(last.records["sweep"][-1]) - before) & 0xFFFF) - 1))
 
 
 def _own_drivers(run: Path, recorded: dict[str, Any]) -> dict[str, Any]:

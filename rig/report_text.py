@@ -22,7 +22,7 @@ _NEXT_STEP = {
     Verdict.GAPS: "frames were lost; lower frame_rate or free the computer, then scan again",
     Verdict.UNSYNCHRONISED: "columns of frames are not sure; check marker cables, or light in the run-in, and clocks",
     Verdict.UNCALIBRATED: "there is no calibration, so no depth; name one in the config",
-    Verdict.ABORTED: "the run ended before its last map; whole maps are kept",
+    Verdict.ABORTED: "the run ended before its last map; whole maps are kept, and with --record every frame that came",
 }
 
 

@@ -2,7 +2,6 @@
 
 import os
 import platform
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -10,7 +9,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from calibration.digits import digits
 from drivers.interfaces import SweepTruth
 from drivers.replay_pace import PaceReport
 from drivers.transports.tap import CONTROL_FILE, TapFile
@@ -19,6 +17,7 @@ from rig.errors import UsageError
 from rig.outputs import Rays, RunFolder
 from rig.reconstruction import MapResult
 from rig.recording.manifest import UNFINISHED, file_crc32
+from rig.recording.space import Space
 from rig.recording.writer import Recording
 from rig.saving import SavePolicy
 from rig.stages import PipelineStats
@@ -83,25 +82,30 @@ class Run:
         """Whether there is a whole map or a recorded block."""
         return self.tally.maps > 0 or (self._recording is not None and self._recording.blocks > 0)
 
+    def space(self, recording_bytes: int, map_bytes: int, maps: int) -> Space:
+        """What a recorded run of `maps` maps takes, and what its disk has.
+
+        recording_bytes: of all frames; map_bytes: of one map. UsageError where it has no folder.
+        """
+        if self._folder is None:
+            raise UsageError("record writes the frames into the run's folder; name one with out")
+        return Space.on_disk_of(self._folder.path, recording_bytes, map_bytes * self._save.count(maps))
+
     def start_recording(
         self,
-        maps: int,
         manifest: Mapping[str, Any],
         write_inputs: Callable[[Path], None],
-        recording_bytes: int,
-        map_bytes: int,
+        space: Space,
     ) -> Recording:
-        """The recording of a run of `maps` maps, in its folder; closed with the run.
+        """The recording of a run, in its folder; closed with the run.
 
         manifest: what is known before the first frame; it is on the disk before this returns, and again with each start
-        of the SPAD. write_inputs: writes what has to stand beside the frames. recording_bytes, map_bytes: what all the
-        frames and one map will take. Raises UsageError where the disk has not so much, RecordingError where it cannot
-        be written.
+        of the SPAD. write_inputs: writes what has to stand beside the frames. space: what all of it will take. Raises
+        UsageError where the disk has not so much, RecordingError where it cannot be written.
         """
         folder = self._folder
-        if folder is None:
-            raise UsageError("record writes the frames into the run's folder; name one with out")
-        _require_space(folder.path, recording_bytes, map_bytes * self._save.count(maps))
+        assert folder is not None, "its space was looked at"
+        space.require()
 
         def begun() -> None:
             assert self._recording is not None, "tells of its starts only"
@@ -118,7 +122,7 @@ class Run:
             }
         except OSError as error:
             raise UsageError(f"cannot write {folder.path}: {error.strerror or error}; name another --out") from error
-        self._recording = Recording(folder.path, expected_bytes=recording_bytes, on_begin=begun)
+        self._recording = Recording(folder.path, expected_bytes=space.recording_bytes, on_begin=begun)
         if self._tap is not None:
             self._recording.also_sync(self._tap.sync)
         begun()
@@ -191,17 +195,6 @@ class Run:
         self._folder.write_map(index, result, self.rays)
         if truth is not None:
             self._folder.write_truth(index, truth)
-
-
-def _require_space(folder: Path, recording_bytes: int, map_bytes: int) -> None:
-    """UsageError where the disk has not enough room for a run."""
-    free = shutil.disk_usage(folder).free
-    if recording_bytes + map_bytes > free:
-        raise UsageError(
-            f"the recording will take {digits(recording_bytes / 1e9)} GB and the maps {digits(map_bytes / 1e9)} GB, "
-            f"the disk of {folder} has {digits(free / 1e9)} GB free; free some, name a folder on another disk with "
-            "--out, or lower --maps"
-        )
 
 
 def versions() -> dict[str, str]:

@@ -1,9 +1,11 @@
 """What the sweeps of a scan come to: frames, synchronisation, verdict, and an account of each for the manifest."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 from calibration.model.rig_model import RigModel
+from drivers.interfaces import SpadCounters
 from rig.summary import RunFrames, Synchronisation, Verdict
 from rig.sweeps import SweepAccount
 
@@ -17,6 +19,15 @@ def frames_of(sweeps: list[SweepAccount], crc_errors: int | None) -> RunFrames:
         crc_errors=crc_errors,
         lit=sum(sweep.frames.lit for sweep in sweeps),
     )
+
+
+def frames_that_came(of_maps: RunFrames, counters: SpadCounters, dropped: int) -> RunFrames:
+    """Frames of a run that ended before its last map: all of them, those behind its last whole map too.
+
+    counters: the SPAD's own; dropped: frames that found no free slot, for a SPAD that does not say what got lost.
+    """
+    lost = dropped if counters.lost is None else counters.lost
+    return replace(of_maps, expected=counters.delivered + lost, received=counters.delivered, lost=lost)
 
 
 def synchronisation_of(sweeps: list[SweepAccount]) -> Synchronisation | None:

@@ -9,25 +9,29 @@ from typing import Any
 from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
 from rig.acquisition import SILENCE_S, Acquisition, ScanProgress
+from rig.burst import lead_s, most_sweeps, spare_lead_s
 from rig.calibration_identity import accepted_by, calibration_use, identity_of, rig_content
 from rig.errors import RigError
 from rig.estimators import LEARNING, Learned
 from rig.monitor import Watch
-from rig.overload import Overload, require_policy
+from rig.overload import FEWEST_SLOTS, Overload, require_policy
 from rig.plan import spad_request
 from rig.plan_figures import plan_content
 from rig.reconstruction import Reconstructor
 from rig.recording.devices import devices_content
 from rig.recording.inputs import write_inputs
-from rig.recording.space import map_bytes, recording_bytes
+from rig.recording.space import Space, map_bytes, recording_bytes
 from rig.recording.writer import Recording
 from rig.replaying import Replayed
 from rig.run import Run, RunResult
-from rig.scan_account import frames_of, sweep_content, synchronisation_of, verdict_of
+from rig.scan_account import frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, prepare
 from rig.sweeps import SweepAccount, SweepData
 from rig.warm_up import warm_binding, warm_up
+
+OnSpace = Callable[[Space], None]
+"""Told, before anything moves, what a recording will take on the disk, once it is known to fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +49,7 @@ class ScanOptions:
     live: Callable[[ScanProgress], None] | None = None
     sweeps: Callable[[SweepData], None] | None = None
     accept_calibration: bool = False
+    on_space: OnSpace | None = None
 
 
 def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanOptions | None = None) -> RunResult:
@@ -83,19 +88,23 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         "maps": maps,
         "on_overload": options.policy.value,
     }
+    recording = None
+    if options.record:
+        starts = None if replayed is None else replayed.starts_for(maps)
+        space = run.space(*recorded_bytes(rig, plan, timing, maps, starts), maps)
+        recording = _recording(rig, run, plan, manifest, space, options.on_space)
     acquisition = Acquisition(
         rig,
         plan,
         timing,
         maps,
         reconstructor,
-        # Learning takes a second or more, and a live stream cannot stand still meanwhile.
-        first_alone=estimate.estimator in LEARNING and not rig.spad.info.can_wait,
+        first_alone=_first_alone(rig),
         groups=None if replayed is None else replayed.groups(),
         on_sweep=options.sweeps,
         policy=options.policy,
         starts=None if replayed is None else replayed.starts(),
-        recording=_recording(rig, run, plan, timing, maps, manifest) if options.record else None,
+        recording=recording,
         watch=options.watch,
         on_progress=options.live,
         silence_s=SILENCE_S if replayed is None else replayed.silence_s,
@@ -110,17 +119,18 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         ended_by = error
     del sweeps[run.tally.maps :]
     frames = frames_of(sweeps, acquisition.counters.crc_errors)
+    counters, stages = acquisition.counters, acquisition.stages
     result = run.finish(
-        frames,
+        frames if ended_by is None else frames_that_came(frames, counters, stages.dropped_frames),
         frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
         verdict_of(sweeps, rig.model, aborted=ended_by is not None),
         {
             **manifest,
             "sweeps": [sweep_content(sweep) for sweep in sweeps],
             "gaps": [list(gap) for sweep in sweeps for gap in sweep.gaps],
-            "counters": asdict(acquisition.counters),
+            "counters": asdict(counters),
         },
-        acquisition.stages,
+        stages,
         synchronisation_of(sweeps),
         None if replayed is None else replayed.report,
         accepted_by(calibration),
@@ -132,17 +142,36 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
     return result
 
 
+def recorded_bytes(
+    rig: OpenRig, plan: ScanPlan, timing: SpadTiming, maps: int, starts: int | None = None
+) -> tuple[int, int]:
+    """Bytes that the frames of a scan take at most, and those of one map.
+
+    starts: of the SPAD, where that is not for the scan to choose.
+    """
+    request = spad_request(rig.config.scan, plan)
+    spare_s = lead_s(rig) + spare_lead_s(rig)
+    if rig.spad.info.can_wait:  # on virtual time the SPAD may be a whole ring ahead of what is counted
+        spare_s += FEWEST_SLOTS * request.block_frames / float(plan.frame_rate_hz)
+    if starts is None:
+        most = most_sweeps(rig, plan) or maps
+        starts = -(-maps // most) + (_first_alone(rig) and maps > 1)
+    return recording_bytes(plan, request, timing, maps, starts=starts, spare_s=spare_s), map_bytes(plan)
+
+
+def _first_alone(rig: OpenRig) -> bool:
+    """Whether the first map has a start of its own: a live stream cannot stand still while it is learned from."""
+    return rig.config.estimate.estimator in LEARNING and not rig.spad.info.can_wait
+
+
 def _recording(
-    rig: OpenRig, run: Run, plan: ScanPlan, timing: SpadTiming, maps: int, manifest: dict[str, Any]
+    rig: OpenRig, run: Run, plan: ScanPlan, manifest: dict[str, Any], space: Space, on_space: OnSpace | None
 ) -> Recording:
     """The recording of a scan, begun in the run's folder with all that is known before the first frame."""
-    return run.start_recording(
-        maps,
-        manifest,
-        lambda folder: write_inputs(folder, plan, rig.model),
-        recording_bytes(plan, spad_request(rig.config.scan, plan), timing, maps),
-        map_bytes(plan),
-    )
+    recording = run.start_recording(manifest, lambda folder: write_inputs(folder, plan, rig.model), space)
+    if on_space is not None:
+        on_space(space)
+    return recording
 
 
 def make_reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned] = ()) -> Reconstructor:

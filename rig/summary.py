@@ -38,6 +38,7 @@ class Verdict(StrEnum):
 class RunFrames:
     """Frames between the first and the last scan marker, dark and fly-back ones too; expected = received + lost.
 
+    Of a run that ended before its last map: all that came, while lit is of its whole maps.
     crc_errors: blocks refused for their checksum, None where the source does not say. lit: frames that fell on columns.
     """
 

@@ -18,6 +18,7 @@ says it all.
 """
 
 import os
+import zipfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -34,6 +35,7 @@ from calibration.model.covariance import Covariance
 from calibration.model.parameters import with_parameters
 from calibration.model.rig_model import Identity, Lag, RigModel
 from calibration.model.scanner import PivotScanner, PlaneTable, Scanner
+from calibration.npy_files import load_numpy
 
 CALIBRATION_FILE: Final = "calibration.yaml"
 """Its name wherever the project writes one."""
@@ -188,12 +190,12 @@ def _plane_rows(planes: PlaneRows, folder: Path) -> NDArray[np.float64]:
 
 def _load_array(file: Path, what: str) -> NDArray[Any]:
     try:
-        array = np.load(file, allow_pickle=False)
+        array = load_numpy(file)
     except FileNotFoundError as error:
         raise CalibrationError(
             f"{what} names {file}, which does not exist; paths are relative to the calibration file"
         ) from error
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise CalibrationError(f"{what} {file} is not a readable .npy array; write it with numpy.save") from error
     if not isinstance(array, np.ndarray):
         raise CalibrationError(f"{what} {file} is an archive, not a single .npy array; write it with numpy.save")

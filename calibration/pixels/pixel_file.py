@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from calibration.errors import CalibrationError
+from calibration.npy_files import load_numpy
 from calibration.pixels.pixel_map import PixelMap
 
 FORMAT: Final = "spadrig-pixels"
@@ -74,7 +75,7 @@ def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:
     """Read one. CalibrationError where there is none."""
     file = Path(path)
     try:
-        with np.load(file, allow_pickle=False) as archive:
+        with load_numpy(file) as archive:
             about: dict[str, Any] = json.loads(str(archive["about"]))
             arrays = {name: archive[name] for name in _ARRAYS}
             dead = archive["dead"] if "dead" in archive.files else None

@@ -167,12 +167,12 @@ def in_order(entries: Entries, runs: list[int], problems: list[str]) -> tuple[En
         return entries, True
     by_place = np.sort(entries, order=["segment", "offset"], kind="stable")
     runs = list(dict.fromkeys([*runs, *by_place["run_id"].tolist()]))
-    rank = np.zeros(max(runs) + 1, np.int64)
-    rank[runs] = np.arange(len(runs))
-    order = np.lexsort((by_place["block_seq"], rank[by_place["run_id"]]))
+    rank_of = {run: rank for rank, run in enumerate(runs)}
+    rank = np.array([rank_of[run] for run in by_place["run_id"].tolist()])
+    order = np.lexsort((by_place["block_seq"], rank))
     ordered = by_place[order]
     keep = np.ones(len(ordered), bool)
-    begins = np.flatnonzero(np.diff(rank[ordered["run_id"]], prepend=-1))
+    begins = np.flatnonzero(np.diff(rank[order], prepend=-1))
     for begin, stop in pairwise([*begins.tolist(), len(ordered)]):
         run = ordered[begin:stop]
         end = np.maximum.accumulate(run["first_frame"] + run["n_frames"])

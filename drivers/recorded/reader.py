@@ -208,7 +208,7 @@ def block_part(block: FrameBlock, first_frame: int, end_frame: int) -> FrameBloc
         flags=flags,
         first_frame=header.first_frame + begin,
         t0_ticks=header.t0_ticks + skipped,
-        sweep=header.sweep + ((int(records["sweep"][0]) - header.sweep) & 0xFFFF),
+        sweep=(header.sweep + ((int(records["sweep"][0]) - header.sweep) & 0xFFFF)) & 0xFFFFFFFF,
     )
     return FrameBlock(header, records, block.bits[begin:end], block.status)
 

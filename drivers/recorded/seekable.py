@@ -22,6 +22,10 @@ SEEKABLE_MAGIC: Final = 0x8F92EAB1
 FRAME_MAGIC: Final = bytes.fromhex("28b52ffd")
 MAX_FRAME_BYTES: Final = 1 << 31
 """A frame holds one block; a table that says more is damaged."""
+MOST_RATIO: Final = 1 << 15
+"""Plain bytes that a packed one can stand for: a block of zstd takes 4 bytes and holds 128 KiB at most (RFC 8878)."""
+_PIECE_BYTES: Final = 1 << 12
+"""Of a frame of unknown size, fed to the unpacker at a time: 128 MiB at most come of it."""
 MISSING_ZSTANDARD: Final = "compressed recordings need the package zstandard: pip install 'spadrig[compress]'"
 
 _HEAD: Final = struct.Struct("<II")
@@ -116,6 +120,8 @@ def _stated_sizes(data: Bytes) -> NDArray[np.int64] | None:
     packed = np.concatenate([[0], np.cumsum(sizes[:, 0])])
     if packed[-1] != begin or (sizes <= 0).any() or (sizes[:, 1] > MAX_FRAME_BYTES).any():
         return None
+    if (sizes[:, 1] > MOST_RATIO * sizes[:, 0]).any():
+        return None
     return sizes
 
 
@@ -127,8 +133,8 @@ def _found_sizes(data: Bytes) -> Iterator[tuple[int, int]]:
         unpacker = zstandard.ZstdDecompressor().decompressobj()
         plain, fed = 0, at
         try:
-            while not unpacker.eof and fed < len(data):
-                piece = data[fed : fed + (1 << 20)].tobytes()
+            while not unpacker.eof and fed < len(data) and plain <= MAX_FRAME_BYTES:
+                piece = data[fed : fed + _PIECE_BYTES].tobytes()
                 plain += len(unpacker.decompress(piece))
                 fed += len(piece)
         except zstandard.ZstdError:

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.npy_files import load_numpy
 from calibration.views import Corners, Passages, View
 from rig.errors import UsageError
 
@@ -41,7 +42,7 @@ def save_view(view: View, file: Path) -> None:
 def load_view(file: Path) -> View:
     """A view as it was written. UsageError where the file holds none."""
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with load_numpy(file) as arrays:
             version = int(arrays["format_version"])
             if version != VERSION:
                 raise UsageError(f"{file} is a view of version {version}, this program reads version {VERSION}")

@@ -1,5 +1,6 @@
 """The maps in a run's folder: which there are, and their arrays."""
 
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.npy_files import load_numpy
 from rig.errors import UsageError
 
 
@@ -35,6 +37,6 @@ class MapFiles:
 def load(file: Path) -> Any:
     """What numpy loads of `file`; UsageError, one line, where it cannot."""
     try:
-        return np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        return load_numpy(file)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise UsageError(f"cannot read {file}: {error}; make the maps again with rig reconstruct") from error

@@ -18,6 +18,9 @@ VIEWS: Final[tuple[View, ...]] = get_args(View)
 _BRIGHT_SHARE: Final = 0.999
 """Of the first picture's pixels so many are darker than what is shown as white."""
 
+_MOST_PIXELS: Final = 1 << 24
+"""Of a picture of frames: five times as many as the largest SPAD array has."""
+
 Picture = NDArray[np.uint8]
 """Grey (height, width) or BGR (height, width, 3)."""
 
@@ -93,6 +96,7 @@ def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
         at = 0
         while at < block.n_frames:
             if counts is None:
+                _require_picture(header.sensor_width, header.sensor_height)
                 counts = np.zeros((header.sensor_height, header.sensor_width), np.uint32)
             same = (x0[at:] == x0[at]) & (y0[at:] == y0[at])
             take = min(missing, len(same) if same.all() else int(np.argmin(same)))
@@ -104,6 +108,15 @@ def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
             if missing == 0:
                 yield counts
                 counts, missing = None, n
+
+
+def _require_picture(width: int, height: int) -> None:
+    """UsageError for a sensor larger than any: its header is all that says so, and the picture is made of it."""
+    if width * height > _MOST_PIXELS:
+        raise UsageError(
+            f"the recording says that its sensor has {width} x {height} pixels; pictures have at most {_MOST_PIXELS}; "
+            "'rig export' the frames as npy, which are only as large as their windows"
+        )
 
 
 def _even(picture: Picture) -> Picture:

@@ -1,14 +1,17 @@
 """What stands beside the frames of a recording so that they mean something without the rig: plan and calibration."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import yaml
 
 from calibration.errors import CalibrationError
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
 from calibration.model.rig_model import RigModel
+from rig.blanking import MOST_CHIP_FRAMES, Blanking
 from rig.errors import UsageError
+from rig.geometry import WORD_PX
 from rig.recording.manifest import read_manifest
 from rig.recording.opening import open_recording
 from rig.recording.plain import from_plain, to_plain
@@ -17,6 +20,10 @@ from rig.scan_plan import ScanPlan
 PLAN_FILE: Final = "plan.yaml"
 PLAN_FORMAT: Final = "spadrig-plan"
 PLAN_VERSION: Final = 1
+MOST_EXPOSURES: Final = 0xFFFF
+"""As of a config."""
+MOST_PIXELS: Final = 0xFFFF
+"""Each way, which is what a block's header can say."""
 
 
 def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None) -> None:
@@ -38,7 +45,8 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
     """The plan that a recording was taken with. UsageError where there is none that this program reads."""
     file = folder / name
     try:
-        content = yaml.load(file.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        text = file.read_text(encoding="utf-8")
+        content = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except FileNotFoundError:
         if holds_frames_alone(folder):
             raise UsageError(
@@ -56,9 +64,57 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
     if head != (PLAN_FORMAT, PLAN_VERSION):
         raise UsageError(f"{file} is not the plan of a recording ('format: {PLAN_FORMAT}', version {PLAN_VERSION})")
     try:
-        return from_plain(ScanPlan, content.get("plan"))
-    except (ValueError, TypeError, KeyError) as error:
-        raise UsageError(f"{file}: {error}") from error
+        _require_no_more_than(content, len(text))
+        plan = from_plain(ScanPlan, content.get("plan"))
+        _require_sizes(plan)
+    except (ValueError, TypeError, KeyError, ArithmeticError) as error:
+        raise UsageError(f"{file}: {error}; take it from a copy of the recording") from error
+    return plan
+
+
+def _require_no_more_than(content: Any, most: int) -> None:
+    """ValueError where a file of `most` characters tells of more values, as YAML's aliases within aliases do."""
+    left, seen = [content], 0
+    while left:
+        one = left.pop()
+        seen += 1
+        if seen > most:
+            raise ValueError("its aliases stand for more values than it has characters")
+        if isinstance(one, Mapping | list):
+            left += one.values() if isinstance(one, Mapping) else one
+
+
+def _require_sizes(plan: ScanPlan) -> None:
+    """ValueError where numbers that sizes are made of do not fit the arrays beside them, or what a block can hold."""
+    row = -(-plan.width // WORD_PX) * WORD_PX
+    points = (plan.sweep_points * len(plan.legs),)
+    blanking = plan.blanking or Blanking(0.0, 0.0, 0.0)
+    rate_hz = float(plan.frame_rate_hz)
+    lines = plan.lines
+    checks = {
+        "columns": plan.columns >= 1 and plan.commands.shape == plan.x0.shape == (plan.columns,),
+        "exposures": 1 <= plan.exposures <= MOST_EXPOSURES,
+        "rows": 1 <= plan.rows <= MOST_PIXELS,
+        "width": 1 <= plan.width <= MOST_PIXELS,
+        "window": plan.x0.size > 0 and 1 <= plan.window <= row and plan.x0.min() >= 0,
+        "x0": plan.x0.size > 0 and plan.x0.max() <= row - plan.window,
+        "windows": plan.windows is None or 1 <= plan.windows.width_px <= row,
+        "legs": 1 <= len(plan.legs) <= 2,
+        "sweep_points": plan.waveform.command.shape == plan.waveform.markers.shape == points != (0,),
+        "marker_points": plan.marker_points.ndim == 1,
+        "frame_rate_hz": plan.frame_rate_hz > 0,
+        "point_rate_hz": plan.point_rate_hz > 0,
+        "blanking": 0 <= blanking.chip_s * rate_hz <= MOST_CHIP_FRAMES + 1
+        and max(blanking.guard_s, blanking.tolerance_s) * rate_hz <= plan.columns * plan.exposures + MOST_CHIP_FRAMES,
+        "lines": lines is None
+        or (
+            lines.line.shape == lines.place.shape == (plan.columns,)
+            and 0 <= lines.line.min() <= lines.line.max() < lines.lines <= plan.columns
+            and 0 <= lines.place.min() <= lines.place.max() < lines.places
+        ),
+    }
+    if wrong := [name for name, right in checks.items() if not right]:
+        raise ValueError(f"{' and '.join(wrong)} of the plan cannot be, or not together with its other numbers")
 
 
 def holds_frames_alone(folder: Path) -> bool:

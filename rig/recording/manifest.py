@@ -56,6 +56,15 @@ def ended_early(manifest: Mapping[str, Any]) -> str | None:
     return None if failed is None else str(failed)
 
 
+def ended_before_last_map(manifest: Mapping[str, Any]) -> bool:
+    """Whether a run ended before it had made maps of all sweeps that its starts were to give.
+
+    Sweeps that it made no maps of may lie whole behind those that it tells of, as where it was killed.
+    """
+    starts = (manifest.get("recording") or {}).get("starts") or []
+    return len(manifest.get("sweeps") or []) < sum(int(start["sweeps"]) for start in starts)
+
+
 def file_crc32(path: Path) -> int:
     """CRC-32 of a file, for the manifest. Raises OSError."""
     crc = 0

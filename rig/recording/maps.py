@@ -1,4 +1,4 @@
-"""Which frames of a recording belong to which map: as its manifest says, or, of a run cut short, its markers."""
+"""Which frames of a recording belong to which map: as its manifest says and, of a run that ended early, its markers."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 
 from drivers.frames import FrameBlock, Mark
 from drivers.recorded import RecordedRun, RunRecording
-from rig.recording.manifest import is_cut_short
+from rig.recording.manifest import ended_before_last_map, is_cut_short
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +30,9 @@ def map_spans(recording: RunRecording, manifest: dict[str, Any] | None) -> list[
     spans = list(_stated(recording, sweeps))
     while spans and is_cut_short(manifest) and spans[-1].end_frame >= recording.runs[spans[-1].run].end_frame:
         del spans[-1]  # the run made a map of frames that are not in the recording
+    if ended_before_last_map(manifest):
+        made = (spans[-1].run, spans[-1].end_frame) if spans else (0, 0)
+        spans += [span for span in _marked(recording) if (span.run, span.first_frame) >= made]
     return spans
 
 

@@ -4,9 +4,8 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calibration.model.rig_model import RigModel
+from calibration.npy_files import load_numpy
 from drivers.frames import Mark
 from drivers.recorded import RecordedRun, RunRecording
 from rig.config import EstimateConfig
@@ -48,7 +47,7 @@ def part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None)
         if not file.exists():  # the whole kept those of some maps only
             return []
         try:
-            with np.load(file, allow_pickle=False) as arrays:
+            with load_numpy(file) as arrays:
                 states.append(RowModel.from_arrays(dict(arrays)))
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to learn anew") from error

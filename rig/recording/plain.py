@@ -5,6 +5,7 @@ number. Fields that a dataclass computes for itself (init=False) are left out, a
 they have no value: files written before there were any are read as they are.
 """
 
+import re
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -14,6 +15,8 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 import numpy as np
 
 T = TypeVar("T")
+
+_FRACTION = re.compile(r"-?\d+(/\d+)?", re.ASCII)
 
 SINCE = "since"
 """Key of a field's metadata: came later than the first recordings, None by default."""
@@ -52,13 +55,18 @@ def _read(kind: Any, content: Any, where: str) -> Any:
     if is_dataclass(kind):
         return _read_dataclass(kind, content, where)
     if origin is np.ndarray:
-        return np.array(_need(content, Mapping, where)["values"], np.dtype(content["dtype"]))
+        dtype = np.dtype(_need(content, Mapping, where)["dtype"])
+        if dtype.kind not in "biuf":
+            raise ValueError(f"{where} holds {dtype}, which are no numbers")
+        return np.array(content["values"], dtype)
     if origin is tuple:
         items = _need(content, Sequence, where)
         kinds = [inner[0]] * len(items) if inner[1:] == (...,) else inner
         return tuple(_read(one, item, f"{where}[{i}]") for i, (one, item) in enumerate(zip(kinds, items, strict=True)))
     if kind is Fraction:
-        return Fraction(_need(content, str, where))
+        if _FRACTION.fullmatch(_need(content, str, where)) is None:  # 1e999999999 is one too, of a gigabyte
+            raise ValueError(f"{where} is {content!r}, which is no fraction of whole numbers")
+        return Fraction(content)
     if kind is float:
         return float(_need(content, int | float, where))
     if origin is Literal:

@@ -3,10 +3,12 @@
 `world.npz` holds `depth_m`, `albedo` and, if some depths were guessed, `trusted`, at the camera's size.
 """
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from calibration.npy_files import load_numpy
 from drivers.errors import DeviceError
 from sim_backend.scenes.surfaces import Surfaces, checked
 
@@ -29,12 +31,12 @@ def load_folder(folder: Path, size: tuple[int, int]) -> Surfaces:
 def _load_world(folder: Path, size: tuple[int, int]) -> Surfaces:
     path = folder / WORLD_FILE
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with load_numpy(path) as stored:
             missing = [key for key in ("depth_m", "albedo") if key not in stored]
             if missing:
                 raise DeviceError(f"scene file {path} lacks {' and '.join(missing)}; it holds {', '.join(stored)}")
             depth_m, albedo = stored["depth_m"], stored["albedo"]
             trusted = stored["trusted"] if "trusted" in stored else np.ones(depth_m.shape, bool)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise DeviceError(f"scene file {path} cannot be read: {error}") from error
     return checked(str(folder), depth_m, albedo, trusted, size)

@@ -4,12 +4,14 @@ Centre crop to the camera's shape, unknown disparity painted in, clipped to its 
 nearest neighbour, quantisation steps smoothed away inside surfaces; inverse depth linear in disparity between 1/6 and
 1/1.5 per metre; albedo from the linearised grey picture."""
 
+import zipfile
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.npy_files import load_numpy
 from drivers.errors import DeviceError
 from sim_backend.scenes.surfaces import Surfaces, checked
 
@@ -29,8 +31,8 @@ EDGE_STEP = 0.02
 def prepare(disparity_file: Path, picture_file: Path, size: tuple[int, int]) -> Surfaces:
     """Surfaces of size (rows, width) from `.npy` disparity (px, NaN = unknown) and an 8-bit picture of that size."""
     try:
-        raw = np.asarray(np.load(disparity_file, allow_pickle=False), dtype=np.float64)
-    except (OSError, ValueError) as error:
+        raw = np.asarray(load_numpy(disparity_file), dtype=np.float64)
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise DeviceError(f"scene file {disparity_file} cannot be read: {error}") from error
     picture = cv2.imread(str(picture_file), cv2.IMREAD_GRAYSCALE)
     if picture is None or raw.ndim != 2 or picture.shape != raw.shape:

@@ -1,7 +1,9 @@
 """Recordings as a user makes them: a folder in place from the start, and depth from it that is the same to the bit."""
 
+import io
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from calibration.digits import digits
 from rig import run as rig_run
 from rig.acquisition import Acquisition
 from tests.system.conftest import Rig
@@ -108,12 +111,52 @@ def test_a_disk_with_too_little_room_is_refused_before_the_start(
     rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = shutil.disk_usage(".")
-    monkeypatch.setattr(rig_run.shutil, "disk_usage", lambda folder: usage._replace(free=1000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage._replace(free=1000))
     ran = rig("scan", small, "--record", "--maps", 50, "--out", "deep/run")
     assert (ran.code, len(ran.problems)) == (2, 1)
-    assert "the recording will take" in ran.problems[0]
+    assert "the recording will take at most" in ran.problems[0]
     assert "has 0.000001 GB free; free some" in ran.problems[0]
     assert not Path("deep").exists()
+    tried = rig("scan", small, "--record", "--maps", 50, "--out", "deep/run", "--dry-run")
+    assert (tried.code, tried.out, tried.problems) == (2, "", ran.problems)
+
+
+@pytest.mark.parametrize("options", [(), ("--adaptive", "--exposures", 8)])
+def test_a_recording_says_before_it_starts_what_it_takes_at_most(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[object, ...]
+) -> None:
+    usage = shutil.disk_usage(".")._replace(free=12_300_000_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
+    arguments = ("scan", small, "--record", "--maps", 3, *options, "--out", "deep/run")
+    tried = rig(*arguments, "--dry-run", "--json")
+    told = json.loads(tried.out)["recording"]
+    assert tried.code == 0, tried.err
+    assert not Path("deep").exists()
+    assert told["free_bytes"] == 12_300_000_000
+    said = (
+        f"at most {digits(told['recording_bytes'] / 1e9)} GB of frames and {digits(told['map_bytes'] / 1e9)} GB of maps"
+    )
+    assert said in rig(*arguments, "--dry-run").out
+    arm, heard = Acquisition._arm, []
+
+    def look(self: Acquisition) -> None:
+        heard.append(sys.stderr.getvalue())  # type: ignore[attr-defined]
+        arm(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Acquisition, "_arm", look)
+        patch.setattr(sys, "stderr", io.StringIO())
+        assert rig(*arguments).code == 0
+    assert said in heard[0]
+    assert "has 12.3 GB free" in heard[0]
+    files = [file for file in Path("deep/run").rglob("*") if file.is_file()]
+    frames = sum(file.stat().st_size for file in files if file.suffix == ".spb")
+    assert 0 < frames <= told["recording_bytes"]
+    assert sum(file.stat().st_size for file in files) <= told["recording_bytes"] + told["map_bytes"]
+
+
+def test_a_dry_run_without_a_recording_says_nothing_of_the_disk(rig: Rig, small: Path) -> None:
+    assert list(json.loads(rig("scan", small, "--dry-run", "--json").out)) == ["plan"]
 
 
 def test_an_error_of_ours_leaves_what_was_recorded(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:

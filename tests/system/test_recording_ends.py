@@ -1,0 +1,179 @@
+"""A recording whose run ended early: whatever ended it, every whole sweep on the disk is found, as after a crash."""
+
+import errno
+import json
+import os
+import shutil
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.errors import DeviceFault, RingOverflow
+from rig.acquisition import Acquisition
+from rig.api import recording_info, verify
+from rig.map_queue import AcquiredMap, MapQueue
+from rig.mapping import Mapping
+from rig.outputs import RunFolder
+from rig.reconstruction import MapResult, Reconstructor
+from rig.recording.manifest import sealed_text
+from rig.recording.recorder import Recorder
+from tests.system.conftest import Rig
+
+SCAN = ("--maps", 20, "--record", "--out", "run")
+
+
+def content(name: str, folder: str = "run") -> dict[str, Any]:
+    """A JSON file of a run."""
+    found: dict[str, Any] = json.loads((Path(folder) / name).read_text())
+    return found
+
+
+def interrupt_while_estimating(index: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C, on the caller's thread, as soon as the estimation of a map has begun."""
+    take, estimate = MapQueue.take_streaming, Reconstructor.map
+    begun, over = threading.Event(), threading.Event()
+    done: list[int] = []
+
+    def take_or_interrupt(self: MapQueue, timeout_s: float) -> AcquiredMap | None:
+        if begun.is_set() and not over.is_set():
+            over.set()
+            raise KeyboardInterrupt
+        return take(self, timeout_s)
+
+    def slow(self: Reconstructor, volume: object) -> MapResult:
+        if len(done) == index:
+            begun.set()
+            assert over.wait(60)
+        done.append(1)
+        return estimate(self, volume)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(MapQueue, "take_streaming", take_or_interrupt)
+    monkeypatch.setattr(Reconstructor, "map", slow)
+
+
+def fail_at_map(index: int, error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the estimation of a map raise."""
+    estimate = Reconstructor.map
+    done: list[int] = []
+
+    def failing(self: Reconstructor, volume: object) -> MapResult:
+        if len(done) == index:
+            raise error
+        done.append(1)
+        return estimate(self, volume)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Reconstructor, "map", failing)
+
+
+def assert_as_after_a_crash(rig: Rig, made: int) -> None:
+    """Info, verify, reconstruct, replay and cut find what repair finds of the frames alone."""
+    found = recording_info("run")
+    assert found.maps > made
+    shutil.copytree("run", "crashed")
+    Path("crashed/manifest.json").unlink()
+    assert rig("repair", "crashed").code == 0
+    assert recording_info("crashed").maps == found.maps
+    assert verify("run").verdict.value in ("intact", "unfinished")
+    for command in (("reconstruct", "run"), ("replay", "run", "--clock", "max")):
+        ran = rig(*command, "--estimator", "argmax", "--out", f"of-{command[0]}", "--json")
+        assert (ran.code, json.loads(ran.out)["maps"]) == (0, found.maps), ran.err
+    ran = rig("cut", "run", "--maps", f"{made}:{found.maps}", "--out", "part")
+    assert ran.code == 0, ran.err
+    assert recording_info("part").maps == found.maps - made
+    again = rig("reconstruct", "part", "--estimator", "argmax", "--out", "of-part", "--json")
+    assert (again.code, json.loads(again.out)["maps"]) == (0, found.maps - made), again.err
+
+
+@pytest.mark.parametrize("made", [0, 2])
+def test_ctrl_c_leaves_every_whole_sweep_that_was_recorded(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch, made: int
+) -> None:
+    with monkeypatch.context() as patch:
+        interrupt_while_estimating(made, patch)
+        assert rig("scan", small, *SCAN).code == 4
+    frames = content("summary.json")["frames"]
+    assert content("summary.json")["maps"] == len(content("manifest.json")["sweeps"]) == made
+    assert frames["received"] == frames["expected"] == recording_info("run").frames > 0
+    assert_as_after_a_crash(rig, made)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(DeviceFault("the mirror stopped"), 3), (RingOverflow("too fast"), 3), (ZeroDivisionError("ours"), 70)],
+)
+def test_an_error_leaves_every_whole_sweep_that_was_recorded(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, code: int
+) -> None:
+    with monkeypatch.context() as patch:
+        fail_at_map(1, error, patch)
+        assert rig("scan", small, *SCAN).code == code
+    assert_as_after_a_crash(rig, 1)
+
+
+def test_a_disk_without_room_for_a_map_leaves_every_whole_sweep_that_was_recorded(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_map = RunFolder.write_map
+
+    def full(self: RunFolder, index: int, *rest: object) -> None:
+        if index == 1:
+            with monkeypatch.context() as patch:
+                patch.setattr(Path, "write_bytes", _no_room)
+                write_map(self, index, *rest)  # type: ignore[arg-type]
+        write_map(self, index, *rest)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "write_map", full)
+        assert rig("scan", small, *SCAN).code == 2
+    assert content("summary.json")["maps"] == 1
+    assert_as_after_a_crash(rig, 1)
+
+
+def test_passes_of_a_map_that_ctrl_c_ended_are_found(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        fail_at_map(1, KeyboardInterrupt(), patch)
+        assert rig("scan", small, "--adaptive", "--exposures", 8, *SCAN).code == 4
+    crashed = {key: value for key, value in content("manifest.json").items() if key not in ("sweeps", "crc32")}
+    made = content("summary.json")["maps"]
+    ran = rig("reconstruct", "run", "--estimator", "argmax", "--out", "again", "--json")
+    assert ran.code == 0, ran.err
+    shutil.copytree("run", "crashed")
+    Path("crashed/manifest.json").write_text(sealed_text(json.dumps({**crashed, "verdict": "recording"})))
+    as_crashed = rig("reconstruct", "crashed", "--estimator", "argmax", "--out", "of-crashed", "--json")
+    assert json.loads(ran.out)["maps"] == json.loads(as_crashed.out)["maps"] >= max(1, made)
+
+
+def test_ctrl_c_before_the_first_frame_leaves_nothing(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(self: Acquisition) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Acquisition, "_arm", interrupted)
+    assert rig("scan", small, *SCAN).code == 4
+    assert not list(Path().iterdir())
+
+
+def test_a_second_ctrl_c_still_waits_for_what_was_received(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupt_while_estimating(1, monkeypatch)
+    join, joined = Recorder.join, []
+
+    def again(self: Mapping, timeout_s: float) -> bool:
+        raise KeyboardInterrupt
+
+    def noted(self: Recorder, timeout_s: float) -> bool:
+        joined.append(join(self, timeout_s))
+        return joined[-1]
+
+    monkeypatch.setattr(Mapping, "join", again)
+    monkeypatch.setattr(Recorder, "join", noted)
+    assert rig("scan", small, *SCAN).code == 4
+    assert joined == [True]
+    assert content("manifest.json")["counters"]["delivered"] == recording_info("run").frames
+    assert verify("run").verdict.value == "intact"
+
+
+def _no_room(self: Path, data: bytes) -> int:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
