@@ -33,9 +33,9 @@ from rig.kernel_cache import ensure_kernel_cache
 app = typer.Typer(
     name="rig",
     help="Runs a single-photon structured-light scanner and returns depth through fog, rain and snow.",
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},  # of every command below as well
 )
 # In the order in which '--help' lists them; groups come last.
 for _commands in (

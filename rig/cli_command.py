@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 
 import typer
 
+from rig.cli_completion import estimator_names, filter_names, one_of, rig_names, scene_names
+
 if TYPE_CHECKING:
     from rig.acquisition import ScanProgress
     from rig.run import RunResult
@@ -23,16 +25,36 @@ EXIT_SOFTWARE = 70
 P = ParamSpec("P")
 
 ConfigArgument = Annotated[
-    str, typer.Argument(metavar="[CONFIG]", help="a bundled rig's name or a YAML file", show_default=True)
+    str,
+    typer.Argument(
+        metavar="[CONFIG]",
+        help="a bundled rig's name or a YAML file",
+        show_default=True,
+        autocompletion=one_of(rig_names),
+    ),
 ]
 SceneOption = Annotated[
     str | None,
-    typer.Option("--scene", help="a bundled scene, a scene file or a folder (simulated rigs)", show_default=False),
+    typer.Option(
+        "--scene",
+        help="a bundled scene, a scene file or a folder (simulated rigs)",
+        show_default=False,
+        autocompletion=one_of(scene_names),
+    ),
 ]
 EstimatorOption = Annotated[
-    str | None, typer.Option("--estimator", help="argmax, edge, likelihood or joint", show_default=False)
+    str | None,
+    typer.Option(
+        "--estimator",
+        help="argmax, edge, likelihood or joint",
+        show_default=False,
+        autocompletion=one_of(estimator_names),
+    ),
 ]
-FilterOption = Annotated[str | None, typer.Option("--filter", help="none or median (5 x 5)", show_default=False)]
+FilterOption = Annotated[
+    str | None,
+    typer.Option("--filter", help="none or median (5 x 5)", show_default=False, autocompletion=one_of(filter_names)),
+]
 ConfidenceOption = Annotated[
     float | None,
     typer.Option("--min-confidence", help="answers below this do not enter the depth map", show_default=False),

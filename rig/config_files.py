@@ -10,14 +10,12 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-import rig
 from drivers.registry import SLOTS, kinds, lookup
+from rig.bundled import BUNDLED, SCENES, bundled_rigs
 from rig.config import CubePlan, RigConfig
 from rig.config_problems import Key, Sources, explain
 from rig.errors import UsageError
 
-BUNDLED = Path(rig.__file__).parent.parent / "config"
-"""Folder of the configs that travel with the program."""
 SUFFIXES = (".yaml", ".yml")
 NO_CONFIG = "no config"
 """Begins what is said of a name that means none."""
@@ -71,7 +69,7 @@ def portable_content(config: RigConfig) -> dict[str, Any]:
     if config.calibration is not None:
         content["calibration"] = _absolute(here / config.calibration)
     scene = (content["world"] or {}).get("scene")
-    if isinstance(scene, str) and not (BUNDLED / "scenes" / f"{scene}.yaml").is_file():
+    if isinstance(scene, str) and not (SCENES / f"{scene}.yaml").is_file():
         file = here / Path(scene).expanduser()  # a folder's name alone may be a scene too
         content["world"]["scene"] = _absolute(file) if file.exists() else scene
     return content
@@ -79,7 +77,7 @@ def portable_content(config: RigConfig) -> dict[str, Any]:
 
 def bundled_configs() -> tuple[str, ...]:
     """Names of the rigs that travel with the program, sorted."""
-    return tuple(sorted(path.stem for path in BUNDLED.glob("*.yaml") if _is_rig(path)))
+    return tuple(one.name for one in bundled_rigs())
 
 
 def find_config(name_or_path: str | Path) -> Path:
@@ -211,14 +209,6 @@ def _lay_over(content: dict[str, Any], key: str, value: object) -> None:
         place[parent] = dict(below) if isinstance(below, dict) else {}
         place = place[parent]
     place[last] = copy.deepcopy(value)
-
-
-def _is_rig(path: Path) -> bool:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError):
-        return False
-    return isinstance(content, dict) and "scan" in content
 
 
 def _shown(path: Path) -> str:
