@@ -4,7 +4,7 @@ A `.zst` file like any other (`zstd -d` gives the plain segment back), with a sk
 long the frames are, packed and unpacked. Source of its layout: zstd_seekable_compression_format.md, version 0.1.0, in
 contrib/seekable_format of facebook/zstd. Where that table is damaged the frames are found one after the other.
 
-The package zstandard is optional: `pip install 'spadrig[compress]'`.
+The package zstandard is optional: the extra `compress`.
 """
 
 import struct
@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import CorruptBlock, ProtocolError
+from drivers.optional_packages import install_command
 
 SKIPPABLE_MAGIC: Final = 0x184D2A5E
 SEEKABLE_MAGIC: Final = 0x8F92EAB1
 FRAME_MAGIC: Final = bytes.fromhex("28b52ffd")
 MAX_FRAME_BYTES: Final = 1 << 31
 """A frame holds one block; a table that says more is damaged."""
-MISSING_ZSTANDARD: Final = "compressed recordings need the package zstandard: pip install 'spadrig[compress]'"
 
 _HEAD: Final = struct.Struct("<II")
 _FOOT: Final = struct.Struct("<IBI")
@@ -96,7 +96,8 @@ def zstandard_or_error() -> Any:
     try:
         import zstandard
     except ImportError:
-        raise ProtocolError(MISSING_ZSTANDARD) from None
+        command = install_command("zstandard", "compress")
+        raise ProtocolError(f"compressed recordings need the package zstandard; install it: {command}") from None
     return zstandard
 
 

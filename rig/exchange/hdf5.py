@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frames import FrameBlock
+from drivers.optional_packages import install_command
 from rig.errors import UsageError
 from rig.exchange.frame_log import FrameLog
 from rig.exchange.maps import MapFiles
@@ -39,7 +40,7 @@ def require_h5py() -> Any:
     try:
         import h5py
     except ImportError as error:
-        raise UsageError("export as hdf5 needs h5py; install it: pip install 'spadrig[exchange]'") from error
+        raise UsageError(f"export as hdf5 needs h5py; install it: {install_command('h5py', 'exchange')}") from error
     return h5py
 
 
