@@ -12,6 +12,7 @@ import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Annotated
 
 import typer
@@ -27,7 +28,7 @@ from rig import (
     cli_scan,
     cli_tradeoff,
 )
-from rig.cli_command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, say
+from rig.cli_command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, refused_file, say
 from rig.kernel_cache import ensure_kernel_cache
 
 app = typer.Typer(
@@ -59,11 +60,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     ensure_kernel_cache()
     with _signals_interrupt():
         try:
+            _require_no_empty(arguments)
             code = app(args=arguments, prog_name="rig", standalone_mode=False)
         except KeyboardInterrupt:
             code = EXIT_ABORTED
         except Exception as error:
-            code = _say_why(error)
+            code = _say_why(error, arguments)
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -90,10 +92,14 @@ def _signals_interrupt() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _say_why(error: Exception) -> int:
+def _say_why(error: Exception, arguments: list[str]) -> int:
     """Say what ended a command that did not handle it: a usage error of click's, an interrupt or a mistake of ours."""
     if isinstance(error.__cause__, KeyboardInterrupt):
         return EXIT_ABORTED
+    refused = refused_file(error)  # the shell's start-up files, by --install-completion
+    if refused is not None:
+        say(f"error: {refused}")
+        return EXIT_USAGE
     # Typer carries click inside or beside itself, depending on its version.
     if not hasattr(error, "format_message"):
         traceback.print_exception(error)
@@ -108,8 +114,26 @@ def _say_why(error: Exception) -> int:
         ("valid number", "write a number or "),
     )
     wanted = next((step for words, step in steps if words in message), "")
+    names = getattr(getattr(error, "param", None), "opts", ())
+    given = [value for name in names for value in _values(name, arguments)]
+    if given and not any(value in message for value in given):
+        message = message.replace("Invalid value", f"Invalid value {given[-1]!r}", 1)
     say(f"error: {message}; {wanted}see '{command} --help'")
     return EXIT_USAGE
+
+
+def _values(option: str, arguments: list[str]) -> list[str]:
+    """What the command line gives an option."""
+    after = [value for name, value in pairwise(arguments) if name == option]
+    return after + [word.removeprefix(f"{option}=") for word in arguments if word.startswith(f"{option}=")]
+
+
+def _require_no_empty(arguments: list[str]) -> None:
+    """UsageError for an argument without a character: a shell's variable that is not set, which would mean '.'."""
+    for before, word in pairwise(["rig", *arguments]):
+        if not word or (word.startswith("--") and word.endswith("=")):
+            place = f"the argument behind '{before}'" if not word else f"'{word}'"
+            raise typer.BadParameter(f"{place} is empty; give it a value or leave it out")
 
 
 @app.callback(invoke_without_command=True)

@@ -1,6 +1,8 @@
 """What all commands have in common: their errors become lines and exit codes, their results text or one JSON object."""
 
+import errno
 import functools
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -83,16 +85,36 @@ def command(function: Callable[P, int | None]) -> Callable[P, None]:
                 say(note)
             code = EXIT_ABORTED
         except Exception as error:
-            code = _code_of(error)
+            refused = refused_file(error)
+            code = EXIT_USAGE if refused else _code_of(error)
             if code is None:
                 raise
-            for line in str(error).splitlines():
+            for line in (refused or str(error)).splitlines():
                 say(f"error: {line}")
             for note in getattr(error, "__notes__", []):
                 say(note)
         raise typer.Exit(code or 0)
 
     return wrapped
+
+
+def refused_file(error: Exception) -> str | None:
+    """One line about a file or disk that the system refused to a command; None for every other error."""
+    if not isinstance(error, OSError) or (error.filename is None and error.errno not in _STEPS):
+        return None
+    step = _STEPS.get(error.errno or 0, "check the path")
+    path = "the disk" if error.filename is None else os.fsdecode(error.filename)
+    return f"cannot use {path}: {error.strerror}; {step}"
+
+
+_STEPS = {
+    errno.EACCES: "ask its owner for permission, or name another path",
+    errno.EPERM: "ask its owner for permission, or name another path",
+    errno.ENAMETOOLONG: "name a shorter path",
+    errno.EROFS: "name a folder on a disk that can be written",
+    errno.ENOSPC: "free some space, or name a folder on another disk",
+    errno.EDQUOT: "free some space, or name a folder on another disk",
+}
 
 
 def _code_of(error: Exception) -> int | None:

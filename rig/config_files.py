@@ -11,7 +11,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from drivers.registry import SLOTS, kinds, lookup
-from rig.bundled import BUNDLED, SCENES, bundled_rigs
+from rig.bundled import BUNDLED, SCENES, bundled_rigs, bundled_scenes
 from rig.config import CubePlan, RigConfig
 from rig.config_problems import Key, Sources, explain
 from rig.errors import UsageError
@@ -93,6 +93,8 @@ def find_config(name_or_path: str | Path) -> Path:
         raise UsageError(f"config {path} is a folder; name the YAML file in it")
     close = difflib.get_close_matches(path.stem, names, n=1)
     meant = f"did you mean '{close[0]}'? " if close else ""
+    if path.name in (one.name for one in bundled_scenes()):
+        meant = f"it is a scene, which is chosen by --scene {path.name}; "
     missing = "" if plain and not str(name_or_path).endswith(("/", os.sep)) else "that path does not exist; "
     raise UsageError(
         f"{NO_CONFIG} '{name_or_path}': {missing}{meant}bundled configs are {', '.join(names) or 'none'}; "
