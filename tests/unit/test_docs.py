@@ -140,9 +140,9 @@ def refused(words: list[str], is_whole: bool) -> str | None:
         if rest[0] not in command.commands:
             return f"{name} has no command {rest[0]}"
         name, command, rest = f"{name} {rest[0]}", command.commands[rest[0]], rest[1:]
-    if hasattr(command, "commands") and is_whole | bool(rest):  # its options do their work while they are parsed
+    if hasattr(command, "commands") and rest:  # its options, such as --install-completion, act while they are parsed
         unknown = [word for word in rest if word not in options(command)]
-        return f"{name} has no {unknown[0]}" if unknown else None if rest else f"{name} needs a command"
+        return f"{name} has no {unknown[0]}" if unknown else None
     try:
         given = command.make_context(name, rest).params
     except typer.Exit:  # --help, --version
