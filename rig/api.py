@@ -12,6 +12,7 @@ from rig.api_recordings import compress, cut, export_run, import_frames, recordi
 from rig.api_rig import bench, bench_disk, bench_simulator, devices, doctor, effects, flux_row, laser_off, soak, warm_up
 from rig.api_scan import plan_scan, replay, scan
 from rig.api_tradeoff import tradeoff
+from rig.bundled import bundled_rigs, bundled_scenes
 from rig.plan_figures import plan_text
 from rig.run import RunResult
 
@@ -24,6 +25,8 @@ __all__ = [
     "bench",
     "bench_disk",
     "bench_simulator",
+    "bundled_rigs",
+    "bundled_scenes",
     "calibrate_camera",
     "calibrate_check",
     "calibrate_pixels",

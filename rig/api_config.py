@@ -2,9 +2,10 @@
 
 import os
 from collections.abc import Mapping
+from pathlib import Path
 
 from rig.config import Estimator, Filter, RigConfig
-from rig.config_files import load_config, parse_config
+from rig.config_files import bundled_configs, load_config, parse_config
 from rig.errors import UsageError
 
 PathLike = str | os.PathLike[str]
@@ -46,6 +47,8 @@ def configure(
     for name, asked in (("scene", scene), ("fog", fog)):
         if asked is not None and loaded.world is None:
             raise UsageError(f"{name} {asked!r} was asked for, but {loaded.name} is a real rig; leave --{name} out")
+    if scene is not None and scene in bundled_configs() and not Path(scene).expanduser().exists():
+        raise UsageError(f"scene {scene!r} is a rig; give it as the config, without --scene")
     given = {key: value for key, value in options.items() if value is not None}
     if not given:
         return loaded

@@ -60,7 +60,7 @@ def cut(
 
 
 def compress(run: PathLike) -> "Compression":
-    """Compress a recording with zstd; it is read as before (`rig compress`). Needs `spadrig[compress]`."""
+    """Compress a recording with zstd; it is read as before (`rig compress`). Needs the extra `compress`."""
     from rig.recording.compress import compress as pack
 
     return pack(Path(run))

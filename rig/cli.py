@@ -12,6 +12,7 @@ import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Annotated
 
 import typer
@@ -27,7 +28,7 @@ from rig import (
     cli_scan,
     cli_tradeoff,
 )
-from rig.cli_command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, say
+from rig.cli_command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, refused_file, say
 from rig.kernel_cache import ensure_kernel_cache
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
@@ -38,9 +39,9 @@ _TYPER_INTERRUPTED = 130
 app = typer.Typer(
     name="rig",
     help="Runs a single-photon structured-light scanner and returns depth through fog, rain and snow.",
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},  # of every command below as well
 )
 # In the order in which '--help' lists them; groups come last.
 for _commands in (
@@ -64,11 +65,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     ensure_kernel_cache()
     with _signals_interrupt():
         try:
+            _require_no_empty(arguments)
             code = app(args=arguments, prog_name="rig", standalone_mode=False)
         except KeyboardInterrupt:
             code = _TYPER_INTERRUPTED
         except Exception as error:
-            code = _say_why(error)
+            code = _say_why(error, arguments)
         if code == _TYPER_INTERRUPTED:  # before a command had begun, or once more while one ended
             say("aborted")
             code = EXIT_ABORTED
@@ -108,10 +110,14 @@ def _signals_interrupt() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _say_why(error: Exception) -> int:
+def _say_why(error: Exception, arguments: list[str]) -> int:
     """Say what ended a command that did not handle it: a usage error of click's, an interrupt or a mistake of ours."""
     if isinstance(error.__cause__, KeyboardInterrupt):
         return _TYPER_INTERRUPTED
+    refused = refused_file(error)  # the shell's start-up files, by --install-completion
+    if refused is not None:
+        say(f"error: {refused}")
+        return EXIT_USAGE
     # Typer carries click inside or beside itself, depending on its version.
     if not hasattr(error, "format_message"):
         traceback.print_exception(error)
@@ -126,8 +132,26 @@ def _say_why(error: Exception) -> int:
         ("valid number", "write a number or "),
     )
     wanted = next((step for words, step in steps if words in message), "")
+    names = getattr(getattr(error, "param", None), "opts", ())
+    given = [value for name in names for value in _values(name, arguments)]
+    if given and not any(value in message for value in given):
+        message = message.replace("Invalid value", f"Invalid value {given[-1]!r}", 1)
     say(f"error: {message}; {wanted}see '{command} --help'")
     return EXIT_USAGE
+
+
+def _values(option: str, arguments: list[str]) -> list[str]:
+    """What the command line gives an option."""
+    after = [value for name, value in pairwise(arguments) if name == option]
+    return after + [word.removeprefix(f"{option}=") for word in arguments if word.startswith(f"{option}=")]
+
+
+def _require_no_empty(arguments: list[str]) -> None:
+    """UsageError for an argument without a character: a shell's variable that is not set, which would mean '.'."""
+    for before, word in pairwise(["rig", *arguments]):
+        if not word or (word.startswith("--") and word.endswith("=")):
+            place = f"the argument behind '{before}'" if not word else f"'{word}'"
+            raise typer.BadParameter(f"{place} is empty; give it a value or leave it out")
 
 
 @app.callback(invoke_without_command=True)

@@ -29,6 +29,7 @@ from rig.cli_command import (
     say,
     whole_numbers,
 )
+from rig.cli_completion import one_of, rig_names
 
 
 def register(app: typer.Typer) -> None:
@@ -45,7 +46,13 @@ def register(app: typer.Typer) -> None:
 @command
 def pixels_command(
     source: Annotated[
-        str, typer.Argument(metavar="[CONFIG|RUN]", help="a rig, or a run taken with --record", show_default=True)
+        str,
+        typer.Argument(
+            metavar="[CONFIG|RUN]",
+            help="a rig, or a run taken with --record",
+            show_default=True,
+            autocompletion=one_of(rig_names),
+        ),
     ] = "simulated",
     frames: Annotated[
         int | None, typer.Option("--frames", help="dark ones", show_default="as many as the limit needs")
@@ -95,6 +102,7 @@ def camera_command(
             metavar="[SOURCE]...",
             help="pictures or folders of them, a rig (config), recorded runs, earlier calibrations",
             show_default="simulated",
+            autocompletion=one_of(rig_names),
         ),
     ] = None,
     board: BoardOption = None,

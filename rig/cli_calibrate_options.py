@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli_command import print_json, say
+from rig.cli_completion import one_of, rig_names, scene_names
 
 if TYPE_CHECKING:
     from rig.calibrating.result import CalibrationResult
@@ -18,6 +19,7 @@ SourcesArgument = Annotated[
         metavar="[SOURCE]...",
         help="a rig (config), runs taken with --record, folders of earlier calibrations",
         show_default="simulated",
+        autocompletion=one_of(rig_names),
     ),
 ]
 BoardOption = Annotated[
@@ -38,7 +40,12 @@ AccuracyOption = Annotated[
 AtOption = Annotated[str | None, typer.Option("--at", help="distance at which it counts", show_default="5 m")]
 CalibrationScene = Annotated[
     str | None,
-    typer.Option("--scene", help="of a simulated rig, with a board", show_default="its own, else board"),
+    typer.Option(
+        "--scene",
+        help="of a simulated rig, with a board",
+        show_default="its own, else board",
+        autocompletion=one_of(scene_names),
+    ),
 ]
 ExposuresOption = Annotated[
     list[str] | None,

@@ -1,6 +1,8 @@
 """What all commands have in common: their errors become lines and exit codes, their results text or one JSON object."""
 
+import errno
 import functools
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -9,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
 
 import typer
+
+from rig.cli_completion import estimator_names, filter_names, one_of, rig_names, scene_names
 
 if TYPE_CHECKING:
     from rig.acquisition import ScanProgress
@@ -24,16 +28,36 @@ EXIT_SOFTWARE = 70
 P = ParamSpec("P")
 
 ConfigArgument = Annotated[
-    str, typer.Argument(metavar="[CONFIG]", help="a bundled rig's name or a YAML file", show_default=True)
+    str,
+    typer.Argument(
+        metavar="[CONFIG]",
+        help="a bundled rig's name or a YAML file",
+        show_default=True,
+        autocompletion=one_of(rig_names),
+    ),
 ]
 SceneOption = Annotated[
     str | None,
-    typer.Option("--scene", help="a bundled scene, a scene file or a folder (simulated rigs)", show_default=False),
+    typer.Option(
+        "--scene",
+        help="a bundled scene, a scene file or a folder (simulated rigs)",
+        show_default=False,
+        autocompletion=one_of(scene_names),
+    ),
 ]
 EstimatorOption = Annotated[
-    str | None, typer.Option("--estimator", help="argmax, edge, likelihood or joint", show_default=False)
+    str | None,
+    typer.Option(
+        "--estimator",
+        help="argmax, edge, likelihood or joint",
+        show_default=False,
+        autocompletion=one_of(estimator_names),
+    ),
 ]
-FilterOption = Annotated[str | None, typer.Option("--filter", help="none or median (5 x 5)", show_default=False)]
+FilterOption = Annotated[
+    str | None,
+    typer.Option("--filter", help="none or median (5 x 5)", show_default=False, autocompletion=one_of(filter_names)),
+]
 ConfidenceOption = Annotated[
     float | None,
     typer.Option("--min-confidence", help="answers below this do not enter the depth map", show_default=False),
@@ -62,16 +86,36 @@ def command(function: Callable[P, int | None]) -> Callable[P, None]:
                 say(note)
             code = EXIT_ABORTED
         except Exception as error:
-            code = _code_of(error)
+            refused = refused_file(error)
+            code = EXIT_USAGE if refused else _code_of(error)
             if code is None:
                 raise
-            for line in str(error).splitlines():
+            for line in (refused or str(error)).splitlines():
                 say(f"error: {line}")
             for note in getattr(error, "__notes__", []):
                 say(note)
         raise typer.Exit(code or 0)
 
     return wrapped
+
+
+def refused_file(error: Exception) -> str | None:
+    """One line about a file or disk that the system refused to a command; None for every other error."""
+    if not isinstance(error, OSError) or (error.filename is None and error.errno not in _STEPS):
+        return None
+    step = _STEPS.get(error.errno or 0, "check the path")
+    path = "the disk" if error.filename is None else os.fsdecode(error.filename)
+    return f"cannot use {path}: {error.strerror}; {step}"
+
+
+_STEPS = {
+    errno.EACCES: "ask its owner for permission, or name another path",
+    errno.EPERM: "ask its owner for permission, or name another path",
+    errno.ENAMETOOLONG: "name a shorter path",
+    errno.EROFS: "name a folder on a disk that can be written",
+    errno.ENOSPC: "free some space, or name a folder on another disk",
+    errno.EDQUOT: "free some space, or name a folder on another disk",
+}
 
 
 def _code_of(error: Exception) -> int | None:

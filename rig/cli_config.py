@@ -1,4 +1,4 @@
-"""Commands for configs: `rig config check`, `show`, `schema`."""
+"""Commands for configs and scenes: `rig config check`, `show`, `schema`, `rig scenes`."""
 
 import typer
 
@@ -12,6 +12,7 @@ def register(app: typer.Typer) -> None:
     config.command("show")(show_command)
     config.command("schema")(schema_command)
     app.add_typer(config)
+    app.command("scenes")(scenes_command)
 
 
 @command
@@ -49,4 +50,21 @@ def schema_command() -> int:
     from rig.config_files import config_schema
 
     print_json(config_schema())
+    return 0
+
+
+@command
+def scenes_command(as_json: JsonOption = False) -> int:
+    """The bundled scenes (--scene) and rigs (CONFIG), with a sentence on each."""
+    from rig import api
+
+    listed = {"scenes": api.bundled_scenes(), "rigs": api.bundled_rigs()}
+    if as_json:
+        print_json({group: [one.as_json() for one in members] for group, members in listed.items()})
+        return 0
+    wide = max(len(one.name) for members in listed.values() for one in members)
+    for group, members in listed.items():
+        print(f"{group}:")
+        for one in members:
+            print(f"  {one.name:<{wide}}  {one.about}")
     return 0

@@ -16,7 +16,9 @@ def register(app: typer.Typer) -> None:
 
 @command
 def import_command(
-    kind: Annotated[str, typer.Argument(help="pi-imaging, swissspad2 or photoncube", show_default=False)],
+    kind: Annotated[
+        str, typer.Argument(metavar="KIND", help="pi-imaging, swissspad2 or photoncube", show_default=False)
+    ],
     files: Annotated[
         list[Path], typer.Argument(metavar="FILES", help="files in order, or folders of them", show_default=False)
     ],
@@ -69,7 +71,7 @@ def import_command(
 @command
 def export_command(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run", show_default=False)],
-    kind: Annotated[str, typer.Argument(help="npy, hdf5, ply, png or mp4", show_default=False)],
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="npy, hdf5, ply, png or mp4", show_default=False)],
     out: Annotated[
         Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="RUN-KIND")
     ] = None,

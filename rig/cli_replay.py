@@ -25,6 +25,7 @@ from rig.cli_command import (
     say,
     say_space,
 )
+from rig.cli_completion import one_of, rig_names
 
 if TYPE_CHECKING:
     from drivers.replay_pace import Pace
@@ -52,6 +53,7 @@ def replay_command(
             "--config",
             help="a rig whose scanner, laser and sync source take part, like hil",
             show_default="they are recorded too",
+            autocompletion=one_of(rig_names),
         ),
     ] = None,
     against_recording: Annotated[

@@ -24,6 +24,7 @@ from rig.cli_command import (
     report,
     say_space,
 )
+from rig.cli_completion import one_of, rig_names
 
 if TYPE_CHECKING:
     from rig.recording.space import Space
@@ -153,7 +154,14 @@ def reconstruct_command(
 def effects_command(
     config: ConfigArgument = "simulated",
     config_option: Annotated[
-        str | None, typer.Option("--config", metavar="CONFIG", help="the same as CONFIG", show_default=False)
+        str | None,
+        typer.Option(
+            "--config",
+            metavar="CONFIG",
+            help="the same as CONFIG",
+            show_default=False,
+            autocompletion=one_of(rig_names),
+        ),
     ] = None,
     scene: SceneOption = None,
     trials: Annotated[

@@ -18,6 +18,7 @@ from rig.cli_command import (
     split_option,
     whole_numbers,
 )
+from rig.cli_completion import estimator_names, filter_names, scene_names, some_of
 
 Some = list[str] | None
 
@@ -31,7 +32,13 @@ def register(app: typer.Typer) -> None:
 def tradeoff_command(
     config: ConfigArgument = "simulated",
     scene: Annotated[
-        Some, typer.Option("--scene", help="scenes, separated by commas", show_default="the config's")
+        Some,
+        typer.Option(
+            "--scene",
+            help="scenes, separated by commas",
+            show_default="the config's",
+            autocompletion=some_of(scene_names),
+        ),
     ] = None,
     fog: Annotated[
         Some, typer.Option("--fog", help="visibilities, or clear: 20m,50m,clear", show_default="the scene's")
@@ -41,11 +48,20 @@ def tradeoff_command(
     estimators: Annotated[
         Some,
         typer.Option(
-            "--estimators", help="of argmax, edge, likelihood, joint, by commas", show_default="edge,likelihood,joint"
+            "--estimators",
+            help="of argmax, edge, likelihood, joint, by commas",
+            show_default="edge,likelihood,joint",
+            autocompletion=some_of(estimator_names),
         ),
     ] = None,
     filters: Annotated[
-        Some, typer.Option("--filters", help="of none, median (5 x 5), by commas", show_default="none,median")
+        Some,
+        typer.Option(
+            "--filters",
+            help="of none, median (5 x 5), by commas",
+            show_default="none,median",
+            autocompletion=some_of(filter_names),
+        ),
     ] = None,
     repeat: Annotated[int, typer.Option("--repeat", help="scans of each, for the confidence intervals")] = 1,
     seed: Annotated[int, typer.Option("--seed", help="of the first of them")] = 0,

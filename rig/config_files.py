@@ -10,18 +10,17 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-import rig
 from calibration.files.camera_file import CAMERA_FORMAT
 from calibration.files.sections import FORMAT
 from drivers.registry import SLOTS, kinds, lookup
+from rig.bundled import BUNDLED, SCENES, bundled_rigs, bundled_scenes
 from rig.config import CubePlan, RigConfig
 from rig.config_problems import Key, Sources, explain
 from rig.errors import UsageError
-from rig.recording.inputs import PLAN_FORMAT
 
-BUNDLED = Path(rig.__file__).parent.parent / "config"
-"""Folder of the configs that travel with the program."""
 SUFFIXES = (".yaml", ".yml")
+PLAN_FORMAT = "spadrig-plan"
+"""`format` of the compiled plan that lies beside a recording's frames."""
 _OTHERS = {
     PLAN_FORMAT: "the compiled plan of a recording, which is found beside its frames",
     FORMAT: "a calibration",
@@ -83,7 +82,7 @@ def portable_content(config: RigConfig) -> dict[str, Any]:
     if config.calibration is not None:
         content["calibration"] = _absolute(here / config.calibration)
     scene = (content["world"] or {}).get("scene")
-    if isinstance(scene, str) and not (BUNDLED / "scenes" / f"{scene}.yaml").is_file():
+    if isinstance(scene, str) and not (SCENES / f"{scene}.yaml").is_file():
         file = here / Path(scene).expanduser()  # a folder's name alone may be a scene too
         content["world"]["scene"] = _absolute(file) if file.exists() else scene
     return content
@@ -91,7 +90,7 @@ def portable_content(config: RigConfig) -> dict[str, Any]:
 
 def bundled_configs() -> tuple[str, ...]:
     """Names of the rigs that travel with the program, sorted."""
-    return tuple(sorted(path.stem for path in BUNDLED.glob("*.yaml") if _is_rig(path)))
+    return tuple(one.name for one in bundled_rigs())
 
 
 def find_config(name_or_path: str | Path) -> Path:
@@ -107,6 +106,8 @@ def find_config(name_or_path: str | Path) -> Path:
         raise UsageError(f"config {path} is a folder; name the YAML file in it")
     close = difflib.get_close_matches(path.stem, names, n=1)
     meant = f"did you mean '{close[0]}'? " if close else ""
+    if path.name in (one.name for one in bundled_scenes()):
+        meant = f"it is a scene, which is chosen by --scene {path.name}; "
     missing = "" if plain and not str(name_or_path).endswith(("/", os.sep)) else "that path does not exist; "
     raise UsageError(
         f"{NO_CONFIG} '{name_or_path}': {missing}{meant}bundled configs are {', '.join(names) or 'none'}; "
@@ -229,14 +230,6 @@ def _lay_over(content: dict[str, Any], key: str, value: object) -> None:
         place[parent] = dict(below) if isinstance(below, dict) else {}
         place = place[parent]
     place[last] = copy.deepcopy(value)
-
-
-def _is_rig(path: Path) -> bool:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError):
-        return False
-    return isinstance(content, dict) and "scan" in content
 
 
 def _shown(path: Path) -> str:

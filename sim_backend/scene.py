@@ -11,6 +11,7 @@ motion: {velocity: [0 m/s, 0 m/s, -2 m/s]}                    # of all surfaces:
 seed: 1                                                       # where the drops are
 """
 
+import difflib
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -121,8 +122,10 @@ def load_scene(name: str) -> tuple[SceneFile, Path]:
     if file.is_dir():
         return SceneFile(surfaces=str(file.resolve())), file
     if not file.is_file():
+        close = difflib.get_close_matches(name, bundled_scenes(), n=1)
+        meant = f"; did you mean {close[0]!r}?" if close else ""
         raise DeviceError(
-            f"scene {name!r} is no file, no folder and none of the bundled: {', '.join(bundled_scenes())}"
+            f"scene {name!r} is no file, no folder and none of the bundled: {', '.join(bundled_scenes())}{meant}"
         )
     try:
         content: Any = yaml.safe_load(file.read_text(encoding="utf-8"))

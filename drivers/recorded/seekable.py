@@ -4,7 +4,7 @@ A `.zst` file like any other (`zstd -d` gives the plain segment back), with a sk
 long the frames are, packed and unpacked. Source of its layout: zstd_seekable_compression_format.md, version 0.1.0, in
 contrib/seekable_format of facebook/zstd. Where that table is damaged the frames are found one after the other.
 
-The package zstandard is optional: `pip install 'spadrig[compress]'`.
+The package zstandard is optional: the extra `compress`.
 """
 
 import struct
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import CorruptBlock, ProtocolError
+from drivers.optional_packages import install_command
 
 SKIPPABLE_MAGIC: Final = 0x184D2A5E
 SEEKABLE_MAGIC: Final = 0x8F92EAB1
@@ -26,7 +27,6 @@ MOST_RATIO: Final = 1 << 15
 """Plain bytes that a packed one can stand for: a block of zstd takes 4 bytes and holds 128 KiB at most (RFC 8878)."""
 _PIECE_BYTES: Final = 1 << 12
 """Of a frame of unknown size, fed to the unpacker at a time: 128 MiB at most come of it."""
-MISSING_ZSTANDARD: Final = "compressed recordings need the package zstandard: pip install 'spadrig[compress]'"
 
 _HEAD: Final = struct.Struct("<II")
 _FOOT: Final = struct.Struct("<IBI")
@@ -100,7 +100,8 @@ def zstandard_or_error() -> Any:
     try:
         import zstandard
     except ImportError:
-        raise ProtocolError(MISSING_ZSTANDARD) from None
+        command = install_command("zstandard", "compress")
+        raise ProtocolError(f"compressed recordings need the package zstandard; install it: {command}") from None
     return zstandard
 
 

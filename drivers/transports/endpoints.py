@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from drivers.errors import DeviceNotFound
 
-UDEV_RULES = "config/udev/70-spadrig.rules"
+UDEV_RULES = str(Path(__file__).parents[2] / "config" / "udev" / "70-spadrig.rules")
 """Gives devices and ports to group plugdev; messages about permissions name it, its first lines say how to install it.
 """
 EMULATED_PREFIX = "emulated:"

@@ -1,14 +1,15 @@
 """Stripe estimators by name: counts of a sweep in, a stripe table out."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:  # the names are to be had without what estimates: shells ask for them at every Tab
+    import numpy as np
+    from numpy.typing import NDArray
 
-from rig.counting import Counter, SweepLayout
-from rig.geometry import SweepGeometry
-from rig.stripes import StripeTable
+    from rig.counting import Counter, SweepLayout
+    from rig.geometry import SweepGeometry
+    from rig.stripes import StripeTable
 
 ESTIMATORS = ("argmax", "edge", "likelihood", "joint")
 FILTERS = ("none", "median")
@@ -31,7 +32,7 @@ class Learned(Protocol):
         """Its standard deviation."""
         ...
 
-    def arrays(self) -> dict[str, NDArray[np.generic]]:
+    def arrays(self) -> "dict[str, NDArray[np.generic]]":
         """Every field as an array, enough to estimate the map again bit for bit."""
         ...
 
@@ -44,11 +45,11 @@ class Estimator(Protocol):
         """State of the last map."""
         ...
 
-    def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
+    def counter(self, layout: "SweepLayout", geometry: "SweepGeometry") -> "Counter":
         """A counter whose sweeps `estimate` takes; geometry: as of every sweep, with columns at their centres."""
         ...
 
-    def estimate(self, sweep: Any, geometry: SweepGeometry) -> StripeTable:
+    def estimate(self, sweep: Any, geometry: "SweepGeometry") -> "StripeTable":
         """Stripe table of what `counter` gave of one sweep, or of a `CountVolume`."""
         ...
 

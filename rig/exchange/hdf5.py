@@ -8,8 +8,11 @@ MATLAB sees dimensions in reverse order and has no arrays below two. What makes 
 the HDF5 part, and the name of a MATLAB class with each array and group (MAT-file format 7.3, as MATLAB writes it).
 """
 
+import errno
 import json
 import math
+import os
+import shutil
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frames import FrameBlock
+from drivers.optional_packages import install_command
 from rig.errors import UsageError
 from rig.exchange.frame_log import FrameLog
 from rig.exchange.maps import MapFiles
@@ -34,12 +38,16 @@ _CLASSES: Final = {"float32": "single", "float64": "double"}
 """MATLAB's names; integers are named as in numpy."""
 
 
+_ROOM_BYTES: Final = 16 << 20
+"""Left free for what HDF5 itself keeps and writes late."""
+
+
 def require_h5py() -> Any:
     """The h5py module; UsageError with the command that installs it."""
     try:
         import h5py
     except ImportError as error:
-        raise UsageError("export as hdf5 needs h5py; install it: pip install 'spadrig[exchange]'") from error
+        raise UsageError(f"export as hdf5 needs h5py; install it: {install_command('h5py', 'exchange')}") from error
     return h5py
 
 
@@ -51,6 +59,7 @@ def write_hdf5(blocks: Iterable[FrameBlock], maps: MapFiles, manifest: Mapping[s
         bits = None
         for block in blocks:
             log.add(block)
+            _require_room(path, block.bits.nbytes)
             pixels = block.bits[:, :, : -(-block.header.width // 8)]
             if bits is None:
                 bits = _growing(_group(file, "frames"), "bits", pixels)
@@ -66,6 +75,12 @@ def write_hdf5(blocks: Iterable[FrameBlock], maps: MapFiles, manifest: Mapping[s
         characters.attrs["MATLAB_int_decode"] = np.int32(2)
     _write_mat_header(path)
     return log
+
+
+def _require_room(path: Path, n_bytes: int) -> None:
+    """OSError before the disk is full: HDF5 cannot close a file that it cannot write, and takes the process with it."""
+    if shutil.disk_usage(path.parent).free < n_bytes + _ROOM_BYTES:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def _write_frames(file: Any, log: FrameLog) -> None:
@@ -90,6 +105,7 @@ def _write_maps(group: Any, maps: MapFiles) -> None:
         depth = maps.depth_m(index)
         if depth is not None:
             arrays["depth_m"] = depth
+        _require_room(Path(group.file.filename), sum(values.nbytes for values in arrays.values()))
         for name, values in arrays.items():
             if name not in group:
                 _growing(group, name, values[None]).resize(len(maps.indices), axis=0)

@@ -10,6 +10,7 @@ from calibration.errors import CalibrationError
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
 from calibration.model.rig_model import RigModel
 from rig.blanking import MOST_CHIP_FRAMES, Blanking
+from rig.config_files import PLAN_FORMAT
 from rig.errors import UsageError
 from rig.geometry import WORD_PX
 from rig.recording.manifest import read_manifest
@@ -18,7 +19,6 @@ from rig.recording.plain import from_plain, to_plain
 from rig.scan_plan import ScanPlan
 
 PLAN_FILE: Final = "plan.yaml"
-PLAN_FORMAT: Final = "spadrig-plan"
 PLAN_VERSION: Final = 1
 MOST_EXPOSURES: Final = 0xFFFF
 """As of a config."""

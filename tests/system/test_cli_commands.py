@@ -1,25 +1,130 @@
 """The other commands, and the command line itself."""
 
+import errno
 import json
+import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 import yaml
 
+from rig.bundled import BUNDLED
+from rig.cli import app
 from tests.system.conftest import Rig
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["scan", "--help"], ["--version"]])
 def test_nothing_heavy_is_imported_for_help(arguments: list[str]) -> None:
-    heavy = ("numba", "cv2", "matplotlib", "viser")
+    heavy = ("numba", "cv2")
     code = (
         f"import sys\nfrom rig.cli import main\ntry: main({arguments!r})\nexcept SystemExit: pass\n"
         f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert ran.stderr.strip() == "[]"
+
+
+def commands_below(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Words of the command itself and of every one below it."""
+    yield words
+    for name, below in getattr(command, "commands", {}).items():
+        yield from commands_below(below, (*words, name))
+
+
+@pytest.mark.parametrize("words", list(commands_below(typer.main.get_command(app))), ids=" ".join)
+def test_every_command_has_short_help(rig: Rig, words: tuple[str, ...]) -> None:
+    short, long = rig(*words, "-h"), rig(*words, "--help")
+    assert (short.code, short.out) == (0, long.out)
+    assert "-h, --help" in short.out
+
+
+def completed(shell: str, line: str) -> list[str]:
+    """What `rig` gives a shell for the last word of a line, in a process that imports nothing heavy for it."""
+    code = (
+        "import sys\nfrom rig.cli import main\n"
+        "try: main([])\n"
+        "finally: assert not {'numba', 'cv2', 'numpy'} & set(sys.modules)"
+    )
+    asked = {
+        "_RIG_COMPLETE": f"complete_{shell}",
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(len(line.split(" ")) - 1),
+        "_TYPER_COMPLETE_ARGS": line,
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
+    }
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60, env=os.environ | asked
+    )
+    return [found for found in ran.stdout.splitlines() if found]
+
+
+@pytest.mark.parametrize(
+    ("line", "names"),
+    [
+        ("rig calib", ["calibrate"]),
+        ("rig config ", ["check", "show", "schema"]),
+        ("rig scan --expo", ["--exposures"]),
+        ("rig scan simulated", ["simulated", "simulated-4-lines"]),
+        ("rig calibrate planes simulated-", ["simulated-4-lines"]),
+        ("rig replay taken --config hi", ["hil"]),
+        ("rig effects --scene street-d", ["street-dense-fog"]),
+        ("rig calibrate sync --scene boa", ["board"]),
+        ("rig tradeoff --scene board,street-sn", ["board,street-snow"]),
+        ("rig scan --estimator ", ["argmax", "edge", "likelihood", "joint"]),
+        ("rig tradeoff --estimators edge,j", ["edge,joint"]),
+        ("rig reconstruct --filter m", ["median"]),
+        ("rig scan ./my", []),
+    ],
+)
+def test_shells_complete_commands_options_and_names(line: str, names: list[str]) -> None:
+    assert completed("bash", line) == names
+    assert [found.partition("\t")[0] for found in completed("fish", line)] == names
+    zsh = " ".join(completed("zsh", line))
+    assert zsh == "_files" if not names else all(f'"{name}"' in zsh for name in names)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_is_installed_for_the_shell_that_calls(
+    shell: str, tmp_path: Path, rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("shellingham.detect_shell", lambda: (shell, shell))
+    assert f"_RIG_COMPLETE=complete_{shell}" in rig("--show-completion").out
+    assert rig("--install-completion").code == 0
+    written = "".join(file.read_text() for file in (tmp_path / "home").rglob("*") if file.is_file())
+    assert f"_RIG_COMPLETE=complete_{shell}" in written
+
+
+def test_completion_that_cannot_be_installed_is_one_line(
+    tmp_path: Path, rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "home").touch()  # no folder: nothing can be written below it
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("shellingham.detect_shell", lambda: ("bash", "bash"))
+    ran = rig("--install-completion")
+    assert (ran.code, len(ran.err.splitlines())) == (2, 1)
+    assert str(tmp_path / "home") in ran.err
+
+
+def test_scenes_and_rigs_are_listed_with_what_their_files_say(rig: Rig) -> None:
+    listed = json.loads(rig("scenes", "--json").out)
+    assert [one["name"] for one in listed["scenes"]] == sorted(
+        file.stem for file in (BUNDLED / "scenes").glob("*.yaml")
+    )
+    assert {"simulated", "lab", "hil"} <= {one["name"] for one in listed["rigs"]}
+    assert not {"board", "simulated-rig"} & {one["name"] for one in listed["rigs"]}
+    told = rig("scenes").out
+    for one in (*listed["scenes"], *listed["rigs"]):
+        comment = " ".join(line.removeprefix("# ") for line in Path(one["file"]).read_text().splitlines())
+        assert one["about"].endswith(".")
+        assert comment.startswith(one["about"])
+        assert f"  {one['name']} " in told
+        assert one["about"] in told
 
 
 def test_help_names_the_commands_and_options(rig: Rig) -> None:
@@ -61,6 +166,44 @@ def test_version_and_no_command(rig: Rig) -> None:
 def test_an_unknown_command_is_one_line(rig: Rig) -> None:
     ran = rig("scann")
     assert (ran.code, len(ran.err.splitlines())) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (("scan", "street"), "it is a scene, which is chosen by --scene street"),
+        (("scan", "--scene", "simulated", "--dry-run"), "scene 'simulated' is a rig; give it as the config"),
+        (("scan", "--scene", "strret", "--dry-run"), "did you mean 'street'?"),
+        (("scan", "", "--dry-run"), "the argument behind 'scan' is empty; give it a value or leave it out"),
+        (("scan", "--out", ""), "the argument behind '--out' is empty"),
+        (("scan", "--out="), "'--out=' is empty"),
+        (("scan", "--exposures", "1e3"), "Invalid value '1e3' for '--exposures'"),
+        (("scan", "--min-confidence=much"), "'much'"),
+        (("replay", "taken", "--block-frames", "0"), "'0'"),
+        (("export", "taken"), "'KIND'"),
+        (("scan", "x" * 300), "File name too long; name a shorter path"),
+        (("scan", "--scene", "x" * 300), "File name too long; name a shorter path"),
+        (("verify", "x" * 300), "File name too long; name a shorter path"),
+        (("doctor", "--out", "x" * 300), "File name too long; name a shorter path"),
+    ],
+    ids=lambda part: " ".join(part)[:40] if isinstance(part, tuple) else "",
+)
+def test_a_mistake_is_one_line_that_says_what_to_do(rig: Rig, arguments: tuple[str, ...], problem: str) -> None:
+    ran = rig(*arguments)
+    assert (ran.code, len(ran.err.splitlines())) == (2, 1)
+    assert problem in ran.err
+
+
+def test_a_full_disk_is_one_line_whoever_meets_it(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full() -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("rig.api.devices", full)
+    ran = rig("devices")
+    assert ran.code == 2
+    assert ran.problems == [
+        "error: cannot use the disk: No space left on device; free some space, or name a folder on another disk"
+    ]
 
 
 def test_effects_says_which_a_scene_calls_for_why_and_what_each_is_worth(rig: Rig, small: Path) -> None:

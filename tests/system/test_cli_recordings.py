@@ -38,7 +38,7 @@ def test_a_recorded_scan_is_intact_until_it_is_damaged_and_whole_once_repaired(r
 
 
 def test_parts_and_compressed_recordings_are_recordings(rig: Rig, run: Path, tmp_path: Path) -> None:
-    pytest.importorskip("zstandard", reason="pip install 'spadrig[compress]'")
+    pytest.importorskip("zstandard", reason="pip install '.[compress]'")
     assert rig("compress", run).code == 0
     assert rig("cut", run, "--maps", "1", "--out", tmp_path / "part").code == 0
     for folder, maps in ((run, 2), (tmp_path / "part", 1)):

@@ -83,7 +83,7 @@ def test_repeats_differ_and_what_cannot_be_had_ends_with_1_and_the_nearest(rig: 
         (["--exposures", "60000"], "exposures above"),
         (["--error", "1"], "write e.g. '0.1 px'"),
         (["--time-budget", "-5 ms"], "--time-budget is -5 ms; it must be more than 0"),
-        (["--estimators", ""], "--estimators is empty"),
+        (["--estimators", ""], "behind '--estimators' is empty"),
         (["--exposures", ","], "--exposures is empty"),
     ],
 )

@@ -17,7 +17,6 @@ from rig.map_queue import AcquiredMap, MapQueue
 from rig.mapping import Mapping
 from rig.outputs import RunFolder
 from rig.reconstruction import MapResult, Reconstructor
-from rig.recording.manifest import sealed_text
 from rig.recording.recorder import Recorder
 from tests.system.conftest import Rig
 
@@ -129,20 +128,6 @@ def test_a_disk_without_room_for_a_map_leaves_every_whole_sweep_that_was_recorde
         assert rig("scan", small, *SCAN).code == 2
     assert content("summary.json")["maps"] == 1
     assert_as_after_a_crash(rig, 1)
-
-
-def test_passes_of_a_map_that_ctrl_c_ended_are_found(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        fail_at_map(1, KeyboardInterrupt(), patch)
-        assert rig("scan", small, "--adaptive", "--exposures", 8, *SCAN).code == 4
-    crashed = {key: value for key, value in content("manifest.json").items() if key not in ("sweeps", "crc32")}
-    made = content("summary.json")["maps"]
-    ran = rig("reconstruct", "run", "--estimator", "argmax", "--out", "again", "--json")
-    assert ran.code == 0, ran.err
-    shutil.copytree("run", "crashed")
-    Path("crashed/manifest.json").write_text(sealed_text(json.dumps({**crashed, "verdict": "recording"})))
-    as_crashed = rig("reconstruct", "crashed", "--estimator", "argmax", "--out", "of-crashed", "--json")
-    assert json.loads(ran.out)["maps"] == json.loads(as_crashed.out)["maps"] >= max(1, made)
 
 
 def test_ctrl_c_before_the_first_frame_leaves_nothing(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:

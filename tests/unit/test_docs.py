@@ -1,6 +1,7 @@
 """The documentation keeps what it promises: its links lead somewhere, its commands and modules exist."""
 
 import re
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import pytest
 import typer
 
+from rig.bundled import bundled_rigs, bundled_scenes
 from rig.cli import app
 
 ROOT = Path(__file__).parents[2]
@@ -48,16 +50,50 @@ def test_modules_that_are_to_be_run_exist(page: Path) -> None:
 
 
 @pages
-def test_commands_exist_with_the_options_they_are_given(page: Path) -> None:
-    for words in commands(page.read_text()):
-        command, said = typer.main.get_command(app), "rig"
-        rest = words[1:]
-        while hasattr(command, "commands") and rest and re.fullmatch(r"[a-z]+", rest[0]):
-            said += f" {rest[0]}"
-            assert rest[0] in command.commands, f"{said} ({' '.join(words)})"
-            command, rest = command.commands[rest[0]], rest[1:]
-        given = {word.split("=")[0] for word in rest if word.startswith("--")}
-        assert given <= options(command), f"{said}: {given - options(command)} ({' '.join(words)})"
+def test_command_lines_parse(page: Path) -> None:
+    for line, is_whole in command_lines(page.read_text()):
+        for words in alternatives(shlex.split(line.removesuffix(" ..."))):
+            problem = refused(words, is_whole and not line.endswith(" ..."))
+            assert problem is None, f"{line}: {problem}"
+
+
+def test_command_lines_in_configs_and_messages_parse() -> None:
+    for file in (*(ROOT / "config").rglob("*.yaml"), *(ROOT / "rig").rglob("*.py"), *(ROOT / "drivers").rglob("*.py")):
+        text = file.read_text()
+        named = re.findall(r"[`'](rig [^`'\n{]*)[`']", text) + re.findall(r"(?:^#   |then: )(rig [^;\n]*)$", text, re.M)
+        for line in named:
+            for words in alternatives(shlex.split(line)):
+                assert refused(words, is_whole=False) is None, f"{file}: {line}: {refused(words, is_whole=False)}"
+
+
+@pages
+def test_options_exist(page: Path) -> None:
+    scripts = "".join(file.read_text() for file in (ROOT / "tests").rglob("*.py"))
+    known = options(typer.main.get_command(app)) | set(re.findall(r'add_argument\("(--[a-z-]+)"', scripts))
+    for code in inline_code(page.read_text()):
+        if code.startswith("--"):
+            named = set(re.findall(r"--[a-z-]+", code))
+            assert named <= known, f"`{code}`: {named - known}"
+
+
+@pytest.mark.parametrize(
+    ("line", "is_whole", "problem"),
+    [
+        ("rig scann", True, "scann"),
+        ("rig calibrate plane", False, "plane"),
+        ("rig scan --monitor", False, "--monitor"),
+        ("rig scan --exposures many", False, "--exposures"),
+        ("rig scan simulate", True, "simulate is no bundled rig"),
+        ("rig scan --scene fog", False, "fog is no bundled scene"),
+        ("rig reconstruct cube.npy", True, "--out"),
+        ("rig reconstruct cube.npy", False, None),
+        ("rig calibrate planes --camera", False, None),
+        ("rig doctor one.yaml two.yaml", False, "two.yaml"),
+    ],
+)
+def test_a_line_that_the_command_line_refuses_is_found(line: str, is_whole: bool, problem: str | None) -> None:
+    found = refused(shlex.split(line), is_whole)
+    assert found is None if problem is None else found is not None and problem in found
 
 
 def anchors(page: Path) -> set[str]:
@@ -66,17 +102,66 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings}
 
 
-def commands(text: str) -> Iterator[list[str]]:
-    """Words of every `rig ...` in code, in blocks and in lines, without comments."""
+def inline_code(text: str) -> list[str]:
+    """Pieces of code within its sentences."""
+    return re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S))
+
+
+def command_lines(text: str) -> Iterator[tuple[str, bool]]:
+    """Every `rig ...` in code, without comments, and whether it is to be typed as it is: those in blocks are."""
     blocks = re.findall(r"^```\w*\n(.*?)^```", text, re.M | re.S)
-    lines = [line.split(" # ")[0] for block in blocks for line in block.splitlines()]
-    inline = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S))
-    for line in (*lines, *inline):
-        words = re.split(r"[\s\[\]|()]+", line.strip().removesuffix(","))
-        if words[0] == "rig" and len(words) > 1:
-            yield words
+    whole = [line for block in blocks for line in block.splitlines()] + re.findall(r"^    (rig .*)$", text, re.M)
+    for line in whole:
+        for part in re.split(r"&&|;|#", line):
+            if found := re.match(r"\s*(?:then: )?(rig( .*)?)$", part):
+                yield found[1].split(" > ")[0], True
+    for code in inline_code(text):
+        if code.startswith("rig "):
+            yield code, False
+
+
+def alternatives(words: list[str]) -> list[list[str]]:
+    """Command lines for `a|b`, one each; what may be left out, in brackets, stays."""
+    plain = [word.strip("[]") for word in words]
+    some = next((i for i, word in enumerate(plain) if "|" in word), None)
+    if some is None:
+        return [plain]
+    return [[*plain[:some], one, *plain[some + 1 :]] for one in plain[some].split("|")]
+
+
+def refused(words: list[str], is_whole: bool) -> str | None:
+    """Why the command line refuses `rig ...`, None where it does not; nothing is run.
+
+    is_whole: nothing that it needs may be missing. Values in capitals stand for any.
+    """
+    command, name = typer.main.get_command(app), "rig"
+    rest = ["1" if re.fullmatch(r"[A-Z_]+", word) else word for word in words[1:]]
+    while hasattr(command, "commands") and rest and not rest[0].startswith("-"):
+        if rest[0] not in command.commands:
+            return f"{name} has no command {rest[0]}"
+        name, command, rest = f"{name} {rest[0]}", command.commands[rest[0]], rest[1:]
+    if hasattr(command, "commands") and rest:  # its options, such as --install-completion, act while they are parsed
+        unknown = [word for word in rest if word not in options(command)]
+        return f"{name} has no {unknown[0]}" if unknown else None
+    try:
+        given = command.make_context(name, rest).params
+    except typer.Exit:  # --help, --version
+        return None
+    except Exception as error:
+        if not hasattr(error, "format_message"):
+            raise
+        lacks = type(error).__name__ in ("MissingParameter", "BadOptionUsage", "NoArgsIsHelpError")
+        return None if lacks and not is_whole else str(error.format_message())
+    for key, known in (("config", bundled_rigs()), ("scene", bundled_scenes())):
+        asked = given.get(key)
+        is_name = isinstance(asked, str) and asked != "1" and not re.search(r"[./]", asked)
+        if is_name and asked not in [one.name for one in known]:
+            return f"{asked} is no bundled {'rig' if key == 'config' else 'scene'}"
+    return None
 
 
 def options(command: Any) -> set[str]:
-    """Names of its options, `--help` among them."""
-    return {"--help", *(name for one in command.params for name in (*one.opts, *one.secondary_opts))}
+    """Names of the options of a command and of those below it, `--help` among them."""
+    own = {name for one in command.params for name in (*one.opts, *one.secondary_opts)}
+    below = (options(each) for each in getattr(command, "commands", {}).values())
+    return {"--help"}.union(own, *below)

@@ -4,6 +4,7 @@ import errno
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -149,11 +150,19 @@ def test_hdf5_holds_the_maps(mapped: Path, tmp_path: Path) -> None:
         assert "frames" not in file
 
 
+def test_hdf5_ends_before_the_disk_is_full(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("h5py")
+    monkeypatch.setattr("rig.exchange.hdf5.shutil.disk_usage", lambda folder: SimpleNamespace(free=1 << 20))
+    with pytest.raises(UsageError, match="No space left on device; free the space it needs"):
+        export_run(run, "hdf5", out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_without_h5py_the_command_that_installs_it_is_told(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
-    with pytest.raises(UsageError, match=r"pip install 'spadrig\[exchange\]'"):
+    with pytest.raises(UsageError, match=r"needs h5py; install it: .* -m pip install .*(\[exchange\]|h5py)"):
         export_run(run, "hdf5", out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
