@@ -175,6 +175,10 @@ class _Text:
     dimension: str
     exact: bool = False
 
+    def written(self, value: float) -> str:
+        """A number of such a field as it is written in a file."""
+        return format_quantity(value, self.dimension)
+
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         def parse(text: object) -> float | Fraction:
             value = parse_quantity(text, self.dimension)  # also bounds what is taken as an exact value

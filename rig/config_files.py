@@ -7,13 +7,15 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 import rig
+from calibration.errors import FileError
+from calibration.files.problems import Key, Sources, validated
+from calibration.files.yaml_file import YamlFile, load_yaml
 from drivers.registry import SLOTS, kinds, lookup
 from rig.config import CubePlan, RigConfig
-from rig.config_problems import Key, Sources, explain
+from rig.config_problems import FLAGS, kind_of
 from rig.errors import UsageError
 
 BUNDLED = Path(rig.__file__).parent.parent / "config"
@@ -33,19 +35,20 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
     per problem, all problems at once.
     """
     path = find_config(name_or_path)
-    content, lines = read_yaml(path)
+    read = read_config(path)
+    content = read.content
     _anchor_paths(content, path.parent)
     given = {key: value for key, value in (overrides or {}).items() if value is not None}
     for key, value in given.items():
         _lay_over(content, key, value)
-    sources = Sources(_shown(path), lines, _keys(given))
+    sources = Sources(_shown(path), read.lines, _keys(given), FLAGS)
     return _validated(RigConfig, content, sources, path.parent)
 
 
 def load_cube_plan(path: str | Path) -> CubePlan:
     """The `plan.yaml` of a bare cube. Raises UsageError with one line per problem."""
-    content, lines = read_yaml(Path(path))
-    return _validated(CubePlan, content, Sources(_shown(Path(path)), lines), Path(path).parent)
+    read = _read(Path(path), "a plan", "columns: 500")
+    return _validated(CubePlan, read.content, Sources(_shown(Path(path)), read.lines), Path(path).parent)
 
 
 def parse_config(content: Mapping[str, object], folder: Path | None = None, options: Iterable[str] = ()) -> RigConfig:
@@ -53,7 +56,7 @@ def parse_config(content: Mapping[str, object], folder: Path | None = None, opti
 
     options: dotted keys whose values were given as options, for these problems.
     """
-    return _validated(RigConfig, dict(content), Sources("config", {}, _keys(options)), folder)
+    return _validated(RigConfig, dict(content), Sources("config", options=_keys(options), flags=FLAGS), folder)
 
 
 def _keys(dotted: Iterable[str]) -> frozenset[Key]:
@@ -121,59 +124,23 @@ def config_schema() -> dict[str, Any]:
     return schema
 
 
-def read_yaml(path: Path) -> tuple[dict[str, Any], dict[Key, int]]:
-    """A YAML file's mapping, and the line of each key by its path. Raises UsageError; a key given twice is one."""
-    name = _shown(path)
+def read_config(path: Path) -> YamlFile:
+    """A config file as it is written. Raises UsageError; a key given twice is one."""
+    return _read(path, "a config", "scan: {columns: 500}")
+
+
+def _read(path: Path, what: str, example: str) -> YamlFile:
     try:
-        text = path.read_text(encoding="utf-8")
-        loader = yaml.SafeLoader(text)
-        try:
-            node = loader.get_single_node()
-            content = loader.construct_document(node) if node is not None else None
-        finally:
-            loader.dispose()
-    except OSError as error:
-        raise UsageError(f"cannot read {name}: {error.strerror or error}; check the path") from error
-    except UnicodeDecodeError as error:
-        raise UsageError(f"{name} is not text in UTF-8; a config is a YAML file") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f":{mark.line + 1}" if mark is not None else ""
-        why = getattr(error, "problem", None) or "unreadable"
-        raise UsageError(f"{name}{where}: not YAML: {why}; check indentation, quotes and brackets there") from error
-    if not isinstance(content, dict):
-        kind = "is empty" if content is None else f"holds a {type(content).__name__}"
-        raise UsageError(f"{name} {kind}; it must hold keys and values, e.g. 'scan: {{columns: 500}}'")
-    lines: dict[Key, int] = {}
-    twice = list(_walk(node, (), lines))
-    if twice:
-        raise UsageError.of(f"{name}:{line}: '{'.'.join(key)}' is given twice; keep one" for key, line in twice)
-    return content, lines
-
-
-def _walk(node: Any, path: Key, lines: dict[Key, int]) -> list[tuple[Key, int]]:
-    """Note the line of every key below `node`; returns the keys that occur twice."""
-    twice: list[tuple[Key, int]] = []
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            here = (*path, str(key.value))
-            line = key.start_mark.line + 1
-            if here in lines:
-                twice.append((here, line))
-            lines[here] = line
-            twice += _walk(value, here, lines)
-    elif isinstance(node, yaml.SequenceNode):
-        for i, value in enumerate(node.value):
-            lines[(*path, str(i))] = value.start_mark.line + 1
-            twice += _walk(value, (*path, str(i)), lines)
-    return twice
+        return load_yaml(path, what, example, _shown(path))
+    except FileError as error:
+        raise UsageError(*error.problems) from error
 
 
 def _validated(model: type[Model], content: Mapping[str, Any], sources: Sources, folder: Path | None) -> Model:
     try:
-        return model.model_validate(content, context={"folder": folder})
-    except ValidationError as error:
-        raise UsageError.of(explain(error, model, content, sources)) from error
+        return validated(model, content, sources, kind_of, {"folder": folder})
+    except FileError as error:
+        raise UsageError(*error.problems) from error
 
 
 def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
@@ -215,10 +182,9 @@ def _lay_over(content: dict[str, Any], key: str, value: object) -> None:
 
 def _is_rig(path: Path) -> bool:
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError):
+        return "scan" in read_config(path).content
+    except UsageError:
         return False
-    return isinstance(content, dict) and "scan" in content
 
 
 def _shown(path: Path) -> str:

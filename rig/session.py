@@ -160,7 +160,7 @@ def _open(config: RigConfig, clock: Clock | None, seed: int, tap: TapFile | None
     try:
         surroundings = _surroundings(config, clock, seed, stack)
     except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
-        usage.append(f"world: {error}")
+        usage += [f"world: {line}" for line in str(error).splitlines()]
     opened: dict[str, Any] = {}
     guard: Guard | None = None
     if surroundings is not None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
@@ -47,8 +47,8 @@ def _known(wanted: Wanted) -> Wanted:
     return wanted
 
 
-def _known_fog(fog: str | None) -> str | None:
-    if fog in (None, CLEAR):
+def _known_fog(fog: object) -> object:
+    if fog is None or fog == CLEAR:
         return fog
     try:
         visibility_m = parse_quantity(fog, "length")
@@ -81,7 +81,7 @@ class WorldConfig(KindConfig):
     """
     scene: str = "street"
     """A bundled scene's name, a scene file, or a folder of surfaces."""
-    fog: Annotated[str | None, AfterValidator(_known_fog)] = None
+    fog: Annotated[str | None, BeforeValidator(_known_fog)] = None
     """How far one sees in the scene's air, in place of what the scene says: a visibility such as `20 m`, or `clear`."""
     board_pose: BoardPlace | None = None
     """Where the scene's calibration board is held, in place of where the scene has it."""

@@ -5,8 +5,9 @@ from typing import Final
 
 import yaml
 
-from calibration.errors import CalibrationError
+from calibration.errors import CalibrationError, FileError
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
+from calibration.files.yaml_file import load_yaml
 from calibration.model.rig_model import RigModel
 from rig.errors import UsageError
 from rig.recording.plain import from_plain, to_plain
@@ -36,22 +37,19 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
     """The plan that a recording was taken with. UsageError where there is none that this program reads."""
     file = folder / name
     try:
-        content = yaml.load(file.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except FileNotFoundError:
+        content = load_yaml(file, "a plan", f"format: {PLAN_FORMAT}").content
+    except FileError as error:
+        if not isinstance(error.__cause__, FileNotFoundError):
+            raise UsageError(*(f"{line}; take it from a copy of the recording" for line in error.problems)) from error
         raise UsageError(
             f"{folder} has no {name}, by which its frames would be bound to columns; name a run taken with "
             "--record, or 'rig export' the frames as npy and 'rig reconstruct' those with a plan and a calibration"
         ) from None
-    except OSError as error:
-        raise UsageError(f"cannot read {file}: {error.strerror or error}; take it from a copy") from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UsageError(f"{file} is no YAML; take it from a copy of the recording") from error
-    head = (content.get("format"), content.get("version")) if isinstance(content, dict) else None
-    if head != (PLAN_FORMAT, PLAN_VERSION):
+    if (content.get("format"), content.get("version")) != (PLAN_FORMAT, PLAN_VERSION):
         raise UsageError(f"{file} is not the plan of a recording ('format: {PLAN_FORMAT}', version {PLAN_VERSION})")
     try:
         return from_plain(ScanPlan, content.get("plan"))
-    except (ValueError, TypeError, KeyError) as error:
+    except (ArithmeticError, ValueError, TypeError, KeyError) as error:
         raise UsageError(f"{file}: {error}") from error
 
 

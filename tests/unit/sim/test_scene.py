@@ -56,12 +56,12 @@ def test_visibility_is_that_of_two_percent_contrast() -> None:
     [
         ("surfaces: street\nfogg: 3", "fogg"),
         ("medium: {fog: {visibility: 30}}", "no unit"),
-        ("medium: {fog: {visibility: -30 m}}", "greater than 0"),
+        ("medium: {fog: {visibility: -30 m}}", "more than 0 m"),
         ("medium: {fog: {visibility: 30 m}, extinction: 0.1 /m}", "exactly one"),
         ("medium: {}", "exactly one"),
         ("medium: {extinction: 0.1 /m, backscatter: 0.05}", "/sr"),
         ("ambient: {illuminance: 100 m}", "lux"),
-        ("[1, 2", "cannot be read"),
+        ("[1, 2", "not YAML"),
         ("- 3", "file"),
     ],
 )
