@@ -54,6 +54,18 @@ def configure(
     return _changed(config, given) if isinstance(config, RigConfig) else load_config(os.fspath(config), given)
 
 
+def check_config(config: Config = SIMULATED) -> RigConfig:
+    """The config, once every file that it names was opened as a scan opens it (`rig config check`).
+
+    Raises UsageError with one line per problem.
+    """
+    from rig.session import check_files
+
+    checked = configure(config)
+    check_files(checked)
+    return checked
+
+
 def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
     content = config.model_dump(mode="json")
     for key, value in options.items():

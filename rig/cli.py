@@ -27,7 +27,7 @@ from rig import (
     cli_scan,
     cli_tradeoff,
 )
-from rig.cli_command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, say
+from rig.cli_command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, fail, say
 from rig.kernel_cache import ensure_kernel_cache
 
 app = typer.Typer(
@@ -60,10 +60,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     with _signals_interrupt():
         try:
             code = app(args=arguments, prog_name="rig", standalone_mode=False)
-        except KeyboardInterrupt:
-            code = EXIT_ABORTED
-        except Exception as error:
-            code = _say_why(error)
+        except (KeyboardInterrupt, Exception) as error:
+            code = _say_why(error, "--json" in arguments)
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -90,14 +88,14 @@ def _signals_interrupt() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _say_why(error: Exception) -> int:
+def _say_why(error: BaseException, as_json: bool) -> int:
     """Say what ended a command that did not handle it: a usage error of click's, an interrupt or a mistake of ours."""
-    if isinstance(error.__cause__, KeyboardInterrupt):
-        return EXIT_ABORTED
+    if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
+        return fail(EXIT_ABORTED, [], ["aborted"], as_json)
     # Typer carries click inside or beside itself, depending on its version.
     if not hasattr(error, "format_message"):
         traceback.print_exception(error)
-        return EXIT_SOFTWARE
+        return fail(EXIT_SOFTWARE, [f"the program failed with {type(error).__name__}: {error}; report it"], [], as_json)
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "rig"
     message = error.format_message().rstrip(".")
@@ -108,8 +106,7 @@ def _say_why(error: Exception) -> int:
         ("valid number", "write a number or "),
     )
     wanted = next((step for words, step in steps if words in message), "")
-    say(f"error: {message}; {wanted}see '{command} --help'")
-    return EXIT_USAGE
+    return fail(EXIT_USAGE, [f"{message}; {wanted}see '{command} --help'"], [], as_json)
 
 
 @app.callback(invoke_without_command=True)

@@ -2,7 +2,7 @@
 
 import functools
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -45,7 +45,7 @@ ArmOption = Annotated[bool, typer.Option("--arm", help="let a real laser shine: 
 AcceptOption = Annotated[
     bool, typer.Option("--accept-calibration", help="use a calibration of another rig, failed or too old, all the same")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout")]
+JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout, errors too")]
 
 
 def command(function: Callable[P, int | None]) -> Callable[P, None]:
@@ -56,21 +56,26 @@ def command(function: Callable[P, int | None]) -> Callable[P, None]:
         try:
             code = function(*args, **kwargs)
         except KeyboardInterrupt as interrupt:
-            say("aborted")
-            for note in getattr(interrupt, "__notes__", []):
-                say(note)
-            code = EXIT_ABORTED
+            code = fail(EXIT_ABORTED, [], ["aborted", *getattr(interrupt, "__notes__", [])], kwargs.get("as_json"))
         except Exception as error:
             code = _code_of(error)
             if code is None:
                 raise
-            for line in str(error).splitlines():
-                say(f"error: {line}")
-            for note in getattr(error, "__notes__", []):
-                say(note)
+            fail(code, str(error).splitlines(), getattr(error, "__notes__", []), kwargs.get("as_json"))
         raise typer.Exit(code or 0)
 
     return wrapped
+
+
+def fail(code: int, problems: Sequence[str], notes: Sequence[str], as_json: object) -> int:
+    """Say why a command has no result, to people on stderr and to programs as its one JSON object; returns the code."""
+    for problem in problems:
+        say(f"error: {problem}")
+    for note in notes:
+        say(note)
+    if as_json:
+        print_json({"error": {"code": code, "problems": [*problems, *notes]}})
+    return code
 
 
 def _code_of(error: Exception) -> int | None:

@@ -16,10 +16,10 @@ def register(app: typer.Typer) -> None:
 
 @command
 def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
-    """Say whether a config is valid; all problems at once."""
-    from rig.api import configure
+    """Say whether a config is valid and the files that it names can be used; all problems at once."""
+    from rig.api import check_config
 
-    checked = configure(config)
+    checked = check_config(config)
     if as_json:
         print_json({"config": config, "name": checked.name, "valid": True})
     else:

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 import rig
 from calibration.errors import FileError
-from calibration.files.problems import Key, Sources, validated
+from calibration.files.problems import Key, Sources, plain_types, validated
 from calibration.files.yaml_file import YamlFile, load_yaml
 from drivers.registry import SLOTS, kinds, lookup
 from rig.config import CubePlan, RigConfig
@@ -21,6 +21,10 @@ from rig.errors import UsageError
 BUNDLED = Path(rig.__file__).parent.parent / "config"
 """Folder of the configs that travel with the program."""
 SUFFIXES = (".yaml", ".yml")
+MAX_PATH = 1000
+"""Longer text is no path, characters."""
+SCENE = ("world", "scene")
+"""A path, or a bundled scene's name."""
 NO_CONFIG = "no config"
 """Begins what is said of a name that means none."""
 
@@ -73,10 +77,6 @@ def portable_content(config: RigConfig) -> dict[str, Any]:
     _anchor_paths(content, here)
     if config.calibration is not None:
         content["calibration"] = _absolute(here / config.calibration)
-    scene = (content["world"] or {}).get("scene")
-    if isinstance(scene, str) and not (BUNDLED / "scenes" / f"{scene}.yaml").is_file():
-        file = here / Path(scene).expanduser()  # a folder's name alone may be a scene too
-        content["world"]["scene"] = _absolute(file) if file.exists() else scene
     return content
 
 
@@ -88,13 +88,13 @@ def bundled_configs() -> tuple[str, ...]:
 def find_config(name_or_path: str | Path) -> Path:
     """The file that a name or path means. Raises UsageError where there is none."""
     path = Path(name_or_path)
-    if path.is_file():
+    if os.path.isfile(path):  # unlike Path.is_file, it takes any text for a name
         return path
     plain = path.suffix not in SUFFIXES and path.parent == Path(".")
     names = bundled_configs()
     if plain and path.name in names:
         return BUNDLED / f"{path.name}.yaml"
-    if path.is_dir():
+    if os.path.isdir(path):
         raise UsageError(f"config {path} is a folder; name the YAML file in it")
     close = difflib.get_close_matches(path.stem, names, n=1)
     meant = f"did you mean '{close[0]}'? " if close else ""
@@ -146,11 +146,12 @@ def _validated(model: type[Model], content: Mapping[str, Any], sources: Sources,
 def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
     """Make relative paths in the slots of devices absolute: their kinds do not know the file's folder.
 
-    A path is text that begins with a dot, or that has a slash or a suffix and exists beside the file.
+    A path is a scene that is not bundled, what a kind's config holds as a path, and text that begins with a dot, ends
+    in .yaml, or has a slash and exists beside the file.
     """
 
     def anchored(value: object) -> object:
-        if isinstance(value, str) and (value.startswith(("./", "../")) or _exists_beside(value, folder)):
+        if isinstance(value, str) and _is_path(value, folder):
             return _absolute(folder / value)
         if isinstance(value, dict):
             return {key: anchored(part) for key, part in value.items()}
@@ -159,6 +160,12 @@ def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
     for slot in SLOTS:
         if slot in content:
             content[slot] = anchored(content[slot])
+            kind = kind_of(slot, content[slot])
+            for name, info in ({} if kind is None else kind.model_fields).items():
+                value = content[slot].get(name)
+                named = Path in plain_types(info.annotation) or ((slot, name) == SCENE and not _is_bundled(value))
+                if named and isinstance(value, str) and not value.startswith("~"):
+                    content[slot][name] = _absolute(folder / value)
 
 
 def _absolute(path: Path) -> str:
@@ -166,8 +173,16 @@ def _absolute(path: Path) -> str:
     return str(path.parent.resolve() / path.name)
 
 
-def _exists_beside(value: str, folder: Path) -> bool:
-    return ("/" in value or value.endswith(SUFFIXES)) and len(value) < 1000 and (folder / value).exists()
+def _is_path(value: str, folder: Path) -> bool:
+    if value.startswith("~") or len(value) >= MAX_PATH:
+        return False
+    return (
+        value.startswith(("./", "../")) or value.endswith(SUFFIXES) or ("/" in value and os.path.exists(folder / value))
+    )
+
+
+def _is_bundled(scene: object) -> bool:
+    return scene in {path.stem for path in (BUNDLED / "scenes").glob("*.yaml")}
 
 
 def _lay_over(content: dict[str, Any], key: str, value: object) -> None:

@@ -12,6 +12,7 @@ seed: 1                                                       # where the drops 
 """
 
 import difflib
+import os
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -123,9 +124,9 @@ def load_scene(name: str) -> tuple[SceneFile, Path]:
     bundled = SCENE_FOLDER / f"{name}.yaml"
     path = Path(name).expanduser()
     file = bundled if name in bundled_scenes() else path
-    if file.is_dir():
+    if os.path.isdir(file):  # unlike Path.is_dir, it takes any text for a name
         return SceneFile(surfaces=str(file.resolve())), file
-    if not file.is_file():
+    if not os.path.isfile(file):
         close = difflib.get_close_matches(path.stem, bundled_scenes(), n=1)
         meant = f"did you mean '{close[0]}'? " if close else ""
         raise DeviceError(

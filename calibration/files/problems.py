@@ -204,17 +204,18 @@ def _leaves(value: Any, key: Key) -> Iterator[tuple[Key, Any]]:
 
 def _number_words(annotation: Any) -> str | None:
     """What a field asks for that takes numbers and no truth values."""
-    kinds = set(_plain_types(annotation))
+    kinds = set(plain_types(annotation))
     if bool in kinds or not kinds & {int, float}:
         return None
     return _TYPES["float" if float in kinds else "int"]
 
 
-def _plain_types(annotation: Any) -> Iterator[type]:
+def plain_types(annotation: Any) -> Iterator[type]:
+    """The types that a field's annotation is made of."""
     if isinstance(annotation, type) and not getattr(annotation, "__args__", ()):
         yield annotation
     for part in getattr(annotation, "__args__", ()):
-        yield from _plain_types(part)
+        yield from plain_types(part)
 
 
 def _key(problem: ErrorDetails, content: Any) -> Key:
