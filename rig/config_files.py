@@ -12,15 +12,17 @@ from pydantic import BaseModel
 import rig
 from calibration.errors import FileError
 from calibration.files.problems import Key, Sources, plain_types, validated
-from calibration.files.yaml_file import YamlFile, load_yaml
+from calibration.files.yaml_file import YamlFile, load_yaml, parse_yaml
 from drivers.registry import SLOTS, kinds, lookup
 from rig.config import CubePlan, RigConfig
+from rig.config_completion import block_text, completed
 from rig.config_problems import FLAGS, kind_of
 from rig.errors import UsageError
 
 BUNDLED = Path(rig.__file__).parent.parent / "config"
 """Folder of the configs that travel with the program."""
 SUFFIXES = (".yaml", ".yml")
+_CONFIG = ("a config", "scan: {columns: 500}")
 MAX_PATH = 1000
 """Longer text is no path, characters."""
 SCENE = ("world", "scene")
@@ -53,6 +55,37 @@ def load_cube_plan(path: str | Path) -> CubePlan:
     """The `plan.yaml` of a bare cube. Raises UsageError with one line per problem."""
     read = _read(Path(path), "a plan", "columns: 500")
     return _validated(CubePlan, read.content, Sources(_shown(Path(path)), read.lines), Path(path).parent)
+
+
+def completed_text(name_or_path: str | Path) -> str:
+    """A config as it is written, its comments with it, with every default filled in and every path absolute.
+
+    What it says is the same in a file of any folder. Where aliases or the like leave no place to fill defaults in, it
+    is written anew without comments. Raises UsageError as `load_config`.
+    """
+    path = find_config(name_or_path)
+    read = read_config(path)
+    anchored = copy.deepcopy(read.content)
+    _anchor_paths(anchored, path.parent)
+    full = portable_content(load_config(path))
+    if anchored.get("calibration") is not None:
+        anchored["calibration"] = full["calibration"]
+    text = completed(read.text, read.node, anchored, full)
+    try:
+        same = portable_content(parse_config(config_content(text))) == full
+    except UsageError:
+        same = False
+    if same:
+        return text
+    return f"# {_shown(path)}, written anew without its comments\n{block_text(full)}"
+
+
+def config_content(text: str) -> dict[str, Any]:
+    """The keys and values of a config's text. Raises UsageError."""
+    try:
+        return parse_yaml(text, *_CONFIG, "config").content
+    except FileError as error:
+        raise UsageError(*error.problems) from error
 
 
 def parse_config(content: Mapping[str, object], folder: Path | None = None, options: Iterable[str] = ()) -> RigConfig:
@@ -126,7 +159,7 @@ def config_schema() -> dict[str, Any]:
 
 def read_config(path: Path) -> YamlFile:
     """A config file as it is written. Raises UsageError; a key given twice is one."""
-    return _read(path, "a config", "scan: {columns: 500}")
+    return _read(path, *_CONFIG)
 
 
 def _read(path: Path, what: str, example: str) -> YamlFile:

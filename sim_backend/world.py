@@ -107,9 +107,18 @@ class SimulatedWorld:
     def __init__(self, config: WorldConfig, surroundings: Surroundings) -> None:
         """DeviceError where the geometry, the scene or the focus cannot be used."""
         self.config = config
-        self.model = _load_geometry(DEFAULT_GEOMETRY if config.geometry is None else Path(config.geometry))
+        wrong: list[str] = []
+        try:
+            self.model = _load_geometry(DEFAULT_GEOMETRY if config.geometry is None else Path(config.geometry))
+        except DeviceError as error:
+            wrong.append(str(error))
+        try:
+            self.scene, folder = load_scene(config.scene)
+        except DeviceError as error:
+            wrong.append(str(error))
+        if wrong:
+            raise DeviceError("\n".join(wrong))
         camera = self.model.camera
-        self.scene, folder = load_scene(config.scene)
         if config.fog is not None:
             self.scene = with_fog(self.scene, config.fog)
         if config.board_pose is not None:

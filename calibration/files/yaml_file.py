@@ -33,8 +33,6 @@ class YamlFile:
     content: dict[str, Any]
     text: str
     node: yaml.MappingNode
-    repeats: bool
-    """Whether aliases in it stand for what is written elsewhere."""
 
     def lines(self) -> dict[Key, int]:
         """The line of each key and of each item of a list, by its path."""
@@ -59,8 +57,13 @@ def load_yaml(file: Path, what: str, example: str, name: str | None = None) -> Y
         raise FileError(f"cannot read {what.split()[-1]} {name}: {error.strerror or error}; check the path") from error
     except UnicodeDecodeError as error:
         raise FileError(f"{name} is not text in UTF-8; {what} is a YAML file") from error
+    return parse_yaml(text, what, example, name)
+
+
+def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
+    """The keys and values of a file's text; as `load_yaml`."""
     try:
-        repeats = _bounded(text)  # before anything is made of it
+        _require_bounded(text)
         loader = _Loader(text)
         try:
             node = loader.get_single_node()
@@ -81,7 +84,7 @@ def load_yaml(file: Path, what: str, example: str, name: str | None = None) -> Y
         raise FileError(f"{name} {kind}; {what} must hold keys and values, e.g. '{example}'")
     if twice:
         raise FileError(*(f"{name}:{line}: '{'.'.join(key)}' is given twice; keep one" for key, line in twice))
-    return YamlFile(content, text, node, repeats)
+    return YamlFile(content, text, node)
 
 
 def read_yaml_file(file: Path, what: str, format_name: str, version: int, model: type[Content]) -> Content:
@@ -134,8 +137,8 @@ class _Open:
     height: int = 0
 
 
-def _bounded(text: str) -> bool:
-    """Whether aliases repeat anything. Raises a YAMLError where the text nests or repeats too much."""
+def _require_bounded(text: str) -> None:
+    """Raise a YAMLError where the text nests or repeats too much, before anything is made of it."""
     known: dict[str | None, tuple[int, int]] = {}  # of what is anchored: its values, and how deep they nest
     opened: list[_Open] = []
     written = repeated = 0
@@ -172,7 +175,6 @@ def _bounded(text: str) -> bool:
         anchor = closed.anchor if isinstance(event, yaml.CollectionEndEvent) else getattr(event, "anchor", None)
         if not isinstance(event, yaml.AliasEvent) and anchor is not None:
             known[anchor] = size, height
-    return repeated > 0
 
 
 def _places(node: yaml.Node, path: Key) -> Iterator[tuple[Key, int]]:
