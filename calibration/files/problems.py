@@ -152,7 +152,8 @@ def validated(
             found.setdefault(_key(problem, content), []).append(problem)
     told = []
     for key, value, words in _no_numbers(schema, model, content, ()):
-        if key not in found:
+        if all(problem["type"] in _BOUNDS for problem in found.get(key, [])):  # true is at most 1, and NaN nothing
+            found.pop(key, None)
             dotted, then = sources.flag(key) or ".".join(key), _then(key, schema, sources.flag(key))
             told.append((key, f"{dotted} is {_shown(value)}, it must be {words}{then}"))
     keys = [*found, *(key for key, _ in told)]
@@ -270,8 +271,6 @@ def _text(problems: list[ErrorDetails], key: Key, schema: _Schema, flag: str | N
         between = "" if not dotted else " " if message.startswith(_READS_ON) else ": "
         return f"{dotted}{between}{message}"
     value = _shown(problem["input"])
-    if isinstance(problem["input"], float) and not math.isfinite(problem["input"]):
-        return f"{dotted} is {value}, it must be a finite number{then}"
     if kind in _BOUNDS:
         words, name = _BOUNDS[kind]
         return f"{dotted} is {value}, it must be {words} {_limit(schema.field(key), context[name])}{then}"
