@@ -15,3 +15,15 @@ class Degenerate(CalibrationError):  # noqa: N818, the input is, not the program
         """Take the reason, and the message: what is wrong, its value and limit, the condition number, the next step."""
         super().__init__(message)
         self.reason = reason
+
+
+class FileError(CalibrationError):
+    """A file that cannot be used. `problems` are all that is wrong with it, a line each; the message has the first."""
+
+    MOST_TOLD = 5
+
+    def __init__(self, *problems: str) -> None:
+        """Take the lines, each of which names the file."""
+        more = f"; and {len(problems) - self.MOST_TOLD} more" if len(problems) > self.MOST_TOLD else ""
+        super().__init__("; ".join(problems[: self.MOST_TOLD]) + more)
+        self.problems = problems

@@ -51,6 +51,9 @@ class Kind:
 
     config: type[BaseModel]
     create: Callable[[Any, Surroundings], Any]
+    check_files: Callable[[Any], object] | None = None
+    """Opens the files that its config names, as `create` does, without the device; `DeviceError` where one cannot be
+    used. None: it names none. A world needs none, it is created."""
     off: Callable[[Any], bytes] | None = None
     """What a laser on a serial port is sent, by its config, where there is no time to open it first: emission off,
     whatever it answers."""

@@ -239,4 +239,10 @@ def create(config: ReplaySpadConfig, surroundings: Surroundings) -> ReplaySpad:
     return ReplaySpad(config, RunRecording(config.recording), surroundings.clock)
 
 
-KIND = Kind(config=ReplaySpadConfig, create=create)
+def check_files(config: ReplaySpadConfig) -> None:
+    """Open the recording, where one is named. `DeviceError` where it cannot be played."""
+    if config.recording is not None:
+        recorded_info(RunRecording(config.recording))
+
+
+KIND = Kind(config=ReplaySpadConfig, create=create, check_files=check_files)

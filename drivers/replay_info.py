@@ -1,6 +1,5 @@
 """What the devices of a recording said of themselves: from its manifest, or as far as the frames themselves tell."""
 
-import json
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 from drivers.errors import ProtocolError
 from drivers.frames import BlockFlag, frame_bytes
 from drivers.interfaces import BurstMode, SpadInfo, StreamMode
+from drivers.json_text import parse_json
 from drivers.recorded import RunRecording
 
 MANIFEST = "manifest.json"
@@ -20,7 +20,7 @@ def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
     """
     file = recording / MANIFEST
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = parse_json(file.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as error:
@@ -38,7 +38,7 @@ def recorded_info(recording: RunRecording) -> SpadInfo:
         return told
     try:
         info = _read(noted["info"])
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+    except (ArithmeticError, KeyError, TypeError, ValueError) as error:
         raise ProtocolError(
             f"{recording.path / MANIFEST}: devices.spad.info is no description of a SPAD ({error!r}); "
             "'rig repair' writes the manifest anew"

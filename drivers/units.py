@@ -21,6 +21,8 @@ _NUMBER = re.compile(
 _MAX_TEXT = 1000
 """Longest text taken, in characters: exact arithmetic on an endless number would take endless time."""
 
+MANY_ZEROS = 5
+"""From so many zeros on a whole number is written with an exponent."""
 _FAITHFUL = Context(prec=20)
 """Decimal digits that pin a 64-bit float (17) with enough to spare for one multiplication by a unit."""
 
@@ -34,6 +36,8 @@ class Dimension:
     name: str
     units: Mapping[str, Fraction]
     example: str
+    only_read: frozenset[str] = frozenset()
+    """Units that nothing is written in."""
 
 
 _ALL = (
@@ -75,6 +79,7 @@ _ALL = (
         "inverse length",
         {"/m": Fraction(1), "1/m": Fraction(1), "/km": Fraction(1, 10**3), "1/km": Fraction(1, 10**3)},
         "0.05 /m",
+        frozenset({"/km", "1/km"}),
     ),
     Dimension("angle", {"rad": Fraction(1), "mrad": Fraction(1, 10**3), "deg": _DEGREE}, "3 deg"),
     Dimension("illuminance", {"lx": Fraction(1), "lux": Fraction(1), "klx": Fraction(10**3)}, "200 lx"),
@@ -87,8 +92,8 @@ _ALL = (
         {"B/s": Fraction(1), "kB/s": Fraction(10**3), "MB/s": Fraction(10**6), "GB/s": Fraction(10**9)},
         "400 MB/s",
     ),
-    Dimension("rate", {"/s": Fraction(1), "1/s": Fraction(1), "/ms": Fraction(10**3)}, "5 /s"),
-    Dimension("acceleration", {"/s2": Fraction(1), "/ms2": Fraction(10**6)}, "1e6 /s2"),
+    Dimension("rate", {"/s": Fraction(1), "1/s": Fraction(1), "/ms": Fraction(10**3)}, "5 /s", frozenset({"/ms"})),
+    Dimension("acceleration", {"/s2": Fraction(1), "/ms2": Fraction(10**6)}, "1e6 /s2", frozenset({"/ms2"})),
 )
 
 DIMENSIONS: Mapping[str, Dimension] = {dimension.name: dimension for dimension in _ALL}
@@ -132,15 +137,28 @@ def parse_exact(text: object, dimension: str) -> Fraction:
 
 
 def format_quantity(value: float | Fraction, dimension: str) -> str:
-    """A short text with a unit that reads back to exactly `value`. ValueError where `value` is not finite."""
+    """A text with a unit, as people write it, that reads back to exactly `value`. ValueError where that is not finite.
+
+    The shortest number from 0.1 to 1000, where there is one; a close race goes to the first unit, then to a number of
+    at least 1.
+    """
     known = DIMENSIONS[dimension]
     if not math.isfinite(value):
         raise ValueError(f"{value} is no {known.name}")
     exact = Fraction(value)
-    texts = [f"{_shortest(exact / scale)} {unit}" for unit, scale in known.units.items()]
-    faithful = [text for text in texts if _means(text, value, dimension)]
+    if exact == 0:
+        return f"0 {next(iter(known.units))}"
+    numbers = {unit: exact / scale for unit, scale in known.units.items() if unit not in known.only_read}
+    texts = {unit: f"{_shortest(number)} {unit}" for unit, number in numbers.items()}
+    first = next(iter(texts))
+    faithful = [unit for unit, text in texts.items() if _means(text, value, dimension)]
+
+    def awkwardness(unit: str) -> tuple[bool, bool, int, bool, bool]:
+        text, size = texts[unit], abs(numbers[unit])
+        return "e" in text.split()[0], not 0.1 <= size < 1000, len(text) - (unit == first), unit != first, size < 1
+
     if faithful:
-        return min(faithful, key=lambda text: len(text) - (text is texts[0]))  # a close race goes to the first unit
+        return texts[min(faithful, key=awkwardness)]
     unit, scale = next(iter(known.units.items()))
     number = exact / scale
     if isinstance(value, Fraction):
@@ -150,9 +168,12 @@ def format_quantity(value: float | Fraction, dimension: str) -> str:
 
 def _shortest(number: Fraction) -> str:
     try:
-        return repr(float(number)).removesuffix(".0")
+        text = repr(float(number)).removesuffix(".0")
     except OverflowError:
         return "inf"
+    digits = text.rstrip("0")
+    zeros = len(text) - len(digits)
+    return f"{digits}e{zeros}" if zeros >= MANY_ZEROS and "." not in text and "e" not in text else text
 
 
 def _means(text: str, value: float | Fraction, dimension: str) -> bool:
@@ -174,6 +195,10 @@ class _Text:
 
     dimension: str
     exact: bool = False
+
+    def written(self, value: float) -> str:
+        """A number of such a field as it is written in a file."""
+        return format_quantity(value, self.dimension)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         def parse(text: object) -> float | Fraction:

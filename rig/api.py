@@ -6,7 +6,7 @@ result.last.depth_m, result.summary.truth
 """
 
 from rig.api_calibrate import calibrate_camera, calibrate_check, calibrate_pixels, calibrate_planes, calibrate_sync
-from rig.api_config import MAX_SEED, SIMULATED, Config, PathLike, configure
+from rig.api_config import MAX_SEED, SIMULATED, Config, PathLike, check_config, configure
 from rig.api_reconstruct import reconstruct
 from rig.api_recordings import compress, cut, export_run, import_frames, recording_info, repair, verify
 from rig.api_rig import bench, bench_disk, bench_simulator, devices, doctor, effects, flux_row, laser_off, soak, warm_up
@@ -32,6 +32,7 @@ __all__ = [
     "calibrate_pixels",
     "calibrate_planes",
     "calibrate_sync",
+    "check_config",
     "compress",
     "configure",
     "cut",

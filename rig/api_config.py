@@ -62,6 +62,18 @@ def seed_problems(seed: int) -> list[str]:
     return [f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})"]
 
 
+def check_config(config: Config = SIMULATED) -> RigConfig:
+    """The config, once every file that it names was opened as a scan opens it (`rig config check`).
+
+    Raises UsageError with one line per problem.
+    """
+    from rig.session import check_files
+
+    checked = configure(config)
+    check_files(checked)
+    return checked
+
+
 def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
     content = config.model_dump(mode="json")
     for key, value in options.items():

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from calibration.model.rig_model import RigModel
+from drivers.json_text import parse_json
 from rig.errors import UsageError
 
 
@@ -47,7 +48,7 @@ def notes_on(file: Path | None, model: RigModel) -> dict[str, dict[str, Any]]:
 
 def _read_notes(file: Path) -> dict[str, dict[str, Any]]:
     try:
-        notes = json.loads(file.read_text(encoding="utf-8"))
+        notes = parse_json(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:

@@ -28,7 +28,7 @@ from rig import (
     cli_scan,
     cli_tradeoff,
 )
-from rig.cli_command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, refused_file, say
+from rig.cli_command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, fail, refused_file, say
 from rig.kernel_cache import ensure_kernel_cache
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
@@ -67,13 +67,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         try:
             _require_no_empty(arguments)
             code = app(args=arguments, prog_name="rig", standalone_mode=False)
-        except KeyboardInterrupt:
-            code = _TYPER_INTERRUPTED
-        except Exception as error:
+        except (KeyboardInterrupt, Exception) as error:
             code = _say_why(error, arguments)
         if code == _TYPER_INTERRUPTED:  # before a command had begun, or once more while one ended
-            say("aborted")
-            code = EXIT_ABORTED
+            code = fail(EXIT_ABORTED, [], ["aborted"], "--json" in arguments)
     if argv is None and code == EXIT_ABORTED:
         _ignore_interrupts()
     sys.exit(code if isinstance(code, int) else 0)
@@ -110,18 +107,18 @@ def _signals_interrupt() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _say_why(error: Exception, arguments: list[str]) -> int:
+def _say_why(error: BaseException, arguments: list[str]) -> int:
     """Say what ended a command that did not handle it: a usage error of click's, an interrupt or a mistake of ours."""
-    if isinstance(error.__cause__, KeyboardInterrupt):
+    as_json = "--json" in arguments
+    if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
         return _TYPER_INTERRUPTED
     refused = refused_file(error)  # the shell's start-up files, by --install-completion
     if refused is not None:
-        say(f"error: {refused}")
-        return EXIT_USAGE
+        return fail(EXIT_USAGE, [refused], [], as_json)
     # Typer carries click inside or beside itself, depending on its version.
     if not hasattr(error, "format_message"):
         traceback.print_exception(error)
-        return EXIT_SOFTWARE
+        return fail(EXIT_SOFTWARE, [f"the program failed with {type(error).__name__}: {error}; report it"], [], as_json)
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "rig"
     message = error.format_message().rstrip(".")
@@ -136,8 +133,7 @@ def _say_why(error: Exception, arguments: list[str]) -> int:
     given = [value for name in names for value in _values(name, arguments)]
     if given and not any(value in message for value in given):
         message = message.replace("Invalid value", f"Invalid value {given[-1]!r}", 1)
-    say(f"error: {message}; {wanted}see '{command} --help'")
-    return EXIT_USAGE
+    return fail(EXIT_USAGE, [f"{message}; {wanted}see '{command} --help'"], [], as_json)
 
 
 def _values(option: str, arguments: list[str]) -> list[str]:

@@ -4,7 +4,7 @@ import errno
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -70,7 +70,7 @@ ArmOption = Annotated[bool, typer.Option("--arm", help="let a real laser shine: 
 AcceptOption = Annotated[
     bool, typer.Option("--accept-calibration", help="use a calibration of another rig, failed or too old, all the same")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout")]
+JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout, errors too")]
 
 
 def command(function: Callable[P, int | None]) -> Callable[P, None]:
@@ -81,25 +81,19 @@ def command(function: Callable[P, int | None]) -> Callable[P, None]:
         try:
             code = function(*args, **kwargs)
         except KeyboardInterrupt as interrupt:
-            say("aborted")
-            for note in getattr(interrupt, "__notes__", []):
-                say(note)
-            code = EXIT_ABORTED
+            code = fail(EXIT_ABORTED, [], ["aborted", *getattr(interrupt, "__notes__", [])], kwargs.get("as_json"))
         except Exception as error:
             refused = refused_file(error)
             code = EXIT_USAGE if refused else _code_of(error)
             if code is None:
                 raise
-            for line in (refused or str(error)).splitlines():
-                say(f"error: {line}")
-            for note in getattr(error, "__notes__", []):
-                say(note)
+            fail(code, (refused or str(error)).splitlines(), getattr(error, "__notes__", []), kwargs.get("as_json"))
         raise typer.Exit(code or 0)
 
     return wrapped
 
 
-def refused_file(error: Exception) -> str | None:
+def refused_file(error: BaseException) -> str | None:
     """One line about a file or disk that the system refused to a command; None for every other error."""
     if not isinstance(error, OSError) or (error.filename is None and error.errno not in _STEPS):
         return None
@@ -116,6 +110,17 @@ _STEPS = {
     errno.ENOSPC: "free some space, or name a folder on another disk",
     errno.EDQUOT: "free some space, or name a folder on another disk",
 }
+
+
+def fail(code: int, problems: Sequence[str], notes: Sequence[str], as_json: object) -> int:
+    """Say why a command has no result, to people on stderr and to programs as its one JSON object; returns the code."""
+    for problem in problems:
+        say(f"error: {problem}")
+    for note in notes:
+        say(note)
+    if as_json:
+        print_json({"error": {"code": code, "problems": [*problems, *notes]}})
+    return code
 
 
 def _code_of(error: Exception) -> int | None:

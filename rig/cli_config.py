@@ -17,10 +17,10 @@ def register(app: typer.Typer) -> None:
 
 @command
 def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
-    """Say whether a config is valid; all problems at once."""
-    from rig.api import configure
+    """Say whether a config is valid and the files that it names can be used; all problems at once."""
+    from rig.api import check_config
 
-    checked = configure(config)
+    checked = check_config(config)
     if as_json:
         print_json({"config": config, "name": checked.name, "valid": True})
     else:
@@ -30,17 +30,14 @@ def check_command(config: ConfigArgument = "simulated", as_json: JsonOption = Fa
 
 @command
 def show_command(config: ConfigArgument = "simulated", as_json: JsonOption = False) -> int:
-    """Print a config with every default filled in and every path absolute."""
-    from rig.api import configure
-    from rig.config_files import portable_content
+    """Print a config as it is written, with every default filled in and every path absolute."""
+    from rig.config_files import completed_text, config_content
 
-    content = portable_content(configure(config))
+    text = completed_text(config)
     if as_json:
-        print_json(content)
+        print_json(config_content(text))
     else:
-        import yaml
-
-        print(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), end="")
+        print(text, end="")
     return 0
 
 

@@ -7,15 +7,18 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
+from calibration.errors import FileError
 from calibration.files.camera_file import CAMERA_FORMAT
+from calibration.files.problems import Key, Sources, plain_types, validated
 from calibration.files.sections import FORMAT
+from calibration.files.yaml_file import YamlFile, load_yaml, parse_yaml
 from drivers.registry import SLOTS, kinds, lookup
-from rig.bundled import BUNDLED, SCENES, bundled_rigs, bundled_scenes
+from rig.bundled import BUNDLED, bundled_rigs, bundled_scenes
 from rig.config import CubePlan, RigConfig
-from rig.config_problems import Key, Sources, explain
+from rig.config_completion import block_text, completed
+from rig.config_problems import FLAGS, kind_of
 from rig.errors import UsageError
 
 SUFFIXES = (".yaml", ".yml")
@@ -27,6 +30,11 @@ _OTHERS = {
     CAMERA_FORMAT: "the calibration of a camera alone",
 }
 """Files of ours that are taken for others, by their `format`."""
+_CONFIG = ("a config", "scan: {columns: 500}")
+MAX_PATH = 1000
+"""Longer text is no path, characters."""
+SCENE = ("world", "scene")
+"""A path, or a bundled scene's name."""
 NO_CONFIG = "no config"
 """Begins what is said of a name that means none."""
 
@@ -41,22 +49,54 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
     per problem, all problems at once.
     """
     path = find_config(name_or_path)
-    content, lines = read_yaml(path)
+    read = read_config(path)
+    content = read.content
     _refuse_others(path, content, f"name the config of a rig, such as {bundled_configs()[0]}")
     _anchor_paths(content, path.parent)
     given = {key: value for key, value in (overrides or {}).items() if value is not None}
     for key, value in given.items():
         _lay_over(content, key, value)
-    sources = Sources(_shown(path), lines, _keys(given))
+    sources = Sources(_shown(path), read.lines, _keys(given), FLAGS)
     return _validated(RigConfig, content, sources, path.parent)
 
 
 def load_cube_plan(path: str | Path) -> CubePlan:
     """The `plan.yaml` of a bare cube. Raises UsageError with one line per problem."""
-    content, lines = read_yaml(Path(path))
-    leave = "leave --plan out; " if content.get("format") == PLAN_FORMAT else ""
-    _refuse_others(path, content, f"{leave}the plan of frames alone has {', '.join(CubePlan.model_fields)}")
-    return _validated(CubePlan, content, Sources(_shown(Path(path)), lines), Path(path).parent)
+    read = _read(Path(path), "a plan", "columns: 500")
+    leave = "leave --plan out; " if read.content.get("format") == PLAN_FORMAT else ""
+    _refuse_others(path, read.content, f"{leave}the plan of frames alone has {', '.join(CubePlan.model_fields)}")
+    return _validated(CubePlan, read.content, Sources(_shown(Path(path)), read.lines), Path(path).parent)
+
+
+def completed_text(name_or_path: str | Path) -> str:
+    """A config as it is written, its comments with it, with every default filled in and every path absolute.
+
+    What it says is the same in a file of any folder. Where aliases or the like leave no place to fill defaults in, it
+    is written anew without comments. Raises UsageError as `load_config`.
+    """
+    path = find_config(name_or_path)
+    read = read_config(path)
+    anchored = copy.deepcopy(read.content)
+    _anchor_paths(anchored, path.parent)
+    full = portable_content(load_config(path))
+    if anchored.get("calibration") is not None:
+        anchored["calibration"] = full["calibration"]
+    text = completed(read.text, read.node, anchored, full)
+    try:
+        same = portable_content(parse_config(config_content(text))) == full
+    except UsageError:
+        same = False
+    if same:
+        return text
+    return f"# {_shown(path)}, written anew without its comments\n{block_text(full)}"
+
+
+def config_content(text: str) -> dict[str, Any]:
+    """The keys and values of a config's text. Raises UsageError."""
+    try:
+        return parse_yaml(text, *_CONFIG, "config").content
+    except FileError as error:
+        raise UsageError(*error.problems) from error
 
 
 def parse_config(content: Mapping[str, object], folder: Path | None = None, options: Iterable[str] = ()) -> RigConfig:
@@ -64,7 +104,7 @@ def parse_config(content: Mapping[str, object], folder: Path | None = None, opti
 
     options: dotted keys whose values were given as options, for these problems.
     """
-    return _validated(RigConfig, dict(content), Sources("config", {}, _keys(options)), folder)
+    return _validated(RigConfig, dict(content), Sources("config", options=_keys(options), flags=FLAGS), folder)
 
 
 def _keys(dotted: Iterable[str]) -> frozenset[Key]:
@@ -81,10 +121,6 @@ def portable_content(config: RigConfig) -> dict[str, Any]:
     _anchor_paths(content, here)
     if config.calibration is not None:
         content["calibration"] = _absolute(here / config.calibration)
-    scene = (content["world"] or {}).get("scene")
-    if isinstance(scene, str) and not (SCENES / f"{scene}.yaml").is_file():
-        file = here / Path(scene).expanduser()  # a folder's name alone may be a scene too
-        content["world"]["scene"] = _absolute(file) if file.exists() else scene
     return content
 
 
@@ -96,13 +132,13 @@ def bundled_configs() -> tuple[str, ...]:
 def find_config(name_or_path: str | Path) -> Path:
     """The file that a name or path means. Raises UsageError where there is none."""
     path = Path(name_or_path)
-    if path.is_file():
+    if os.path.isfile(path):  # unlike Path.is_file, it takes any text for a name
         return path
     plain = path.suffix not in SUFFIXES and path.parent == Path(".")
     names = bundled_configs()
     if plain and path.name in names:
         return BUNDLED / f"{path.name}.yaml"
-    if path.is_dir():
+    if os.path.isdir(path):
         raise UsageError(f"config {path} is a folder; name the YAML file in it")
     close = difflib.get_close_matches(path.stem, names, n=1)
     meant = f"did you mean '{close[0]}'? " if close else ""
@@ -134,34 +170,16 @@ def config_schema() -> dict[str, Any]:
     return schema
 
 
-def read_yaml(path: Path) -> tuple[dict[str, Any], dict[Key, int]]:
-    """A YAML file's mapping, and the line of each key by its path. Raises UsageError; a key given twice is one."""
-    name = _shown(path)
+def read_config(path: Path) -> YamlFile:
+    """A config file as it is written. Raises UsageError; a key given twice is one."""
+    return _read(path, *_CONFIG)
+
+
+def _read(path: Path, what: str, example: str) -> YamlFile:
     try:
-        text = path.read_text(encoding="utf-8")
-        loader = yaml.SafeLoader(text)
-        try:
-            node = loader.get_single_node()
-            content = loader.construct_document(node) if node is not None else None
-        finally:
-            loader.dispose()
-    except OSError as error:
-        raise UsageError(f"cannot read {name}: {error.strerror or error}; check the path") from error
-    except UnicodeDecodeError as error:
-        raise UsageError(f"{name} is not text in UTF-8; a config is a YAML file") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f":{mark.line + 1}" if mark is not None else ""
-        why = getattr(error, "problem", None) or "unreadable"
-        raise UsageError(f"{name}{where}: not YAML: {why}; check indentation, quotes and brackets there") from error
-    if not isinstance(content, dict):
-        kind = "is empty" if content is None else f"holds a {type(content).__name__}"
-        raise UsageError(f"{name} {kind}; it must hold keys and values, e.g. 'scan: {{columns: 500}}'")
-    lines: dict[Key, int] = {}
-    twice = list(_walk(node, (), lines))
-    if twice:
-        raise UsageError.of(f"{name}:{line}: '{'.'.join(key)}' is given twice; keep one" for key, line in twice)
-    return content, lines
+        return load_yaml(path, what, example, _shown(path))
+    except FileError as error:
+        raise UsageError(*error.problems) from error
 
 
 def _refuse_others(path: str | Path, content: Mapping[str, Any], then: str) -> None:
@@ -170,39 +188,22 @@ def _refuse_others(path: str | Path, content: Mapping[str, Any], then: str) -> N
         raise UsageError(f"{path} is {what}; {then}")
 
 
-def _walk(node: Any, path: Key, lines: dict[Key, int]) -> list[tuple[Key, int]]:
-    """Note the line of every key below `node`; returns the keys that occur twice."""
-    twice: list[tuple[Key, int]] = []
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            here = (*path, str(key.value))
-            line = key.start_mark.line + 1
-            if here in lines:
-                twice.append((here, line))
-            lines[here] = line
-            twice += _walk(value, here, lines)
-    elif isinstance(node, yaml.SequenceNode):
-        for i, value in enumerate(node.value):
-            lines[(*path, str(i))] = value.start_mark.line + 1
-            twice += _walk(value, (*path, str(i)), lines)
-    return twice
-
-
 def _validated(model: type[Model], content: Mapping[str, Any], sources: Sources, folder: Path | None) -> Model:
     try:
-        return model.model_validate(content, context={"folder": folder})
-    except ValidationError as error:
-        raise UsageError.of(explain(error, model, content, sources)) from error
+        return validated(model, content, sources, kind_of, {"folder": folder})
+    except FileError as error:
+        raise UsageError(*error.problems) from error
 
 
 def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
     """Make relative paths in the slots of devices absolute: their kinds do not know the file's folder.
 
-    A path is text that begins with a dot, or that has a slash or a suffix and exists beside the file.
+    A path is a scene that is not bundled, what a kind's config holds as a path, and text that begins with a dot, ends
+    in .yaml, or has a slash and exists beside the file.
     """
 
     def anchored(value: object) -> object:
-        if isinstance(value, str) and (value.startswith(("./", "../")) or _exists_beside(value, folder)):
+        if isinstance(value, str) and _is_path(value, folder):
             return _absolute(folder / value)
         if isinstance(value, dict):
             return {key: anchored(part) for key, part in value.items()}
@@ -211,6 +212,12 @@ def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
     for slot in SLOTS:
         if slot in content:
             content[slot] = anchored(content[slot])
+            kind = kind_of(slot, content[slot])
+            for name, info in ({} if kind is None else kind.model_fields).items():
+                value = content[slot].get(name)
+                named = Path in plain_types(info.annotation) or ((slot, name) == SCENE and not _is_bundled(value))
+                if named and isinstance(value, str) and not value.startswith("~"):
+                    content[slot][name] = _absolute(folder / value)
 
 
 def _absolute(path: Path) -> str:
@@ -218,8 +225,16 @@ def _absolute(path: Path) -> str:
     return str(path.parent.resolve() / path.name)
 
 
-def _exists_beside(value: str, folder: Path) -> bool:
-    return ("/" in value or value.endswith(SUFFIXES)) and len(value) < 1000 and (folder / value).exists()
+def _is_path(value: str, folder: Path) -> bool:
+    if value.startswith("~") or len(value) >= MAX_PATH:
+        return False
+    return (
+        value.startswith(("./", "../")) or value.endswith(SUFFIXES) or ("/" in value and os.path.exists(folder / value))
+    )
+
+
+def _is_bundled(scene: object) -> bool:
+    return scene in {path.stem for path in (BUNDLED / "scenes").glob("*.yaml")}
 
 
 def _lay_over(content: dict[str, Any], key: str, value: object) -> None:

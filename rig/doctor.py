@@ -18,7 +18,7 @@ from rig.calibration_identity import identity_of, refusals
 from rig.calibration_refusals import NEXT
 from rig.config import RigConfig
 from rig.dark_look import DarkLook, look
-from rig.errors import DevicesError, RigError
+from rig.errors import RigError
 from rig.gate_pulses import sync_program
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, open_rig, prepare
@@ -57,8 +57,7 @@ def examine(config: RigConfig, folder: Path) -> list[Finding]:
             findings += _frames(look(rig, plan, timing.stride), plan)
             findings += _memory(rig)
     except (RigError, DeviceError) as error:
-        lines = str(error).splitlines() if isinstance(error, DevicesError) else [str(error)]
-        findings += [Finding("devices", False, line) for line in lines]
+        findings += [Finding("devices", False, line) for line in str(error).splitlines()]
     findings.append(_disk(folder))
     return findings
 

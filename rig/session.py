@@ -31,6 +31,8 @@ _log = logging.getLogger(__name__)
 
 GUARDED = ("laser", "sync")
 """Slots whose devices a process of its own owns, since they let light out."""
+DEVICES = ("spad", "scanner", "laser", "sync")
+"""Slots of devices, in the order in which they are opened."""
 HOLD_EXPOSURES = 10
 """From so many frames per column on, simulated light is held within columns; with fewer, within parts of them."""
 
@@ -120,6 +122,24 @@ def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSour
         yield opened["sync"], opened["laser"]
 
 
+def check_files(config: RigConfig) -> None:
+    """Open every file that a config names, as `open_rig` does, but no device. UsageError with a line per problem."""
+    problems: list[str] = []
+    _load_model(config, problems)
+    with ExitStack() as stack:
+        _create_surroundings(config, None, 0, stack, problems)
+    for slot in DEVICES:
+        kind = getattr(config, slot)
+        check = lookup(slot, kind.kind).check_files
+        try:
+            if check is not None:
+                check(kind)
+        except DeviceError as error:
+            problems += [f"{slot}: {line}" for line in str(error).splitlines()]
+    if problems:
+        raise UsageError.of(problems)
+
+
 def prepare(
     rig: OpenRig, scan: ScanConfig | None = None, windows: ColumnWindows | None = None
 ) -> tuple[ScanPlan, SpadTiming]:
@@ -156,17 +176,13 @@ def _open(config: RigConfig, clock: Clock | None, seed: int, tap: TapFile | None
     usage: list[str] = []
     devices: list[str] = []
     model = _load_model(config, usage)
-    surroundings: Surroundings | None = None
-    try:
-        surroundings = _surroundings(config, clock, seed, stack)
-    except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
-        usage.append(f"world: {error}")
+    surroundings = _create_surroundings(config, clock, seed, stack, usage)
     opened: dict[str, Any] = {}
     guard: Guard | None = None
     if surroundings is not None:
         guard = _guard_of(config, surroundings.ports, tap, stack)
         # Closing runs backwards: the gate goes low before the laser pauses, the mirror parks and the SPAD stops.
-        for slot in ("spad", "scanner", "laser", "sync"):
+        for slot in DEVICES:
             try:
                 opened[slot] = stack.enter_context(
                     _open_device(slot, getattr(config, slot), _tapped(surroundings, slot, tap, stack), guard)
@@ -182,6 +198,17 @@ def _open(config: RigConfig, clock: Clock | None, seed: int, tap: TapFile | None
     assert surroundings is not None, "else there is trouble"
     clock, world = surroundings.clock, surroundings.world
     return OpenRig(config=config, clock=clock, world=world, model=model, guard=guard, **opened)
+
+
+def _create_surroundings(
+    config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack, problems: list[str]
+) -> Surroundings | None:
+    """Clock and world; None where there is no world, which `problems` then says."""
+    try:
+        return _surroundings(config, clock, seed, stack)
+    except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
+        problems += [f"world: {line}" for line in str(error).splitlines()]
+        return None
 
 
 def _surroundings(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -> Surroundings:

@@ -66,14 +66,14 @@ class Section(BaseModel):
 class Fog(Section):
     """Fog by how far one sees in it (2 % contrast)."""
 
-    visibility: Annotated[Metres, Field(gt=0)]
+    visibility: Annotated[Metres, Field(gt=0, examples=["30 m"])]
 
 
 class Smoke(Section):
     """Smoke by its extinction or by how far one sees in it (2 % contrast)."""
 
-    extinction: Annotated[PerMetre, Field(gt=0)] | None = None
-    visibility: Annotated[Metres, Field(gt=0)] | None = None
+    extinction: Annotated[PerMetre, Field(gt=0)] | None = Field(default=None, examples=["0.5 /m"])
+    visibility: Annotated[Metres, Field(gt=0)] | None = Field(default=None, examples=["30 m"])
 
     @model_validator(mode="after")
     def _one_density(self) -> "Smoke":
@@ -85,8 +85,10 @@ class Smoke(Section):
 class Phase(Section):
     """A Henyey-Greenstein phase function of mean cosine g, or the sum of several as (weight, g)."""
 
-    g: MeanCosine | None = None
-    terms: tuple[tuple[Annotated[float, Field(gt=0)], MeanCosine], ...] | None = None
+    g: MeanCosine | None = Field(default=None, examples=["0.85"])
+    terms: tuple[tuple[Annotated[float, Field(gt=0)], MeanCosine], ...] | None = Field(
+        default=None, examples=["[[0.9, 0.9], [0.1, -0.5]]"]
+    )
 
     @model_validator(mode="after")
     def _whole(self) -> "Phase":
@@ -102,17 +104,17 @@ class Phase(Section):
 class Medium(Section):
     """A homogeneous scattering medium. Exactly one of `fog`, `smoke` and `extinction` says how dense it is."""
 
-    fog: Fog | None = None
-    smoke: Smoke | None = None
-    extinction: Annotated[PerMetre, Field(gt=0)] | None = None
+    fog: Fog | None = Field(default=None, examples=["{visibility: 30 m}"])
+    smoke: Smoke | None = Field(default=None, examples=["{extinction: 0.5 /m}"])
+    extinction: Annotated[PerMetre, Field(gt=0)] | None = Field(default=None, examples=["0.1 /m"])
     backscatter: PerSteradian = DROPLET_BACKSCATTER
     """Phase function near 180 degrees, where no `phase` is given. Water droplets 0.05, smoke 0.027, isotropic
     0.0796."""
-    phase: Literal["isotropic"] | Phase | None = None
+    phase: Literal["isotropic"] | Phase | None = Field(default=None, examples=["{g: 0.85}"])
     """The phase function at all angles, in place of `backscatter`."""
-    scattering_share: float = Field(default=1.0, ge=0, le=1)
+    scattering_share: float = Field(default=1.0, ge=0, le=1, examples=["0.96"])
     """Scattering over extinction; droplets hardly absorb visible light."""
-    forward_share: float = Field(default=0.0, ge=0, le=0.5)
+    forward_share: float = Field(default=0.0, ge=0, le=0.5, examples=["0.5"])
     """Part of the scattering that is diffraction, which turns light by `FORWARD_ANGLE` only: it blurs the stripe in
     place of dimming it. Droplets 0.5; 0 takes all scattered light as lost to the stripe."""
     multiple_scattering: bool = True

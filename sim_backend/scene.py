@@ -12,12 +12,15 @@ seed: 1                                                       # where the drops 
 """
 
 import difflib
+import os
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
-import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
+from calibration.errors import FileError
+from calibration.files.problems import Sources, validated
+from calibration.files.yaml_file import load_yaml
 from drivers.errors import DeviceError
 from drivers.units import Lux, Metres, MetresPerSecond, Radians
 from sim_backend.medium import Fog, Medium, Section
@@ -35,22 +38,22 @@ CLEAR = "clear"
 class Ambient(Section):
     """Daylight or lamps on the scene, diffuse."""
 
-    illuminance: Annotated[Lux, Field(ge=0)]
+    illuminance: Annotated[Lux, Field(ge=0, examples=["100 lux"])]
 
 
 class Motion(Section):
     """How the surfaces move, all of them together and straight on, from the bench's time 0 on."""
 
-    velocity: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond]
+    velocity: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] = Field(examples=["[0 m/s, 0 m/s, -2 m/s]"])
     """Along x (right), y (down), z (away from the camera)."""
 
 
 class BoardPlace(Section):
     """Where a calibration board is held, as `calibration.views.BoardPose` has it."""
 
-    rotation: tuple[Radians, Radians, Radians]
+    rotation: tuple[Radians, Radians, Radians] = Field(examples=["[20 deg, 0 deg, 0 deg]"])
     """Rotation vector; all 0: square to the camera's axis."""
-    position: tuple[Metres, Metres, Metres]
+    position: tuple[Metres, Metres, Metres] = Field(examples=["[-30 cm, -20 cm, 1.5 m]"])
     """Of the top left corner of the board's squares: x right, y down, z away from the camera."""
 
 
@@ -66,17 +69,19 @@ class BoardShown(BoardPlace):
 class SceneFile(Section):
     """A whole scene file."""
 
-    surfaces: str = "street"
-    board: BoardShown | tuple[BoardShown, ...] = ()
+    surfaces: str = Field(default="street", examples=["street"])
+    board: BoardShown | tuple[BoardShown, ...] = Field(
+        default=(), examples=["{rotation: [20 deg, 0 deg, 0 deg], position: [-30 cm, -20 cm, 1.5 m]}"]
+    )
     """What stands in front of the wall where `surfaces` is `board`."""
-    wall: Annotated[Metres, Field(gt=0)] = 4.0
+    wall: Annotated[Metres, Field(gt=0, examples=["4 m"])] = 4.0
     """How far behind the camera's plane the wall is that boards stand in front of."""
-    medium: Medium | None = None
-    rain: Rain | None = None
-    snow: Snow | None = None
-    ambient: Ambient | None = None
-    motion: Motion | None = None
-    seed: int = Field(default=1, ge=0, lt=2**63)
+    medium: Medium | None = Field(default=None, examples=["{fog: {visibility: 30 m}}"])
+    rain: Rain | None = Field(default=None, examples=["{rate: 20 mm/h}"])
+    snow: Snow | None = Field(default=None, examples=["{rate: 2 mm/h}"])
+    ambient: Ambient | None = Field(default=None, examples=["{illuminance: 100 lux}"])
+    motion: Motion | None = Field(default=None, examples=["{velocity: [0 m/s, 0 m/s, -2 m/s]}"])
+    seed: int = Field(default=1, ge=0, lt=2**63, examples=["1"])
     """Which drops and flakes there are, where, and which speckle."""
 
     @model_validator(mode="after")
@@ -114,31 +119,25 @@ def bundled_scenes() -> tuple[str, ...]:
 def load_scene(name: str) -> tuple[SceneFile, Path]:
     """The scene of a bundled name, a scene file or a folder of surfaces, and the folder its paths are relative to.
 
-    A bare folder is its surfaces in clear, dark air. DeviceError, one line, where there is no such scene or it is
-    wrong."""
+    A bare folder is its surfaces in clear, dark air. DeviceError where there is no such scene or it is wrong, a line
+    for each problem of its file."""
     bundled = SCENE_FOLDER / f"{name}.yaml"
     path = Path(name).expanduser()
     file = bundled if name in bundled_scenes() else path
-    if file.is_dir():
+    if os.path.isdir(file):  # unlike Path.is_dir, it takes any text for a name
         return SceneFile(surfaces=str(file.resolve())), file
-    if not file.is_file():
-        close = difflib.get_close_matches(name, bundled_scenes(), n=1)
-        meant = f"; did you mean {close[0]!r}?" if close else ""
+    if not os.path.isfile(file):
+        close = difflib.get_close_matches(path.stem, bundled_scenes(), n=1)
+        meant = f"did you mean '{close[0]}'? " if close else ""
         raise DeviceError(
-            f"scene {name!r} is no file, no folder and none of the bundled: {', '.join(bundled_scenes())}{meant}"
+            f"scene {name!r} is no file, no folder and none of the bundled; {meant}bundled scenes are "
+            f"{', '.join(bundled_scenes())}"
         )
     try:
-        content: Any = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise DeviceError(f"scene file {file} cannot be read: {reason}") from error
-    try:
-        return SceneFile.model_validate({} if content is None else content), file.parent
-    except ValidationError as error:
-        problems = "; ".join(
-            f"{'.'.join(str(part) for part in item['loc']) or 'file'}: {item['msg']}" for item in error.errors()
-        )
-        raise DeviceError(f"scene file {file}: {problems}") from error
+        read = load_yaml(file, "a scene", "surfaces: street")
+        return validated(SceneFile, read.content, Sources(str(file), read.lines)), file.parent
+    except FileError as error:
+        raise DeviceError("\n".join(error.problems)) from error
 
 
 def with_fog(scene: SceneFile, visibility: str) -> SceneFile:

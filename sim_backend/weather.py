@@ -52,7 +52,7 @@ class Sizes:
 class Rain(Section):
     """Rain by the water that falls."""
 
-    rate: Annotated[MetresPerHour, Field(gt=0, le=0.3)]
+    rate: Annotated[MetresPerHour, Field(gt=0, le=0.3, examples=["20 mm/h"])]
     backscatter: PerSteradian = DROPLET_BACKSCATTER
     """Phase function of a drop near 180 degrees."""
     wind: MetresPerSecond = 0.0
@@ -81,8 +81,8 @@ class Rain(Section):
 class Snow(Section):
     """Snow by the water that falls."""
 
-    rate: Annotated[MetresPerHour, Field(gt=0, le=0.05)]
-    albedo: float = Field(default=0.9, ge=0, le=1)
+    rate: Annotated[MetresPerHour, Field(gt=0, le=0.05, examples=["2 mm/h"])]
+    albedo: float = Field(default=0.9, ge=0, le=1, examples=["0.9"])
     wind: MetresPerSecond = 0.0
     """Drift towards +x."""
 

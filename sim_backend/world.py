@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
@@ -49,8 +49,8 @@ def _known(wanted: Wanted) -> Wanted:
     return wanted
 
 
-def _known_fog(fog: str | None) -> str | None:
-    if fog in (None, CLEAR):
+def _known_fog(fog: object) -> object:
+    if fog is None or fog == CLEAR:
         return fog
     try:
         visibility_m = parse_quantity(fog, "length")
@@ -83,7 +83,7 @@ class WorldConfig(KindConfig):
     """
     scene: str = "street"
     """A bundled scene's name, a scene file, or a folder of surfaces."""
-    fog: Annotated[str | None, AfterValidator(_known_fog)] = None
+    fog: Annotated[str | None, BeforeValidator(_known_fog)] = None
     """How far one sees in the scene's air, in place of what the scene says: a visibility such as `20 m`, or `clear`."""
     board_pose: BoardPlace | None = None
     """Where the scene's calibration board is held, in place of where the scene has it."""
@@ -109,9 +109,18 @@ class SimulatedWorld:
     def __init__(self, config: WorldConfig, surroundings: Surroundings) -> None:
         """DeviceError where the geometry, the scene or the focus cannot be used."""
         self.config = config
-        self.model = _load_geometry(DEFAULT_GEOMETRY if config.geometry is None else Path(config.geometry))
+        wrong: list[str] = []
+        try:
+            self.model = _load_geometry(DEFAULT_GEOMETRY if config.geometry is None else Path(config.geometry))
+        except DeviceError as error:
+            wrong.append(str(error))
+        try:
+            self.scene, folder = load_scene(config.scene)
+        except DeviceError as error:
+            wrong.append(str(error))
+        if wrong:
+            raise DeviceError("\n".join(wrong))
         camera = self.model.camera
-        self.scene, folder = load_scene(config.scene)
         if config.fog is not None:
             self.scene = with_fog(self.scene, config.fog)
         if config.board_pose is not None:

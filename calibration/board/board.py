@@ -16,12 +16,11 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ValidationError
 
 from calibration.board.board_file import BoardFile
 from calibration.errors import CalibrationError
-from calibration.files.sections import explain
-from calibration.files.yaml_file import read_yaml
+from calibration.files.problems import Sources, validated
+from calibration.files.yaml_file import load_yaml
 
 Array = NDArray[np.float64]
 
@@ -160,19 +159,20 @@ class Board:
 def load_board(path: str | os.PathLike[str] = BUNDLED_BOARD) -> Board:
     """The board that a YAML file describes. Raises CalibrationError, one line, where it describes none."""
     file = Path(path)
-    content = read_yaml(file, "a board")
+    read = load_yaml(file, "a board", "kind: charuco")
+    parsed = validated(BoardFile, read.content, Sources(str(file), read.lines))
     try:
-        return parse_board(content)
+        return _board(parsed)
     except CalibrationError as error:
         raise CalibrationError(f"{file}: {error}") from error
 
 
 def parse_board(content: Mapping[str, Any]) -> Board:
     """A board from the keys of its file, lengths as text with a unit. Raises CalibrationError."""
-    try:
-        parsed = BoardFile.model_validate(dict(content))
-    except ValidationError as error:
-        raise CalibrationError(explain(error)) from error
+    return _board(validated(BoardFile, content, Sources("board")))
+
+
+def _board(parsed: BoardFile) -> Board:
     return Board(parsed.kind, parsed.squares, parsed.square, parsed.marker, parsed.dictionary)
 
 

@@ -1,8 +1,8 @@
-"""What a calibration file may say, section by section, and what is said of a file that says something else."""
+"""What a calibration file may say, section by section."""
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from calibration.verdict import VerdictWord
 
@@ -125,24 +125,3 @@ class CalibrationFile(Section):
         if (self.planes is None) == (self.scanner is None):
             raise ValueError("give exactly one of 'planes' and 'scanner'")
         return self
-
-
-def explain(error: ValidationError) -> str:
-    """The validation errors on one line, the offending key first."""
-    said = []
-    for problem in error.errors():
-        # A union reports once per member, with the member's name in the path; the key is what people need.
-        key = ".".join(str(part) for part in problem["loc"] if not str(part).startswith(("list[", "str")))
-        if problem["type"] == "extra_forbidden":
-            text = f"unknown key '{key}'; remove it or correct its spelling"
-        elif problem["type"] == "missing":
-            text = f"'{key}' is missing"
-        elif problem["type"] == "value_error":
-            text = f"{key + ': ' if key else ''}{problem['ctx']['error']}"
-        else:
-            value = repr(problem["input"])
-            shown = value if len(value) < 60 else value[:57] + "..."
-            text = f"{key} is {shown}: {problem['msg'][0].lower()}{problem['msg'][1:]}"
-        if text not in said:
-            said.append(text)
-    return "; ".join(said[:5]) + (f"; and {len(said) - 5} more" if len(said) > 5 else "")

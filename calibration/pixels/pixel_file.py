@@ -71,6 +71,12 @@ def save_pixels(version: PixelVersion, path: str | os.PathLike[str]) -> None:
     scratch.replace(file)
 
 
+_DAMAGE = (
+    ArithmeticError, AttributeError, EOFError, KeyError, RecursionError, TypeError, ValueError, zipfile.BadZipFile,
+)  # fmt: skip
+"""What reading a file raises that is not as it was written."""
+
+
 def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:
     """Read one. CalibrationError where there is none."""
     file = Path(path)
@@ -89,5 +95,5 @@ def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:
         return PixelVersion(pixels, int(about["version"]), str(about["created"]), about["parent"], str(about["sensor"]))
     except OSError as error:
         raise CalibrationError(f"cannot read {file}: {error.strerror or error}; {_NEXT}") from error
-    except (EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
         raise CalibrationError(f"{file} holds no map of pixels ({error}); {_NEXT}") from error

@@ -5,7 +5,6 @@ t_ns from the run's start on the host's monotonic clock, ">" towards the device.
 each line is one write at its end. Of the SPAD it is the control traffic alone; its frames are in the recording.
 """
 
-import json
 import logging
 import os
 import threading
@@ -16,6 +15,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from drivers.errors import ProtocolError
+from drivers.json_text import parse_json
 
 _log = logging.getLogger(__name__)
 
@@ -128,8 +128,8 @@ def read_taps(file: Path) -> list[Passed]:
     found = []
     for number, line in enumerate(lines, 1):
         try:
-            found.append(_passed(json.loads(line)))
-        except (KeyError, TypeError, ValueError) as error:
+            found.append(_passed(parse_json(line)))
+        except (ArithmeticError, KeyError, TypeError, ValueError) as error:
             raise ProtocolError(f"{file}, line {number} is not as it was written: {error!r}") from None
     return sorted(found, key=lambda passed: passed.t_ns)
 

@@ -6,7 +6,6 @@
 A session that was interrupted, or whose views made no calibration, leaves its views, which are a source for the next.
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +17,7 @@ from calibration.board.board import Board, load_board
 from calibration.files.rig_file import CALIBRATION_FILE, save_rig_model
 from calibration.model.rig_model import Identity, RigModel
 from calibration.views import View
+from drivers.json_text import parse_json
 from rig.calibrating.sources import VIEWS
 from rig.calibrating.view_files import save_view
 from rig.calibration_notes import carry_notes
@@ -35,7 +35,7 @@ BOARD_FILE = "board.yaml"
 def session_rig(folder: Path) -> Identity | None:
     """Which rig the views of a session are of; None where it does not say."""
     try:
-        content = json.loads((folder / RIG_FILE).read_text(encoding="utf-8"))
+        content = parse_json((folder / RIG_FILE).read_text(encoding="utf-8"))
         return Identity(**{**content, "reasons": tuple(content["reasons"])})
     except FileNotFoundError:
         return None

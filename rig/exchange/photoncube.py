@@ -4,7 +4,6 @@ Packed along the width, most significant bit first (`numpy.packbits(axis=2)`). W
 it may: `NAME.json` of `rig export` (width, frame rate, frame numbers) or visionsim's `transforms.json` (width).
 """
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -14,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.json_text import parse_json
 from rig.errors import UsageError
 from rig.exchange.foreign import ForeignFrames, chunks_of
 from rig.packed_arrays import PACK, holds_bits, open_array
@@ -109,7 +109,7 @@ def _beside(file: Path) -> Mapping[str, Any]:
     """What `rig export` or visionsim wrote beside a cube; nothing where there is no such file."""
     for sidecar in (file.with_suffix(".json"), file.with_name(TRANSFORMS)):
         try:
-            content = json.loads(sidecar.read_text(encoding="utf-8"))
+            content = parse_json(sidecar.read_text(encoding="utf-8"))
         except FileNotFoundError:
             continue
         except (OSError, ValueError) as error:

@@ -1,13 +1,13 @@
 """What stands beside the frames of a recording so that they mean something without the rig: plan and calibration."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import yaml
 
-from calibration.errors import CalibrationError
+from calibration.errors import CalibrationError, FileError
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
+from calibration.files.yaml_file import load_yaml
 from calibration.model.rig_model import RigModel
 from rig.blanking import MOST_CHIP_FRAMES, Blanking
 from rig.config_files import PLAN_FORMAT
@@ -45,9 +45,10 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
     """The plan that a recording was taken with. UsageError where there is none that this program reads."""
     file = folder / name
     try:
-        text = file.read_text(encoding="utf-8")
-        content = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except FileNotFoundError:
+        content = load_yaml(file, "a plan", f"format: {PLAN_FORMAT}").content
+    except FileError as error:
+        if not isinstance(error.__cause__, FileNotFoundError):
+            raise UsageError(*(f"{line}; take it from a copy of the recording" for line in error.problems)) from error
         if holds_frames_alone(folder):
             raise UsageError(
                 f"{folder} holds frames without the plan of a scan, as imported ones are; say how they were taken: "
@@ -56,32 +57,14 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
         raise UsageError(
             f"{folder} has no {name}, by which its frames are bound to columns; take it from a copy of the recording"
         ) from None
-    except OSError as error:
-        raise UsageError(f"cannot read {file}: {error.strerror or error}; take it from a copy") from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UsageError(f"{file} is no YAML; take it from a copy of the recording") from error
-    head = (content.get("format"), content.get("version")) if isinstance(content, dict) else None
-    if head != (PLAN_FORMAT, PLAN_VERSION):
+    if (content.get("format"), content.get("version")) != (PLAN_FORMAT, PLAN_VERSION):
         raise UsageError(f"{file} is not the plan of a recording ('format: {PLAN_FORMAT}', version {PLAN_VERSION})")
     try:
-        _require_no_more_than(content, len(text))
         plan = from_plain(ScanPlan, content.get("plan"))
         _require_sizes(plan)
     except (ValueError, TypeError, KeyError, ArithmeticError) as error:
         raise UsageError(f"{file}: {error}; take it from a copy of the recording") from error
     return plan
-
-
-def _require_no_more_than(content: Any, most: int) -> None:
-    """ValueError where a file of `most` characters tells of more values, as YAML's aliases within aliases do."""
-    left, seen = [content], 0
-    while left:
-        one = left.pop()
-        seen += 1
-        if seen > most:
-            raise ValueError("its aliases stand for more values than it has characters")
-        if isinstance(one, Mapping | list):
-            left += one.values() if isinstance(one, Mapping) else one
 
 
 def _require_sizes(plan: ScanPlan) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from drivers.json_text import parse_json
 from rig.errors import DamagedRecordingError, UsageError
 
 MANIFEST: Final = "manifest.json"
@@ -34,8 +35,8 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     except OSError as error:
         raise DamagedRecordingError(f"{folder / MANIFEST} cannot be read: {error.strerror or error}") from error
     try:
-        content = json.loads(raw)
-    except (ValueError, RecursionError) as error:
+        content = parse_json(raw)
+    except ValueError as error:
         raise DamagedRecordingError(f"{MANIFEST} is no JSON any more: {str(error).splitlines()[0]}; {_NEXT}") from None
     if not isinstance(content, dict) or content.get(SEAL) != _crc32(content):
         raise DamagedRecordingError(f"{MANIFEST} is not as it was written, its checksum does not fit; {_NEXT}")

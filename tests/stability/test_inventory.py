@@ -95,7 +95,7 @@ ELSEWHERE = {
         "calibration.robust:*",
     ),
     "numbers in words": ("tests/unit/calibration/test_digits.py", "calibration.digits:*"),
-    "words of a file": ("tests/unit/calibration/test_model_files.py", "calibration.files.yaml_file:*"),
+    "words of a file": ("tests/unit/calibration/test_model_files.py", "calibration.files.*:*"),
     "rays and surfaces put together; their light in test_light.py": (
         "tests/unit/sim/test_scene.py", "sim_backend.view:make_view",
     ),

@@ -13,8 +13,11 @@ import pytest
 import typer
 import yaml
 
+from drivers.errors import DeviceError
 from rig.bundled import BUNDLED
 from rig.cli import app
+from rig.config_files import bundled_configs
+from rig.errors import UsageError
 from tests.system.conftest import Rig
 
 
@@ -266,6 +269,91 @@ def test_check_says_valid_or_what_is_wrong(rig: Rig, small: Path) -> None:
     ran = rig("config", "check", small)
     assert (ran.code, len(ran.problems)) == (2, 1)
     assert "scan.columns is 'many'" in ran.err
+
+
+def test_check_opens_every_file_that_a_config_names(rig: Rig, small: Path) -> None:
+    content = yaml.safe_load(small.read_text())
+    content["calibration"] = "none.yaml"
+    content["world"] |= {"scene": "scenes/nowhere.yaml", "geometry": "none-either.yaml"}
+    content["spad"] = {"kind": "replay", "recording": "runs/none"}
+    small.write_text(yaml.safe_dump(content))
+    ran = rig("config", "check", small)
+    assert ran.code == 2
+    assert ran.out == ""
+    beside = small.parent
+    assert [problem.split(";")[0] for problem in ran.problems] == [
+        f"error: calibration: cannot read calibration {beside}/none.yaml: No such file or directory",
+        f"error: world: world geometry: cannot read calibration {beside}/none-either.yaml: No such file or directory",
+        f"error: world: scene '{beside}/scenes/nowhere.yaml' is no file, no folder and none of the bundled",
+        f"error: spad: {beside}/runs/none holds no recording (frames-000000.spb)",
+    ]
+    scanned = rig("scan", small, "--dry-run")
+    assert scanned.problems[:3] == ran.problems[:3]
+
+
+@pytest.mark.parametrize("scene", ["fog: 20", "- 1", "seed: true", "surfaces: nowhere", "surfaces: board"])
+def test_check_reads_what_the_files_say(rig: Rig, small: Path, scene: str) -> None:
+    (small.parent / "mine.yaml").write_text(scene)
+    small.write_text(small.read_text().replace("scene: street-clear", "scene: mine.yaml"))
+    ran = rig("config", "check", small)
+    assert (ran.code, len(ran.problems)) == (2, 1)
+    assert ran.problems == rig("scan", small, "--dry-run").problems
+
+
+@pytest.mark.parametrize("name", bundled_configs())
+def test_bundled_configs_are_valid_with_all_their_files(rig: Rig, name: str) -> None:
+    assert rig("config", "check", name).code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["config", "check", "nowhere"], 2),
+        (["config", "show", "nowhere"], 2),
+        (["config", "schema"], 2),  # it has no such option
+        (["laser", "off"], 2),
+        (["scan", "--maps", "many"], 2),
+        (["scan", "--nonsense"], 2),
+        (["scann"], 2),
+        ([], 2),
+        (["import"], 2),
+        (["cut", "nowhere", "--out", "out"], 2),
+        (["doctor", "nowhere"], 2),
+        (["calibrate", "planes", "nowhere.yaml"], 2),
+        (["tradeoff", "--exposures", "x"], 2),
+        (["verify", "nowhere"], 2),
+    ],
+)
+def test_with_json_an_error_is_exactly_one_object(rig: Rig, arguments: list[str], code: int) -> None:
+    ran = rig(*arguments, "--json")
+    assert ran.code == code
+    told = json.loads(ran.out)["error"]
+    assert told["code"] == code
+    assert [f"error: {problem}" for problem in told["problems"]] == ran.problems
+    assert told["problems"]
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "problems"),
+    [
+        (DeviceError("laser is gone"), 3, ["laser is gone"]),
+        (UsageError("one", "two"), 2, ["one", "two"]),
+        (KeyboardInterrupt(), 4, ["aborted"]),
+        (ZeroDivisionError("by 0"), 70, ["the program failed with ZeroDivisionError: by 0; report it"]),
+    ],
+    ids=["device", "usage", "aborted", "defect"],
+)
+def test_whatever_ends_a_command_json_says_why(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, raised: BaseException, code: int, problems: list[str]
+) -> None:
+    def fails(*_: object) -> None:
+        raise raised
+
+    monkeypatch.setattr("rig.api.check_config", fails)
+    ran = rig("config", "check", "--json")
+    assert ran.code == code
+    assert json.loads(ran.out) == {"error": {"code": code, "problems": problems}}
+    assert rig("config", "check").out == ""
 
 
 def test_the_schema_is_a_json_schema_with_the_installed_kinds(rig: Rig) -> None:

@@ -1,5 +1,6 @@
 """What `rig scan` refuses before anything moves, in a line each."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ def test_problems_of_spad_and_scanner_are_listed_together(rig: Rig, tmp_path: Pa
         ({"scan.columns": 3, "scan.exposures": 1}, "raise scan.exposures to"),
         ({"scan.depth_range": ["8 m", "1 m"]}, "near < far"),
         ({"spad.kind": "simulatd"}, "choose one of"),
-        ({"world.scene": "nowhere"}, "scene 'nowhere'"),
+        ({"world.scene": "nowhere"}, "nowhere' is no file, no folder and none of the bundled"),
         ({"calibration": "absent.yaml"}, "cannot read calibration"),
         ({"calibration": "other.yaml"}, "sensor of 128 x 40 pixels, this one has 96 x 40"),
         ({"scan.command_range": [-1, 1]}, "command"),
@@ -64,7 +65,7 @@ def test_a_bad_config_is_refused_in_a_line_and_nothing_is_left(
     (file.parent / "other.yaml").write_text(yaml.safe_dump(calibration(width=128)))
     ran = rig("scan", file, "--out", "deep/run", "--json")
     assert ran.code == 2
-    assert ran.out == ""
+    assert json.loads(ran.out)["error"]["problems"] == [line.removeprefix("error: ") for line in ran.problems]
     assert said in ran.err
     assert ran.err.splitlines() == ran.problems
     assert len(ran.problems) == 1

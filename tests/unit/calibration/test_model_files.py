@@ -147,9 +147,9 @@ def test_the_fingerprint_changes_with_what_depth_depends_on() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "first entry must be 'format: spadrig-calibration'"),
+        ("", "is empty; a calibration must hold keys and values, e.g. 'format: spadrig-calibration'"),
         ("just: text", "first entry must be"),
-        ("[1, 2", "is not YAML"),
+        ("[1, 2", "not YAML"),
         ("format: spadrig-calibration\nversion: 2\n", "has version 2; this program reads version 1"),
         (HEAD + ROWS, "'camera' is missing"),
         (HEAD + CAMERA, "exactly one of 'planes' and 'scanner'"),

@@ -9,6 +9,8 @@ from rig.config import MIN_DARK_FRACTION, Estimator, Filter
 from rig.config_files import (
     BUNDLED,
     bundled_configs,
+    completed_text,
+    config_content,
     config_schema,
     find_config,
     load_config,
@@ -92,6 +94,21 @@ def test_all_problems_are_listed_at_once_in_the_order_of_the_file(write):
     ("change", "message"),
     [
         (("exposures: 4", "exposures: 2.5"), "scan.exposures is 2.5, it must be a whole number"),
+        (("columns: 100", "columns: true"), "scan.columns is true, it must be a whole number; write for example 'col"),
+        (("exposures: 4", "dark_fraction: true"), "scan.dark_fraction is true, it must be a number; write for"),
+        (("exposures: 4", "dark_fraction: .nan"), "scan.dark_fraction is nan, it must be a finite number"),
+        (("exposures: 4", "command_range: [-0.5, .inf]"), "scan.command_range.1 is inf, it must be a finite number"),
+        (("exposures: 4", "command_range: [-0.5, true]"), "scan.command_range.1 is true, it must be a number"),
+        (("exposures: 4", "power: 0 W"), "scan.power is '0 W', it must be more than 0 W"),
+        (("world: {kind: simulated}", "world: {kind: simulated, fog: 20}"), "world.fog: 20 has no unit"),
+        (
+            ("world: {kind: simulated}", "world: {kind: simulated, line: {sigma_px: .nan}}"),
+            "world.line.sigma_px is nan, it must be a finite number",
+        ),
+        (("name: test", "name: test\nfog: 20 m"), "unknown key 'fog'; did you mean 'world.fog'?"),
+        (("name: test", "name: test\nexposures: 5"), "unknown key 'exposures'; did you mean 'scan.exposures'?"),
+        (("name: test", "name: test\n3: 5"), "key 3 is no text; put it in quotes"),
+        (("name: test", "name: test\nestimate: 5"), "estimate is 5, it must be keys and values"),
         (("exposures: 4", "exposures: many"), "scan.exposures is 'many', it must be a whole number"),
         (("exposures: 4", "bidirectional: maybe"), "scan.bidirectional is 'maybe', it must be true or false"),
         (("exposures: 4", "command_range: [-2, 1]"), "scan.command_range.0 is -2, it must be at least -1"),
@@ -205,6 +222,91 @@ def test_a_config_named_by_a_relative_path_is_written_out_for_any_folder(write, 
     monkeypatch.chdir(tmp_path)
     for scene, meant in (("street", "street"), ("art", str(tmp_path / "art"))):
         assert portable_content(load_config("rig/r.yaml", {"world.scene": scene}))["world"]["scene"] == meant
+
+
+@pytest.mark.parametrize("name", bundled_configs())
+def test_a_config_shown_keeps_what_is_written_and_is_the_very_same(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    written = find_config(name).read_text(encoding="utf-8")
+    shown = completed_text(name)
+    file = tmp_path / "shown.yaml"
+    file.write_text(shown, encoding="utf-8")
+    assert load_config(file) == load_config(name)
+    assert completed_text(file) == shown
+    calibration = f"calibration: {BUNDLED.resolve() / 'simulated-rig.yaml'} "
+    kept = [line.replace("calibration: simulated-rig.yaml ", calibration) for line in written.splitlines()]
+    rest = iter(shown.splitlines())
+    left = [line for line in kept if "{" not in line and not any(line == other for other in rest)]
+    assert left == []  # every line is there, in the same order; those with braces may be filled in
+    assert "0 %" not in shown
+    full = load_config(name).model_dump(mode="json")
+    assert set(full) == set(config_content(shown))
+    assert set(full["scan"]) == set(config_content(shown)["scan"])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        RIG,
+        RIG.rstrip(),
+        RIG.replace("\n", "\r\n"),
+        RIG + "estimate: {}\n",
+        RIG + "estimate: {filter: none,}  # behind\n",
+        RIG + "estimate:\n    filter: none # two\n    # the end\n",
+        RIG.replace("world: {kind: simulated}", "world:\n  kind: simulated\n  fog:\n  effects: [fog,\n    stripe]"),
+        RIG.replace("name: test", "name: |\n  test"),
+        RIG.replace("name: test", 'name: "t: {ü} # 1"  # said'),
+        json.dumps(yaml.safe_load(RIG)),
+        json.dumps(yaml.safe_load(RIG), indent=2),
+        "---\n" + RIG + "...\n",
+        RIG.replace("world: {kind: simulated}", "world: {kind: simulated, scene: 'my hall.yaml', geometry: ./g.yaml}"),
+    ],
+)
+def test_a_config_in_any_style_is_completed_in_place(write, text):
+    path = write(text)
+    shown = completed_text(path)
+    again = write(shown, "again.yaml")
+    assert load_config(again) == load_config(path)
+    assert completed_text(again) == shown
+    assert not shown.startswith("# ")
+    assert "depth_range" in shown
+
+
+def test_a_config_with_aliases_is_written_anew(write):
+    path = write(
+        "# mine\n" + RIG.replace("spad: {kind", "spad: &a {kind").replace("scanner: {kind: simulated}", "scanner: *a")
+    )
+    shown = completed_text(path)
+    assert shown.startswith(f"# {path}, written anew without its comments\n")
+    assert load_config(write(shown, "again.yaml")) == load_config(path)
+
+
+def test_files_that_are_not_there_are_looked_for_beside_the_config_alone(write, tmp_path, monkeypatch):
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "hall").mkdir(parents=True)
+    monkeypatch.chdir(elsewhere)
+    for scene in ("hall", "./hall", "scenes/hall", "hall.yaml"):
+        config = load_config(
+            write(RIG.replace("world: {kind: simulated}", f"world: {{kind: simulated, scene: {scene}}}"))
+        )
+        assert config.world.model_dump()["scene"] == str(tmp_path / scene)
+    config = load_config(write(RIG.replace("spad: {kind: simulated}", "spad: {kind: replay, recording: runs/one}")))
+    assert config.spad.model_dump()["recording"] == tmp_path / "runs" / "one"
+
+
+def test_a_plan_is_checked_as_a_config_is(write):
+    def refused(text):
+        with pytest.raises(UsageError) as caught:
+            load_cube_plan(write(text, "plan.yaml"))
+        return [line.rpartition("plan.yaml")[2] for line in caught.value.problems]
+
+    assert refused("") == [" is empty; a plan must hold keys and values, e.g. 'columns: 500'"]
+    assert refused("columns: true\nexposures: .nan\nframe_rate: 100\ndepth_range: 5") == [
+        ":1: columns is true, it must be a whole number; write for example 'columns: 500'",
+        ":2: exposures is nan, it must be a finite number; write for example 'exposures: 10'",
+        ':3: frame_rate: 100 has no unit; write the frequency with a unit, like "100 kHz"',
+        ":4: depth_range is 5, it must be a list; write for example 'depth_range: [1 m, 8 m]'",
+    ]
 
 
 def test_a_config_written_out_reads_back_to_the_same(write):

@@ -51,18 +51,43 @@ def test_visibility_is_that_of_two_percent_contrast() -> None:
     assert scene.extinction_per_m == pytest.approx(3.912 / 30)
 
 
+PLACE = "rotation: [0 deg, 0 deg, 0 deg]\n  position: [0 m, 0 m, 1 m]"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("surfaces: street\nfogg: 3", "fogg"),
+        ("surfaces: street\nfogg: 3", ":2: unknown key 'fogg'; keys here are surfaces, board"),
+        ("surfaces: street\nsurface: street", "did you mean 'surfaces'"),
+        ("fog: 20", "unknown key 'fog'; did you mean 'medium.fog'. write for example 'fog: {visibility: 30 m}'"),
+        ("medium: {fog: 20}", "medium.fog is 20, it must be keys and values; write for example 'fog: {visibility: 30"),
+        ("seed: 1\nambient: 5", ":2: ambient is 5, it must be keys and values; write for example 'ambient: {illumin"),
+        ("ambient: [5 lux]", "it must be keys and values"),
+        ("seed: true", "seed is true, it must be a whole number; write for example 'seed: 1'"),
+        ("seed: .nan", "seed is nan, it must be a finite number"),
+        ("snow: {rate: 2 mm/h, albedo: true}", "snow.albedo is true, it must be a number"),
+        ("snow: {rate: 2 mm/h, albedo: .nan}", "snow.albedo is nan, it must be a finite number"),
+        ("snow: {rate: 200 mm/h}", "snow.rate is '200 mm/h', it must be at most 50 mm/h"),
+        ("wall: .inf", "wall: inf has no unit; write the length with a unit"),
+        ("wall: true", "has no unit"),
+        ("motion: {velocity: [1 m/s, 2 m/s]}", "motion.velocity has 2 values, too few; write for example 'velocity: "),
+        ("medium: {extinction: 0.1 /m, phase: 5}", "medium.phase is 5, it must be 'isotropic' or keys and values"),
+        ("medium: {extinction: 0.1 /m, phase: {g: 2}}", "medium.phase.g is 2, it must be less than 1"),
+        (
+            f"surfaces: board\nboard:\n  {PLACE}\n  mirorred: true",
+            ":5: unknown key 'board.mirorred'; did you mean 'mir",
+        ),
+        (f"surfaces: board\nboard:\n- {PLACE}\n  mirrored: 3", ":5: board.0.mirrored is 3, it must be true or false"),
+        ("true: 3", "key 1 is no text; put it in quotes"),
+        ("", "is empty; a scene must hold keys and values, e.g. 'surfaces: street'"),
         ("medium: {fog: {visibility: 30}}", "no unit"),
-        ("medium: {fog: {visibility: -30 m}}", "greater than 0"),
+        ("medium: {fog: {visibility: -30 m}}", "more than 0 m"),
         ("medium: {fog: {visibility: 30 m}, extinction: 0.1 /m}", "exactly one"),
         ("medium: {}", "exactly one"),
         ("medium: {extinction: 0.1 /m, backscatter: 0.05}", "/sr"),
         ("ambient: {illuminance: 100 m}", "lux"),
-        ("[1, 2", "cannot be read"),
-        ("- 3", "file"),
+        ("[1, 2", "not YAML"),
+        ("- 3", "holds a list; a scene must hold keys and values"),
     ],
 )
 def test_a_wrong_scene_file_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
@@ -74,9 +99,28 @@ def test_a_wrong_scene_file_is_refused_in_one_line(tmp_path: Path, text: str, me
     assert "wrong.yaml" in str(caught.value)
 
 
-def test_an_unknown_scene_lists_the_bundled_ones() -> None:
+def test_all_problems_of_a_scene_file_are_listed_in_its_order(tmp_path: Path) -> None:
+    file = tmp_path / "wrong.yaml"
+    file.write_text("rain: {rate: 20}\nseed: -1\nsnow: {rat: 2 mm/h}\n")
+    with pytest.raises(DeviceError) as caught:
+        load_scene(str(file))
+    assert [line.removeprefix(f"{file}:")[:14] for line in str(caught.value).splitlines()] == [
+        "1: rain.rate: ",
+        "2: seed is -1,",
+        "3: 'snow.rate'",
+        "3: unknown key",
+    ]
+
+
+@pytest.mark.parametrize("name", ["strete", "x" * 300, "a\0b"])
+def test_an_unknown_scene_lists_the_bundled_ones(name: str) -> None:
     with pytest.raises(DeviceError, match="street-clear"):
-        load_scene("strete")
+        load_scene(name)
+
+
+def test_an_unknown_scene_suggests_the_nearest_one() -> None:
+    with pytest.raises(DeviceError, match="did you mean 'street'"):
+        load_scene("/some/folder/strete")
 
 
 def test_the_street_is_the_same_every_time_and_lies_within_its_depths() -> None:
@@ -225,7 +269,10 @@ def test_another_fog_changes_how_dense_a_medium_is_and_nothing_else():
     assert world.scene == with_fog(scene, "20 m")
 
 
-@pytest.mark.parametrize(("fog", "named"), [("20", "no unit"), ("-1 m", "more than 0 m"), ("thick", "write clear")])
+@pytest.mark.parametrize(
+    ("fog", "named"),
+    [(20, "20 has no unit"), (True, "no unit"), ("20", "no unit"), ("-1 m", "more than 0 m"), ("thick", "write clear")],
+)
 def test_a_fog_that_is_none_is_refused(fog, named):
     with pytest.raises(ValueError, match=named):
         WorldConfig(fog=fog)

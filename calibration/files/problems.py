@@ -1,0 +1,339 @@
+"""Checks the content of a file against its model and says in one line each what is wrong: file, line, key, value, limit
+and what to write instead.
+"""
+
+import difflib
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from calibration.errors import FileError
+
+Key = tuple[str, ...]
+Model = TypeVar("Model", bound=BaseModel)
+KindOf = Callable[[str, Any], type[BaseModel] | None]
+
+MAX_VALUE_CHARACTERS = 60
+"""Values longer than this are cut in messages, which stay one line."""
+
+_TYPES = {
+    "int": "a whole number",
+    "float": "a number",
+    "finite": "a finite number",
+    "bool": "true or false",
+    "string": "text",
+    "dict": "keys and values",
+    "model": "keys and values",
+    "list": "a list",
+    "tuple": "a list",
+    "path": "a path",
+}
+"""What pydantic's error types ask for, by their first word."""
+_BOUNDS = {
+    "greater_than": ("more than", "gt"),
+    "greater_than_equal": ("at least", "ge"),
+    "less_than": ("less than", "lt"),
+    "less_than_equal": ("at most", "le"),
+}
+_READS_ON = ("is ", "has ", "runs ", "begins ")
+"""A validator's message that begins so reads on from the key; any other follows a colon."""
+_WORDS = {True: "true", False: "false", None: "null"}
+
+
+def _no_kinds(name: str, content: Any) -> None:
+    """Every section has one model."""
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Where values came from: a file with the line of each key, and the keys that were given as options.
+
+    lines_of: called where there is something wrong. flags: what the command line calls some keys.
+    """
+
+    file: str
+    lines_of: Callable[[], Mapping[Key, int]] = dict
+    options: frozenset[Key] = field(default_factory=frozenset)
+    flags: Mapping[Key, str] = field(default_factory=dict)
+
+    @cached_property
+    def lines(self) -> Mapping[Key, int]:
+        """The line of each key."""
+        return self.lines_of()
+
+    def line(self, key: Key) -> int | None:
+        """Line of a key, or of the nearest one that contains it."""
+        return next((self.lines[key[:n]] for n in range(len(key), 0, -1) if key[:n] in self.lines), None)
+
+    def flag(self, key: Key) -> str | None:
+        """The option that the value of a key was given with, where it has a name of its own."""
+        return self.flags.get(key) if self._is_option(key) else None
+
+    def place(self, key: Key) -> str:
+        """What a message begins with: the option, or the file with the line."""
+        if self._is_option(key):
+            return "option:"
+        line = self.line(key)
+        return f"{self.file}:" if line is None else f"{self.file}:{line}:"
+
+    def _is_option(self, key: Key) -> bool:
+        return any(key[: len(option)] == option for option in self.options)
+
+
+@dataclass(frozen=True, slots=True)
+class _Schema:
+    """The models behind a file's mappings."""
+
+    model: type[BaseModel]
+    content: Mapping[str, Any]
+    kind_of: KindOf
+
+    def section(self, path: Key) -> type[BaseModel] | None:
+        """The model that validates the mapping at `path`."""
+        here: type[BaseModel] | None = self.model
+        content: Any = self.content
+        for part in path:
+            content = _below(content, part)
+            if part.isdigit() and here is not None and part not in here.model_fields:
+                continue  # an item of a list has the model of the list's items
+            if here is None or part not in here.model_fields:
+                return None
+            here = self.of(part, here.model_fields[part], content)
+        return here
+
+    def of(self, name: str, info: FieldInfo, content: Any) -> type[BaseModel] | None:
+        """The model of what a field holds, where it holds mappings."""
+        return self.kind_of(name, content) or _model_in(info.annotation)
+
+    def field(self, key: Key) -> FieldInfo | None:
+        """The field at `key`; for an item of a list, the list's."""
+        named = _named(key)
+        section = self.section(named[:-1])
+        return section.model_fields.get(named[-1]) if section is not None and named else None
+
+    def keys_called(self, name: str) -> Iterator[Key]:
+        """Where a key of that name would be known, the outermost first."""
+        level: list[tuple[Key, type[BaseModel], Any]] = [((), self.model, self.content)]
+        while level:
+            yield from ((*path, name) for path, model, _ in level if name in model.model_fields)
+            level = [
+                ((*path, part), below, _below(content, part))
+                for path, model, content in level
+                for part, info in model.model_fields.items()
+                if (below := self.of(part, info, _below(content, part))) is not None and part not in path
+            ]
+
+
+def validated(
+    model: type[Model],
+    content: Mapping[str, Any],
+    sources: Sources,
+    kind_of: KindOf = _no_kinds,
+    context: Mapping[str, Any] | None = None,
+) -> Model:
+    """The content as a model. Raises FileError with a line for each problem, in the order of the file.
+
+    true and false are no numbers, and a number is finite, whatever pydantic takes. kind_of: gives the model of a
+    section whose model depends on its content, by the section's name and its content.
+    """
+    schema = _Schema(model, content, kind_of)
+    found: dict[Key, list[ErrorDetails]] = {}
+    result = None
+    try:
+        result = model.model_validate(content, context=context)
+    except ValidationError as error:
+        for problem in error.errors():
+            found.setdefault(_key(problem, content), []).append(problem)
+    told = []
+    for key, value, words in _no_numbers(schema, model, content, ()):
+        if all(problem["type"] in _BOUNDS for problem in found.get(key, [])):  # true is at most 1, and NaN nothing
+            found.pop(key, None)
+            dotted, then = sources.flag(key) or ".".join(key), _then(key, schema, sources.flag(key))
+            told.append((key, f"{dotted} is {_shown(value)}, it must be {words}{then}"))
+    keys = [*found, *(key for key, _ in told)]
+    for key, problems in found.items():
+        if not _is_met_below(key, problems, keys):
+            told.append((key, _text(problems, key, schema, sources.flag(key))))
+    if result is not None and not told:
+        return result
+    told.sort(key=lambda item: sources.line(item[0]) or 0)
+    lines = [text if sources.flag(key) else f"{sources.place(key)} {text}" for key, text in told]
+    raise FileError(*dict.fromkeys(lines))
+
+
+def _is_met_below(key: Key, problems: Iterable[ErrorDetails], found: Iterable[Key]) -> bool:
+    """Whether a value is of one of several shapes, the problems are those of the others, and its own lie within it."""
+    shape = all(problem["type"] == "literal_error" or problem["type"].endswith("_type") for problem in problems)
+    return shape and any(len(other) > len(key) and other[: len(key)] == key for other in found)
+
+
+def _no_numbers(
+    schema: _Schema, model: type[BaseModel], content: Mapping[str, Any], path: Key
+) -> Iterator[tuple[Key, Any, str]]:
+    """Truth values, NaN and infinities where numbers are due: key, value and what it must be."""
+    for name, value in content.items():
+        info = model.model_fields.get(name)
+        if info is None:
+            continue
+        below = schema.of(name, info, value)
+        words = _number_words(info.annotation)
+        for key, leaf in _leaves(value, (*path, name)):
+            if isinstance(leaf, Mapping):
+                if below is not None:
+                    yield from _no_numbers(schema, below, leaf, key)
+            elif words is not None:
+                if isinstance(leaf, bool):
+                    yield key, leaf, words
+                elif isinstance(leaf, float) and not math.isfinite(leaf):
+                    yield key, leaf, "a finite number"
+
+
+def _leaves(value: Any, key: Key) -> Iterator[tuple[Key, Any]]:
+    """Mappings, and what is neither a mapping nor a list."""
+    if isinstance(value, list | tuple):
+        for i, item in enumerate(value):
+            yield from _leaves(item, (*key, str(i)))
+    else:
+        yield key, value
+
+
+def _number_words(annotation: Any) -> str | None:
+    """What a field asks for that takes numbers and no truth values."""
+    kinds = set(plain_types(annotation))
+    if bool in kinds or not kinds & {int, float}:
+        return None
+    return _TYPES["float" if float in kinds else "int"]
+
+
+def plain_types(annotation: Any) -> Iterator[type]:
+    """The types that a field's annotation is made of."""
+    if isinstance(annotation, type) and not getattr(annotation, "__args__", ()):
+        yield annotation
+    for part in getattr(annotation, "__args__", ()):
+        yield from plain_types(part)
+
+
+def _key(problem: ErrorDetails, content: Any) -> Key:
+    """Where a problem is: pydantic's own names for validators and members of unions left out."""
+    key: list[str] = []
+    for i, part in enumerate(problem["loc"]):
+        last = i == len(problem["loc"]) - 1
+        if isinstance(part, int) and isinstance(content, list | tuple):
+            known = True
+        elif isinstance(content, Mapping):
+            known = part in content or (last and problem["type"] == "missing")
+        else:
+            known = False
+        if known:
+            key.append(str(part))
+            content = _below(content, part)
+    return tuple(key)
+
+
+def _below(content: Any, part: str | int) -> Any:
+    if isinstance(content, Mapping):
+        return content.get(part)
+    try:
+        return content[int(part)] if isinstance(content, list | tuple) else None
+    except (IndexError, ValueError):
+        return None
+
+
+def _named(key: Key) -> Key:
+    while key and key[-1].isdigit():
+        key = key[:-1]
+    return key
+
+
+def _text(problems: list[ErrorDetails], key: Key, schema: _Schema, flag: str | None) -> str:
+    """flag: the option that the value was given with."""
+    # Of a value with several shapes, what a shape that fits says of it is worth more than that others do not fit.
+    problem = next((one for one in problems if one["type"] == "value_error"), problems[0])
+    dotted = flag or ".".join(key)
+    kind, context = problem["type"], problem.get("ctx", {})
+    then = _then(key, schema, flag)
+    if kind == "invalid_key":
+        return f"key {dotted} is no text; put it in quotes"
+    if kind == "extra_forbidden":
+        return _unknown_key(key, schema)
+    if kind == "missing" and key[-1].isdigit():
+        return f"{'.'.join(key[:-1])} has {key[-1]} values, too few{then}"
+    if kind == "missing":
+        return f"'{dotted}' is missing{then or '; add it'}"
+    if kind == "value_error":
+        message = str(context["error"])
+        between = "" if not dotted else " " if message.startswith(_READS_ON) else ": "
+        return f"{dotted}{between}{message}"
+    value = _shown(problem["input"])
+    if kind in _BOUNDS:
+        words, name = _BOUNDS[kind]
+        return f"{dotted} is {value}, it must be {words} {_limit(schema.field(key), context[name])}{then}"
+    if kind == "literal_error" and len(problems) == 1:
+        return f"{dotted} is {value}; choose {context['expected']}{_meant(problem['input'], context['expected'])}"
+    if kind in ("too_short", "too_long"):
+        return f"{dotted} is {value}, of the wrong length{then}"
+    words = " or ".join(dict.fromkeys(filter(None, map(_asked_for, problems))))
+    if words:
+        return f"{dotted} is {value}, it must be {words}{then}"
+    return f"{dotted} is {value}: {problem['msg'][:1].lower()}{problem['msg'][1:]}{then}"
+
+
+def _limit(info: FieldInfo | None, value: float) -> str:
+    """A limit in the unit of its field, where that has one: its metadata then knows how numbers are `written`."""
+    marks = [] if info is None else [*info.metadata, *_metadata(info.annotation)]
+    written = next((mark.written for mark in marks if hasattr(mark, "written")), None)
+    return f"{float(value):g}" if written is None else str(written(value))
+
+
+def _metadata(annotation: Any) -> Iterator[Any]:
+    yield from getattr(annotation, "__metadata__", ())
+    for part in getattr(annotation, "__args__", ()):
+        yield from _metadata(part)
+
+
+def _asked_for(problem: ErrorDetails) -> str:
+    if problem["type"] == "literal_error":
+        return str(problem["ctx"]["expected"])
+    return _TYPES.get(problem["type"].split("_")[0], "")
+
+
+def _then(key: Key, schema: _Schema, flag: str | None) -> str:
+    info = schema.field(key)
+    if info is None or not info.examples:
+        return ""
+    return f"; write for example '{f'{_named(key)[-1]}: ' if flag is None else f'{flag} '}{info.examples[0]}'"
+
+
+def _unknown_key(key: Key, schema: _Schema) -> str:
+    section = schema.section(key[:-1])
+    known = list(section.model_fields) if section is not None else []
+    elsewhere = next(schema.keys_called(key[-1]), None)
+    close = difflib.get_close_matches(key[-1], known, n=1)
+    if elsewhere is not None:
+        meant = f"did you mean '{'.'.join(elsewhere)}'?{_then(elsewhere, schema, None).replace(';', '', 1)}"
+    else:
+        meant = f"did you mean '{close[0]}'?" if close else f"keys here are {', '.join(known)}"
+    return f"unknown key '{'.'.join(key)}'; {meant}"
+
+
+def _meant(value: object, expected: str) -> str:
+    choices = [part.strip("' ") for part in expected.replace(" or ", ", ").split(",")]
+    close = difflib.get_close_matches(str(value), choices, n=1)
+    return f"; did you mean '{close[0]}'?" if close else ""
+
+
+def _shown(value: object) -> str:
+    text = _WORDS[value] if value is None or isinstance(value, bool) else repr(value)
+    return text if len(text) <= MAX_VALUE_CHARACTERS else f"{text[: MAX_VALUE_CHARACTERS - 3]}..."
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((found for part in getattr(annotation, "__args__", ()) if (found := _model_in(part)) is not None), None)

@@ -1,0 +1,37 @@
+"""The one reader of JSON files: what nests too deep or counts beyond 64 bits is a ValueError like any other damage."""
+
+import json
+from typing import Any, Final
+
+MAX_DEPTH: Final = 64
+"""Most lists and mappings within one another."""
+_MOST_DIGITS: Final = 20
+"""Of a whole number of 64 bits."""
+
+
+def parse_json(text: str | bytes) -> Any:
+    """What a text of JSON says. Raises ValueError, one line, where it is none or more than this program takes."""
+    try:
+        content = json.loads(text, parse_int=_whole)
+    except RecursionError:
+        raise ValueError(_TOO_DEEP) from None
+    _require_flat(content, MAX_DEPTH)
+    return content
+
+
+def _whole(digits: str) -> int:
+    if len(digits.lstrip("-")) > _MOST_DIGITS:
+        raise ValueError(f"a whole number has {len(digits)} digits, at most {_MOST_DIGITS} are taken")
+    return int(digits)
+
+
+def _require_flat(content: Any, left: int) -> None:
+    if not isinstance(content, dict | list):
+        return
+    if left == 0:
+        raise ValueError(_TOO_DEEP)
+    for part in content.values() if isinstance(content, dict) else content:
+        _require_flat(part, left - 1)
+
+
+_TOO_DEEP: Final = f"nested more than {MAX_DEPTH} deep"
