@@ -41,7 +41,7 @@ class AdaptiveAcquisition:
     """A scan of `maps` maps in the passes that `passes` chooses; as `Acquisition`, iterate once over `run()`.
 
     whole: the plan of one sweep over all columns. on_pass: called before a pass, with the number of its map and its
-    plan. starts: with which sweep the passes of a recording begin; None: it is none.
+    plan. starts: with which sweep the passes of a recording begin; None: it is none. learns: as of `Acquisition`.
     """
 
     def __init__(
@@ -59,6 +59,7 @@ class AdaptiveAcquisition:
         recording: Recording | None = None,
         watch: Watch | None = None,
         on_progress: Callable[[ScanProgress], None] | None = None,
+        learns: bool = False,
         silence_s: float = SILENCE_S,
     ) -> None:
         self._rig = rig
@@ -73,6 +74,7 @@ class AdaptiveAcquisition:
         self._recording = recording
         self._watch = watch
         self._on_progress = on_progress
+        self._learns = learns
         self._silence_s = silence_s
         self._frames = 0
         self._done = 0
@@ -125,6 +127,7 @@ class AdaptiveAcquisition:
             count_s += found.compute_s
             self.taken += 1
         assert counts is not None, "there is a first pass"
+        self._say("learning" if self._learns and index == 0 else "estimating")
         result = self._reconstructor.map(counts)
         self.stages = replace(self.stages, estimation_s=self.stages.estimation_s + result.compute_s)
         return AcquiredMap(
@@ -140,7 +143,7 @@ class AdaptiveAcquisition:
             "starts": iter([next(self._starts)]) if self._starts is not None else None,
             "recording": self._recording,
             "watch": self._watch,
-            "on_progress": self._tell if self._on_progress is not None else None,
+            "on_progress": self._tell,
             "silence_s": self._silence_s,
         }
 
@@ -156,13 +159,17 @@ class AdaptiveAcquisition:
         return found
 
     def _tell(self, now: ScanProgress) -> None:
-        assert self._on_progress is not None, "only then"
-        planned = round(self._maps * self._whole.frames_per_sweep)
-        lost = now.lost + (self.counters.lost or 0)
-        stages = self.stages.and_then(now.stages)
-        self._on_progress(
-            ScanProgress(self._frames + now.frames, max(planned, self._frames), lost, self._done, self._maps, stages)
-        )
+        self._say(now.stage, now.frames, now.lost, self.stages.and_then(now.stages))
+
+    def _say(self, stage: str, frames: int = 0, lost: int = 0, stages: PipelineStats | None = None) -> None:
+        """Of the pass under way so many frames. How many there will be is decided pass by pass."""
+        if self._on_progress is None:
+            return
+        frames += self._frames
+        planned = max(round(self._maps * self._whole.frames_per_sweep), frames)
+        lost += self.counters.lost or 0
+        stages = stages or self.stages
+        self._on_progress(ScanProgress(frames, planned, lost, self._done, self._maps, stages, stage=stage))
 
 
 class _PassMaker:

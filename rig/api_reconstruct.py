@@ -11,7 +11,8 @@ from rig.config import CubePlan, EstimateConfig, Estimator, Filter
 from rig.config_files import load_cube_plan
 from rig.errors import UsageError
 from rig.estimators import ESTIMATORS, FILTERS
-from rig.run import OutFolder, Progress, RunResult
+from rig.progress import Progress
+from rig.run import OutFolder, RunResult
 
 
 def reconstruct(

@@ -8,7 +8,8 @@ from rig.api_config import SIMULATED, Config, configure
 from rig.api_scan import MAX_SEED
 from rig.config import RigConfig
 from rig.errors import UsageError
-from rig.run import OutFolder, Progress
+from rig.progress import Progress
+from rig.run import OutFolder
 
 if TYPE_CHECKING:
     from rig.tradeoff import Tradeoff

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli_command import print_json, say
+from rig.cli_progress import paused
 
 if TYPE_CHECKING:
     from rig.calibrating.result import CalibrationResult
@@ -53,10 +54,11 @@ def ask_at_terminal() -> "Ask | None":
         return None
 
     def ask(what: str) -> None:
-        say(what)
-        sys.stderr.write("then press Enter (Ctrl-C ends the session; its views are kept) ")
-        sys.stderr.flush()
-        sys.stdin.readline()
+        with paused():
+            say(what)
+            sys.stderr.write("then press Enter (Ctrl-C ends the session; its views are kept) ")
+            sys.stderr.flush()
+            sys.stdin.readline()
 
     return ask
 

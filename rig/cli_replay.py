@@ -20,10 +20,10 @@ from rig.cli_command import (
     RecordOption,
     command,
     default_out,
-    live_progress,
     report,
     say,
 )
+from rig.cli_progress import progress
 
 if TYPE_CHECKING:
     from drivers.replay_pace import Pace
@@ -82,7 +82,7 @@ def replay_command(
     from rig import api
 
     options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
-    with live_progress() as live:
+    with progress():
         result = api.replay(
             run,
             clock=clock,
@@ -98,7 +98,6 @@ def replay_command(
             out=default_out() if out is None else out,
             record=record,
             on_overload=on_overload,
-            live=live,
             steps=_step_by_keys if clock == "step" else None,
             **options,
         )

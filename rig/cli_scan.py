@@ -18,11 +18,10 @@ from rig.cli_command import (
     SceneOption,
     command,
     default_out,
-    live_progress,
     print_json,
-    progress,
     report,
 )
+from rig.cli_progress import progress
 
 if TYPE_CHECKING:
     from rig.config import AdaptiveConfig
@@ -90,7 +89,7 @@ def scan_command(
         checked: dict[str, Any] = {"maps": maps, "seed": seed, "save": save, "on_overload": on_overload}
         plan = api.plan_scan(config, accept_calibration=accept_calibration, **checked, **options)
         return _show_plan(plan, api.configure(config, **options).scan.adaptive, as_json)
-    with live_progress() as live:
+    with progress():
         result = api.scan(
             config,
             maps=maps,
@@ -100,7 +99,6 @@ def scan_command(
             out=default_out() if out is None else out,
             record=record,
             on_overload=on_overload,
-            live=live,
             accept_calibration=accept_calibration,
             **options,
         )
@@ -153,8 +151,8 @@ def reconstruct_command(
     # Names that are none are refused by the call, which knows which there are.
     options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
     options["accept_calibration"] = accept_calibration
-    with progress("done") as bar:
-        result = api.reconstruct(source, plan, calibration, out=out, progress=bar, **options)
+    with progress():
+        result = api.reconstruct(source, plan, calibration, out=out, **options)
     return report(result, as_json)
 
 
@@ -188,8 +186,8 @@ def effects_command(
         else:
             flux_table(flux)
         return 0
-    with progress("trial scans") as bar:
-        effects = api.effects(chosen, scene=scene, trials=trials, progress=bar)
+    with progress():
+        effects = api.effects(chosen, scene=scene, trials=trials)
     if as_json:
         print_json(effects.as_json())
     else:

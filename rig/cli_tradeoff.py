@@ -13,11 +13,11 @@ from rig.cli_command import (
     command,
     default_out,
     print_json,
-    progress,
     say,
     split_option,
     whole_numbers,
 )
+from rig.cli_progress import progress
 
 Some = list[str] | None
 
@@ -65,7 +65,7 @@ def tradeoff_command(
     use."""
     from rig import api
 
-    with progress("frames") as bar:
+    with progress():
         done = api.tradeoff(
             config,
             scenes=split_option("--scene", scene),
@@ -82,7 +82,6 @@ def tradeoff_command(
             of=of,
             accept_calibration=accept_calibration,
             out=default_out() if out is None else out,
-            progress=bar,
         )
     if as_json:
         print_json(done.as_json())

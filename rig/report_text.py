@@ -39,9 +39,20 @@ def run_table(result: RunResult) -> None:
             for file in sorted((result.folder / name).glob("*.p[nl][gy]"))[-1:]:
                 table.add_row(what, str(file))
     verdict = summary.verdict.value
-    advice = _NEXT_STEP.get(summary.verdict)
+    advice = _advice(result)
     table.add_row("verdict", f"{verdict}: {advice}" if advice else verdict)
     console().print(table)
+
+
+def _advice(result: RunResult) -> str | None:
+    """What follows from the verdict; of an aborted run what of it is there."""
+    summary = result.summary
+    if summary.verdict is not Verdict.ABORTED or (summary.maps and result.folder is not None):
+        return _NEXT_STEP.get(summary.verdict)
+    if summary.maps:
+        return "the run ended before its last map"
+    kept = "nothing is kept" if result.folder is None else f"the recorded frames are kept in {result.folder}"
+    return f"the run ended before its first map was whole; {kept}"
 
 
 def effects_table(scene: SceneEffects) -> None:
@@ -49,7 +60,7 @@ def effects_table(scene: SceneEffects) -> None:
     table = Table(box=None, pad_edge=False)
     for name in ("effect", "", "photons", "stripe error", "decisions changed", "us per frame"):
         table.add_column(name, justify="right" if name not in ("effect", "") else "left", no_wrap=True)
-    table.add_column("why")
+    table.add_column("why", min_width=_WHY_CELLS, ratio=1)
     for effect in scene:
         bound = effect.changed_decisions_bound
         table.add_row(

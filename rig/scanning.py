@@ -9,7 +9,7 @@ from typing import Any
 
 from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
-from rig.acquisition import SILENCE_S, Acquisition, ScanProgress
+from rig.acquisition import SILENCE_S, Acquisition, ScanProgress, told_of
 from rig.adaptive_decision import ChoosesPasses, DecidedPasses
 from rig.adaptive_recording import PassNotes, RecordedPasses
 from rig.adaptive_scan import AdaptiveAcquisition
@@ -22,6 +22,7 @@ from rig.monitor import Watch
 from rig.overload import Overload, require_policy
 from rig.plan import spad_request
 from rig.plan_figures import plan_content
+from rig.progress import tell_stage
 from rig.reconstruction import Reconstructor
 from rig.recording.devices import devices_content
 from rig.recording.inputs import write_inputs
@@ -69,9 +70,8 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
     replayed = Replayed.of(rig.spad, plan, maps)
     maps = maps or 1 if replayed is None else replayed.maps
     threads = rig.config.estimate.threads or os.cpu_count() or 1
-    reconstructor = make_reconstructor(
-        rig, plan, threads, () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
-    )
+    recalled = () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
+    reconstructor = make_reconstructor(rig, plan, threads, recalled)
     geometry = reconstructor.geometry
     passes = _passes(rig, plan, timing, geometry, threads, replayed)
     run.rays = geometry.rays if rig.model is not None else None
@@ -90,12 +90,14 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         "maps": maps,
         "on_overload": options.policy.value,
     }
+    learns = estimate.estimator in LEARNING
     settings: dict[str, Any] = {
         "policy": options.policy,
         "starts": None if replayed is None else replayed.starts(),
         "recording": _recording(rig, run, plan, timing, maps, manifest) if options.record else None,
         "watch": options.watch,
-        "on_progress": options.live,
+        "learns": learns and not recalled,
+        "on_progress": told_of(options.live, frames_known=passes is None),
         "silence_s": SILENCE_S if replayed is None else replayed.silence_s,
     }
     acquisition: Acquisition | AdaptiveAcquisition
@@ -110,7 +112,7 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
             maps,
             reconstructor,
             # Learning takes a second or more, and a live stream cannot stand still meanwhile.
-            first_alone=estimate.estimator in LEARNING and not rig.spad.info.can_wait,
+            first_alone=learns and not rig.spad.info.can_wait,
             groups=None if replayed is None else replayed.groups(),
             on_sweep=options.sweeps,
             **settings,
@@ -144,7 +146,8 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
     )
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:
-            ended_by.add_note(f"{len(of_maps)} of {maps} maps were whole and are in {result.folder}")
+            whole = f"{len(of_maps)} of {maps} maps were whole and are" if of_maps else "no map was whole; frames are"
+            ended_by.add_note(f"{whole} in {result.folder}")
         raise ended_by
     return result
 
@@ -215,6 +218,7 @@ def _collect(
             if replayed is not None:
                 truth = replayed.truth(found.sweep.index)
             elif rig.world is not None:  # asked only now: no estimate ever sees it
+                tell_stage("comparing with the truth")
                 velocity_per_s = plan.velocity_per_s(found.sweeps[0].direction)
                 truth = rig.world.truth(plan.line_commands(found.column), velocity_per_s)
             of_maps.append(found.sweeps)  # before its map: whatever ends the run, no map is without its account

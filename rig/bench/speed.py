@@ -7,7 +7,6 @@ begins behind the frames of the one before it, so that frames come from memory.
 import os
 import tempfile
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from rig.bench.frames import PLACE_FRAMES, BenchFrames, window_frames
 from rig.bench.latency import Latency, measure_latency
 from rig.bench.machine import machine
 from rig.bench.stages import Measured, StripeError, Walk, count_stage
+from rig.progress import Progress, counted, tell_stage
 from rig.row_threads import RowWorkers
 
 REAL_TIME_HZ = 100_000
@@ -69,7 +69,7 @@ class SpeedReport:
 
 
 def measure_speed(
-    threads: int | None = None, extent: Extent | None = None, progress: Callable[[int, int], None] | None = None
+    threads: int | None = None, extent: Extent | None = None, progress: Progress | None = None
 ) -> SpeedReport:
     """Measure everything. threads: the most; by default one for each core. progress: told rows done and all."""
     begun = time.perf_counter()
@@ -81,10 +81,12 @@ def measure_speed(
         workers = {n: stack.enter_context(RowWorkers(n)) for n in sorted({1, min(2, most), most})}
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="spadrig-bench-")))
         frames = {window: window_frames(window, workers[most], extent.frames_bytes) for window in extent.windows}
+        tell_stage("learning")
         learned = {window: learn(these, most) for window, these in frames.items()}
         cases = stream_cases(frames, learned, workers, extent, folder) + map_cases(workers, extent)
         memory, measured = _in_turn(cases, frames[extent.windows[-1]], extent, progress)
         window = usual_window(extent)
+        tell_stage("measuring the latency")
         latency = measure_latency(frames[window], LEARN_EXPOSURES, workers[most], learned[window], extent.latency_s)
     read = float(np.median(memory))
     return SpeedReport(found, read / 1e9, _rows(cases, measured, read), latency, time.perf_counter() - begun)
@@ -99,7 +101,7 @@ def warm_bench() -> None:
 
 
 def _in_turn(
-    cases: list[Case], frames: BenchFrames, extent: Extent, progress: Callable[[int, int], None] | None
+    cases: list[Case], frames: BenchFrames, extent: Extent, progress: Progress | None
 ) -> tuple[list[float], list[list[Measured]]]:
     """Bytes a second of each reading of the memory, and what each case measured in each round."""
     words = _random_words(frames, extent.read_bytes)
@@ -108,14 +110,14 @@ def _in_turn(
     read_all(words)
     for stage in {case.stage: case for case in cases}.values():  # compiled code is loaded before anything is timed
         stage.measure(0.0)
+    told = counted("measuring", "rows", progress)
     for done in range(extent.rounds):
         for i, case in enumerate(cases):
             if i % READ_EVERY == 0:
                 memory.append(_read_bytes_per_s(words))
             moment_s = extent.count_moment_s if case.stage.startswith("count") else extent.moment_s
             measured[i].append(case.measure(moment_s))
-            if progress is not None:
-                progress(done * len(cases) + i + 1, extent.rounds * len(cases))
+            told(done * len(cases) + i + 1, extent.rounds * len(cases))
     return memory, measured
 
 
