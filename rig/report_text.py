@@ -60,7 +60,7 @@ def effects_table(scene: SceneEffects) -> None:
     table = Table(box=None, pad_edge=False)
     for name in ("effect", "", "photons", "stripe error", "decisions changed", "us per frame"):
         table.add_column(name, justify="right" if name not in ("effect", "") else "left", no_wrap=True)
-    table.add_column("why", min_width=_WHY_CELLS, ratio=1)
+    table.add_column("why", overflow="fold")
     for effect in scene:
         bound = effect.changed_decisions_bound
         table.add_row(
