@@ -15,6 +15,8 @@ from rig.summary import AdaptiveFigures, Summary, Synchronisation, Verdict
 WIDE = 300
 """Characters; wider than any line here."""
 
+_NAME_CELLS = 17
+"""Of an effect's name, on each of its lines."""
 LEAST_WAIT_S = 1e-3
 """Shorter waits of the source are not worth words."""
 
@@ -57,10 +59,13 @@ def _advice(result: RunResult) -> str | None:
 
 def effects_table(scene: SceneEffects) -> None:
     """Print which effects are on, what each is worth and why, to stdout."""
-    table = Table(box=None, pad_edge=False)
-    for name in ("effect", "", "photons", "stripe error", "decisions changed", "us per frame"):
-        table.add_column(name, justify="right" if name not in ("effect", "") else "left", no_wrap=True)
-    table.add_column("why", overflow="fold")
+    # Narrow enough that a terminal of 80 columns has room for the reasons, which are wrapped.
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("effect", max_width=_NAME_CELLS if sys.stdout.isatty() else None)
+    table.add_column("", no_wrap=True)
+    for name in ("photons", "stripe error\npx", "decisions\nchanged", "us per\nframe"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("why")
     for effect in scene:
         bound = effect.changed_decisions_bound
         table.add_row(
@@ -91,8 +96,8 @@ def _error_change(effect: Effect) -> str:
     if effect.stripe_error_change_px is None:
         return "-"
     if effect.basis == "bound":
-        return f"<= {digits(effect.stripe_error_change_px, 2)} px" if effect.stripe_error_change_px else "-"
-    return f"{effect.stripe_error_change_px:+.3f} +- {effect.stripe_error_change_sd_px or 0.0:.3f} px"
+        return f"<= {digits(effect.stripe_error_change_px, 2)}" if effect.stripe_error_change_px else "-"
+    return f"{effect.stripe_error_change_px:+.3f} +- {effect.stripe_error_change_sd_px or 0.0:.3f}"
 
 
 def console() -> Console:

@@ -10,7 +10,7 @@ from rig.config import RigConfig
 from rig.errors import UsageError
 from rig.estimators import ESTIMATORS, FILTERS
 from rig.progress import Progress, part, tell_stage
-from rig.tradeoff_choice import Answer, Wish, choose
+from rig.tradeoff_choice import Answer, Wish, advice, choose
 from rig.tradeoff_limits import SceneLimits
 from rig.tradeoff_rows import MapScore, Setting, TradeoffRow, row_of, with_fronts
 from rig.tradeoff_scan import MAPS, Method, require_plan, score_methods
@@ -96,9 +96,19 @@ class Tradeoff:
     folder: Path | None = None
     accepted_calibration: tuple[str, ...] = ()
 
+    @property
+    def advice(self) -> str:
+        """Which setting to take, in a sentence."""
+        of = "of what was whole by then, " if self.verdict == "aborted" else ""
+        return of + advice(self.rows, self.wish, self.answer)
+
     def as_json(self) -> dict[str, Any]:
         """Plain values; `answer` only where a setting was asked for."""
-        content: dict[str, Any] = {"rows": [row.as_json() for row in self.rows], "ci95_by": self.ci95_by}
+        content: dict[str, Any] = {
+            "advice": self.advice,
+            "rows": [row.as_json() for row in self.rows],
+            "ci95_by": self.ci95_by,
+        }
         if self.wish is not None:
             content["answer"] = None if self.answer is None else self.answer.as_json()
         if self.accepted_calibration:

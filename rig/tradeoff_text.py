@@ -40,7 +40,9 @@ _LEFT = ("estimator", "filter", "")
 
 
 def tradeoff_table(done: Tradeoff) -> None:
-    """Print it to stdout; * marks what lies on the front of error over sensor time, + on that over compute time."""
+    """Print it to stdout, the setting to take first; * marks what lies on the front of error over sensor time, + on that over compute time."""
+    print(done.advice)
+    print()
     for place in dict.fromkeys((row.scene, row.fog, row.lines) for row in done.rows):
         rows = [row for row in done.rows if (row.scene, row.fog, row.lines) == place]
         _print(_named(*place), _FIGURES, rows)
@@ -53,8 +55,6 @@ def tradeoff_table(done: Tradeoff) -> None:
         print("In brackets: more than 5 % of the answers are missing, such an error counts for\nnothing.")
     for reason in done.accepted_calibration:
         print(f"calibration accepted in spite of {reason}")
-    if done.answer is not None:
-        print(done.answer)
     if done.folder is not None:
         print(f"files: {done.folder}")
 

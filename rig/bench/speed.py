@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.digits import digits
 from rig.bench.bench_kernels import read_all
 from rig.bench.cases import LEARN_EXPOSURES, WINDOWS, Case, Extent, learn, map_cases, stream_cases, usual_window
-from rig.bench.frames import PLACE_FRAMES, BenchFrames, window_frames
+from rig.bench.frames import COLUMNS, PLACE_FRAMES, BenchFrames, window_frames
 from rig.bench.latency import Latency, measure_latency
 from rig.bench.machine import machine
 from rig.bench.stages import Measured, StripeError, Walk, count_stage
@@ -54,6 +55,32 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
+class WorkingPoint:
+    """Whether an estimator keeps up with the sensor, counting included. maps_per_s: of COLUMNS columns; needed_per_s:
+    as many as frames at REAL_TIME_HZ make.
+    """
+
+    estimator: str
+    exposures: int
+    threads: int
+    maps_per_s: float
+    needed_per_s: float
+
+    @property
+    def keeps_up(self) -> bool:
+        """Whether no frame has to wait for long."""
+        return self.maps_per_s >= self.needed_per_s
+
+    def __str__(self) -> str:
+        """In words."""
+        at = f"at K = {self.exposures} with {self.estimator} on {self.threads} thread{'s' * (self.threads > 1)}"
+        needed, possible = digits(self.needed_per_s), digits(self.maps_per_s)
+        if self.keeps_up:
+            return f"keeps up: {needed} maps a second {at}, {possible} would be possible"
+        return f"does not keep up: {possible} of {needed} maps a second {at}"
+
+
+@dataclass(frozen=True, slots=True)
 class SpeedReport:
     """What `rig bench` found."""
 
@@ -63,9 +90,24 @@ class SpeedReport:
     latency_us: Latency
     seconds: float
 
+    @property
+    def working_points(self) -> tuple[WorkingPoint, ...]:
+        """Of each estimator at each number of exposures that whole sweeps were measured with, on all threads."""
+        most = max(row.threads for row in self.rows)
+        return tuple(
+            WorkingPoint(
+                row.stage.removesuffix("-sweep"), row.exposures, most, row.frames_per_s / frames, REAL_TIME_HZ / frames
+            )
+            for row in self.rows
+            if row.stage in ("likelihood-sweep", "joint-sweep") and row.threads == most
+            if row.exposures is not None and row.frames_per_s is not None
+            for frames in [COLUMNS * row.exposures]
+        )
+
     def as_json(self) -> dict[str, Any]:
         """For programs."""
-        return asdict(self)
+        points = [{**asdict(point), "keeps_up": point.keeps_up} for point in self.working_points]
+        return {"advice": [str(point) for point in self.working_points], "working_points": points, **asdict(self)}
 
 
 def measure_speed(
