@@ -194,7 +194,7 @@ def _watched_compiler(began: Any, ended: Any) -> Iterator[None]:
     """Within it both are called for each kernel that numba finds in none of its caches."""
     from numba.core import event
 
-    class Watch(event.Listener):  # type: ignore[misc]
+    class Watch(event.Listener):
         def on_start(self, event: Any) -> None:
             began()
 
