@@ -309,8 +309,7 @@ class Acquisition:
             return "learning" if self._learns and sweeps == 1 else "estimating"
         if isinstance(self._rig.spad, PlaysRecording):
             return "replaying"
-        simulated = self._rig.world is not None and isinstance(self._rig.clock, VirtualClock)
-        return "rendering" if simulated else "scanning"
+        return "rendering" if isinstance(self._rig.clock, VirtualClock) else "scanning"
 
     def _arm(self) -> None:
         """Arm the laser behind a gate that reads back low and wait for it; a started SPAD would overflow meanwhile."""

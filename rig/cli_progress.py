@@ -10,14 +10,12 @@ from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
-from rig.progress import Step, listening
+from rig.progress import PREPARING, Step, listening
 
 if TYPE_CHECKING:
     from rich.live import Live
     from rich.table import Table
 
-FIRST = Step("preparing")
-"""Until anything is told."""
 COMPILING = "compiling, about a minute, the first time only"
 PATIENCE_S = 2.0
 """Where there is no terminal a command that takes less says nothing of its progress."""
@@ -34,7 +32,7 @@ class ProgressLine:
         self._begun_s = time.monotonic()
         self._compilers = 0
         self._compiling = False
-        self.step = FIRST
+        self.step = Step(PREPARING)
 
     def heard(self, step: Step) -> None:
         """Take the newest step."""

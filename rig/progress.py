@@ -13,6 +13,10 @@ Progress = Callable[[int, int], None]
 """Called now and then with what is done and what there is to do, in frames, maps or rows."""
 
 
+PREPARING = "preparing"
+"""The stage before anything else is told."""
+
+
 @dataclass(frozen=True, slots=True)
 class Step:
     """One moment of a command. total: None where nobody knows how many there will be; else `done` is never more.
@@ -65,8 +69,9 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def part(name: str) -> Iterator[None]:
-    """Within it everything told is of this part of the whole."""
+    """Within it everything told is of this part of the whole, which begins with being prepared."""
     token = _part.set(name)
+    tell_stage(PREPARING)
     try:
         yield
     finally:

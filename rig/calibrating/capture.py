@@ -137,6 +137,7 @@ def _captured(
     mask = even_pixels(picture) & ~bad
     if corners is not None and board is not None:
         mask &= board_pixels(corners, board, picture.shape)
+    tell_stage("finding the line")
     passages = tuple(
         _steady(find_passages(count, sweep.direction, plan.speed_per_s, mask), plan)
         for count, sweep in zip(counts, sweeps, strict=True)

@@ -219,7 +219,6 @@ def test_progress_names_the_stage_that_the_run_is_at(learns):
         assert heard.wait(PATIENCE_S)
 
     rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], size=16, behaviour=lambda seq: seq or wait_to_be_told(seq))
-    rig = dataclasses.replace(rig, world=object())
     maker = FakeMaker(lambda index: (wait_to_be_told(index), wait_to_be_told(index)))
     list(acquisition(rig, PLAN, 2, maker, learns=learns, on_progress=told, silence_s=PATIENCE_S).run())
     assert list(dict.fromkeys(stages)) == ["rendering", *["learning"] * learns, "estimating"]

@@ -48,6 +48,7 @@ def test_what_is_told_is_heard_within_and_nowhere_else():
     tell_stage("behind")
     assert heard == [
         Step("fitting", 3, None, "views"),
+        Step("preparing", part="pose 2 of 12"),
         Step("rendering", 1, 5, "frames", "2 lost", "pose 2 of 12"),
     ]
 
@@ -101,8 +102,8 @@ def test_without_a_terminal_each_stage_is_one_line_however_often_it_is_told(impa
     assert stages(printed.err) == [
         "rendering, 0 of 5000 frames",
         "estimating, 0 of 5000 frames",
-        "pose 1 of 2: rendering",
-        "pose 2 of 2: rendering",
+        "pose 1 of 2: preparing",
+        "pose 2 of 2: preparing",
     ]
 
 
