@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, fields
 from fractions import Fraction
 
-from drivers.clock import Clock
+from drivers.clock import Clock, VirtualClock
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
@@ -25,7 +25,9 @@ from rig.mapping import MakesMaps
 from rig.monitor import Watch
 from rig.overload import Overload, require_policy, ring_for
 from rig.pipeline import JOIN_S, Pipeline
+from rig.progress import tell_stage
 from rig.recording.writer import Recording
+from rig.replaying import ENDLESS, PlaysRecording
 from rig.scan_plan import ScanPlan
 from rig.session import OpenRig
 from rig.stages import PipelineStats
@@ -45,8 +47,10 @@ TELL_S = 0.1
 class ScanProgress:
     """How far a run is, told several times a second and at its end.
 
-    frames: received, of about frames_planned; lost: the SPAD's own count. sweeps: counted, of `maps`. stages: what each
-    stage has done so far. fog: as the newest map says, None before.
+    frames: received, of frames_planned at most, which is what the plan takes from the first scan marker to the last;
+    lost: the SPAD's own count. sweeps: counted, of `maps`. stages: what each stage has done so far. fog: as the newest
+    map says, None before. stage: rendering where the frames are simulated, else scanning or replaying; learning while
+    the first map is learned from, estimating while another one is made.
     """
 
     frames: int
@@ -56,13 +60,30 @@ class ScanProgress:
     maps: int
     stages: PipelineStats
     fog: FogEstimate | None = None
+    stage: str = "scanning"
+
+
+def told_of(live: Callable[[ScanProgress], None] | None) -> Callable[[ScanProgress], None]:
+    """Tells `rig.progress` and `live` how far a scan is."""
+
+    def both(now: ScanProgress) -> None:
+        notes = [f"{now.sweeps} of {now.maps} maps counted"] if 1 < now.maps < ENDLESS else []
+        notes += [f"{now.lost} lost"] if now.lost else []
+        notes += [] if now.fog is None or not now.fog.brief() else [now.fog.brief()]
+        planned = now.frames_planned if now.maps < ENDLESS else None
+        tell_stage(now.stage, now.frames, planned, "frames", ", ".join(notes))
+        if live is not None:
+            live(now)
+
+    return both
 
 
 class Acquisition:
     """A scan of `maps` maps with an open rig, a plan and the SPAD's timing from `rig.session.prepare`.
 
     Iterate once over `run()`. maker: makes the maps, on the counting thread. first_alone: take the first map with a
-    start of its own, so that a SPAD that cannot wait stands still while it is learned from. groups: sweeps of each
+    start of its own, so that a SPAD that cannot wait stands still while it is learned from. learns: whether `maker`
+    learns from its first map. groups: sweeps of each
     start, where that is not for the scan to choose; starts: with which sweep each begins. recording, watch: what
     recorder and monitor work for, None for none. on_progress is called on the caller's thread, on_sweep as `Mapping`
     says.
@@ -79,6 +100,7 @@ class Acquisition:
         *,
         policy: Overload = Overload.ABORT,
         first_alone: bool = False,
+        learns: bool = False,
         groups: Iterator[int] | None = None,
         starts: Iterator[SweepStart] | None = None,
         recording: Recording | None = None,
@@ -101,6 +123,7 @@ class Acquisition:
         self._maker = maker
         self._policy = policy
         self._first_alone = first_alone
+        self._learns = learns
         self._recording = recording
         self._watch = watch
         self._on_progress = on_progress
@@ -111,11 +134,6 @@ class Acquisition:
         self._counters_before = SpadCounters(0, 0, 0, 0, 0)
         self._frames_before = 0
         self._fog: FogEstimate | None = None
-
-    @property
-    def frames_planned(self) -> int:
-        """Frames of all maps, nominally."""
-        return round(self._maps * self._plan.frames_per_sweep)
 
     @property
     def counters(self) -> SpadCounters:
@@ -265,11 +283,21 @@ class Acquisition:
     def _tell(self, assembler: SweepAssembler, done: int) -> None:
         if self._on_progress is None:
             return
-        frames, sweeps = self._frames_before + assembler.frames_seen, done + assembler.sweeps_done
+        planned = self._frames_before + math.ceil(self._plan.frames_for(self._maps - done))
+        frames, sweeps = min(self._frames_before + assembler.frames_seen, planned), done + assembler.sweeps_done
         stages = self.stages
         lost = self.counters.lost
         lost = stages.dropped_frames if lost is None else lost
-        self._on_progress(ScanProgress(frames, self.frames_planned, lost, sweeps, self._maps, stages, self._fog))
+        self._on_progress(
+            ScanProgress(frames, planned, lost, sweeps, self._maps, stages, self._fog, self._stage(sweeps))
+        )
+
+    def _stage(self, sweeps: int) -> str:
+        if self._pipeline is not None and self._pipeline.estimating:
+            return "learning" if self._learns and sweeps == 1 else "estimating"
+        if isinstance(self._rig.spad, PlaysRecording):
+            return "replaying"
+        return "rendering" if isinstance(self._rig.clock, VirtualClock) else "scanning"
 
     def _arm(self) -> None:
         """Arm the laser behind a gate that reads back low and wait for it; a started SPAD would overflow meanwhile."""

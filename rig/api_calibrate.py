@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from rig.api_config import SIMULATED, Config, PathLike
 from rig.calibrating.arguments import SourcesLike, length_m, listed, problems_of, quantity, read_base, read_board
 from rig.errors import UsageError
-from rig.run import OutFolder, Progress
+from rig.progress import Progress
+from rig.run import OutFolder
 
 if TYPE_CHECKING:
     from rig.calibrating.pixel_result import PixelResult

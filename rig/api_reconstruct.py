@@ -11,9 +11,10 @@ from rig.config import CubePlan, EstimateConfig, Estimator, Filter
 from rig.config_files import load_cube_plan
 from rig.errors import UsageError
 from rig.estimators import ESTIMATORS, FILTERS
+from rig.progress import Progress
 from rig.recording.inputs import holds_frames_alone
 from rig.recording.opening import require_recording
-from rig.run import OutFolder, Progress, RunResult
+from rig.run import OutFolder, RunResult
 
 
 def reconstruct(

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 from drivers.units import parse_exact
 from rig.api_config import PathLike
 from rig.errors import UsageError
-from rig.run import OutFolder, Progress
+from rig.progress import Progress
+from rig.run import OutFolder
 
 if TYPE_CHECKING:
     from rig.exchange.exporting import ExportResult

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from rig.api_config import SIMULATED, Config, PathLike, configure
 from rig.errors import UsageError
-from rig.run import Progress
+from rig.progress import Progress
 
 if TYPE_CHECKING:
     from rig.attached import Attached

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 from rig.api_config import SIMULATED, Config, PathLike, configure, seed_problems
 from rig.config import Estimator, Filter, RigConfig
 from rig.errors import UsageError
-from rig.run import OutFolder, Progress, Run, RunResult
+from rig.progress import Progress
+from rig.run import OutFolder, Run, RunResult
 from rig.saving import SavePolicy
 from rig.summary import MapTally
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 from rig.api_config import MAX_SEED, SIMULATED, Config, configure
 from rig.config import RigConfig
 from rig.errors import UsageError
-from rig.run import OutFolder, Progress
+from rig.progress import Progress
+from rig.run import OutFolder
 
 if TYPE_CHECKING:
     from rig.tradeoff import Tradeoff

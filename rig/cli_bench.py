@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from rig.cli_command import ConfigArgument, JsonOption, command, print_json, progress
+from rig.cli_command import ConfigArgument, JsonOption, command, print_json
+from rig.cli_progress import progress
 
 
 def register(app: typer.Typer) -> None:
@@ -53,13 +54,12 @@ def bench_command(
         return _bench_disk(disk, as_json)
     stream = None
     if soak is not None:  # before all that takes a minute: what it is asked for may be wrong
-        with progress("frames") as bar:
+        with progress():
             stream = api.soak(
                 soak, threads=threads, window=window, slow_consumer_s=slow_consumer / 1e3, on_overload=on_overload,
-                progress=bar,
             )  # fmt: skip
-    with progress("rows") as bar:
-        report = api.bench(threads=threads, progress=bar)
+    with progress():
+        report = api.bench(threads=threads)
     if as_json:
         print_json(report.as_json() | ({} if stream is None else {"soak": stream.as_json()}))
     else:
@@ -91,8 +91,8 @@ def _require_used(measured: list[bool], *, of_rows: bool, of_soak: bool) -> None
 def _bench_disk(folder: Path, as_json: bool) -> int:
     from rig import api
 
-    with progress("measurements") as bar:
-        found = api.bench_disk(folder, progress=bar)
+    with progress():
+        found = api.bench_disk(folder)
     if as_json:
         print_json(found.as_json())
     else:
@@ -105,8 +105,8 @@ def _bench_disk(folder: Path, as_json: bool) -> int:
 def _bench_simulator(as_json: bool) -> int:
     from rig import api
 
-    with progress("rows") as bar:
-        found = api.bench_simulator(progress=bar)
+    with progress():
+        found = api.bench_simulator()
     if as_json:
         print_json(found.as_json())
     else:
@@ -121,7 +121,8 @@ def warmup_command(config: ConfigArgument = "simulated", as_json: JsonOption = F
     """Compile everything that is compiled, so that no scan waits for it."""
     from rig import api
 
-    seconds = api.warm_up(config)
+    with progress():
+        seconds = api.warm_up(config)
     if as_json:
         print_json({"seconds": seconds})
     else:

@@ -25,11 +25,11 @@ from rig.cli_command import (
     command,
     default_out,
     print_json,
-    progress,
     say,
     whole_numbers,
 )
 from rig.cli_completion import one_of, rig_names
+from rig.cli_progress import progress
 
 
 def register(app: typer.Typer) -> None:
@@ -74,7 +74,7 @@ def pixels_command(
     from rig.calibrating.printed import print_result
 
     ask = ask_at_terminal()
-    with progress("frames") as bar:
+    with progress():
         result = api.calibrate_pixels(
             source,
             frames=frames,
@@ -84,7 +84,6 @@ def pixels_command(
             against=against,
             seed=seed,
             out=default_out() if out is None else out,
-            progress=bar,
             covered=None if ask is None else lambda: ask("cover the lens"),
         )
     if as_json:
@@ -117,18 +116,19 @@ def camera_command(
     """Calibrate the camera alone, from views of a board or from pictures."""
     from rig import api
 
-    result = api.calibrate_camera(
-        sources or (),
-        board=board,
-        poses=poses,
-        terms=terms,
-        scene=scene,
-        seed=seed,
-        arm=arm,
-        out=default_out() if out is None else out,
-        ask=ask_at_terminal(),
-        tell=say,
-    )
+    with progress():
+        result = api.calibrate_camera(
+            sources or (),
+            board=board,
+            poses=poses,
+            terms=terms,
+            scene=scene,
+            seed=seed,
+            arm=arm,
+            out=default_out() if out is None else out,
+            ask=ask_at_terminal(),
+            tell=say,
+        )
     return print_report(result, as_json)
 
 
@@ -166,25 +166,26 @@ def planes_command(
     """Calibrate camera, light planes and lag from views of a board."""
     from rig import api
 
-    result = api.calibrate_planes(
-        sources or (),
-        board=board,
-        poses=poses,
-        guided=guided,
-        calibration=calibration,
-        camera=camera,
-        stated_baseline=stated_baseline,
-        accuracy=accuracy,
-        at=at,
-        scene=scene,
-        exposures=whole_numbers("--exposures", exposures),
-        seed=seed,
-        arm=arm,
-        accept_calibration=accept_calibration,
-        out=default_out() if out is None else out,
-        ask=ask_at_terminal(),
-        tell=say,
-    )
+    with progress():
+        result = api.calibrate_planes(
+            sources or (),
+            board=board,
+            poses=poses,
+            guided=guided,
+            calibration=calibration,
+            camera=camera,
+            stated_baseline=stated_baseline,
+            accuracy=accuracy,
+            at=at,
+            scene=scene,
+            exposures=whole_numbers("--exposures", exposures),
+            seed=seed,
+            arm=arm,
+            accept_calibration=accept_calibration,
+            out=default_out() if out is None else out,
+            ask=ask_at_terminal(),
+            tell=say,
+        )
     return print_report(result, as_json)
 
 
@@ -206,18 +207,19 @@ def sync_command(
     """Measure the mirror's lag each way and the rows' delay, from one unmoved scene at several speeds."""
     from rig import api
 
-    result = api.calibrate_sync(
-        sources or (),
-        calibration=calibration,
-        exposures=whole_numbers("--exposures", exposures),
-        accuracy=accuracy,
-        at=at,
-        scene=scene,
-        seed=seed,
-        arm=arm,
-        out=default_out() if out is None else out,
-        tell=say,
-    )
+    with progress():
+        result = api.calibrate_sync(
+            sources or (),
+            calibration=calibration,
+            exposures=whole_numbers("--exposures", exposures),
+            accuracy=accuracy,
+            at=at,
+            scene=scene,
+            seed=seed,
+            arm=arm,
+            out=default_out() if out is None else out,
+            tell=say,
+        )
     return print_report(result, as_json)
 
 
@@ -244,19 +246,20 @@ def check_command(
     """Judge a calibration by scans of a flat board: flatness, scale, angle."""
     from rig import api
 
-    result = api.calibrate_check(
-        sources or (),
-        board=board,
-        poses=poses,
-        calibration=calibration,
-        angle=angle,
-        accuracy=accuracy,
-        at=at,
-        scene=scene,
-        seed=seed,
-        arm=arm,
-        out=default_out() if out is None else out,
-        ask=ask_at_terminal(),
-        tell=say,
-    )
+    with progress():
+        result = api.calibrate_check(
+            sources or (),
+            board=board,
+            poses=poses,
+            calibration=calibration,
+            angle=angle,
+            accuracy=accuracy,
+            at=at,
+            scene=scene,
+            seed=seed,
+            arm=arm,
+            out=default_out() if out is None else out,
+            ask=ask_at_terminal(),
+            tell=say,
+        )
     return print_report(result, as_json)

@@ -8,6 +8,7 @@ import typer
 
 from rig.cli_command import print_json, say
 from rig.cli_completion import one_of, rig_names, scene_names
+from rig.cli_progress import paused
 
 if TYPE_CHECKING:
     from rig.calibrating.result import CalibrationResult
@@ -60,10 +61,11 @@ def ask_at_terminal() -> "Ask | None":
         return None
 
     def ask(what: str) -> None:
-        say(what)
-        sys.stderr.write("then press Enter (Ctrl-C ends the session; its views are kept) ")
-        sys.stderr.flush()
-        sys.stdin.readline()
+        with paused():
+            say(what)
+            sys.stderr.write("then press Enter (Ctrl-C ends the session; its views are kept) ")
+            sys.stderr.flush()
+            sys.stdin.readline()
 
     return ask
 

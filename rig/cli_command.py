@@ -4,8 +4,7 @@ import errno
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
@@ -15,7 +14,6 @@ import typer
 from rig.cli_completion import estimator_names, filter_names, one_of, rig_names, scene_names
 
 if TYPE_CHECKING:
-    from rig.acquisition import ScanProgress
     from rig.recording.space import Space
     from rig.run import RunResult
 
@@ -155,39 +153,6 @@ def print_json(content: Mapping[str, Any]) -> None:
     from rig.outputs import json_text
 
     print(json_text(content))
-
-
-@contextmanager
-def progress(what: str) -> Iterator["Callable[..., None] | None"]:
-    """A progress bar on stderr while somebody is watching it: what is done, all there is, how many got lost, a note."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)
-
-        def update(done: int, total: int, lost: int = 0, note: str = "") -> None:
-            parts = [what, *([f"{lost} lost"] if lost else []), *([note] if note else [])]
-            bar.update(task, completed=done, total=total, description=", ".join(parts))
-
-        yield update
-
-
-@contextmanager
-def live_progress() -> Iterator["Callable[[ScanProgress], None] | None"]:
-    """The progress bar of an acquisition's frames, with what the fog meter says."""
-    with progress("frames") as bar:
-
-        def tell(done: "ScanProgress") -> None:
-            assert bar is not None, "somebody is watching"
-            bar(done.frames, done.frames_planned, done.lost, "" if done.fog is None else done.fog.brief())
-
-        yield None if bar is None else tell
 
 
 def say_space(space: "Space") -> None:

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from rig.cli_command import JsonOption, command, print_json, progress, say
+from rig.cli_command import JsonOption, command, print_json, say
+from rig.cli_progress import progress
 
 
 def register(app: typer.Typer) -> None:
@@ -52,10 +53,8 @@ def import_command(
     """Make a recording of the frames in another program's files."""
     from rig import api
 
-    with progress("frames") as bar:
-        result = api.import_frames(
-            kind, files, out, form=form, frame_rate=frame_rate, turn_deg=rotate, rows=rows, progress=bar
-        )
+    with progress(compiles=False):
+        result = api.import_frames(kind, files, out, form=form, frame_rate=frame_rate, turn_deg=rotate, rows=rows)
     for hint in result.hints:
         say(f"warning: {hint}")
     if as_json:
@@ -92,10 +91,8 @@ def export_command(
     """Write a run in a form that other programs read."""
     from rig import api
 
-    with progress("frames") as bar:
-        result = api.export_run(
-            run, kind, out=out, view=view, frames_per_picture=frames, pictures_per_s=fps, progress=bar
-        )
+    with progress(compiles=False):
+        result = api.export_run(run, kind, out=out, view=view, frames_per_picture=frames, pictures_per_s=fps)
     for line in result.damage:
         say(f"warning: {line}")
     if as_json:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli_command import JsonOption, command, print_json, say
+from rig.cli_progress import progress
 
 if TYPE_CHECKING:
     from rig.recording.info import RecordingInfo
@@ -33,7 +34,8 @@ def verify_command(run: RunArgument, as_json: JsonOption = False) -> int:
     """Read every byte of a recording and say whether it is what was recorded; exit code 1 where it is not."""
     from rig import api
 
-    found = api.verify(run)
+    with progress(compiles=False):
+        found = api.verify(run)
     if as_json:
         print_json(found.as_json())
     else:
@@ -45,7 +47,8 @@ def repair_command(run: RunArgument, as_json: JsonOption = False) -> int:
     """Make a torn recording whole: cut torn tails off, write a lost index or manifest anew; frames stay as they are."""
     from rig import api
 
-    made = api.repair(run)
+    with progress(compiles=False):
+        made = api.repair(run)
     if as_json:
         print_json({"done": made.done, "after": made.after.as_json()})
     else:
@@ -86,7 +89,8 @@ def cut_command(
     """Write a part of a recording to a folder of its own, with all that is needed to reconstruct it."""
     from rig import api
 
-    content = api.cut(run, out, maps=maps, frames=frames, time=time, start=start)
+    with progress(compiles=False):
+        content = api.cut(run, out, maps=maps, frames=frames, time=time, start=start)
     if as_json:
         print_json({"out": str(out), "recording": content["recording"], "cut": content["cut"]})
     else:
@@ -100,7 +104,8 @@ def compress_command(run: RunArgument, as_json: JsonOption = False) -> int:
     """Compress a recording with zstd; every command reads it as before."""
     from rig import api
 
-    made = api.compress(run)
+    with progress(compiles=False):
+        made = api.compress(run)
     if as_json:
         print_json({"segments": made.segments, "bytes_before": made.bytes_before, "bytes_after": made.bytes_after})
     else:

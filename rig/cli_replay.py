@@ -20,12 +20,12 @@ from rig.cli_command import (
     RecordOption,
     command,
     default_out,
-    live_progress,
     report,
     say,
     say_space,
 )
 from rig.cli_completion import one_of, rig_names
+from rig.cli_progress import progress
 
 if TYPE_CHECKING:
     from drivers.replay_pace import Pace
@@ -85,7 +85,7 @@ def replay_command(
     from rig import api
 
     options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
-    with live_progress() as live:
+    with progress():
         result = api.replay(
             run,
             clock=clock,
@@ -101,7 +101,6 @@ def replay_command(
             out=default_out() if out is None else out,
             record=record,
             on_overload=on_overload,
-            live=live,
             on_space=say_space,
             steps=_step_by_keys if clock == "step" else None,
             **options,

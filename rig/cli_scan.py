@@ -18,13 +18,12 @@ from rig.cli_command import (
     SceneOption,
     command,
     default_out,
-    live_progress,
     print_json,
-    progress,
     report,
     say_space,
 )
 from rig.cli_completion import one_of, rig_names
+from rig.cli_progress import progress
 
 if TYPE_CHECKING:
     from rig.recording.space import Space
@@ -87,7 +86,7 @@ def scan_command(
         spaces: list[Space] = []
         plan = api.plan_scan(config, on_space=spaces.append, **checked, **options)
         return _show_plan(plan, spaces[0] if spaces else None, as_json)
-    with live_progress() as live:
+    with progress():
         result = api.scan(
             config,
             maps=maps,
@@ -97,7 +96,6 @@ def scan_command(
             out=out,
             record=record,
             on_overload=on_overload,
-            live=live,
             on_space=say_space,
             accept_calibration=accept_calibration,
             **options,
@@ -145,8 +143,8 @@ def reconstruct_command(
     # Names that are none are refused by the call, which knows which there are.
     options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
     options["accept_calibration"] = accept_calibration
-    with progress("done") as bar:
-        result = api.reconstruct(source, plan, calibration, out=out, progress=bar, **options)
+    with progress():
+        result = api.reconstruct(source, plan, calibration, out=out, **options)
     return report(result, as_json)
 
 
@@ -187,8 +185,8 @@ def effects_command(
         else:
             flux_table(flux)
         return 0
-    with progress("trial scans") as bar:
-        effects = api.effects(chosen, scene=scene, trials=trials, progress=bar)
+    with progress():
+        effects = api.effects(chosen, scene=scene, trials=trials)
     if as_json:
         print_json(effects.as_json())
     else:

@@ -13,12 +13,12 @@ from rig.cli_command import (
     command,
     default_out,
     print_json,
-    progress,
     say,
     split_option,
     whole_numbers,
 )
 from rig.cli_completion import estimator_names, filter_names, scene_names, some_of
+from rig.cli_progress import progress
 
 Some = list[str] | None
 
@@ -81,7 +81,7 @@ def tradeoff_command(
     use."""
     from rig import api
 
-    with progress("frames") as bar:
+    with progress():
         done = api.tradeoff(
             config,
             scenes=split_option("--scene", scene),
@@ -98,7 +98,6 @@ def tradeoff_command(
             of=of,
             accept_calibration=accept_calibration,
             out=default_out() if out is None else out,
-            progress=bar,
         )
     if as_json:
         print_json(done.as_json())

@@ -7,8 +7,10 @@ from rig.calibration_identity import CalibrationUse, accepted_by
 from rig.config import EstimateConfig
 from rig.counting import SweepLayout
 from rig.cube import Cube, Gap, column_commands, count_map
+from rig.estimators import LEARNING
+from rig.progress import Progress, counted, tell_stage
 from rig.reconstruction import Reconstructor
-from rig.run import OutFolder, Progress, Run, RunResult
+from rig.run import OutFolder, Run, RunResult
 from rig.summary import MapTally, RunFrames, Verdict
 from rig.warm_up import warm_up
 
@@ -43,16 +45,18 @@ def reconstruct_cube(
     with Run(out, tally) as run:
         run.rays = geometry.rays
         verdict = Verdict.COMPLETE
+        told = counted("estimating", "maps", progress)
         try:
             for index in range(cube.maps):
+                if estimate.estimator in LEARNING and not index:
+                    tell_stage("learning")
                 begun = time.perf_counter()
                 sweep, missing = count_map(cube, index, counter)
                 count_s = time.perf_counter() - begun
                 result = reconstructor.map(sweep)
                 gaps.append(missing)
                 run.add(result, count_s + result.compute_s)
-                if progress is not None:
-                    progress(tally.maps, cube.maps)
+                told(tally.maps, cube.maps)
         except KeyboardInterrupt:
             verdict = Verdict.ABORTED
         gaps_of_run = [gap for of_map in gaps[: tally.maps] for gap in of_map]

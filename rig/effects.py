@@ -15,7 +15,7 @@ from drivers.registry import Surroundings, lookup
 from rig.config import RigConfig
 from rig.errors import PlanError, UsageError
 from rig.multi_line import line_grid
-from rig.run import Progress
+from rig.progress import Progress, part
 from rig.scan_plan import column_command
 from rig.scoring import MISSING_PX, charged_errors
 from rig.session import ProjectsLines
@@ -184,19 +184,22 @@ def _trials(
     if config.world is None or config.world.real_time:
         return {}
     columns = min(TRIAL_COLUMNS - TRIAL_COLUMNS % -len(config.line_offsets), config.scan.columns)
+    trials = 1 + len(tried)
     while True:
         try:
-            whole = _trial(config, columns, on)
+            with part(f"trial scan 1 of {trials}"):
+                whole = _trial(config, columns, on)
             break
         except PlanError:  # the mirror cannot sweep as fast
             if columns == config.scan.columns:
                 raise
             columns = min(2 * columns, config.scan.columns)
     changes = {}
-    for done, name in enumerate(tried):
+    for done, name in enumerate(tried, 1):
         if progress is not None:
-            progress(1 + done, 1 + len(tried))
-        change = whole - _trial(config, columns, [other for other in on if other != name])
+            progress(done, trials)
+        with part(f"trial scan {done + 1} of {trials}"):
+            change = whole - _trial(config, columns, [other for other in on if other != name])
         per_column = [float(np.nanmean(each)) for each in change.T if np.isfinite(each).any()]
         if per_column:
             spread = float(np.std(per_column, ddof=1)) if len(per_column) > 1 else float("nan")

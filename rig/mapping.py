@@ -61,6 +61,8 @@ class Mapping:
         self.estimation_s = 0.0
         self.wait_s = 0.0
         """Time spent waiting for the caller to take maps."""
+        self.estimating = False
+        """Whether the map of a counted sweep is being made just now."""
         self.error: BaseException | None = None
 
     def start(self) -> None:
@@ -115,9 +117,11 @@ class Mapping:
 
     def _estimate(self, sweep: SweepData) -> None:
         begun = time.perf_counter()
+        self.estimating = True
         if self._on_sweep is not None:
             self._on_sweep(sweep)
         result = self._maker.map(sweep.volume)
+        self.estimating = False
         column = sweep.volume.bound_column()
         found = AcquiredMap(sweep.account(), column, result, sweep.count_s + result.compute_s)
         estimated = time.perf_counter()

@@ -86,6 +86,11 @@ class Pipeline:
         """Whether every map was taken and none will come."""
         return self._queue.drained
 
+    @property
+    def estimating(self) -> bool:
+        """Whether a map is being made just now. Any thread."""
+        return self._mapping.estimating
+
     def stats(self) -> PipelineStats:
         """The figures of this moment. Any thread."""
         ring, mapping, recorder, monitor = self._ring, self._mapping, self._recorder, self._monitor

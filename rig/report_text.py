@@ -15,6 +15,8 @@ from rig.summary import Summary, Synchronisation, Verdict
 WIDE = 300
 """Characters; wider than any line here."""
 
+_NAME_CELLS = 17
+"""Of an effect's name, on each of its lines."""
 LEAST_WAIT_S = 1e-3
 """Shorter waits of the source are not worth words."""
 
@@ -39,16 +41,30 @@ def run_table(result: RunResult) -> None:
             for file in sorted((result.folder / name).glob("*.p[nl][gy]"))[-1:]:
                 table.add_row(what, str(file))
     verdict = summary.verdict.value
-    advice = _NEXT_STEP.get(summary.verdict)
+    advice = _advice(result)
     table.add_row("verdict", f"{verdict}: {advice}" if advice else verdict)
     console().print(table)
 
 
+def _advice(result: RunResult) -> str | None:
+    """What follows from the verdict; of an aborted run what of it is there."""
+    summary = result.summary
+    if summary.verdict is not Verdict.ABORTED or (summary.maps and result.folder is not None):
+        return _NEXT_STEP.get(summary.verdict)
+    if summary.maps:
+        return "the run ended before its last map"
+    kept = "nothing is kept" if result.folder is None else f"the recorded frames are kept in {result.folder}"
+    return f"the run ended before its first map was whole; {kept}"
+
+
 def effects_table(scene: SceneEffects) -> None:
     """Print which effects are on, what each is worth and why, to stdout."""
-    table = Table(box=None, pad_edge=False)
-    for name in ("effect", "", "photons", "stripe error", "decisions changed", "us per frame"):
-        table.add_column(name, justify="right" if name not in ("effect", "") else "left", no_wrap=True)
+    # Narrow enough that a terminal of 80 columns has room for the reasons, which are wrapped.
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("effect", max_width=_NAME_CELLS if sys.stdout.isatty() else None)
+    table.add_column("", no_wrap=True)
+    for name in ("photons", "stripe error\npx", "decisions\nchanged", "us per\nframe"):
+        table.add_column(name, justify="right", no_wrap=True)
     table.add_column("why")
     for effect in scene:
         bound = effect.changed_decisions_bound
@@ -80,8 +96,8 @@ def _error_change(effect: Effect) -> str:
     if effect.stripe_error_change_px is None:
         return "-"
     if effect.basis == "bound":
-        return f"<= {digits(effect.stripe_error_change_px, 2)} px" if effect.stripe_error_change_px else "-"
-    return f"{effect.stripe_error_change_px:+.3f} +- {effect.stripe_error_change_sd_px or 0.0:.3f} px"
+        return f"<= {digits(effect.stripe_error_change_px, 2)}" if effect.stripe_error_change_px else "-"
+    return f"{effect.stripe_error_change_px:+.3f} +- {effect.stripe_error_change_sd_px or 0.0:.3f}"
 
 
 def console() -> Console:

@@ -15,6 +15,7 @@ from drivers.transports.tap import CONTROL_FILE, TapFile
 from rig.control_check import ControlCheck
 from rig.errors import UsageError
 from rig.outputs import Rays, RunFolder
+from rig.progress import tell_stage
 from rig.reconstruction import MapResult
 from rig.recording.manifest import UNFINISHED, file_crc32
 from rig.recording.space import Space
@@ -23,8 +24,6 @@ from rig.saving import SavePolicy
 from rig.stages import PipelineStats
 from rig.summary import MapTally, RunFrames, Summary, Synchronisation, Verdict
 
-Progress = Callable[[int, int], None]
-"""Called now and then with what is done and what there is to do, in frames or maps."""
 OutFolder = str | os.PathLike[str] | None
 
 
@@ -150,7 +149,8 @@ class Run:
         index = self.tally.maps
         before = self._last
         try:
-            if self._save.keeps(index):
+            if self._folder is not None and self._save.keeps(index):
+                tell_stage("writing")
                 self._write(index, result, truth)
             self._last = index, result, truth
             self.tally.add(result, compute_s, truth)
@@ -178,6 +178,7 @@ class Run:
         index, result, truth = self._last or (None, None, None)
         folder = None
         if self._folder is not None and self.worth_keeping:
+            tell_stage("writing")
             if self._save.step is None and index is not None and result is not None:
                 self._write(index, result, truth)
             content = {"versions": versions(), **manifest, "verdict": verdict.value}
@@ -190,8 +191,7 @@ class Run:
         return RunResult(summary, result, truth, folder)
 
     def _write(self, index: int, result: MapResult, truth: SweepTruth | None) -> None:
-        if self._folder is None:
-            return
+        assert self._folder is not None, "asked for where there is one"
         self._folder.write_map(index, result, self.rays)
         if truth is not None:
             self._folder.write_truth(index, truth)

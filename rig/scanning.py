@@ -8,7 +8,7 @@ from typing import Any
 
 from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
-from rig.acquisition import SILENCE_S, Acquisition, ScanProgress
+from rig.acquisition import SILENCE_S, Acquisition, ScanProgress, told_of
 from rig.burst import lead_s, most_sweeps, spare_lead_s
 from rig.calibration_identity import accepted_by, calibration_use, identity_of, rig_content
 from rig.errors import RigError
@@ -17,6 +17,7 @@ from rig.monitor import Watch
 from rig.overload import FEWEST_SLOTS, Overload, require_policy
 from rig.plan import spad_request
 from rig.plan_figures import plan_content
+from rig.progress import tell_stage
 from rig.reconstruction import Reconstructor
 from rig.recording.devices import devices_content
 from rig.recording.inputs import write_inputs
@@ -68,9 +69,8 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
     replayed = Replayed.of(rig.spad, plan, maps)
     maps = maps or 1 if replayed is None else replayed.maps
     threads = rig.config.estimate.threads or os.cpu_count() or 1
-    reconstructor = make_reconstructor(
-        rig, plan, threads, () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
-    )
+    recalled = () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
+    reconstructor = make_reconstructor(rig, plan, threads, recalled)
     geometry = reconstructor.geometry
     run.rays = geometry.rays if rig.model is not None else None
 
@@ -106,7 +106,8 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         starts=None if replayed is None else replayed.starts(),
         recording=recording,
         watch=options.watch,
-        on_progress=options.live,
+        learns=estimate.estimator in LEARNING and not recalled,
+        on_progress=told_of(options.live),
         silence_s=SILENCE_S if replayed is None else replayed.silence_s,
     )
     sweeps: list[SweepAccount] = []
@@ -137,7 +138,8 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
     )
     if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
         if result.folder is not None:
-            ended_by.add_note(f"{len(sweeps)} of {maps} maps were whole and are in {result.folder}")
+            whole = f"{len(sweeps)} of {maps} maps were whole and are" if sweeps else "no map was whole; frames are"
+            ended_by.add_note(f"{whole} in {result.folder}")
         raise ended_by
     return result
 
@@ -207,6 +209,7 @@ def _collect(
             if replayed is not None:
                 truth = replayed.truth(found.sweep.index)
             elif rig.world is not None:  # asked only now: no estimate ever sees it
+                tell_stage("comparing with the truth")
                 velocity_per_s = plan.velocity_per_s(found.sweep.direction)
                 truth = rig.world.truth(plan.line_commands(found.column), velocity_per_s)
             sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account

@@ -2,15 +2,15 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product, starmap
+from itertools import count, product, starmap
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from rig.config import RigConfig
 from rig.errors import UsageError
 from rig.estimators import ESTIMATORS, FILTERS
-from rig.run import Progress
-from rig.tradeoff_choice import Answer, Wish, choose
+from rig.progress import Progress, part, tell_stage
+from rig.tradeoff_choice import Answer, Wish, advice, choose
 from rig.tradeoff_limits import SceneLimits
 from rig.tradeoff_rows import MapScore, Setting, TradeoffRow, row_of, with_fronts
 from rig.tradeoff_scan import MAPS, Method, require_plan, score_methods
@@ -96,9 +96,19 @@ class Tradeoff:
     folder: Path | None = None
     accepted_calibration: tuple[str, ...] = ()
 
+    @property
+    def advice(self) -> str:
+        """Which setting to take, in a sentence."""
+        of = "of what was whole by then, " if self.verdict == "aborted" else ""
+        return of + advice(self.rows, self.wish, self.answer)
+
     def as_json(self) -> dict[str, Any]:
         """Plain values; `answer` only where a setting was asked for."""
-        content: dict[str, Any] = {"rows": [row.as_json() for row in self.rows], "ci95_by": self.ci95_by}
+        content: dict[str, Any] = {
+            "advice": self.advice,
+            "rows": [row.as_json() for row in self.rows],
+            "ci95_by": self.ci95_by,
+        }
         if self.wish is not None:
             content["answer"] = None if self.answer is None else self.answer.as_json()
         if self.accepted_calibration:
@@ -145,10 +155,13 @@ def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRo
     configs = trials.configs()
     bar = _Bar(progress, trials.repeat * sum(map(_frames_of, configs.values())))
     limits = SceneLimits(trials.exposures)
+    scans = len(configs) * trials.repeat
+    numbers = count(1)
     for trial, config in configs.items():
         scores: dict[Method, list[MapScore]] = {}
         for seed in range(trials.seed, trials.seed + trials.repeat):
-            found = score_methods(config, trials.estimators, trials.filters, seed, bar.within(_frames_of(config)))
+            with part(f"scan {next(numbers)} of {scans}"):
+                found = score_methods(config, trials.estimators, trials.filters, seed, bar.within(_frames_of(config)))
             for method, score in found.items():
                 scores.setdefault(method, []).append(score)
             bar.add(_frames_of(config))
@@ -157,6 +170,8 @@ def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRo
         rows = [
             row_of(scene, trial.fog, Setting(*method, trial.exposures, lines), each) for method, each in scores.items()
         ]
+        if trials.limits:
+            tell_stage("finding what the light allows")
         yield limits.beside(rows, config) if trials.limits else rows
 
 

@@ -17,6 +17,10 @@ from rig.tradeoff_rows import Clock, Setting, TradeoffRow
 _PIXELS = re.compile(r"\s*(\d+\.?\d*(?:[eE][+-]?\d{1,3})?|\.\d+)\s*px\s*", re.ASCII)
 
 
+WORTH = 1.5
+"""Times the least error of all: what a longer scan would still take off is not worth its time to most."""
+
+
 @dataclass(frozen=True, slots=True)
 class Wish:
     """What is asked for: exactly one of a time and an error; of: whose time counts."""
@@ -45,20 +49,25 @@ class Answer:
 
     def __str__(self) -> str:
         """In words."""
-        figures = (
-            f"{self.setting}: {digits(self.mean_abs_px)} px in {digits(self.sensor_ms)} ms of sensor and "
+        if self.fits:
+            return f"for {self.wish}: {self.setting}: {self.figures}"
+        nearest = f"{self.setting}: {self.figures}"
+        return f"nothing tried gives {self.wish}; nearest is {nearest}; try other --exposures or --estimators"
+
+    @property
+    def figures(self) -> str:
+        """Error and times, in words."""
+        return (
+            f"{digits(self.mean_abs_px)} px in {digits(self.sensor_ms)} ms of sensor and "
             f"{digits(self.compute_ms)} ms of computing a map"
         )
-        if self.fits:
-            return f"for {self.wish}: {figures}"
-        return f"nothing tried gives {self.wish}; nearest is {figures}; try other --exposures or --estimators"
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         wish = {"time_budget_ms": self.wish.time_ms, "error_px": self.wish.error_px, "of": self.wish.of}
-        return {"asked": wish, "fits": self.fits, **asdict(self.setting), **self._figures()}
+        return {"asked": wish, "fits": self.fits, **asdict(self.setting), **self._times()}
 
-    def _figures(self) -> dict[str, float]:
+    def _times(self) -> dict[str, float]:
         return {"mean_abs_px": self.mean_abs_px, "sensor_ms": self.sensor_ms, "compute_ms": self.compute_ms}
 
 
@@ -113,6 +122,28 @@ def choose(rows: Sequence[TradeoffRow], wish: Wish) -> Answer | None:
     if by_error:
         return min(fitting or answers, key=lambda answer: (answer.mean_abs_px, time_ms(answer)))
     return min(fitting or answers, key=lambda answer: (time_ms(answer), answer.mean_abs_px))
+
+
+def advice(rows: Sequence[TradeoffRow], wish: Wish | None, answer: Answer | None) -> str:
+    """Which setting to take, in a sentence: what was asked for, or where nothing was, the shortest scan whose error is
+    at most `WORTH` times the least of all. answer: to the wish.
+    """
+    if wish is not None and answer is not None:
+        return f"take {_named(answer)}, the best for {wish}" if answer.fits else str(answer)
+    least = choose(rows, Wish(error_px=0.0))
+    if least is None:
+        return "no setting can be named: every one leaves more than 5 % of the answers out; raise --exposures"
+    found = choose(rows, Wish(error_px=WORTH * least.mean_abs_px))
+    assert found is not None, "the one with the least error fits"
+    why = f"the shortest scan within {WORTH:g} times the least error, {digits(least.mean_abs_px)} px"
+    return f"take {_named(found)}; {why}"
+
+
+def _named(answer: Answer) -> str:
+    setting = answer.setting
+    filtered = "" if setting.filter == "none" else f" + {setting.filter}"
+    lines = "" if setting.lines == 1 else f" and {setting.lines} lines"
+    return f"K = {setting.exposures} with {setting.estimator}{filtered}{lines}: {answer.figures}"
 
 
 def _answer(wish: Wish, setting: Setting, rows: Sequence[TradeoffRow]) -> Answer:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.acquisition import Acquisition
+from rig.acquisition import Acquisition, told_of
 from rig.config import RigConfig
 from rig.counting import Counter, FrameTally, SweepLayout, SweepTally
 from rig.errors import UsageError
@@ -169,8 +169,9 @@ def score_methods(
                 warm_up(estimator, filter, plan.exposures, dark=True)
         warm_binding(plan)
         maker = ManyMakers({name: _maker(rig, plan, name) for name in estimators}, filters)
-        tell = None if on_frames is None else lambda done: on_frames(done.frames, done.frames_planned)
-        running = Acquisition(rig, plan, timing, MAPS, maker, on_progress=tell).run()
+        told = told_of(None if on_frames is None else lambda done: on_frames(done.frames, done.frames_planned))
+        learns = not LEARNING.isdisjoint(estimators)
+        running = Acquisition(rig, plan, timing, MAPS, maker, learns=learns, on_progress=told).run()
         with closing(running):
             last = [found for found in running][-1]
         truth = rig.world.truth(plan.line_commands(last.column), plan.velocity_per_s(last.sweep.direction))

@@ -1,5 +1,6 @@
 """A trade-off for people: tables of at most 80 characters, the setting to use and where the files are."""
 
+import textwrap
 from collections.abc import Callable, Sequence
 
 from rich.table import Table
@@ -7,6 +8,9 @@ from rich.table import Table
 from rig.report_text import console
 from rig.tradeoff import Tradeoff
 from rig.tradeoff_rows import TradeoffRow
+
+WIDTH = 80
+"""Characters; no line here is longer but those that name files."""
 
 Column = tuple[str, Callable[[TradeoffRow], str]]
 """Heading and cell."""
@@ -40,7 +44,12 @@ _LEFT = ("estimator", "filter", "")
 
 
 def tradeoff_table(done: Tradeoff) -> None:
-    """Print it to stdout; * marks what lies on the front of error over sensor time, + on that over compute time."""
+    """Print it to stdout, the setting to take first.
+
+    * marks what lies on the front of error over sensor time, + on that over compute time.
+    """
+    print(textwrap.fill(done.advice, WIDTH))
+    print()
     for place in dict.fromkeys((row.scene, row.fog, row.lines) for row in done.rows):
         rows = [row for row in done.rows if (row.scene, row.fog, row.lines) == place]
         _print(_named(*place), _FIGURES, rows)
@@ -53,8 +62,6 @@ def tradeoff_table(done: Tradeoff) -> None:
         print("In brackets: more than 5 % of the answers are missing, such an error counts for\nnothing.")
     for reason in done.accepted_calibration:
         print(f"calibration accepted in spite of {reason}")
-    if done.answer is not None:
-        print(done.answer)
     if done.folder is not None:
         print(f"files: {done.folder}")
 

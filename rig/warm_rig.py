@@ -8,10 +8,11 @@ from contextlib import closing
 
 import numpy as np
 
-from rig.acquisition import Acquisition, ScanProgress
+from rig.acquisition import Acquisition, ScanProgress, told_of
 from rig.bench.speed import warm_bench
 from rig.config import RigConfig
 from rig.estimators import ESTIMATORS
+from rig.progress import tell_stage
 from rig.reconstruction import Reconstructor
 from rig.session import OpenRig, open_rig, prepare
 from rig.warm_up import warm_up
@@ -23,12 +24,15 @@ ENOUGH_FRAMES = 1000
 def warm_rig(config: RigConfig) -> float:
     """Compile everything; the seconds it took. Real devices are not opened."""
     begun = time.perf_counter()
-    for estimator in ESTIMATORS:
+    for done, estimator in enumerate(ESTIMATORS):
+        tell_stage("warming up", done, len(ESTIMATORS), "estimators")
         for dark in (True, False):  # a scan has dark frames, a bare cube has none
             warm_up(estimator, "median", config.scan.exposures, dark=dark)
+    tell_stage("warming up the bench")
     warm_bench()
     if config.world is not None:
         with open_rig(config) as rig:
+            tell_stage("warming up the simulator")
             _simulate(rig)
     return time.perf_counter() - begun
 
@@ -44,11 +48,11 @@ def _simulate(rig: OpenRig) -> None:
         rig.model, plan.commands, plan.depth_range_m, sensor=(plan.rows, plan.width), estimator="argmax", threads=1
     )
 
-    def tell(done: ScanProgress) -> None:
+    def enough(done: ScanProgress) -> None:
         if done.frames >= ENOUGH_FRAMES:
             raise _EnoughError
 
-    running = Acquisition(rig, plan, timing, 1, maker, on_progress=tell).run()
+    running = Acquisition(rig, plan, timing, 1, maker, on_progress=told_of(enough)).run()
     with closing(running):
         try:
             for _ in running:

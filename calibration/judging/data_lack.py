@@ -14,6 +14,7 @@ _MEND_VIEWS = "mend what is said of the other views, then show more"
 _SHOW_ANEW = "show the board again for each of these, at rest until its sweeps are over"
 FEWEST_POSES: Final = 6
 """With fewer, a single bad view bends the fit to it, so that nothing shows that it was bad."""
+FEWEST_WHY: Final = "are the fewest that can be checked against each other"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,7 @@ def hiding(views: ViewEvidence, poses: PoseEvidence | None, *, photons: bool = T
 
 def _too_few(views: ViewEvidence) -> Reason:
     shown = f"{views.shown} {'pose was' if views.shown == 1 else 'poses were'} shown"
-    limit = f"{FEWEST_POSES} are the fewest that can be checked against each other"
+    limit = f"{FEWEST_POSES} {FEWEST_WHY}"
     if views.used == views.shown:
         return reason_for("too-few-poses", f"{shown}, {limit}", views.shown, FEWEST_POSES)
     odd = f" ({unfit(views.odd)})" if views.odd else ""

@@ -29,6 +29,7 @@ from drivers.spb1 import BlockLayout, block_views
 from rig.bench.machine import machine
 from rig.bench.recorded import PERIOD_TICKS, header_of
 from rig.errors import RecordingError, UsageError
+from rig.progress import Progress, counted
 from rig.recording.segment import Staging, paged
 from rig.recording.writer import WRITERS, Recording
 
@@ -68,7 +69,7 @@ class DiskReport:
         return asdict(self)
 
 
-def measure_disk(folder: Path, progress: Callable[[int, int], None] | None = None) -> DiskReport:
+def measure_disk(folder: Path, progress: Progress | None = None) -> DiskReport:
     """Measure the disk of `folder`.
 
     UsageError where there is none, or not room for the bytes twice; RecordingError where it does not take them.
@@ -88,7 +89,8 @@ def measure_disk(folder: Path, progress: Callable[[int, int], None] | None = Non
         ) from error
 
 
-def _measured(folder: Path, progress: Callable[[int, int], None] | None) -> DiskReport:
+def _measured(folder: Path, progress: Progress | None) -> DiskReport:
+    told = counted("measuring", "rows", progress)
     source = _Source(round(GIGABYTES * 1e9))
     found: dict[str, list[tuple[float, float]]] = {}
     with tempfile.TemporaryDirectory(prefix="spadrig-disk-", dir=folder) as name:
@@ -107,8 +109,7 @@ def _measured(folder: Path, progress: Callable[[int, int], None] | None) -> Disk
                 (Path(name) / "run").mkdir()
             _settle(Path(name))
             found.setdefault(stage, []).append(_timed(stages[stage]))
-            if progress is not None:
-                progress(index + 1, ROUNDS * len(stages))
+            told(index + 1, ROUNDS * len(stages))
     rows = [_row(stage, found, source.bytes) for stage in found]
     return DiskReport(machine(), str(folder), source.bytes / 1e9, plain.direct, tuple(rows))
 

@@ -34,7 +34,7 @@ from rig.bench.machine import machine
 from rig.config import RigConfig
 from rig.effects import open_world
 from rig.errors import UsageError
-from rig.run import Progress
+from rig.progress import Progress, counted
 from rig.scan_plan import column_command
 
 Array = NDArray[np.float64]
@@ -247,6 +247,7 @@ def _in_turn(cases: list[_Case], extent: SimulatorExtent, progress: Progress | N
     read_all(words)
     for case in cases:  # compiled code is loaded before anything is timed
         case.frames()
+    told = counted("measuring", "rows", progress)
     memory, speeds = np.zeros(extent.rounds), np.zeros((extent.rounds, len(cases)))
     for done in range(extent.rounds):
         begun = time.perf_counter()
@@ -257,8 +258,7 @@ def _in_turn(cases: list[_Case], extent: SimulatorExtent, progress: Progress | N
             while time.perf_counter() - begun < extent.moment_s or frames == 0:
                 frames += case.frames()
             speeds[done, i] = frames / (time.perf_counter() - begun)
-            if progress is not None:
-                progress(done * len(cases) + i + 1, extent.rounds * len(cases))
+            told(done * len(cases) + i + 1, extent.rounds * len(cases))
     return float(np.median(memory)), np.median(speeds, axis=0)
 
 

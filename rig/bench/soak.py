@@ -21,7 +21,7 @@ from drivers.errors import RingOverflow
 from drivers.frames import FrameBlock, frame_bytes
 from drivers.interfaces import SpadCounters
 from drivers.spb1 import walk_blocks
-from rig.acquisition import Acquisition, ScanProgress
+from rig.acquisition import Acquisition, ScanProgress, told_of
 from rig.bench.looped_spad import Loop, LoopedSpad
 from rig.bench.machine import machine
 from rig.config_files import load_config
@@ -191,7 +191,8 @@ def _recorded(rig: OpenRig, plan: ScanPlan) -> Loop:
     with tempfile.TemporaryDirectory(prefix="spadrig-bench-") as folder:
         maker = _reconstructor(rig, plan, "argmax", 1)
         with closing(Recording(Path(folder))) as recording:
-            for _ in Acquisition(rig, plan, timing, sweeps, maker, recording=recording).run():
+            acquired = Acquisition(rig, plan, timing, sweeps, maker, recording=recording, on_progress=told_of(None))
+            for _ in acquired.run():
                 pass
         files = (np.memmap(Path(folder) / name, np.uint8, "r") for name in recording.files)
         items = (item for file in files for item in walk_blocks(file, None, check_payload=False))
@@ -225,7 +226,7 @@ def _run(
 
     acquisition = Acquisition(
         rig, plan, timing, maps, _SlowMaker(_reconstructor(rig, plan, "likelihood", threads), options.slow_s),
-        policy=options.policy, first_alone=True, watch=_look, on_progress=tell,
+        policy=options.policy, first_alone=True, learns=True, watch=_look, on_progress=told_of(tell),
     )  # fmt: skip
     expected = received = lost = made = worked_off = 0
     compute_s = 0.0

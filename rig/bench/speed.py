@@ -7,7 +7,6 @@ begins behind the frames of the one before it, so that frames come from memory.
 import os
 import tempfile
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -16,12 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.digits import digits
 from rig.bench.bench_kernels import read_all
 from rig.bench.cases import LEARN_EXPOSURES, WINDOWS, Case, Extent, learn, map_cases, stream_cases, usual_window
-from rig.bench.frames import PLACE_FRAMES, BenchFrames, window_frames
+from rig.bench.frames import COLUMNS, PLACE_FRAMES, BenchFrames, window_frames
 from rig.bench.latency import Latency, measure_latency
 from rig.bench.machine import machine
 from rig.bench.stages import Measured, StripeError, Walk, count_stage
+from rig.progress import Progress, counted, tell_stage
 from rig.row_threads import RowWorkers
 
 REAL_TIME_HZ = 100_000
@@ -54,6 +55,32 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
+class WorkingPoint:
+    """Whether an estimator keeps up with the sensor, counting included. maps_per_s: of COLUMNS columns; needed_per_s:
+    as many as frames at REAL_TIME_HZ make.
+    """
+
+    estimator: str
+    exposures: int
+    threads: int
+    maps_per_s: float
+    needed_per_s: float
+
+    @property
+    def keeps_up(self) -> bool:
+        """Whether no frame has to wait for long."""
+        return self.maps_per_s >= self.needed_per_s
+
+    def __str__(self) -> str:
+        """In words."""
+        at = f"at K = {self.exposures} with {self.estimator} on {self.threads} thread{'s' * (self.threads > 1)}"
+        needed, possible = digits(self.needed_per_s), digits(self.maps_per_s)
+        if self.keeps_up:
+            return f"keeps up: {needed} maps a second {at}, {possible} would be possible"
+        return f"does not keep up: {possible} of {needed} maps a second {at}"
+
+
+@dataclass(frozen=True, slots=True)
 class SpeedReport:
     """What `rig bench` found."""
 
@@ -63,13 +90,28 @@ class SpeedReport:
     latency_us: Latency
     seconds: float
 
+    @property
+    def working_points(self) -> tuple[WorkingPoint, ...]:
+        """Of each estimator at each number of exposures that whole sweeps were measured with, on all threads."""
+        most = max(row.threads for row in self.rows)
+        return tuple(
+            WorkingPoint(
+                row.stage.removesuffix("-sweep"), row.exposures, most, row.frames_per_s / frames, REAL_TIME_HZ / frames
+            )
+            for row in self.rows
+            if row.stage in ("likelihood-sweep", "joint-sweep") and row.threads == most
+            if row.exposures is not None and row.frames_per_s is not None
+            for frames in [COLUMNS * row.exposures]
+        )
+
     def as_json(self) -> dict[str, Any]:
         """For programs."""
-        return asdict(self)
+        points = [{**asdict(point), "keeps_up": point.keeps_up} for point in self.working_points]
+        return {"advice": [str(point) for point in self.working_points], "working_points": points, **asdict(self)}
 
 
 def measure_speed(
-    threads: int | None = None, extent: Extent | None = None, progress: Callable[[int, int], None] | None = None
+    threads: int | None = None, extent: Extent | None = None, progress: Progress | None = None
 ) -> SpeedReport:
     """Measure everything. threads: the most; by default one for each core. progress: told rows done and all."""
     begun = time.perf_counter()
@@ -81,10 +123,12 @@ def measure_speed(
         workers = {n: stack.enter_context(RowWorkers(n)) for n in sorted({1, min(2, most), most})}
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="spadrig-bench-")))
         frames = {window: window_frames(window, workers[most], extent.frames_bytes) for window in extent.windows}
+        tell_stage("learning")
         learned = {window: learn(these, most) for window, these in frames.items()}
         cases = stream_cases(frames, learned, workers, extent, folder) + map_cases(workers, extent)
         memory, measured = _in_turn(cases, frames[extent.windows[-1]], extent, progress)
         window = usual_window(extent)
+        tell_stage("measuring the latency")
         latency = measure_latency(frames[window], LEARN_EXPOSURES, workers[most], learned[window], extent.latency_s)
     read = float(np.median(memory))
     return SpeedReport(found, read / 1e9, _rows(cases, measured, read), latency, time.perf_counter() - begun)
@@ -99,7 +143,7 @@ def warm_bench() -> None:
 
 
 def _in_turn(
-    cases: list[Case], frames: BenchFrames, extent: Extent, progress: Callable[[int, int], None] | None
+    cases: list[Case], frames: BenchFrames, extent: Extent, progress: Progress | None
 ) -> tuple[list[float], list[list[Measured]]]:
     """Bytes a second of each reading of the memory, and what each case measured in each round."""
     words = _random_words(frames, extent.read_bytes)
@@ -108,14 +152,14 @@ def _in_turn(
     read_all(words)
     for stage in {case.stage: case for case in cases}.values():  # compiled code is loaded before anything is timed
         stage.measure(0.0)
+    told = counted("measuring", "rows", progress)
     for done in range(extent.rounds):
         for i, case in enumerate(cases):
             if i % READ_EVERY == 0:
                 memory.append(_read_bytes_per_s(words))
             moment_s = extent.count_moment_s if case.stage.startswith("count") else extent.moment_s
             measured[i].append(case.measure(moment_s))
-            if progress is not None:
-                progress(done * len(cases) + i + 1, extent.rounds * len(cases))
+            told(done * len(cases) + i + 1, extent.rounds * len(cases))
     return memory, measured
 
 

@@ -7,9 +7,10 @@ from rich.console import Console
 from rich.table import Table
 
 from rig.bench.disk import DiskReport
+from rig.bench.frames import COLUMNS
 from rig.bench.simulator import SimulatorReport
 from rig.bench.soak import SoakReport
-from rig.bench.speed import Row, SpeedReport
+from rig.bench.speed import REAL_TIME_HZ, Row, SpeedReport
 
 WIDTH = 100
 """Characters; no line here is longer."""
@@ -32,8 +33,11 @@ _TITLES = {
 
 
 def speed_table(report: SpeedReport) -> None:
-    """Print the rows, grouped by stage, to stdout."""
+    """Print whether this machine keeps up, then the rows, grouped by stage, to stdout."""
     console = Console(highlight=False, width=WIDTH)
+    for point in report.working_points:
+        console.print(str(point))
+    console.print(f"(maps of {COLUMNS} columns at {REAL_TIME_HZ / 1e3:g} kHz, counting included)\n")
     _print_machine(console, report.machine)
     console.print(f"memory read, one thread: {report.memory_read_gb_per_s:.1f} GB/s")
     order = list(_TITLES)

@@ -23,7 +23,8 @@ from rig.calibrating.session import Session
 from rig.calibrating.showing import Ask, Tell, require_live
 from rig.calibrating.sources import Sources
 from rig.calibrating.taken import Taken
-from rig.calibrating.taking import Live, good_poses, take_live
+from rig.calibrating.taking import Live, good_poses, require_poses, take_live
+from rig.progress import tell_stage
 from rig.run import OutFolder, versions
 
 CAMERA_FILE = "camera.yaml"
@@ -60,14 +61,17 @@ def run_camera(
         taken = Taken(session, tell)
         take_kept(taken, sources, board)
         if live is not None:
+            require_poses(taken, asked.poses)
             choose = good_poses(live, board, asked.poses, AT_M, asked.seed, len(taken.views))
             take_live(taken, Live(live, asked.poses, choose, ask, seed=asked.seed, arm=asked.arm, line=False), board)
+        tell_stage("fitting", len(taken.views), unit="views")
         try:
             fit = _fitted(taken, board, asked.terms)
         except Degenerate as refused:
             raise refusal(refused, taken, board, photons=photons, line=False) from refused
         judged = judge_camera(fit, taken.views, board, photons=photons)
         summary = {"command": "camera", **_summary(fit, judged, taken), "versions": versions()}
+        tell_stage("writing the report")
         figures = tuple(_figures(fit, judged, taken))
         used = [view for view in taken.views if view.name in fit.views]
         about = subject(taken.identity, board, summary["versions"], datetime.now(UTC))

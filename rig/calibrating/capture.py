@@ -29,6 +29,7 @@ from rig.calibration_identity import identity_of
 from rig.config import RigConfig
 from rig.counting import CountVolume
 from rig.errors import PlanError, UsageError
+from rig.progress import tell_stage
 from rig.recording.inputs import read_plan
 from rig.recording.manifest import read_manifest
 from rig.replaying import ReplayOptions, replay_config
@@ -130,10 +131,13 @@ def _captured(
     counts = tuple(_sweep_counts(sweep, plan) for sweep in sweeps)
     picture = flux_picture(counts)
     bad = np.zeros(picture.shape, np.bool_) if defects is None else defects
+    if board is not None:
+        tell_stage("finding the board")
     corners, refused = _corners(picture, board, defects)
     mask = even_pixels(picture) & ~bad
     if corners is not None and board is not None:
         mask &= board_pixels(corners, board, picture.shape)
+    tell_stage("finding the line")
     passages = tuple(
         _steady(find_passages(count, sweep.direction, plan.speed_per_s, mask), plan)
         for count, sweep in zip(counts, sweeps, strict=True)

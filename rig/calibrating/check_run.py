@@ -35,6 +35,7 @@ from rig.calibrating.taking import Live, good_poses, take_live
 from rig.calibrating.truth import true_errors, truth_content
 from rig.calibration_notes import note_check
 from rig.errors import UsageError
+from rig.progress import tell_stage
 from rig.run import OutFolder, versions
 
 NO_COVARIANCE = "the calibration has no covariance: nothing tells what depth error to expect"
@@ -88,6 +89,7 @@ def run_check(
             take_live(taken, Live(live, poses, choose, ask, (), seed, asked.arm, model.defects), board)
         views = _with_board(taken, 1 if asked.angle_rad is None else 2)
         model.check_sensor(*taken.size)
+        tell_stage("judging", len(views), unit="views")
         boards = check_boards(model, views, board)
         angle = None if asked.angle_rad is None else check_angle(model, views[0], views[1], board)
         verdict = judge_check(boards, wanted, board.size_m[0], angle, asked.angle_rad)
@@ -101,6 +103,7 @@ def run_check(
             "truth": None if truth is None else truth_content(truth),
             "versions": versions(),
         }
+        tell_stage("writing the report")
         figures = tuple(_figures(boards, angle) + _consequence(verdict, model, file))
         about = subject(taken.identity or model.identity, board, summary["versions"], datetime.now(UTC))
         session.finish(summary, check_report(boards, uncertainty, verdict, line, figures, about), None)

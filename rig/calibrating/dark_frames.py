@@ -19,14 +19,16 @@ from calibration.pixels.dark_tally import DarkTally
 from drivers.frames import FrameBlock, frame_bytes
 from drivers.interfaces import SpadInfo, SpadMode, SpadRequest
 from drivers.ring import BlockRing
+from rig.acquisition import ScanProgress
 from rig.config import ScanConfig
 from rig.counting import BIN_DARK, CountVolume, SweepCounter, SweepLayout
 from rig.errors import UsageError
 from rig.geometry import WORD_PX
 from rig.pipeline import JOIN_S
+from rig.progress import Progress, counted
 from rig.recording.inputs import read_plan
 from rig.row_threads import RowWorkers
-from rig.run import Progress, Run
+from rig.run import Run
 from rig.scanning import ScanOptions, run_scan
 from rig.session import OpenRig
 from rig.source import Source, blocks
@@ -102,17 +104,17 @@ def take_dark(
     tally = DarkTally((info.height, info.width))
     starts = math.ceil(frames / per_start)
     rest_s = max(0.0, (spread_s - frames / float(request.frame_rate_hz)) / max(starts - 1, 1))
+    told = counted("taking dark frames", "frames", progress)
     for start in range(starts):
         if start:
             rig.clock.sleep(rest_s)
         counter.reset()
         for block in _blocks(rig, per_start, timing.stride, request.block_frames):
             _count(counter, block)
-        counted = counter.finish()
-        if counted.dark_counts is not None:
-            tally.add(counted.dark_counts.astype(np.int64), counted.n_dark)
-        if progress is not None:
-            progress(min((start + 1) * per_start, frames), frames)
+        sums = counter.finish()
+        if sums.dark_counts is not None:
+            tally.add(sums.dark_counts.astype(np.int64), sums.n_dark)
+        told((start + 1) * per_start, frames)
     return tally, float(timing.exposure_ticks / timing.tick_hz)
 
 
@@ -123,13 +125,11 @@ def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None
     """
     scan, sums = rig.config.scan, SweepSums()
 
-    def tell(done: int, planned: int) -> None:
+    def live(now: ScanProgress) -> None:
         if progress is not None:
-            progress(done, planned)
+            progress(now.frames, now.frames_planned)
 
-    options = ScanOptions(
-        sweeps=sums.add, accept_calibration=True, live=lambda told: tell(told.frames, told.frames_planned)
-    )
+    options = ScanOptions(sweeps=sums.add, accept_calibration=True, live=live)
     with Run(None, MapTally(scan.columns, scan.exposures, "argmax", "none")) as run:
         run_scan(rig, run, maps, 0, options).uninterrupted()
     if sums.tally is None:

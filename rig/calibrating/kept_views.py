@@ -16,6 +16,7 @@ from rig.calibrating.sources import VIEWS, Sources
 from rig.calibrating.taken import Taken
 from rig.calibrating.view_files import load_views
 from rig.errors import UsageError
+from rig.progress import part, tell_stage
 
 
 def take_kept(taken: Taken, sources: Sources, board: Board | None, defects: NDArray[np.bool_] | None = None) -> None:
@@ -30,9 +31,11 @@ def take_kept(taken: Taken, sources: Sources, board: Board | None, defects: NDAr
         identity = session_rig(folder)
         for view in load_views(folder / VIEWS):
             taken.add(view, None, identity, folder / VIEWS / view.name)
-    for run in sources.recorded:
-        taken.add_capture(capture_recorded(run, run.name, board, defects=defects), run)
-    for file in sources.pictures:
+    for number, run in enumerate(sources.recorded, 1):
+        with part(f"run {number} of {len(sources.recorded)}"):
+            taken.add_capture(capture_recorded(run, run.name, board, defects=defects), run)
+    for done, file in enumerate(sources.pictures):
+        tell_stage("finding the board", done, len(sources.pictures), "pictures")
         taken.add(*_pictured(file, board), source=file)
 
 

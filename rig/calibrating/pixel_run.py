@@ -32,8 +32,8 @@ from rig.config import RigConfig
 from rig.errors import UsageError
 from rig.outputs import RunFolder
 from rig.pictures import png_bytes
+from rig.progress import Progress
 from rig.replaying import ReplayOptions, replay_config
-from rig.run import Progress
 from rig.session import OpenRig, open_rig
 
 _log = logging.getLogger(__name__)

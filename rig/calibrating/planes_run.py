@@ -28,9 +28,10 @@ from rig.calibrating.session import Session
 from rig.calibrating.showing import Ask, Tell, require_live
 from rig.calibrating.sources import Sources
 from rig.calibrating.taken import Taken
-from rig.calibrating.taking import Live, good_poses, take_live
+from rig.calibrating.taking import Live, good_poses, require_poses, take_live
 from rig.calibrating.truth import true_errors, truth_content
 from rig.config import RigConfig
+from rig.progress import tell_stage
 from rig.run import OutFolder, versions
 
 POSES = 12
@@ -81,6 +82,7 @@ def run_planes(
         defects = None if base is None else base.defects
         take_kept(taken, sources, board, defects)
         if live is not None:
+            require_poses(taken, asked.poses)
             start = good_poses(live, board, asked.poses, asked.at_m, asked.seed, len(taken.views))
             fit_and_judge = partial(_fit, taken, board, base, known), partial(_judged, taken, asked)
             guide = Guide(start, board, live.scan.depth_range, taken, *fit_and_judge, tell)
@@ -92,6 +94,7 @@ def run_planes(
         told = () if known is None else known.views
         digests = sorted({*told, *(corners_digest(view) for view in taken.views if view.name in fit.views)})
         model = _signed(fit, judged, taken.identity, digests, camera)
+        tell_stage("writing the report")
         truth = None if live is None else true_errors(model, live, asked.at_m)
         line = judged.uncertainty.line()
         summary = {
@@ -115,6 +118,7 @@ def speeds_of(live: RigConfig) -> tuple[int, ...]:
 
 def _fit(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
     """Of the views so far, with all that is known from elsewhere."""
+    tell_stage("fitting", len(taken.views), unit="views")
     return fit_rig(
         taken.views,
         board,
@@ -126,6 +130,7 @@ def _fit(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera 
 
 
 def _judged(taken: Taken, asked: PlanesAsked, fit: RigFit) -> Judged:
+    tell_stage("judging")
     return judge_fit(
         fit, taken.views, at_m=asked.at_m, accuracy_m=asked.accuracy_m, stated_baseline_m=asked.stated_baseline_m
     )

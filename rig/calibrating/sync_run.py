@@ -30,6 +30,7 @@ from rig.calibrating.sources import Sources
 from rig.calibrating.taken import Taken
 from rig.calibrating.truth import true_model
 from rig.config import RigConfig
+from rig.progress import part, tell_stage
 from rig.run import OutFolder, versions
 
 
@@ -67,6 +68,7 @@ def run_sync(
         if live is not None:
             gates.append(_scanned(live, asked, taken))
         gate = min((one for one in gates if one is not None and one.sd_s > 0), key=lambda one: one.sd_s, default=None)
+        tell_stage("fitting", len(taken.views), unit="views")
         fit = _fitted(taken, base)
         given, changed = (None, None) if base is None else with_lags(base, fit)
         verdict = judge_sync(fit, base, wanted, changed)
@@ -88,7 +90,9 @@ def _scanned(live: RigConfig, asked: SyncAsked, taken: Taken) -> GateDelay | Non
         for at, exposures in enumerate(speeds):
             run = Path(scratch) / "run" if exposures == min(speeds) else None
             name, seed = f"{exposures} exposures", asked.seed + at
-            taken.add_capture(capture_view(live, name, None, seed=seed, exposures=exposures, arm=asked.arm, out=run))
+            with part(f"speed {at + 1} of {len(speeds)}"):
+                capture = capture_view(live, name, None, seed=seed, exposures=exposures, arm=asked.arm, out=run)
+            taken.add_capture(capture)
             gate = gate if run is None else gate_delay(run)
     return gate
 

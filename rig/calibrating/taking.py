@@ -13,6 +13,7 @@ from calibration.board.board import Board
 from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
 from calibration.guide.poses import Advice, candidates, rough_camera, sequence
+from calibration.judging.data_lack import FEWEST_POSES, FEWEST_WHY
 from calibration.model.camera import Camera
 from calibration.rig_fit.sightings import shows_line
 from calibration.views import View
@@ -22,6 +23,7 @@ from rig.calibrating.speed_turns import SpeedTurns
 from rig.calibrating.taken import Taken
 from rig.config import RigConfig
 from rig.errors import UsageError
+from rig.progress import part
 from rig.session import open_rig
 
 MISSED_SHARE = 0.5
@@ -48,6 +50,16 @@ class FixedPoses:
     def next(self, views: Sequence[View]) -> Advice | None:
         """The one that follows."""
         return self.poses[len(views)] if len(views) < len(self.poses) else None
+
+
+def require_poses(taken: Taken, poses: int) -> None:
+    """UsageError where so many poses of a live rig, and the views there are, can never pass, whatever they show."""
+    there = sum(view.corners is not None for view in taken.views)
+    if there + poses < FEWEST_POSES:
+        beside = f" and {there} view{'s' * (there > 1)} taken before" if there else ""
+        raise UsageError(
+            f"poses is {poses}{beside}; {FEWEST_POSES} {FEWEST_WHY}: ask for {FEWEST_POSES - there} or more"
+        )
 
 
 def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> FixedPoses:
@@ -109,7 +121,8 @@ def take_live(taken: Taken, live: Live, board: Board) -> None:
         config = shown(
             live.config, f"pose {good + 1} of {live.poses}: {advice}", advice.candidate, live.ask, taken.tell
         )
-        capture = speeds.capture(good, partial(_scan, taken, live, config, board))
+        with part(f"pose {good + 1} of {live.poses}"):
+            capture = speeds.capture(good, partial(_scan, taken, live, config, board))
         taken.add_capture(capture)
         seen.append(capture.view)
         good += live.sees(capture)

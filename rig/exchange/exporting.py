@@ -18,10 +18,10 @@ from rig.exchange.maps import MapFiles
 from rig.exchange.npy import write_npy
 from rig.exchange.pictures import VIEWS, Picture, View
 from rig.outputs import RunFolder
+from rig.progress import Progress, counted
 from rig.recording.inputs import read_model, reconstruct_line
 from rig.recording.manifest import read_manifest
 from rig.recording.opening import SEGMENTS, require_recording
-from rig.run import Progress
 
 ExportKind = Literal["npy", "hdf5", "ply", "png", "mp4"]
 EXPORT_KINDS: Final[tuple[ExportKind, ...]] = get_args(ExportKind)
@@ -101,7 +101,8 @@ class _Export:
     """One export on its way: a method for each kind."""
 
     def __init__(self, run: Path, folder: RunFolder, options: ExportOptions, progress: Progress | None) -> None:
-        self._run, self._folder, self._options, self._progress = run, folder, options, progress
+        self._run, self._folder, self._options = run, folder, options
+        self._told = counted("writing", "frames", progress)
         self._frames_per_picture = options.frames_per_picture or FRAMES_PER_PICTURE
         self._maps = MapFiles(run)
         self.log: FrameLog | None = None
@@ -158,8 +159,7 @@ class _Export:
                 for block in recording.blocks(run):
                     yield block
                     done += block.n_frames
-                    if self._progress is not None:
-                        self._progress(done, recording.frames)
+                    self._told(done, recording.frames)
         except ProtocolError as error:
             raise DamagedRecordingError(str(error)) from error
         self.damage += recording.problems

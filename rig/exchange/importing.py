@@ -24,9 +24,10 @@ from rig.errors import UsageError
 from rig.exchange import photoncube, pi_imaging, swissspad2
 from rig.exchange.foreign import ForeignFrames, gather
 from rig.outputs import RunFolder
+from rig.progress import Progress, counted
 from rig.recording.manifest import MANIFEST
 from rig.recording.writer import Recording
-from rig.run import Progress, versions
+from rig.run import versions
 
 ImportKind = Literal["pi-imaging", "swissspad2", "photoncube"]
 IMPORT_KINDS: Final[tuple[ImportKind, ...]] = get_args(ImportKind)
@@ -115,12 +116,11 @@ def import_frames(
         _require_space(scratch, expected)
         recording = Recording(scratch, expected_bytes=expected)
         try:
-            done = 0
+            done, told = 0, counted("reading", "frames", progress)
             for block in _blocks(_turned(foreign, turn), width, height, ranges, clock):
                 recording.append(block)
                 done += block.n_frames
-                if progress is not None:
-                    progress(done, foreign.n_frames)
+                told(done, foreign.n_frames)
         finally:
             recording.close()
         manifest: dict[str, Any] = {

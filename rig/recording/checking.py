@@ -15,7 +15,10 @@ from drivers.recorded.index import INDEX_RECORD, index_of
 from drivers.recorded.segments import Segment
 from drivers.spb1 import HEADER_BYTES, TRAILER_BYTES, Placed
 from drivers.spb1.layout import TRAILER
+from rig.progress import tell_stage
 
+CHECKING: Final = "checking every block"
+"""The stage's name."""
 CHECKERS: Final = 2
 """Segments checked at a time."""
 _STEP_BYTES: Final = 64 * 2**20
@@ -55,7 +58,10 @@ def check_segments(segments: Sequence[Segment]) -> tuple[list[SoundBlock], list[
         found = list(map(_check, segments))
     else:
         with ThreadPoolExecutor(CHECKERS, "recording checker") as pool:
-            found = list(pool.map(_check, segments))
+            found = []
+            for done, each in enumerate(pool.map(_check, segments), 1):
+                found.append(each)
+                tell_stage(CHECKING, done, len(segments), "segments")
     return [block for blocks, _ in found for block in blocks], [line for _, lines in found for line in lines]
 
 

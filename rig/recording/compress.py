@@ -15,6 +15,7 @@ from drivers.errors import ProtocolError
 from drivers.recorded.seekable import table_bytes, unpack_frame, zstandard_or_error
 from drivers.recorded.segments import PACKED_SUFFIX, PackedSegment, PlainSegment
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
+from rig.progress import tell_stage
 from rig.recording.manifest import UNFINISHED
 from rig.recording.sync import sync_folder
 from rig.recording.verify import Integrity, examine
@@ -47,7 +48,8 @@ def compress(folder: Path) -> Compression:
         why = found.problems[0] if found.problems else f"its run is not over ({Integrity.UNFINISHED.value})"
         raise DamagedRecordingError(f"{folder} is not compressed as it is: {why}; 'rig repair' it first")
     before = after = 0
-    for segment in found.segments:
+    for done, segment in enumerate(found.segments):
+        tell_stage("compressing", done, len(found.segments), "segments")
         before += segment.size
         if isinstance(segment, PlainSegment):
             mine = found.entries[found.entries["segment"] == segment.number]

@@ -18,6 +18,7 @@ from rig.binding import MAX_RESIDUAL_COLUMNS
 from rig.blanking import MAX_CLOCK_ERROR
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
 from rig.outputs import RunFolder
+from rig.progress import tell_stage
 from rig.recording.manifest import MANIFEST, UNFINISHED, require_inputs, require_plain_sweeps
 from rig.recording.maps import MapSpan, map_spans
 from rig.recording.opening import manifest_or_none, open_recording
@@ -74,6 +75,7 @@ def cut(
                 written.begin(part.end_map - part.first_map)
                 for block in recording.blocks(part.run, part.first_frame, part.end_frame):
                     written.append(block)
+                    tell_stage("writing", written.blocks, unit="blocks")
                 lost += [list(gap) for gap in part.run.gaps() if gap[0] < part.end_frame and gap[1] >= part.first_frame]
         finally:
             written.close()

@@ -13,7 +13,8 @@ from drivers.recorded.contents import Contents, find_blocks, in_order, round_up_
 from drivers.recorded.index import INDEX_FILE, INDEX_RECORD
 from drivers.recorded.segments import Segment, open_segments
 from rig.errors import DamagedRecordingError, UsageError
-from rig.recording.checking import Continuity, Gap, SoundBlock, check_segments, continuity
+from rig.progress import tell_stage
+from rig.recording.checking import CHECKING, Continuity, Gap, SoundBlock, check_segments, continuity
 from rig.recording.manifest import MANIFEST, UNFINISHED, ended_early, inputs_problems, read_manifest
 from rig.recording.opening import require_recording
 
@@ -109,6 +110,7 @@ def examine(folder: Path) -> Examined:
         raise UsageError(str(error)) from None
     except ProtocolError as error:  # a package is missing
         raise UsageError(f"{folder}: {error}") from None
+    tell_stage(CHECKING)
     contents = find_blocks(segments, folder)
     sound, damage = check_segments(segments)
     problems = list(dict.fromkeys([*contents.problems, *damage]))

@@ -106,6 +106,21 @@ def test_ctrl_c_before_the_first_map_leaves_nothing(rig: Rig, small: Path, monke
     assert not list(Path().iterdir())
 
 
+def test_an_aborted_run_says_what_of_it_is_kept(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        stop_at_map(0, KeyboardInterrupt(), patch)
+        nothing = rig("scan", small, "--out", "run")
+        frames = rig("scan", small, "--record", "--out", "recorded")
+    with monkeypatch.context() as patch:
+        stop_at_map(1, KeyboardInterrupt(), patch)
+        maps = rig("scan", small, "--maps", 3, "--out", "run")
+    before = "verdict aborted: the run ended before its first map was whole;"
+    told = [" ".join(ran.out.split()) for ran in (nothing, frames, maps)]
+    assert told[0].endswith(f"{before} nothing is kept")
+    assert told[1].endswith(f"{before} the recorded frames are kept in {Path('recorded').absolute()}")
+    assert told[2].endswith("verdict aborted: the run ended before its last map; whole maps are kept")
+
+
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_real_signal_ends_a_scan_in_order(small: Path, tmp_path: Path, name: str) -> None:

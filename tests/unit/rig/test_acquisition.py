@@ -1,5 +1,7 @@
 import dataclasses
 import itertools
+import math
+import threading
 import time
 from types import SimpleNamespace
 
@@ -16,7 +18,7 @@ from rig.errors import DevicesError
 from rig.pipeline import Pipeline
 from rig.row_threads import RowWorkers
 from rig.sweeps import SweepAssembler
-from tests.unit.rig.fakes import PATIENCE_S, START, STOP, acquisition, fake_rig
+from tests.unit.rig.fakes import PATIENCE_S, START, STOP, FakeMaker, acquisition, fake_rig
 from tests.unit.rig.streams import HEIGHT, SPAD, WIDTH, plan_of, scan, stream_of
 
 LAG = Lag(1e-4, 2e-4)
@@ -192,8 +194,34 @@ def test_progress_is_told_on_the_way_and_at_the_end():
     assert [p.frames for p in told] == sorted(p.frames for p in told)
     assert told[-1].sweeps == told[-1].maps == 2
     assert told[-1].lost == 0
-    assert told[-1].frames == pytest.approx(told[-1].frames_planned, abs=40)
     assert told[-1].stages.counting_s > 0
+
+
+def test_progress_ends_with_the_frames_planned_and_is_never_above_them():
+    told = []
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], size=1000)  # the last block goes on behind the last marker
+    list(acquisition(rig, PLAN, 2, on_progress=told.append).run())
+    assert all(p.frames <= p.frames_planned for p in told)
+    assert {p.frames_planned for p in told} == {math.ceil(PLAN.frames_for(2))}
+    assert told[-1].frames == told[-1].frames_planned
+
+
+@pytest.mark.parametrize("learns", [True, False])
+def test_progress_names_the_stage_that_the_run_is_at(learns):
+    stages, heard = [], threading.Event()
+
+    def told(progress):
+        stages.append(progress.stage)
+        heard.set()
+
+    def wait_to_be_told(_):
+        heard.clear()
+        assert heard.wait(PATIENCE_S)
+
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], size=16, behaviour=lambda seq: seq or wait_to_be_told(seq))
+    maker = FakeMaker(lambda index: (wait_to_be_told(index), wait_to_be_told(index)))
+    list(acquisition(rig, PLAN, 2, maker, learns=learns, on_progress=told, silence_s=PATIENCE_S).run())
+    assert list(dict.fromkeys(stages)) == ["rendering", *["learning"] * learns, "estimating"]
 
 
 def test_bursts_are_taken_in_groups_and_numbered_through():

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+from dataclasses import replace
 from fractions import Fraction
 
 import cv2
@@ -27,6 +28,7 @@ from rig.bench.soak import SoakOptions, soak
 from rig.bench.speed import measure_speed
 from rig.bench.stages import Walk, search_stage
 from rig.bench.surface import WINDOW, bench_surface, count_surface
+from rig.bench.table import speed_table
 from rig.counting import SweepCounter, SweepLayout
 from rig.counting_kernels import CHUNK, new_planes, planes_for
 from rig.errors import UsageError
@@ -298,6 +300,20 @@ def test_the_command_prints_one_json_object_or_a_table_of_100_columns(report, mo
     told = capsys.readouterr().out.splitlines()
     assert max(map(len, told)) <= 100
     assert any("GB/s" in line for line in told)
+
+
+def test_the_report_begins_with_whether_this_machine_keeps_up(report, monkeypatch, capsys):
+    rows = {(row.stage, row.exposures): row for row in report.rows if row.threads == 2}
+    speeds = {("likelihood-sweep", 10): 310_000.0, ("joint-sweep", 10): 16_000.0}
+    told = replace(report, rows=tuple(replace(rows[key], frames_per_s=speed) for key, speed in speeds.items()))
+    said = [
+        "keeps up: 20 maps a second at K = 10 with likelihood on 2 threads, 62 would be possible",
+        "does not keep up: 3.2 of 20 maps a second at K = 10 with joint on 2 threads",
+    ]
+    assert told.as_json()["advice"] == said
+    assert [point["keeps_up"] for point in told.as_json()["working_points"]] == [True, False]
+    speed_table(told)
+    assert capsys.readouterr().out.splitlines()[:2] == said
 
 
 @pytest.mark.parametrize(

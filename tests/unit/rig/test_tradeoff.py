@@ -19,7 +19,7 @@ from rig.row_light import RowLight
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 from rig.tradeoff import Tradeoff, Trials, run_tradeoff
-from rig.tradeoff_choice import Wish, choose, wish_of
+from rig.tradeoff_choice import Wish, advice, choose, wish_of
 from rig.tradeoff_figure import tradeoff_svg
 from rig.tradeoff_files import csv_text
 from rig.tradeoff_limits import LEAST_WRONG, SceneLimits
@@ -100,6 +100,24 @@ def test_a_setting_is_judged_by_its_worst_scene():
     assert (answer.setting.exposures, answer.mean_abs_px, answer.fits) == (20, pytest.approx(0.27), True)
     missing = replace(hard[1], missing=0.06)
     assert choose([*easy, hard[0], missing], Wish(error_px=0.28)).setting.exposures == 10
+
+
+def test_the_advice_is_what_was_asked_for_and_else_the_shortest_scan_of_little_more_than_the_least_error():
+    rows = [
+        replace(ROW, estimator="joint", filter="none", exposures=k, mean_abs_px=px, sensor_ms=5.0 * k, compute_ms=80.0)
+        for k, px in ((1, 0.4), (3, 0.14), (10, 0.1))
+    ]
+    took = "K = 3 with joint: 0.14 px in 15 ms of sensor and 80 ms of computing a map"
+    assert advice(rows, None, None) == f"take {took}; the shortest scan within 1.5 times the least error, 0.1 px"
+    wish = Wish(time_ms=20.0)
+    asked = f"take {took}, the best for at most 20 ms of sensor time a map"
+    assert advice(rows, wish, choose(rows, wish)) == asked
+    wish = Wish(error_px=0.01)
+    assert advice(rows, wish, choose(rows, wish)).startswith("nothing tried gives at most 0.01 px of error; nearest is")
+    missing = [replace(row, missing=0.5) for row in rows]
+    assert advice(missing, None, None).startswith("no setting can be named")
+    done = Tradeoff(tuple(rows), "blocks of a map", None, None, "complete")
+    assert done.as_json()["advice"] == advice(rows, None, None)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,203 @@
+"""How far a command is, on stderr: one line with a clock at a terminal, else a line where a stage begins."""
+
+import logging
+import math
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any
+
+from rig.progress import PREPARING, Step, listening
+
+if TYPE_CHECKING:
+    from rich.live import Live
+    from rich.table import Table
+
+COMPILING = "compiling, about a minute, the first time only"
+PATIENCE_S = 2.0
+"""Where there is no terminal a command that takes less says nothing of its progress."""
+BAR_CELLS = 20
+
+_live: ContextVar["Live | None"] = ContextVar("live", default=None)
+
+
+class ProgressLine:
+    """What there is to say of a command now. It may be told and asked on any thread."""
+
+    def __init__(self) -> None:
+        """The clock starts."""
+        self._begun_s = time.monotonic()
+        self._compilers = 0
+        self._compiling = False
+        self.step = Step(PREPARING)
+
+    def heard(self, step: Step) -> None:
+        """Take the newest step."""
+        self.step = step
+        self._compiling = self._compilers > 0
+
+    def compiler_began(self) -> None:
+        """Code is being compiled, on some thread."""
+        self._compilers += 1
+        self._compiling = True
+
+    def compiler_ended(self) -> None:
+        """That is over; it is called compiling until the next step is told, since there is mostly more."""
+        self._compilers -= 1
+
+    @property
+    def stage(self) -> str:
+        """What the command is at."""
+        return COMPILING if self._compiling else self.step.stage
+
+    @property
+    def clock(self) -> str:
+        """Time since the beginning."""
+        seconds = math.floor(time.monotonic() - self._begun_s)
+        hours, minutes = seconds // 3600, seconds // 60 % 60
+        return f"{hours}:{minutes:02d}:{seconds % 60:02d}" if hours else f"{minutes}:{seconds % 60:02d}"
+
+    def text(self) -> str:
+        """Stage, counts and notes, in one line."""
+        step = self.step
+        count = ""
+        if step.total is not None:
+            count = f"{step.done} of {step.total} {step.unit}"
+        elif step.done:
+            count = f"{step.done} {step.unit}"
+        words = self.stage if self._compiling else ", ".join(filter(None, (self.stage, count.rstrip(), step.note)))
+        return f"{step.part}: {words}" if step.part else words
+
+    def __rich__(self) -> "Table":
+        """The same with clock and bar, cut off at the terminal's edge."""
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+        from rich.text import Text
+
+        line = Table.grid(padding=(0, 1))
+        line.add_column(no_wrap=True)
+        line.add_column(no_wrap=True, overflow="ellipsis")
+        cells: list[Any] = [Text(self.clock), Text(self.text())]
+        if self.step.total and not self._compiling:
+            cells.append(ProgressBar(total=self.step.total, completed=self.step.done, width=BAR_CELLS))
+        line.add_row(*cells)
+        return line
+
+
+class _Announcer:
+    """Says each stage once, and each part once, as soon as the command has taken `PATIENCE_S`."""
+
+    def __init__(self, line: ProgressLine) -> None:
+        self._line = line
+        self._lock = threading.Lock()
+        self._said: set[str] = set()
+        self._patient = PATIENCE_S > 0
+        self._timer = threading.Timer(PATIENCE_S, self._speak)
+        self._timer.daemon = True
+
+    def start(self) -> None:
+        if self._patient:
+            self._timer.start()
+
+    def stop(self) -> None:
+        with self._lock:
+            self._patient = True
+        self._timer.cancel()
+
+    def changed(self) -> None:
+        """A step was told, or a compiler began."""
+        with self._lock:
+            line = self._line
+            key = line.step.part if line.step.part and line.stage != COMPILING else line.stage
+            if not self._patient and key not in self._said:
+                self._said.add(key)
+                print(f"{line.clock} {line.text()}", file=sys.stderr, flush=True)
+
+    def _speak(self) -> None:
+        with self._lock:
+            self._patient = False
+        self.changed()
+
+
+@contextmanager
+def progress(*, compiles: bool = True) -> Iterator[None]:
+    """Within it stderr says how far the work is. compiles: whether any of it is compiled code."""
+    line = ProgressLine()
+    with ExitStack() as stack:
+        if sys.stderr.isatty():
+            stack.enter_context(_drawn(line))
+            stack.enter_context(listening(line.heard))
+            begins = line.compiler_began
+        else:
+            announcer = _Announcer(line)
+
+            def heard(step: Step) -> None:
+                line.heard(step)
+                announcer.changed()
+
+            def begins() -> None:
+                line.compiler_began()
+                announcer.changed()
+
+            announcer.start()
+            stack.callback(announcer.stop)
+            stack.enter_context(listening(heard))
+        if compiles:
+            stack.enter_context(_watched_compiler(begins, line.compiler_ended))
+        yield
+
+
+@contextmanager
+def paused() -> Iterator[None]:
+    """Within it no line is drawn, so that a person can be asked something."""
+    live = _live.get()
+    if live is None:
+        yield
+        return
+    live.stop()
+    try:
+        yield
+    finally:
+        live.start()
+
+
+@contextmanager
+def _drawn(line: ProgressLine) -> Iterator[None]:
+    """Within it the line stands at the bottom of the terminal, below all else that goes to stderr."""
+    from rich.console import Console
+    from rich.live import Live
+
+    stream = sys.stderr
+    handlers = [h for h in logging.root.handlers if isinstance(h, logging.StreamHandler) and h.stream is stream]
+    with Live(
+        get_renderable=lambda: line, console=Console(stderr=True), refresh_per_second=10, transient=True,
+        redirect_stdout=False,
+    ) as live:  # fmt: skip
+        token = _live.set(live)
+        try:
+            for handler in handlers:
+                handler.setStream(sys.stderr)
+            yield
+        finally:
+            for handler in handlers:
+                handler.setStream(stream)
+            _live.reset(token)
+
+
+@contextmanager
+def _watched_compiler(began: Any, ended: Any) -> Iterator[None]:
+    """Within it both are called for each kernel that numba finds in none of its caches."""
+    from numba.core import event
+
+    class Watch(event.Listener):
+        def on_start(self, event: Any) -> None:
+            began()
+
+        def on_end(self, event: Any) -> None:
+            ended()
+
+    with event.install_listener("numba:compile", Watch()):
+        yield

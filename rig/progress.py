@@ -1,0 +1,78 @@
+"""How far a command is: named stages, with a count where one is known, told to whoever listens.
+
+It goes the way of a log: told from where the work is done to the listener of the calling thread, if there is one, and
+handed down through no call.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+
+Progress = Callable[[int, int], None]
+"""Called now and then with what is done and what there is to do, in frames, maps or rows."""
+
+
+PREPARING = "preparing"
+"""The stage before anything else is told."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One moment of a command. total: None where nobody knows how many there will be; else `done` is never more.
+
+    part: of which of several pieces of the whole this is, as 'pose 3 of 12'. unit: of the counts, in the plural.
+    note: what else is to be said.
+    """
+
+    stage: str
+    done: int = 0
+    total: int | None = None
+    unit: str = ""
+    note: str = ""
+    part: str = ""
+
+
+Listener = Callable[[Step], None]
+
+_listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
+_part: ContextVar[str] = ContextVar("part", default="")
+
+
+def tell_stage(stage: str, done: int = 0, total: int | None = None, unit: str = "", note: str = "") -> None:
+    """Say which stage the work of this thread is at."""
+    listener = _listener.get()
+    if listener is not None:
+        listener(Step(stage, done if total is None else min(done, total), total, unit, note, _part.get()))
+
+
+def counted(stage: str, unit: str, progress: Progress | None = None) -> Progress:
+    """Tells of a stage whatever it is called with; `progress`, which a caller of the API gave, hears the same."""
+
+    def count(done: int, total: int) -> None:
+        tell_stage(stage, done, total, unit)
+        if progress is not None:
+            progress(min(done, total), total)
+
+    return count
+
+
+@contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """Within it `listener` hears all that is told on this thread."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
+@contextmanager
+def part(name: str) -> Iterator[None]:
+    """Within it everything told is of this part of the whole, which begins with being prepared."""
+    token = _part.set(name)
+    tell_stage(PREPARING)
+    try:
+        yield
+    finally:
+        _part.reset(token)

@@ -1,0 +1,95 @@
+"""What commands say of their progress, what they begin with, and what they refuse before they begin."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from rig import api
+from rig.acquisition import ScanProgress
+from rig.report_text import effects_table
+from tests.system.conftest import Rig
+
+
+def test_a_scan_counts_to_all_of_its_plan_s_frames_and_no_further(small: Path) -> None:
+    told: list[ScanProgress] = []
+    counted: list[tuple[int, int]] = []
+    api.scan(str(small), maps=2, live=told.append, progress=lambda *count: counted.append(count))
+    assert all(now.frames <= now.frames_planned for now in told)
+    assert told[-1].frames == told[-1].frames_planned
+    assert counted == [(now.frames, now.frames_planned) for now in told]
+    assert {now.stage for now in told} <= {"rendering", "learning", "estimating"}
+
+
+def test_a_scan_in_passes_is_never_above_its_plan(small: Path) -> None:
+    told: list[ScanProgress] = []
+    api.scan(str(small), exposures=6, adaptive={}, live=told.append)
+    assert all(now.frames <= now.frames_planned for now in told)
+    assert told[-1].stage in ("learning", "estimating")
+
+
+@pytest.mark.parametrize(
+    ("command", "stages"),
+    [
+        (("scan", "--out", "run"), {"writing", "comparing with the truth"}),
+        (("verify", "RUN"), {"checking every block"}),
+        (("repair", "RUN"), {"checking every block"}),
+        (("replay", "RUN", "--clock", "max", "--out", "again"), {"writing"}),
+        (("reconstruct", "RUN", "--out", "again"), {"writing"}),
+        (("export", "RUN", "npy", "--out", "cube"), {"writing"}),
+        (("effects",), {"trial scan 1 of "}),
+        (("warmup",), {"warming up", "warming up the bench", "warming up the simulator"}),
+        (
+            ("tradeoff", "--exposures", "3", "--estimators", "argmax", "--out", "out"),
+            {"scan 1 of 1", "finding what the"},
+        ),
+        (("calibrate", "sync", "--out", "out"), {"speed 1 of 3", "speed 3 of 3"}),
+    ],
+    ids=lambda part: part[0] if isinstance(part, tuple) else None,
+)
+def test_every_long_command_names_its_stages_on_stderr_and_prints_one_object(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...], stages: set[str]
+) -> None:
+    if "RUN" in command:
+        assert rig("scan", small, "--record", "--out", "recorded").code == 0
+    words = 2 if command[0] == "calibrate" else 1
+    source = () if "RUN" in command else (small,)
+    options = ("recorded" if part == "RUN" else part for part in command[words:])
+    monkeypatch.setattr("rig.cli_progress.PATIENCE_S", 0.0)
+    ran = rig(*command[:words], *source, *options, "--json")
+    assert isinstance(json.loads(ran.out), dict)
+    lines = [line for line in ran.err.splitlines() if re.match(r"\d+:\d\d ", line)]
+    said = [line.split(" ", 1)[1] for line in lines]
+    assert all(any(line.startswith(stage) for line in said) for stage in stages), said
+    assert len(said) == len(set(said)) < 100
+
+
+@pytest.mark.parametrize("poses", [1, 5])
+@pytest.mark.parametrize("command", ["planes", "camera"])
+def test_poses_that_can_never_suffice_are_refused_before_anything_is_scanned(
+    rig: Rig, small: Path, command: str, poses: int
+) -> None:
+    ran = rig("calibrate", command, small, "--poses", poses, "--out", "out")
+    assert ran.code == 2
+    assert ran.problems == [
+        f"error: poses is {poses}; 6 are the fewest that can be checked against each other: ask for 6 or more"
+    ]
+    assert "pose 1 of" not in ran.err
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("columns", [80, 100])
+def test_effects_keep_their_reasons_at_a_terminal(
+    small: Path, columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = api.effects(str(small), trials=False)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    effects_table(found)
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out).splitlines()
+    place = next(line.index("why") for line in lines if line.rstrip().endswith("why"))
+    assert all(len(line) <= columns for line in lines[:-1])
+    reasons = " ".join(line[place:].strip() for line in lines)
+    assert all(effect.why in reasons for effect in found)
