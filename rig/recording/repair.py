@@ -19,7 +19,7 @@ from drivers.recorded.segments import PlainSegment, Segment
 from rig.errors import RecordingError, UsageError
 from rig.recording.checking import SoundBlock
 from rig.recording.holding import is_held
-from rig.recording.manifest import MANIFEST, UNFINISHED, ended_early, sealed_text
+from rig.recording.manifest import MANIFEST, UNFINISHED, device_counters, ended_early, sealed_text
 from rig.recording.sync import sync_folder
 from rig.recording.verify import Examined, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
@@ -163,6 +163,11 @@ def _write_manifest(folder: Path, found: Examined, done: list[str]) -> None:
         return
     recording = {**(manifest.get("recording") or {}), **_recording(found)}
     missing = [*(manifest.get("missing") or []), *map(list, found.joined.missing)]
+    done += [
+        f"start {number}: frames {first} to {last} are not there; they count as lost"
+        for number, first, last in dict.fromkeys(found.joined.missing)
+    ]
+    done += [f"{line}; left out" for line in device_counters(manifest)[1]]
     content: dict[str, Any] = {
         **{key: value for key, value in manifest.items() if key != "counters"},
         "verdict": _verdict(manifest, recording, missing),
