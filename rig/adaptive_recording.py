@@ -36,14 +36,16 @@ class PassNotes:
 class RecordedPasses:
     """The passes of the maps of a recording, again and again where it loops."""
 
-    def __init__(self, rig: OpenRig, whole: ScanPlan, passes: Sequence[Sequence[Pass]], timing: SpadTiming) -> None:
-        """timing: of the SPAD, configured by `replay_plan`."""
+    def __init__(
+        self, rig: OpenRig, whole: ScanPlan, passes: Sequence[Sequence[tuple[int, Pass]]], timing: SpadTiming
+    ) -> None:
+        """passes: of each map, with the recorded starts they are. timing: of the SPAD, configured by `replay_plan`."""
         assert isinstance(rig.spad, PlaysRecording), "asked for by a replay"
         self._rig = rig
         self._folder = rig.spad.recording.path
         self._whole = whole
-        self._maps = passes
-        plans = [read_plan(self._folder, pass_plan(i)) for i in range(sum(map(len, passes)))]
+        self._maps = [[one for _, one in of_map] for of_map in passes]
+        plans = [read_plan(self._folder, pass_plan(start)) for of_map in passes for start, _ in of_map]
         widest = max(plan.frame_width for plan in plans)
         least, most = (BlockLayout(1, width, whole.rows).min_stride for width in (plans[0].frame_width, widest))
         self._timing = replace(timing, stride=-(-timing.stride * most // least))

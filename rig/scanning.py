@@ -1,5 +1,6 @@
 """A scan from open devices to its folder: sweeps in, maps out, and an account of what was lost."""
 
+import logging
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -34,6 +35,8 @@ from rig.scan_plan import ScanPlan
 from rig.session import OpenRig, prepare
 from rig.sweeps import SweepAccount, SweepData
 from rig.warm_up import warm_binding, warm_up
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,15 +128,18 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
         ended_by = error
     del of_maps[run.tally.maps :]
     sweeps = [sweep for passes_of_map in of_maps for sweep in passes_of_map]
-    frames = frames_of(sweeps, acquisition.counters.crc_errors)
+    outside = [] if replayed is None or ended_by is not None else replayed.lost_outside(sweeps)
+    if outside:
+        _log.warning("%d frames are gone from the recording, beside its whole maps", sum(b + 1 - a for a, b in outside))
+    frames = frames_of(sweeps, acquisition.counters.crc_errors, outside)
     result = run.finish(
         frames,
         frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
-        verdict_of(sweeps, rig.model, aborted=ended_by is not None),
+        verdict_of(sweeps, rig.model, aborted=ended_by is not None, outside=outside),
         {
             **manifest,
             "sweeps": [sweep_content(sweep) for sweep in sweeps],
-            "gaps": [list(gap) for sweep in sweeps for gap in sweep.gaps],
+            "gaps": [list(gap) for gap in (*(gap for sweep in sweeps for gap in sweep.gaps), *outside)],
             "counters": asdict(acquisition.counters),
         },
         acquisition.stages,

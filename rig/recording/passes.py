@@ -18,8 +18,8 @@ def pass_plan(start: int) -> str:
     return f"plan-{start:06d}.yaml"
 
 
-def recorded_passes(folder: Path, whole_sweeps: Sequence[int]) -> list[list[Pass]] | None:
-    """The passes of each whole map of a recording; None where it was not taken in passes.
+def recorded_passes(folder: Path, whole_sweeps: Sequence[int]) -> dict[int, list[tuple[int, Pass]]] | None:
+    """Of each whole map of a recording, by its number, the starts and passes; None where it was not taken in passes.
 
     whole_sweeps: sweeps that each start gave, 0 or 1 here: where one is missing, the map is not whole.
     """
@@ -30,9 +30,9 @@ def recorded_passes(folder: Path, whole_sweeps: Sequence[int]) -> list[list[Pass
         taken = [(int(one["map"]), Pass(*(int(one[key]) for key in Pass.__slots__))) for one in noted]
     except (KeyError, TypeError, ValueError) as error:
         raise DamagedRecordingError(f"{folder}: the manifest's {PASSES} are not readable ({error!r})") from None
-    maps = []
-    for _, group in groupby(enumerate(taken), key=lambda each: each[1][0]):
+    maps = {}
+    for number, group in groupby(enumerate(taken), key=lambda each: each[1][0]):
         starts = list(group)
         if all(start < len(whole_sweeps) and whole_sweeps[start] for start, _ in starts):
-            maps.append([one for _, (_, one) in starts])
+            maps[number] = [(start, one) for start, (_, one) in starts]
     return maps
