@@ -21,7 +21,7 @@ CHECKERS: Final = 2
 """Segments checked at a time."""
 _STEP_BYTES: Final = 64 * 2**20
 _CLOCK_SHARE: Final = 0.01
-"""Ticks may be so far from those that the frame numbers say, as a share of them, beside one frame."""
+"""Ticks may be so far from those that the frame numbers say, as a share of them, beside half a frame."""
 _NEIGHBOURS: Final = 2
 """Blocks before and behind that one is compared with."""
 _FEW: Final = 4
@@ -108,7 +108,7 @@ def continuity(runs: Iterable[Sequence[SoundBlock]], *, is_part: bool, known: Co
 def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
     """Whether so many frames can be so many ticks apart; anything can where they are triggered from outside."""
     period = header.frame_period_ticks
-    return not period or abs(ticks - frames * period) <= period * (1 + _CLOCK_SHARE * abs(frames))
+    return not period or abs(ticks - frames * period) <= period * (0.5 + _CLOCK_SHARE * abs(frames))
 
 
 def out_of_step(run: Sequence[SoundBlock]) -> list[SoundBlock]:
