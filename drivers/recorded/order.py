@@ -52,12 +52,12 @@ def _foreign(by_place: Entries, told: Entries) -> NDArray[np.bool_]:
 
     The index is believed where it tells of a run that has other segments, and the block of one that has not.
     """
-    run, segment = by_place["run_id"].astype(np.int64), by_place["segment"].astype(np.int64)
+    run, segment = by_place["run_id"].astype(np.uint64), by_place["segment"].astype(np.uint64)
     runs, of_run = np.unique(run, return_counts=True)
-    pairs, votes = np.unique(segment << 32 | run, return_counts=True)
-    at, claimed = pairs >> 32, pairs & 0xFFFFFFFF
+    pairs, votes = np.unique(segment << np.uint64(32) | run, return_counts=True)
+    at, claimed = pairs >> np.uint64(32), pairs & np.uint64(0xFFFFFFFF)
     best = np.lexsort((of_run[np.searchsorted(runs, claimed)], votes, at))
-    best = best[np.append(np.diff(at[best]) > 0, True)]
+    best = best[np.append(at[best][1:] > at[best][:-1], True)]
     owned, owner = at[best], claimed[best]
     foreign: NDArray[np.bool_] = run != owner[np.searchsorted(owned, segment)]
     for number in np.flatnonzero(np.bincount(np.searchsorted(owned, segment)) == 1):
@@ -114,7 +114,8 @@ def _agreeing(seq: Ints, first: Ints, t0: Ints, n_frames: Ints) -> Ints:
         for vote, yes in zip(votes, agree, strict=True):
             vote[step:] += yes
             vote[:-step] += yes
-    least: Ints = votes.min(axis=0)
+    reaches = np.append(first[1:] < (first + n_frames)[:-1], False)  # into the frames of the next one
+    least: Ints = np.where(reaches, 0, votes.min(axis=0))
     return least
 
 

@@ -79,13 +79,20 @@ def forge_payload(data: bytearray, at: int, change: Any) -> None:
 
 
 def forge_index(folder: Path, number: int, name: str, value: int) -> None:
-    """Write another value into a record of the index."""
+    """Write another value into a record of a recording's index."""
     file = folder / INDEX_FILE
     data = bytearray(file.read_bytes())
-    records = np.frombuffer(data, INDEX_RECORD, -1, INDEX_HEADER_BYTES)
+    forge_record(data, number, name, value)
+    file.write_bytes(data)
+
+
+def forge_record(data: bytearray, number: int, name: str, value: int) -> None:
+    """Write another value into a record of the bytes of an index."""
+    records = np.frombuffer(
+        data, INDEX_RECORD, (len(data) - INDEX_HEADER_BYTES) // INDEX_RECORD.itemsize, INDEX_HEADER_BYTES
+    )
     records[number][name] = value
     _sign(data, INDEX_HEADER_BYTES + number % len(records) * INDEX_RECORD.itemsize, INDEX_RECORD.itemsize)
-    file.write_bytes(data)
 
 
 def _sign(data: bytearray, at: int, size: int) -> None:
