@@ -7,6 +7,7 @@ damaged block is left out, a gap like any other.
 
 import threading
 import time
+from collections.abc import Collection
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -62,6 +63,7 @@ class ReplaySpad(SpadArray):
         self.pace = Pace(ReplayClock.parse(config.clock), clock)
         self._info = recorded_info(recording)
         self._played = 0
+        self._runs = recording.runs
         self._reading: Cursor | None = None
         self._busy = threading.Lock()
         self._counters = SpadCounters(0, 0, 0, 0, 0)
@@ -80,6 +82,10 @@ class ReplaySpad(SpadArray):
     def loops(self) -> bool:
         """Whether it begins again behind the last start."""
         return self._config.loop
+
+    def leave_out(self, runs: Collection[int]) -> None:
+        """Do not play these starts, by their numbers."""
+        self._runs = [run for run in self._recording.runs if run.number not in runs]
 
     def _do_configure(self, request: SpadRequest) -> SpadTiming:
         first = self._recording.runs[0].header
@@ -105,7 +111,7 @@ class ReplaySpad(SpadArray):
         return SpadTiming(first.tick_hz, first.frame_period_ticks, first.exposure_ticks, stride)
 
     def _do_start(self, n_frames: int | None) -> None:
-        runs = self._recording.runs
+        runs = self._runs
         times, index = divmod(self._played, len(runs))
         if times and not self._config.loop:
             raise DeviceFault(f"{self.name}: all its {len(runs)} starts are played; configure it anew, or let it loop")

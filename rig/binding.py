@@ -125,11 +125,14 @@ class BlockTerms(NamedTuple):
 class FrameBinder:
     """Binds the blocks of one run, in order. Records count markers up to and including their own frame.
 
-    clock_ratio: of the scanner's clock to nominal, as of the sweep before the first, where that is known. end_sweep:
-    one behind the last sweep that is wanted; None: all that the frames tell of.
+    clock_ratio: of the scanner's clock to nominal, as of the sweep before the first, where that is known. first_sweep:
+    number of that first one; of those before it only a piece may be there, which fits no clock. end_sweep: one behind
+    the last sweep that is wanted; None: all that the frames tell of.
     """
 
-    def __init__(self, plan: ScanPlan, clock_ratio: float = 1.0, end_sweep: int | None = None) -> None:
+    def __init__(
+        self, plan: ScanPlan, clock_ratio: float = 1.0, first_sweep: int = 0, end_sweep: int | None = None
+    ) -> None:
         from rig.binding_kernels import walk
 
         self._walk = walk
@@ -137,6 +140,7 @@ class FrameBinder:
         self._terms = _plan_terms(plan)
         self._ratio = clock_ratio
         self._end_sweep = end_sweep
+        self._first_sweep = first_sweep
         self._nominal = math.nan
         self._tick_hz: Fraction | None = None
         self._t0: int | None = None
@@ -309,7 +313,7 @@ class FrameBinder:
         point, time = self._edges[0, : now["edges"]], self._edges[1, : now["edges"]]
         fit = _fit(point, time, nominal, float(self._plan.points_per_column))
         clock = SweepClock(number, *fit, self._first_frame, end_frame, int(now["wrong_way"]))
-        if fit[2] > 2 and clock.synchronised:
+        if number >= self._first_sweep and fit[2] > 2 and clock.synchronised:
             self._ratio = 1 + clock.clock_error
         self._first_frame = end_frame
         now["edges"] = now["wrong_way"] = 0

@@ -129,7 +129,7 @@ def _show_verification(found: "Verification") -> None:
 
 _ADVICE = {
     "intact": "every frame that was recorded is there",
-    "gaps": "frames were lost, and every other one is there",
+    "gaps": "whole with gaps; frames were lost, and every other one is there",
     "unfinished": "the recording is not over, or was cut short; 'rig repair' ends it behind its last whole block",
     "damaged": "not all is there that was recorded; 'rig repair' keeps what is sound",
 }
@@ -142,7 +142,7 @@ def _show_info(found: "RecordingInfo") -> None:
     for number, run in enumerate(found.runs):
         rate = "triggered from outside" if run.frame_rate_hz is None else f"{run.frame_rate_hz:.6g} Hz"
         maps = "no whole map" if run.first_map is None else f"maps {run.first_map} to {(run.end_map or 0) - 1}"
-        gaps = f", {run.gaps} gaps" if run.gaps else ""
+        gaps = f", {run.gaps} gaps of {run.lost} frames" if run.gaps else ""
         print(
             f"start {number}: frames {run.first_frame} to {run.end_frame - 1}{gaps}, {run.width} x {run.height} of "
             f"{run.sensor_width} x {run.sensor_height}, {rate}, {run.duration_s:.6g} s, {maps}"

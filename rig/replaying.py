@@ -6,7 +6,7 @@ SPAD is played as one: so a map is made of the very same frames in the very same
 
 import itertools
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -24,6 +24,7 @@ from rig.config_files import parse_config
 from rig.errors import DamagedRecordingError, UsageError
 from rig.estimators import Learned
 from rig.plan import spad_request
+from rig.recording.ends import EndGap, end_block, end_gaps, readable_range
 from rig.recording.inputs import PLAN_FILE, read_plan
 from rig.recording.manifest import (
     MANIFEST,
@@ -34,9 +35,9 @@ from rig.recording.manifest import (
     require_plain_sweeps,
 )
 from rig.recording.opening import require_recording
-from rig.recording.part import part_learned, part_starts
+from rig.recording.part import fitted_ratio, part_learned, part_starts
 from rig.scan_plan import ScanPlan
-from rig.sweeps import SweepStart
+from rig.sweeps import Gap, SweepAccount, SweepStart
 
 SILENCE_S = 5.0
 """As of a live SPAD, in the time of the recording."""
@@ -64,6 +65,10 @@ class PlaysRecording(Protocol):
     @property
     def loops(self) -> bool:
         """Whether it begins again behind the last start."""
+        ...
+
+    def leave_out(self, runs: Collection[int]) -> None:
+        """Do not play these starts, by their numbers."""
         ...
 
 
@@ -170,10 +175,17 @@ class Replayed:
     def __init__(self, spad: PlaysRecording, plan: ScanPlan, maps: int | None) -> None:
         self._spad = spad
         self._shapes = (plan.rows, plan.columns), (plan.rows, plan.width)
-        self._sweeps = recorded_sweeps(spad.recording, plan)
-        there = self._there = sum(self._sweeps)
+        self._all = maps is None
+        starts = recorded_sweeps(spad.recording, plan)
+        self._played = [start for start in starts if start.sweeps]
+        self._numbers = [start.first_map + i for start in starts for i in range(start.sweeps)]
+        spad.leave_out({run.number for run in spad.recording.runs} - {start.number for start in self._played})
+        self._gone = _merged([*end_gaps(spad.recording), *(gap for start in starts for gap in start.gone)])
+        there = self._there = len(self._numbers)
         if there == 0:
-            raise UsageError(f"{spad.recording.path} holds no whole sweep, so there is no map to be made of it")
+            lost = sum(last + 1 - first for _, first, last in self._gone)
+            gone = f" ({lost} frames of it are gone)" if lost else ""
+            raise UsageError(f"{spad.recording.path} holds no whole sweep{gone}, so there is no map to be made of it")
         if maps is not None and maps > there and not spad.loops:
             raise UsageError(f"--maps is {maps}, {spad.recording.path} holds {there}; ask for fewer, or add --loop")
         self.maps: int = maps or (ENDLESS if spad.loops else there)
@@ -196,33 +208,51 @@ class Replayed:
 
     def groups(self) -> Iterator[int]:
         """Sweeps of one start after the other."""
-        return itertools.cycle(self._sweeps) if self._spad.loops else iter(self._sweeps)
+        sweeps = [start.sweeps for start in self._played]
+        return itertools.cycle(sweeps) if self._spad.loops else iter(sweeps)
 
     def starts_for(self, maps: int) -> int:
         """Starts that give so many maps, at most."""
-        return -(-maps // self._there) * len(self._sweeps)
+        return -(-maps // self._there) * len(self._played)
 
     def starts(self) -> Iterator[SweepStart]:
         """With which sweep each of the starts begins."""
-        found = part_starts(self._spad.recording)
+        found = [start.begin for start in self._played]
         return itertools.cycle(found) if self._spad.loops else iter(found)
 
     def learned(self, estimate: EstimateConfig, model: RigModel | None) -> Sequence[Learned]:
         """Of a part of a recording, what its maps were estimated with; empty where they are to be learned anew."""
-        return part_learned(self._spad.recording.path, estimate, model)
+        learned = part_learned(self._spad.recording.path, estimate, model)
+        return [learned[number] for number in self._numbers if number < len(learned)]
 
     def truth(self, index: int) -> SweepTruth | None:
         """What was known of a map when it was recorded, where that was kept.
 
         DamagedRecordingError where it is of other columns or of another sensor.
         """
-        truth = recorded_truth(self._spad.recording.path, index % self._there)
+        truth = recorded_truth(self._spad.recording.path, self._numbers[index % self._there])
         if truth is not None and (truth.x_px.shape, truth.depth_m.shape) != self._shapes:
             raise DamagedRecordingError(
                 f"{self._spad.recording.path}: the truth of map {index} is of {truth.x_px.shape} and "
                 f"{truth.depth_m.shape} pixels, not {self._shapes[0]} and {self._shapes[1]}; move it away"
             )
         return truth
+
+    def lost_outside(self, sweeps: Sequence[SweepAccount]) -> list[Gap]:
+        """(first, last) frames known to be gone from the recording that lie in none of these sweeps, its whole ones.
+
+        None where fewer maps were asked for than there are.
+        """
+        if not self._all:
+            return []
+        spans = _by_start(sweeps, [start.number for start in self._played])
+        lost = []
+        for number, first, last in self._gone:
+            for begin, end in (*spans.get(number, ()), (last + 1, last + 1)):
+                if first < min(begin, last + 1):
+                    lost.append((first, min(begin, last + 1) - 1))
+                first = max(first, end)
+        return lost
 
 
 def pace_of(spad: SpadArray) -> Pace:
@@ -231,28 +261,103 @@ def pace_of(spad: SpadArray) -> Pace:
     return spad.pace
 
 
-def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[int]:
-    """How many sweeps each start of the SPAD gave; of one that was cut short, by whatever, the whole ones.
+@dataclass(frozen=True, slots=True)
+class RecordedStart:
+    """One start of the SPAD. begin: with which sweep its whole maps begin. first_map: number of the first of them in
+    the recording; sweeps: how many there are. gone: frames at its ends that the manifest tells of and no block has.
+    """
+
+    number: int
+    begin: SweepStart
+    first_map: int
+    sweeps: int
+    gone: tuple[EndGap, ...]
+
+
+def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedStart]:
+    """The whole sweeps that each start of the SPAD gave, as the run took them, as far as their frames are there.
 
     DamagedRecordingError where a start is missing: its maps would be taken for those of others.
     """
     manifest = read_manifest(recording.path) or {}
     noted = manifest.get("recording") or {}
+    begins = part_starts(recording)
     starts = noted.get("starts")
     if not starts:
-        return [_whole_sweeps(recording, run, plan) for run in recording.runs]
-    planned = [int(start["sweeps"]) for start in starts]
-    segments = np.array([int(start["segment"]) for start in starts])
-    found = [int(np.searchsorted(segments, run.entries["segment"][0], "right")) - 1 for run in recording.runs]
-    if found != list(range(len(found))):
-        raise DamagedRecordingError(
-            f"{recording.path}: of {len(starts)} starts of the SPAD only {len(set(found))} are there, not the first; "
-            "take the missing segments from a copy"
-        )
-    planned = [min(sweeps, run.frames) for sweeps, run in zip(planned, recording.runs, strict=False)]
-    if is_cut_short(manifest) or ended_before_last_map(manifest):
-        planned[-1] = min(planned[-1], _whole_sweeps(recording, recording.runs[-1], plan))
-    return [sweeps for sweeps in planned if sweeps]
+        planned = [_whole_sweeps(recording, run, plan) for run in recording.runs]
+    else:
+        planned = [int(start["sweeps"]) for start in starts]
+        segments = np.array([int(start["segment"]) for start in starts])
+        found = [int(np.searchsorted(segments, run.entries["segment"][0], "right")) - 1 for run in recording.runs]
+        if found != list(range(len(found))):
+            raise DamagedRecordingError(
+                f"{recording.path}: of {len(starts)} starts of the SPAD only {len(set(found))} are there, not the "
+                "first; take the missing segments from a copy"
+            )
+        planned = [min(sweeps, run.frames) for sweeps, run in zip(planned, recording.runs, strict=False)]
+    sweeps = manifest.get("sweeps")
+    taken: list[RecordedStart] = []
+    first_map = 0
+    for run, begin, of_run in zip(recording.runs, begins, planned, strict=False):
+        mine = None if sweeps is None else sweeps[first_map : first_map + of_run]
+        taken.append(_recorded_start(recording, run, begin, first_map, of_run, mine, manifest, plan))
+        first_map += of_run
+    return taken
+
+
+def _recorded_start(
+    recording: RunRecording,
+    run: RecordedRun,
+    begin: SweepStart,
+    first_map: int,
+    maps: int,
+    sweeps: Sequence[dict[str, Any]] | None,
+    manifest: dict[str, Any],
+    plan: ScanPlan,
+) -> RecordedStart:
+    """Of a start that gave `maps` maps from number `first_map` on; sweeps: theirs in the manifest, None: not noted."""
+    first, end = readable_range(recording, run)
+    whole = maps
+    cut_short = is_cut_short(manifest) or ended_before_last_map(manifest)
+    if plan.blanking is None or sweeps is None or cut_short or recording.problems:
+        whole = max(0, min(maps, _whole_sweeps(recording, run, plan) - begin.sweep))
+    gone: list[EndGap] = []
+    if sweeps and not is_cut_short(manifest) and end <= int(sweeps[-1]["end_frame"]):
+        gone.append((run.number, end, int(sweeps[-1]["end_frame"])))
+    ranges = (manifest.get("cut") or {}).get("frames") or []
+    before = 0
+    if run.number < len(ranges) and int(ranges[run.number][1]) < first:
+        _, part_first, part_end = map(int, ranges[run.number])
+        gone.append((run.number, part_first, first - 1))
+        if sweeps is not None:
+            before = sum(int(sweep["first_frame"]) < first for sweep in sweeps)
+            begin = replace(begin, clock_ratio=fitted_ratio(begin.clock_ratio, sweeps[:before]))
+        else:  # of a run that was killed nobody noted them; at a lost end a part lacks one map
+            before = maps - whole if end >= part_end else min(1, maps)
+    return RecordedStart(run.number, begin, first_map + before, min(whole, maps - before), tuple(gone))
+
+
+def _merged(gaps: Sequence[EndGap]) -> list[EndGap]:
+    """The gaps of each start in order, those that meet as one."""
+    merged: list[EndGap] = []
+    for number, first, last in sorted(gaps):
+        if merged and merged[-1][0] == number and first <= merged[-1][2] + 1:
+            merged[-1] = number, merged[-1][1], max(last, merged[-1][2])
+        else:
+            merged.append((number, first, last))
+    return merged
+
+
+def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[int, list[Gap]]:
+    """From which frame to before which the sweeps of each start go: frames are counted anew with each."""
+    spans: dict[int, list[Gap]] = {}
+    at, end = 0, 0
+    for sweep in sweeps:
+        at += sweep.first_frame < end
+        end = sweep.end_frame
+        if at < len(numbers):
+            spans.setdefault(numbers[at], []).append((sweep.first_frame, end))
+    return spans
 
 
 def recorded_truth(folder: Path, index: int) -> SweepTruth | None:
@@ -274,12 +379,12 @@ def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> 
     """
     if plan.blanking is not None:
         frames = float(plan.frames_per_sweep)
-        return min(run.frames, max(0, int((run.end_frame - plan.frames_for(0)) / frames)))
-    last = next((b for e in run.entries[::-1] if (b := recording.read(run, e)) is not None and b.n_frames), None)
+        return min(run.frames, max(0, int((readable_range(recording, run)[1] - plan.frames_for(0)) / frames)))
+    last = end_block(recording, run, last=True)
     if last is None:
         return 0
     before = last.header.sweep
-    return min(run.frames, max(0, before + ((int(last.records["sweep"][-1]) - before) & 0xFFFF) - 1))
+    return min(run.frames, max(0, before + int(((last.records["sweep"].astype(np.int64) - before) & 0xFFFF).max()) - 1))
 
 
 def _own_drivers(run: Path, recorded: dict[str, Any]) -> dict[str, Any]:

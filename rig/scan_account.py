@@ -1,21 +1,26 @@
 """What the sweeps of a scan come to: frames, synchronisation, verdict, and an account of each for the manifest."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 from calibration.model.rig_model import RigModel
 from drivers.interfaces import SpadCounters
 from rig.summary import RunFrames, Synchronisation, Verdict
-from rig.sweeps import SweepAccount
+from rig.sweeps import Gap, SweepAccount
 
 
-def frames_of(sweeps: list[SweepAccount], crc_errors: int | None) -> RunFrames:
-    """Sums over the sweeps; crc_errors: as the SPAD counts them, None where it does not."""
+def frames_of(sweeps: list[SweepAccount], crc_errors: int | None, outside: Sequence[Gap] = ()) -> RunFrames:
+    """Sums over the sweeps; crc_errors: as the SPAD counts them, None where it does not.
+
+    outside: frames that are known to be lost beside the sweeps, (first, last).
+    """
+    beside = sum(last + 1 - first for first, last in outside)
     return RunFrames(
-        expected=sum(sweep.frames.expected for sweep in sweeps),
+        expected=beside + sum(sweep.frames.expected for sweep in sweeps),
         received=sum(sweep.frames.received for sweep in sweeps),
-        lost=sum(sweep.frames.lost for sweep in sweeps),
+        lost=beside + sum(sweep.frames.lost for sweep in sweeps),
         crc_errors=crc_errors,
         lit=sum(sweep.frames.lit for sweep in sweeps),
     )
@@ -44,13 +49,15 @@ def synchronisation_of(sweeps: list[SweepAccount]) -> Synchronisation | None:
     )
 
 
-def verdict_of(sweeps: list[SweepAccount], model: RigModel | None, *, aborted: bool) -> Verdict:
-    """The gravest that applies."""
+def verdict_of(
+    sweeps: list[SweepAccount], model: RigModel | None, *, aborted: bool, outside: Sequence[Gap] = ()
+) -> Verdict:
+    """The gravest that applies. outside: as of `frames_of`."""
     if aborted:
         return Verdict.ABORTED
     if not all(sweep.synchronised or _markers_lost(sweep) for sweep in sweeps):
         return Verdict.UNSYNCHRONISED
-    if any(sweep.frames.lost for sweep in sweeps):
+    if outside or any(sweep.frames.lost for sweep in sweeps):
         return Verdict.GAPS
     return Verdict.COMPLETE if model is not None else Verdict.UNCALIBRATED
 

@@ -1,5 +1,6 @@
 """A scan from open devices to its folder: sweeps in, maps out, and an account of what was lost."""
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -31,6 +32,7 @@ from rig.session import OpenRig, prepare
 from rig.sweeps import SweepAccount, SweepData
 from rig.warm_up import warm_binding, warm_up
 
+_log = logging.getLogger(__name__)
 OnSpace = Callable[[Space], None]
 """Told, before anything moves, what a recording will take on the disk, once it is known to fit."""
 
@@ -119,16 +121,19 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
             raise
         ended_by = error
     del sweeps[run.tally.maps :]
-    frames = frames_of(sweeps, acquisition.counters.crc_errors)
     counters, stages = acquisition.counters, acquisition.stages
+    outside = [] if replayed is None or ended_by is not None else replayed.lost_outside(sweeps)
+    if outside:
+        _log.warning("%d frames are gone from the recording, beside its whole maps", sum(b + 1 - a for a, b in outside))
+    frames = frames_of(sweeps, counters.crc_errors, outside)
     result = run.finish(
         frames if ended_by is None else frames_that_came(frames, counters, stages.dropped_frames),
         frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
-        verdict_of(sweeps, rig.model, aborted=ended_by is not None),
+        verdict_of(sweeps, rig.model, aborted=ended_by is not None, outside=outside),
         {
             **manifest,
             "sweeps": [sweep_content(sweep) for sweep in sweeps],
-            "gaps": [list(gap) for sweep in sweeps for gap in sweep.gaps],
+            "gaps": [list(gap) for gap in (*(gap for sweep in sweeps for gap in sweep.gaps), *outside)],
             "counters": asdict(counters),
         },
         stages,

@@ -101,7 +101,7 @@ class SweepAssembler:
         self._maps = maps
         self._first_index = first_index
         self._start = start or SweepStart()
-        self._binder = FrameBinder(plan, self._start.clock_ratio, self._start.sweep + maps)
+        self._binder = FrameBinder(plan, self._start.clock_ratio, self._start.sweep, self._start.sweep + maps)
         self._adds: deque[int] = deque(maxlen=MOST_UNDER_WAY)
         self._next_frame: int | None = None
         self._last_tick: int | None = None

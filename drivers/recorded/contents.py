@@ -6,16 +6,15 @@ they say. What they leave out is searched for blocks; where they do not fit, eve
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.errors import CorruptBlock, UnsupportedBlock
 from drivers.frames import FrameBlock
 from drivers.recorded.index import INDEX_FILE, INDEX_RECORD, decode_index, index_of
+from drivers.recorded.order import Entries, in_order
 from drivers.recorded.segments import Segment
 from drivers.spb1 import ALIGN, Damage, Placed, parse_block
 
@@ -23,29 +22,30 @@ PAGE_BYTES: Final = 4096
 """Blocks of a recording begin on multiples of this."""
 MOST_FRAMES: Final = 0xFFFF
 """Of a block."""
-
-Entries = NDArray[Any]
-"""(n,) of INDEX_RECORD."""
+MOST_COUNTED: Final = 2**63 - 2**32
+"""Of frames and ticks, as of a block's header."""
 
 
 @dataclass(slots=True)
 class Contents:
     """entries: the blocks in the order of their frames, run after run. problems: a line for each thing that is wrong.
 
-    indexed: whether the index told where they are. run_order: ids of the runs as far as the index tells of them.
+    indexed: whether the index told where they are. told: its sound records, in the order of places, whether what they
+    tell of is there or not.
     """
 
     entries: Entries
     problems: list[str] = field(default_factory=list)
     indexed: bool = True
-    run_order: list[int] = field(default_factory=list)
+    told: Entries = field(default_factory=lambda: np.empty(0, INDEX_RECORD))
 
 
 def find_blocks(segments: Sequence[Segment], folder: Path) -> Contents:
     """The blocks of a recording. Nothing is raised for damage: it is in `problems`, and costs what it hit."""
     by_number = {segment.number: segment for segment in segments}
     problems: list[str] = []
-    records, order = _index_records(folder, by_number, problems)
+    told = _told(folder, problems)
+    records = None if told is None else _inside(told, by_number, problems)
     indexed = records is not None and all(_fits(records[records["segment"] == s.number], s) for s in segments)
     if not indexed:
         if records is not None:
@@ -59,10 +59,11 @@ def find_blocks(segments: Sequence[Segment], folder: Path) -> Contents:
         if found and indexed:
             problems.append(f"{segment.path.name}: {len(found)} blocks are not in {INDEX_FILE}")
         parts.append(np.frombuffer(b"".join(found), INDEX_RECORD))
-    entries, in_place = in_order(np.concatenate(parts), order, problems)
+    told = np.empty(0, INDEX_RECORD) if told is None else told
+    entries, in_place = in_order(np.concatenate(parts), told, problems, folder=folder.is_dir())
     if not (indexed or in_place):
         problems.append("the blocks do not lie in the order of their frames")
-    return Contents(entries, problems, indexed, order)
+    return Contents(entries, problems, indexed, told)
 
 
 def read_entry(segment: Segment, entry: Any) -> FrameBlock:
@@ -73,23 +74,23 @@ def read_entry(segment: Segment, entry: Any) -> FrameBlock:
     return block
 
 
-def _index_records(folder: Path, segments: dict[int, Segment], problems: list[str]) -> tuple[Entries | None, list[int]]:
-    """Sound index records, sorted by place, and the runs in their order; None where there is no index."""
+def _told(folder: Path, problems: list[str]) -> Entries | None:
+    """Sound index records, sorted by place; None where there is no index."""
     try:
         data = np.fromfile(folder / INDEX_FILE, np.uint8) if folder.is_dir() else None
     except FileNotFoundError:
         problems.append(f"{INDEX_FILE} is missing")
-        return None, []
+        return None
     except OSError as error:
         problems.append(f"{INDEX_FILE} cannot be read: {error.strerror or error}")
-        return None, []
+        return None
     if data is None:  # a single file has none
-        return None, []
+        return None
     try:
         records, sound = decode_index(data)
     except CorruptBlock as error:
         problems.append(str(error))
-        return None, []
+        return None
     if len(data) % INDEX_RECORD.itemsize:
         problems.append(f"{INDEX_FILE} ends in the middle of a record")
     if not sound.all():
@@ -98,22 +99,28 @@ def _index_records(folder: Path, segments: dict[int, Segment], problems: list[st
     by_place = np.lexsort((records["offset"], records["segment"]))
     if (np.diff(by_place) < 0).any():
         problems.append(f"{INDEX_FILE}: its records are not in the order in which they were written")
-    records = records[by_place]
-    order = list(dict.fromkeys(records["run_id"].tolist()))
+    return records[by_place]
+
+
+def _inside(records: Entries, segments: dict[int, Segment], problems: list[str]) -> Entries:
+    """Those records that tell of blocks which can be there; where two tell of the same bytes, neither."""
     sizes = np.zeros(max(segments) + 2)
     sizes[list(segments)] = [segment.size for segment in segments.values()]
     room = sizes[np.minimum(records["segment"], len(sizes) - 1)]
     inside = records["offset"].astype(np.float64) + records["length"] <= room
     inside &= (records["offset"] % ALIGN == 0) & (records["length"] > 0) & (records["n_frames"] <= MOST_FRAMES)
+    inside &= (records["first_frame"] <= MOST_COUNTED) & (records["t0_ticks"] <= MOST_COUNTED)
     if not inside.all():
         problems.append(f"{INDEX_FILE}: {int((~inside).sum())} blocks lie beyond the end of their segments")
     records = records[inside]
     end = records["offset"] + records["length"]
+    close = (records["segment"][1:] == records["segment"][:-1]) & (records["offset"][1:] < end[:-1])
     apart = np.ones(len(records), bool)
-    apart[1:] = (records["segment"][1:] != records["segment"][:-1]) | (records["offset"][1:] >= end[:-1])
+    apart[1:] &= ~close
+    apart[:-1] &= ~close
     if not apart.all():
         problems.append(f"{INDEX_FILE}: {int((~apart).sum())} records tell of the same bytes as others")
-    return records[apart], order
+    return records[apart]
 
 
 def _fits(records: Entries, segment: Segment) -> bool:
@@ -141,14 +148,11 @@ def _search(segment: Segment, known: Entries, problems: list[str]) -> Iterator[b
     starts = np.concatenate([np.zeros(1, np.int64), ends.astype(np.int64)])
     stops = np.concatenate([known["offset"].astype(np.int64), np.array([segment.size], np.int64)])
     for i in np.flatnonzero(stops > starts):
-        try:
-            for item in segment.walk(int(starts[i]), int(stops[i]), check_payload=False):
-                if isinstance(item, Placed):
-                    yield index_of(item.block, segment.number, item.offset, item.length)
-                else:
-                    problems.append(damage_line(segment, item))
-        except UnsupportedBlock as error:
-            problems.append(f"{segment.path.name}: {error}")
+        for item in segment.walk(int(starts[i]), int(stops[i]), check_payload=False):
+            if isinstance(item, Placed):
+                yield index_of(item.block, segment.number, item.offset, item.length)
+            else:
+                problems.append(damage_line(segment, item))
 
 
 def round_up_to_page(size: Any) -> Any:
@@ -159,24 +163,3 @@ def round_up_to_page(size: Any) -> Any:
 def damage_line(segment: Segment, damage: Damage) -> str:
     """What people are told of a damage."""
     return f"{segment.path.name}, bytes {damage.offset} to {damage.offset + damage.length}: {damage.reason}"
-
-
-def in_order(entries: Entries, runs: list[int], problems: list[str]) -> tuple[Entries, bool]:
-    """The blocks run after run, with rising numbers, without what comes twice or goes back; whether they lie so too."""
-    if len(entries) == 0:
-        return entries, True
-    by_place = np.sort(entries, order=["segment", "offset"], kind="stable")
-    runs = list(dict.fromkeys([*runs, *by_place["run_id"].tolist()]))
-    rank_of = {run: rank for rank, run in enumerate(runs)}
-    rank = np.array([rank_of[run] for run in by_place["run_id"].tolist()])
-    order = np.lexsort((by_place["block_seq"], rank))
-    ordered = by_place[order]
-    keep = np.ones(len(ordered), bool)
-    begins = np.flatnonzero(np.diff(rank[order], prepend=-1))
-    for begin, stop in pairwise([*begins.tolist(), len(ordered)]):
-        run = ordered[begin:stop]
-        end = np.maximum.accumulate(run["first_frame"] + run["n_frames"])
-        keep[begin + 1 : stop] = (run["block_seq"][1:] > run["block_seq"][:-1]) & (run["first_frame"][1:] >= end[:-1])
-    if not keep.all():
-        problems.append(f"{int((~keep).sum())} blocks come twice or tell of frames of others")
-    return ordered[keep], bool((np.diff(order) > 0).all())

@@ -9,6 +9,7 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +19,8 @@ import numpy as np
 
 from drivers.errors import ProtocolError
 from drivers.frames import BlockFlag, BlockHeader, FrameBlock
-from drivers.recorded.contents import Entries, find_blocks, read_entry
+from drivers.recorded.contents import find_blocks, read_entry
+from drivers.recorded.order import Entries
 from drivers.recorded.segments import open_segments
 
 READERS: Final = 2
@@ -28,13 +30,17 @@ READ_AHEAD_BYTES: Final = 32 * 2**20
 _ROUNDING_TICKS: Final = 1e-6
 """Seconds are no whole number of ticks in binary: so much less than one still is that one."""
 _MOST_TICKS: Final = 2.0**62
+_WITNESSES: Final = 3
+"""Blocks of a run that are asked for its size and clock."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedRun:
-    """The blocks of one start of the SPAD. entries: (n,) of `INDEX_RECORD`. header: of its first sound block.
+    """The blocks of one start of the SPAD. entries: (n,) of `INDEX_RECORD`.
+
+    header: of its first sound block, where that is of the size and clock of the others.
 
     Frame numbers of the run are counted from the SPAD's start, so that the first need not be 0.
     """
@@ -123,7 +129,7 @@ class RunRecording:
         segment = self._segments[int(entry["segment"])]
         try:
             block = read_entry(segment, entry)
-            if not _is_of(block.header, run.header):
+            if not is_of_run(block.header, run.header):
                 raise ProtocolError(f"block {block.header.block_seq} is of another size or clock than its run")
         except ProtocolError as error:
             self._add_problem(f"{segment.path.name}, byte {entry['offset']}: {error}")
@@ -166,21 +172,22 @@ class RunRecording:
         runs: list[RecordedRun] = []
         for begin, stop in pairwise([*begins.tolist(), len(entries)]):
             mine = entries[begin:stop]
-            header = self._first_header(mine)
+            header = self._header(mine)
             if header is None:
                 self.problems.append(f"run {mine['run_id'][0]}: none of its {len(mine)} blocks is sound")
             elif mine["n_frames"].any():
                 runs.append(RecordedRun(len(runs), header, mine))
         return runs
 
-    def _first_header(self, entries: Entries) -> BlockHeader | None:
-        """Of the first block that is sound; those before it are told of where they are read."""
-        for entry in entries:
-            try:
-                return read_entry(self._segments[int(entry["segment"])], entry).header
-            except ProtocolError:
-                continue
-        return None
+    def _header(self, entries: Entries) -> BlockHeader | None:
+        """Of the first sound block, of several asked, that is of the size and clock of most of them; None: none is."""
+        headers: list[BlockHeader] = []
+        for at in _spread(len(entries)):
+            with suppress(ProtocolError):
+                headers.append(read_entry(self._segments[int(entries[at]["segment"])], entries[at]).header)
+            if len(headers) == _WITNESSES:
+                break
+        return max(headers, key=lambda one: sum(is_of_run(one, other) for other in headers), default=None)
 
     def _add_problem(self, line: str) -> None:
         if line not in self.problems:
@@ -213,9 +220,21 @@ def block_part(block: FrameBlock, first_frame: int, end_frame: int) -> FrameBloc
     return FrameBlock(header, records, block.bits[begin:end], block.status)
 
 
-def _is_of(header: BlockHeader, first: BlockHeader) -> bool:
+def is_of_run(header: BlockHeader, other: BlockHeader) -> bool:
     """Whether a block can be of the run that another one is of."""
-    return all(getattr(header, name) == getattr(first, name) for name in _OF_A_RUN)
+    return run_kind(header) == run_kind(other)
+
+
+def run_kind(header: BlockHeader) -> tuple[Any, ...]:
+    """What all blocks of a run have in common: its id, size and clock."""
+    return tuple(getattr(header, name) for name in _OF_A_RUN)
+
+
+def _spread(n: int) -> Iterator[int]:
+    """0 to n - 1, the first and some from all over first."""
+    asked = np.unique(np.linspace(0, n - 1, _WITNESSES).astype(int)).tolist()
+    yield from asked
+    yield from (at for at in range(n) if at not in asked)
 
 
 _OF_A_RUN: Final = (

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import CorruptBlock
+from drivers.errors import CorruptBlock, UnsupportedBlock
 from drivers.frames import FrameBlock
 from drivers.spb1.layout import ALIGN, MAGIC, check_stride, round_up
-from drivers.spb1.reader import read_frames, read_header
+from drivers.spb1.reader import read_control, read_frames, read_header
 
 _SEARCH_BYTES = 16 * 2**20
 """A search looks at this much at a time, so that a big file mapped into memory is not read to its end for one gap."""
@@ -17,11 +17,15 @@ _SEARCH_BYTES = 16 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A piece of a stream that gave no block: where, how much (0 where only padding is missing) and why."""
+    """A piece of a stream that gave no block: where, how much (0 where only padding is missing) and why.
+
+    unsupported: a header with the right CRC tells of a block that this reader does not take.
+    """
 
     offset: int
     length: int
     reason: str
+    unsupported: bool = False
 
 
 def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[FrameBlock | Damage]:
@@ -35,6 +39,8 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
     last: FrameBlock | None = None
     for item in walk_placed(buffer, stride, check_payload=check_payload):
         if isinstance(item, Damage):
+            if item.unsupported:
+                raise UnsupportedBlock(item.reason)
             yield item
         elif last is None or not _repeats(item.block, last):
             last = item.block
@@ -56,7 +62,10 @@ class Placed:
 
 
 def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[Placed | Damage]:
-    """As `walk_blocks`, with the places of the blocks and in whatever order they come, twice too."""
+    """As `walk_blocks`, with the places of the blocks and in whatever order they come, twice too.
+
+    A block of another sort is damage here: it costs what is behind it nothing.
+    """
     if stride is not None:
         check_stride(stride)
     offset = 0
@@ -68,11 +77,15 @@ def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
         try:
             fields = read_header(buffer[offset:])
             room = buffer[offset:] if stride is None else buffer[offset : offset + stride]
-            block = None if fields.is_control else read_frames(room, fields, check_payload=check_payload)
-        except CorruptBlock as error:
+            block = None
+            if fields.is_control:
+                read_control(room, fields)  # only one that is sound to its end says where the next block begins
+            else:
+                block = read_frames(room, fields, check_payload=check_payload)
+        except (CorruptBlock, UnsupportedBlock) as error:
             found = _next_header(buffer, rest, passed_over=offset)
             start = min(offset, found)
-            yield Damage(start, found - start, str(error))
+            yield Damage(start, found - start, str(error), isinstance(error, UnsupportedBlock))
             offset = rest = found
             continue
         rest = offset + round_up(fields.block_bytes, ALIGN)

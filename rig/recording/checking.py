@@ -1,15 +1,16 @@
 """Reading every byte of a recording: which blocks are sound, what is damaged, and whether frames follow on frames."""
 
 import zlib
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from drivers.errors import UnsupportedBlock
+from drivers.frames import BlockHeader
 from drivers.recorded.contents import damage_line
 from drivers.recorded.index import INDEX_RECORD, index_of
 from drivers.recorded.segments import Segment
@@ -22,6 +23,12 @@ CHECKING: Final = "checking every block"
 CHECKERS: Final = 2
 """Segments checked at a time."""
 _STEP_BYTES: Final = 64 * 2**20
+_CLOCK_SHARE: Final = 0.01
+"""Ticks may be so far from those that the frame numbers say, as a share of them, beside half a frame."""
+_NEIGHBOURS: Final = 2
+"""Blocks before and behind that one is compared with."""
+_FEW: Final = 4
+"""One in so many blocks of a run at most is left out for its ticks or sweep."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +36,13 @@ class SoundBlock:
     """A block whose every byte is right. entry: its index record. lost_before: as the device counted. sweep,
     last_sweep: scan markers up to its first and its last frame.
 
-    first_tick, last_tick: of its frames, 0 where it has none. rises: whether their ticks rise. checked: whether the
-    payload has a checksum at all.
+    header: what holds for it. first_tick, last_tick: of its frames, 0 where it has none. repeated: (first, last)
+    numbers of frames whose ticks do not rise: they count as lost. objection: why it cannot be what was recorded; else
+    None.
     """
 
     entry: bytes
+    header: BlockHeader
     run_id: int
     block_seq: int
     first_frame: int
@@ -43,8 +52,8 @@ class SoundBlock:
     last_sweep: int
     first_tick: int
     last_tick: int
-    rises: bool
-    checked: bool
+    repeated: tuple[tuple[int, int], ...]
+    objection: str | None
 
     @property
     def end_frame(self) -> int:
@@ -71,12 +80,23 @@ Gap = tuple[int, int, int]
 
 @dataclass(slots=True)
 class Continuity:
-    """What joins the blocks of a recording. gaps: frames that the device lost; missing: others; lost: as it counted."""
+    """What joins the blocks of a recording. gaps: frames that the device lost, or that a repair found missing, and said
+    so; missing: others.
+    """
 
     gaps: list[Gap] = field(default_factory=list)
     missing: list[Gap] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
-    lost: int = 0
+
+    @property
+    def lost(self) -> int:
+        """Frames in the gaps, each counted once."""
+        lost, reached = 0, (-1, -1)
+        for number, first, last in sorted(self.gaps):
+            begin = max(first, reached[1] + 1) if reached[0] == number else first
+            lost += max(0, last + 1 - begin)
+            reached = number, max(last, reached[1] if reached[0] == number else -1)
+        return lost
 
 
 def continuity(runs: Iterable[Sequence[SoundBlock]], *, is_part: bool, known: Collection[Gap] | None) -> Continuity:
@@ -91,21 +111,45 @@ def continuity(runs: Iterable[Sequence[SoundBlock]], *, is_part: bool, known: Co
     return found
 
 
+def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
+    """Whether so many frames can be so many ticks apart; anything can where they are triggered from outside."""
+    period = header.frame_period_ticks
+    return not period or abs(ticks - frames * period) <= period * (0.5 + _CLOCK_SHARE * abs(frames))
+
+
+def out_of_step(run: Sequence[SoundBlock]) -> list[SoundBlock]:
+    """Blocks of a run whose ticks or sweep cannot be those of their frames, as their neighbours have them.
+
+    None where those would be more than a few: then it is how the device counts.
+    """
+    votes = [0] * len(run)
+    for i, block in enumerate(run):
+        for j in range(max(0, i - _NEIGHBOURS), i):
+            votes_each = _go_together(run[j], block)
+            votes[i] += votes_each
+            votes[j] += votes_each
+    alone = [block for block, vote in zip(run, votes, strict=True) if not vote]
+    return alone if len(run) > 2 and len(alone) * _FEW <= max(len(run), _FEW) else []
+
+
+def _go_together(before: SoundBlock, block: SoundBlock) -> bool:
+    frames = block.first_frame - before.first_frame
+    ticks = block.header.t0_ticks - before.header.t0_ticks
+    return 0 <= block.sweep - before.sweep <= frames and in_step(frames, ticks, block.header)
+
+
 def _check(segment: Segment) -> tuple[list[SoundBlock], list[str]]:
     blocks: list[SoundBlock] = []
     lines: list[str] = []
     told = 0
-    try:
-        for item in segment.walk(0, segment.size, check_payload=True):
-            if item.offset + _STEP_BYTES > told:
-                segment.expect(told, _STEP_BYTES)
-                told += _STEP_BYTES
-            if isinstance(item, Placed):
-                blocks.append(_sound(segment, item))
-            else:
-                lines.append(damage_line(segment, item))
-    except UnsupportedBlock as error:
-        lines.append(f"{segment.path.name}: {error}")
+    for item in segment.walk(0, segment.size, check_payload=True):
+        if item.offset + _STEP_BYTES > told:
+            segment.expect(told, _STEP_BYTES)
+            told += _STEP_BYTES
+        if isinstance(item, Placed):
+            blocks.append(_sound(segment, item))
+        else:
+            lines.append(damage_line(segment, item))
     return blocks, lines
 
 
@@ -115,6 +159,7 @@ def _sound(segment: Segment, placed: Placed) -> SoundBlock:
     entry = np.frombuffer(index_of(block, segment.number, placed.offset, placed.length), INDEX_RECORD)[0]
     return SoundBlock(
         entry.tobytes(),
+        header,
         header.run_id,
         int(entry["block_seq"]),
         header.first_frame,
@@ -124,9 +169,27 @@ def _sound(segment: Segment, placed: Placed) -> SoundBlock:
         header.sweep + ((int(block.records["sweep"][-1]) - header.sweep) & 0xFFFF if len(ticks) else 0),
         int(ticks[0]) if len(ticks) else 0,
         int(ticks[-1]) if len(ticks) else 0,
-        bool((np.diff(ticks) > 0).all()),
-        _has_checksum(segment, placed),
+        tuple(_stretches(header.first_frame + 1 + np.flatnonzero(np.diff(ticks) <= 0))),
+        _objection(segment, placed),
     )
+
+
+def _stretches(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+    """(first, last) of each piece of numbers that follow on each other."""
+    for piece in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1):
+        if len(piece):
+            yield int(piece[0]), int(piece[-1])
+
+
+def _objection(segment: Segment, placed: Placed) -> str | None:
+    """Why a block with all its checksums cannot be what was recorded; None where it can."""
+    if not _has_checksum(segment, placed):
+        return "has no checksum of its pixels"
+    block = placed.block
+    markers = (block.records["sweep"].astype(np.int64) - block.header.sweep) & 0xFFFF
+    if block.n_frames and int(np.sort(markers)[(block.n_frames - 1) // 2]) > block.n_frames:
+        return f"says that it begins in sweep {block.header.sweep}, its frames do not"
+    return None
 
 
 def _has_checksum(segment: Segment, placed: Placed) -> bool:
@@ -142,27 +205,39 @@ def _follow(
     number: int, run: Sequence[SoundBlock], is_part: bool, known: Collection[Gap] | None, found: Continuity
 ) -> None:
     first = run[0]
-    if not is_part:
+    found.gaps += [
+        gap
+        for gap in dict.fromkeys(known or ())
+        if gap[0] == number and (gap[2] < first.first_frame or gap[1] >= run[-1].end_frame)
+    ]
+    if not is_part and not any(gap[0] == number and gap[2] == first.first_frame - 1 for gap in found.gaps):
         _join(number, (0, 0, -1), first, known, found)
     for before, block in pairwise(run):
         _join(number, (before.end_frame, before.lost_before, before.block_seq), block, known, found)
         if before.n_frames and block.n_frames and block.first_tick <= before.last_tick:
-            found.problems.append(f"run {number}: the clock goes back at frame {block.first_frame}")
-    found.lost += run[-1].lost_before - (first.lost_before if is_part else 0)
+            _repeat(number, block.first_frame, block.first_frame, f"at frame {block.first_frame}", known, found)
     for block in run:
-        if not block.rises:
-            found.problems.append(f"run {number}: the clock goes back within block {block.block_seq}")
-        if not block.checked:
-            found.problems.append(
-                f"run {number}: block {block.block_seq} (frames {block.first_frame} to {block.end_frame - 1}) has no "
-                "checksum of its pixels"
-            )
+        for frames in block.repeated:
+            _repeat(number, *frames, f"within block {block.block_seq}", known, found)
+
+
+def _repeat(number: int, first: int, last: int, where: str, known: Collection[Gap] | None, found: Continuity) -> None:
+    """Frames whose ticks do not rise are there, and count as lost all the same."""
+    gap = number, first, last
+    if known is not None and gap in known:
+        found.gaps.append(gap)
+        return
+    found.missing.append(gap)
+    found.problems.append(f"run {number}: the clock goes back {where}")
 
 
 def _join(
     number: int, before: tuple[int, int, int], block: SoundBlock, known: Collection[Gap] | None, found: Continuity
 ) -> None:
-    """Whether `block` can come behind what was before: its end, the frames lost by then, the number of its block."""
+    """Whether `block` can come behind what was before: its end, the frames lost by then, the number of its block.
+
+    What a repair found missing takes the place of the device's counts, which may be of blocks that are gone.
+    """
     end_frame, lost_before, block_seq = before
     missing, lost = block.first_frame - end_frame, block.lost_before - lost_before
     gap = number, end_frame, block.first_frame - 1
@@ -172,10 +247,13 @@ def _join(
         found.missing.append(gap)
         found.problems.append(
             f"run {number}: frames {end_frame} to {block.first_frame - 1} are missing, of which the device lost "
-            f"{max(0, lost)}"
+            f"{min(max(0, lost), missing)}"
         )
-    elif lost:
-        found.problems.append(f"run {number}: the device says that it lost {lost} frames before {block.first_frame}")
+    elif lost and known is None:
+        found.problems.append(
+            f"run {number}: block {block.block_seq} counts {block.lost_before} lost frames, the one before "
+            f"{lost_before}, and none is missing between them"
+        )
     gone = block.block_seq - block_seq - 1
     if gone and known is None and missing in (0, lost):
         found.problems.append(f"run {number}: {gone} blocks are missing before block {block.block_seq}")

@@ -14,14 +14,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.recorded import RecordedRun, RunRecording
-from rig.binding import MAX_RESIDUAL_COLUMNS
-from rig.blanking import MAX_CLOCK_ERROR
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
 from rig.outputs import RunFolder
 from rig.progress import tell_stage
 from rig.recording.manifest import MANIFEST, UNFINISHED, require_inputs, require_plain_sweeps
 from rig.recording.maps import MapSpan, map_spans
 from rig.recording.opening import manifest_or_none, open_recording
+from rig.recording.part import fitted_ratio
 from rig.recording.writer import Recording
 from rig.summary import Verdict
 
@@ -208,13 +207,7 @@ def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
     sweeps = manifest.get("sweeps") or []
     known = (manifest.get("cut") or {}).get("clock_ratios") or []
     ratio = float(known[part.run.number]) if part.run.number < len(known) else 1.0
-    for i, sweep in enumerate(sweeps[: part.first_map] if is_first else ()):
-        if i and sweep["first_frame"] < sweeps[i - 1]["end_frame"]:
-            ratio = 1.0  # another start of the SPAD
-        residual, error = sweep.get("residual_columns"), float(sweep.get("clock_error") or 0.0)
-        if residual is not None and residual <= MAX_RESIDUAL_COLUMNS and abs(error) <= MAX_CLOCK_ERROR:
-            ratio = 1 + error
-    return ratio
+    return fitted_ratio(ratio, sweeps[: part.first_map] if is_first else ())
 
 
 def _seal_of(manifest: dict[str, Any]) -> int:

@@ -6,19 +6,23 @@ from typing import Any
 
 from drivers.recorded import RecordedRun
 from drivers.recorded.segments import PACKED_SUFFIX, segment_files
-from rig.recording.maps import map_spans
+from rig.recording.manifest import known_missing
+from rig.recording.maps import MapSpan, map_spans
 from rig.recording.opening import manifest_or_none, open_recording
 
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """One start of the SPAD. Frames first_frame to end_frame - 1; gaps: how many pieces of them are missing."""
+    """One start of the SPAD. Frames first_frame to end_frame - 1; gaps: how many pieces are missing between them and,
+    as a repair found, at their ends; lost: frames of those.
+    """
 
     run_id: int
     first_frame: int
     end_frame: int
     frames: int
     gaps: int
+    lost: int
     width: int
     height: int
     sensor_width: int
@@ -60,7 +64,8 @@ def info(folder: Path) -> RecordingInfo:
     files = list(segment_files(folder).values())
     content = manifest or {}
     maps_of = {run.number: [i for i, span in enumerate(spans) if span.run == run.number] for run in recording.runs}
-    runs = [_run_info(run, maps_of[run.number]) for run in recording.runs]
+    known = known_missing(manifest) or []
+    runs = [_run_info(run, maps_of[run.number], [g[1:] for g in known if g[0] == run.number]) for run in recording.runs]
     return RecordingInfo(
         folder=folder,
         verdict=content.get("verdict"),
@@ -69,7 +74,7 @@ def info(folder: Path) -> RecordingInfo:
         bytes=sum(file.stat().st_size for file in files),
         blocks=sum(len(run.entries) for run in recording.runs),
         frames=recording.frames,
-        maps=len(spans),
+        maps=sum(_is_there(span, recording.runs[span.run], content) for span in spans),
         runs=runs,
         config=(content.get("config") or {}).get("name"),
         devices={slot: str(of.get("name")) for slot, of in (content.get("devices") or {}).items()},
@@ -78,15 +83,26 @@ def info(folder: Path) -> RecordingInfo:
     )
 
 
-def _run_info(run: RecordedRun, maps: list[int]) -> RunInfo:
+def _is_there(span: MapSpan, run: RecordedRun, manifest: dict[str, Any]) -> bool:
+    """Whether a map can be made of what a repair left: of a part, which has none before it, the whole ones only."""
+    if "repaired" not in manifest:
+        return True
+    begin = span.first_frame if "cut" in manifest else span.end_frame - 1
+    return begin >= run.first_frame and span.end_frame < run.end_frame
+
+
+def _run_info(run: RecordedRun, maps: list[int], known: list[tuple[int, int]]) -> RunInfo:
     header = run.header
+    ends = {gap for gap in known if gap[1] < run.first_frame or gap[0] >= run.end_frame}
+    gaps = [*run.gaps(), *ends]
     period = header.frame_period_ticks
     return RunInfo(
         run_id=header.run_id,
         first_frame=run.first_frame,
         end_frame=run.end_frame,
         frames=run.frames,
-        gaps=len(run.gaps()),
+        gaps=len(gaps),
+        lost=sum(last + 1 - first for first, last in gaps),
         width=header.width,
         height=header.height,
         sensor_width=header.sensor_width,

@@ -17,6 +17,8 @@ MANIFEST: Final = "manifest.json"
 SEAL: Final = "crc32"
 UNFINISHED: Final = "recording"
 """Verdict of a run that is not over, or was killed."""
+MOST_FRAMES: Final = 1 << 48
+"""Of a run: 80 years at 100 kHz."""
 _PIECE_BYTES: Final = 1 << 20
 
 
@@ -64,6 +66,24 @@ def ended_before_last_map(manifest: Mapping[str, Any]) -> bool:
     """
     starts = (manifest.get("recording") or {}).get("starts") or []
     return len(manifest.get("sweeps") or []) < sum(int(start["sweeps"]) for start in starts)
+
+
+def known_missing(manifest: Mapping[str, Any] | None) -> list[tuple[int, int, int]] | None:
+    """What a repair found missing, (number of the run, first, last frame); None where there was none."""
+    if manifest is None or "repaired" not in manifest:
+        return None
+    return [(int(run), int(first), int(last)) for run, first, last in manifest.get("missing") or []]
+
+
+def device_counters(manifest: Mapping[str, Any]) -> tuple[dict[str, int], list[str]]:
+    """The SPAD's own counts of a run's frames as far as they can be, and a line for each that cannot."""
+    counters = {key: value for key, value in (manifest.get("counters") or {}).items() if value is not None}
+    sane = {key: value for key, value in counters.items() if isinstance(value, int) and 0 <= value < MOST_FRAMES}
+    return sane, [
+        f"{MANIFEST}: the device's count '{key}' is {value}, which cannot be"
+        for key, value in counters.items()
+        if key not in sane
+    ]
 
 
 def file_crc32(path: Path) -> int:

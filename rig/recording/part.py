@@ -1,6 +1,7 @@
 """What a part of a recording (`rig cut`) takes over from the whole, so that its maps come out the same bit for bit."""
 
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,13 @@ from calibration.model.rig_model import RigModel
 from calibration.npy_files import load_numpy
 from drivers.frames import Mark
 from drivers.recorded import RecordedRun, RunRecording
+from rig.binding import MAX_RESIDUAL_COLUMNS
+from rig.blanking import MAX_CLOCK_ERROR
 from rig.config import EstimateConfig
 from rig.errors import DamagedRecordingError
 from rig.estimators import LEARNING
 from rig.estimators.row_model import RowModel
+from rig.recording.ends import end_block
 from rig.recording.manifest import read_manifest
 from rig.sweeps import SweepStart
 
@@ -26,6 +30,17 @@ def part_starts(recording: RunRecording) -> list[SweepStart]:
         SweepStart(_first_sweep(recording, run), float(ratios[run.number]) if run.number < len(ratios) else 1.0)
         for run in recording.runs
     ]
+
+
+def fitted_ratio(ratio: float, sweeps: Sequence[dict[str, Any]]) -> float:
+    """Ratio of the scanner's clock to nominal behind these sweeps of a manifest; `ratio` is that before the first."""
+    for i, sweep in enumerate(sweeps):
+        if i and sweep["first_frame"] < sweeps[i - 1]["end_frame"]:
+            ratio = 1.0  # another start of the SPAD
+        residual, error = sweep.get("residual_columns"), float(sweep.get("clock_error") or 0.0)
+        if residual is not None and residual <= MAX_RESIDUAL_COLUMNS and abs(error) <= MAX_CLOCK_ERROR:
+            ratio = 1 + error
+    return ratio
 
 
 def part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None) -> list[RowModel]:
@@ -56,8 +71,10 @@ def part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None)
 
 def _first_sweep(recording: RunRecording, run: RecordedRun) -> int:
     """Number of the first sweep that begins in a run: a part may begin in the middle of one."""
-    block = recording.read(run, run.entries[0])
+    block = end_block(recording, run, last=False)
     if block is None:
-        raise DamagedRecordingError(f"{recording.path}: its first block is damaged; take it from the whole again")
+        raise DamagedRecordingError(
+            f"{recording.path}: no block of start {run.number} is sound; take it from the whole"
+        )
     begins = bool(int(block.records["marks"][0]) & Mark.SCAN)
     return block.header.sweep - begins

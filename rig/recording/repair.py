@@ -1,7 +1,8 @@
 """Making a torn recording whole: nothing but sound blocks, with an index and a manifest that say so.
 
 No frame is changed and no byte is thrown away: what is no sound block goes to `frames-000000.torn`, at the place where
-it was in the segment, a damaged manifest to `manifest.damaged.json`. What a repair left stays as it is in another one.
+it was in the segment, a damaged compressed segment to `frames-000000.torn.zst` and a damaged manifest to
+`manifest.damaged.json`. What a repair left stays as it is in another one.
 """
 
 import json
@@ -13,13 +14,14 @@ from typing import Any, Final
 
 import numpy as np
 
+from drivers.errors import CorruptBlock
 from drivers.recorded.contents import round_up_to_page
 from drivers.recorded.index import INDEX_FILE, index_header
-from drivers.recorded.segments import PlainSegment, Segment
+from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, Segment
 from rig.errors import RecordingError, UsageError
 from rig.recording.checking import SoundBlock
 from rig.recording.holding import is_held
-from rig.recording.manifest import MANIFEST, UNFINISHED, ended_early, sealed_text
+from rig.recording.manifest import MANIFEST, UNFINISHED, device_counters, ended_early, sealed_text
 from rig.recording.sync import sync_folder
 from rig.recording.verify import Examined, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
@@ -52,8 +54,8 @@ def repair(folder: Path) -> Repair:
         if _put_in_order(found, done):
             found = examine(folder)
         for segment in found.segments:
-            if isinstance(segment, PlainSegment):
-                _clear(segment, _blocks_in(segment, found), done)
+            mend = _clear if isinstance(segment, PlainSegment) else _unpack
+            mend(segment, _blocks_in(segment, found), done)
         _write_index(folder, found, done)
         _write_manifest(folder, found, done)
         (folder / RESERVE_FILE).unlink(missing_ok=True)
@@ -88,7 +90,7 @@ def _blocks_in(segment: Segment, found: Examined) -> list[Range]:
     return list(zip(begin["offset"].tolist(), (begin["offset"] + begin["length"]).tolist(), strict=True))
 
 
-def _clear(segment: PlainSegment, blocks: list[Range], done: list[str]) -> None:
+def _clear(segment: Segment, blocks: list[Range], done: list[str]) -> None:
     """Zero what is no sound block, and end the segment behind the last one; a copy of it is kept."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     others = [(a, used) for a, b in _between(blocks, segment.size) if (used := _used(segment, a, b)) > a]
@@ -112,6 +114,38 @@ def _clear(segment: PlainSegment, blocks: list[Range], done: list[str]) -> None:
         done.append(f"{segment.path.name} ends at byte {end}, not {segment.size}")
 
 
+def _unpack(segment: Segment, blocks: list[Range], done: list[str]) -> None:
+    """Write the sound blocks of a compressed segment plain where it holds anything else; as it was, it is kept."""
+    end = round_up_to_page(blocks[-1][1]) if blocks else 0
+    if blocks and segment.size == end and not any(_is_damaged(segment, a, b) for a, b in _between(blocks, end)):
+        return
+    plain = segment.path.with_name(segment.path.name.removesuffix(PACKED_SUFFIX))
+    torn = plain.with_suffix(f".torn{PACKED_SUFFIX}")
+    number = 1
+    while torn.exists():
+        torn, number = plain.with_suffix(f".torn-{number}{PACKED_SUFFIX}"), number + 1
+    if blocks:
+        scratch = plain.with_name(f"{plain.name}.part")
+        with scratch.open("wb") as file:
+            for begin, stop in blocks:
+                file.seek(begin)
+                file.write(segment.at(begin, stop - begin).data)
+            file.truncate(end)
+            os.fsync(file.fileno())
+        scratch.replace(plain)
+    segment.path.rename(torn)
+    kept = f"its sound blocks are in {plain.name}, plain" if blocks else "it holds no sound block"
+    done.append(f"{segment.path.name} is kept as {torn.name}; {kept}")
+
+
+def _is_damaged(segment: Segment, begin: int, stop: int) -> bool:
+    """Whether anything but zeros is between two blocks, or nobody can say."""
+    try:
+        return _used(segment, begin, stop) > begin
+    except CorruptBlock:
+        return True
+
+
 def _between(blocks: list[Range], size: int) -> Iterator[Range]:
     """What lies between the blocks, in pieces."""
     begin = 0
@@ -127,7 +161,7 @@ def _used(segment: Segment, begin: int, stop: int) -> int:
     return stop - int((data[::-1] != 0).argmax()) if data.any() else begin
 
 
-def _keep(segment: PlainSegment, pieces: list[Range], torn: Path) -> None:
+def _keep(segment: Segment, pieces: list[Range], torn: Path) -> None:
     """Copy pieces of a segment to the same places of another file, which has them by the time this returns."""
     with torn.open("rb+" if torn.exists() else "wb") as copy:
         for begin, stop in pieces:
@@ -163,6 +197,11 @@ def _write_manifest(folder: Path, found: Examined, done: list[str]) -> None:
         return
     recording = {**(manifest.get("recording") or {}), **_recording(found)}
     missing = [*(manifest.get("missing") or []), *map(list, found.joined.missing)]
+    done += [
+        f"start {number}: frames {first} to {last} are not there; they count as lost"
+        for number, first, last in dict.fromkeys(found.joined.missing)
+    ]
+    done += [f"{line}; left out" for line in device_counters(manifest)[1]]
     content: dict[str, Any] = {
         **{key: value for key, value in manifest.items() if key != "counters"},
         "verdict": _verdict(manifest, recording, missing),

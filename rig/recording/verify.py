@@ -1,5 +1,6 @@
 """Whether a recording is what was recorded: every byte of it, its index, its manifest and the device's own counts."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -9,13 +10,25 @@ from typing import Any
 import numpy as np
 
 from drivers.errors import DeviceNotFound, ProtocolError
-from drivers.recorded.contents import Contents, find_blocks, in_order, round_up_to_page
+from drivers.frames import BlockHeader
+from drivers.recorded.contents import Contents, find_blocks, round_up_to_page
 from drivers.recorded.index import INDEX_FILE, INDEX_RECORD
+from drivers.recorded.order import in_order
+from drivers.recorded.reader import is_of_run, run_kind
 from drivers.recorded.segments import Segment, open_segments
 from rig.errors import DamagedRecordingError, UsageError
 from rig.progress import tell_stage
-from rig.recording.checking import CHECKING, Continuity, Gap, SoundBlock, check_segments, continuity
-from rig.recording.manifest import MANIFEST, UNFINISHED, ended_early, inputs_problems, read_manifest
+from rig.recording.checking import CHECKING, Continuity, Gap, SoundBlock, check_segments, continuity, out_of_step
+from rig.recording.lost_ends import lost_ends
+from rig.recording.manifest import (
+    MANIFEST,
+    UNFINISHED,
+    device_counters,
+    ended_early,
+    inputs_problems,
+    known_missing,
+    read_manifest,
+)
 from rig.recording.opening import require_recording
 
 
@@ -24,7 +37,7 @@ class Integrity(StrEnum):
 
     INTACT = "intact"
     GAPS = "gaps"
-    """Whole, but the device lost frames, and said so."""
+    """Whole, but the device lost frames, or a repair cut some away, and said so."""
     UNFINISHED = "unfinished"
     """The run is not over, or was killed, or went on without the recording; nothing else is wrong."""
     DAMAGED = "damaged"
@@ -34,8 +47,9 @@ class Integrity(StrEnum):
 class Verification:
     """The verdict and what it rests on.
 
-    blocks, frames, bytes: sound ones. lost: frames that the device lost, gaps: [run, first, last] where. problems: a
-    line each; run: the verdict of the run that was recorded. ended: why the recording ended before the run, else None.
+    blocks, frames, bytes: sound ones. lost: frames that the device lost or a repair found missing, gaps: [run, first,
+    last] where. problems: a line each; run: the verdict of the run that was recorded. ended: why the recording ended
+    before the run, else None.
     """
 
     verdict: Integrity
@@ -122,8 +136,10 @@ def examine(folder: Path) -> Examined:
     except DamagedRecordingError as error:
         problems.append(str(error))
     runs = _runs(contents, sound, problems)
-    joined = continuity(runs, is_part=manifest is not None and "cut" in manifest, known=_known_missing(manifest))
+    joined = continuity(runs, is_part=manifest is not None and "cut" in manifest, known=known_missing(manifest))
     problems += joined.problems
+    if problems:  # where nothing is wrong nothing is gone
+        joined.missing += lost_ends(contents, runs, joined, manifest)
     if manifest is not None and manifest.get("verdict") != UNFINISHED:
         problems += _against_manifest(manifest, segments, contents, runs, joined)
     if manifest is not None:
@@ -133,7 +149,16 @@ def examine(folder: Path) -> Examined:
 
 def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) -> list[list[SoundBlock]]:
     """The sound blocks of each run, in order; a problem for each block that should be there and is not."""
-    by_entry = {block.entry: block for block in sound}
+    usual = {run_id: _usual([block.header for block in sound if block.run_id == run_id]) for run_id in _run_ids(sound)}
+    by_entry = {}
+    for block in sound:
+        why = block.objection
+        if why is None and not is_of_run(block.header, usual[block.run_id]):
+            why = "is of another size or clock than its run"
+        if why is None:
+            by_entry[block.entry] = block
+        else:
+            problems.append(_left_out(block, why))
     told = {entry.tobytes(): entry for entry in contents.entries}
     for entry in (entry for raw, entry in told.items() if raw not in by_entry):
         last = int(entry["first_frame"]) + int(entry["n_frames"]) - 1
@@ -143,20 +168,35 @@ def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) 
         )
     others = sum(raw not in told for raw in by_entry)
     if others:
-        problems.append(f"{others} blocks are not where {INDEX_FILE} tells of them, or come twice")
+        problems.append(
+            f"{others} blocks are not where {INDEX_FILE} tells of them, come twice or do not fit the others"
+        )
     entries = np.frombuffer(b"".join(by_entry), INDEX_RECORD)
     runs: dict[int, list[SoundBlock]] = {}
-    for entry in in_order(entries, contents.run_order, [])[0]:
+    for entry in in_order(entries, contents.told, [], folder=True)[0]:
         block = by_entry[entry.tobytes()]
         runs.setdefault(block.run_id, []).append(block)
+    for run in runs.values():
+        for block in out_of_step(run):
+            problems.append(_left_out(block, "is not in step with those around it"))
+            run.remove(block)
     return list(runs.values())
 
 
-def _known_missing(manifest: dict[str, Any] | None) -> list[Gap] | None:
-    """What a repair found missing; None where there was none."""
-    if manifest is None or "repaired" not in manifest:
-        return None
-    return [(run, first, last) for run, first, last in manifest.get("missing") or []]
+def _left_out(block: SoundBlock, why: str) -> str:
+    frames = f"frames {block.first_frame} to {block.end_frame - 1}"
+    return f"block {block.block_seq} of run {block.run_id} ({frames}) {why}"
+
+
+def _run_ids(blocks: Sequence[SoundBlock]) -> set[int]:
+    return {block.run_id for block in blocks}
+
+
+def _usual(headers: Sequence[BlockHeader]) -> BlockHeader:
+    """A header of the size and clock that most have; the earliest of as many."""
+    kinds = Counter(run_kind(header) for header in headers)
+    most = max(kinds.values())
+    return next(header for header in headers if kinds[run_kind(header)] == most)
 
 
 def _against_manifest(
@@ -179,13 +219,13 @@ def _against_manifest(
         )
         if stated is not None and stated != found
     ]
-    counters = manifest.get("counters") or {}
-    delivered = counters.get("delivered")
-    if delivered not in (None, frames) and (delivered < frames or ended_early(manifest) is None):
-        problems.append(f"the device delivered {counters['delivered']} frames, {frames} are recorded")
-    if counters.get("lost") is not None and counters["lost"] < joined.lost:
-        problems.append(f"the device says that it lost {counters['lost']} frames, its blocks say {joined.lost}")
-    return problems
+    counters, absurd = device_counters(manifest)
+    delivered, lost = counters.get("delivered"), counters.get("lost")
+    if delivered is not None and delivered != frames and (delivered < frames or ended_early(manifest) is None):
+        problems.append(f"the device delivered {delivered} frames, {frames} are recorded")
+    if lost is not None and lost < joined.lost:
+        problems.append(f"the device says that it lost {lost} frames, its blocks say {joined.lost}")
+    return problems + absurd
 
 
 def _verdict(found: Examined) -> Integrity:

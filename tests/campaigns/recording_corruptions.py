@@ -4,21 +4,25 @@
 
 A small recording of two starts, plain or compressed, with or without frames that the device lost, gets one to three
 wounds: bytes flipped, cut off, doubled, swapped or zeroed, in a segment, the index or the manifest, or whole files lost
-or swapped. It ends wrong where
+or swapped. Some of the plain ones get false numbers with the right checksums instead, in headers, trailers and index,
+and such wounds beside; they are repaired, and only what holds of any repair is looked at. It ends wrong where
 
 - `verify` calls it what it was before, and a frame or a word of the manifest is not as it was;
 - a frame is read that is not one of those recorded, or not in order without a problem being told;
 - anything is raised but an error of ours on one line, or the sequence takes longer than `DEADLINE_S`;
-- after `repair` (one of five sequences) damage is left or a sound block is gone.
+- after `repair` (one of five sequences) damage is left or a sound block is gone;
+- after `repair` of false numbers `verify` says anything but whole, or whole with gaps, or a second repair does more.
 """
 
 import atexit
 import logging
 import shutil
+import struct
 import tempfile
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +30,29 @@ import numpy as np
 
 from drivers.errors import DeviceError
 from drivers.recorded import INDEX_FILE, RunRecording
+from drivers.recorded.contents import PAGE_BYTES
+from drivers.recorded.index import HEADER_BYTES as INDEX_HEADER_BYTES
+from drivers.recorded.index import INDEX_RECORD
+from drivers.spb1.layout import HEADER, TRAILER
 from rig.errors import DamagedRecordingError, RigError
 from rig.recording.compress import compress
 from rig.recording.manifest import MANIFEST, read_manifest
 from rig.recording.repair import repair
 from rig.recording.verify import Integrity, verify
 from tests.campaigns.outcomes import Ending, ending, run
+from tests.unit.rig.forging import (
+    HEADER_FIELDS,
+    TRAILER_FIELDS,
+    forge_header,
+    forge_record,
+    forge_trailer,
+    most_of,
+)
 from tests.unit.rig.recorded import record, run_blocks
 
 DEADLINE_S = 10.0
+FORGED = 3
+"""One of so many sequences gets false numbers with the right checksums."""
 REPAIRED = 5
 """One of so many sequences is repaired afterwards."""
 
@@ -202,14 +220,65 @@ def mend(folder: Path, pristine: Pristine) -> None:
     except RigError as error:
         _require_one_line(error)
         return
-    packed = any(name.endswith(".zst") for name in pristine.files)
-    assert after.verdict is not Integrity.DAMAGED or packed or after.frames == 0, f"left: {after.problems}"
+    assert after.verdict is not Integrity.DAMAGED or after.frames == 0, f"left: {after.problems}"
     frames = _read(folder)[1]
     _require_true(frames, pristine.frames)
     assert frames.keys() >= before.keys(), f"{len(before.keys() - frames.keys())} frames were there before repair"
     assert _in_order(frames, pristine) or not _in_order(before, pristine), "repair changed the order of the starts"
     again = repair(folder)
-    assert again.done == [] or packed or after.frames == 0, f"repaired twice: {again.done}"
+    assert again.done == [] or after.frames == 0, f"repaired twice: {again.done}"
+
+
+def forge(files: dict[str, bytes], rng: np.random.Generator) -> str:
+    """Give one block or one record of the index a false number with the right checksum; what was done."""
+    if rng.integers(4) == 0 and INDEX_FILE in files:
+        data = bytearray(files[INDEX_FILE])
+        records = (len(data) - INDEX_HEADER_BYTES) // INDEX_RECORD.itemsize
+        if records > 0:
+            name = str(rng.choice([name for name in INDEX_RECORD.names or () if name != "crc"]))
+            most = 2 ** (8 * INDEX_RECORD[name].itemsize) - 1
+            forge_record(data, int(rng.integers(records)), name, _number(rng, most))
+            files[INDEX_FILE] = bytes(data)
+            return "index forged"
+    segments = sorted(name for name in files if name.endswith(".spb") and len(files[name]) >= PAGE_BYTES)
+    if not segments:
+        return "nothing forged"
+    target = str(rng.choice(segments))
+    data = bytearray(files[target])
+    at = int(rng.integers(len(data) // PAGE_BYTES)) * PAGE_BYTES
+    name = str(rng.choice(HEADER_FIELDS[1:-1]))
+    with suppress(struct.error):  # what is there is no block any more
+        forge_header(data, at, **{name: _number(rng, most_of(HEADER, HEADER_FIELDS, name))})
+        if rng.integers(3) == 0:
+            fields = dict(zip(HEADER_FIELDS, HEADER.unpack_from(data, at), strict=True))
+            name = str(rng.choice(TRAILER_FIELDS[1:-1]))
+            end = at + fields["header_len"] + fields["payload_len"]
+            forge_trailer(data, end, **{name: _number(rng, most_of(TRAILER, TRAILER_FIELDS, name))})
+    files[target] = bytes(data)
+    return "block forged"
+
+
+def _number(rng: np.random.Generator, most: int) -> int:
+    """Small, extreme or anything."""
+    kind = int(rng.integers(3))
+    if kind == 0:
+        return min(most, int(rng.integers(400)))
+    return most >> int(rng.integers(3)) if kind == 1 else int(rng.random() * most)
+
+
+def salvage(folder: Path) -> str:
+    """Repair whatever there is. AssertionError where `verify` is not content with it, or a second repair does more."""
+    try:
+        after = repair(folder).after
+    except RigError as error:
+        _require_one_line(error)
+        return "refused"
+    assert after.verdict in (Integrity.INTACT, Integrity.GAPS), f"{after.verdict.value}: {after.problems}"
+    assert after.lost >= 0, f"{after.lost} frames lost"
+    assert verify(folder) == after, "verify says something else the second time"
+    assert repair(folder).done == [], "repaired twice"
+    assert RunRecording(folder).problems == [], "the reader sees what verify does not"
+    return after.verdict.value
 
 
 def make_sequence(root: Path) -> Callable[[int], Ending]:
@@ -225,7 +294,12 @@ def make_sequence(root: Path) -> Callable[[int], Ending]:
         rng = np.random.default_rng(seed)
         pristine = made[int(rng.choice(len(made), p=_ODDS[len(made)]))]
         files = dict(pristine.files)
-        kinds = {wound(files, rng) for _ in range(int(rng.choice([1, 2, 3], p=[0.8, 0.15, 0.05])))}
+        wounds = int(rng.choice([1, 2, 3], p=[0.8, 0.15, 0.05]))
+        forged = seed % FORGED == 0 and not any(name.endswith(".zst") for name in files)
+        if forged:
+            kinds = {forge(files, rng) for _ in range(wounds)} | {wound(files, rng) for _ in range(wounds - 1)}
+        else:
+            kinds = {wound(files, rng) for _ in range(wounds)}
         with lock:
             folder = root / f"case-{next(names)}"
         folder.mkdir()
@@ -233,6 +307,8 @@ def make_sequence(root: Path) -> Callable[[int], Ending]:
             (folder / name).write_bytes(data)
 
         def act() -> Ending:
+            if forged:
+                return f"forged: {salvage(folder)}", None
             outcome = judge(folder, pristine)
             if seed % REPAIRED == 0:
                 mend(folder, pristine)

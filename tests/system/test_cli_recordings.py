@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from drivers.recorded import RunRecording
 from tests.system.conftest import Rig
 from tests.system.small_rig import config, write_rig
 
@@ -130,3 +131,43 @@ def test_a_run_without_record_says_that_its_frames_were_not_recorded(rig: Rig, s
             ran = rig(*arguments)
             assert (ran.code, ran.err.count("\n")) == (2, 1), arguments
             assert f"{folder} holds no recording (frames-*.spb): the frames of this run were not recorded" in ran.err
+
+
+@pytest.mark.parametrize(("block", "kept"), [(0, (1, 2)), (-1, (0, 1))], ids=["first", "last"])
+@pytest.mark.parametrize("repaired", [True, False], ids=["repaired", "as it is"])
+def test_a_part_that_lacks_an_end_gives_the_maps_that_are_whole(
+    rig: Rig, small: Path, tmp_path: Path, block: int, kept: tuple[int, int], repaired: bool
+) -> None:
+    whole, part, again = tmp_path / "whole", tmp_path / "part", tmp_path / "again"
+    assert rig("scan", small, "--maps", 4, "--record", "--out", whole).code == 0
+    assert rig("cut", whole, "--maps", "1:4", "--out", part).code == 0
+    entry = RunRecording(part).runs[0].entries[block]
+    damage(part, int(entry["offset"]) + 300)
+    lost = int(entry["n_frames"])
+    if repaired:
+        ran = rig("repair", part)
+        assert (ran.code, "gaps: whole with gaps" in ran.out) == (1, True)
+        assert json.loads(rig("info", part, "--json").out)["maps"] == 2
+    ran = rig("reconstruct", part, "--out", again, "--json")
+    assert (ran.code, "marker line" in ran.err) == (1, False), ran.err
+    summary = json.loads(ran.out)
+    assert (summary["verdict"], summary["maps"], summary["frames"]["lost"]) == ("gaps", 2, lost)
+    for made, was in enumerate(kept):
+        for name in ("depth/{:06d}.npy", "stripe/{:06d}.npz"):
+            assert (again / name.format(made)).read_bytes() == (whole / name.format(was + 1)).read_bytes()
+
+
+def test_a_part_without_a_whole_map_says_so(rig: Rig, run: Path, tmp_path: Path) -> None:
+    assert rig("cut", run, "--maps", "1", "--out", tmp_path / "part").code == 0
+    damage(tmp_path / "part", int(RunRecording(tmp_path / "part").runs[0].entries[-1]["offset"]) + 300)
+    assert rig("repair", tmp_path / "part").code == 1
+    ran = rig("reconstruct", tmp_path / "part", "--out", tmp_path / "again")
+    assert ran.code == 2
+    assert "holds no whole sweep (" in ran.problems[0]
+
+
+def damage(folder: Path, at: int) -> None:
+    segment = folder / "frames-000000.spb"
+    data = bytearray(segment.read_bytes())
+    data[at] ^= 1
+    segment.write_bytes(data)
