@@ -23,13 +23,6 @@ def test_a_scan_counts_to_all_of_its_plan_s_frames_and_no_further(small: Path) -
     assert {now.stage for now in told} <= {"rendering", "learning", "estimating"}
 
 
-def test_a_scan_in_passes_is_never_above_its_plan(small: Path) -> None:
-    told: list[ScanProgress] = []
-    api.scan(str(small), exposures=6, adaptive={}, live=told.append)
-    assert all(now.frames <= now.frames_planned for now in told)
-    assert told[-1].stage in ("learning", "estimating")
-
-
 @pytest.mark.parametrize(
     ("command", "stages"),
     [

@@ -70,8 +70,8 @@ def two_starts() -> list[FrameBlock]:
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    with (tmp_path / "frames-000000.spb").open("wb") as file:
-        for one in two_starts():
+    for one in two_starts():
+        with (tmp_path / f"frames-{one.header.run_id - 7:06d}.spb").open("ab") as file:
             file.writelines(block_parts(one))
     return tmp_path
 

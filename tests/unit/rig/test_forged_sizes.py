@@ -92,9 +92,9 @@ def test_pictures_are_not_made_as_large_as_a_header_says(tmp_path: Path) -> None
 def test_no_more_sweeps_are_made_than_there_are_frames(tmp_path: Path) -> None:
     folder = forged(tmp_path / "run", lambda i, _: {"sweep": 2**32 - 1}, recording={})
     recording = RunRecording(folder)
-    assert recorded_sweeps(recording, plan_of(scan())) == [recording.frames]
+    assert [start.sweeps for start in recorded_sweeps(recording, plan_of(scan()))] == [recording.frames]
     folder = forged(tmp_path / "other", lambda i, _: {}, recording={"starts": [{"sweeps": 10**12, "segment": 0}]})
-    assert sum(recorded_sweeps(RunRecording(folder), plan_of(scan()))) <= recording.frames
+    assert sum(start.sweeps for start in recorded_sweeps(RunRecording(folder), plan_of(scan()))) <= recording.frames
 
 
 def test_sweeps_that_nobody_wants_are_not_bound() -> None:
