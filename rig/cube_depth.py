@@ -50,6 +50,8 @@ def reconstruct_cube(
                     progress(tally.maps, cube.maps)
         except KeyboardInterrupt:
             verdict = Verdict.ABORTED
+        if verdict is Verdict.COMPLETE and tally.doubts:
+            verdict = Verdict.DOUBTFUL
         n = tally.maps * cube.frames_per_map
         manifest = {
             "command": "reconstruct",

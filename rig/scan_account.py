@@ -33,12 +33,14 @@ def synchronisation_of(sweeps: list[SweepAccount]) -> Synchronisation | None:
     )
 
 
-def verdict_of(sweeps: list[SweepAccount], model: RigModel | None, *, aborted: bool) -> Verdict:
-    """The gravest that applies."""
+def verdict_of(sweeps: list[SweepAccount], model: RigModel | None, *, aborted: bool, doubtful: bool) -> Verdict:
+    """The gravest that applies. doubtful: whether a map's own light speaks against it."""
     if aborted:
         return Verdict.ABORTED
     if not all(sweep.synchronised or _markers_lost(sweep) for sweep in sweeps):
         return Verdict.UNSYNCHRONISED
+    if doubtful:
+        return Verdict.DOUBTFUL
     if any(sweep.frames.lost for sweep in sweeps):
         return Verdict.GAPS
     return Verdict.COMPLETE if model is not None else Verdict.UNCALIBRATED

@@ -25,6 +25,7 @@ class Verdict(StrEnum):
     COMPLETE = "complete"
     GAPS = "gaps"
     UNSYNCHRONISED = "unsynchronised"
+    DOUBTFUL = "doubtful"
     UNCALIBRATED = "uncalibrated"
     ABORTED = "aborted"
 
@@ -76,6 +77,14 @@ class AdaptiveFigures:
     wall_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What speaks against some maps of a run. maps: their numbers."""
+
+    reason: str
+    maps: tuple[int, ...]
+
+
 Errors = Mapping[str, float | None]
 
 
@@ -109,6 +118,8 @@ class Summary:
     sync: Synchronisation | None = None
     replay: PaceReport | None = None
     adaptive: AdaptiveFigures | None = None
+    verdict_reasons: tuple[Doubt, ...] = ()
+    """What maps have against themselves, whatever the verdict."""
     accepted_calibration: tuple[str, ...] = ()
     """What speaks against the calibration that the run was told to use all the same."""
 
@@ -126,6 +137,8 @@ class Summary:
             del content["replay"]
         if self.adaptive is None:
             del content["adaptive"]
+        if not self.verdict_reasons:
+            del content["verdict_reasons"]
         if not self.accepted_calibration:
             del content["accepted_calibration"]
         return content
@@ -137,6 +150,7 @@ class _OfMap(NamedTuple):
     fog: FogEstimate
     errors: tuple[Errors, Errors] | None
     """Of stripe and depth, where the truth is known."""
+    doubts: tuple[str, ...]
 
 
 @dataclass(slots=True)
@@ -154,6 +168,15 @@ class MapTally:
         """Maps so far."""
         return len(self._maps)
 
+    @property
+    def doubts(self) -> tuple[Doubt, ...]:
+        """What speaks against maps, each reason with its maps; empty where nothing does."""
+        of_reason: dict[str, list[int]] = {}
+        for index, each in enumerate(self._maps):
+            for reason in each.doubts:
+                of_reason.setdefault(reason, []).append(index)
+        return tuple(Doubt(reason, tuple(maps)) for reason, maps in of_reason.items())
+
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
         """Count one map; `compute_s` is the wall time of its counting and estimation."""
         valid = float(np.isfinite(result.depth_m).mean())
@@ -161,7 +184,7 @@ class MapTally:
         if truth is not None:
             errors = stripe_errors(result.stripe.x_px, truth.x_px), depth_errors(result.depth_m, truth.depth_m)
         # What was learned grows from map to map; the last one knows most. One step: an interrupt counts it or does not.
-        self._maps.append(_OfMap(compute_s, valid, result.fog, errors))
+        self._maps.append(_OfMap(compute_s, valid, result.fog, errors, result.doubts))
 
     def summary(
         self,
@@ -196,6 +219,7 @@ class MapTally:
             sync=sync,
             replay=replay,
             adaptive=adaptive,
+            verdict_reasons=self.doubts,
         )
 
 

@@ -1,0 +1,76 @@
+"""Compiled part of `map_checks`: light that lines of counts have in common, and how smooth rows are in other orders."""
+
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.geometry import MARGIN_PX, WORD_PX
+
+LAGS_PX: Final = 2
+"""A surface may lean by so much between the lines that are compared."""
+
+
+@numba.njit(cache=True, nogil=True)
+def compare_lines(
+    lines: NDArray[np.int32],
+    exposures: NDArray[np.int32],
+    row: NDArray[np.int32],
+    column: NDArray[np.int32],
+    shift: NDArray[np.int32],
+    x0: NDArray[np.int32],
+    x_lo: NDArray[np.int32],
+    x_hi: NDArray[np.int32],
+    usual: NDArray[np.float32],
+    orders: NDArray[np.int64],
+    first: int,
+    last: int,
+    out: NDArray[np.float64],
+) -> None:
+    """Compare points first..last-1; out: (points, 2 + orders).
+
+    lines: (3, points, window) counts of each point's line and its two partners; exposures, row, column: (3, points).
+    shift: (2, points), pixels from a stripe of the line to the partner's. usual: (rows, width), mean ones per exposure
+    of each pixel over the sweep, NaN where it is not to be used. orders: (orders, WORD_PX), pixels of each word.
+
+    Out come the light in common with each partner (products of line-shaped excess over what is usual for each pixel,
+    0 on average for noise and for whatever stands still), and by how much the sum of products of neighbouring pixels
+    grows when the pixels are taken in each order.
+    """
+    window = lines.shape[2]
+    line = np.zeros((3, window))
+    total = np.zeros(window + 1)
+    for i in range(first, last):
+        for k in range(3):
+            y, c = row[k, i], column[k, i]
+            low = max(x_lo[y, c] - MARGIN_PX, x0[c], 0) - x0[c]
+            high = min(x_hi[y, c] + MARGIN_PX, x0[c] + window - 1, usual.shape[1] - 1) - x0[c]
+            for j in range(window):
+                excess = 0.0
+                if low <= j <= high and not np.isnan(usual[y, x0[c] + j]):
+                    excess = lines[k, i, j] - exposures[k, i] * usual[y, x0[c] + j]
+                total[j + 1] = total[j] + excess
+            for j in range(window):
+                line[k, j] = 0.0
+                if low <= j <= high:
+                    before = total[max(j - 3, 0)] - total[max(j - 9, 0)]
+                    behind = total[min(j + 10, window)] - total[min(j + 4, window)]
+                    line[k, j] = (total[min(j + 2, window)] - total[max(j - 1, 0)]) / 3.0 - (before + behind) / 12.0
+        for k in range(1, 3):
+            to = shift[k - 1, i] + x0[column[0, i]] - x0[column[k, i]]
+            common = 0.0
+            for j in range(window):
+                near = 0.0
+                for partner in range(max(j + to - LAGS_PX, 0), min(j + to + LAGS_PX + 1, window)):
+                    near += line[k, partner]
+                common += line[0, j] * near
+            out[i, k - 1] = common
+        for order in range(orders.shape[0]):
+            grows = 0.0
+            for j in range(window - 1):
+                one, next_one = j % WORD_PX, (j + 1) % WORD_PX
+                a = lines[0, i, j - one + orders[order, one]]
+                b = lines[0, i, j + 1 - next_one + orders[order, next_one]]
+                grows += float(a) * b - float(lines[0, i, j]) * lines[0, i, j + 1]
+            out[i, 2 + order] = grows
