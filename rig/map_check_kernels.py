@@ -23,6 +23,7 @@ def compare_lines(
     x_lo: NDArray[np.int32],
     x_hi: NDArray[np.int32],
     usual: NDArray[np.float32],
+    least: float,
     orders: NDArray[np.int64],
     first: int,
     last: int,
@@ -32,15 +33,17 @@ def compare_lines(
 
     lines: (3, points, window) counts of each point's line and its two partners; exposures, row, column: (3, points).
     shift: (2, points), pixels from a stripe of the line to the partner's. usual: (rows, width), mean ones per exposure
-    of each pixel over the sweep, NaN where it is not to be used. orders: (orders, WORD_PX), pixels of each word.
+    of each pixel over the sweep, NaN where it is not to be used; least: what a lower one counts as. orders: (orders,
+    WORD_PX), pixels of each word.
 
-    Out come the light in common with each partner (products of line-shaped excess over what is usual for each pixel,
-    0 on average for noise and for whatever stands still), and by how much the sum of products of neighbouring pixels
-    grows when the pixels are taken in each order.
+    Out come the light in common with each partner (products of line-shaped excess over what is usual for each pixel, in
+    its standard deviations; 0 on average for noise and for whatever stands still), and by how much the sum of products
+    of neighbouring pixels grows when the pixels are taken in each order.
     """
     window = lines.shape[2]
     line = np.zeros((3, window))
     total = np.zeros(window + 1)
+    pixels = np.zeros((2, window))
     for i in range(first, last):
         for k in range(3):
             y, c = row[k, i], column[k, i]
@@ -49,7 +52,8 @@ def compare_lines(
             for j in range(window):
                 excess = 0.0
                 if low <= j <= high and not np.isnan(usual[y, x0[c] + j]):
-                    excess = lines[k, i, j] - exposures[k, i] * usual[y, x0[c] + j]
+                    rate = usual[y, x0[c] + j]
+                    excess = (lines[k, i, j] - exposures[k, i] * rate) / np.sqrt(exposures[k, i] * max(rate, least))
                 total[j + 1] = total[j] + excess
             for j in range(window):
                 line[k, j] = 0.0
@@ -59,18 +63,20 @@ def compare_lines(
                     line[k, j] = (total[min(j + 2, window)] - total[max(j - 1, 0)]) / 3.0 - (before + behind) / 12.0
         for k in range(1, 3):
             to = shift[k - 1, i] + x0[column[0, i]] - x0[column[k, i]]
-            common = 0.0
+            total[0] = 0.0
             for j in range(window):
-                near = 0.0
-                for partner in range(max(j + to - LAGS_PX, 0), min(j + to + LAGS_PX + 1, window)):
-                    near += line[k, partner]
-                common += line[0, j] * near
+                total[j + 1] = total[j] + line[k, j]
+            common = 0.0
+            for j in range(max(-to - LAGS_PX, 0), min(window - to + LAGS_PX, window)):
+                begin, end = max(j + to - LAGS_PX, 0), min(j + to + LAGS_PX + 1, window)
+                common += line[0, j] * (total[end] - total[begin])
             out[i, k - 1] = common
+        for j in range(window):
+            pixels[0, j] = lines[0, i, j]
         for order in range(orders.shape[0]):
+            for j in range(window):
+                pixels[1, j] = lines[0, i, j // WORD_PX * WORD_PX + orders[order, j % WORD_PX]]
             grows = 0.0
             for j in range(window - 1):
-                one, next_one = j % WORD_PX, (j + 1) % WORD_PX
-                a = lines[0, i, j - one + orders[order, one]]
-                b = lines[0, i, j + 1 - next_one + orders[order, next_one]]
-                grows += float(a) * b - float(lines[0, i, j]) * lines[0, i, j + 1]
+                grows += pixels[1, j] * pixels[1, j + 1] - pixels[0, j] * pixels[0, j + 1]
             out[i, 2 + order] = grows

@@ -25,7 +25,7 @@ from rig.stripes import StripeTable
 
 Array = NDArray[np.float64]
 
-POINTS: Final = 1024
+POINTS: Final = 512
 """Of a sweep whose counts are not kept: their lines are."""
 VOLUME_POINTS: Final = 8192
 """Of a sweep whose counts are kept."""
@@ -40,6 +40,8 @@ LEAST_FOLLOWING: Final = 0.25
 """Light in common with the other column, over that with the next row. Scenes have 0.8 and more, clutter as of fences
 half of it; columns that do not follow one another have none."""
 SATURATED: Final = 0.99
+DIMMEST: Final = 0.1
+"""Mean rate of a pixel over that of all, below which its noise is taken for that of so much."""
 SURE: Final = 0.9
 GROUPS: Final = 8
 """Sure answers by distance: what is wrong is mostly wrong together, as one surface that is not there."""
@@ -105,7 +107,8 @@ class MapChecks:
 
         sweep: a `CountVolume`, or one with `checked`, the counts of the POINTS. stripe: the estimator's own answers.
         """
-        counts = _Counts(sweep, self._geometry, self._points[POINTS])
+        points = self._points[VOLUME_POINTS if isinstance(sweep, CountVolume) else POINTS]
+        counts = _Counts(sweep, self._geometry, points)
         fired = float(intensity.sum()) / max(float(counts.exposures_seen().sum()) * self._geometry.rows, 1.0)
         if fired == 0.0:
             return ("no light: not one pixel fired in any frame; check lens cap, laser, gate and the sensor's power",)
@@ -114,29 +117,23 @@ class MapChecks:
                 f"saturated: {fired:.1%} of the pixels fired in every frame; shorten the exposure, darken the room, or "
                 "check that ones are photons",
             )
-        wrong = self._of_counts(counts, intensity)
+        usual = intensity / np.maximum(counts.exposures_seen(), 1)
+        usual[self._geometry.defects] = np.nan
+        wrong = self._of_counts(counts, usual.astype(np.float32), stripe)
         if wrong is None and self._knows:
-            whole = isinstance(sweep, CountVolume)
-            points = _Counts(sweep, self._geometry, self._points[VOLUME_POINTS]) if whole else counts
-            wrong = self._of_answers(points, stripe)
+            wrong = self._of_answers(counts, stripe)
         return () if wrong is None else (wrong,)
 
-    def _of_counts(self, counts: "_Counts", intensity: NDArray[np.uint32]) -> str | None:
-        from rig.map_check_kernels import compare_lines
-
-        geometry, points = self._geometry, counts.points
+    def _of_counts(self, counts: "_Counts", usual: NDArray[np.float32], stripe: StripeTable) -> str | None:
         lit = np.flatnonzero((counts.exposures > 0).all(axis=0))
         if len(lit) < FEWEST_POINTS:
             return None
-        usual = intensity / np.maximum(counts.exposures_seen(), 1)
-        usual[geometry.defects] = np.nan
-        out = np.zeros((len(lit), 2 + len(self._orders)))
-        compare_lines(
-            counts.lines(lit), counts.exposures[:, lit], points.row[:, lit], points.column[:, lit],
-            points.shift[:, lit], geometry.x0, geometry.x_lo, geometry.x_hi, usual.astype(np.float32), self._orders,
-            0, len(lit), out,
-        )  # fmt: skip
-        _, of_row = np.unique(points.row[0, lit], return_inverse=True)
+        few = lit[:: max(len(lit) // POINTS, 1)]
+        out = self._compared(counts, few, usual)
+        if len(few) < len(lit) and _deviations(out[:, 0] - out[:, 1] / LEAST_FOLLOWING) > -LIMIT:
+            out, few = self._compared(counts, lit, usual), lit  # what few points leave open
+        points = counts.points
+        _, of_row = np.unique(points.row[0, few], return_inverse=True)
         if of_row.max() + 1 >= FEWEST_ROWS:
             # Pixels that are always on are the same on every line of a row: rows are what is independent.
             smoother = [_deviations(np.bincount(of_row, grows).astype(np.float64)) for grows in out.T[2:]]
@@ -149,6 +146,8 @@ class MapChecks:
                 )
         rows, columns = out[:, 0], out[:, 1]
         if _deviations(rows) < LIMIT:
+            if self._knows and self._sure(counts, stripe)[0] and self._of_answers(counts, stripe) is None:
+                return None  # too faint for the points alone, but the answers have found it
             return (
                 "no line: no light that one row shares with the next stands out of the noise; check laser, gate, power "
                 "and depth range, and that frames are height x width with the line across the rows"
@@ -161,14 +160,31 @@ class MapChecks:
             )
         return None
 
+    def _compared(self, counts: "_Counts", chosen: NDArray[np.int64], usual: NDArray[np.float32]) -> Array:
+        """What `compare_lines` finds at chosen points."""
+        from rig.map_check_kernels import compare_lines
+
+        geometry, points = self._geometry, counts.points
+        out = np.zeros((len(chosen), 2 + len(self._orders)))
+        compare_lines(
+            counts.lines(chosen), counts.exposures[:, chosen], points.row[:, chosen], points.column[:, chosen],
+            points.shift[:, chosen], geometry.x0, geometry.x_lo, geometry.x_hi, usual,
+            DIMMEST * float(np.nanmean(usual)), self._orders, 0, len(chosen), out,
+        )  # fmt: skip
+        return out
+
+    def _sure(self, counts: "_Counts", stripe: StripeTable) -> tuple[int, NDArray[np.int64]]:
+        """Into how many groups the sure answers go, and which points they are at."""
+        y, c = counts.points.row[0], counts.points.column[0]
+        sure = np.flatnonzero((stripe.confidence[y, c] >= SURE) & (counts.exposures > 0).all(axis=0))
+        return min(len(sure) // FEWEST_POINTS, GROUPS), sure
+
     def _of_answers(self, counts: "_Counts", stripe: StripeTable) -> str | None:
         geometry, points = self._geometry, counts.points
-        y, c = points.row[0], points.column[0]
-        sure = np.flatnonzero((stripe.confidence[y, c] >= SURE) & (counts.exposures > 0).all(axis=0))
-        groups = min(len(sure) // FEWEST_POINTS, GROUPS)
+        groups, sure = self._sure(counts, stripe)
         if not groups:
             return None
-        y, c = y[sure], c[sure]
+        y, c = points.row[0, sure], points.column[0, sure]
         x = np.rint(stripe.x_px[y, c]).astype(np.int64)
         away = 1 if geometry.near_is_left else -1
         contrast, asked = np.zeros(len(sure)), np.zeros(len(sure), np.int64)
