@@ -136,9 +136,8 @@ class MapChecks:
         _, of_row = np.unique(points.row[0, few], return_inverse=True)
         if of_row.max() + 1 >= FEWEST_ROWS:
             # Pixels that are always on are the same on every line of a row: rows are what is independent.
-            smoother = [_deviations(np.bincount(of_row, grows).astype(np.float64)) for grows in out.T[2:]]
-            likeliest = int(np.argmax(smoother))
-            if smoother[likeliest] > LIMIT:
+            likeliest = int(out[:, 2:].sum(axis=0).argmax())
+            if _deviations(np.bincount(of_row, out[:, 2 + likeliest]).astype(np.float64)) > LIMIT:
                 what, expected = list(ORDERS.items())[likeliest]
                 return (
                     f"{what} seem reversed: in that order neighbouring pixels agree better than as they come; frames "
