@@ -11,6 +11,16 @@ from rig.geometry import MARGIN_PX, WORD_PX
 LAGS_PX: Final = 2
 """A surface may lean by so much between the lines that are compared."""
 
+BESIDE_PX: Final = 9
+"""Light that is still in common so far from where the line should be is haze."""
+
+
+@numba.njit(inline="always")
+def _around(total, j):  # type: ignore[no-untyped-def]
+    """Sum of the pixels up to LAGS_PX from pixel j; total: of all those before each, and of all."""
+    last = total.shape[0] - 1
+    return total[min(max(j + LAGS_PX + 1, 0), last)] - total[min(max(j - LAGS_PX, 0), last)]
+
 
 @numba.njit(cache=True, nogil=True)
 def compare_lines(
@@ -36,9 +46,9 @@ def compare_lines(
     of each pixel over the sweep, NaN where it is not to be used; least: what a lower one counts as. orders: (orders,
     WORD_PX), pixels of each word.
 
-    Out come the light in common with each partner (products of line-shaped excess over what is usual for each pixel, in
-    its standard deviations; 0 on average for noise and for whatever stands still), and by how much the sum of products
-    of neighbouring pixels grows when the pixels are taken in each order.
+    Out come the light in common with each partner and by how much the sum of products of neighbouring pixels grows when
+    they are taken in each order. Light in common is a product of line-shaped excess over what is usual for each pixel,
+    in its standard deviations: 0 on average for noise, haze and whatever stands still.
     """
     window = lines.shape[2]
     line = np.zeros((3, window))
@@ -67,9 +77,10 @@ def compare_lines(
             for j in range(window):
                 total[j + 1] = total[j] + line[k, j]
             common = 0.0
-            for j in range(max(-to - LAGS_PX, 0), min(window - to + LAGS_PX, window)):
-                begin, end = max(j + to - LAGS_PX, 0), min(j + to + LAGS_PX + 1, window)
-                common += line[0, j] * (total[end] - total[begin])
+            for j in range(window):
+                near = _around(total, j + to)
+                beside = _around(total, j + to - BESIDE_PX) + _around(total, j + to + BESIDE_PX)
+                common += line[0, j] * (near - 0.5 * beside)
             out[i, k - 1] = common
         for j in range(window):
             pixels[0, j] = lines[0, i, j]
