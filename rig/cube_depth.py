@@ -59,6 +59,8 @@ def reconstruct_cube(
                 told(tally.maps, cube.maps)
         except KeyboardInterrupt:
             verdict = Verdict.ABORTED
+        if verdict is Verdict.COMPLETE and tally.doubts:
+            verdict = Verdict.DOUBTFUL
         gaps_of_run = [gap for of_map in gaps[: tally.maps] for gap in of_map]
         lost = sum(last - first + 1 for first, last in gaps_of_run)
         n = tally.maps * cube.frames_per_map

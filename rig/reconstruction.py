@@ -12,9 +12,10 @@ from calibration.model.rig_model import RigModel
 from rig.counting import Counter, FrameTally, SweepLayout
 from rig.depth import depth_map
 from rig.errors import UsageError
-from rig.estimators import COUPLED, ESTIMATORS, FILTERS, Learned, create_estimator, recalling
+from rig.estimators import COUPLED, ESTIMATORS, FILTERS, LEARNING, Learned, create_estimator, recalling
 from rig.fog_meter import FogEstimate, read_fog
 from rig.geometry import SweepGeometry, sweep_geometry, uncalibrated_geometry
+from rig.map_checks import MapChecks
 from rig.multi_line import LineGrid
 from rig.multi_line_claims import share_claims
 from rig.multi_line_counter import LineCounter
@@ -26,7 +27,8 @@ from rig.stripes import StripeTable
 class MapResult:
     """One reconstructed map: stripe table, depth_m (rows, width) float32 with NaN, intensity (rows, width) uint32.
 
-    learned: the state that the estimator used, None where it learns nothing.
+    learned: the state that the estimator used, None where it learns nothing. doubts: what its own light has against it,
+    a sentence each (`map_checks`).
     """
 
     stripe: StripeTable
@@ -35,6 +37,7 @@ class MapResult:
     fog: FogEstimate
     compute_s: float
     learned: Learned | None = None
+    doubts: tuple[str, ...] = ()
 
 
 class Reconstructor:
@@ -83,6 +86,7 @@ class Reconstructor:
             self.geometry = uncalibrated_geometry(*sensor, len(self._commands))
         else:
             raise UsageError("without a calibration the sensor size (rows, width) must be given")
+        self._checks = MapChecks(self.geometry, calibrated=model is not None, knows=estimator in LEARNING)
 
     def counter(self, layout: SweepLayout) -> Counter:
         """A counter whose sweeps `map` takes, one after the other and each before frames of the next are added."""
@@ -102,7 +106,8 @@ class Reconstructor:
     def complete(self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float) -> MapResult:
         """The map of a sweep whose stripe table the estimator gave, in `estimate_s`: filter, depth and intensity."""
         begun = time.perf_counter() - estimate_s
-        geometry, fog = self._bound(sweep), self._fog(sweep, stripe)
+        geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe), sweep.intensity()
+        doubts = self._checks.doubts(sweep, intensity, stripe)
         if self._lines is not None:
             stripe = share_claims(stripe, self._lines)
         if filter == "median":
@@ -114,7 +119,7 @@ class Reconstructor:
         else:
             depth = depth_map(stripe, geometry, self._min_confidence, self._workers)
         compute_s = time.perf_counter() - begun
-        return MapResult(stripe, depth, sweep.intensity(), fog, compute_s, self.estimator.used)
+        return MapResult(stripe, depth, intensity, fog, compute_s, self.estimator.used, doubts)
 
     def _bound(self, sweep: FrameTally) -> SweepGeometry:
         """Geometry with the planes where the frames of each column really were."""

@@ -23,6 +23,7 @@ LEAST_WAIT_S = 1e-3
 _NEXT_STEP = {
     Verdict.GAPS: "frames were lost; lower frame_rate or free the computer, then scan again",
     Verdict.UNSYNCHRONISED: "columns of frames are not sure; check marker cables, or light in the run-in, and clocks",
+    Verdict.DOUBTFUL: "the frames themselves speak against the depth; see below",
     Verdict.UNCALIBRATED: "there is no calibration, so no depth; name one in the config",
     Verdict.ABORTED: "the run ended before its last map; whole maps are kept, and with --record every frame that came",
 }
@@ -43,6 +44,8 @@ def run_table(result: RunResult) -> None:
     verdict = summary.verdict.value
     advice = _advice(result)
     table.add_row("verdict", f"{verdict}: {advice}" if advice else verdict)
+    for doubt in summary.verdict_reasons:
+        table.add_row("because", f"{_of_maps(doubt.maps, summary.maps)}{doubt.reason}")
     console().print(table)
 
 
@@ -98,6 +101,13 @@ def _error_change(effect: Effect) -> str:
     if effect.basis == "bound":
         return f"<= {digits(effect.stripe_error_change_px, 2)}" if effect.stripe_error_change_px else "-"
     return f"{effect.stripe_error_change_px:+.3f} +- {effect.stripe_error_change_sd_px or 0.0:.3f}"
+
+
+def _of_maps(maps: tuple[int, ...], of: int) -> str:
+    """Which maps a reason is about, where there are several."""
+    if of == 1:
+        return ""
+    return f"map {maps[0]}: " if len(maps) == 1 else f"{len(maps)} of {of} maps, the first is {maps[0]}: "
 
 
 def console() -> Console:

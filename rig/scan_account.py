@@ -50,13 +50,20 @@ def synchronisation_of(sweeps: list[SweepAccount]) -> Synchronisation | None:
 
 
 def verdict_of(
-    sweeps: list[SweepAccount], model: RigModel | None, *, aborted: bool, outside: Sequence[Gap] = ()
+    sweeps: list[SweepAccount],
+    model: RigModel | None,
+    *,
+    aborted: bool,
+    doubtful: bool,
+    outside: Sequence[Gap] = (),
 ) -> Verdict:
-    """The gravest that applies. outside: as of `frames_of`."""
+    """The gravest that applies. doubtful: whether a map's own light speaks against it. outside: as of `frames_of`."""
     if aborted:
         return Verdict.ABORTED
     if not all(sweep.synchronised or _markers_lost(sweep) for sweep in sweeps):
         return Verdict.UNSYNCHRONISED
+    if doubtful:
+        return Verdict.DOUBTFUL
     if outside or any(sweep.frames.lost for sweep in sweeps):
         return Verdict.GAPS
     return Verdict.COMPLETE if model is not None else Verdict.UNCALIBRATED

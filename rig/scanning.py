@@ -129,7 +129,7 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
     result = run.finish(
         frames if ended_by is None else frames_that_came(frames, counters, stages.dropped_frames),
         frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
-        verdict_of(sweeps, rig.model, aborted=ended_by is not None, outside=outside),
+        verdict_of(sweeps, rig.model, aborted=ended_by is not None, doubtful=bool(run.tally.doubts), outside=outside),
         {
             **manifest,
             "sweeps": [sweep_content(sweep) for sweep in sweeps],

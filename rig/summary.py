@@ -25,6 +25,7 @@ class Verdict(StrEnum):
     COMPLETE = "complete"
     GAPS = "gaps"
     UNSYNCHRONISED = "unsynchronised"
+    DOUBTFUL = "doubtful"
     UNCALIBRATED = "uncalibrated"
     ABORTED = "aborted"
 
@@ -63,6 +64,14 @@ class Synchronisation:
     detection_probability: float | None
 
 
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What speaks against some maps of a run. maps: their numbers."""
+
+    reason: str
+    maps: tuple[int, ...]
+
+
 Errors = Mapping[str, float | None]
 
 
@@ -95,6 +104,8 @@ class Summary:
     stages: PipelineStats | None = None
     sync: Synchronisation | None = None
     replay: PaceReport | None = None
+    verdict_reasons: tuple[Doubt, ...] = ()
+    """What maps have against themselves, whatever the verdict."""
     accepted_calibration: tuple[str, ...] = ()
     """What speaks against the calibration that the run was told to use all the same."""
 
@@ -110,6 +121,8 @@ class Summary:
             del content["sync"]
         if self.replay is None:
             del content["replay"]
+        if not self.verdict_reasons:
+            del content["verdict_reasons"]
         if not self.accepted_calibration:
             del content["accepted_calibration"]
         return content
@@ -121,6 +134,7 @@ class _OfMap(NamedTuple):
     fog: FogEstimate
     errors: tuple[Errors, Errors] | None
     """Of stripe and depth, where the truth is known."""
+    doubts: tuple[str, ...]
 
 
 @dataclass(slots=True)
@@ -138,6 +152,15 @@ class MapTally:
         """Maps so far."""
         return len(self._maps)
 
+    @property
+    def doubts(self) -> tuple[Doubt, ...]:
+        """What speaks against maps, each reason with its maps; empty where nothing does."""
+        of_reason: dict[str, list[int]] = {}
+        for index, each in enumerate(self._maps):
+            for reason in each.doubts:
+                of_reason.setdefault(reason, []).append(index)
+        return tuple(Doubt(reason, tuple(maps)) for reason, maps in of_reason.items())
+
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
         """Count one map; `compute_s` is the wall time of its counting and estimation."""
         valid = float(np.isfinite(result.depth_m).mean())
@@ -145,7 +168,7 @@ class MapTally:
         if truth is not None:
             errors = stripe_errors(result.stripe.x_px, truth.x_px), depth_errors(result.depth_m, truth.depth_m)
         # What was learned grows from map to map; the last one knows most. One step: an interrupt counts it or does not.
-        self._maps.append(_OfMap(compute_s, valid, result.fog, errors))
+        self._maps.append(_OfMap(compute_s, valid, result.fog, errors, result.doubts))
 
     def summary(
         self,
@@ -178,6 +201,7 @@ class MapTally:
             stages=stages,
             sync=sync,
             replay=replay,
+            verdict_reasons=self.doubts,
         )
 
 

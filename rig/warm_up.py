@@ -8,6 +8,7 @@ from rig.depth import depth_map
 from rig.estimators import COUPLED, create_estimator
 from rig.fog_meter import read_fog
 from rig.geometry import WORD_PX, uncalibrated_geometry
+from rig.map_checks import MapChecks
 from rig.scan_plan import ScanPlan
 
 ROWS, COLUMNS = 16, 24
@@ -34,12 +35,13 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
     lit = np.flatnonzero(bins >= 0)
     rate[lit, :, WORD_PX // 4 + bins[lit]] = 0.95
     frames = np.packbits(rng.random(rate.shape) < rate, axis=2)
+    checks = MapChecks(geometry, calibrated=False, knows=maker.used is not None)
     for _ in range(MAPS):
         counter.reset()
         counter.add(frames, bins, bins.astype(np.float64), np.zeros(len(bins), np.int32))
         sweep = counter.finish()
         stripe = maker.estimate(sweep, geometry)
-        sweep.intensity()
+        checks.doubts(sweep, sweep.intensity(), stripe)
         if maker.used is not None:
             read_fog(sweep, stripe, geometry, maker.used)
     if filter == "median":

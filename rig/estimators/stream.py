@@ -15,6 +15,7 @@ from rig.estimators.search_desk import Desk, Found, Judge, desk_of
 from rig.estimators.stream_kernels import OpenColumn, carry_sums, search_frames
 from rig.geometry import WORD_PX, SweepGeometry
 from rig.lane_order import padded_lanes, pixel_order
+from rig.map_checks import check_points
 from rig.row_threads import RowWorkers
 from rig.stripes import StripeTable
 
@@ -26,13 +27,15 @@ class SearchedSweep(FrameTally):
     """A sweep whose columns have been judged.
 
     stripe: the stripe table. light: uint32 (rows, width), counts summed over the columns. quiet: int32 (2, rows,
-    width), ones and exposures of pixels while clearly behind a stripe. lines: what the learning reads.
+    width), ones and exposures of pixels while clearly behind a stripe. lines: what the learning reads. checked: int32
+    (3, points, window), counts of the `check_points`.
     """
 
     stripe: StripeTable
     light: NDArray[np.uint32]
     quiet: NDArray[np.float64]
     lines: Lines
+    checked: NDArray[np.int32]
 
     def intensity(self) -> NDArray[np.uint32]:
         """Counts summed over the columns, (rows, width) uint32."""
@@ -50,7 +53,15 @@ class ColumnJudge:
         self._judge = judge
         self._workers = workers
         self._lines = next_lattice(geometry)
-        self._found: Found = nothing_found(geometry, self._lines)
+        points = check_points(geometry)
+        rows, columns = (
+            np.concatenate([lines, of_points.ravel()])
+            for lines, of_points in zip(self._lines, (points.row, points.column), strict=True)
+        )
+        order = np.lexsort((rows, columns))
+        self._found: Found = nothing_found(geometry, (rows[order], columns[order]))
+        self._kept_at = np.argsort(order)
+        """Where the lines of the lattice are among all that are kept, and then those of the points."""
         self._tally = SweepTally(layout)
         self._row_words = 0
         self._open: dict[int, OpenColumn] = {}
@@ -101,13 +112,15 @@ class ColumnJudge:
         carry_sums(self._desk(0), self._opened().sums_x0, 0, layout.rows)
         rows, columns = self._lines
         alone = np.zeros((2, len(rows)), np.float32)
+        of_lattice, of_points = self._kept_at[: len(rows)], self._kept_at[len(rows) :]
         tally = self._tally.finish()
         return SearchedSweep(
             n_frames=tally.n_frames, column=tally.column, dark_counts=tally.dark_counts, n_dark=tally.n_dark,
             width=tally.width, dark_frames=tally.dark_frames, stripe=stripes_of(found, self._judge, self._workers),
             light=pixel_order(found.light, layout.width).astype(np.uint32),
             quiet=quiet_of(found, layout.width),
-            lines=Lines(found.lines.copy(), rows, columns, tally.n_frames[columns], *alone),
+            lines=Lines(found.lines[of_lattice], rows, columns, tally.n_frames[columns], *alone),
+            checked=found.lines[of_points].reshape(3, -1, layout.window),
         )  # fmt: skip
 
     def _judge_block(

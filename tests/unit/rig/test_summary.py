@@ -64,7 +64,7 @@ def test_nothing_known_is_null_and_no_truth_is_no_key() -> None:
 
 def test_each_verdict_has_its_exit_code() -> None:
     codes = {verdict.value: verdict.exit_code for verdict in Verdict}
-    assert codes == {"complete": 0, "gaps": 1, "unsynchronised": 1, "uncalibrated": 1, "aborted": 4}
+    assert codes == {"complete": 0, "gaps": 1, "unsynchronised": 1, "doubtful": 1, "uncalibrated": 1, "aborted": 4}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,141 @@
+"""How often a right map is doubted, and a wrong one: scenes, lights, rigs and exposures drawn by chance.
+
+    python -m tests.campaigns.map_checks --maps 120
+    python -m tests.campaigns.map_checks --maps 12 --estimator joint --seed 1
+
+Each map is 64 rows of a scene (prepared, made or random) under a working point, 250 columns. It is judged as it is and
+with each fault of FAULTS. With `argmax` the checks of counts are asked alone; an estimator that knows its confidence is
+asked for its answers too, and what is `right` says how many of the sure ones are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.map_checks import SURE
+from tests.reference.adapter import reconstructor_of, volume_of, windowed
+from tests.reference.geometry import Geometry
+from tests.reference.made_scenes import pane_scene, thin_scene
+from tests.reference.random_scenes import random_scene
+from tests.reference.scene import Scene, load_scene, scene_names
+from tests.reference.working_point import POINTS, WorkingPoint
+
+Counts = NDArray[np.unsignedinteger[Any]]
+
+ROWS, COLUMNS = 64, 250
+RIGS: dict[str, dict[str, Any]] = {
+    "left": {},
+    "right": {"side": "right"},
+    "turned": {"side": "right", "roll_deg": 3.0, "k1": -0.35, "axis_tilt_z_deg": 2.0, "axis_tilt_x_deg": 3.0},
+}
+EXPOSURES = (1, 3, 10, 20)
+
+
+def _bits(counts: Counts, exposures: int, rng: np.random.Generator) -> Counts:
+    x = np.arange(counts.shape[2])
+    return counts[:, :, 8 * (x // 8) + 7 - x % 8]
+
+
+def _exposures_first(counts: Counts, exposures: int, rng: np.random.Generator) -> Counts:
+    out = np.zeros_like(counts)
+    for c in range(len(counts)):
+        for k in range(exposures):
+            # One frame of each column: its ones are a share of the column's.
+            out[c] += rng.random(out.shape[1:]) < counts[(c * exposures + k) % len(counts)] / exposures
+    return out
+
+
+def _noise(counts: Counts, exposures: int, rng: np.random.Generator) -> Counts:
+    return rng.binomial(exposures, counts.mean() / exposures, counts.shape).astype(counts.dtype)
+
+
+FAULTS: dict[str, Callable[[Counts, int, np.random.Generator], Counts]] = {
+    "bits of bytes reversed": _bits,
+    "exposures before columns": _exposures_first,
+    "columns reversed": lambda counts, exposures, rng: counts[::-1],
+    "columns shuffled": lambda counts, exposures, rng: counts[rng.permutation(len(counts))],
+    "planes of half the angle": lambda counts, exposures, rng: counts[np.minimum(2 * np.arange(COLUMNS), COLUMNS - 1)],
+    "picture mirrored": lambda counts, exposures, rng: counts[:, :, ::-1],
+    "noise alone": _noise,
+    "all zero": lambda counts, exposures, rng: np.zeros_like(counts),
+    "all one": lambda counts, exposures, rng: np.full_like(counts, exposures),
+}
+
+
+def _scene(rng: np.random.Generator) -> Scene:
+    """Some rows of a scene."""
+    prepared = [scene for name in scene_names() if (scene := load_scene(name)) is not None]
+    pick = int(rng.integers(2 * (len(prepared) + 2)))
+    whole = (
+        prepared[pick]
+        if pick < len(prepared)
+        else thin_scene()[0]
+        if pick == len(prepared)
+        else pane_scene()
+        if pick == len(prepared) + 1
+        else random_scene(int(rng.integers(400, 500)))
+    )
+    first = int(rng.integers(0, whole.shape[0] - ROWS))
+    part = slice(first, first + ROWS)
+    pane = None if whole.pane is None else replace(whole.pane, depth_m=whole.pane.depth_m[part])
+    depth, albedo, trusted = (np.ascontiguousarray(a[part]) for a in (whole.depth_m, whole.albedo, whole.trusted))
+    return Scene(whole.name, depth, albedo, trusted, pane)
+
+
+def _one(seed: int, estimator: str, exposures: int) -> tuple[str, dict[str, tuple[str, ...]], float]:
+    """What a map is, what speaks against it and its faulty kin, and the share of its sure answers that are right."""
+    rng = np.random.default_rng([seed, 79])
+    light, rig, scene = str(rng.choice(list(POINTS))), str(rng.choice(list(RIGS))), _scene(rng)
+    geometry = Geometry.build(width=512, height=ROWS, columns=COLUMNS, **RIGS[rig])
+    point = WorkingPoint(scene, POINTS[light], geometry)
+    counts = point.counts(exposures, seed)
+    doubts: dict[str, tuple[str, ...]] = {}
+    right = np.nan
+    for fault, change in {"none": None, **FAULTS}.items():
+        if fault == "exposures before columns" and exposures == 1:
+            continue  # the same frames
+        maker = reconstructor_of(point, estimator)
+        seen = counts if change is None else change(counts, exposures, rng)
+        part = windowed(seen, maker.geometry.x0, maker.geometry.window)
+        result = maker.map(volume_of(maker, part, exposures))
+        doubts[fault] = result.doubts
+        if change is None:
+            sure = result.stripe.confidence >= SURE
+            error = np.abs(result.stripe.x_px - point.truth())
+            right = float(np.mean(error[sure] <= 1)) if sure.any() else np.nan
+    return f"{scene.name}, {light}, K = {exposures}, {rig}, seed {seed}", doubts, right
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Draw the maps and print the table; 1 where a right map was doubted."""
+    parser = argparse.ArgumentParser(description="right and wrong maps against the checks of map_checks")
+    parser.add_argument("--maps", type=int, default=120)
+    parser.add_argument("--estimator", default="argmax")
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args(arguments)
+    maps: defaultdict[str, Counter[int]] = defaultdict(Counter)
+    found: defaultdict[str, Counter[int]] = defaultdict(Counter)
+    for index in range(asked.maps):
+        exposures = EXPOSURES[index % len(EXPOSURES)]
+        what, doubts, right = _one(asked.seed * 100_000 + index, asked.estimator, exposures)
+        for fault, reasons in doubts.items():
+            maps[fault][exposures] += 1
+            found[fault][exposures] += bool(reasons)
+        if doubts["none"]:
+            print(f"doubted: {what}, {right:.2f} of the sure answers right: {doubts['none'][0]}", flush=True)
+    print("| fault | " + " | ".join(f"K = {k}" for k in EXPOSURES) + " |\n|---|" + "---|" * len(EXPOSURES))
+    for fault, of in maps.items():
+        print(f"| {fault} | " + " | ".join(f"{found[fault][k]} of {of[k]}" for k in EXPOSURES) + " |")
+    return 1 if sum(found["none"].values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
