@@ -26,6 +26,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import yaml
 
@@ -39,6 +40,8 @@ Task = tuple[str, str, Callable[[Path], Hashes]]
 """Case, step and what hashes it, given an empty folder."""
 
 RIG = Path(sys.executable).with_name("rig")
+ENVIRONMENT = os.environ | {"OPENCV_FOR_THREADS_NUM": "1"}
+"""OpenCV 5.0 adds up in the order in which its threads end: `cv2.calibrateCamera` differs in its last bits."""
 ESTIMATES: Mapping[str, tuple[str, ...]] = {
     "argmax": ("--estimator", "argmax", "--filter", "none"),
     "edge": ("--estimator", "edge", "--filter", "none"),
@@ -61,9 +64,9 @@ ACCURACY = ("--at", "3 m", "--accuracy", "20 mm")
 
 MOMENTS = {
     "compute_time_s", "realtime_factor", "stages", "rest_s", "wall_s", "replay", "created", "taken", "age_s", "folder",
-    "compute_s", "seconds", "source", "calibration_file",
+    "compute_s", "seconds", "id",
 }  # fmt: skip
-"""Keys whose values are times of the clock or paths."""
+"""Keys whose values go with the time of the day, or that of the computation."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -131,7 +134,8 @@ def all_tasks(folder: Path) -> Iterator[Task]:
         for step, options in ESTIMATES.items():
             if step == "joint" or name not in ONLY_JOINT:
                 yield name, step, partial(made_by, "reconstruct", recorded, *options)
-        yield name, "replay", partial(made_by, "replay", recorded, "--clock", "max")
+        options = ESTIMATES["joint" if name in ONLY_JOINT else "likelihood"]
+        yield name, "replay", partial(made_by, "replay", recorded, "--clock", "max", *options)
         yield name, "frames", partial(exported, recorded)
         if case.repeats:
             yield name, "scan", partial(scanned, *scan_options(name, folder / name / "rig" / "config.yaml"))
@@ -188,7 +192,8 @@ def run(tasks: Sequence[Task], jobs: int) -> Results:
 
 def rig(*words: object, cwd: Path | None = None) -> tuple[int, str]:
     """Exit code of `rig` and what it printed: stdout where it is 0 or 1, else stderr."""
-    done = subprocess.run([RIG, *map(str, words)], capture_output=True, text=True, cwd=cwd, check=False)
+    command = [RIG, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=ENVIRONMENT, check=False)
     return done.returncode, done.stdout if done.returncode in (0, 1) else done.stderr
 
 
@@ -201,22 +206,50 @@ def made_by(*words: object) -> Hashes:
 
 
 def scanned(*words: object) -> Hashes:
-    """As `made_by`, with the plan, and the frames as they are exported."""
+    """As `made_by`, with the plan, and the frames up to the marker that closes the last sweep of each start.
+
+    How many frames are recorded behind that marker depends on the moment at which the devices are stopped.
+    """
     *command, scratch = words
     assert isinstance(scratch, Path)
     hashes = made_by(*command, scratch)
-    return hashes | exported(scratch / "out", scratch) if (scratch / "out").exists() else hashes
+    recorded = scratch / "out"
+    if not (recorded / "manifest.json").exists():
+        return hashes
+    code, told = rig("export", recorded, "hdf5", "--out", scratch / "hdf5", cwd=scratch)
+    hashes |= plan_hashes(recorded) | ended(code, told, "export's exit code")
+    if code in (0, 1):
+        manifest = json.loads((recorded / "manifest.json").read_text())
+        with h5py.File(scratch / "hdf5" / "run.h5") as file:
+            of_frame = {name: np.squeeze(column[:]) for name, column in file["frames"].items()}
+        hashes |= {f"frames:{name}": array_hash(column) for name, column in bound_frames(of_frame, manifest).items()}
+    return hashes
+
+
+def bound_frames(of_frame: Mapping[str, np.ndarray], manifest: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Of arrays with one entry a frame, the frames up to the end of the last sweep of their start of the SPAD."""
+    sweeps = manifest["sweeps"]
+    last = np.cumsum([start["sweeps"] for start in manifest["recording"]["starts"]]) - 1
+    ends = np.array([sweeps[min(index, len(sweeps) - 1)]["end_frame"] for index in last])
+    start_of_frame = np.unique(of_frame["run"], return_inverse=True)[1]
+    kept = of_frame["number"] <= ends[start_of_frame]
+    return {name: column[kept] for name, column in of_frame.items()}
 
 
 def exported(recorded: Path, scratch: Path) -> Hashes:
-    """Hashes of a recording's plans and frames."""
+    """Hashes of a recording's plans and of all its frames."""
     code, told = rig("export", recorded, "npy", "--out", scratch / "npy", cwd=scratch)
-    hashes = ended(code, told, "export's exit code")
+    hashes = plan_hashes(recorded) | ended(code, told, "export's exit code") | folder_hashes(scratch / "npy")
+    if code in (0, 1):
+        hashes |= mapping_hashes("frames.json", json.loads((scratch / "npy" / "frames.json").read_text()))
+    return hashes
+
+
+def plan_hashes(recorded: Path) -> Hashes:
+    """Hashes of the compiled plans in a run folder."""
+    hashes: Hashes = {}
     for file in sorted(recorded.glob("plan*.yaml")):
         hashes |= mapping_hashes(file.name, yaml.load(file.read_bytes(), yaml.CSafeLoader))
-    if (scratch / "npy").exists():
-        hashes |= folder_hashes(scratch / "npy")
-        hashes |= mapping_hashes("frames.json", json.loads((scratch / "npy" / "frames.json").read_text()))
     return hashes
 
 
@@ -225,14 +258,20 @@ def printed(*words: object) -> Hashes:
     *command, scratch = words
     assert isinstance(scratch, Path)
     code, told = rig(*command, cwd=scratch)
-    return ended(code, told) | {"printed": digest(re.sub(r"/\S*/", "", told).encode())}
+    return ended(code, told) | {"printed": digest(without_folders(told).encode())}
 
 
 def ended(code: int, told: str, name: str = "exit code") -> Hashes:
     """The exit code, as it is, with the error where there is one."""
     if code in (0, 1):
         return {name: str(code)}
-    return {name: f"{code}: {told.strip().splitlines()[-1] if told.strip() else 'nothing said'}"}
+    said = without_folders(told).strip().splitlines()
+    return {name: f"{code}: {said[-1] if said else 'nothing said'}"}
+
+
+def without_folders(text: str) -> str:
+    """The text with the names of files in place of their paths, which differ from run to run."""
+    return re.sub(r"/\S*/", "", text)
 
 
 def folder_hashes(folder: Path) -> Hashes:
@@ -244,14 +283,25 @@ def folder_hashes(folder: Path) -> Hashes:
             hashes[name] = array_hash(np.load(file, allow_pickle=False))
         elif file.suffix == ".npz":
             with np.load(file, allow_pickle=False) as members:
-                hashes |= {f"{name}:{member}": array_hash(members[member]) for member in sorted(members.files)}
+                for member in sorted(members.files):
+                    hashes |= member_hashes(f"{name}:{member}", members[member])
         elif file.suffix in (".ply", ".png"):
             hashes[name] = digest(file.read_bytes())
         elif name in ("calibration.yaml", "camera.yaml"):
             hashes |= mapping_hashes(name, yaml.safe_load(file.read_bytes()))
         elif name == "summary.json":
             hashes |= mapping_hashes(name, json.loads(file.read_text()))
+        elif name == "manifest.json":
+            manifest = json.loads(file.read_text())
+            hashes |= mapping_hashes(name, {key: manifest[key] for key in ("sweeps", "passes") if key in manifest})
     return hashes
+
+
+def member_hashes(name: str, array: np.ndarray) -> Hashes:
+    """Hash of an array; of a JSON text, those of its keys."""
+    if array.dtype.kind == "U" and array.ndim == 0:
+        return mapping_hashes(name, json.loads(str(array)))
+    return {name: array_hash(array)}
 
 
 def array_hash(array: np.ndarray) -> str:
@@ -268,7 +318,9 @@ def mapping_hashes(name: str, content: Mapping[str, Any]) -> Hashes:
 
 
 def without_moments(value: Any) -> Any:
-    """The value without the keys of MOMENTS, at any depth."""
+    """The value without the keys of MOMENTS, at any depth, and without folders."""
+    if isinstance(value, str):
+        return without_folders(value)
     if isinstance(value, dict):
         return {str(key): without_moments(each) for key, each in value.items() if key not in MOMENTS}
     return [without_moments(each) for each in value] if isinstance(value, list) else value

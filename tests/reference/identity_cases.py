@@ -157,7 +157,8 @@ CASES: Mapping[str, Case] = {
     "both-ways-dense-fog-K5": Case(config("street-dense-fog", 160, 5, scan={"bidirectional": True}), maps=4),
     "tilted-K10": Case(config("street", 160, 10), TILTED),
     "dirty-sensor-K20": Case(
-        config("street", 100, 20, calibration="known.yaml", world={"sensor": DIRTY}), defect_share=0.01
+        config("street", 100, 20, calibration="known.yaml", world={"sensor": DIRTY, "line": {"speckle": True}}),
+        defect_share=0.01,
     ),
     "two-lines-K5": Case(
         config(
@@ -193,7 +194,7 @@ CASES: Mapping[str, Case] = {
         maps=3,
     ),
     "bent-weather-K3": Case(
-        config("street-everything", 180, 3, scan={"bidirectional": True}, world={"line": {"speckle": True}}),
+        config("street-everything", 180, 3, scan={"bidirectional": True}),
         geometry(pivot={"bow_per_rad": 0.02}, row_delay_s=2e-7),
         maps=2,
     ),
