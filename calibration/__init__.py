@@ -9,8 +9,7 @@ views; `judging` says whether it will do.
 from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model, save_rig_model
 from calibration.model.camera import Camera
-from calibration.model.covariance import Covariance
-from calibration.model.rig_model import Identity, Lag, RigModel
+from calibration.model.rig_model import Covariance, Identity, Lag, RigModel
 from calibration.model.scanner import PivotScanner, PlaneTable, Scanner
 
 __all__ = [

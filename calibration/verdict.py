@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal
 
-from calibration.digits import digits
+from calibration.errors import digits
 
 VerdictWord = Literal["passed", "failed"]
 """A verdict as files have it."""

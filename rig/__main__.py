@@ -1,6 +1,6 @@
 """`python -m rig` is `rig`."""
 
-from rig.cli import main
+from rig.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -15,7 +15,7 @@ from calibration.model.rig_model import Lag
 from drivers.clock import NS_PER_S, Clock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, Pulse, ScanWaveform
 from sim_backend.gate_program import GateProgram, gate_shares
-from sim_backend.mirror_motion import Jitter, Motion, Playing, Resting
+from sim_backend.mirror_motion import Jitter, Playing, Resting, ScannerMotion
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ class Bench:
         self.lag = lag
         self._epoch_ns = clock.now_ns()
         self._lock = threading.RLock()
-        self._motion: Motion = Resting(0.0)
+        self._motion: ScannerMotion = Resting(0.0)
         self._program: GateProgram | None = None
         self._aborted = False
         self._power_w = 0.0

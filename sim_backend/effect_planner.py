@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from sim_backend.effects.catalogue import CATALOGUE, MEASURED, Entry
 from sim_backend.effects.setting import PlannedFor, Setting
-from sim_backend.flux import FluxModel, hold_s
-from sim_backend.light_sheet import LightSheet, empty_sheet
+from sim_backend.frames.flux import FluxModel, hold_s
+from sim_backend.light.sheet import LightSheet, empty_sheet
 
 Array = NDArray[np.float64]
 Wanted = Literal["planned", "all"] | tuple[str, ...]
@@ -42,7 +42,7 @@ SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8
 
 
 @dataclass(frozen=True, slots=True)
-class Decision:
+class EffectDecision:
     """Whether an effect is run, and why. changes: the largest share of decisions that can differ without it, at most 1,
     where it is known.
     """
@@ -58,7 +58,7 @@ class EffectPlan:
     """The decision on every effect of the catalogue. changes: the bound on all together that is left out."""
 
     planned_for: PlannedFor
-    decisions: tuple[Decision, ...]
+    decisions: tuple[EffectDecision, ...]
     changes: float
 
 
@@ -92,14 +92,14 @@ def is_wanted(name: str, wanted: Wanted) -> bool:
 
 def _decision(
     entry: Entry, call: tuple[bool, str], wanted: Wanted, changes: dict[str, float], left_out: Collection[str]
-) -> Decision:
+) -> EffectDecision:
     called, why = call
     if called and not is_wanted(entry.name, wanted):
-        return Decision(entry, False, "not among the world's effects")
+        return EffectDecision(entry, False, "not among the world's effects")
     bound = min(1.0, changes[entry.name]) if entry.name in changes else None
     if entry.name in left_out:
-        return Decision(entry, False, f"{why}; without it at most {bound:.2g} of decisions change", bound)
-    return Decision(entry, called, why, bound if called else 0.0)
+        return EffectDecision(entry, False, f"{why}; without it at most {bound:.2g} of decisions change", bound)
+    return EffectDecision(entry, called, why, bound if called else 0.0)
 
 
 def _smallest(changes: dict[str, float]) -> tuple[set[str], float]:

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.effect_planner import Decision
+from sim_backend.effect_planner import EffectDecision
 from sim_backend.effects.catalogue import CATALOGUE, MEASURED
 from sim_backend.effects.setting import FrameTimes, Words
-from sim_backend.flux import FluxModel, hold_s
-from sim_backend.light_sheet import LightSheet
-from sim_backend.random_lanes import WORD_PX
+from sim_backend.frames.flux import FluxModel, hold_s
+from sim_backend.light.sheet import LightSheet
+from sim_backend.random_numbers import WORD_PX
 
 if TYPE_CHECKING:
     from sim_backend.world import SimulatedWorld
@@ -84,7 +84,7 @@ def flux_row(
     return found
 
 
-def _line(decision: Decision, share: float, costs: Mapping[str, float | None]) -> dict[str, Any]:
+def _line(decision: EffectDecision, share: float, costs: Mapping[str, float | None]) -> dict[str, Any]:
     entry = decision.entry
     return {
         "effect": entry.name,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interfaces import LEVEL_BACKWARD, ScanWaveform
-from sim_backend.split_mix import GOLDEN, mixed
+from sim_backend.random_numbers import GOLDEN, mixed
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class Jitter:
         return result
 
 
-class Motion(Protocol):
+class ScannerMotion(Protocol):
     """What the bench asks of the scanner."""
 
     def mirror(self, time_s: Array) -> Array:

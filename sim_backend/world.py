@@ -17,20 +17,18 @@ from drivers.interfaces import SweepTruth
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.units import parse_quantity
 from sim_backend.bench import Bench, Happening
-from sim_backend.command_grid import ROUNDING, column_grid, fine_grid
 from sim_backend.effect_planner import MOST, SAMPLED_COLUMNS, EffectPlan, Wanted, is_wanted, plan_effects
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.setting import FrameTimes, PlannedFor, Setting
-from sim_backend.flux import FluxModel
-from sim_backend.line_fan import ONE_LINE, LineFan, line_fan
-from sim_backend.line_width import line_width
-from sim_backend.optics import Line, Optics, Sensor, detections_per_radiance
-from sim_backend.photons import PhotonSource
-from sim_backend.scene import CLEAR, BoardPlace, load_scene, load_surfaces, with_board_at, with_fog
-from sim_backend.view import make_view
+from sim_backend.frames.flux import ROUNDING, FluxModel, column_grid, fine_grid
+from sim_backend.frames.photons import PhotonSource
+from sim_backend.light.line import ONE_LINE, LineFan, line_fan, line_width
+from sim_backend.light.optics import Line, Optics, Sensor, detections_per_radiance
+from sim_backend.light.view import make_view
+from sim_backend.scenes.scene import CLEAR, BoardPlace, load_scene, load_surfaces, with_board_at, with_fog
 
 if TYPE_CHECKING:
-    from sim_backend.numpy_frames import NumpyFrames
+    from sim_backend.frames.numpy_frames import NumpyFrames
 
 Array = NDArray[np.float64]
 
@@ -279,7 +277,7 @@ class SimulatedWorld:
 
     def numpy_frames(self, exposure_s: float, seed: int) -> "NumpyFrames":
         """The straightforward way to the same frames, to compare with."""
-        from sim_backend.numpy_frames import NumpyFrames
+        from sim_backend.frames.numpy_frames import NumpyFrames
 
         return NumpyFrames(self.setting, self.flux_model.steady_per_s, exposure_s, seed)
 

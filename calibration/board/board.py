@@ -5,22 +5,54 @@ which is black. The inner corners are numbered row by row, as cv2.aruco.CharucoB
 
 A chessboard looks the same from more than one side. Only with an even number of squares along both sides, and not the
 same number, does its mirror image differ; only with one of the two even can it be told from itself upside down.
+
+The schema of a board's file: what was printed, lengths as text with a unit.
+
+How much of the picture, of the angles and of the distances a set of views has shown the camera.
 """
 
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import BeforeValidator, Field
 
-from calibration.board.board_file import BoardFile
 from calibration.errors import CalibrationError
-from calibration.files.problems import Sources, validated
-from calibration.files.yaml_file import load_yaml
+from calibration.files.problems import ValueSources, validated
+from calibration.files.sections import FileSection, load_yaml
+from calibration.views import BoardPose, View
+
+_METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_LENGTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
+
+
+def _metres(text: object) -> float:
+    """The length that a text such as '60 mm' means; a bare number is refused, as everywhere in the project."""
+    match = _LENGTH.fullmatch(text.strip()) if isinstance(text, str) else None
+    if match is None or match[2] not in _METRES:
+        raise ValueError(f"{text!r} is no length; write it with a unit ({', '.join(_METRES)}), like '60 mm'")
+    # Divided rather than multiplied: 44 / 1000 is the float nearest to 44 mm.
+    return float(match[1]) / round(1 / _METRES[match[2]])
+
+
+Length = Annotated[float, BeforeValidator(_metres)]
+
+
+class BoardFile(FileSection):
+    """One board."""
+
+    kind: Literal["charuco", "chessboard"] = Field(description="with markers in the white squares, or without")
+    squares: tuple[int, int] = Field(description="squares along x and y, those at the border included")
+    square: Length = Field(description="side of a square, measured on the print")
+    marker: Length | None = Field(None, description="side of a marker, its black border included (charuco)")
+    dictionary: str | None = Field(None, description="OpenCV's name of the set of markers, e.g. DICT_5X5_100 (charuco)")
+
 
 Array = NDArray[np.float64]
 
@@ -160,7 +192,7 @@ def load_board(path: str | os.PathLike[str] = BUNDLED_BOARD) -> Board:
     """The board that a YAML file describes. Raises CalibrationError, one line, where it describes none."""
     file = Path(path)
     read = load_yaml(file, "a board", "kind: charuco")
-    parsed = validated(BoardFile, read.content, Sources(str(file), read.lines))
+    parsed = validated(BoardFile, read.content, ValueSources(str(file), read.lines))
     try:
         return _board(parsed)
     except CalibrationError as error:
@@ -169,7 +201,7 @@ def load_board(path: str | os.PathLike[str] = BUNDLED_BOARD) -> Board:
 
 def parse_board(content: Mapping[str, Any]) -> Board:
     """A board from the keys of its file, lengths as text with a unit. Raises CalibrationError."""
-    return _board(validated(BoardFile, content, Sources("board")))
+    return _board(validated(BoardFile, content, ValueSources("board")))
 
 
 def _board(parsed: BoardFile) -> Board:
@@ -181,3 +213,45 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
     if name not in known:
         raise CalibrationError(f"there is no dictionary '{name}'; OpenCV has {', '.join(known)}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+CELLS = 8
+"""Along each side of the picture."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coverage:
+    """cells: (8, 8) int64, corners in each cell of the picture. tilt_rad, distance_m: (views,) float64.
+
+    tilt: between the board's normal and the line of sight to its middle. spread_rad: largest angle between the normals
+    of two views: what tells the focal length from the distance.
+    """
+
+    cells: NDArray[np.int64]
+    tilt_rad: Array
+    distance_m: Array
+    spread_rad: float
+
+    @property
+    def share(self) -> float:
+        """Of the cells, those that hold a corner."""
+        return float(np.count_nonzero(self.cells) / self.cells.size)
+
+
+def coverage_of(views: Sequence[View], poses: Sequence[BoardPose], board: Board, size: tuple[int, int]) -> Coverage:
+    """What the corners of `views`, whose boards stand at `poses`, cover of a picture of size (width, height)."""
+    px = np.concatenate([view.corners.px for view in views if view.corners is not None])
+    edges = [np.linspace(-0.5, length - 0.5, CELLS + 1) for length in (size[1], size[0])]
+    cells = np.histogram2d(px[:, 1], px[:, 0], bins=edges)[0].astype(np.int64)
+    middle = np.array([*board.size_m, 0.0]) / 2
+    middles = np.stack([pose.to_camera(middle) for pose in poses])
+    distance = np.linalg.norm(middles, axis=1)
+    normals = np.stack([pose.matrix[:, 2] for pose in poses])
+    tilt = np.arccos(np.clip(np.sum(normals * middles, axis=1) / distance, -1, 1))
+    return Coverage(cells, tilt, distance, spread_rad(poses))
+
+
+def spread_rad(poses: Sequence[BoardPose]) -> float:
+    """The largest angle between the normals of two boards."""
+    normals = np.stack([pose.matrix[:, 2] for pose in poses])
+    return float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())

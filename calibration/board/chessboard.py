@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
-from calibration.board.lattice import Lattice, known_lattice
-from calibration.board.search import FORMS, Gray, Sighting, as_form
+from calibration.board.lattice import FORMS, Gray, Lattice, Sighting, as_form, known_lattice
 
 Array = NDArray[np.float64]
 

@@ -1,9 +1,18 @@
-"""A board drawn so that a picture of it can be compared with the drawing."""
+"""A board drawn so that a picture of it can be compared with the drawing.
+
+A smooth map from board to picture: a homography and, with points enough, what a lens bends on top of it.
+
+It needs no camera: the bend is a polynomial over the picture, fitted to points whose board positions are known. It says
+where corners should be and how the board is drawn around one. Not over the board: a lens bends the picture, by terms
+that are a polynomial there, whatever the board's tilt; over tilted boards they are none, and what was left of them drew
+corners off by less than 0.002 px, but alike in all pictures, which made focal lengths wrong by 0.025 % at k1 = 0.2.
+"""
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calibration.board.board import MARGIN_SQUARES, Board
 
@@ -47,3 +56,87 @@ class Drawing:
         drawn = np.einsum("pi,rcij,qj->rpcq", covered, white, covered, optimize=True)
         size = (down * fine, across * fine)
         return cls(board, np.pad(drawn.reshape(size), pad, constant_values=1.0), fine, pad)
+
+
+Array = NDArray[np.float64]
+
+_BENDS = ((30, 3), (12, 2))
+"""(least number of points, degree of the polynomial): three points to a term at least."""
+_FEWEST_POINTS = 4
+_KEPT_SHARES = (0.8, 0.8, 1.0)
+"""Of the points, the closest ones, on which the polynomial is fitted again: a point far off must not bend it."""
+_OUTLIER_MEDIANS = 5.0
+_LEAST_OUTLIER_PX = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardMap:
+    """Board positions (metres) to raw pixels. homography: (3, 3) float64, of positions from -1 to 1 over the board.
+    bend_px: (terms, 2) float64, x^i y^j of what it gives, from -1 to 1 over the board's picture.
+    """
+
+    homography: Array
+    bend_px: Array
+    degree: int
+    half_m: Array
+    centre_px: Array
+    half_px: float
+
+    def to_px(self, points_m: ArrayLike) -> Array:
+        """Raw pixels (..., 2) of board positions (..., 2)."""
+        flat = _projected(self.homography, (np.asarray(points_m, np.float64) - self.half_m) / self.half_m)
+        mapped: Array = flat + _terms((flat - self.centre_px) / self.half_px, self.degree) @ self.bend_px
+        return mapped
+
+
+def fit_map(
+    points_m: Array, px: Array, outlier_px: float, size_m: tuple[float, float]
+) -> tuple[BoardMap, NDArray[np.bool_]] | None:
+    """The map through points (n, 2) seen at px (n, 2), and which of them lie on it within outlier_px.
+
+    size_m: the board's, over which the polynomial runs from -1 to 1. None where no four points agree.
+    """
+    if len(points_m) < _FEWEST_POINTS:
+        return None
+    half = np.array(size_m) / 2
+    at = (points_m - half) / half
+    first, mask = cv2.findHomography(at, px, cv2.RANSAC, outlier_px, maxIters=2000, confidence=0.9999)
+    if first is None or not np.isfinite(first).all():
+        return None
+    homography = np.asarray(first, np.float64)
+    inside: NDArray[np.bool_] = mask.ravel() > 0
+    if inside.sum() < _FEWEST_POINTS:
+        return None
+    degree = next((degree for fewest, degree in _BENDS if inside.sum() >= fewest), 0)
+    flat = _projected(homography, at)
+    centre = flat[inside].mean(axis=0)
+    reach = max(float(np.abs(flat[inside] - centre).max()), 1e-9)
+    terms, missed = _terms((flat - centre) / reach, degree), px - flat
+    bend: Array = np.zeros((terms.shape[1], 2))
+    for share in _KEPT_SHARES if degree else ():
+        bend = np.asarray(np.linalg.lstsq(terms[inside], missed[inside], rcond=1e-6)[0], np.float64)
+        off = np.hypot(*(missed - terms @ bend).T)
+        usual = float(np.median(off[inside]))
+        close = max(_OUTLIER_MEDIANS * usual, _LEAST_OUTLIER_PX)
+        inside = off <= (close if share == 1 else max(float(np.quantile(off[inside], share)), _LEAST_OUTLIER_PX))
+    if degree:
+        bend = np.asarray(np.linalg.lstsq(terms[inside], missed[inside], rcond=1e-6)[0], np.float64)
+    return BoardMap(homography, bend, degree, half, centre, reach), inside
+
+
+def _projected(homography: Array, at: Array) -> Array:
+    seen = np.concatenate([at, np.ones((*at.shape[:-1], 1))], axis=-1) @ homography.T
+    flat: Array = seen[..., :2] / seen[..., 2:]
+    return flat
+
+
+def _powers(degree: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+
+
+def _terms(at: Array, degree: int) -> Array:
+    across = np.polynomial.polynomial.polyvander(at[..., 0], degree)
+    down = np.polynomial.polynomial.polyvander(at[..., 1], degree)
+    i, j = np.array(_powers(degree)).T
+    terms: Array = across[..., i] * down[..., j]
+    return terms

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
-from calibration.board.drawing import Drawing
-from calibration.board.picture_map import BoardMap
+from calibration.board.drawing import BoardMap, Drawing
 
 Array = NDArray[np.float64]
 

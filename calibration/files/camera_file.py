@@ -17,10 +17,9 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from calibration.files.sections import CameraSection, Number, Section
-from calibration.files.yaml_file import read_yaml_file
+from calibration.files.sections import CameraSection, FileSection, Number, read_yaml_file
 from calibration.model.camera import Camera
-from calibration.model.covariance import Covariance
+from calibration.model.rig_model import Covariance
 from calibration.verdict import Verdict, VerdictWord
 from calibration.views import View
 
@@ -30,12 +29,12 @@ CORNERS = "corners"
 """In the provenance of a rig's calibration: digests of the views it was made of, those of its camera too."""
 
 
-class _CovarianceRows(Section):
+class _CovarianceRows(FileSection):
     names: list[str]
     matrix: list[list[Number]]
 
 
-class _CameraFile(Section):
+class _CameraFile(FileSection):
     format: Literal["spadrig-camera"]
     version: Literal[1]
     camera: CameraSection

@@ -51,7 +51,7 @@ def _no_kinds(name: str, content: Any) -> None:
 
 
 @dataclass(frozen=True)
-class Sources:
+class ValueSources:
     """Where values came from: a file with the line of each key, and the keys that were given as options.
 
     lines_of: called where there is something wrong. flags: what the command line calls some keys.
@@ -133,7 +133,7 @@ class _Schema:
 def validated(
     model: type[Model],
     content: Mapping[str, Any],
-    sources: Sources,
+    sources: ValueSources,
     kind_of: KindOf = _no_kinds,
     context: Mapping[str, Any] | None = None,
 ) -> Model:

@@ -29,13 +29,11 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.files.camera_file import build_camera, camera_content
-from calibration.files.sections import FORMAT, VERSION, CalibrationFile, PlaneRows
-from calibration.files.yaml_file import read_yaml_file
-from calibration.model.covariance import Covariance
+from calibration.files.npy_files import load_numpy
+from calibration.files.sections import FORMAT, VERSION, CalibrationFile, PlaneRows, read_yaml_file
 from calibration.model.parameters import with_parameters
-from calibration.model.rig_model import Identity, Lag, RigModel
+from calibration.model.rig_model import Covariance, Identity, Lag, RigModel
 from calibration.model.scanner import PivotScanner, PlaneTable, Scanner
-from calibration.npy_files import load_numpy
 
 CALIBRATION_FILE: Final = "calibration.yaml"
 """Its name wherever the project writes one."""

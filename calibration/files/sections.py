@@ -1,9 +1,18 @@
-"""What a calibration file may say, section by section."""
+"""What a calibration file may say, section by section.
 
-from typing import Annotated, Literal
+The one reader of YAML files: bounded in size, depth and repetition, keys given once, errors in a line.
+"""
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from calibration.errors import CalibrationError, FileError
+from calibration.files.problems import Key, ValueSources, validated
 from calibration.verdict import VerdictWord
 
 FORMAT = "spadrig-calibration"
@@ -16,13 +25,13 @@ Row = Annotated[list[Number], Field(min_length=4, max_length=4)]
 PlaneRows = str | list[Row]
 
 
-class Section(BaseModel):
+class FileSection(BaseModel):
     """A part of a file: what it does not know is refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class CameraSection(Section):
+class CameraSection(FileSection):
     """The camera, in pixels."""
 
     width: int
@@ -31,14 +40,14 @@ class CameraSection(Section):
     distortion: list[Number] = []
 
 
-class TableSection(Section):
+class TableSection(FileSection):
     """Planes at commands."""
 
     command: list[Number]
     planes: PlaneRows
 
 
-class PivotSection(Section):
+class PivotSection(FileSection):
     """A mirror that turns about an axis, as `PivotScanner` has it."""
 
     axis_point_m: Triple
@@ -51,7 +60,7 @@ class PivotSection(Section):
     bow_per_rad: Number = 0.0
 
 
-class ScannerSection(Section):
+class ScannerSection(FileSection):
     """One of the two forms."""
 
     table: TableSection | None = None
@@ -64,21 +73,21 @@ class ScannerSection(Section):
         return self
 
 
-class LagSection(Section):
+class LagSection(FileSection):
     """By how much the mirror follows a rising and a falling command."""
 
     forward: Number = 0.0
     backward: Number = 0.0
 
 
-class CovarianceSection(Section):
+class CovarianceSection(FileSection):
     """Names of the parameters, and the file of their matrix."""
 
     names: list[str]
     file: str
 
 
-class IdentitySection(Section):
+class IdentitySection(FileSection):
     """Of which rig, as `Identity` has it."""
 
     rig: str
@@ -99,7 +108,7 @@ class ProvenanceSection(BaseModel):
     corners: list[str] | None = None
 
 
-class CalibrationFile(Section):
+class CalibrationFile(FileSection):
     """The whole file."""
 
     format: Literal["spadrig-calibration"]
@@ -125,3 +134,198 @@ class CalibrationFile(Section):
         if (self.planes is None) == (self.scanner is None):
             raise ValueError("give exactly one of 'planes' and 'scanner'")
         return self
+
+
+Content = TypeVar("Content", bound=BaseModel)
+
+MAX_BYTES: Final = 64 << 20
+"""Largest file: the plan of a long scan takes a hundredth of that."""
+MAX_DEPTH: Final = 64
+"""Most lists and mappings within one another."""
+MAX_NODES: Final = 4_000_000
+"""Most values that a file may write out."""
+MAX_REPEATED: Final = 100_000
+"""Most values that aliases may repeat: anchors that name one another multiply, nine lines become a billion values."""
+MAX_WHOLE: Final = 1 << 64
+"""Whole numbers are below: what counts, identifies or seeds has at most 64 bits."""
+_MOST_SHOWN: Final = 40
+
+
+@dataclass(frozen=True, slots=True)
+class YamlFile:
+    """A file's keys and values, with the text and the nodes that they were read from."""
+
+    content: dict[str, Any]
+    text: str
+    node: yaml.MappingNode
+
+    def lines(self) -> dict[Key, int]:
+        """The line of each key and of each item of a list, by its path."""
+        return dict(_places(self.node, ()))
+
+
+def load_yaml(file: Path, what: str, example: str, name: str | None = None) -> YamlFile:
+    """The keys and values of a file.
+
+    what: 'a calibration', for messages, as is an example of a line. name: of the file there, its path by default.
+    Raises FileError, also where a key is given twice.
+    """
+    name = str(file) if name is None else name
+    try:
+        size = file.stat().st_size
+        if size > MAX_BYTES:
+            raise FileError(
+                f"{name} has {size / 1e6:.0f} MB, {what} has at most {MAX_BYTES / 1e6:.0f} MB; name another file"
+            )
+        text = file.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise FileError(f"cannot read {what.split()[-1]} {name}: {error.strerror or error}; check the path") from error
+    except UnicodeDecodeError as error:
+        raise FileError(f"{name} is not text in UTF-8; {what} is a YAML file") from error
+    return parse_yaml(text, what, example, name)
+
+
+def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
+    """The keys and values of a file's text; as `load_yaml`."""
+    try:
+        _require_bounded(text)
+        loader = _Loader(text)
+        try:
+            node = loader.get_single_node()
+            twice = [] if node is None else list(_twice(node, ()))  # before merge keys are resolved, which may repeat
+            content = None if node is None else loader.construct_document(node)
+        finally:
+            loader.dispose()
+    except _Refused as error:
+        raise FileError(f"{name}:{error}") from error.__cause__
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f":{mark.line + 1}" if mark is not None else ""
+        why = getattr(error, "problem", None) or getattr(error, "reason", None) or "unreadable"
+        raise FileError(f"{name}{where}: not YAML: {why}; check indentation, quotes and brackets there") from error
+    if not isinstance(content, dict):
+        holds = "a list" if isinstance(content, list) else "a single value"
+        kind = "is empty" if content is None else f"holds {holds}"
+        raise FileError(f"{name} {kind}; {what} must hold keys and values, e.g. '{example}'")
+    if twice:
+        raise FileError(*(f"{name}:{line}: '{'.'.join(key)}' is given twice; keep one" for key, line in twice))
+    return YamlFile(content, text, node)
+
+
+def read_yaml_file(file: Path, what: str, format_name: str, version: int, model: type[Content]) -> Content:
+    """The content of a file that must say that format and version.
+
+    Raises CalibrationError, one line: the file, the key, what is wrong and what would be right.
+    """
+    read = load_yaml(file, what, f"format: {format_name}")
+    content = read.content
+    if content.get("format") != format_name:
+        raise CalibrationError(f"{file} is not {what}: its first entry must be 'format: {format_name}'")
+    if content.get("version") != version:
+        raise CalibrationError(f"{file} has version {content.get('version')!r}; this program reads version {version}")
+    return validated(model, content, ValueSources(str(file), read.lines))
+
+
+class _Refused(yaml.YAMLError):
+    """YAML that this program does not take; the text begins with the line."""
+
+    def __init__(self, mark: Any, why: str) -> None:
+        super().__init__(f"{mark.line + 1}: {why}")
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """Says in which line a value is that its tag or looks promise but that is none, as 2024-13-45."""
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """The value of a node."""
+        try:
+            value = super().construct_object(node, deep=deep)
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            kind = node.tag.rpartition(":")[-1]
+            raise _Refused(node.start_mark, f"{_cut(node)} is no {kind}; mend it, or put text in quotes") from error
+        if isinstance(value, int) and abs(value) >= MAX_WHOLE:
+            raise _Refused(node.start_mark, f"{_cut(node)} is too large, a whole number is below 2^64; lower it")
+        return value
+
+
+def _cut(node: yaml.Node) -> str:
+    text = str(node.value)
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
+
+
+@dataclass(slots=True)
+class _Open:
+    """A list or mapping that is being read: its anchor, how many values came before it, how deep it nests so far."""
+
+    anchor: str | None
+    before: int
+    height: int = 0
+
+
+def _require_bounded(text: str) -> None:
+    """Raise a YAMLError where the text nests or repeats too much, before anything is made of it."""
+    known: dict[str | None, tuple[int, int]] = {}  # of what is anchored: its values, and how deep they nest
+    opened: list[_Open] = []
+    written = repeated = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        size, height = 1, 0
+        if isinstance(event, yaml.CollectionStartEvent):
+            opened.append(_Open(event.anchor, written + repeated))
+            written += 1
+            if len(opened) > MAX_DEPTH:
+                raise _Refused(event.start_mark, f"nested more than {MAX_DEPTH} deep; write it flatter")
+            continue
+        if isinstance(event, yaml.ScalarEvent):
+            written += 1
+        elif isinstance(event, yaml.AliasEvent):
+            if any(event.anchor == one.anchor for one in opened):
+                raise _Refused(
+                    event.start_mark, f"'*{event.anchor}' stands within what it repeats; write out what is meant"
+                )
+            size, height = known.get(event.anchor, (1, 0))
+            repeated += size
+        elif isinstance(event, yaml.CollectionEndEvent):
+            closed = opened.pop()
+            size, height = written + repeated - closed.before, closed.height + 1
+        else:
+            continue
+        if len(opened) + height > MAX_DEPTH:
+            raise _Refused(event.start_mark, f"nested more than {MAX_DEPTH} deep; write it flatter")
+        if written > MAX_NODES:
+            raise _Refused(event.start_mark, f"more than {MAX_NODES} values; put arrays into .npy files")
+        if repeated > MAX_REPEATED:
+            raise _Refused(event.start_mark, f"aliases repeat more than {MAX_REPEATED} values; write out what is meant")
+        if opened:
+            opened[-1].height = max(opened[-1].height, height)
+        anchor = closed.anchor if isinstance(event, yaml.CollectionEndEvent) else getattr(event, "anchor", None)
+        if not isinstance(event, yaml.AliasEvent) and anchor is not None:
+            known[anchor] = size, height
+
+
+def _places(node: yaml.Node, path: Key) -> Iterator[tuple[Key, int]]:
+    """Every key and item below `node` with its line, repeated keys too."""
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            here = (*path, str(key.value))
+            yield here, key.start_mark.line + 1
+            yield from _places(value, here)
+    elif isinstance(node, yaml.SequenceNode):
+        for i, value in enumerate(node.value):
+            yield (*path, str(i)), value.start_mark.line + 1
+            yield from _places(value, (*path, str(i)))
+
+
+def _twice(node: yaml.Node, path: Key) -> Iterator[tuple[Key, int]]:
+    """The keys that were there before, with their lines."""
+    if isinstance(node, yaml.MappingNode):
+        seen = set()
+        for key, value in node.value:
+            here = (*path, str(key.value))
+            if here in seen:
+                yield here, key.start_mark.line + 1
+            seen.add(here)
+            yield from _twice(value, here)
+    elif isinstance(node, yaml.SequenceNode):
+        for i, value in enumerate(node.value):
+            if isinstance(value, yaml.CollectionNode):
+                yield from _twice(value, (*path, str(i)))

@@ -12,26 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
-from calibration.camera_fit.fit import CameraFit, fit_camera
+from calibration.camera_fit import CameraFit, fit_camera
 from calibration.errors import CalibrationError, Degenerate
 from calibration.model.camera import Camera
-from calibration.model.covariance import Covariance
-from calibration.model.lag_speeds import lag_groups
-from calibration.model.rig_model import RigModel
+from calibration.model.parameters import lag_groups
+from calibration.model.rig_model import Covariance, RigModel
 from calibration.model.scanner import PivotScanner
-from calibration.rig_fit.degenerate import check_poses, check_views, no_start
+from calibration.rig_fit.misfit import with_free
 from calibration.rig_fit.noise import Noise, passage_noise, restated
-from calibration.rig_fit.normal import all_rows
 from calibration.rig_fit.result import RigFit, result_of
 from calibration.rig_fit.rounds import Rounds
 from calibration.rig_fit.rows import ANGLE_TERMS, LENS_TERMS, OFFSET_TERMS, Terms
-from calibration.rig_fit.select import with_free
-from calibration.rig_fit.sightings import Sighting, sighting, usable
-from calibration.rig_fit.solve import Problem, camera_prior
-from calibration.rig_fit.start import board_points, first_pose, first_scanner
-from calibration.rig_fit.state import RigState, first_state, with_terms_of
-from calibration.robust import robust_sd
-from calibration.views import BoardPose, View
+from calibration.rig_fit.solve import RigProblem, all_rows, camera_prior
+from calibration.rig_fit.start import board_points, check_poses, check_views, first_pose, first_scanner, no_start
+from calibration.rig_fit.state import RigState, Sighting, first_state, sighting, usable, with_terms_of
+from calibration.views import BoardPose, View, robust_sd
 
 Array = NDArray[np.float64]
 
@@ -78,7 +73,7 @@ def fit_rig(
     groups += lag_groups(velocities)
     state = with_terms_of(state, groups)
     prior = None if known is None or hold_camera else camera_prior(known, camera, terms)
-    problem = with_free(Problem(sightings, terms, np.zeros((0, 0)), np.ones(len(shown), bool), prior), groups)
+    problem = with_free(RigProblem(sightings, terms, np.zeros((0, 0)), np.ones(len(shown), bool), prior), groups)
     problem, noise = _first_noise(problem, state)
     fit = Rounds(problem, tuple(groups), state, noise)
     try:
@@ -146,7 +141,7 @@ def _command_range(sightings: Sequence[Sighting], start: RigModel | None) -> tup
     return low, high
 
 
-def _first_noise(problem: Problem, state: RigState) -> tuple[Problem, Noise]:
+def _first_noise(problem: RigProblem, state: RigState) -> tuple[RigProblem, Noise]:
     """The problem with the sd that the passages' errors speak for, and how noisy all is."""
     rows = all_rows(state, problem.sightings, problem.terms)
     corners, passages = ([pair[which].residual for pair in rows] for which in (0, 1))

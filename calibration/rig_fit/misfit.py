@@ -1,16 +1,155 @@
-"""What a fitted rig does not describe: views that do not belong, slow misfit, terms that are neither there nor not."""
+"""What a fitted rig does not describe: views that do not belong, slow misfit, terms that are neither there nor not.
 
-from collections.abc import Sequence
+Which terms of the mirror the data call for, decided one at a time, each decision kept.
+
+A term that is not in the model is tried to first order: the equations say what value it would take and how sure that
+would be. It comes in where it would be SIGNIFICANT_SD of its own standard deviations and can be told from the others.
+The angle's polynomial grows by one order or two, since a symmetric mirror has no even terms. Of several that would come
+in the first is the one that leaves least unexplained: what is not there can stand for a part of what is, as light that
+passes the axis for an angle that bends, and be surer of its value than what it stands for.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.rig_fit.noise import smooth_basis
-from calibration.rig_fit.select import Decision, first_order
-from calibration.rig_fit.solve import Problem, Solution, scaled_inverse
+from calibration.model.parameters import TIMES
+from calibration.rig_fit.noise import Noise, smooth_basis
+from calibration.rig_fit.rows import ANGLE_TERMS
+from calibration.rig_fit.solve import RigProblem, RigSolution, scaled_inverse
 
 Array = NDArray[np.float64]
+
+SIGNIFICANT_SD = 5.0
+LEAST_OWN_SHARE = 1e-7
+"""Of a term's weight in the equations, what is its own when all others are free; less is rounding."""
+
+
+@dataclass(frozen=True, slots=True)
+class TermDecision:
+    """One about a term. value, sd: what it is or would be, in its own unit; NaN where nothing tells. along: name and
+    value of the terms that would come in with it. gain: by which chi2 would fall with all of them."""
+
+    name: str
+    kept: bool
+    value: float
+    sd: float
+    reason: str
+    along: tuple[tuple[str, float], ...] = ()
+    gain: float = 0.0
+
+
+def with_free(problem: RigProblem, groups: Sequence[Sequence[str]]) -> RigProblem:
+    """The problem with these parameters free; those of one group have one value."""
+    tie = np.zeros((len(problem.terms.names), len(groups)))
+    for column, group in enumerate(groups):
+        tie[problem.terms.at(group), column] = 1.0
+    return replace(problem, tie=tie)
+
+
+def candidates(free: Sequence[Sequence[str]], row_delay: bool) -> list[tuple[str, ...]]:
+    """What could come in next: (new terms), of which the last is the one that is judged."""
+    names = {name for group in free for name in group}
+    order = max(k for k in range(ANGLE_TERMS) if f"angle_{k}" in names)
+    tried = [tuple(f"angle_{k}" for k in range(order + 1, top + 1)) for top in range(order + 1, order + 3)]
+    tried = [terms for terms in tried if int(terms[-1][-1]) < ANGLE_TERMS]
+    tried += [(name,) for name in ("offset_0", "cone", "bow") if name not in names]
+    if "offset_0" in names and "offset_1" not in names:
+        tried.append(("offset_1",))
+    if row_delay and "row_delay" not in names:
+        tried.append(("row_delay",))
+    return tried
+
+
+def tried(
+    problem: RigProblem, solution: RigSolution, new: Sequence[str], left_over: Callable[[float], float]
+) -> TermDecision:
+    """What the last of the new terms would be with all of them free.
+
+    left_over: by which factor variances would still be too large, were chi2 less by so much.
+    """
+    at = problem.terms.at(new)
+    matrix, right = solution.matrix, solution.right
+    tie = problem.tie
+    inverse, _ = scaled_inverse(tie.T @ matrix @ tie)
+    across = tie.T @ matrix[:, at]
+    own = matrix[np.ix_(at, at)]
+    left = own - across.T @ inverse @ across
+    wanted = right[at] - across.T @ inverse @ (tie.T @ right)
+    weight = np.diag(own)
+    share = np.linalg.eigvalsh(left / np.sqrt(np.outer(weight, weight)))[0] if np.all(weight > 0) else 0.0
+    if not share > LEAST_OWN_SHARE:
+        return TermDecision(new[-1], False, np.nan, np.nan, "cannot be told from the other terms")
+    spread = np.linalg.inv(left)
+    values = (spread @ wanted).tolist()
+    value, gain = values[-1], float(wanted @ spread @ wanted)
+    sd = float(np.sqrt(left_over(gain) * spread[-1, -1]))
+    kept = abs(value) > SIGNIFICANT_SD * sd
+    said = f"{abs(value) / sd:.1f} sd from 0, limit {SIGNIFICANT_SD:g}"
+    return TermDecision(new[-1], kept, value, sd, said, tuple(zip(new[:-1], values[:-1], strict=True)), gain)
+
+
+def best(decisions: Sequence[TermDecision]) -> int | None:
+    """Of those that would be kept the one that leaves least unexplained."""
+    kept = [at for at, decision in enumerate(decisions) if decision.kept]
+    return max(kept, key=lambda at: decisions[at].gain) if kept else None
+
+
+def lag_decisions(
+    solution: RigSolution, problem: RigProblem, free: Sequence[Sequence[str]], timing: Array
+) -> list[TermDecision]:
+    """What the directions and speeds told of the lags."""
+    spread = np.sqrt(np.diag(solution.covariance(problem.tie)))
+    told = {group[0]: group for group in free if group[0].startswith("lag")}
+    decisions = []
+    for group in told.values():
+        at = problem.terms.at(group[:1])[0]
+        said = "of each direction" if len(group) == 1 else "one for both: the sweeps do not tell them apart"
+        value = float(timing[TIMES.index(group[0])])
+        decisions.append(TermDecision("/".join(group), True, value, float(spread[at]), said))
+    if not told:
+        value = float(timing[0])
+        decisions.append(TermDecision("lag", False, value, np.nan, "not told by one direction at one speed: as it was"))
+    return decisions
+
+
+def first_order(problem: RigProblem, solution: RigSolution, open_one: TermDecision) -> Array:
+    """(p,) by how much all shared parameters would change, were this term taken in, and those that go along."""
+    taken = dict((*open_one.along, (open_one.name, open_one.value)))
+    at, values = problem.terms.at(tuple(taken)), np.array(list(taken.values()))
+    inverse, _ = scaled_inverse(problem.tie.T @ solution.matrix @ problem.tie)
+    change: Array = -problem.tie @ (inverse @ (problem.tie.T @ (solution.matrix[:, at] @ values)))
+    change[at] = values
+    return change
+
+
+def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> float:
+    """Corner sd (pixels) that is left when the corners alone decide about camera and poses.
+
+    With the passages in, corners that contradict them, as after a knock on the rig, would only pass for noisy ones.
+    """
+    p = len(problem.terms.names)
+    shared: Array = np.zeros((p, p))
+    right: Array = np.zeros(p)
+    chi2, count = 0.0, 0.0
+    for view, (rows, _), counts in zip(solution.views, solution.rows, problem.counted, strict=True):
+        if not counts:
+            continue
+        own, pose_right = view.corner_part[p:, p:], view.corner_right[p:]
+        across = np.linalg.solve(own, np.hstack([view.corner_part[p:, :p], pose_right[:, None]]))
+        shared += view.corner_part[:p, :p] - view.corner_part[:p, p:] @ across[:, :-1]
+        right += view.corner_right[:p] - view.corner_part[:p, p:] @ across[:, -1]
+        chi2 += view.chi2[0] - float(pose_right @ across[:, -1])
+        count += rows.residual.size - 6
+    tie = problem.tie[:, np.any(problem.tie[: len(problem.terms.camera)] != 0, axis=0)]
+    if tie.shape[1]:
+        told = tie.T @ right
+        chi2 -= float(told @ np.linalg.lstsq(tie.T @ shared @ tie, told, rcond=1e-12)[0])
+    return noise.corner_sd_px * float(np.sqrt(max(chi2, 0.0) / max(count - tie.shape[1], 1.0)))
+
 
 SCANNER_MOVES = ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2", "angle_0")
 """What a scanner that was knocked changes: five of six, since a shift along the axis changes nothing."""
@@ -32,7 +171,7 @@ MISFIT_SD = 3.0
 """By which chi2 of the slow misfit must exceed its mean before it is believed."""
 
 
-def odd_view(problem: Problem, solution: Solution, left: "Misfit") -> int | None:
+def odd_view(problem: RigProblem, solution: RigSolution, left: "Misfit") -> int | None:
     """The view that would most like a scanner elsewhere, if it stands out, else None. left: the misfit of the fit.
 
     Each view's equations say how far chi2 would fall if the scanner had a place of its own for this view alone. Views
@@ -59,12 +198,12 @@ def _alone(left: "Misfit", gain: float, next_gain: float) -> bool:
     return excess >= LEAST_EXPLAINED - 1 and remains <= EXPLAINED_SHARE * excess and otherwise >= OTHERS_SHARE * excess
 
 
-def with_passages(problem: Problem) -> NDArray[np.bool_]:
+def with_passages(problem: RigProblem) -> NDArray[np.bool_]:
     """(views,) True where the line was seen on the board."""
     return np.array([seen.command.size > 0 for seen in problem.sightings])
 
 
-def _own_place(problem: Problem, solution: Solution, view: int) -> float:
+def _own_place(problem: RigProblem, solution: RigSolution, view: int) -> float:
     """Fall of chi2 to first order."""
     at = problem.terms.at(SCANNER_MOVES)
     tie, own = problem.tie, solution.views[view]
@@ -79,7 +218,7 @@ def _own_place(problem: Problem, solution: Solution, view: int) -> float:
     return float(np.sum(along**2 / values[told]))
 
 
-def widening(problem: Problem, solution: Solution, decisions: Sequence[Decision]) -> Array:
+def widening(problem: RigProblem, solution: RigSolution, decisions: Sequence[TermDecision]) -> Array:
     """(p, p) to add to the covariance, for the term that came nearest to being taken in: what it would change."""
     wider: Array = np.zeros_like(solution.matrix)
     open_ones = [d for d in decisions if not d.kept and np.isfinite(d.sd) and abs(d.value) > UNDECIDED_SD * d.sd]
@@ -111,12 +250,12 @@ class Misfit(NamedTuple):
         return max(1.0, 1 + (excess - gain) / max(self.slow[1], 1.0))
 
 
-def misfit(problem: Problem, solution: Solution) -> Misfit:
+def misfit(problem: RigProblem, solution: RigSolution) -> Misfit:
     """What corners and passages have against each other, and passages among themselves."""
     return Misfit(_of_corners(problem, solution), _of_sweeps(problem, solution))
 
 
-def _of_corners(problem: Problem, solution: Solution) -> tuple[float, float]:
+def _of_corners(problem: RigProblem, solution: RigSolution) -> tuple[float, float]:
     """With the noise that the corners alone speak for."""
     covariance = solution.covariance(problem.tie)
     chi2 = free = 0.0
@@ -127,7 +266,7 @@ def _of_corners(problem: Problem, solution: Solution) -> tuple[float, float]:
     return chi2, free
 
 
-def _of_sweeps(problem: Problem, solution: Solution) -> tuple[float, float]:
+def _of_sweeps(problem: RigProblem, solution: RigSolution) -> tuple[float, float]:
     """Of the smooth part of what is left of each sweep."""
     chi2, count = 0.0, 0
     jitter = solution.weight.jitter
@@ -150,7 +289,7 @@ def _of_sweeps(problem: Problem, solution: Solution) -> tuple[float, float]:
     return chi2, count - _taken(problem, solution)
 
 
-def _taken(problem: Problem, solution: Solution) -> float:
+def _taken(problem: RigProblem, solution: RigSolution) -> float:
     """How many parameters the passages, rather than the corners, determine."""
     covariance = solution.covariance(problem.tie)
     return float(

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.model.lag_speeds import alike_speeds
-from calibration.rig_fit.sightings import Sighting
-from calibration.robust import MAD_TO_SD, robust_sd
+from calibration.model.parameters import alike_speeds
+from calibration.rig_fit.state import Sighting
+from calibration.views import MAD_TO_SD, robust_sd
 
 Array = NDArray[np.float64]
 

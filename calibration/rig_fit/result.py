@@ -1,4 +1,7 @@
-"""What a fit of a whole rig comes to: model with covariance, residuals, and what had a say."""
+"""What a fit of a whole rig comes to: model with covariance, residuals, and what had a say.
+
+What a fit leaves of each sweep's passages.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -6,19 +9,61 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
-from calibration.model.covariance import Covariance
-from calibration.model.lag_speeds import SWEPT, speed_range
-from calibration.model.rig_model import Lag, RigModel
-from calibration.rig_fit.degenerate import check_depth
-from calibration.rig_fit.misfit import misfit, widening
+from calibration.model.parameters import SWEPT, speed_range
+from calibration.model.rig_model import Covariance, Lag, RigModel
+from calibration.rig_fit.misfit import TermDecision, lag_decisions, misfit, widening
 from calibration.rig_fit.noise import Noise
 from calibration.rig_fit.rounds import Rounds
-from calibration.rig_fit.select import Decision, lag_decisions
-from calibration.rig_fit.solve import Problem
-from calibration.rig_fit.sweeps import SweepFit, sweep_fits
+from calibration.rig_fit.rows import mirror_command, sheet_rows
+from calibration.rig_fit.solve import RigProblem
+from calibration.rig_fit.start import board_points, check_depth
+from calibration.rig_fit.state import RigState, Sighting
 from calibration.views import BoardPose
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepFit:
+    """What is left of the passages of one sweep of a view; all float64 (m,), sorted by command.
+
+    command: the mirror's, as the model has it. residual, sd: in command units. distance_m: how far the point on the
+    board lies off the light.
+    """
+
+    direction: int
+    speed_per_s: float
+    x_px: Array
+    y_px: Array
+    command: Array
+    residual: Array
+    distance_m: Array
+    sd: Array
+
+
+def sweep_fits(seen: Sighting, residual: Array, state: RigState, view: int) -> tuple[SweepFit, ...]:
+    """Of a view's sweeps, from the residuals of its passages."""
+    command = mirror_command(state.timing, seen.command, seen.y_px, seen.velocity_per_s)
+    points = board_points(state.model.camera, [seen], [state.poses[view]]).points_m
+    per_command_m = sheet_rows(
+        state.scanner, state.model.source_m, points, command, seen.y_px, seen.velocity_per_s
+    ).per_command
+    found = []
+    for sweep in seen.sweeps:
+        velocity = seen.velocity_per_s[sweep]
+        found.append(
+            SweepFit(
+                direction=1 if velocity[0] > 0 else -1,
+                speed_per_s=float(abs(velocity[0])),
+                x_px=seen.x_px[sweep],
+                y_px=seen.y_px[sweep],
+                command=command[sweep],
+                residual=residual[sweep],
+                distance_m=residual[sweep] * per_command_m[sweep],
+                sd=seen.sd[sweep],
+            )
+        )
+    return tuple(found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +90,7 @@ class RigFit:
     misfit: float
     condition: float
     converged: bool
-    decisions: tuple[Decision, ...]
+    decisions: tuple[TermDecision, ...]
     board: Board
     free: tuple[tuple[str, ...], ...]
     information: Array
@@ -123,7 +168,7 @@ def result_of(
     )
 
 
-def _swept(problem: Problem) -> list[float]:
+def _swept(problem: RigProblem) -> list[float]:
     """Signed velocities of the sweeps that had a say."""
     shown = [seen.velocity_per_s for seen, counts in zip(problem.sightings, problem.counted, strict=True) if counts]
     swept: list[float] = np.unique(np.concatenate(shown)).tolist()

@@ -8,12 +8,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibration.digits import digits
-from calibration.errors import Degenerate
-from calibration.rig_fit.misfit import misfit, odd_view, with_passages
+from calibration.errors import Degenerate, digits
+from calibration.rig_fit.misfit import (
+    TermDecision,
+    best,
+    candidates,
+    corner_noise,
+    misfit,
+    odd_view,
+    tried,
+    with_free,
+    with_passages,
+)
 from calibration.rig_fit.noise import Noise, passage_noise
-from calibration.rig_fit.select import Decision, best, candidates, corner_noise, tried, with_free
-from calibration.rig_fit.solve import Problem, Solution, solved
+from calibration.rig_fit.solve import RigProblem, RigSolution, solved
 from calibration.rig_fit.state import RigState, with_terms_of
 
 MOST_ROUNDS = 16
@@ -32,14 +40,14 @@ class Rounds:
     terms; kept: those that changed the model.
     """
 
-    problem: Problem
+    problem: RigProblem
     base: tuple[tuple[str, ...], ...]
     state: RigState
     noise: Noise
     free: list[tuple[str, ...]] = field(init=False)
-    solution: Solution | None = None
-    decisions: tuple[Decision, ...] = ()
-    kept: tuple[Decision, ...] = ()
+    solution: RigSolution | None = None
+    decisions: tuple[TermDecision, ...] = ()
+    kept: tuple[TermDecision, ...] = ()
 
     def __post_init__(self) -> None:
         """Begin with the least of all models."""
@@ -100,7 +108,7 @@ class Rounds:
             self.state = replace(self.state, timing=timing)
             self.free.remove(group)
             self.problem = with_free(self.problem, self.free)
-            self.kept += (Decision("/".join(group), False, value, sd, "not below 0 for any mirror: held at 0"),)
+            self.kept += (TermDecision("/".join(group), False, value, sd, "not below 0 for any mirror: held at 0"),)
             return True
         return False
 

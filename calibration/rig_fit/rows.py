@@ -18,8 +18,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
-from calibration.model.camera import Camera
-from calibration.model.distortion import LensModel
+from calibration.model.camera import Camera, LensModel
 from calibration.model.light_sheet import fan_origin
 from calibration.model.parameters import AXIS, DISTORTION, MATRIX, TIMES
 from calibration.model.scanner import PivotScanner

@@ -1,4 +1,7 @@
-"""Where a fit of a rig stands: the model, its timing, the poses, and all residuals at that point."""
+"""Where a fit of a rig stands: the model, its timing, the poses, and all residuals at that point.
+
+What the fit of a rig sees of each pose of the board: corners and passages, cleaned, in the order it needs them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,14 +9,124 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.board.board import PAPER_SQUARES, Board
+from calibration.model.camera import Camera
 from calibration.model.parameters import ROW_DELAY, TIMES, with_parameters
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.rows import Rows, Terms, corner_rows, passage_rows, refined_rays
-from calibration.rig_fit.sightings import Sighting
-from calibration.views import BoardPose
+from calibration.views import FEWEST_CORNERS, LEAST_ACROSS_PX, USUAL_CORNER_SD_PX, BoardPose, Corners, Passages, View
 
 Array = NDArray[np.float64]
+
+EDGE_PX = 1.5
+"""Passages this close to the board's outline are left out: such pixels see what stands behind it too."""
+LEAST_SD_SHARE = 0.05
+"""Of the median sd of a sweep: none counts as better known, or a few too sure of themselves would decide."""
+LEAST_CORNER_SD_PX = 0.02
+"""What the print, the lens model and the finding of corners leave, however bright the picture."""
+FEWEST_PASSAGES = 30
+"""Of a sweep; fewer say nothing that the noise can be told from."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """One view. corners_m (n, 3), corner_px (n, 2), corner_scale (n,): sd of a corner against that of the others.
+
+    Per passage (m,), float64, sorted by sweep and command: x_px, y_px, command, sd, velocity_per_s (signed). starts:
+    (sweeps + 1,) where the sweeps begin and end.
+    """
+
+    name: str
+    corners_m: Array
+    corner_px: Array
+    corner_scale: Array
+    x_px: Array
+    y_px: Array
+    command: Array
+    sd: Array
+    velocity_per_s: Array
+    starts: NDArray[np.int64]
+
+    @property
+    def sweeps(self) -> list[slice]:
+        """The passages of each sweep."""
+        return [slice(int(a), int(b)) for a, b in zip(self.starts[:-1], self.starts[1:], strict=True)]
+
+
+def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sighting:
+    """The corners of a view and those of its passages that lie on the board's paper."""
+    assert view.corners is not None
+    sweeps = [_on_board(sweep, board, camera, pose) for sweep in view.passages]
+    sweeps = [sweep for sweep in sweeps if sweep.x_px.size >= FEWEST_PASSAGES]
+
+    def joined(name: str) -> Array:
+        return np.concatenate([np.zeros(0), *(getattr(sweep, name) for sweep in sweeps)])
+
+    sizes = [sweep.x_px.size for sweep in sweeps]
+    velocity = [np.full(sweep.x_px.size, sweep.velocity_per_s) for sweep in sweeps]
+    return Sighting(
+        name=view.name,
+        corners_m=board.corners_m[view.corners.ids],
+        corner_px=np.asarray(view.corners.px, np.float64),
+        corner_scale=corner_scale(view.corners),
+        x_px=joined("x_px"),
+        y_px=joined("y_px"),
+        command=joined("command"),
+        sd=joined("sd"),
+        velocity_per_s=np.concatenate([np.zeros(0), *velocity]),
+        starts=np.cumsum([0, *sizes]),
+    )
+
+
+def corner_scale(corners: Corners) -> Array:
+    """Of each corner, 1 where the picture did not tell."""
+    if corners.sd_px is None:
+        return np.ones(len(corners.ids))
+    scale: Array = np.hypot(corners.likely_sd_px, LEAST_CORNER_SD_PX) / USUAL_CORNER_SD_PX
+    return scale
+
+
+def usable(views: Sequence[View]) -> list[View]:
+    """The views that have corners enough for a pose, without corners that are nowhere."""
+    found = []
+    for view in views:
+        if view.corners is None:
+            continue
+        ids, px, sd_px = view.corners.ids, view.corners.px, view.corners.sd_px
+        seen = np.isfinite(px).all(axis=1)
+        if seen.sum() >= FEWEST_CORNERS:
+            corners = Corners(ids[seen], px[seen], None if sd_px is None else sd_px[seen])
+            if corners.across_px >= LEAST_ACROSS_PX:
+                found.append(replace(view, corners=corners))
+    return found
+
+
+def shows_line(view: View) -> bool:
+    """Whether a sweep of a view has passages enough to be looked at."""
+    return any(sweep.x_px.size >= FEWEST_PASSAGES for sweep in view.passages)
+
+
+def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose) -> Passages:
+    """The passages of a sweep within the board's outline, sorted by command."""
+    x, y, command, sd = (np.asarray(values, np.float64) for values in (sweep.x_px, sweep.y_px, sweep.command, sweep.sd))
+    keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(command) & np.isfinite(sd) & (sd > 0)
+    u, v = camera.tangents_at(x, y)
+    ray = np.stack([u, v, np.ones_like(u)], axis=-1)
+    turn = pose.matrix
+    with np.errstate(all="ignore"):
+        depth = (turn[:, 2] @ pose.position_m) / (ray @ turn[:, 2])
+        place = (depth[:, None] * ray - pose.position_m) @ turn
+    margin = EDGE_PX * float(np.linalg.norm(pose.position_m)) / camera.matrix[0, 0]
+    margin -= PAPER_SQUARES * board.square_m
+    width, height = board.size_m
+    with np.errstate(invalid="ignore"):
+        keep &= (depth > 0) & (place[:, 0] > margin) & (place[:, 0] < width - margin)
+        keep &= (place[:, 1] > margin) & (place[:, 1] < height - margin)
+    at = np.flatnonzero(keep)
+    at = at[np.argsort(command[at], kind="stable")]
+    floor = LEAST_SD_SHARE * float(np.median(sd[at])) if at.size else 0.0
+    return Passages(x[at], y[at], command[at], np.maximum(sd[at], floor), sweep.direction, sweep.speed_per_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

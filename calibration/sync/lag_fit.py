@@ -8,7 +8,7 @@ sees it at (calibration/views.py)
 Positions drop out as each pixel's weighted mean; what is left is linear in the two lags and the row delay. No board is
 needed and no geometry, only pixels that tell of a passage in several of the sweeps: 2000 pixels of 4 sweeps take 10 ms.
 
-What the sweeps can tell depends on them (`calibration.model.lag_speeds`). One speed each way: a mean of the lags alone,
+What the sweeps can tell depends on them (`calibration.model.parameters`). One speed each way: a mean of the lags alone,
 both are taken to be it. Two speeds in one direction at least: the lag of each way that was scanned. Whether a lag is
 the same at all speeds shows with two speeds both ways, or three. The row delay needs rows, not speeds. One that is
 known from elsewhere counts with what the sweeps tell of it, unless they contradict it significantly; nothing known is
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import Degenerate
-from calibration.model.lag_speeds import lag_groups, speed_range
+from calibration.model.parameters import lag_groups, speed_range
 from calibration.model.rig_model import Lag
 from calibration.sync.shared_pixels import (
     CLUSTERS,

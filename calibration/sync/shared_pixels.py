@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import Degenerate
-from calibration.robust import robust_sd
-from calibration.views import Passages
+from calibration.views import Passages, robust_sd
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """A model with the lags that other sweeps told, and what follows from them for its mirror's angle.
 
 A mirror's angle was fitted together with lags, and given other lags it is another: by how much, their covariance C
-tells. Where the sweeps of the planes told no lags apart (`calibration.model.lag_speeds`), any lags go with them, each
+tells. Where the sweeps of the planes told no lags apart (`calibration.model.parameters`), any lags go with them, each
 with an angle of its own: C is wide open then. With x the lags, y all else, S the covariance of the new lags:
 
     y | x = y0 + A (x - x0),    A = C_yx C_xx^-1,    cov y = (1 -A) C (1 -A)' + A S A',    cov (y, x) = A S
@@ -18,10 +18,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.model.covariance import Covariance
-from calibration.model.lag_speeds import SWEPT, untold
-from calibration.model.parameters import BACKWARD, FORWARD, ROW_DELAY, TIMES, parameters, with_parameters
-from calibration.model.rig_model import Lag, RigModel
+from calibration.model.parameters import BACKWARD, FORWARD, ROW_DELAY, SWEPT, TIMES, parameters, untold, with_parameters
+from calibration.model.rig_model import Covariance, Lag, RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.sync.lag_fit import SIGNIFICANT, SyncFit
 from calibration.verdict import Reason

@@ -1,6 +1,11 @@
-"""A device that the guard owns: opened from its config, asked by the application's messages, made safe at the end."""
+"""A device that the guard owns: opened from its config, asked by the application's messages, made safe at the end.
 
+A thread that does one job after the other for one device, urgent ones first.
+"""
+
+import itertools
 import logging
+import queue
 import threading
 import time
 from collections.abc import Callable
@@ -9,11 +14,45 @@ from typing import Any
 
 from drivers.clock import SystemClock
 from drivers.errors import DeviceError
-from drivers.guard.lane import Lane
 from drivers.interfaces import DeviceState, LineLaser, Pulse, SyncSource
 from drivers.registry import Surroundings, lookup
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import TapFile
+
+Job = Callable[[], object]
+
+
+class Lane:
+    """Jobs must not raise. The thread is a daemon: a job that hangs in a driver does not keep the process alive."""
+
+    def __init__(self, name: str) -> None:
+        self._jobs: queue.PriorityQueue[tuple[int, int, Job]] = queue.PriorityQueue()
+        self._order = itertools.count()
+        self._open = 0
+        self._lock = threading.Lock()
+        threading.Thread(target=self._work, name=name, daemon=True).start()
+
+    def do(self, job: Job, *, first: bool = False) -> None:
+        """Queue a job; `first`: ahead of all that are not."""
+        with self._lock:
+            self._open += 1
+        self._jobs.put((0 if first else 1, next(self._order), job))
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is queued or under way."""
+        with self._lock:
+            return self._open == 0
+
+    def _work(self) -> None:
+        while True:
+            _, _, job = self._jobs.get()
+            try:
+                job()
+            finally:
+                with self._lock:
+                    self._open -= 1
+
 
 _log = logging.getLogger(__name__)
 

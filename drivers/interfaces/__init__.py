@@ -21,6 +21,7 @@ from drivers.interfaces.spad import (
     SpadRequest,
     SpadTiming,
     StreamMode,
+    WindowTable,
 )
 from drivers.interfaces.sync import (
     HOLD_S,
@@ -33,7 +34,6 @@ from drivers.interfaces.sync import (
     sliced,
     slices,
 )
-from drivers.interfaces.window_table import WindowTable
 from drivers.interfaces.world import SweepTruth, World
 
 __all__ = [

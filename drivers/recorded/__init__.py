@@ -1,6 +1,6 @@
 """Recordings on disk: segments of SPB1 blocks and their index, and the one reader that replay and all others use."""
 
-from drivers.recorded.index import INDEX_FILE, segment_name
+from drivers.recorded.contents import INDEX_FILE, segment_name
 from drivers.recorded.reader import RecordedRun, RunRecording
 
 __all__ = ["INDEX_FILE", "RecordedRun", "RunRecording", "segment_name"]

@@ -2,21 +2,116 @@
 
 Index records count where their CRC is right, their place exists and the first and last block of their segment are what
 they say. What they leave out is searched for blocks; where they do not fit, everything is. Payloads are not read here.
+
+The index of a recording, `frames.idx`: one record of fixed size for each block, in the order of writing.
+
+64 bytes of header, then records of 64 bytes, each with a CRC of its own: a torn or damaged record is known as such
+and costs no other. The index tells where to look; what is there only the block itself can tell, so that a lost index is
+no loss (`rig repair` writes it anew from the blocks).
 """
 
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.errors import CorruptBlock, UnsupportedBlock
 from drivers.frames import FrameBlock
-from drivers.recorded.index import INDEX_FILE, INDEX_RECORD, decode_index, index_of
 from drivers.recorded.order import Entries, in_order
-from drivers.recorded.segments import Segment
-from drivers.spb1 import ALIGN, Damage, Placed, parse_block
+from drivers.recorded.segments import SegmentReader
+from drivers.spb1 import ALIGN, BlockLayout, Damage, Placed, parse_block
+
+INDEX_FILE: Final = "frames.idx"
+HEADER_BYTES: Final = 64
+RECORD_BYTES: Final = 64
+MAGIC: Final = b"SPBI"
+MAJOR: Final = 1
+MINOR: Final = 0
+
+INDEX_RECORD: Final = np.dtype(
+    [
+        ("segment", "<u4"),
+        ("flags", "<u4"),
+        ("offset", "<u8"),
+        ("length", "<u8"),
+        ("run_id", "<u4"),
+        ("block_seq", "<u4"),
+        ("first_frame", "<u8"),
+        ("n_frames", "<u4"),
+        ("sweep", "<u4"),
+        ("t0_ticks", "<u8"),
+        ("reserved", "<u4"),
+        ("crc", "<u4"),
+    ]
+)
+"""Where a block is: number of its segment, offset and length in bytes (header to trailer, without the zeros behind it);
+and what it holds, as its header says: flags, run_id, block_seq (low 32 bits), first_frame, n_frames, sweep and t0_ticks
+of the first frame. reserved: 0. crc: CRC-32 (zlib) of the 60 bytes before."""
+
+_HEADER: Final = struct.Struct("<4sHHI48xI")
+_RECORD: Final = struct.Struct("<IIQQIIQIIQII")
+_CRC: Final = struct.Struct("<I")
+
+
+def segment_name(number: int) -> str:
+    """File of a segment: frames-000000.spb, ..."""
+    return f"frames-{number:06d}.spb"
+
+
+def index_header() -> bytes:
+    """The first 64 bytes of an index."""
+    bare = _HEADER.pack(MAGIC, MAJOR, MINOR, RECORD_BYTES, 0)[: -_CRC.size]
+    return bare + _CRC.pack(zlib.crc32(bare))
+
+
+def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = None) -> bytes:
+    """The record, 64 bytes, of a block that begins at byte `offset` of `segment`.
+
+    length: its bytes, where it was not written by `drivers.spb1.block_parts`.
+    """
+    header = block.header
+    bare = _RECORD.pack(
+        segment,
+        int(header.flags),
+        offset,
+        length or BlockLayout(block.n_frames, header.width, header.height).block_bytes,
+        header.run_id,
+        header.block_seq & 0xFFFFFFFF,
+        header.first_frame,
+        block.n_frames,
+        header.sweep,
+        header.t0_ticks,
+        0,
+        0,
+    )[: -_CRC.size]
+    return bare + _CRC.pack(zlib.crc32(bare))
+
+
+def decode_index(buffer: NDArray[np.uint8]) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
+    """Records (n,) of `INDEX_RECORD` over the memory of `buffer` (uint8 (bytes,)), and which of them are sound (n,).
+
+    A torn record at the end is left out. Raises CorruptBlock where the header is no sound header of an index.
+    """
+    head = buffer[:HEADER_BYTES].tobytes()
+    if len(head) < HEADER_BYTES or head[:4] != MAGIC or zlib.crc32(head[: -_CRC.size]) != _CRC.unpack(head[-4:])[0]:
+        raise CorruptBlock(f"{INDEX_FILE} does not begin with the header of an index; 'rig repair' writes it anew")
+    major, minor, record_bytes = struct.unpack_from("<HHI", head, 4)
+    if major != MAJOR or record_bytes != RECORD_BYTES:
+        raise CorruptBlock(
+            f"{INDEX_FILE} is of version {major}.{minor} with records of {record_bytes} bytes; "
+            f"this program reads {MAJOR}.x with {RECORD_BYTES}"
+        )
+    whole = (len(buffer) - HEADER_BYTES) // RECORD_BYTES * RECORD_BYTES
+    raw = buffer[HEADER_BYTES : HEADER_BYTES + whole]
+    records: NDArray[Any] = raw.view(INDEX_RECORD)
+    crc = [zlib.crc32(raw.data[at : at + RECORD_BYTES - _CRC.size]) for at in range(0, whole, RECORD_BYTES)]
+    return records, np.array(crc, np.uint32) == records["crc"]
+
 
 PAGE_BYTES: Final = 4096
 """Blocks of a recording begin on multiples of this."""
@@ -40,7 +135,7 @@ class Contents:
     told: Entries = field(default_factory=lambda: np.empty(0, INDEX_RECORD))
 
 
-def find_blocks(segments: Sequence[Segment], folder: Path) -> Contents:
+def find_blocks(segments: Sequence[SegmentReader], folder: Path) -> Contents:
     """The blocks of a recording. Nothing is raised for damage: it is in `problems`, and costs what it hit."""
     by_number = {segment.number: segment for segment in segments}
     problems: list[str] = []
@@ -66,7 +161,7 @@ def find_blocks(segments: Sequence[Segment], folder: Path) -> Contents:
     return Contents(entries, problems, indexed, told)
 
 
-def read_entry(segment: Segment, entry: Any) -> FrameBlock:
+def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
     """The block that an entry tells of, its payload checked. CorruptBlock where there is another one, or none."""
     block = _block_at(segment, entry, check_payload=True)
     if block is None:
@@ -102,7 +197,7 @@ def _told(folder: Path, problems: list[str]) -> Entries | None:
     return records[by_place]
 
 
-def _inside(records: Entries, segments: dict[int, Segment], problems: list[str]) -> Entries:
+def _inside(records: Entries, segments: dict[int, SegmentReader], problems: list[str]) -> Entries:
     """Those records that tell of blocks which can be there; where two tell of the same bytes, neither."""
     sizes = np.zeros(max(segments) + 2)
     sizes[list(segments)] = [segment.size for segment in segments.values()]
@@ -123,26 +218,26 @@ def _inside(records: Entries, segments: dict[int, Segment], problems: list[str])
     return records[apart]
 
 
-def _fits(records: Entries, segment: Segment) -> bool:
+def _fits(records: Entries, segment: SegmentReader) -> bool:
     """Whether the first and the last block that the index tells of in a segment are there."""
     return len(records) == 0 or all(_is_there(segment, entry) for entry in (records[0], records[-1]))
 
 
-def _is_there(segment: Segment, entry: Any) -> bool:
+def _is_there(segment: SegmentReader, entry: Any) -> bool:
     try:
         return _block_at(segment, entry, check_payload=False) is not None
     except (CorruptBlock, UnsupportedBlock):
         return False
 
 
-def _block_at(segment: Segment, entry: Any, *, check_payload: bool) -> FrameBlock | None:
+def _block_at(segment: SegmentReader, entry: Any, *, check_payload: bool) -> FrameBlock | None:
     """The block at an entry's place; None where its header is not what the entry says."""
     offset, length = int(entry["offset"]), int(entry["length"])
     block = parse_block(segment.at(offset, length), check_payload=check_payload)
     return block if index_of(block, segment.number, offset, length) == entry.tobytes() else None
 
 
-def _search(segment: Segment, known: Entries, problems: list[str]) -> Iterator[bytes]:
+def _search(segment: SegmentReader, known: Entries, problems: list[str]) -> Iterator[bytes]:
     """Index records of the blocks that lie where `known` (sorted by offset) has none."""
     ends = round_up_to_page(known["offset"] + known["length"])
     starts = np.concatenate([np.zeros(1, np.int64), ends.astype(np.int64)])
@@ -160,6 +255,6 @@ def round_up_to_page(size: Any) -> Any:
     return -(-size // PAGE_BYTES) * PAGE_BYTES
 
 
-def damage_line(segment: Segment, damage: Damage) -> str:
+def damage_line(segment: SegmentReader, damage: Damage) -> str:
     """What people are told of a damage."""
     return f"{segment.path.name}, bytes {damage.offset} to {damage.offset + damage.length}: {damage.reason}"

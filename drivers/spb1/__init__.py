@@ -1,8 +1,7 @@
 """SPB1 blocks, the zero-copy form of frames on the wire and on disk: layout, writing, reading, walking a stream."""
 
 from drivers.spb1.layout import ALIGN, HEADER_BYTES, TRAILER_BYTES, BlockLayout, block_views, frames_per_block
-from drivers.spb1.reader import parse_block
-from drivers.spb1.walk import Damage, Placed, walk_blocks, walk_placed
+from drivers.spb1.reader import Damage, Placed, parse_block, walk_blocks, walk_placed
 from drivers.spb1.writer import block_parts, seal_block
 
 __all__ = [

@@ -2,6 +2,10 @@
 
 Little-endian: header 96 B, records 16 B per frame, zeros to a multiple of 64, packed pixels, trailer 32 B, zeros to the
 stride.
+
+CRC-32 as zlib defines it, from ISA-L where that is installed: 12 GB/s on a core, zlib's own 3.5.
+
+Both read large buffers without the interpreter's lock.
 """
 
 import struct
@@ -125,3 +129,11 @@ def check_stride(stride: int) -> None:
 def round_up(size: int, step: int) -> int:
     """The smallest multiple of `step` not under `size`."""
     return -(-size // step) * step
+
+
+try:
+    from isal.isal_zlib import crc32
+except ImportError:  # there is no wheel for this machine
+    from zlib import crc32
+
+__all__ = ["crc32"]

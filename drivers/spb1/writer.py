@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, BlockStatus, FrameBlock
-from drivers.spb1.checksum import crc32
 from drivers.spb1.layout import (
     CRC,
     HEADER,
@@ -22,6 +21,7 @@ from drivers.spb1.layout import (
     TRAILER_MAGIC,
     BlockLayout,
     block_views,
+    crc32,
     round_up,
 )
 

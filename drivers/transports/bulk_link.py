@@ -1,17 +1,24 @@
 """A USB device that streams: commands and answers, and reads that are queued so that its FIFO never starves.
 
-Two implementations: `plain_link` reads one piece after the other through pyusb, with a gap between two; `queued_link`
-keeps many transfers in flight through asynchronous libusb, which write straight into the caller's memory.
-tests/benchmarks/spb_usb.py compares them. Both have a deadline on every call and our errors.
+Two implementations: `drivers.transports.bulk_link` reads one piece after the other through pyusb, with a gap between
+two; `queued_link` keeps many transfers in flight through asynchronous libusb, which write straight into the caller's
+memory. tests/benchmarks/spb_usb.py compares them. Both have a deadline on every call and our errors.
 
 A queue belongs to one thread at a time. Buffers are whole packets long and stay the caller's until `reap` or `cancel`
 gives them back.
+
+A streaming USB device read by pyusb, one piece after the other: nothing is queued between two reads.
 """
 
+import array
+from collections import deque
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from drivers.errors import DeviceTimeout
+from drivers.transports.usb_device import UsbDevice
 
 Buffer = NDArray[np.uint8]
 
@@ -57,3 +64,70 @@ class BulkLink(Protocol):
     def close(self) -> None:
         """Cancel and give the device back; again: nothing happens."""
         ...
+
+
+class PlainLink:
+    """A `BulkLink`."""
+
+    def __init__(self, device: UsbDevice) -> None:
+        self.label = device.label
+        self.endpoints = frozenset(device.endpoints())
+        self._device = device
+        self._queue: deque[tuple[int, Buffer]] = deque()
+        self._scratch = array.array("B")
+        self._got = 0
+
+    @property
+    def in_flight(self) -> int:
+        """Reads that are waiting."""
+        return len(self._queue)
+
+    def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
+        """See `BulkLink`."""
+        self._device.write(endpoint, data, timeout_s)
+
+    def read(self, endpoint: int, size: int, timeout_s: float) -> bytes:
+        """See `BulkLink`."""
+        return self._device.read(endpoint, size, timeout_s)
+
+    def control_in(
+        self, request_type: int, request: int, value: int, index: int, length: int, timeout_s: float
+    ) -> bytes:
+        """See `BulkLink`."""
+        return self._device.control_in(request_type, request, value, index, length, timeout_s)
+
+    def submit(self, endpoint: int, buffer: Buffer) -> bool:
+        """Remember it for `reap`."""
+        self._queue.append((endpoint, buffer))
+        return True
+
+    def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
+        """Read the oldest now. What a time-out interrupts goes on with the next call."""
+        if not self._queue:
+            return None
+        endpoint, buffer = self._queue[0]
+        left = len(buffer) - self._got
+        if len(self._scratch) != left:
+            self._scratch = array.array("B", bytes(left))
+        try:
+            n = self._device.read_into(endpoint, self._scratch, timeout_s)
+        except DeviceTimeout:
+            return None
+        buffer[self._got : self._got + n] = np.frombuffer(self._scratch, np.uint8)[:n]
+        self._got += n
+        # A time-out that brought whole packets only is no end of the transfer: a short packet would be one.
+        if self._got < len(buffer) and n > 0 and n % 512 == 0:
+            return None
+        self._queue.popleft()
+        got, self._got = self._got, 0
+        return buffer, got
+
+    def cancel(self) -> None:
+        """Forget what is queued."""
+        self._queue.clear()
+        self._got = 0
+
+    def close(self) -> None:
+        """Give the device back."""
+        self.cancel()
+        self._device.close()

@@ -13,8 +13,7 @@ import usb.util
 
 from drivers.errors import DeviceError, DeviceNotFound, DeviceTimeout
 from drivers.transports.bulk_link import Buffer
-from drivers.transports.usb_device import UsbListing, milliseconds
-from drivers.transports.usb_errors import USBFS_HINT, usb_failure
+from drivers.transports.usb_device import USBFS_HINT, UsbListing, milliseconds, usb_failure
 
 _log = logging.getLogger(__name__)
 

@@ -6,15 +6,33 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bench.frames import COLUMNS, FRAMES_BYTES, PLACE_FRAMES, ROWS, BenchFrames, full_frames
-from rig.bench.latency import SECONDS
-from rig.bench.map_stages import joint_stage, joint_sweep_stage, learn_joint, sgbm_stage
-from rig.bench.recorded import recording_of
-from rig.bench.stages import Stage, Walk, count_stage, from_file, numpy_stage, parse_stage, search_stage
-from rig.bench.surface import bench_surface, count_surface
-from rig.counting import SweepCounter
-from rig.estimators.likelihood import Likelihood
-from rig.row_threads import RowWorkers
+from rig.bench.frames import (
+    COLUMNS,
+    FRAMES_BYTES,
+    PLACE_FRAMES,
+    ROWS,
+    BenchFrames,
+    bench_surface,
+    count_surface,
+    full_frames,
+)
+from rig.bench.latency import SECONDS, recording_of
+from rig.bench.stages import (
+    Stage,
+    Walk,
+    count_stage,
+    from_file,
+    joint_stage,
+    joint_sweep_stage,
+    learn_joint,
+    numpy_stage,
+    parse_stage,
+    search_stage,
+    sgbm_stage,
+)
+from rig.count.volume import SweepCounter
+from rig.estimate.likelihood import Likelihood
+from rig.threads import RowWorkers
 
 WINDOWS = (64, 128, 256, 512)
 EXPOSURES = (1, 5, 10, 20, 50)

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from drivers.frames import BlockFlag, FrameBlock
 from drivers.recorded import RunRecording
 from drivers.spb1 import BlockLayout, block_views
+from rig.bench.latency import PERIOD_TICKS, header_of
 from rig.bench.machine import machine
-from rig.bench.recorded import PERIOD_TICKS, header_of
 from rig.errors import RecordingError, UsageError
 from rig.progress import Progress, counted
 from rig.recording.segment import Staging, paged

@@ -2,17 +2,85 @@
 
 Haze falls off with distance and ends, but for a tenth, at a stripe whose place and brightness are drawn anew on every
 row for every `PLACE_FRAMES` frames. The light is that of the working point `report` (docs/results.md).
+
+One made-up surface for the rows that make whole maps: as frames of a sweep, and as a pair of pictures.
+
+Both show the same disparities, so that `joint` and OpenCV's StereoSGBM have maps of one size and one range to make.
+
+Compiled work of the bench alone: a plain read of memory, made-up frames, and counting without an estimate.
 """
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bench.bench_kernels import BITS_OF_CHANCE, draw_frames
-from rig.counting import SweepLayout
-from rig.geometry import SweepGeometry
-from rig.row_threads import RowWorkers
+from rig.count.kernels import add_frames, rows_of_chunk
+from rig.count.volume import CountVolume, SweepCounter, SweepLayout
+from rig.geometry.windows import SweepGeometry
+from rig.threads import RowWorkers
+
+BITS_OF_CHANCE = 16
+"""A pixel detects where a random number of so many bits is below its threshold."""
+
+
+@numba.njit(cache=True, nogil=True)
+def read_all(words: NDArray[np.uint64]) -> int:
+    """Read every word once; what comes back only keeps the compiler from leaving it out."""
+    total = np.uint64(0)
+    for i in range(words.shape[0]):
+        total ^= words[i]
+    return int(total)
+
+
+@numba.njit(cache=True, nogil=True)
+def draw_frames(threshold: NDArray[np.uint32], seed: int, frames: NDArray[np.uint8]) -> None:
+    """Draw frames (n, rows, window / 8) of pixels that detect where a 16-bit number is below threshold (rows, window).
+
+    The numbers are SplitMix64's (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014).
+    """
+    state = np.uint64(seed)
+    for f in range(frames.shape[0]):
+        for y in range(frames.shape[1]):
+            for b in range(frames.shape[2]):
+                byte = np.uint64(0)
+                for half in range(2):
+                    state += np.uint64(0x9E3779B97F4A7C15)
+                    z = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+                    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+                    z = z ^ (z >> np.uint64(31))
+                    for i in range(4):
+                        detected = (z & np.uint64(0xFFFF)) < np.uint64(threshold[y, 8 * b + 4 * half + i])
+                        byte = (byte << np.uint64(1)) | np.uint64(detected)
+                        z = z >> np.uint64(BITS_OF_CHANCE)
+                frames[f, y, b] = byte
+
+
+@numba.njit(cache=True, nogil=True)
+def count_columns(
+    words: NDArray[np.uint64],
+    rows: int,
+    row_words: int,
+    exposures: int,
+    planes: NDArray[np.uint64],
+    first_chunk: int,
+    last_chunk: int,
+) -> None:
+    """Count whole columns of frames, one after the other, into bit planes that the next column takes over.
+
+    words: (all words,) of frames of `rows` rows; planes: see `new_planes`. Expanding counts is part of an estimate.
+    """
+    frame = rows * row_words
+    frames = words.shape[0] // frame
+    chunk_rows = rows_of_chunk(row_words)
+    for j in range(first_chunk, last_chunk):
+        at = j * chunk_rows * row_words
+        n = (min((j + 1) * chunk_rows, rows) - j * chunk_rows) * row_words
+        counters = planes[j].ravel()
+        for first in range(0, frames, exposures):
+            add_frames(words, frame, at, first, min(first + exposures, frames), n, 0, counters)
+
 
 ROWS, WIDTH = 512, 512
 COLUMNS = 500
@@ -21,7 +89,7 @@ PLACE_FRAMES = 100
 """Frames for which a stripe stays; every number of exposures that estimates are measured at divides it."""
 BLOCK_PLACES = 5
 BLOCK_FRAMES = BLOCK_PLACES * PLACE_FRAMES
-"""Frames handed over at a time, as many as in a scan at 100 kHz (`rig.plan.BLOCK_S`)."""
+"""Frames handed over at a time, as many as in a scan at 100 kHz (`rig.plan.compile.BLOCK_S`)."""
 FRAMES_BYTES = 192 * 2**20
 """Frames of each window size: several times a big cache."""
 DISTINCT = 64
@@ -117,3 +185,77 @@ def thresholds(window: int, place: NDArray[np.float32], photons: NDArray[np.floa
     line = photons[:, None] * np.exp(-0.5 * away**2) / (LINE_SD_PX * np.sqrt(2 * np.pi))
     flux = np.where(x < place[:, None], haze, BEHIND * haze) + AMBIENT + line
     return np.asarray(np.round(-np.expm1(-flux) * 2**BITS_OF_CHANCE), np.uint32)
+
+
+WINDOW = 64
+"""Pixels that are searched, and disparities of the pictures."""
+PATCH = 16
+"""Rows and columns of one brightness."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BenchSurface:
+    """place_px: float32 (columns, rows), the stripe's place in its window; photons: of the stripe, the same shape."""
+
+    place_px: NDArray[np.float32]
+    photons: NDArray[np.float32]
+    geometry: SweepGeometry
+
+    def truth_px(self) -> NDArray[np.float32]:
+        """Stripe position (rows, columns) in pixels of the picture."""
+        return np.ascontiguousarray(self.place_px.T) + np.float32(self.geometry.x0[0])
+
+    def layout(self, exposures: int) -> SweepLayout:
+        """The sweep of frames that carry just the window."""
+        columns, rows = self.place_px.shape
+        return SweepLayout(columns, rows, WIDTH, self.geometry.x0, WINDOW, exposures, WINDOW)
+
+    def frames(self, exposures: int, workers: RowWorkers) -> NDArray[np.uint8]:
+        """Packed frames (columns x exposures, rows, row bytes), column after column, light as in `rig.bench.frames`."""
+        columns, rows = self.place_px.shape
+        bits = np.empty((columns * exposures, rows, WINDOW // 8), np.uint8)
+
+        def draw(first: int, last: int) -> None:
+            for c in range(first, last):
+                light = thresholds(WINDOW, self.place_px[c], self.photons[c])
+                draw_frames(light, (exposures << 32) + (c << 16), bits[c * exposures : (c + 1) * exposures])
+
+        workers.over(columns, draw)
+        return bits
+
+    def pictures(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Left and right picture (rows, columns) of a texture; what left shows at x is at x - place in right."""
+        import cv2
+
+        disparity = np.ascontiguousarray(self.place_px.T)
+        right = np.random.default_rng(1).integers(0, 256, disparity.shape, np.uint8)
+        at: NDArray[np.float32] = np.indices(disparity.shape).astype(np.float32)
+        left = cv2.remap(right, at[1] - disparity, at[0], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        return np.asarray(left, np.uint8), right
+
+
+def bench_surface(rows: int = ROWS, columns: int = COLUMNS) -> BenchSurface:
+    """A wavy slope, and a wall that stands before the middle of it."""
+    c, y = np.linspace(0.0, 1.0, columns)[:, None], np.linspace(0.0, 1.0, rows)
+    place = 0.55 + 0.3 * c + 0.1 * np.sin(4 * np.pi * y)
+    wall = (np.abs(c - 0.5) < 0.2) & (np.abs(y - 0.5) < 0.3)
+    place = EDGE_PX + (WINDOW - 2 * EDGE_PX) * np.where(wall, 0.2, place)
+    patches = np.random.default_rng(0).uniform(*STRIPE, (-(-columns // PATCH), -(-rows // PATCH)))
+    photons = patches.repeat(PATCH, 0).repeat(PATCH, 1)[:columns, :rows]
+    return BenchSurface(place.astype(np.float32), photons.astype(np.float32), bench_geometry(WINDOW, rows, columns))
+
+
+def count_surface(surface: BenchSurface, bits: NDArray[np.uint8], exposures: int, workers: RowWorkers) -> CountVolume:
+    """The counts of all frames."""
+    counter = SweepCounter(surface.layout(exposures), workers)
+    bins, column, x0 = sweep_frames(surface, exposures)
+    counter.add(bits, bins, column, x0)
+    return counter.finish()
+
+
+def sweep_frames(
+    surface: BenchSurface, exposures: int
+) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
+    """Bins and fractional columns of the sweep's frames, and where the window of each begins."""
+    bins = np.repeat(np.arange(len(surface.place_px), dtype=np.int32), exposures)
+    return bins, bins.astype(np.float64), np.full(len(bins), surface.geometry.x0[0], np.int32)

@@ -5,22 +5,56 @@ A source thread copies blocks of 5 ms into the ring and publishes each when its 
 takes the result and clears the counter for the next, as a scan does. A frame's time is its block's minus the frames
 behind it: the wait for the block to fill is included, and so is that of a block's last column for the next block, whose
 first frame says that the column is complete. Binding frames to columns and making the map are not included.
+
+The bench's frames as an SPB1 recording, in blocks as large as a scan's.
 """
 
 import threading
 import time
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.frames import FRAME_RECORD, FrameBlock
+from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock
 from drivers.ring import BlockRing
-from rig.bench.frames import BLOCK_FRAMES, COLUMNS, BenchFrames
-from rig.bench.recorded import PERIOD_TICKS, TICK_HZ, header_of
-from rig.estimators.likelihood import Likelihood
-from rig.estimators.stream import ColumnJudge
-from rig.row_threads import RowWorkers
+from drivers.spb1 import BlockLayout, block_views, seal_block
+from rig.bench.frames import BLOCK_FRAMES, COLUMNS, ROWS, WIDTH, BenchFrames
+from rig.estimate.likelihood import Likelihood
+from rig.estimate.search.stream import ColumnJudge
+from rig.threads import RowWorkers
+
+TICK_HZ = Fraction(100_000_000)
+PERIOD_TICKS = 1000
+"""10 us: 100 kHz."""
+
+
+def recording_of(frames: BenchFrames) -> tuple[NDArray[np.uint8], int]:
+    """The recording, uint8 (all bytes,) with payload checksums, and the bytes from block to block."""
+    width = frames.bits.shape[2] * 8
+    layout = BlockLayout(BLOCK_FRAMES, width, ROWS)
+    blocks = len(frames.bits) // BLOCK_FRAMES
+    memory = np.empty((blocks, layout.min_stride), np.uint8)
+    for seq in range(blocks):
+        records, bits = block_views(memory[seq], layout)
+        records[:] = 0
+        records["ticks"] = np.arange(BLOCK_FRAMES) * PERIOD_TICKS
+        records["x0"] = frames.geometry.x0[0] if width < WIDTH else 0
+        bits[:] = frames.bits[seq * BLOCK_FRAMES : (seq + 1) * BLOCK_FRAMES]
+        seal_block(memory[seq], header_of(seq, BLOCK_FRAMES, width), layout, payload_crc=True)
+    return memory.reshape(-1), layout.min_stride
+
+
+def header_of(seq: int, frames: int, width: int) -> BlockHeader:
+    """Of block number `seq`, with `frames` frames of the bench's sensor in it as in all others."""
+    first = seq * frames
+    return BlockHeader(
+        flags=BlockFlag(0), run_id=1, block_seq=seq, first_frame=first, t0_ticks=first * PERIOD_TICKS, lost_before=0,
+        tick_hz=TICK_HZ, frame_period_ticks=PERIOD_TICKS, exposure_ticks=PERIOD_TICKS, sweep=0, frame_step=1,
+        width=width, height=ROWS, sensor_width=WIDTH, sensor_height=ROWS,
+    )  # fmt: skip
+
 
 FRAME_S = float(PERIOD_TICKS / TICK_HZ)
 SECONDS = 3.0

@@ -29,13 +29,13 @@ from numpy.typing import NDArray
 
 from drivers.frames import packed_row_bytes
 from drivers.interfaces import World
-from rig.bench.bench_kernels import read_all
+from rig.bench.frames import read_all
 from rig.bench.machine import machine
-from rig.config import RigConfig
-from rig.effects import open_world
+from rig.config.models import RigConfig
 from rig.errors import UsageError
+from rig.plan.scan_plan import column_command
 from rig.progress import Progress, counted
-from rig.scan_plan import column_command
+from rig.tradeoff.effects import open_world
 
 Array = NDArray[np.float64]
 

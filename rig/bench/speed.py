@@ -15,15 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.digits import digits
-from rig.bench.bench_kernels import read_all
+from calibration.errors import digits
 from rig.bench.cases import LEARN_EXPOSURES, WINDOWS, Case, Extent, learn, map_cases, stream_cases, usual_window
-from rig.bench.frames import COLUMNS, PLACE_FRAMES, BenchFrames, window_frames
+from rig.bench.frames import COLUMNS, PLACE_FRAMES, BenchFrames, read_all, window_frames
 from rig.bench.latency import Latency, measure_latency
 from rig.bench.machine import machine
 from rig.bench.stages import Measured, StripeError, Walk, count_stage
 from rig.progress import Progress, counted, tell_stage
-from rig.row_threads import RowWorkers
+from rig.threads import RowWorkers
 
 REAL_TIME_HZ = 100_000
 """Frames a second of the sensor."""
@@ -32,7 +31,7 @@ READ_EVERY = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class SpeedRow:
     """One figure. exposures: None where columns play no part; None as well where a speed or quotient means nothing.
 
     ms_per_map: of stages that make whole maps. times_sgbm: of `joint`, the time of a map over that of one of
@@ -86,7 +85,7 @@ class SpeedReport:
 
     machine: dict[str, Any]
     memory_read_gb_per_s: float
-    rows: tuple[Row, ...]
+    rows: tuple[SpeedRow, ...]
     latency_us: Latency
     seconds: float
 
@@ -174,7 +173,7 @@ def _read_bytes_per_s(words: NDArray[np.uint64]) -> float:
     return words.nbytes / (time.perf_counter() - begun)
 
 
-def _rows(cases: list[Case], measured: list[list[Measured]], read: float) -> tuple[Row, ...]:
+def _rows(cases: list[Case], measured: list[list[Measured]], read: float) -> tuple[SpeedRow, ...]:
     speeds = [float(np.median([each.frames / each.seconds for each in these])) or None for these in measured]
     naive = {
         (case.window, case.exposures): speed for case, speed in zip(cases, speeds, strict=True) if case.stage == "numpy"
@@ -183,7 +182,7 @@ def _rows(cases: list[Case], measured: list[list[Measured]], read: float) -> tup
     for case, speed, these in zip(cases, speeds, measured, strict=True):
         slow = naive.get((case.window, case.exposures))
         error = these[0].error or StripeError(*(float("nan"),) * 3)
-        row = Row(
+        row = SpeedRow(
             stage=case.stage,
             window=case.window,
             exposures=case.exposures,

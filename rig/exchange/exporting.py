@@ -14,14 +14,13 @@ from drivers.recorded.segments import segment_files
 from rig.errors import DamagedRecordingError, UsageError
 from rig.exchange import hdf5, pictures
 from rig.exchange.frame_log import FrameLog
-from rig.exchange.maps import MapFiles
-from rig.exchange.npy import write_npy
+from rig.exchange.npy import MapFiles, write_npy
 from rig.exchange.pictures import VIEWS, Picture, View
-from rig.outputs import RunFolder
 from rig.progress import Progress, counted
 from rig.recording.inputs import read_model, reconstruct_line
-from rig.recording.manifest import read_manifest
-from rig.recording.opening import SEGMENTS, require_recording
+from rig.recording.open import SEGMENTS, require_recording
+from rig.run_folder.folder import RunFolder
+from rig.run_folder.manifest import read_manifest
 
 ExportKind = Literal["npy", "hdf5", "ply", "png", "mp4"]
 EXPORT_KINDS: Final[tuple[ExportKind, ...]] = get_args(ExportKind)

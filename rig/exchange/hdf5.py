@@ -25,8 +25,8 @@ from drivers.frames import FrameBlock
 from drivers.optional_packages import install_command
 from rig.errors import UsageError
 from rig.exchange.frame_log import FrameLog
-from rig.exchange.maps import MapFiles
-from rig.outputs import json_text
+from rig.exchange.npy import MapFiles
+from rig.run_folder.folder import json_text
 
 FILE: Final = "run.h5"
 _USER_BLOCK: Final = 512

@@ -16,18 +16,18 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.digits import digits
+from calibration.errors import digits
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, FrameBlock, frame_bytes, packed_row_bytes
-from drivers.orientation import QuarterTurn, turn_packed, turned_size
+from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
 from drivers.spb1 import BlockLayout, frames_per_block
 from rig.errors import UsageError
 from rig.exchange import photoncube, pi_imaging, swissspad2
 from rig.exchange.foreign import ForeignFrames, gather
-from rig.outputs import RunFolder
 from rig.progress import Progress, counted
-from rig.recording.manifest import MANIFEST
 from rig.recording.writer import Recording
-from rig.run import versions
+from rig.run_folder.folder import RunFolder
+from rig.run_folder.manifest import MANIFEST
+from rig.scan.run import versions
 
 ImportKind = Literal["pi-imaging", "swissspad2", "photoncube"]
 IMPORT_KINDS: Final[tuple[ImportKind, ...]] = get_args(ImportKind)

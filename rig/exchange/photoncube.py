@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drivers.json_text import parse_json
 from rig.errors import UsageError
 from rig.exchange.foreign import ForeignFrames, chunks_of
-from rig.packed_arrays import PACK, holds_bits, open_array
+from rig.recording.cube import PACK, holds_bits, open_array
 
 FORMS: Final = ("packed",)
 SIDECAR_FORMAT: Final = "spadrig-frames"

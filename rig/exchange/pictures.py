@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from drivers.frames import FrameBlock
 from rig.errors import UsageError
-from rig.exchange.maps import MapFiles, load
-from rig.outputs import RunFolder
-from rig.pictures import depth_limits, depth_picture, png_bytes
+from rig.exchange.npy import MapFiles, load
+from rig.run_folder.folder import RunFolder
+from rig.run_folder.pictures import depth_limits, depth_picture, png_bytes
 
 View = Literal["depth", "intensity", "frames"]
 VIEWS: Final[tuple[View, ...]] = get_args(View)

@@ -12,13 +12,19 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import ProtocolError
-from drivers.recorded.seekable import table_bytes, unpack_frame, zstandard_or_error
-from drivers.recorded.segments import PACKED_SUFFIX, PackedSegment, PlainSegment
+from drivers.recorded.segments import (
+    PACKED_SUFFIX,
+    PackedSegment,
+    PlainSegment,
+    table_bytes,
+    unpack_frame,
+    zstandard_or_error,
+)
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
 from rig.progress import tell_stage
-from rig.recording.manifest import UNFINISHED
-from rig.recording.sync import sync_folder
 from rig.recording.verify import Integrity, examine
+from rig.run_folder.folder import sync_folder
+from rig.run_folder.manifest import UNFINISHED
 
 LEVEL: Final = 3
 """Of zstd, its default: binary frames are noise to it, and higher levels find little more."""

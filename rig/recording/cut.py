@@ -15,19 +15,17 @@ from typing import Any, Final
 
 from drivers.recorded import RecordedRun, RunRecording
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
-from rig.outputs import RunFolder
 from rig.progress import tell_stage
-from rig.recording.manifest import MANIFEST, UNFINISHED, require_inputs, require_plain_sweeps
-from rig.recording.maps import MapSpan, map_spans
-from rig.recording.opening import manifest_or_none, open_recording
-from rig.recording.part import fitted_ratio
+from rig.recording.open import MapSpan, fitted_ratio, manifest_or_none, map_spans, open_recording
 from rig.recording.writer import Recording
-from rig.summary import Verdict
+from rig.run_folder.folder import RunFolder
+from rig.run_folder.manifest import MANIFEST, UNFINISHED, require_inputs, require_plain_sweeps
+from rig.run_folder.summary import RunVerdict
 
 OF_MAPS: Final = ("learned", "truth")
 """Folders with a file for each map, which a part takes along."""
 
-_VERDICT_WITHOUT_GAPS: Final = {Verdict.GAPS: Verdict.COMPLETE, UNFINISHED: Verdict.ABORTED}
+_VERDICT_WITHOUT_GAPS: Final = {RunVerdict.GAPS: RunVerdict.COMPLETE, UNFINISHED: RunVerdict.ABORTED}
 """Of a part, by that of the whole: its gaps may lie elsewhere, and a part is over whatever the run is."""
 
 
@@ -174,7 +172,7 @@ def _manifest(
     before = (manifest.get("cut") or {}).get("maps", [0])[0]
     content |= {
         "command": "cut",
-        "verdict": Verdict.GAPS if lost else _VERDICT_WITHOUT_GAPS.get(verdict, verdict),
+        "verdict": RunVerdict.GAPS if lost else _VERDICT_WITHOUT_GAPS.get(verdict, verdict),
         "recording": recording,
         "gaps": lost,
         "cut": {
@@ -211,7 +209,7 @@ def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
 
 
 def _seal_of(manifest: dict[str, Any]) -> int:
-    from rig.recording.manifest import SEAL, sealed_text
+    from rig.run_folder.manifest import SEAL, sealed_text
 
     return int(json.loads(sealed_text(json.dumps(manifest)))[SEAL])
 

@@ -15,17 +15,15 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.errors import CorruptBlock
-from drivers.recorded.contents import round_up_to_page
-from drivers.recorded.index import INDEX_FILE, index_header
-from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, Segment
+from drivers.recorded.contents import INDEX_FILE, index_header, round_up_to_page
+from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, SegmentReader
 from rig.errors import RecordingError, UsageError
-from rig.recording.checking import SoundBlock
-from rig.recording.holding import is_held
-from rig.recording.manifest import MANIFEST, UNFINISHED, device_counters, ended_early, sealed_text
-from rig.recording.sync import sync_folder
+from rig.recording.check import SoundBlock
 from rig.recording.verify import Examined, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
-from rig.summary import Verdict
+from rig.run_folder.folder import is_held, sync_folder
+from rig.run_folder.manifest import MANIFEST, UNFINISHED, device_counters, ended_early, sealed_text
+from rig.run_folder.summary import RunVerdict
 
 _PIECE_BYTES: Final = 1 << 24
 
@@ -83,14 +81,14 @@ def _put_in_order(found: Examined, done: list[str]) -> bool:
     return True
 
 
-def _blocks_in(segment: Segment, found: Examined) -> list[Range]:
+def _blocks_in(segment: SegmentReader, found: Examined) -> list[Range]:
     """Where the sound blocks of a segment lie, in order."""
     mine = found.entries[found.entries["segment"] == segment.number]
     begin = np.sort(mine, order="offset")
     return list(zip(begin["offset"].tolist(), (begin["offset"] + begin["length"]).tolist(), strict=True))
 
 
-def _clear(segment: Segment, blocks: list[Range], done: list[str]) -> None:
+def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
     """Zero what is no sound block, and end the segment behind the last one; a copy of it is kept."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     others = [(a, used) for a, b in _between(blocks, segment.size) if (used := _used(segment, a, b)) > a]
@@ -114,7 +112,7 @@ def _clear(segment: Segment, blocks: list[Range], done: list[str]) -> None:
         done.append(f"{segment.path.name} ends at byte {end}, not {segment.size}")
 
 
-def _unpack(segment: Segment, blocks: list[Range], done: list[str]) -> None:
+def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
     """Write the sound blocks of a compressed segment plain where it holds anything else; as it was, it is kept."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     if blocks and segment.size == end and not any(_is_damaged(segment, a, b) for a, b in _between(blocks, end)):
@@ -138,7 +136,7 @@ def _unpack(segment: Segment, blocks: list[Range], done: list[str]) -> None:
     done.append(f"{segment.path.name} is kept as {torn.name}; {kept}")
 
 
-def _is_damaged(segment: Segment, begin: int, stop: int) -> bool:
+def _is_damaged(segment: SegmentReader, begin: int, stop: int) -> bool:
     """Whether anything but zeros is between two blocks, or nobody can say."""
     try:
         return _used(segment, begin, stop) > begin
@@ -155,13 +153,13 @@ def _between(blocks: list[Range], size: int) -> Iterator[Range]:
         begin = stop
 
 
-def _used(segment: Segment, begin: int, stop: int) -> int:
+def _used(segment: SegmentReader, begin: int, stop: int) -> int:
     """Where the last byte ends that is not zero; `begin` where all are."""
     data = segment.at(begin, stop - begin)
     return stop - int((data[::-1] != 0).argmax()) if data.any() else begin
 
 
-def _keep(segment: Segment, pieces: list[Range], torn: Path) -> None:
+def _keep(segment: SegmentReader, pieces: list[Range], torn: Path) -> None:
     """Copy pieces of a segment to the same places of another file, which has them by the time this returns."""
     with torn.open("rb+" if torn.exists() else "wb") as copy:
         for begin, stop in pieces:
@@ -190,7 +188,7 @@ def _write_manifest(folder: Path, found: Examined, done: list[str]) -> None:
         done.append(f"{MANIFEST} written anew, from the blocks alone: plan and calibration are as they lie here")
         manifest = {"verdict": UNFINISHED}
     elif manifest.get("verdict") == UNFINISHED:
-        done.append(f"{MANIFEST}: the run was not over; its verdict is '{Verdict.ABORTED}' now")
+        done.append(f"{MANIFEST}: the run was not over; its verdict is '{RunVerdict.ABORTED}' now")
     elif (why := ended_early(manifest)) is not None:
         done.append(f"{MANIFEST}: says that the recording ended before the run ({why}), and how many frames it has")
     elif not (done or found.problems):
@@ -217,8 +215,8 @@ def _write_manifest(folder: Path, found: Examined, done: list[str]) -> None:
 def _verdict(manifest: dict[str, Any], recording: dict[str, Any], missing: list[Any]) -> str:
     before = (manifest.get("recording") or {}).get("blocks")
     if missing or (manifest["verdict"] != UNFINISHED and before is not None and before > recording["blocks"]):
-        return Verdict.GAPS
-    return Verdict.ABORTED if manifest["verdict"] == UNFINISHED else str(manifest["verdict"])
+        return RunVerdict.GAPS
+    return RunVerdict.ABORTED if manifest["verdict"] == UNFINISHED else str(manifest["verdict"])
 
 
 def _recording(found: Examined) -> dict[str, Any]:

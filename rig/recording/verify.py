@@ -11,16 +11,24 @@ import numpy as np
 
 from drivers.errors import DeviceNotFound, ProtocolError
 from drivers.frames import BlockHeader
-from drivers.recorded.contents import Contents, find_blocks, round_up_to_page
-from drivers.recorded.index import INDEX_FILE, INDEX_RECORD
+from drivers.recorded.contents import INDEX_FILE, INDEX_RECORD, Contents, find_blocks, round_up_to_page
 from drivers.recorded.order import in_order
 from drivers.recorded.reader import is_of_run, run_kind
-from drivers.recorded.segments import Segment, open_segments
+from drivers.recorded.segments import SegmentReader, open_segments
 from rig.errors import DamagedRecordingError, UsageError
 from rig.progress import tell_stage
-from rig.recording.checking import CHECKING, Continuity, Gap, SoundBlock, check_segments, continuity, out_of_step
-from rig.recording.lost_ends import lost_ends
-from rig.recording.manifest import (
+from rig.recording.check import (
+    CHECKING,
+    Continuity,
+    Gap,
+    SoundBlock,
+    check_segments,
+    continuity,
+    lost_ends,
+    out_of_step,
+)
+from rig.recording.open import require_recording
+from rig.run_folder.manifest import (
     MANIFEST,
     UNFINISHED,
     device_counters,
@@ -29,7 +37,6 @@ from rig.recording.manifest import (
     known_missing,
     read_manifest,
 )
-from rig.recording.opening import require_recording
 
 
 class Integrity(StrEnum):
@@ -78,7 +85,7 @@ class Verification:
 class Examined:
     """All that can be known of a recording. runs: the sound blocks of each, in order of their frames."""
 
-    segments: list[Segment]
+    segments: list[SegmentReader]
     contents: Contents
     runs: list[list[SoundBlock]]
     joined: Continuity
@@ -201,7 +208,7 @@ def _usual(headers: Sequence[BlockHeader]) -> BlockHeader:
 
 def _against_manifest(
     manifest: dict[str, Any],
-    segments: Sequence[Segment],
+    segments: Sequence[SegmentReader],
     contents: Contents,
     runs: Sequence[Sequence[SoundBlock]],
     joined: Continuity,

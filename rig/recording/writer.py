@@ -3,6 +3,11 @@
 A block counts once all its bytes and those of every block before it are with the system; then its index record is
 written. So a killed program loses no block that counted, and a loss of power none older than `SYNC_INTERVAL_S`: a
 thread makes the disk keep what was written, blocks before index.
+
+The pipeline's recorder: a thread that hands the blocks of one start of the SPAD to the recording.
+
+It has a required place in the ring: where the disk is slower than the stream, the ring fills and the overload policy
+decides. Blocks are written by the recording's own threads, several at a time, from the slots they lie in.
 """
 
 import errno
@@ -17,12 +22,13 @@ from pathlib import Path
 from typing import Final
 
 from drivers.frames import FrameBlock
-from drivers.recorded.index import HEADER_BYTES, INDEX_FILE, RECORD_BYTES, index_header, index_of, segment_name
+from drivers.recorded.contents import HEADER_BYTES, INDEX_FILE, RECORD_BYTES, index_header, index_of, segment_name
+from drivers.ring import RingReader
 from drivers.spb1 import BlockLayout
 from rig.errors import RecordingError
-from rig.recording.holding import hold
-from rig.recording.segment import Segment, Staging, paged
-from rig.recording.sync import sync_folder
+from rig.recording.segment import OpenSegment, Staging, paged
+from rig.run_folder.folder import hold, sync_folder
+from rig.threads import StageThread
 
 SEGMENT_BYTES: Final = 1 << 30
 """A segment is no larger, except for a block that is."""
@@ -41,7 +47,7 @@ RESERVE_BYTES: Final = 1 << 20
 class _Placed:
     """A block on its way to its place. end: of the block in its segment."""
 
-    segment: Segment
+    segment: OpenSegment
     end: int
     index_record: bytes
     done: bool = False
@@ -85,9 +91,9 @@ class Recording:
         self._expected_bytes = expected_bytes
         self._segment_bytes = segment_bytes
         self._on_begin = on_begin
-        self._segment: Segment | None = None
+        self._segment: OpenSegment | None = None
         self._segment_is_for: tuple[int, int] | None = None
-        self._open: list[Segment] = []
+        self._open: list[OpenSegment] = []
         self._order: deque[_Placed] = deque()
         self._lock = threading.Lock()
         self._failure: BaseException | None = None
@@ -182,7 +188,7 @@ class Recording:
             "starts": [asdict(start) for start in self.starts],
         }
 
-    def _segment_for(self, size: int, is_for: tuple[int, int]) -> Segment:
+    def _segment_for(self, size: int, is_for: tuple[int, int]) -> OpenSegment:
         """The segment that a block goes to: a new one where the old is full, or of another run or width."""
         segment = self._segment
         fits = segment is not None and (segment.placed == 0 or segment.placed + size <= self._segment_bytes)
@@ -193,7 +199,7 @@ class Recording:
             reserve = min(reserve, max(0, self._expected_bytes - self.bytes))
         name = segment_name(len(self.files))
         try:
-            segment = Segment(self.folder, len(self.files), name, reserve)
+            segment = OpenSegment(self.folder, len(self.files), name, reserve)
             sync_folder(self.folder)
         except OSError as error:
             raise self._failed(error) from error
@@ -278,3 +284,64 @@ class Recording:
 
 def _reason(error: BaseException) -> str:
     return getattr(error, "strerror", None) or str(error)
+
+
+class Recorder:
+    """Records the blocks of one start of the SPAD, up to the last one. on_failure: called on its thread.
+
+    reader: holds as many blocks as are to be written at a time.
+    """
+
+    def __init__(self, reader: RingReader, recording: Recording, on_failure: Callable[[], None]) -> None:
+        self._reader = reader
+        self._recording = recording
+        self._on_failure = on_failure
+        self._thread = StageThread(self._run, "recorder")
+        self._before = recording.busy_s, recording.blocks, recording.bytes
+        self.error: BaseException | None = None
+
+    @property
+    def busy_s(self) -> float:
+        """Time of all writers together, for checksums and writing."""
+        return self._recording.busy_s - self._before[0]
+
+    @property
+    def blocks(self) -> int:
+        """Blocks written of this start."""
+        return self._recording.blocks - self._before[1]
+
+    @property
+    def bytes(self) -> int:
+        """What they take in the recording."""
+        return self._recording.bytes - self._before[2]
+
+    def start(self) -> None:
+        """Begin to record."""
+        self._thread.start()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait until everything is written; False where that takes longer."""
+        return self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        with self._reader:
+            under_way: deque[Future[None]] = deque()
+            try:
+                while (block := self._next()) is not None:
+                    under_way.append(self._recording.submit(block))
+                    while len(under_way) >= self._reader.holds:  # asking for the next block gives the oldest one back
+                        under_way.popleft().result()
+                while under_way:
+                    under_way.popleft().result()
+            except BaseException as error:  # raised again on the caller's thread
+                self.error = error
+                for each in under_way:
+                    each.exception()  # slots go back only once nobody reads them
+                self._on_failure()
+
+    def _next(self) -> FrameBlock | None:
+        """The next block; None where none will come. An error of the source is for counting to tell."""
+        try:
+            return self._reader.next()
+        except Exception:
+            return None

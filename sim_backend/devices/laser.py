@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from drivers.plain_laser import PlainLaser
+from drivers.lasers.serial_laser import PlainLaser
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.units import Watts
 from sim_backend.devices.place import bench_of

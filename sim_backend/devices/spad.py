@@ -1,7 +1,24 @@
 """The simulated SPAD array: asks the bench what happened during its frames and draws them, block by block.
 
 On a `VirtualClock` time passes as frames are made; on any other clock a block comes when its last frame has been
-exposed. Its tick counter runs on a crystal of its own (`clock_error`, `clock_wander`)."""
+exposed. Its tick counter runs on a crystal of its own (`clock_error`, `clock_wander`).
+
+What becomes of frames between the simulated SPAD's pixels and the computer: some get lost, some come twice.
+
+A frame comes twice where the memory before the link gives its last entry once more instead of the next one: pixels,
+markers, counters and ticks are all those of the frame before, and the frame itself is gone. Its number is the next one
+all the same, since blocks count what they hold; only its ticks tell. Which frames follows from seed and number.
+
+Frame records of the simulated SPAD: which edges and levels fell into which frame.
+
+The SPAD's crystal against the time of the bench: off by a constant, and wandering.
+
+    dt/dtick = 1 / (tick_hz (1 + y)),    y = error + W,    W a random walk: var W(t) = wander^2 t
+
+(random walk of frequency, of which the Allan deviation is wander sqrt(t/3): D. Allan, IEEE Trans. UFFC 34, 647, 1987.)
+W makes a step every millisecond of the counter, the same for any blocks. An ordinary crystal is off by up to 50 ppm,
+and by 1 ppm more per K; a wander of 0.1 ppm per root second is much.
+"""
 
 import os
 from fractions import Fraction
@@ -13,20 +30,138 @@ from pydantic import Field
 
 from drivers.clock import NS_PER_S, VirtualClock
 from drivers.errors import DeviceTimeout, LimitExceeded
-from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader
+from drivers.frames import FRAME_RECORD, SUBFRAME_SHIFT, BlockFlag, BlockHeader, Mark
 from drivers.interfaces import SpadArray, SpadCounters, SpadInfo, SpadRequest, SpadTiming, StreamMode, WindowTable
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from drivers.units import BytesPerSecond, ExactHertz, Ppm
 from sim_backend.bench import Happening
-from sim_backend.devices.frame_link import FrameLink
-from sim_backend.devices.markers import MarkerInputs, windows_at
 from sim_backend.devices.place import note_effect, world_of
-from sim_backend.devices.tick_clock import TickClock
 from sim_backend.effects.setting import FrameTimes
-from sim_backend.photons import PhotonSource
+from sim_backend.frames.photon_kernels import dropped_frames
+from sim_backend.frames.photons import PhotonSource
 from sim_backend.world import SimulatedWorld
+
+_TWICE = np.uint64(0xE7037ED1A0B428DB)
+"""Keeps the draws of frames that come twice apart from those that get lost."""
+
+
+class FrameLink:
+    """lost_frames: numbers of frames that get lost. loss, duplicates: probability of each frame to get lost, and to be
+    replaced by the one before it in its block.
+    """
+
+    def __init__(self, lost_frames: tuple[int, ...], loss: float, duplicates: float, seed: int) -> None:
+        self._lost_frames = np.array(sorted(set(lost_frames)), dtype=np.int64)
+        self._loss = loss
+        self._duplicates = duplicates
+        self._seed = np.uint64(seed & 0xFFFFFFFFFFFFFFFF)
+
+    def loses(self, first_frame: int, n: int) -> NDArray[np.bool_]:
+        """Which of n frames get lost, bool (n,)."""
+        lost: NDArray[np.bool_] = dropped_frames(self._seed, first_frame, n, self._loss)
+        named = self._lost_frames[np.searchsorted(self._lost_frames, first_frame) :]
+        lost[named[named < first_frame + n] - first_frame] = True
+        return lost
+
+    def repeat(self, first_frame: int, records: NDArray[np.void], bits: NDArray[np.uint8]) -> None:
+        """Replace frames of a block by those before them; its first has none before it in the memory."""
+        if self._duplicates == 0:
+            return
+        twice = dropped_frames(self._seed ^ _TWICE, first_frame, len(records), self._duplicates)
+        for i in np.flatnonzero(twice[1:]) + 1:
+            records[i], bits[i] = records[i - 1], bits[i - 1]
+
+
+Array = NDArray[np.float64]
+
+SUBFRAME_STEPS = 256
+
+
+class MarkerInputs:
+    """Counts marker edges since START. Counters of a frame include the edges that fall into its period.
+
+    A scan marker sets the line counter to 0; a line marker at the same moment counts as the first of the new sweep.
+    """
+
+    def __init__(self) -> None:
+        self.line = 0
+        self.sweep = 0
+
+    def record(self, happening: Happening, start_s: Array, period_s: float, records: NDArray[np.void]) -> int:
+        """Fill marks, line and sweep of consecutive frames that start at start_s (n,), about one period apart.
+
+        Returns the scan markers since START at the first of them, which the records' own counters cut to 16 bits.
+        """
+        marks = np.zeros(len(start_s), np.int64)
+        marks[happening.edge] |= Mark.GATE_EDGE
+        marks[~happening.edge & (happening.share > 0)] |= Mark.GATE_HIGH
+        marks[happening.backward] |= Mark.BACKWARD
+        lines = np.full(len(start_s), self.line, np.int64)
+        sweeps = np.full(len(start_s), self.sweep, np.int64)
+        events = [(float(t), 0, Mark.SCAN) for t in happening.scan_s] + [
+            (float(t), 1, Mark.LINE) for t in happening.line_s
+        ]
+        first = self.sweep
+        for time_s, _, mark in sorted(events):
+            frame = max(int(np.searchsorted(start_s, time_s, side="right")) - 1, 0)
+            if frame == 0 and mark is Mark.SCAN:
+                first += 1
+            place = min(int((time_s - float(start_s[frame])) / period_s * SUBFRAME_STEPS), SUBFRAME_STEPS - 1)
+            marks[frame] = (int(marks[frame]) & ~(0xFF << SUBFRAME_SHIFT)) | mark | (max(place, 0) << SUBFRAME_SHIFT)
+            if mark is Mark.SCAN:
+                self.sweep, self.line = self.sweep + 1, 0
+            else:
+                self.line += 1
+            lines[frame:] = self.line
+            sweeps[frame:] = self.sweep
+        records["marks"] = marks
+        records["line"] = lines & 0xFFFF
+        records["sweep"] = sweeps & 0xFFFF
+        return first
+
+
+def windows_at(window: WindowTable | None, first_sweep: int, records: NDArray[np.void]) -> NDArray[np.int32]:
+    """First pixel of each frame's window (n,), 0 without a table; first_sweep: what `MarkerInputs.record` returned."""
+    if window is None:
+        return np.zeros(len(records), np.int32)
+    since = first_sweep + ((records["sweep"].astype(np.int64) - first_sweep) & 0xFFFF)
+    return window.x0_of(records["marks"], records["line"], since - 1)
+
+
+STEP_S = 1e-3
+
+
+class TickClock:
+    """Counts from 0 at `start_s` of the bench. error: relative, positive is fast. wander: per root second."""
+
+    def __init__(self, tick_s: float, start_s: float, error: float, wander: float, seed: list[int]) -> None:
+        """tick_s: nominal."""
+        self._tick_s = tick_s
+        self._step_ticks = max(1, round(STEP_S / tick_s)) if wander else np.iinfo(np.int64).max
+        self._sd = wander * np.sqrt(self._step_ticks * tick_s)
+        self._random = np.random.default_rng(seed)
+        self._step = 0
+        """Of the first one in the lists: steps that nobody will ask for any more are forgotten."""
+        self._start_s = [start_s]
+        self._error = [error]
+
+    def times_s(self, first_tick: int, period_ticks: int, n: int) -> Array:
+        """When the counter is at n ticks, one period apart, float64 (n,). Not before the first of the last call."""
+        ticks = first_tick + period_ticks * np.arange(n)
+        step = ticks // self._step_ticks
+        while self._step + len(self._error) <= step[-1]:
+            self._start_s.append(self._start_s[-1] + self._step_ticks * self._tick_s / (1 + self._error[-1]))
+            self._error.append(self._error[-1] + self._sd * self._random.standard_normal())
+        gone = int(step[0]) - self._step
+        del self._start_s[:gone], self._error[:gone]
+        self._step += gone
+        at = step - self._step
+        since_s = (ticks - step * self._step_ticks) * self._tick_s
+        times: Array = np.array(self._start_s)[at] + since_s / (1 + np.array(self._error)[at])
+        return times
+
 
 TICK_HZ = 100_000_000
 """Tick rate where it divides the frame period; else a multiple of the frame rate near it, so that nothing is rounded.

@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 
 from sim_backend.effects.rare_bits import bit_of, log_miss, next_hit
 from sim_backend.effects.setting import FrameTimes, Setting, Words
-from sim_backend.random_lanes import WORD_PX
-from sim_backend.split_mix import frame_key
+from sim_backend.random_numbers import WORD_PX, frame_key
 
 _AFTER, _BLIND = np.uint64(0x9FB21C651E98DF25), np.uint64(0xD6E8FEB86659FD93)
 """Keep these draws apart from those of photons and other effects."""

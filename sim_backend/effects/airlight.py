@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from sim_backend.effects.setting import Array, Setting
-from sim_backend.optics import ambient_irradiance
+from sim_backend.light.optics import ambient_irradiance
 
 
 class Airlight:

@@ -4,7 +4,7 @@
 
 They happen inside the sensor, on the way from the pixels to the logic that packs frames: checksums are made of the
 wrong bits, so no CRC tells of them, and neither does a recording's `verify`. Errors behind the checksum, on the cable,
-are not modelled here; those are damage that the link's CRC finds (`sim_backend.wire.faults`).
+are not modelled here; those are damage that the link's CRC finds (`sim_backend.wire.serve.wire_server`).
 
 Called for by `world.sensor.bit_error_rate` above 0, which is e. Exact; cost per frame of 512 x 512: 5 us at 0.1 %, in
 proportion to e.
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from sim_backend.effects.rare_bits import bit_of, log_miss, next_hit
 from sim_backend.effects.setting import FrameTimes, Setting, Words
-from sim_backend.random_lanes import WORD_PX
-from sim_backend.split_mix import frame_key
+from sim_backend.random_numbers import WORD_PX, frame_key
 
 _STREAM = np.uint64(0x8EBC6AF09C88C6E3)
 """Keeps these draws apart from those of photons and other effects."""

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import Any, Literal
 
 from sim_backend.effects.setting import PlannedFor, Setting
-from sim_backend.optics import ambient_irradiance
+from sim_backend.light.optics import ambient_irradiance
 
 Call = tuple[bool, str]
 EffectKind = Literal["laser", "steady", "bits", "within"]

@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from sim_backend.effects.setting import Array, Setting
-from sim_backend.optics import Sensor
+from sim_backend.light.optics import Sensor
 
 _BODY_SD = 0.12
 """Of ln(rate) of the ordinary pixels: the measured spread less that of the counting."""

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Array, Setting
-from sim_backend.exponential import HALVING, LOG2_E, power_of_half
-from sim_backend.gaussian_edge import edge_sum
-from sim_backend.light_sheet import LightSheet
+from sim_backend.light.line import edge_sum
+from sim_backend.light.sheet import LightSheet
+from sim_backend.random_numbers import HALVING, LOG2_E, power_of_half
 
 REACH_SIGMAS = 5.0
 """The blurred end is cut here."""

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Array, Setting
 from sim_backend.effects.stripe import Lit, lit_surface, row_light, spread_line
-from sim_backend.light_sheet import LightSheet
-from sim_backend.line_width import line_width, sigma_px
-from sim_backend.medium import FORWARD_ANGLE
+from sim_backend.light.line import line_width, sigma_px
+from sim_backend.light.sheet import LightSheet
+from sim_backend.scenes.medium import FORWARD_ANGLE
 
 MOST_TURNS = 600.0
 """Of light turned more often nothing comes back; keeps exponentials finite."""

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Array, Setting
 from sim_backend.effects.stripe import Lit, lit_surface, row_light
-from sim_backend.light_sheet import LightSheet
-from sim_backend.medium import DROPLET_G
+from sim_backend.light.sheet import LightSheet
+from sim_backend.scenes.medium import DROPLET_G
 
 NARROW, WIDE = math.radians(1.7), math.radians(6.0)
 """The halo's two exponentials."""

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Array, Setting
-from sim_backend.light_sheet import LightSheet
-from sim_backend.view import View
+from sim_backend.light.sheet import LightSheet
+from sim_backend.light.view import CameraView
 
 HOLD_S = 1e-3
 KEPT_VIEWS = 8
@@ -36,9 +36,9 @@ class MovingSurfaces:
         """velocity: x (right), y (down), z (away from the camera)."""
         self._velocity = np.array(velocity_m_per_s, dtype=np.float64)
         self._lock = threading.Lock()
-        self._views: dict[int, View] = {}
+        self._views: dict[int, CameraView] = {}
 
-    def view(self, still: View, time_s: float) -> View:
+    def view(self, still: CameraView, time_s: float) -> CameraView:
         """The view that holds at the time."""
         step = math.floor(time_s / HOLD_S + 1e-6)
         with self._lock:
@@ -61,7 +61,7 @@ class Motion:
         """Nothing: `View.at` is asked by what makes the light."""
 
 
-def shifted(still: View, shift_m: Array) -> View:
+def shifted(still: CameraView, shift_m: Array) -> CameraView:
     """The view of the same surfaces shifted by (3,) metres."""
     surface, albedo, facet = np.zeros_like(still.surface), np.zeros_like(still.albedo), np.zeros_like(still.facet)
     _shift(still.u, still.v, still.surface, still.facet, still.albedo, shift_m, surface, facet, albedo)

@@ -8,22 +8,138 @@ The particles are a fixed set in the cone that the camera sees: each has its dep
 speed and comes in again at the other side, so that they are spread evenly at any time and a time says where all of them
 are. Those too faint (diameter below k z^1.5, brightness goes with D^2/z^3) are left out: k is that of 0.5 mm at 8 m, or
 more where more than `MOST` were left. With 50 mW and the default optics that is 5 thousandths of a photon per exposure
-for the brightest left out. 0.6 to 0.8 ms per mirror position and thread for `MOST` of them."""
+for the brightest left out. 0.6 to 0.8 ms per mirror position and thread for `MOST` of them.
+
+Compiled search for the particles in a sheet, and their pictures (`sim_backend.effects.particles`).
+"""
 
 import math
 from dataclasses import dataclass
 from typing import Protocol
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.effects.particle_kernels import add_particles
 from sim_backend.effects.setting import Setting
-from sim_backend.light_sheet import LightSheet
-from sim_backend.line_width import line_width
-from sim_backend.weather import Sizes
+from sim_backend.light.line import edge, edge_sum, line_width, sigma_px
+from sim_backend.light.sheet import LightSheet
+from sim_backend.scenes.medium import Sizes
 
 Array = NDArray[np.float64]
+
+REACH_SIGMAS = 4.0
+"""Sheet and picture of a particle are cut here."""
+FARTHEST_RANGE_M = 30.0
+"""No particle is farther than this from the mirror."""
+NEWTON_STEPS = 8
+SHORT_PX = 0.05
+"""A streak shorter than this is a point."""
+
+
+@numba.njit(cache=True, nogil=True)
+def find_pixel(u: Array, v: Array, at_u: float, at_v: float) -> tuple[float, float, float]:
+    """Pixel (x, y) whose ray has the tangents, and the area of a pixel in tangents there; NaN where there is none.
+
+    Newton's method on the maps of tangents (rows, width), continued straight past their borders.
+    """
+    rows, width = u.shape
+    x, y, area = 0.5 * (width - 1), 0.5 * (rows - 1), np.nan
+    for _ in range(NEWTON_STEPS):
+        i = min(max(math.floor(x), 0), width - 2)
+        j = min(max(math.floor(y), 0), rows - 2)
+        s, t = x - i, y - j
+        u_x, u_y = u[j, i + 1] - u[j, i], u[j + 1, i] - u[j, i]
+        v_x, v_y = v[j, i + 1] - v[j, i], v[j + 1, i] - v[j, i]
+        area = u_x * v_y - u_y * v_x
+        if not abs(area) > 0.0:
+            return np.nan, np.nan, np.nan
+        off_u = at_u - (u[j, i] + s * u_x + t * u_y)
+        off_v = at_v - (v[j, i] + s * v_x + t * v_y)
+        step_x, step_y = (off_u * v_y - off_v * u_y) / area, (off_v * u_x - off_u * v_x) / area
+        x += step_x
+        y += step_y
+        if not (abs(x) < 4 * width and abs(y) < 4 * rows):
+            return np.nan, np.nan, np.nan
+        if abs(step_x) + abs(step_y) < 1e-3:
+            break
+    return x, y, abs(area)
+
+
+@numba.njit(cache=True, nogil=True)
+def share(pixel: int, first: float, length: float, sigma: float) -> float:
+    """Share of a streak (first..first + length, blurred by sigma) that falls within a pixel, in one dimension."""
+    a, b = pixel - 0.5 - first, pixel + 0.5 - first
+    if length < SHORT_PX:
+        middle = 0.5 * length
+        return max(edge((b - middle) / sigma) - edge((a - middle) / sigma), 0.0)
+    before = edge_sum(b / sigma) - edge_sum(a / sigma)
+    after = edge_sum((b - length) / sigma) - edge_sum((a - length) / sigma)
+    return max((before - after) * sigma / length, 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def add_particles(
+    view: tuple[Array, Array, Array],
+    particles: tuple[Array, Array, Array, Array, Array],
+    sheet: tuple[Array, Array, Array, NDArray[np.int64]],
+    light: tuple[float, float, float, float],
+    thickness: Array,
+    width: Array,
+    first_row: int,
+    last_row: int,
+    rate: Array,
+) -> None:
+    """Add the particles' light to rows first_row..last_row-1 of `rate`.
+
+    view: u, v, source. particles: cone, z, back, at, per_s. sheet: normal, offset, x_end, step. light: detections per
+    second per W/rad and W/(m^2 sr), extinction per metre, time, time for which it holds. thickness: sigma of the sheet
+    at the mirror and per metre. width: `line_width`.
+    """
+    u, v, source = view
+    cone, depth, back, at, per_s = particles
+    normal, offset_m, x_end, step = sheet
+    scale, extinction_per_m, time_s, hold_s = light
+    most_off_m = REACH_SIGMAS * (thickness[0] + thickness[1] * FARTHEST_RANGE_M)
+    middle, k = u.shape[1] // 2, 0
+    top_v, rows_per_v = v[0, middle], (len(v) - 1) / (v[len(v) - 1, middle] - v[0, middle])
+    u_low, u_span, v_low, v_span = cone[0, 0], cone[0, 1], cone[1, 0], cone[1, 1]
+    for i in range(len(depth)):
+        z = depth[i]
+        at_u = at[i, 0] + per_s[i, 0] * time_s
+        at_v = at[i, 1] + per_s[i, 1] * time_s
+        at_u = u_low + (at_u - math.floor(at_u)) * u_span
+        at_v = v_low + (at_v - math.floor(at_v)) * v_span
+        if len(offset_m) > 1:  # about the row that sees it; between rows that are near each other sheets differ little
+            k = min(max(int((at_v - top_v) * rows_per_v), 0), len(offset_m) - 1)
+        off_m = z * (normal[k, 0] * at_u + normal[k, 1] * at_v + normal[k, 2]) - offset_m[k]
+        if abs(off_m) > most_off_m:
+            continue
+        away_x, away_y, away_z = z * at_u - source[0], z * at_v - source[1], z - source[2]
+        r = math.sqrt(away_x**2 + away_y**2 + away_z**2)
+        sigma_m = math.hypot(thickness[0], thickness[1] * r)
+        if abs(off_m) > REACH_SIGMAS * sigma_m or r == 0.0:
+            continue
+        x, y, area = find_pixel(u, v, at_u, at_v)
+        if not area > 0.0:
+            continue
+        sigma = sigma_px(width, 1.0 / z, r)
+        streak_px = per_s[i, 1] * v_span * hold_s / math.sqrt(area)
+        reach = REACH_SIGMAS * sigma + 0.5
+        top, bottom = max(first_row, math.ceil(y - reach)), min(last_row - 1, math.floor(y + streak_px + reach))
+        left, right = max(0, math.ceil(x - reach)), min(rate.shape[1] - 1, math.floor(x + reach))
+        if top > bottom or left > right:
+            continue
+        q = math.sqrt(at_u * at_u + at_v * at_v + 1.0)
+        across = math.exp(-0.5 * (off_m / sigma_m) ** 2) / (sigma_m * math.sqrt(2.0 * math.pi))
+        total = scale * across / r * back[i] * q / (z * z * area) * math.exp(-extinction_per_m * (r + z * q))
+        for row in range(top, bottom + 1):
+            if not (x_end[row] - x) * step[row] > 0.0:
+                continue  # behind what ends the sheet on this row, or in its shadow
+            here = total * share(row, y, streak_px, sigma)
+            for column in range(left, right + 1):
+                rate[row, column] += here * share(column, x, 0.0, sigma)
+
 
 MOST = 100_000
 """Particles that are kept, on average."""
@@ -38,7 +154,7 @@ DEPTH_STEPS = 4096
 
 
 class Precipitation(Protocol):
-    """Rain or snow (`sim_backend.weather`)."""
+    """Rain or snow (`sim_backend.scenes.medium`)."""
 
     wind: float
 

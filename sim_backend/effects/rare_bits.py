@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Words
-from sim_backend.random_lanes import WORD_PX
-from sim_backend.split_mix import frame_key
+from sim_backend.random_numbers import WORD_PX, frame_key
 
 _S11 = np.uint64(11)
 _ONE, _ZERO = np.uint64(1), np.uint64(0)

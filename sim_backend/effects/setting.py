@@ -6,10 +6,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.light_sheet import LightSheet
-from sim_backend.optics import Line, Optics, Sensor
-from sim_backend.scene import SceneFile
-from sim_backend.view import View
+from sim_backend.light.optics import Line, Optics, Sensor
+from sim_backend.light.sheet import LightSheet
+from sim_backend.light.view import CameraView
+from sim_backend.scenes.scene import SceneFile
 
 Array = NDArray[np.float64]
 Words = NDArray[np.uint64]
@@ -21,7 +21,7 @@ class Setting:
     devices said they do when they were made.
     """
 
-    view: View
+    view: CameraView
     scene: SceneFile
     optics: Optics
     sensor: Sensor
@@ -81,7 +81,7 @@ class BitEffect(Protocol):
 
     def apply(self, seed: np.uint64, first_frame: int, words: Words, before: Words, times: FrameTimes) -> None:
         """Change whole frames first_frame, first_frame + 1, ... in place: `words` (frames, rows, words) uint64 in
-        packbits order (`sim_backend.photon_kernels`), pad bits stay 0.
+        packbits order (`sim_backend.frames.photon_kernels`), pad bits stay 0.
 
         seed: of the run. before: (rows, words), the bits of frame first_frame - 1 as this effect found them, zeros
         where there is none. The outcome for a frame depends on seed, its number, its own and its predecessor's bits

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Array, Setting
-from sim_backend.light_sheet import LightSheet
-from sim_backend.optics import Line, Optics, Sensor
-from sim_backend.split_mix import frame_key
+from sim_backend.light.optics import Line, Optics, Sensor
+from sim_backend.light.sheet import LightSheet
+from sim_backend.random_numbers import frame_key
 
 POLARISATIONS = 2
 

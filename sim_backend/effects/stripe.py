@@ -9,7 +9,7 @@ along the row:
 n.X taken on the surface along the row. For a rectified rig this is the camera-side cosine law
 (rho/pi) I0 du |N.q| / Z^2 exp(-sigma Z (|q_p| + |q_c|)), with I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The surface is the
 facet m.X = 1 through the point: |N.e| = |1 - m.S|/(|m| r) for a source at S. The profile across the row is a Gaussian
-integrated over each pixel, of the width that `sim_backend.line_width` gives."""
+integrated over each pixel, of the width that `sim_backend.light.line` gives."""
 
 import math
 
@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Array, Setting
-from sim_backend.gaussian_edge import edge
-from sim_backend.light_sheet import LightSheet
-from sim_backend.line_width import line_width, sigma_px
-from sim_backend.view import View
+from sim_backend.light.line import edge, line_width, sigma_px
+from sim_backend.light.sheet import LightSheet
+from sim_backend.light.view import CameraView
 
 REACH_SIGMAS = 5.0
 """The Gaussian is cut here; 6e-7 of the stripe is left out."""
@@ -33,7 +32,7 @@ along the row, which has no position in it, from being infinitely bright."""
 Lit = tuple[Array, Array, Array, Array, Array, Array, Array]
 
 
-def lit_surface(view: View) -> Lit:
+def lit_surface(view: CameraView) -> Lit:
     """What `row_light` takes of a view."""
     return view.u, view.v, view.u_x, view.v_x, view.facet, view.albedo, view.source_m
 

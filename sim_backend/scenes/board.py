@@ -17,7 +17,7 @@ from calibration.board.board import BUNDLED_BOARD, Board, load_board
 from calibration.errors import CalibrationError
 from calibration.views import BoardPose
 from drivers.errors import DeviceError
-from sim_backend.scene import BoardShown
+from sim_backend.scenes.scene import BoardShown
 from sim_backend.scenes.surfaces import Surfaces, checked
 
 Array = NDArray[np.float64]

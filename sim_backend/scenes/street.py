@@ -9,9 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.scenes.solids import Face, box, convex, ellipsoid, post
-from sim_backend.scenes.surfaces import Surfaces, checked
-from sim_backend.scenes.texture import layered_noise
+from sim_backend.scenes.surfaces import Face, Surfaces, box, checked, convex, ellipsoid, layered_noise, post
 
 Array = NDArray[np.float64]
 Texture = Callable[[Array, Array, Array], Array]

@@ -24,22 +24,22 @@ from drivers.interfaces import OUT_GATE
 from drivers.registry import Kind, Surroundings
 from drivers.transports.endpoints import Endpoint
 from sim_backend.bench import Happening
-from sim_backend.devices.markers import MarkerInputs, windows_at
+from sim_backend.devices.spad import MarkerInputs, windows_at
 from sim_backend.effects.setting import FrameTimes
-from sim_backend.flux import FluxModel
+from sim_backend.frames.flux import FluxModel
+from sim_backend.frames.photons import PhotonSource
 from sim_backend.gate_program import gate_shares
-from sim_backend.photons import PhotonSource
-from sim_backend.wire.cobolt import CoboltModel
-from sim_backend.wire.helios import BLUE, GREEN, INTENSITY, HeliosModel
-from sim_backend.wire.obis import ObisModel
-from sim_backend.wire.prawndo import PrawnDoModel
-from sim_backend.wire.serial_server import SerialServer
-from sim_backend.wire.spad512s import Spad512sModel
-from sim_backend.wire.spb_usb import SpbUsbModel
-from sim_backend.wire.spb_usb_run import Span
-from sim_backend.wire.tcp_server import TcpServer
-from sim_backend.wire.usb_backend import EmulatedUsb
-from sim_backend.wire.usb_model import AttachedDevice, UsbModel
+from sim_backend.wire.firmware.cobolt import CoboltModel
+from sim_backend.wire.firmware.helios import BLUE, GREEN, INTENSITY, HeliosModel
+from sim_backend.wire.firmware.obis import ObisModel
+from sim_backend.wire.firmware.prawndo import PrawnDoModel
+from sim_backend.wire.firmware.spad512s import Spad512sModel
+from sim_backend.wire.firmware.spb_usb import SpbUsbModel
+from sim_backend.wire.firmware.spb_usb_run import Span
+from sim_backend.wire.serve.serial import SerialServer
+from sim_backend.wire.serve.tcp import TcpServer
+from sim_backend.wire.serve.usb import EmulatedUsb
+from sim_backend.wire.serve.usb_model import AttachedDevice, UsbModel
 from sim_backend.world import SimulatedWorld, WorldConfig
 
 Array = NDArray[np.float64]

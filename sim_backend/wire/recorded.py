@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.clock import Clock
-from drivers.control_words import is_question
 from drivers.errors import DeviceError
 from drivers.interfaces import SweepTruth
+from drivers.recorded.control_words import is_question
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import CONTROL_FILE, OUT, Passed, read_taps
-from sim_backend.wire.helios import HeliosModel
-from sim_backend.wire.lasercube import LaserCubeModel
-from sim_backend.wire.serial_server import SerialServer
-from sim_backend.wire.usb_backend import EmulatedUsb
+from sim_backend.wire.firmware.helios import HeliosModel
+from sim_backend.wire.firmware.lasercube import LaserCubeModel
+from sim_backend.wire.serve.serial import SerialServer
+from sim_backend.wire.serve.usb import EmulatedUsb
 
 _TOKEN = re.compile(rb"#[0-9a-f]{8}")
 """A PrawnDO driver numbers its questions so that their answers are known."""

@@ -11,8 +11,8 @@ import numpy as np
 
 from rig.bench.cases import learn
 from rig.bench.frames import COLUMNS, window_frames
-from rig.estimators.stream import ColumnJudge
-from rig.row_threads import RowWorkers
+from rig.estimate.search.stream import ColumnJudge
+from rig.threads import RowWorkers
 
 EXPOSURES = 10
 BLOCKS = (50, 100, 250, 500, 1000)

@@ -26,13 +26,13 @@ import numpy as np
 from drivers.clock import SystemClock
 from drivers.interfaces import SpadRequest
 from drivers.ring import BlockRing
+from drivers.spads.spb_usb import SpbUsb, SpbUsbConfig, open_link
 from drivers.spb1.control import Op, Register
-from drivers.spb_usb import SpbUsb, SpbUsbConfig, open_link
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.queued_link import QueuedLink
-from sim_backend.wire.spb_usb import SpbUsbModel
-from sim_backend.wire.umockdev_server import UmockdevBus, missing
+from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from tests.wire.spb_device import TiledSource
+from tests.wire.usb.umockdev import UmockdevBus, missing
 
 STRIDE = 1 << 20
 FRAMES = 31

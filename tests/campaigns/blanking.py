@@ -13,10 +13,10 @@ from collections import Counter
 import numpy as np
 
 from drivers.errors import DeviceFault
-from rig.binding import FrameBinder
-from rig.counting import BIN_DARK
+from rig.count.bind import FrameBinder
+from rig.count.volume import BIN_DARK
 from rig.errors import PlanError
-from tests.unit.rig.light import blanked_plan, see
+from tests.unit.rig.count.light import blanked_plan, see
 
 WRONG_COLUMNS = 0.15
 

@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from calibration.board.board import MARGIN_SQUARES, Board
 from calibration.views import BoardPose
-from rig.counting import CountVolume, SweepCounter, SweepLayout
-from rig.row_threads import RowWorkers
+from rig.count.volume import CountVolume, SweepCounter, SweepLayout
+from rig.threads import RowWorkers
 from sim_backend.effects.dark_counts import dark_rates
 from sim_backend.effects.setting import FrameTimes, Setting
-from sim_backend.flux import FluxModel
+from sim_backend.frames.flux import FluxModel
+from sim_backend.frames.photons import PhotonSource
+from sim_backend.light.optics import Line, Optics, Sensor, detections_per_radiance
+from sim_backend.light.view import make_view
 from sim_backend.mirror_motion import Jitter
-from sim_backend.optics import Line, Optics, Sensor, detections_per_radiance
-from sim_backend.photons import PhotonSource
-from sim_backend.scene import SceneFile
 from sim_backend.scenes.board import ShownBoard, board_scene
-from sim_backend.view import make_view
+from sim_backend.scenes.scene import SceneFile
 from tests.reference.random_rigs import COMMAND_REACH, RandomRig
 
 Array = NDArray[np.float64]

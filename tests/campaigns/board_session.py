@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.board.board import Board
-from calibration.board.detection import find_corners
+from calibration.board.detect import find_corners
+from calibration.diagnosis.rig import judge_fit, judge_refused
 from calibration.errors import Degenerate
-from calibration.judging.rig import judge_fit, judge_refused
 from calibration.rig_fit.fit import fit_rig
 from calibration.views import BoardPose, View
 from sim_backend.scenes.board import ShownBoard

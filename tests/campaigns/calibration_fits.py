@@ -16,7 +16,7 @@ import numpy as np
 from calibration.errors import CalibrationError
 from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.result import RigFit
-from calibration.robust import MAD_TO_SD
+from calibration.views import MAD_TO_SD
 from tests.campaigns.asked import INSIDE, RATIO, Figure, exit_code
 from tests.reference.calibration_data import BOARD, Seen, random_rig, random_views
 from tests.reference.fitted_depth import depth_errors

@@ -13,10 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calibration.diagnosis.rig import judge_fit
 from calibration.errors import CalibrationError
-from calibration.guide.forecast import Forecast
-from calibration.guide.poses import candidates, next_pose, rough_camera, sequence
-from calibration.judging.rig import judge_fit
+from calibration.guide import Forecast, candidates, next_pose, rough_camera, sequence
 from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.result import RigFit
 from calibration.views import View

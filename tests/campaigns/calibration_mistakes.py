@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
-from calibration.judging.evidence import baseline_m
+from calibration.diagnosis.evidence import baseline_m
 from calibration.model.scanner import PivotScanner
 from calibration.views import BoardPose, View
 from sim_backend.scenes.board import ShownBoard

@@ -27,16 +27,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
-from calibration.board.detection import find_corners
+from calibration.board.detect import find_corners
 from calibration.errors import CalibrationError, Degenerate
-from calibration.passages.even_albedo import board_pixels, even_pixels
-from calibration.passages.even_pixels import evenly
-from calibration.passages.finding import SweepCounts, find_passages
+from calibration.passages.find import SweepCounts, evenly, find_passages
+from calibration.passages.flux_picture import board_pixels, even_pixels
 from calibration.rig_fit.fit import fit_rig
 from calibration.views import Passages, View
-from rig.calibrating.view_files import load_views, save_view
+from rig.calibrate.session import load_views, save_view
 from sim_backend.effects.dark_counts import dark_rates
-from sim_backend.optics import Sensor
+from sim_backend.light.optics import Sensor
 from sim_backend.scenes.board import ShownBoard
 from tests.campaigns.asked import exit_code
 from tests.campaigns.board_capture import FRAME_S, HOT_PER_S, Stand, SweepAsked, SweepTaken, set_up, take_sweeps

@@ -6,11 +6,11 @@ python -m tests.campaigns.cobolt_faults --sequences 10000 --seed 1
 import random
 from typing import cast
 
-from drivers.cobolt import CoboltConfig, create
-from drivers.dialogue import LineTiming
 from drivers.interfaces import LineLaser
+from drivers.lasers.cobolt import CoboltConfig, create
 from drivers.registry import Surroundings
-from sim_backend.wire.cobolt import CoboltModel, Family
+from drivers.transports.dialogue import LineTiming
+from sim_backend.wire.firmware.cobolt import CoboltModel, Family
 from tests.campaigns.laser_sequences import GAP_S, LIMIT_W, LaserModel, Subject, run
 
 TIMING = LineTiming(gap_s=GAP_S, reply_s=0.03, quiet_s=0.01, drain_s=0.05)

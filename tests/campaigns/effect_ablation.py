@@ -22,8 +22,8 @@ import numpy as np
 import yaml
 
 from rig import api
-from rig.config import RigConfig
-from rig.scoring import MISSING_PX, charged_errors
+from rig.config.models import RigConfig
+from rig.geometry.stripe_table import MISSING_PX, charged_errors
 
 AIR = {"medium": {"fog": {"visibility": "300 km"}}}
 """Molecules alone."""

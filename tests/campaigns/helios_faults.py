@@ -6,7 +6,7 @@ python -m tests.campaigns.helios_faults --sequences 10000 --seed 1
 import sys
 from functools import partial
 
-from sim_backend.wire.helios import BLUE, GREEN, RED, HeliosModel
+from sim_backend.wire.firmware.helios import BLUE, GREEN, RED, HeliosModel
 from tests.campaigns.outcomes import run
 from tests.campaigns.scanner_sequences import Subject, scanner_sequence
 

@@ -21,8 +21,8 @@ from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
 from drivers.interfaces import LineLaser
 from drivers.registry import Surroundings
-from sim_backend.wire.faults import Fault, FaultSchedule
-from sim_backend.wire.serial_server import SerialModel, SerialServer
+from sim_backend.wire.serve.serial import SerialModel, SerialServer
+from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 
 LIMIT_W = 0.08
 DEADLINE_S = 10.0

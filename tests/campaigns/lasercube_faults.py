@@ -6,7 +6,7 @@ python -m tests.campaigns.lasercube_faults --sequences 10000 --seed 1
 import sys
 from functools import partial
 
-from sim_backend.wire.lasercube import BLUE, GREEN, PLAYING, LaserCubeModel
+from sim_backend.wire.firmware.lasercube import BLUE, GREEN, PLAYING, LaserCubeModel
 from tests.campaigns.outcomes import run
 from tests.campaigns.scanner_sequences import Subject, scanner_sequence
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.map_checks import SURE
+from rig.count.map_checks import SURE
 from tests.reference.adapter import reconstructor_of, volume_of, windowed
 from tests.reference.geometry import Geometry
 from tests.reference.made_scenes import pane_scene, thin_scene

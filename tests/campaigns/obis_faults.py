@@ -6,11 +6,11 @@ python -m tests.campaigns.obis_faults --sequences 10000 --seed 1
 import random
 from typing import cast
 
-from drivers.dialogue import LineTiming
 from drivers.interfaces import LineLaser
-from drivers.obis import ObisConfig, create
+from drivers.lasers.obis import ObisConfig, create
 from drivers.registry import Surroundings
-from sim_backend.wire.obis import ObisModel
+from drivers.transports.dialogue import LineTiming
+from sim_backend.wire.firmware.obis import ObisModel
 from tests.campaigns.laser_sequences import LIMIT_W, LaserModel, Subject, run
 
 TIMING = LineTiming(reply_s=0.03, quiet_s=0.01, drain_s=0.05)

@@ -12,7 +12,7 @@ import argparse
 
 import numpy as np
 
-from calibration.passages.finding import find_passages
+from calibration.passages.find import find_passages
 from tests.unit.calibration.passed_lines import Light, passed, sweep_of, true_at
 
 SIGMAS = (0.25, 0.3, 0.4, 0.6)

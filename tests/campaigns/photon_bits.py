@@ -16,7 +16,7 @@ import mpmath
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.photon_kernels import draw_frames, new_levels, set_levels
+from sim_backend.frames.photon_kernels import draw_frames, new_levels, set_levels
 
 Array = NDArray[np.float64]
 

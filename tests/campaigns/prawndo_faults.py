@@ -18,13 +18,13 @@ from dataclasses import dataclass
 
 from drivers.errors import DeviceError, WrongState
 from drivers.interfaces import OUT_FRAME, OUT_GATE, Pulse
-from drivers.prawndo import PrawnDo, PrawnDoConfig, create
-from drivers.prawndo_line import LineTiming
 from drivers.registry import Surroundings
-from sim_backend.wire.faults import Fault, FaultSchedule
+from drivers.sync.prawndo import PrawnDo, PrawnDoConfig, create
+from drivers.sync.prawndo_line import PrawnDoTiming
+from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 from tests.wire.syncs import Board
 
-TIMING = LineTiming(reply_s=0.06, hasty_s=0.03, lower_s=0.15, load_s=0.3)
+TIMING = PrawnDoTiming(reply_s=0.06, hasty_s=0.03, lower_s=0.15, load_s=0.3)
 DEADLINE_S = 5.0
 """For one verb at this timing, freeing a board that swallows 180 kB included, on a machine that does other things."""
 LATE_S = 0.08

@@ -30,17 +30,16 @@ import numpy as np
 
 from drivers.errors import DeviceError
 from drivers.recorded import INDEX_FILE, RunRecording
-from drivers.recorded.contents import PAGE_BYTES
-from drivers.recorded.index import HEADER_BYTES as INDEX_HEADER_BYTES
-from drivers.recorded.index import INDEX_RECORD
+from drivers.recorded.contents import HEADER_BYTES as INDEX_HEADER_BYTES
+from drivers.recorded.contents import INDEX_RECORD, PAGE_BYTES
 from drivers.spb1.layout import HEADER, TRAILER
 from rig.errors import DamagedRecordingError, RigError
 from rig.recording.compress import compress
-from rig.recording.manifest import MANIFEST, read_manifest
 from rig.recording.repair import repair
 from rig.recording.verify import Integrity, verify
+from rig.run_folder.manifest import MANIFEST, read_manifest
 from tests.campaigns.outcomes import Ending, ending, run
-from tests.unit.rig.forging import (
+from tests.unit.rig.recording.forging import (
     HEADER_FIELDS,
     TRAILER_FIELDS,
     forge_header,
@@ -48,7 +47,7 @@ from tests.unit.rig.forging import (
     forge_trailer,
     most_of,
 )
-from tests.unit.rig.recorded import record, run_blocks
+from tests.unit.rig.recording.recorded import record, run_blocks
 
 DEADLINE_S = 10.0
 FORGED = 3

@@ -19,7 +19,7 @@ from calibration.files.rig_file import CALIBRATION_FILE
 from rig import api
 from rig.errors import RigError
 from rig.recording.inputs import PLAN_FILE
-from rig.summary import Verdict
+from rig.run_folder.summary import RunVerdict
 from tests.campaigns.outcomes import Ending, ending, run
 from tests.campaigns.recording_corruptions import scratch_folder, wound
 from tests.system.small_rig import config, write_rig
@@ -58,7 +58,7 @@ def make_sequence(root: Path) -> Callable[[int], Ending]:
                 summary = api.reconstruct(case, out=case / "again").summary
             except RigError as error:
                 return type(error).__name__, None
-            if summary.verdict is not Verdict.COMPLETE:
+            if summary.verdict is not RunVerdict.COMPLETE:
                 return summary.verdict.value, None
             found = _depth(case / "again")
             assert len(found) == len(wanted), f"{len(found)} maps of {len(wanted)}, and nobody says so"

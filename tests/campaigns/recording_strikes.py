@@ -21,10 +21,9 @@ from drivers.recorded import RunRecording
 from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, seal_block
 from rig.errors import RigError, UsageError
-from rig.outputs import RunFolder
-from rig.recording.recorder import Recorder
 from rig.recording.repair import repair
-from rig.recording.writer import WRITERS, Recording
+from rig.recording.writer import WRITERS, Recorder, Recording
+from rig.run_folder.folder import RunFolder
 
 WIDTH, HEIGHT = 256, 64
 MOST_FRAMES = 120

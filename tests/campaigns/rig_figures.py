@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.depth.uncertainty import command_at, depth_sd_m
+from calibration.depth_error import command_at, depth_sd_m
+from calibration.model.light_sheet import depth_slope
 from calibration.model.rig_model import RigModel
-from calibration.model.triangulation import depth_slope
 from calibration.rig_fit.result import RigFit
-from calibration.robust import robust_sd
+from calibration.views import robust_sd
 from tests.campaigns.asked import ADDED_PX, INSIDE, RATIO, Figure
 from tests.campaigns.board_capture import speed
 

@@ -14,12 +14,11 @@ import numpy as np
 
 from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
-from sim_backend.wire.dac_history import DacHistory
-from sim_backend.wire.dac_model import DacModel
-from sim_backend.wire.faults import Fault, FaultSchedule
-from sim_backend.wire.usb_faults import FaultyUsb
+from sim_backend.wire.firmware.dac_model import DacHistory, DacModel
+from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 from tests.campaigns.outcomes import Ending, ending
 from tests.wire.scanners import Plugged, open_scanner, plug
+from tests.wire.usb.faulty_usb import FaultyUsb
 
 POINTS, LINE_POINTS, RATE_HZ = 700, 50, 25_000.0
 DEADLINE_S = 30.0

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from drivers.interfaces import SpadRequest
 from drivers.ring import BlockRing
-from drivers.spad512s import Spad512s, Spad512sConfig
-from drivers.spad512s_line import Deadlines
-from sim_backend.wire.faults import Fault, FaultSchedule
-from sim_backend.wire.spad512s import Spad512sModel
-from sim_backend.wire.tcp_server import TcpServer
+from drivers.spads.spad512s import Spad512s, Spad512sConfig
+from drivers.spads.spad512s_line import Deadlines
+from sim_backend.wire.firmware.spad512s import Spad512sModel
+from sim_backend.wire.serve.tcp import TcpServer
+from sim_backend.wire.serve.wire_server import Fault, FaultSchedule
 from tests.campaigns.outcomes import Ending, ending, run
 
 KINDS = tuple(kind for kind in Fault if kind is not Fault.CORRUPTED)

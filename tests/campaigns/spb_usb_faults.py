@@ -18,10 +18,10 @@ from drivers.errors import DeviceTimeout
 from drivers.frames import FrameBlock
 from drivers.interfaces import SpadRequest
 from drivers.ring import BlockRing
-from drivers.spb_usb import SpbUsb
-from sim_backend.wire.spb_usb import SpbUsbModel
-from sim_backend.wire.usb_backend import EmulatedUsb
-from sim_backend.wire.usb_model import STALL, Answer
+from drivers.spads.spb_usb import SpbUsb
+from sim_backend.wire.firmware.spb_usb import SpbUsbModel
+from sim_backend.wire.serve.usb import EmulatedUsb
+from sim_backend.wire.serve.usb_model import STALL, Answer
 from tests.campaigns.outcomes import Ending, ending, run
 from tests.wire.spb_device import HEIGHT, WIDTH, NumberedSource, on_bus, require_right
 

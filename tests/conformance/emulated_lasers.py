@@ -6,8 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sim_backend.wire.cobolt import CoboltModel
-from sim_backend.wire.obis import ObisModel
+from sim_backend.wire.firmware.cobolt import CoboltModel
+from sim_backend.wire.firmware.obis import ObisModel
 from tests.conformance.cases import LaserCase
 from tests.wire.lasers import open_cobolt, open_obis, wire
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from drivers.clock import SystemClock
-from sim_backend.wire.helios import HeliosModel
-from sim_backend.wire.lasercube import LaserCubeModel
+from sim_backend.wire.firmware.helios import HeliosModel
+from sim_backend.wire.firmware.lasercube import LaserCubeModel
 from tests.conformance.cases import ScannerCase
 from tests.wire.scanners import opened
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interfaces import SpadRequest, WindowTable
-from drivers.spad512s import Spad512s, Spad512sConfig
-from sim_backend.wire.spad512s import Spad512sModel
-from sim_backend.wire.spb_usb import SpbUsbModel
-from sim_backend.wire.tcp_server import TcpServer
+from drivers.spads.spad512s import Spad512s, Spad512sConfig
+from sim_backend.wire.firmware.spad512s import Spad512sModel
+from sim_backend.wire.firmware.spb_usb import SpbUsbModel
+from sim_backend.wire.serve.tcp import TcpServer
 from tests.conformance.cases import SpadCase
 from tests.wire.spb_device import HEIGHT, REQUEST, WIDTH, TiledSource, model, opened
 

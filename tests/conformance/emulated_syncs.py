@@ -7,9 +7,9 @@ from typing import Any
 
 from drivers.guard import Guard
 from drivers.interfaces import SyncSource
-from drivers.obis import ObisConfig
-from drivers.prawndo import PrawnDoConfig
-from sim_backend.wire.obis import ObisModel
+from drivers.lasers.obis import ObisConfig
+from drivers.sync.prawndo import PrawnDoConfig
+from sim_backend.wire.firmware.obis import ObisModel
 from tests.conformance.cases import LaserCase, SyncCase
 from tests.wire.lasers import wire
 from tests.wire.syncs import Board, board

@@ -40,7 +40,7 @@ def reconstructor_of(
 ) -> Any:
     """The project's Reconstructor for the rig of a working point; it has learned nothing yet. lines: a LineGrid."""
     from calibration.files.rig_file import load_rig_model
-    from rig.reconstruction import Reconstructor
+    from rig.depth.reconstruct import Reconstructor
 
     with tempfile.TemporaryDirectory() as folder:
         model = load_rig_model(point.write_calibration(Path(folder)))
@@ -53,7 +53,7 @@ def reconstructor_of(
 
 def volume_of(reconstructor: Any, counts: NDArray[np.unsignedinteger], exposures: int) -> Any:
     """One sweep of counts (columns, H, window) in the reconstructor's windows."""
-    from rig.counting import CountVolume
+    from rig.count.volume import CountVolume
 
     columns = counts.shape[0]
     return CountVolume(

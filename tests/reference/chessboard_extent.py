@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
-from calibration.board.detection import find_corners
+from calibration.board.detect import find_corners
 from calibration.errors import Degenerate
 from tests.reference.board_pictures import CHESSBOARD, SIZE, albedo, exposed, pose
 from tests.reference.chessboards import FOLDER

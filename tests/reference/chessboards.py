@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from calibration.board.board import Board
-from calibration.board.detection import find_corners
-from calibration.camera_fit.fit import fit_camera
+from calibration.board.detect import find_corners
+from calibration.camera_fit import fit_camera
 from calibration.views import Corners, View
 
 FOLDER = Path(__file__).parents[2].parent / "shared" / "calibration-images"

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.detection import find_corners
-from calibration.board.search import gray
+from calibration.board.detect import find_corners
+from calibration.board.lattice import gray
 from calibration.errors import Degenerate
 from tests.reference.board_pictures import CHARUCO, SIZE, albedo, corners_px, exposed, pose
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.depth.uncertainty import depth_sd_m
+from calibration.depth_error import depth_sd_m
 from calibration.model.rig_model import RigModel
 from tests.reference.calibration_data import TrueRig, points_at
 

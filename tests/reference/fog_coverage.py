@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rig.fog_meter import VISIBILITY_CONTRAST
+from rig.depth.fog_meter import VISIBILITY_CONTRAST
 from tests.reference import kernels
 from tests.reference.adapter import reconstruct
 from tests.reference.geometry import Geometry

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.svg_chart import INK, Series
+from rig.run_folder.charts import INK, Series
 
 COLOURS = 24
 """Steps between the nearest and the farthest depth."""

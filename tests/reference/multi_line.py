@@ -75,7 +75,7 @@ class Lines:
     @property
     def grid(self) -> Any:
         """The project's account of what is lit together."""
-        from rig.multi_line import LineGrid
+        from rig.geometry.line_grid import LineGrid
 
         line, place = np.divmod(np.arange(COLUMNS, dtype=np.int32), np.int32(COLUMNS // self.lines))
         return LineGrid((0.0,) * self.lines, 1.0, line, place)
@@ -118,7 +118,7 @@ TITLES = ("scene", "point", "power", "lines", "K", "lit ms", "overlap", "estimat
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table, and write it where asked."""
-    from rig.multi_line import window_overlap
+    from rig.geometry.line_grid import window_overlap
 
     parser = argparse.ArgumentParser(prog="python -m tests.reference.multi_line", description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", default="procedural", help=f"procedural, {', '.join(scene_names())}")

@@ -17,7 +17,7 @@ from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from sim_backend.effects.catalogue import CATALOGUE
-from sim_backend.flux import FluxModel
+from sim_backend.frames.flux import FluxModel
 from tests.unit.sim.rigs import setting, wall
 
 Array = NDArray[np.float64]

@@ -22,9 +22,9 @@ from statistics import fmean
 
 import numpy as np
 
-from rig.estimators import ESTIMATORS, FILTERS
-from rig.svg_chart import Drawable, Mark, Panel, Series, chart_svg
-from rig.tradeoff_figure import colour_of
+from rig.estimate.registry import ESTIMATORS, FILTERS
+from rig.run_folder.charts import ChartMark, Drawable, Panel, Series, chart_svg
+from rig.tradeoff.files import colour_of
 from tests.reference.adapter import reconstructor_of, volume_of, windowed
 from tests.reference.mosaics import PLACE_PX, Mosaic
 from tests.reference.scene import Scene, load_scene, procedural_scene, scene_names
@@ -33,7 +33,7 @@ from tests.reference.working_point import CLEAR, DENSE, POINTS, REPORT, WorkingP
 COLUMNS, FRAME_RATE_HZ = 500, 100_000
 EXPOSURES = (1, 3, 5, 10, 20)
 SEED = 1
-CLAIMS = (Mark((10, 1.0), "report: < 1 px"), Mark((20, 0.1), "report: about 0.1 px"))
+CLAIMS = (ChartMark((10, 1.0), "report: < 1 px"), ChartMark((20, 0.1), "report: about 0.1 px"))
 """Mean error of the report by exposures, on truth rounded to whole pixels."""
 SHARE = "within_1px"
 ROW = 250
@@ -97,7 +97,7 @@ def figure_3(scene: Scene) -> str:
         shown = slice(max(0, round(x) - 130), round(x) + 40)
         points = list(zip(range(shown.start, shown.stop), map(float, flux[shown]), strict=True))
         series = Series("expected photons", colour_of("likelihood"), points, marker=False, step=True)
-        at = Mark((x, float(flux[round(x)])), "stripe")
+        at = ChartMark((x, float(flux[round(x)])), "stripe")
         panels.append(
             Panel(name, "pixel of the row", "photons an exposure", [series], x_log=False, y_log=False, marks=[at])
         )
@@ -118,7 +118,7 @@ def figure_4(scene: Scene) -> str:
             Series("expected", colour_of("likelihood"), _points(shown, expected), marker=False),
         ]
         title = f"{k} exposure{'s' * (k > 1)}"
-        mark = Mark((x, float(expected[round(x)])), "stripe")
+        mark = ChartMark((x, float(expected[round(x)])), "stripe")
         panels.append(
             Panel(title, "pixel of the row", "share of exposures", curves, x_log=False, y_log=False, marks=[mark])
         )
@@ -164,7 +164,7 @@ def figure_9(figures: Sequence[Figure]) -> str:
     """Error over map rate, and the share within 1 px: what speed costs."""
     here = [figure for figure in figures if figure.point == "report"]
     rates = {k: FRAME_RATE_HZ / (COLUMNS * k) for k in {figure.exposures for figure in here}}
-    marks = [Mark((20.0, 1.0), "report: 20 maps/s, < 1 px"), Mark((10.0, 0.1), "report: 0.1 px")]
+    marks = [ChartMark((20.0, 1.0), "report: 20 maps/s, < 1 px"), ChartMark((10.0, 0.1), "report: 0.1 px")]
 
     def curves(value: str) -> list[Series]:
         found = []

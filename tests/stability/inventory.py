@@ -1,6 +1,6 @@
 """Which public numeric functions there are, and by what each is held to its whole domain.
 
-A test says with `@covers("calibration.model.triangulation:depth")` whose domain it goes through; what needs no such
+A test says with `@covers("calibration.model.light_sheet:depth")` whose domain it goes through; what needs no such
 test is in `EXCUSED` with the reason. `test_inventory.py` fails where a function of `SCOPE` is in neither.
 """
 
@@ -25,7 +25,7 @@ SCOPE = (
     *(f"rig/{name}.py" for name in ("mirror_path", "path_search", "plan", "scan_plan", "scoring", "stripes", "sweeps")),
     *(f"rig/{name}.py" for name in ("calibration_reach", "frame_rates", "gate_pulses", "plan_figures", "waveform")),
     "rig/bent_light*.py",
-    "rig/windows.py",
+    "rig/plan/waveform.py",
     *(f"rig/{name}.py" for name in ("error_bounds", "limits", "row_light", "scene_limits")),
     "rig/fog_*.py",
     *(f"rig/{name}.py" for name in ("intervals", "multi_line*", "tradeoff_rows")),

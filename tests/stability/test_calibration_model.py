@@ -7,15 +7,13 @@ import numpy as np
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from calibration.depth.uncertainty import command_at, depth_jacobian, depth_sd_m, depth_uncertainty, explained
+from calibration.depth_error import command_at, depth_jacobian, depth_sd_m, depth_uncertainty, explained
 from calibration.errors import CalibrationError
 from calibration.model.camera import Camera
-from calibration.model.covariance import Covariance
-from calibration.model.light_sheet import fan_origin, light_sheets
+from calibration.model.light_sheet import NEARLY_PARALLEL, fan_origin, light_sheets
 from calibration.model.parameters import parameters, with_parameters
-from calibration.model.rig_model import Lag, RigModel
+from calibration.model.rig_model import Covariance, Lag, RigModel
 from calibration.model.scanner import PivotScanner, PlaneTable
-from calibration.model.triangulation import NEARLY_PARALLEL
 from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 
@@ -120,7 +118,7 @@ def test_changed_models_are_models_or_refused(changes) -> None:
     assert np.abs(np.linalg.norm(changed.planes([-1, 0, 1])[:, :3], axis=1) - 1).max() < 1e-12
 
 
-@covers("calibration.depth.uncertainty:*", "calibration.model.covariance:Covariance.of")
+@covers("calibration.depth_error:*", "calibration.model.rig_model:Covariance.of")
 @EXAMPLES
 @given(
     seed=st.integers(0, 10**6), scale=st.sampled_from([0.0, 1e-12, 1e-3, 1e3]), depth_m=st.floats(1e-3, 1e4),

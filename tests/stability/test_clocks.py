@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from drivers.clock import NS_PER_S, VirtualClock, ticks_to_ns
 from drivers.frames import frame_bytes, packed_row_bytes
-from drivers.replay_pace import Pace, ReplayClock
+from drivers.replay.pace import Pace, ReplayClock
 from drivers.units import DIMENSIONS, format_quantity, parse_exact, parse_quantity
-from rig.binding import FrameBinder
-from rig.marker_line import MarkerLine
+from rig.count.bind import FrameBinder
+from rig.count.blanking import MarkerLine
 from tests.stability.inventory import EXAMPLES, covers
-from tests.unit.rig.streams import plan_of, scan, stream_of
+from tests.unit.rig.count.streams import plan_of, scan, stream_of
 
 TWO_DAYS_S = 48 * 3600
 RATES = (
@@ -66,8 +66,8 @@ def test_virtual_time_never_runs_back_and_keeps_its_nanoseconds(start, steps, to
 
 
 @covers(
-    "drivers.replay_pace:Pace.speed", "drivers.replay_pace:Pace.most_frames", "drivers.replay_pace:Pace.wait",
-    "drivers.replay_pace:Pace.hold",
+    "drivers.replay.pace:Pace.speed", "drivers.replay.pace:Pace.most_frames", "drivers.replay.pace:Pace.wait",
+    "drivers.replay.pace:Pace.hold",
 )  # fmt: skip
 @EXAMPLES
 @given(
@@ -89,7 +89,7 @@ def test_a_replay_keeps_its_pace_after_any_time_of_running(uptime_s, speed, ahea
     assert 0 <= report.held_s <= min(late_s, held_s) + 1e-6
 
 
-@covers("drivers.replay_pace:Pace.wait")
+@covers("drivers.replay.pace:Pace.wait")
 def test_the_spread_of_lateness_is_not_lost_behind_its_mean(worst) -> None:
     clock = VirtualClock()
     pace = Pace(ReplayClock(1.0), clock)
@@ -129,7 +129,7 @@ def places(blocks, plan, t0_ticks=None):
     return columns, [clock for closed in clocks for clock in closed]
 
 
-@covers("rig.binding_kernels:walk", "drivers.frames:FrameBlock.*")
+@covers("rig.count.bind_kernels:walk", "drivers.frames:FrameBlock.*")
 @pytest.mark.parametrize("bidirectional", [False, True])
 def test_frames_are_bound_alike_in_the_first_second_and_after_two_days(bidirectional) -> None:
     plan = plan_of(scan(columns=24, exposures=5, bidirectional=bidirectional))
@@ -157,7 +157,7 @@ def test_frames_are_bound_alike_in_the_first_second_and_after_two_days(bidirecti
     assert moved[-1].start_ticks[-1] == blocks[-1].start_ticks[-1] + ticks
 
 
-@covers("rig.binding_kernels:walk")
+@covers("rig.count.bind_kernels:walk")
 def test_a_run_that_has_gone_on_for_two_days_still_places_its_frames(worst) -> None:
     """Frames of one run 48 hours after its first one: sweep numbers beyond 2^16, units of time beyond 2^52."""
     plan = plan_of(scan(columns=24, exposures=5))
@@ -190,7 +190,7 @@ def test_a_run_that_has_gone_on_for_two_days_still_places_its_frames(worst) -> N
     worst("column of a frame after 48 hours", "first second", late[2][on] - early[2][on], 1e-9)
 
 
-@covers("rig.marker_line:MarkerLine.fit", "rig.marker_line:MarkerLine.add")
+@covers("rig.count.blanking:MarkerLine.fit", "rig.count.blanking:MarkerLine.add")
 def test_the_line_of_two_days_of_markers_is_exact(worst) -> None:
     line, period = MarkerLine(), 5500.123456789
     index = np.concatenate([np.arange(20), np.arange(3_000_000, 3_000_020)])

@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rig.estimators import ESTIMATORS, create_estimator
-from rig.estimators.median import median_filter
-from rig.geometry import uncalibrated_geometry
+from rig.estimate.median import median_filter
+from rig.estimate.registry import ESTIMATORS, create_estimator
+from rig.geometry.windows import uncalibrated_geometry
 from tests.reference.geometry import Geometry
 from tests.unit.small_maps import RIGS, geometry_of, simulated, volume_of
 

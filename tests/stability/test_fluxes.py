@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.estimators.learning import flux
-from rig.estimators.peak_kernels import _flux, peak_confidence, sub_pixel
-from rig.estimators.row_kernels import (
+from rig.estimate.argmax_edge import _flux, peak_confidence, sub_pixel
+from rig.estimate.row.em import flux
+from rig.estimate.row.likelihood import (
     CELL_BITS,
     EXPONENT_HIGH,
     EXPONENT_LOW,
@@ -22,8 +22,8 @@ from rig.estimators.row_kernels import (
     row_posterior,
     row_scores,
 )
-from rig.estimators.row_model import EXTINCTION_MAX_PER_M, fine_profiles, fit_haze, line_profile, stripe_scale
-from rig.estimators.search_desk import EXPOSURE_PARTS, count_fluxes
+from rig.estimate.row.model import EXTINCTION_MAX_PER_M, fine_profiles, fit_haze, line_profile, stripe_scale
+from rig.estimate.search.inputs import EXPOSURE_PARTS, count_fluxes
 from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 
@@ -35,7 +35,7 @@ def exact_flux(n, k):
     return mpmath.log((k + mpmath.mpf("0.5")) / (k - n + mpmath.mpf("0.5")))
 
 
-@covers("rig.estimators.learning:flux", "rig.estimators.search_desk:count_fluxes")
+@covers("rig.estimate.row.em:flux", "rig.estimate.search.inputs:count_fluxes")
 def test_fluxes_of_counts_are_exact_from_no_counts_to_all_ones(worst) -> None:
     for k in EXPOSURES:
         n = np.unique(np.round(np.concatenate([[0, 1, k - 1, k], np.geomspace(1, k, 25)])))
@@ -54,7 +54,7 @@ def test_fluxes_of_counts_are_exact_from_no_counts_to_all_ones(worst) -> None:
     )
 
 
-@covers("rig.estimators.row_kernels:logit_table", "rig.estimators.row_kernels:cell_of")
+@covers("rig.estimate.row.likelihood:logit_table", "rig.estimate.row.likelihood:cell_of")
 def test_what_a_count_says_is_exact_at_every_flux(worst) -> None:
     """p' lies within floor / 2 of 0 and of 1 at the ends: neither logarithm may cancel."""
     cells = np.unique(np.linspace(0, TABLE.shape[1] - 1, 300).astype(int))
@@ -91,7 +91,7 @@ def sums(length: int, k: int, seed: int = 1):
     return edge, np.concatenate([[0], np.cumsum(taps[0].astype(float) - taps[1].astype(float))]), taps, score
 
 
-@covers("rig.estimators.row_kernels:row_scores", "rig.estimators.row_kernels:add_evidence")
+@covers("rig.estimate.row.likelihood:row_scores", "rig.estimate.row.likelihood:add_evidence")
 @pytest.mark.parametrize("length", [512, 100_000])
 def test_sums_along_a_row_are_as_good_as_in_float64(length, worst) -> None:
     for k in (1, 10, 10**6):
@@ -102,9 +102,9 @@ def test_sums_along_a_row_are_as_good_as_in_float64(length, worst) -> None:
 
 
 @covers(
-    "rig.estimators.row_kernels:row_posterior",
-    "rig.estimators.row_kernels:none_prior",
-    "rig.estimators.row_kernels:mode_of",
+    "rig.estimate.row.likelihood:row_posterior",
+    "rig.estimate.row.likelihood:none_prior",
+    "rig.estimate.row.likelihood:mode_of",
 )
 @EXAMPLES
 @given(
@@ -145,7 +145,7 @@ def test_posteriors_are_probabilities_for_any_counts(k, level, length, light, di
 ROW = st.lists(st.integers(0, 1000), min_size=1, max_size=40)
 
 
-@covers("rig.estimators.peak_kernels:sub_pixel")
+@covers("rig.estimate.argmax_edge:sub_pixel")
 @EXAMPLES
 @given(row=ROW, at=st.integers(0, 39), scale=st.sampled_from([1.0, 2.0**-40, 2.0**40]))
 def test_sub_pixel_offsets_stay_in_the_pixel_and_turn_round_with_the_row(row, at, scale) -> None:
@@ -158,7 +158,7 @@ def test_sub_pixel_offsets_stay_in_the_pixel_and_turn_round_with_the_row(row, at
         assert offset == 0
 
 
-@covers("rig.estimators.peak_kernels:sub_pixel")
+@covers("rig.estimate.argmax_edge:sub_pixel")
 def test_flat_tops_have_the_offset_of_their_middle() -> None:
     assert sub_pixel(np.array([2.0, 5, 5, 2]), 1, 4) == 0.5
     assert sub_pixel(np.array([2.0, 5, 5, 2]), 2, 4) == -0.5
@@ -167,7 +167,7 @@ def test_flat_tops_have_the_offset_of_their_middle() -> None:
     assert sub_pixel(np.array([1.0, 1e6, 1]), 1, 3) == 0
 
 
-@covers("rig.estimators.peak_kernels:peak_confidence")
+@covers("rig.estimate.argmax_edge:peak_confidence")
 def test_confidence_of_a_peak_is_exact_up_to_a_million_exposures(worst) -> None:
     def exact(peak, rest, k, length):
         half = mpmath.mpf("0.5")
@@ -199,7 +199,7 @@ def test_confidence_of_a_peak_is_exact_up_to_a_million_exposures(worst) -> None:
                 )
 
 
-@covers("rig.estimators.peak_kernels:peak_confidence")
+@covers("rig.estimate.argmax_edge:peak_confidence")
 @EXAMPLES
 @given(row=ROW, at=st.integers(0, 39), more=st.integers(0, 10**6))
 def test_confidences_are_probabilities(row, at, more) -> None:
@@ -209,7 +209,7 @@ def test_confidences_are_probabilities(row, at, more) -> None:
     assert rest >= 0
 
 
-@covers("rig.estimators.row_model:fit_haze")
+@covers("rig.estimate.row.model:fit_haze")
 @EXAMPLES
 @given(
     near=st.floats(0.05, 2000), ratio=st.floats(1.01, 50), extinction=st.floats(0, 50), level=st.floats(1e-12, 1e3),
@@ -225,7 +225,7 @@ def test_haze_of_any_density_and_distance_has_a_finite_fit_or_none(near, ratio, 
         assert fit.extinction_sd_per_m >= 0
 
 
-@covers("rig.estimators.row_model:fit_haze")
+@covers("rig.estimate.row.model:fit_haze")
 @pytest.mark.parametrize("extinction", [0.0, 1e-3, 0.13, 4.0])
 def test_noise_free_haze_gives_its_extinction_back(extinction, worst) -> None:
     path = np.linspace(0.8, 9, 64)
@@ -235,7 +235,7 @@ def test_noise_free_haze_gives_its_extinction_back(extinction, worst) -> None:
     worst("extinction of noise-free haze, 0 to 4 /m", "exact", fit.extinction_per_m - extinction, 1e-6)
 
 
-@covers("rig.estimators.row_model:stripe_scale", "rig.estimators.row_model:RowModel.path_m")
+@covers("rig.estimate.row.model:stripe_scale", "rig.estimate.row.model:RowModel.path_m")
 @EXAMPLES
 @given(near=st.floats(1e-3, 1e3), ratio=st.floats(1.0, 1e4), extinction=st.floats(0, 50))
 def test_stripe_scales_are_finite_and_fall_with_distance(near, ratio, extinction) -> None:
@@ -244,7 +244,7 @@ def test_stripe_scales_are_finite_and_fall_with_distance(near, ratio, extinction
     assert np.all(np.diff(scale) <= 0)
 
 
-@covers("rig.estimators.row_model:line_profile", "rig.estimators.row_model:fine_profiles")
+@covers("rig.estimate.row.model:line_profile", "rig.estimate.row.model:fine_profiles")
 @pytest.mark.parametrize("sigma_px", [0.05, 0.25, 0.6, 2.4])
 def test_line_profiles_are_exact_and_whole(sigma_px, worst) -> None:
     def share(distance, sigma):

@@ -6,66 +6,69 @@ from tests.stability.inventory import ROOT, covered, public_functions
 
 ELSEWHERE = {
     "exact whole numbers, against unpacked sums": (
-        "tests/unit/rig/test_counting_kernels.py", "rig.counting_kernels:*",
+        "tests/unit/rig/count/test_kernels.py", "rig.count.kernels:*",
     ),
-    "columns from the frame number, exactly": ("tests/unit/rig/test_cube.py", "rig.cube:*"),
+    "columns from the frame number, exactly": ("tests/unit/rig/count/test_cube.py", "rig.recording.cube:*"),
     "what a sweep is made of, frame by frame": (
-        "tests/unit/rig/test_binding.py", "rig.binding_kernels:cover", "rig.sweeps:*",
+        "tests/unit/rig/count/test_bind.py", "rig.count.bind_kernels:cover", "rig.count.sweeps:*",
     ),
     "places and numbers that the light gives, with the patterns of test_plans.py": (
-        "tests/unit/rig/test_blanking.py", "rig.blanking_sync:*",
+        "tests/unit/rig/count/test_blanking.py", "rig.count.blanking:*",
     ),
-    "asks the search of test_plans.py again": ("tests/unit/rig/test_plan.py", "rig.path_search:remedy"),
+    "asks the search of test_plans.py again": ("tests/unit/rig/plan/test_compile.py", "rig.plan.mirror_path:remedy"),
     "whole-number tables and lanes of the compiled search; its answers for any counts in test_estimators.py": (
-        "tests/unit/estimators/test_search.py", "rig.estimators.best_kernels:*", "rig.estimators.row_search:*",
-        "rig.estimators.screen_tables:*", "rig.estimators.search_*:*", "rig.estimators.judging:*",
-        "rig.estimators.volume_search:*",
+        "tests/unit/rig/estimate/search/test_rows.py", "rig.estimate.search.scores:*", "rig.estimate.search.rows:*",
+        "rig.estimate.search.tables:*", "rig.estimate.registry.search_*:*", "rig.estimate.search.prepare:*",
+        "rig.estimate.search.stream:*",
     ),
     "rows of a simulated scene, whose light test_light.py holds": (
-        "tests/unit/rig/test_scene_limits.py", "rig.scene_limits:*",
+        "tests/unit/rig/tradeoff/test_scene_limits.py", "rig.tradeoff.row_light:*",
     ),
     "labels around the best position, against the likelihood itself": (
-        "tests/unit/estimators/test_closeup.py", "rig.estimators.closeup_kernels:*",
+        "tests/unit/rig/estimate/search/test_closeup.py", "rig.estimate.search.closeup:*",
     ),
     "bytes that stop at 255, against whole numbers": (
-        "tests/unit/estimators/test_aggregation.py", "rig.estimators.aggregation_*:*",
+        "tests/unit/rig/estimate/joint/test_paths.py", "rig.estimate.registry.aggregation_*:*",
     ),
     "costs of labels against log-likelihoods; any rays and windows in test_estimators.py": (
-        "tests/unit/estimators/test_label_volume.py", "rig.estimators.label_places:*", "rig.estimators.label_tables:*",
-        "rig.estimators.label_volume*:*",
+        "tests/unit/rig/estimate/joint/test_label_volume.py", "rig.estimate.joint.labels.grid:*",
+        "rig.estimate.joint.labels.tables:*",
+        "rig.estimate.joint.labels.costs*:*",
     ),
     "light around the stripe, against costs written out": (
-        "tests/unit/estimators/test_halo.py", "rig.estimators.halo*:*",
+        "tests/unit/rig/estimate/joint/test_halo.py", "rig.estimate.row.inputs*:*",
     ),
     "answers of whole maps; those to any counts in test_estimators.py": (
-        "tests/unit/estimators/test_joint.py", "rig.estimators.joint_*:*",
+        "tests/unit/rig/estimate/joint/test_joint.py", "rig.estimate.registry.joint_*:*",
     ),
     "trust of any light, margin and sd": (
-        "tests/unit/estimators/test_joint_teaching.py", "rig.estimators.joint_teaching:*",
+        "tests/unit/rig/estimate/joint/test_lesson.py", "rig.estimate.joint.lesson:*",
     ),
     "places pooled over walls and neighbours; those of any counts in test_estimators.py": (
-        "tests/unit/estimators/test_placing.py", "rig.estimators.placing*:*",
+        "tests/unit/rig/estimate/joint/test_place.py", "rig.estimate.joint.place.place*:*",
     ),
-    "which maps teach": ("tests/unit/estimators/test_lessons.py", "rig.estimators.lessons:*"),
-    "what the last map says": ("tests/unit/estimators/test_temporal.py", "rig.estimators.temporal:*"),
+    "which maps teach": ("tests/unit/rig/estimate/search/test_online_learning.py",
+    "rig.estimate.search.online_learning:*"),
+    "what the last map says": ("tests/unit/rig/estimate/joint/test_temporal.py", "rig.estimate.joint.temporal:*"),
     "columns of several lines, counted as of each alone": (
-        "tests/unit/rig/test_multi_line.py", "rig.multi_line:*", "rig.multi_line_counter:*", "rig.multi_line_kernels:*",
+        "tests/unit/rig/count/test_line_counter.py", "rig.geometry.line_grid:*", "rig.count.line_counter:*",
+        "rig.count.line_counter:*",
     ),
     "what a link carries, and what is said of a scan that asks for more": (
-        "tests/unit/rig/test_windows.py", "rig.frame_rates:*",
+        "tests/unit/rig/plan/test_moving_windows.py", "rig.plan.describe:*",
     ),
     "which calibrations a plan refuses; those of any speed in test_plans.py": (
-        "tests/unit/rig/test_plan.py", "rig.calibration_reach:model_problems",
+        "tests/unit/rig/plan/test_compile.py", "rig.plan.calibration_reach:model_problems",
     ),
-    "lines by the number, as the config says": ("tests/unit/rig/test_multi_line_config.py", "rig.multi_line_config:*"),
+    "lines by the number, as the config says": ("tests/unit/rig/config/test_models.py", "rig.config.models:*"),
     "sheets, in one kernel; those of any numbers in test_calibration_model.py": (
-        "tests/unit/rig/test_bent_light.py", "rig.bent_light:*", "rig.bent_light_kernels:*",
+        "tests/unit/rig/geometry/test_bent_light.py", "rig.geometry.bent_light:*", "rig.geometry.kernels:*",
     ),
     "boards, their drawings and corners; pictures of anything in test_calibration_data.py": (
         "tests/unit/calibration/test_detection.py", "calibration.board.*:*", "calibration.views:*",
     ),
     "steps of the camera's fit; whole fits of any views in test_calibration_data.py": (
-        "tests/unit/calibration/test_camera_fit.py", "calibration.camera_fit.*:*", "calibration.judging.camera:*",
+        "tests/unit/calibration/test_camera_fit.py", "calibration.camera_fit.*:*", "calibration.diagnosis.camera:*",
     ),
     "steps from counts to passages; any counts in test_calibration_data.py": (
         "tests/unit/calibration/test_passages.py", "calibration.passages.*:*", "calibration.sync.shared_pixels:*",
@@ -77,58 +80,58 @@ ELSEWHERE = {
         "tests/unit/calibration/test_sync_fit.py", "calibration.sync.lag_fit:*", "calibration.sync.gate_fit:*",
     ),
     "which lags sweeps tell, against sweeps and fits of them": (
-        "tests/unit/calibration/test_lags.py", "calibration.model.lag_speeds:*", "calibration.judging.lags:*",
+        "tests/unit/calibration/test_lags.py", "calibration.model.parameters:*", "calibration.diagnosis.rules:*",
         "calibration.sync.transfer:*",
     ),
     "boards at known places, scanned": (
-        "tests/unit/calibration/test_check_fit.py", "calibration.check.*:*", "calibration.judging.check:*",
-        "calibration.depth.propagation:*",
+        "tests/unit/calibration/test_check_fit.py", "calibration.check.*:*", "calibration.diagnosis.camera:*",
+        "calibration.depth_error:*",
     ),
     "mistakes made on purpose, each by its own number": (
-        "tests/unit/calibration/test_verdict.py", "calibration.judging.data_lack:*", "calibration.verdict:*",
-        "calibration.judging.evidence:*", "calibration.judging.rig:*", "calibration.judging.view_shifts:*",
-        "calibration.depth.sensitivity:*", "calibration.depth.against_truth:*",
+        "tests/unit/calibration/test_verdict.py", "calibration.diagnosis.evidence:*", "calibration.verdict:*",
+        "calibration.diagnosis.evidence:*", "calibration.diagnosis.rig:*", "calibration.diagnosis.view_shifts:*",
+        "calibration.depth_error:*", "calibration.depth_error:*",
     ),
-    "poses to show next": ("tests/unit/calibration/test_guide.py", "calibration.guide.poses:*"),
+    "poses to show next": ("tests/unit/calibration/test_guide.py", "calibration.guide:*"),
     "rates drawn from a measured distribution": (
-        "tests/unit/calibration/test_pixels.py", "calibration.pixels.pixel_map:*", "calibration.pixels.dark_tally:*",
-        "calibration.robust:*",
+        "tests/unit/calibration/test_pixels.py", "calibration.pixel_map:*", "calibration.pixel_map:*",
+        "calibration.views:*",
     ),
-    "numbers in words": ("tests/unit/calibration/test_digits.py", "calibration.digits:*"),
+    "numbers in words": ("tests/unit/calibration/test_digits.py", "calibration.errors:*"),
     "words of a file": ("tests/unit/calibration/test_model_files.py", "calibration.files.*:*"),
     "rays and surfaces put together; their light in test_light.py": (
-        "tests/unit/sim/test_scene.py", "sim_backend.view:make_view",
+        "tests/unit/sim/test_scene.py", "sim_backend.light.view:make_view",
     ),
-    "intervals against drawn repeats": ("tests/unit/rig/test_intervals.py", "rig.intervals:*"),
-    "a missing answer's charge": ("tests/unit/rig/test_tradeoff.py", "rig.tradeoff_rows:*"),
-    "powers of two off the bits of a number": ("tests/unit/estimators/test_powers.py", "rig.estimators.powers:*"),
+    "intervals against drawn repeats": ("tests/unit/rig/tradeoff/test_intervals.py", "rig.tradeoff.rows:*"),
+    "a missing answer's charge": ("tests/unit/rig/tradeoff/test_tradeoff.py", "rig.tradeoff.rows:*"),
+    "powers of two off the bits of a number": ("tests/unit/rig/simd/test_powers.py", "rig.simd.functions:*"),
     "the search, column by column: the same bits": (
-        "tests/unit/estimators/test_stream.py", "rig.estimators.stream*:*", "rig.estimators.likelihood:*",
+        "tests/unit/rig/estimate/search/test_stream.py", "rig.estimate.search.stream*:*", "rig.estimate.likelihood:*",
     ),
     "which lines are read and how they are weighted": (
-        "tests/unit/estimators/test_learning.py", "rig.estimators.learning:*",
-        "rig.estimators.likelihood_kernels:*", "rig.estimators.row_model:RowModel.*",
+        "tests/unit/rig/estimate/row/test_em.py", "rig.estimate.row.em:*",
+        "rig.estimate.row.em_kernels:*", "rig.estimate.row.model:RowModel.*",
     ),
     "rows as the kernels read them; any rays and windows in test_estimators.py": (
-        "tests/stability/test_estimators.py", "rig.estimators.row_input:*", "rig.estimators:*",
-        "rig.estimators.second_return*:*",
+        "tests/stability/test_estimators.py", "rig.estimate.row.inputs:*", "rig.estimate.registry:*",
+        "rig.estimate.joint.second_returns*:*",
     ),
-    "against 50 digits, for kernels only": ("tests/stability/test_photon_bits.py", "sim_backend.exponential:*"),
+    "against 50 digits, for kernels only": ("tests/stability/test_photon_bits.py", "sim_backend.random_numbers:*"),
     "statistics of the bits": (
-        "tests/unit/sim/test_photons.py", "sim_backend.photon_kernels:*", "sim_backend.photons:*",
+        "tests/unit/sim/test_photons.py", "sim_backend.frames.photon_kernels:*", "sim_backend.frames.photons:*",
     ),
     "what a scene file says, validated with units": (
-        "tests/unit/sim/test_scene.py", "sim_backend.scene:*", "sim_backend.medium:Medium.*",
+        "tests/unit/sim/test_scene.py", "sim_backend.scenes.scene:*", "sim_backend.scenes.medium:Medium.*",
     ),
     "sizes and speeds of drops and flakes, against their sources": (
-        "tests/unit/sim/test_weather.py", "sim_backend.weather:*",
+        "tests/unit/sim/test_weather.py", "sim_backend.scenes.medium:*",
     ),
     "particles, one by one; any scene's light in test_light.py": (
         "tests/unit/sim/test_particles.py", "sim_backend.effects.particle*:*",
     ),
     "surfaces that move": ("tests/unit/sim/test_motion.py", "sim_backend.effects.motion:*"),
     "grains": ("tests/unit/sim/test_speckle.py", "sim_backend.effects.speckle:*"),
-    "widths of the line": ("tests/unit/sim/test_line_width.py", "sim_backend.line_width:*"),
+    "widths of the line": ("tests/unit/sim/test_line_width.py", "sim_backend.light.line:*"),
     "light of the row and its spread; closed forms in test_light.py": (
         "tests/unit/sim/test_stripe.py", "sim_backend.effects.stripe:*",
     ),
@@ -141,7 +144,7 @@ ELSEWHERE = {
         "sim_backend.effects.setting:*",
     ),
     "waits on the host's clock": (
-        "tests/unit/drivers/test_clock.py", "drivers.clock:SystemClock.*", "drivers.replay_pace:Pace.wait_for_step",
+        "tests/unit/drivers/test_clock.py", "drivers.clock:SystemClock.*", "drivers.replay.pace:Pace.wait_for_step",
     ),
 }  # fmt: skip
 """Why a function has no test here: the test that holds it, then the functions."""

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
 from calibration.errors import CalibrationError
-from calibration.model.camera import Camera
-from calibration.model.distortion import TERM_COUNTS, LensModel
+from calibration.model.camera import TERM_COUNTS, Camera, LensModel
 from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 
@@ -51,7 +50,7 @@ def first_fold(k1: float, k2: float, k3: float, k4: float, k5: float, k6: float)
     return float(np.sqrt(real.min(initial=np.inf)))
 
 
-@covers("calibration.model.distortion:LensModel.valid", "calibration.model.distortion:LensModel.distort")
+@covers("calibration.model.camera:LensModel.valid", "calibration.model.camera:LensModel.distort")
 @EXAMPLES
 @given(radial=RADIAL)
 def test_past_the_first_fold_nothing_is_seen(radial) -> None:
@@ -67,7 +66,7 @@ def test_past_the_first_fold_nothing_is_seen(radial) -> None:
     np.testing.assert_array_equal(np.isfinite(x) & np.isfinite(y), r < fold)
 
 
-@covers("calibration.model.distortion:LensModel.undistort", "calibration.model.distortion:LensModel.distort")
+@covers("calibration.model.camera:LensModel.undistort", "calibration.model.camera:LensModel.distort")
 @EXAMPLES
 @given(terms=LENS)
 def test_what_is_seen_leads_back_to_its_ray(terms) -> None:
@@ -93,8 +92,8 @@ def test_what_is_seen_leads_back_to_its_ray(terms) -> None:
 @covers(
     "calibration.model.camera:Camera.tangents", "calibration.model.camera:Camera.tangents_at",
     "calibration.model.camera:Camera.project", "calibration.model.camera:Camera.tangent_slopes",
-    "calibration.model.distortion:LensModel.undistort_slope",
-    "calibration.model.distortion:LensModel.forward", "calibration.model.distortion:Forward.determinant",
+    "calibration.model.camera:LensModel.undistort_slope",
+    "calibration.model.camera:LensModel.forward", "calibration.model.camera:Forward.determinant",
 )  # fmt: skip
 @EXAMPLES
 @given(
@@ -115,7 +114,7 @@ def test_cameras_of_any_numbers_see_a_finite_ray_or_none(terms, count, focal, x,
     assert np.isnan(pairs[2][0][1])  # behind the camera
 
 
-@covers("calibration.model.distortion:LensModel.forward", "calibration.model.distortion:LensModel.undistort")
+@covers("calibration.model.camera:LensModel.forward", "calibration.model.camera:LensModel.undistort")
 @pytest.mark.parametrize(
     "terms",
     [[-0.35, 0.1, 0.001, -0.002, 0.01], [-0.3, 0.1, 0.001, 0.001, 0, 0.1, 0.1, 0, 0.01, 0.02, -0.01, 0.01]],

@@ -12,23 +12,24 @@ from calibration.errors import CalibrationError
 from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
-from rig.counting import BIN_DARK, CountVolume, SweepCounter, SweepLayout, SweepTally
-from rig.depth import depth_map
+from rig.count.volume import BIN_DARK, CountVolume, SweepCounter, SweepLayout, SweepTally
+from rig.depth.depth import depth_map
 from rig.errors import UsageError
-from rig.estimators import ESTIMATORS, create_estimator
-from rig.estimators.ambient import ambient_map, hot_pixels
-from rig.estimators.median import median_filter
-from rig.geometry import sweep_geometry, uncalibrated_geometry
-from rig.row_threads import RowWorkers
-from rig.scoring import MISSING_PX, charged_errors, depth_errors, stripe_errors
-from rig.stripes import StripeTable
+from rig.estimate.median import median_filter
+from rig.estimate.registry import ESTIMATORS, create_estimator
+from rig.estimate.row.ambient import ambient_map, hot_pixels
+from rig.geometry.stripe_table import MISSING_PX, StripeTable, charged_errors, depth_errors, stripe_errors
+from rig.geometry.windows import sweep_geometry, uncalibrated_geometry
+from rig.threads import RowWorkers
 from tests.stability.inventory import EXAMPLES, covers
 from tests.unit.small_maps import rows_of, simulated, volume_of
 
 NAN = st.just(np.nan)
 
 
-@covers("rig.geometry:sweep_geometry", "rig.geometry:SweepGeometry.*", "rig.geometry_kernels:row_windows")
+@covers(
+    "rig.geometry.windows:sweep_geometry", "rig.geometry.windows:SweepGeometry.*", "rig.geometry.kernels:row_windows"
+)
 @EXAMPLES
 @given(
     focal=st.sampled_from([1.0, 60.0, 6e4]), k1=st.sampled_from([-2.0, -0.3, 0.0, 0.5]), width=st.integers(1, 130),
@@ -62,7 +63,7 @@ def test_windows_hold_what_lies_in_the_depth_range_and_nothing_else(
     assert np.all(w[inside] >= (1 / (near * ratio) - slack)[inside])
 
 
-@covers("rig.geometry:uncalibrated_geometry")
+@covers("rig.geometry.windows:uncalibrated_geometry")
 @EXAMPLES
 @given(rows=st.integers(1, 4), width=st.integers(1, 200), columns=st.integers(1, 4))
 def test_without_a_model_the_whole_row_is_searched(rows, width, columns) -> None:
@@ -73,10 +74,10 @@ def test_without_a_model_the_whole_row_is_searched(rows, width, columns) -> None
 
 
 @covers(
-    "rig.depth:depth_map",
-    "rig.depth_kernels:fill_rows",
-    "rig.stripes:StripeTable.*",
-    "rig.estimators.median:median_filter",
+    "rig.depth.depth:depth_map",
+    "rig.depth.kernels:fill_rows",
+    "rig.geometry.stripe_table:StripeTable.*",
+    "rig.estimate.median:median_filter",
 )
 @EXAMPLES
 @given(
@@ -106,7 +107,11 @@ def test_depth_lies_in_the_depth_range_or_there_is_none(seed, spread, missing, s
     assert np.isnan(depth_map(empty, geometry, 0.5)).all()
 
 
-@covers("rig.scoring:stripe_errors", "rig.scoring:depth_errors", "rig.scoring:charged_errors")
+@covers(
+    "rig.geometry.stripe_table:stripe_errors",
+    "rig.geometry.stripe_table:depth_errors",
+    "rig.geometry.stripe_table:charged_errors",
+)
 @EXAMPLES
 @given(
     x=st.lists(st.floats(-(2.0**99), 2.0**99, width=32) | NAN, min_size=4, max_size=4),
@@ -125,8 +130,8 @@ def test_scores_are_numbers_or_none(x, true) -> None:
 
 
 @covers(
-    "rig.counting:SweepCounter.*", "rig.counting:SweepTally.*", "rig.counting:SweepLayout.*",
-    "rig.counting:FrameTally.*", "rig.counting:CountVolume.*", "rig.counting:with_room",
+    "rig.count.volume:SweepCounter.*", "rig.count.volume:SweepTally.*", "rig.count.volume:SweepLayout.*",
+    "rig.count.volume:FrameTally.*", "rig.count.volume:CountVolume.*", "rig.count.volume:with_room",
 )  # fmt: skip
 def test_a_million_exposures_are_counted_to_the_last_one(worst) -> None:
     layout = SweepLayout(columns=2, rows=1, width=64, x0=np.zeros(2, np.int32), window=64, exposures=10**6)
@@ -154,7 +159,7 @@ def test_a_million_exposures_are_counted_to_the_last_one(worst) -> None:
     assert list(nothing.bound_column()) == [0, 1]
 
 
-@covers("rig.estimators.ambient:ambient_map", "rig.estimators.ambient:hot_pixels")
+@covers("rig.estimate.row.ambient:ambient_map", "rig.estimate.row.ambient:hot_pixels")
 @EXAMPLES
 @given(
     k=st.sampled_from([1, 10, 10**6]), level=st.sampled_from([0.0, 1e-6, 0.3, 1.0]),
@@ -183,7 +188,7 @@ def test_ambient_light_is_a_finite_flux_for_any_counts(k, level, n_dark, dark, q
 EVERY = pytest.mark.parametrize("name", ESTIMATORS)
 
 
-@covers("rig.estimators.peak_kernels:peak_rows")
+@covers("rig.estimate.argmax_edge:peak_rows")
 @EVERY
 @pytest.mark.parametrize("level", [0, 1])
 def test_a_million_exposures_of_nothing_or_all_ones(name, level) -> None:

@@ -13,19 +13,18 @@ from hypothesis import strategies as st
 
 from calibration import CalibrationError, RigModel
 from drivers.interfaces import LEVEL_BACKWARD, ScanWaveform
-from drivers.mirror_ramps import brake, ramp
-from rig.blanking_search import PatternSearch, PatternShape, detection_probability
-from rig.calibration_reach import require_speed
+from drivers.scanners.galvo import brake, ramp
+from rig.count.blanking import PatternSearch, PatternShape, detection_probability
 from rig.errors import PlanError
-from rig.gate_pulses import sync_program
-from rig.mirror_path import Motion, mirrored, sweep_path
-from rig.path_search import narrowed
-from rig.plan_figures import rounded
-from rig.scan_plan import ScanPlan
+from rig.plan.calibration_reach import require_speed
+from rig.plan.describe import rounded
+from rig.plan.gate_pulses import sync_program
+from rig.plan.mirror_path import MirrorLimits, mirrored, narrowed, sweep_path
+from rig.plan.scan_plan import ScanPlan
 from sim_backend.mirror_motion import Playing, Resting
 from tests.stability.inventory import EXAMPLES, covers
-from tests.unit.rig.light import blanked_plan
-from tests.unit.rig.streams import plan_of, scan, scanner_limits
+from tests.unit.rig.count.light import blanked_plan
+from tests.unit.rig.count.streams import plan_of, scan, scanner_limits
 
 COMMAND = st.floats(-1, 1)
 LIMITS = st.builds(
@@ -35,7 +34,7 @@ LIMITS = st.builds(
 RATE = st.floats(1e3, 1e5)
 
 
-@covers("drivers.mirror_ramps:ramp")
+@covers("drivers.scanners.galvo:ramp")
 @EXAMPLES
 @given(start=COMMAND, end=COMMAND, limits=LIMITS, rate=RATE)
 def test_ramps_end_where_they_should_within_limits(start, end, limits, rate) -> None:
@@ -50,7 +49,7 @@ def test_ramps_end_where_they_should_within_limits(start, end, limits, rate) -> 
     assert np.all(steps * np.sign(end - start) >= -1e-15)
 
 
-@covers("drivers.mirror_ramps:brake")
+@covers("drivers.scanners.galvo:brake")
 @EXAMPLES
 @given(at=COMMAND, velocity=st.floats(-1e5, 1e5) | st.sampled_from([0.0, 5e-324, -1e-300]), limits=LIMITS, rate=RATE)
 def test_brakes_come_to_rest_inside_the_range(at, velocity, limits, rate) -> None:
@@ -63,8 +62,9 @@ def test_brakes_come_to_rest_inside_the_range(at, velocity, limits, rate) -> Non
 
 
 @covers(
-    "rig.mirror_path:Segment.command", "rig.mirror_path:SweepPath.command",
-    "rig.mirror_path:SweepPath.rms_acceleration", "rig.mirror_path:Motion.*", "rig.mirror_path:sweep_path",
+    "rig.plan.mirror_path:Segment.command", "rig.plan.mirror_path:SweepPath.command",
+    "rig.plan.mirror_path:SweepPath.rms_acceleration", "rig.plan.mirror_path:Motion.*",
+    "rig.plan.mirror_path:sweep_path",
 )  # fmt: skip
 @EXAMPLES
 @given(
@@ -76,7 +76,9 @@ def test_sweeps_are_smooth_and_lit_at_constant_velocity(
     edges, lit_s, margin, velocity, acceleration, rate, fly_back, least
 ) -> None:
     assume(abs(edges[1] - edges[0]) > 1e-9)
-    path = sweep_path(edges, lit_s, margin, Motion(velocity, acceleration, rate), fly_back=fly_back, least_points=least)
+    path = sweep_path(
+        edges, lit_s, margin, MirrorLimits(velocity, acceleration, rate), fly_back=fly_back, least_points=least
+    )
     for way in (path, mirrored(path)):
         command = way.command(np.arange(way.points, dtype=float))
         span = way.high - way.low
@@ -90,7 +92,7 @@ def test_sweeps_are_smooth_and_lit_at_constant_velocity(
     assert np.isfinite(path.rms_acceleration)
 
 
-@covers("rig.path_search:narrowed")
+@covers("rig.plan.mirror_path:narrowed")
 @EXAMPLES
 @given(edges=st.tuples(COMMAND, COMMAND), share=st.floats(0, 1), low=COMMAND, high=COMMAND)
 def test_narrowed_ranges_lie_inside_the_scanner_s(edges, share, low, high) -> None:
@@ -121,7 +123,7 @@ def plans(draw):
         raise
 
 
-@covers("rig.calibration_reach:require_speed")
+@covers("rig.plan.calibration_reach:require_speed")
 @EXAMPLES
 @given(
     speed=st.floats(0, 1e6), ends=st.lists(st.floats(0, 1e6), min_size=2, max_size=2), exposures=st.integers(1, 10**6)
@@ -142,15 +144,15 @@ def test_a_speed_that_was_not_calibrated_comes_with_exposures_that_can_be_scanne
 
 
 @covers(
-    "rig.scan_plan:ScanPlan.*",
-    "rig.scan_plan:column_command",
-    "rig.path_search:PathDemand.*",
-    "rig.path_search:find_path",
-    "rig.gate_pulses:sync_program",
-    "rig.plan:compile_plan",
-    "rig.plan:path_demand",
-    "rig.waveform:*",
-    "rig.windows:window_widths",
+    "rig.plan.scan_plan:ScanPlan.*",
+    "rig.plan.scan_plan:column_command",
+    "rig.plan.mirror_path:PathDemand.*",
+    "rig.plan.mirror_path:find_path",
+    "rig.plan.gate_pulses:sync_program",
+    "rig.plan.compile:compile_plan",
+    "rig.plan.compile:path_demand",
+    "rig.plan.waveform:*",
+    "rig.plan.waveform:window_widths",
 )
 @EXAMPLES
 @given(plan=plans())
@@ -184,14 +186,14 @@ def test_plans_are_exact_in_time_and_finite_in_all_their_figures(plan) -> None:
     assert not plan.window_x0(np.zeros(2, np.uint32), np.zeros(2, np.int64), np.array([-1, 0])).any() or plan.windows
 
 
-@covers("rig.plan_figures:rounded")
+@covers("rig.plan.describe:rounded")
 @EXAMPLES
 @given(value=st.floats(1e-12, 1e12))
 def test_figures_for_people_keep_four_digits(value) -> None:
     assert float(rounded(value)) == pytest.approx(value, rel=1e-3)
 
 
-@covers("rig.blanking:Blanking.*", "rig.blanking:blanking_for", "rig.windows:moving_windows")
+@covers("rig.plan.scan_plan:Blanking.*", "rig.plan.scan_plan:blanking_for", "rig.plan.waveform:moving_windows")
 @pytest.mark.parametrize("exposures", [4, 40, 300])
 def test_blanking_patterns_lie_before_the_lit_part_in_order(exposures) -> None:
     plan = blanked_plan(exposures=exposures)
@@ -208,8 +210,8 @@ SHAPE = PatternShape(np.array([[0.0, 1.3], [2.6, 6.5], [7.8, 9.1], [11.7, 13.0],
 
 
 @covers(
-    "rig.blanking_search:PatternSearch.*", "rig.blanking_search:PatternShape.*",
-    "rig.blanking_search:detection_probability",
+    "rig.count.blanking:PatternSearch.*", "rig.count.blanking:PatternShape.*",
+    "rig.count.blanking:detection_probability",
 )  # fmt: skip
 @EXAMPLES
 @given(

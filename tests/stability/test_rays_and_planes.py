@@ -8,18 +8,11 @@ from hypothesis import strategies as st
 
 from calibration.errors import CalibrationError
 from calibration.model.camera import Camera
+from calibration.model.light_sheet import LEAST_OFFSET_M, NEARLY_PARALLEL, depth, depth_slope, inverse_depth, near_side
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner, PlaneTable
-from calibration.model.triangulation import (
-    LEAST_OFFSET_M,
-    NEARLY_PARALLEL,
-    depth,
-    depth_slope,
-    inverse_depth,
-    near_side,
-)
 from rig.errors import UsageError
-from rig.geometry import sweep_geometry
+from rig.geometry.windows import sweep_geometry
 from tests.stability.exactly import relative
 from tests.stability.inventory import EXAMPLES, covers
 
@@ -42,7 +35,7 @@ def rays_about(plane: np.ndarray, sines: np.ndarray) -> tuple[np.ndarray, np.nda
     return u, v
 
 
-@covers("calibration.model.triangulation:depth", "calibration.model.triangulation:inverse_depth")
+@covers("calibration.model.light_sheet:depth", "calibration.model.light_sheet:inverse_depth")
 def test_depth_keeps_nine_digits_wherever_it_is_given(worst) -> None:
     rng = np.random.default_rng(1)
     for side in (-1, 1):
@@ -66,7 +59,7 @@ def test_depth_keeps_nine_digits_wherever_it_is_given(worst) -> None:
         )
 
 
-@covers("calibration.model.triangulation:depth", "calibration.model.triangulation:inverse_depth")
+@covers("calibration.model.light_sheet:depth", "calibration.model.light_sheet:inverse_depth")
 @EXAMPLES
 @given(u=ANY, v=ANY, normal=st.tuples(METRES, METRES, METRES), offset=METRES | st.floats(-1e-5, 1e-5))
 def test_there_is_no_huge_no_negative_and_no_infinite_depth(u, v, normal, offset) -> None:
@@ -81,7 +74,7 @@ def test_there_is_no_huge_no_negative_and_no_infinite_depth(u, v, normal, offset
         assert np.isnan(inverse)
 
 
-@covers("calibration.model.triangulation:depth")
+@covers("calibration.model.light_sheet:depth")
 @pytest.mark.parametrize(
     ("u", "plane"),
     [
@@ -99,7 +92,7 @@ def test_what_meets_nowhere_has_no_depth(u, plane) -> None:
     assert np.isnan(depth(u, 0.0, plane))
 
 
-@covers("calibration.model.triangulation:depth")
+@covers("calibration.model.light_sheet:depth")
 def test_the_scanner_s_own_axis_is_at_its_depth() -> None:
     pivot = np.array([-0.1, 0.0, 0.5])
     planes = PivotScanner(pivot, np.array([0, 1.0, 0]), np.array([1.0, 0, 0]), np.array([0, 0.3])).planes(
@@ -108,7 +101,7 @@ def test_the_scanner_s_own_axis_is_at_its_depth() -> None:
     assert depth(-0.2, 0.0, planes) == pytest.approx(np.full(21, 0.5), rel=1e-12)
 
 
-@covers("calibration.model.triangulation:depth_slope", "calibration.model.triangulation:near_side")
+@covers("calibration.model.light_sheet:depth_slope", "calibration.model.light_sheet:near_side")
 @EXAMPLES
 @given(u=TANGENT, v=TANGENT, normal=st.tuples(METRES, METRES, METRES), offset=METRES | st.floats(-1e-5, 1e-5))
 def test_slopes_are_finite_or_none_and_agree_with_the_near_side(u, v, normal, offset) -> None:
@@ -121,7 +114,7 @@ def test_slopes_are_finite_or_none_and_agree_with_the_near_side(u, v, normal, of
         assert side == -np.sign(slope)  # near points lie where depth falls
 
 
-@covers("calibration.model.triangulation:depth_slope")
+@covers("calibration.model.light_sheet:depth_slope")
 def test_depth_slopes_keep_nine_digits(worst) -> None:
     plane = np.array([0.9, 0.1, -0.4, -0.3])
     plane[:3] /= np.linalg.norm(plane[:3])

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sim_backend.light_sheet_kernels import span_bounds, trace_rows
+from sim_backend.light.sheet import span_bounds, trace_rows
 from tests.stability.inventory import EXAMPLES, covers
 
 Array = NDArray[np.float64]
@@ -18,7 +18,7 @@ def _traced(maps: tuple[Array, Array, Array], bounds: Array, plane: Array) -> tu
     return found
 
 
-@covers("sim_backend.light_sheet_kernels:span_bounds", "sim_backend.light_sheet_kernels:trace_rows")
+@covers("sim_backend.light.sheet:span_bounds", "sim_backend.light.sheet:trace_rows")
 @given(
     seed=st.integers(0, 2**32 - 1),
     plane=st.tuples(*[st.floats(-5, 5)] * 3),

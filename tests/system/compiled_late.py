@@ -12,8 +12,9 @@ from typing import Any
 from numba.core.dispatcher import Dispatcher
 
 from rig import api
-from rig.acquisition import Acquisition
-from rig.estimators import ESTIMATORS, lessons
+from rig.estimate.registry import ESTIMATORS
+from rig.estimate.search import online_learning as lessons
+from rig.scan.acquisition import Acquisition
 from tests.system.small_rig import config, write_rig
 
 MAPS, LESSON_FRAMES = 5, 1600

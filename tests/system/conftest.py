@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.cli import main
+from rig.cli.main import main
 from tests.system.small_rig import write_rig
 
 
@@ -33,7 +33,7 @@ def rig(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.
     work = tmp_path / "work"
     work.mkdir()
     monkeypatch.chdir(work)
-    monkeypatch.setattr("rig.cli_progress.PATIENCE_S", 3600.0)  # however slow the machine, progress is not in `err`
+    monkeypatch.setattr("rig.cli.progress.PATIENCE_S", 3600.0)  # however slow the machine, progress is not in `err`
 
     def run(*arguments: object) -> Ran:
         capsys.readouterr()

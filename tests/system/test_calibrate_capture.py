@@ -8,9 +8,9 @@ from calibration.files.rig_file import load_rig_model
 from drivers.clock import VirtualClock
 from drivers.registry import Surroundings
 from rig.api import configure
-from rig.calibrating.capture import MOST_LAG_S, capture_recorded, capture_view
-from rig.calibrating.gate_times import gate_delay
-from rig.config import ScanConfig
+from rig.calibrate.capture import MOST_LAG_S, capture_recorded, capture_view
+from rig.calibrate.sync import gate_delay
+from rig.config.models import ScanConfig
 from rig.errors import PlanError, UsageError
 from sim_backend.world import DEFAULT_GEOMETRY, SimulatedWorld
 

@@ -11,16 +11,14 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.files.rig_file import load_rig_model, save_rig_model
-from calibration.pixels.pixel_file import load_pixels
-from calibration.pixels.pixel_map import frames_for, hot_flux
+from calibration.pixel_map import frames_for, hot_flux, load_pixels
 from drivers.interfaces import SpadRequest
 from rig import api
-from rig.calibrating.pixel_result import PixelResult
-from rig.calibrating.pixel_run import run_pixels
+from rig.calibrate.pixels import PixelResult, run_pixels
 from rig.errors import UsageError
 from sim_backend.devices.spad import SimulatedSpad
 from sim_backend.effects.dark_counts import dark_rates
-from sim_backend.optics import Sensor
+from sim_backend.light.optics import Sensor
 from tests.system.small_rig import HEIGHT, WIDTH, config, write_rig
 
 FRAMES = frames_for(float(hot_flux(0.1, 0.0)))

@@ -12,8 +12,7 @@ import yaml
 from calibration.board.board import load_board
 from calibration.files.rig_file import load_rig_model
 from rig import api
-from rig.calibration_identity import refusals
-from rig.calibration_notes import note_check
+from rig.devices.calibration_use import note_check, refusals
 from rig.errors import UsageError
 from tests.system.board_rig import write_board_rig
 from tests.system.conftest import Rig

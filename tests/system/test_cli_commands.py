@@ -14,9 +14,9 @@ import typer
 import yaml
 
 from drivers.errors import DeviceError
-from rig.bundled import BUNDLED
-from rig.cli import app
-from rig.config_files import bundled_configs
+from rig.cli.main import app
+from rig.config.bundled import BUNDLED
+from rig.config.files import bundled_configs
 from rig.errors import UsageError
 from tests.system.conftest import Rig
 
@@ -25,7 +25,7 @@ from tests.system.conftest import Rig
 def test_nothing_heavy_is_imported_for_help(arguments: list[str]) -> None:
     heavy = ("numba", "cv2")
     code = (
-        f"import sys\nfrom rig.cli import main\ntry: main({arguments!r})\nexcept SystemExit: pass\n"
+        f"import sys\nfrom rig.cli.main import main\ntry: main({arguments!r})\nexcept SystemExit: pass\n"
         f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
@@ -49,7 +49,7 @@ def test_every_command_has_short_help(rig: Rig, words: tuple[str, ...]) -> None:
 def completed(shell: str, line: str) -> list[str]:
     """What `rig` gives a shell for the last word of a line, in a process that imports nothing heavy for it."""
     code = (
-        "import sys\nfrom rig.cli import main\n"
+        "import sys\nfrom rig.cli.main import main\n"
         "try: main([])\n"
         "finally: assert not {'numba', 'cv2', 'numpy'} & set(sys.modules)"
     )

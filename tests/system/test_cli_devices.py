@@ -41,7 +41,7 @@ def test_a_folder_that_cannot_be_written_is_found(rig, small, monkeypatch):
     def refuse(*arguments, **options):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("rig.doctor.tempfile.NamedTemporaryFile", refuse)
+    monkeypatch.setattr("rig.devices.doctor.tempfile.NamedTemporaryFile", refuse)
     ran = rig("doctor", small)
     assert ran.code == 3
     assert "cannot be written: Permission denied; choose another folder" in ran.out

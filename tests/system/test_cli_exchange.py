@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.system.conftest import Rig
-from tests.unit.rig.foreign_files import pi_packed, some_frames, swissspad2_full
+from tests.unit.rig.exchange.foreign_files import pi_packed, some_frames, swissspad2_full
 
 
 @pytest.fixture

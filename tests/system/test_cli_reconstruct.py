@@ -106,7 +106,7 @@ def test_bits_past_the_width_are_no_pixels(rig: Rig, wall: Path) -> None:
 
 
 def test_an_interrupt_exits_4(rig: Rig, wall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rig.reconstruction import Reconstructor
+    from rig.depth.reconstruct import Reconstructor
 
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration.digits import digits
-from rig import run as rig_run
-from rig.acquisition import Acquisition
+from calibration.errors import digits
+from rig.scan import run as rig_run
+from rig.scan.acquisition import Acquisition
 from tests.system.conftest import Rig
 
 OPTIONS = ("--exposures", 3, "--maps", 3, "--seed", 5)

@@ -17,9 +17,9 @@ import pytest
 from drivers.frames import FrameBlock
 from drivers.ring import BlockRing
 from drivers.spb1 import walk_blocks
-from rig.outputs import RunFolder
-from rig.reconstruction import MapResult, Reconstructor
-from rig.recording.segment import Segment, Staging
+from rig.depth.reconstruct import MapResult, Reconstructor
+from rig.recording.segment import OpenSegment, Staging
+from rig.run_folder.folder import RunFolder
 from tests.system.conftest import Rig
 from tests.system.run_files import FILES, files, strict
 from tests.system.small_rig import config, write_rig
@@ -54,14 +54,14 @@ def test_frames_dropped_for_a_slow_estimate_are_gaps(rig: Rig, small: Path, monk
 def test_a_disk_that_the_recording_fills_ends_the_scan_in_a_line_and_keeps_what_is_whole(
     rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write = Segment.write
+    write = OpenSegment.write
 
-    def full(self: Segment, block: FrameBlock, offset: int, staging: Staging) -> None:
+    def full(self: OpenSegment, block: FrameBlock, offset: int, staging: Staging) -> None:
         if block.header.block_seq == 3:
             os.write(-1, b"")
         write(self, block, offset, staging)
 
-    monkeypatch.setattr(Segment, "write", full)
+    monkeypatch.setattr(OpenSegment, "write", full)
     ran = rig("scan", small, "--maps", 20, "--record", "--out", "run")
     assert (ran.code, len(ran.problems)) == (3, 1)
     assert "cannot write the recording frames-000000.spb" in ran.problems[0]
@@ -126,7 +126,7 @@ def test_an_aborted_run_says_what_of_it_is_kept(rig: Rig, small: Path, monkeypat
 def test_a_real_signal_ends_a_scan_in_order(small: Path, tmp_path: Path, name: str) -> None:
     # Background shells and nohup leave signals ignored, and a child would inherit that.
     handler = "default_int_handler" if name == "SIGINT" else "SIG_DFL"
-    program = f"import signal; signal.signal(signal.{name}, signal.{handler}); from rig.cli import main; main()"
+    program = f"import signal; signal.signal(signal.{name}, signal.{handler}); from rig.cli.main import main; main()"
     command = [sys.executable, "-c", program, "scan", str(small), "--maps", "100000"]
     out = tmp_path / "run"
     with subprocess.Popen([*command, "--json", "--out", str(out)], stdout=-1, stderr=-1, text=True) as process:

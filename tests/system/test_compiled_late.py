@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from rig.estimators import ESTIMATORS
+from rig.estimate.registry import ESTIMATORS
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.obis import ObisConfig
+from drivers.lasers.obis import ObisConfig
 from rig import api
-from rig.api_config import configure
-from rig.doctor import Finding
+from rig.config.overrides import configure
+from rig.devices.doctor import Finding
 from rig.errors import PlanError
 from sim_backend.wire.emulated_world import EmulatedWorld
-from sim_backend.wire.helios import GREEN
+from sim_backend.wire.firmware.helios import GREEN
 from tests.system.small_rig import config, write_rig
 
 Examine = Callable[..., dict[str, Finding]]
@@ -153,7 +153,7 @@ def test_a_full_disk(examine: Examine, monkeypatch: pytest.MonkeyPatch) -> None:
     class Usage:
         free = 10**6
 
-    monkeypatch.setattr("rig.doctor.shutil.disk_usage", lambda folder: Usage)
+    monkeypatch.setattr("rig.devices.doctor.shutil.disk_usage", lambda folder: Usage)
     found = examine()
     assert not found["disk"].ok
     assert "make room" in found["disk"].text

@@ -9,9 +9,10 @@ import yaml
 
 from drivers.spb1.control import ACK, COMMAND
 from drivers.transports.tap import IN, OUT, read_taps
-from rig import api, replay_run
-from rig.config_files import load_config
+from rig import api
+from rig.config.files import load_config
 from rig.errors import DivergedError, UsageError
+from rig.scan import replay as replay_run
 from tests.system.small_rig import config, write_rig
 
 LASER = {"kind": "obis", "port": "emulated:laser", "max_power": "50 mW"}

@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rig.stripes import StripeTable
+from rig.geometry.stripe_table import StripeTable
 from tests.reference.adapter import reconstructor_of, volume_of
 from tests.reference.answers import Answers, calibration_error
 from tests.reference.made_scenes import smooth_scene, thin_scene

@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from rig import api
-from rig.config_files import load_config
-from rig.multi_line_config import with_lines
+from rig.config.files import load_config
+from rig.config.models import with_lines
 from tests.system import small_rig
 from tests.system.conftest import Rig
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from rig import api
-from rig.acquisition import ScanProgress
-from rig.report_text import effects_table
+from rig.cli.tables import effects_table
+from rig.scan.acquisition import ScanProgress
 from tests.system.conftest import Rig
 
 
@@ -50,7 +50,7 @@ def test_every_long_command_names_its_stages_on_stderr_and_prints_one_object(
     words = 2 if command[0] == "calibrate" else 1
     source = () if "RUN" in command else (small,)
     options = ("recorded" if part == "RUN" else part for part in command[words:])
-    monkeypatch.setattr("rig.cli_progress.PATIENCE_S", 0.0)
+    monkeypatch.setattr("rig.cli.progress.PATIENCE_S", 0.0)
     ran = rig(*command[:words], *source, *options, "--json")
     assert isinstance(json.loads(ran.out), dict)
     lines = [line for line in ran.err.splitlines() if re.match(r"\d+:\d\d ", line)]

@@ -11,13 +11,12 @@ from typing import Any
 import pytest
 
 from drivers.errors import DeviceFault, RingOverflow
-from rig.acquisition import Acquisition
 from rig.api import recording_info, verify
-from rig.map_queue import AcquiredMap, MapQueue
-from rig.mapping import Mapping
-from rig.outputs import RunFolder
-from rig.reconstruction import MapResult, Reconstructor
-from rig.recording.recorder import Recorder
+from rig.depth.reconstruct import MapResult, Reconstructor
+from rig.recording.writer import Recorder
+from rig.run_folder.folder import RunFolder
+from rig.scan.acquisition import Acquisition
+from rig.scan.counting import AcquiredMap, Mapping, MapQueue
 from tests.system.conftest import Rig
 
 SCAN = ("--maps", 20, "--record", "--out", "run")

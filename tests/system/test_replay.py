@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from drivers.recorded import RunRecording
-from rig import api, scanning
-from rig.acquisition import Acquisition
+from rig import api
 from rig.errors import DamagedRecordingError, UsageError
-from rig.recording.manifest import read_manifest, sealed_text
+from rig.run_folder.manifest import read_manifest, sealed_text
+from rig.scan import scan as scanning
+from rig.scan.acquisition import Acquisition
 from tests.system.conftest import Rig
 from tests.system.small_rig import config, write_rig
 
@@ -193,7 +194,7 @@ def test_a_wrong_clock_and_a_wrong_folder_are_the_users(learned: Path, rig: Rig,
 
 
 def test_enter_lets_one_sweep_pass(lossy: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "from rig.cli import main; main()", "replay", str(lossy), "--clock", "step"]
+    command = [sys.executable, "-c", "from rig.cli.main import main; main()", "replay", str(lossy), "--clock", "step"]
     out = ["--out", str(tmp_path / "again"), "--json"]
     ran = subprocess.run([*command, *out], input=b"\n\n", capture_output=True, timeout=120, check=False)
     assert ran.returncode == 1, ran.stderr  # gaps

@@ -2,10 +2,10 @@
 
 import pytest
 
-from rig import overload
 from rig.api import soak
 from rig.bench import soak as soaking
 from rig.errors import UsageError
+from rig.scan import pipeline as overload
 
 SLOW_S = 0.4
 """Four times what the ring holds, so that it overflows on any machine."""

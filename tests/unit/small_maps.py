@@ -8,8 +8,8 @@ import numpy as np
 from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
-from rig.counting import CountVolume
-from rig.geometry import SweepGeometry, sweep_geometry, uncalibrated_geometry
+from rig.count.volume import CountVolume
+from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
 from tests.reference.adapter import windowed
 from tests.reference.geometry import DEPTH_RANGE_M, Geometry
 from tests.reference.scene import Scene, procedural_scene

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import typer
 
-from rig.bundled import bundled_rigs, bundled_scenes
-from rig.cli import app
+from rig.cli.main import app
+from rig.config.bundled import bundled_rigs, bundled_scenes
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])

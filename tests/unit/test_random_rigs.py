@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibration.depth.uncertainty import command_at
+from calibration.depth_error import command_at
 from tests.reference.random_rigs import BOARD, COMMAND_REACH, random_poses, random_rig
 
 

@@ -13,13 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.reference import kernels
-from tests.reference.genie import (
-    Genie,
-    albedo_histogram,
-    label_profiles,
-    log_expm1,
-    log_expm1_table,
-)
+from tests.reference.genie import Genie, albedo_histogram, label_profiles, log_expm1, log_expm1_table
 from tests.reference.geometry import BASELINE_M, DEPTH_RANGE_M, FOCAL_PX, Geometry, undistorted_rays
 from tests.reference.made_scenes import pane_scene, smooth_scene, thin_scene
 from tests.reference.scattering import halo_total, pedestal_share

@@ -7,7 +7,7 @@ import traceback
 from collections.abc import Callable
 from typing import Protocol
 
-from sim_backend.wire.usb_model import AttachedDevice, UsbModel
+from sim_backend.wire.serve.usb_model import AttachedDevice, UsbModel
 
 WITHIN_S = 120
 

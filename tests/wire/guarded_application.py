@@ -14,8 +14,8 @@ import time
 from drivers.errors import DeviceError
 from drivers.guard import Guard
 from drivers.interfaces import OUT_GATE, Pulse
-from drivers.obis import ObisConfig
-from drivers.prawndo import PrawnDoConfig
+from drivers.lasers.obis import ObisConfig
+from drivers.sync.prawndo import PrawnDoConfig
 from tests.wire.guarded_rig import POWER_W, SWEEP_S
 
 SWEEP = (Pulse(0, None), Pulse(0, 0.001), Pulse(OUT_GATE, SWEEP_S - 0.003), Pulse(0, 0.001))

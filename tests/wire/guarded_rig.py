@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from sim_backend.wire.obis import ObisModel
-from sim_backend.wire.prawndo import PrawnDoModel
-from sim_backend.wire.serial_server import SerialServer
+from sim_backend.wire.firmware.obis import ObisModel
+from sim_backend.wire.firmware.prawndo import PrawnDoModel
+from sim_backend.wire.serve.serial import SerialServer
 
 USB_BAUD = 8_000_000
 """A virtual COM port over USB full speed carries about 0.8 MB/s."""

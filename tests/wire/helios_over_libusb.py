@@ -15,7 +15,7 @@ import pytest
 from drivers.clock import SystemClock
 from drivers.interfaces import MARKER_SCAN, BeamScanner, ScanWaveform
 from drivers.registry import Surroundings, lookup
-from sim_backend.wire.helios import BLUE, HeliosModel
+from sim_backend.wire.firmware.helios import BLUE, HeliosModel
 from tests.wire.bodies import ServesProcesses
 from tests.wire.scanners import GALVO, PATIENCE_S
 

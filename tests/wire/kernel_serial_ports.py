@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from serial.tools import list_ports
 
-from sim_backend.wire.serial_server import SerialServer
+from sim_backend.wire.serve.serial import SerialServer
 
 WIRES = ("wire0", "wire1")
 """Serial ports there can be at a time, and the virtio ports at their far ends."""

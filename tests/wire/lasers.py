@@ -9,16 +9,16 @@ from typing import Any
 import pytest
 
 from drivers.clock import NS_PER_S, Clock, VirtualClock
-from drivers.cobolt import CoboltConfig
-from drivers.cobolt import create as create_cobolt
-from drivers.dialogue import LineTiming
 from drivers.errors import DeviceError
 from drivers.interfaces import LineLaser
-from drivers.obis import ObisConfig
-from drivers.obis import create as create_obis
+from drivers.lasers.cobolt import CoboltConfig
+from drivers.lasers.cobolt import create as create_cobolt
+from drivers.lasers.obis import ObisConfig
+from drivers.lasers.obis import create as create_obis
 from drivers.registry import Surroundings
-from sim_backend.wire.faults import FaultSchedule
-from sim_backend.wire.serial_server import SerialModel, SerialServer
+from drivers.transports.dialogue import LineTiming
+from sim_backend.wire.serve.serial import SerialModel, SerialServer
+from sim_backend.wire.serve.wire_server import FaultSchedule
 
 QUICK_COBOLT = LineTiming(gap_s=0.1, reply_s=0.15, quiet_s=0.02, drain_s=0.1)
 """For virtual time, in which the gap costs nothing: replies come within milliseconds."""

@@ -28,8 +28,8 @@ import yaml
 from drivers.clock import SystemClock
 from drivers.registry import Surroundings
 from sim_backend.wire.emulated_world import EmulatedWorld, EmulatedWorldConfig
-from sim_backend.wire.umockdev_server import PRELOAD, UmockdevBus
 from tests.system.small_rig import calibration
+from tests.wire.usb.umockdev import PRELOAD, UmockdevBus
 
 WIDTH, HEIGHT = 64, 16
 COLUMNS, EXPOSURES = 20, 12

@@ -12,11 +12,11 @@ from drivers.clock import NS_PER_S, Clock, VirtualClock
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
 from drivers.registry import Surroundings, lookup
 from drivers.transports.endpoints import Endpoint
-from sim_backend.wire.dac_model import DacModel
-from sim_backend.wire.helios import HeliosModel
-from sim_backend.wire.lasercube import LaserCubeModel
-from sim_backend.wire.usb_backend import EmulatedUsb
-from sim_backend.wire.usb_model import AttachedDevice, Stall, UsbModel
+from sim_backend.wire.firmware.dac_model import DacModel
+from sim_backend.wire.firmware.helios import HeliosModel
+from sim_backend.wire.firmware.lasercube import LaserCubeModel
+from sim_backend.wire.serve.usb import EmulatedUsb
+from sim_backend.wire.serve.usb_model import AttachedDevice, Stall, UsbModel
 
 GALVO = {"max_velocity": "2000 /s", "max_acceleration": "2e6 /s2"}
 PATIENCE_S = 20.0

@@ -17,8 +17,8 @@ from concurrent.futures import Future
 from typing import Any
 
 from drivers.frames import FrameBlock
+from rig.depth.warm_up import warm_up
 from rig.recording.writer import Recording
-from rig.warm_up import warm_up
 from tests.wire.guarded_application import labour
 from tests.wire.scan_rig import EXPOSURES
 
@@ -27,7 +27,7 @@ _POLL_S = 0.005
 
 
 def main() -> None:
-    from rig import acquisition, api, cli, scanning  # noqa: F401 - imported once, before the forks
+    from rig.cli import main as cli  # noqa: F401 - imported once, before the forks
 
     warm_up("argmax", "none", EXPOSURES, dark=True)
     say("ready")
@@ -56,7 +56,7 @@ def fork(arguments: list[str], environment: dict[str, str], log: str, labours: b
 
 
 def become(arguments: list[str], environment: dict[str, str], log: str, labours: bool) -> None:
-    from rig.cli import main as rig
+    from rig.cli.main import main as rig
 
     os.environ.update(environment)
     with open(log, "wb", buffering=0) as output, open(os.devnull, "rb") as nothing:

@@ -12,7 +12,7 @@ import pytest
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceNotFound
 from drivers.interfaces import SpadRequest, WindowTable
 from drivers.ring import BlockRing
-from drivers.spb_usb import SpbUsb, SpbUsbConfig, open_link
+from drivers.spads.spb_usb import SpbUsb, SpbUsbConfig, open_link
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.queued_link import QueuedLink
 from tests.wire.bodies import report

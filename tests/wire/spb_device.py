@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from drivers.clock import SystemClock
 from drivers.frames import FrameBlock, Mark
 from drivers.interfaces import SpadRequest, SpadTiming
-from drivers.spb_usb import SpbUsb, SpbUsbConfig, open_link
+from drivers.spads.spb_usb import SpbUsb, SpbUsbConfig, open_link
 from drivers.transports.endpoints import Endpoint
-from sim_backend.wire.spb_usb import SpbUsbModel
-from sim_backend.wire.spb_usb_run import Span
-from sim_backend.wire.usb_backend import EmulatedUsb
+from sim_backend.wire.firmware.spb_usb import SpbUsbModel
+from sim_backend.wire.firmware.spb_usb_run import Span
+from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.spads import take_run
 
 WIDTH, HEIGHT = 128, 24

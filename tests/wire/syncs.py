@@ -6,11 +6,11 @@ from typing import Any
 
 from drivers.clock import NS_PER_S, VirtualClock
 from drivers.interfaces import OUT_GATE, Pulse
-from drivers.prawndo import PrawnDo, PrawnDoConfig, create
 from drivers.registry import Surroundings
-from sim_backend.wire.faults import FaultSchedule
-from sim_backend.wire.prawndo import PrawnDoModel, TriggerLine
-from sim_backend.wire.serial_server import SerialServer
+from drivers.sync.prawndo import PrawnDo, PrawnDoConfig, create
+from sim_backend.wire.firmware.prawndo import PrawnDoModel, TriggerLine
+from sim_backend.wire.serve.serial import SerialServer
+from sim_backend.wire.serve.wire_server import FaultSchedule
 
 USB_BAUD = 8_000_000
 """A virtual COM port over USB full speed carries about 0.8 MB/s."""

@@ -5,12 +5,11 @@ import time
 import pytest
 
 from drivers.clock import SystemClock
-from drivers.cobolt import CoboltConfig
-from drivers.cobolt import create as create_cobolt
-from drivers.cobolt_dialects import classify
 from drivers.errors import DeviceFault, InterlockOpen, ProtocolError, WrongState
-from sim_backend.wire.cobolt import MODELS, CoboltModel, Family
-from sim_backend.wire.faults import Fault, FaultScript
+from drivers.lasers.cobolt import CoboltConfig, classify
+from drivers.lasers.cobolt import create as create_cobolt
+from sim_backend.wire.firmware.cobolt import MODELS, CoboltModel, Family
+from sim_backend.wire.serve.wire_server import Fault, FaultScript
 from tests.wire.lasers import arming, bring_up, now_s, open_cobolt, wire
 
 FAMILIES: tuple[Family, ...] = ("06-MLD", "06-01")

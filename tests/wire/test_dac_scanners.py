@@ -8,8 +8,8 @@ import pytest
 
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceNotFound, DevicePermission, DeviceTimeout
-from sim_backend.wire.dac_model import DAC_STEPS
-from sim_backend.wire.usb_backend import EmulatedUsb
+from sim_backend.wire.firmware.dac_model import DAC_STEPS
+from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.scanners import HeliosRecorder, LaserCubeRecorder, Recording, cosine, finish, open_scanner, opened, plug
 
 STEP = 2 / DAC_STEPS

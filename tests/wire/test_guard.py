@@ -9,14 +9,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from drivers.cobolt import CoboltConfig
 from drivers.errors import DeviceBusy, DeviceError, DeviceNotFound, GuardLost, LimitExceeded
 from drivers.guard import Guard, GuardLimits
-from drivers.obis import ObisConfig
-from drivers.prawndo import PrawnDo, PrawnDoConfig
+from drivers.lasers.cobolt import CoboltConfig
+from drivers.lasers.obis import ObisConfig
 from drivers.registry import Surroundings
-from sim_backend.wire.obis import ObisModel
-from sim_backend.wire.serial_server import SerialServer
+from drivers.sync.prawndo import PrawnDo, PrawnDoConfig
+from sim_backend.wire.firmware.obis import ObisModel
+from sim_backend.wire.serve.serial import SerialServer
 from tests.wire.guard_strikes import EMISSION_S, NEVER_S, STRIKES, Outcome, strike
 from tests.wire.guarded_application import SWEEP
 from tests.wire.guarded_rig import POWER_W, GuardedRig, guarded_rig

@@ -11,25 +11,18 @@ import numpy as np
 import pytest
 
 from drivers.clock import SystemClock, VirtualClock
-from drivers.errors import (
-    DeviceError,
-    DeviceNotFound,
-    DeviceTimeout,
-    LimitExceeded,
-    ProtocolError,
-)
-from drivers.helios_frames import encode, sendable, slice_points
-from drivers.helios_link import HELIOS
+from drivers.errors import DeviceError, DeviceNotFound, DeviceTimeout, LimitExceeded, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, ScanWaveform
-from drivers.point_source import Points
+from drivers.scanners.dac_scanner import PointSlice
+from drivers.scanners.helios import HELIOS, encode, sendable, slice_points
 from drivers.transports.usb_device import open_device
-from sim_backend.wire.helios import BLUE, COMMANDS, FRAMES, GREEN, INTENSITY, RED, REPLIES, HeliosModel
-from sim_backend.wire.umockdev_server import UmockdevBus, missing
-from sim_backend.wire.usb_backend import EmulatedUsb
-from sim_backend.wire.usb_model import Answer
+from sim_backend.wire.firmware.helios import BLUE, COMMANDS, FRAMES, GREEN, INTENSITY, RED, REPLIES, HeliosModel
+from sim_backend.wire.serve.usb import EmulatedUsb
+from sim_backend.wire.serve.usb_model import Answer
 from tests.wire import helios_over_libusb
 from tests.wire.bodies import ServesProcesses
 from tests.wire.scanners import HeliosRecorder, cosine, finish, open_scanner, opened, plug
+from tests.wire.usb.umockdev import UmockdevBus, missing
 
 TOLERANCE_S = 1e-6
 
@@ -38,7 +31,7 @@ TOLERANCE_S = 1e-6
 
 
 def test_a_frame_is_the_bytes_of_the_manual() -> None:
-    points = Points(
+    points = PointSlice(
         np.array([1.0, -1.0, 0.0]),
         np.array([MARKER_LINE, MARKER_SCAN, LEVEL_BACKWARD], np.uint8),
         np.array([True, True, False]),

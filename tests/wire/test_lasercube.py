@@ -4,23 +4,18 @@ import numpy as np
 import pytest
 
 from drivers.clock import VirtualClock
-from drivers.errors import (
-    DeviceFault,
-    DeviceNotFound,
-    LimitExceeded,
-    ProtocolError,
-)
+from drivers.errors import DeviceFault, DeviceNotFound, LimitExceeded, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
-from drivers.lasercube_link import encode
-from drivers.point_source import Points
-from sim_backend.wire.lasercube import BLUE, COMMANDS, GREEN, RED, SAMPLES, LaserCubeModel
-from sim_backend.wire.usb_model import Stall
+from drivers.scanners.dac_scanner import PointSlice
+from drivers.scanners.lasercube import encode
+from sim_backend.wire.firmware.lasercube import BLUE, COMMANDS, GREEN, RED, SAMPLES, LaserCubeModel
+from sim_backend.wire.serve.usb_model import Stall
 from tests.wire.scanners import LaserCubeRecorder, cosine, finish, open_scanner, opened, plug
 
 
 def test_samples_are_the_bytes_of_the_manual() -> None:
     markers = np.array([MARKER_LINE, MARKER_SCAN, LEVEL_BACKWARD], np.uint8)
-    points = Points(np.array([1.0, -1.0, 0.0]), markers, np.ones(3, bool))
+    points = PointSlice(np.array([1.0, -1.0, 0.0]), markers, np.ones(3, bool))
     assert encode(points, "x", markers=True).hex(" ", 8) == "00ff0000ff0f0008 0000ff0000000008 ff00000000080008"
     assert encode(points, "y", markers=False).hex(" ", 8) == "000000000008ff0f 0000000000080000 0000000000080008"
 

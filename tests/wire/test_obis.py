@@ -15,9 +15,8 @@ from drivers.errors import (
     WrongState,
 )
 from drivers.guard import Guard
-from drivers.obis import FAULTS, ObisConfig
-from drivers.obis_framing import ERRORS
-from sim_backend.wire.obis import ObisModel
+from drivers.lasers.obis import ERRORS, FAULTS, ObisConfig
+from sim_backend.wire.firmware.obis import ObisModel
 from tests.wire.lasers import arming, bring_up, now_s, open_obis, wire
 
 HANDSHAKES = (True, False)

@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from drivers.clock import SystemClock
-from sim_backend.wire.usb_loopback import LoopbackModel
-from sim_backend.wire.usbip_server import UsbIpBus, missing
 from tests.wire import helios_over_libusb, spb_bodies, usb_bodies
 from tests.wire.bodies import ServesProcesses, outcomes
 from tests.wire.spb_device import model
 from tests.wire.test_spb_over_libusb import pulling
+from tests.wire.usb.loopback import LoopbackModel
+from tests.wire.usb.usbip import UsbIpBus, missing
 
 if missing():
     pytest.skip(missing(), allow_module_level=True)

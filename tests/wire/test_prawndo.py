@@ -17,8 +17,8 @@ from drivers.errors import (
     WrongState,
 )
 from drivers.interfaces import HOLD_S, OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
-from drivers.prawndo_program import Board, compile_program, most_repeats
-from sim_backend.wire.prawndo import PrawnDoModel, TriggerLine
+from drivers.sync.prawndo import ProgramLimits, compile_program, most_repeats
+from sim_backend.wire.firmware.prawndo import PrawnDoModel, TriggerLine
 from tests.wire.syncs import SWEEP, board
 
 # The emulator, against bytes written by hand from hardware.md section 5.1
@@ -112,7 +112,7 @@ def test_closing_aborts_then_sets_all_outputs_low_then_reads_them_back() -> None
 
 
 def test_a_held_pulse_goes_out_in_slices_that_wait_for_the_marker_with_the_gate_low() -> None:
-    pico = Board("Pico", 1e8, 30_000, 40e-6)
+    pico = ProgramLimits("Pico", 1e8, 30_000, 40e-6)
     pulses = [Pulse(0, None), Pulse(OUT_GATE | OUT_MARKER, 1.2e-3, held=True), Pulse(0, 1e-5)]
     words = compile_program(pulses, 2, pico).tolist()
     wait, part = (OUT_MARKER, 0), (OUT_GATE | OUT_MARKER, 40_000)

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from sim_backend.wire.umockdev_server import missing
 from tests.wire.guard_strikes import NEVER_S
 from tests.wire.scan_rig import Applications, applications, scan_bench
 from tests.wire.scan_strikes import SCAN_STRIKES, strike_scan, trouble_of
+from tests.wire.usb.umockdev import missing
 
 WAIT_S = 0.6
 SHARES = {name: 0.15 + 0.5 * i / len(SCAN_STRIKES) for i, name in enumerate(SCAN_STRIKES)}

@@ -10,20 +10,21 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from drivers import cobolt_framing, obis_framing
 from drivers.clock import SystemClock
-from drivers.cobolt import CoboltConfig
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceNotFound, DeviceTimeout, LimitExceeded
 from drivers.interfaces import LineLaser
-from drivers.obis import ObisConfig
-from drivers.serial_laser import SerialLaserConfig
+from drivers.lasers import cobolt as cobolt_framing
+from drivers.lasers import obis as obis_framing
+from drivers.lasers.cobolt import CoboltConfig
+from drivers.lasers.obis import ObisConfig
+from drivers.lasers.serial_laser import SerialLaserConfig
 from drivers.transports.endpoints import Endpoint
-from rig.config_files import load_config
+from rig.config.files import load_config
+from rig.devices.open import open_rig
 from rig.errors import DevicesError
-from rig.session import open_rig
-from sim_backend.wire.cobolt import CoboltModel
-from sim_backend.wire.faults import Fault, FaultScript
-from sim_backend.wire.obis import ObisModel
+from sim_backend.wire.firmware.cobolt import CoboltModel
+from sim_backend.wire.firmware.obis import ObisModel
+from sim_backend.wire.serve.wire_server import Fault, FaultScript
 from tests.wire.lasers import Babble, Silent, around, bring_up, now_s, open_cobolt, open_obis, wire
 
 

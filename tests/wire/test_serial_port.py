@@ -19,8 +19,8 @@ from drivers.errors import (
 )
 from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.serial_port import SerialPort
-from sim_backend.wire.faults import Fault, FaultSchedule, FaultScript
-from sim_backend.wire.serial_server import SerialServer
+from sim_backend.wire.serve.serial import SerialServer
+from sim_backend.wire.serve.wire_server import Fault, FaultSchedule, FaultScript
 
 
 class Echo:

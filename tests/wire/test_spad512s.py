@@ -27,12 +27,12 @@ from drivers.errors import (
 from drivers.frames import BlockFlag, FrameBlock
 from drivers.interfaces import SpadRequest
 from drivers.ring import BlockRing, OnFull
-from drivers.spad512s import Spad512s, Spad512sConfig
-from drivers.spad512s_line import Deadlines
+from drivers.spads.spad512s import Spad512s, Spad512sConfig
+from drivers.spads.spad512s_line import Deadlines
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import CONTROL_FILE, IN, OUT, TapFile, read_taps
-from sim_backend.wire.spad512s import Spad512sModel
-from sim_backend.wire.tcp_server import TcpServer
+from sim_backend.wire.firmware.spad512s import Spad512sModel
+from sim_backend.wire.serve.tcp import TcpServer
 from tests.wire.spads import take_run
 
 FRAME_BYTES = 32_768

@@ -7,15 +7,13 @@ from contextlib import contextmanager
 import pytest
 
 from drivers.clock import SystemClock
-from drivers.spb1.control import State
-from sim_backend.wire.spb_usb import SpbUsbModel
-from sim_backend.wire.umockdev_server import UmockdevBus, missing
-from sim_backend.wire.usb_model import AttachedDevice
+from drivers.spb1.control import SensorState
+from sim_backend.wire.firmware.spb_usb import SpbUsbModel
+from sim_backend.wire.serve.usb_model import AttachedDevice
 from tests.wire import spb_bodies
 from tests.wire.bodies import outcomes
-from tests.wire.spb_device import (
-    model,
-)
+from tests.wire.spb_device import model
+from tests.wire.usb.umockdev import UmockdevBus, missing
 
 
 @contextmanager
@@ -25,7 +23,7 @@ def pulling(attached: AttachedDevice, device: SpbUsbModel) -> Iterator[None]:
 
     def watch() -> None:
         while not over.wait(0.02):
-            if device.state is State.RUNNING and device.heartbeat_ms == 12_345:
+            if device.state is SensorState.RUNNING and device.heartbeat_ms == 12_345:
                 over.wait(0.1)
                 attached.unplug()
                 return

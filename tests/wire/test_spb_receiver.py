@@ -8,20 +8,10 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.errors import (
-    RingOverflow,
-    WrongState,
-)
+from drivers.errors import RingOverflow, WrongState
 from drivers.frames import BlockFlag, BlockStatus
 from drivers.ring import BlockRing, OnFull
-from tests.wire.spb_device import (
-    REQUEST,
-    model,
-    nth,
-    opened,
-    require_right,
-    take,
-)
+from tests.wire.spb_device import REQUEST, model, nth, opened, require_right, take
 
 
 def flipped(at: int) -> Callable[[bytearray], tuple[bytes]]:

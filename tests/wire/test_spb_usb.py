@@ -23,9 +23,9 @@ from drivers.errors import (
 from drivers.frames import BlockFlag, Mark
 from drivers.interfaces import WindowTable
 from drivers.ring import BlockRing
-from drivers.spb1.control import Ack, AckStatus, Command, Feature, Op, Register, State, pattern_row, read_acks
-from sim_backend.wire.spb_usb import SpbUsbModel
-from sim_backend.wire.usb_backend import EmulatedUsb
+from drivers.spb1.control import Ack, AckStatus, Command, Feature, Op, Register, SensorState, pattern_row, read_acks
+from sim_backend.wire.firmware.spb_usb import SpbUsbModel
+from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.spb_device import (
     HEIGHT,
     LINE_FRAMES,
@@ -262,7 +262,7 @@ def test_a_host_that_falls_silent_ends_the_run_with_the_gate_low() -> None:
             while spad.fill(ring, 1.0):
                 pass
         assert not device.gate_allowed
-        assert device.state is State.ARMED
+        assert device.state is SensorState.ARMED
         spad.stop()
         _, blocks = take(spad, 20)
         assert require_right(blocks) == list(range(20))

@@ -17,12 +17,11 @@ from drivers.errors import (
     DeviceTimeout,
     ProtocolError,
 )
-from drivers.transports.usb_device import attached, open_device
-from drivers.transports.usb_errors import translated
-from sim_backend.wire.umockdev_server import UmockdevBus, missing
-from sim_backend.wire.usb_backend import EmulatedUsb
-from sim_backend.wire.usb_loopback import LoopbackModel
+from drivers.transports.usb_device import attached, open_device, translated
+from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.bodies import outcomes
+from tests.wire.usb.loopback import LoopbackModel
+from tests.wire.usb.umockdev import UmockdevBus, missing
 from tests.wire.usb_bodies import BODIES, LOOPBACK
 
 

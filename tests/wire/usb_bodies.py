@@ -12,17 +12,10 @@ from functools import partial
 
 import pytest
 
-from drivers.errors import (
-    DeviceBusy,
-    DeviceDisconnected,
-    DeviceFault,
-    DeviceNotFound,
-    DeviceTimeout,
-    ProtocolError,
-)
+from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceFault, DeviceNotFound, DeviceTimeout, ProtocolError
 from drivers.transports.usb_device import UsbDevice, UsbId, attached, open_device
-from sim_backend.wire.usb_loopback import DEAF, ECHO_IN, GONE, OVERLONG, STALL_BULK_IN
 from tests.wire.bodies import report
+from tests.wire.usb.loopback import DEAF, ECHO_IN, GONE, OVERLONG, STALL_BULK_IN
 
 LOOPBACK = UsbId("loopback", 0x1209, 0x0001)
 VENDOR_IN, VENDOR_OUT = 0xC0, 0x40

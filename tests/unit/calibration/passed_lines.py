@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.passages.finding import SweepCounts
+from calibration.passages.find import SweepCounts
 
 ROWS = 30
 _INTEGRAL = np.vectorize(lambda z: 0.5 * (1 + math.erf(z / math.sqrt(2))))

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.camera_fit.fit import fit_camera
+from calibration.camera_fit import fit_camera
 from calibration.errors import CalibrationError, Degenerate
 from calibration.views import Corners, View
 from tests.reference.board_pictures import CHARUCO, DISTORTION, SIZE, corners_px, pose

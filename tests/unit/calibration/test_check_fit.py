@@ -8,12 +8,11 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
-from calibration.check.boards import check_angle, check_boards
+from calibration.check import check_angle, check_boards
 from calibration.errors import Degenerate
 from calibration.model.camera import Camera
-from calibration.model.covariance import Covariance
 from calibration.model.parameters import with_parameters
-from calibration.model.rig_model import Lag, RigModel
+from calibration.model.rig_model import Covariance, Lag, RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.views import BoardPose, Corners, Passages, View
 

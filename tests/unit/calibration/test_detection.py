@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from calibration.board.board import BLACK, WHITE, Board
-from calibration.board.detection import find_corners
-from calibration.board.hot_pixels import repaired
+from calibration.board.detect import find_corners, repaired
 from calibration.errors import Degenerate
 from calibration.views import BoardPose
 from tests.reference.board_pictures import CHARUCO, CHESSBOARD, SIZE, albedo, corners_px, exposed, pose

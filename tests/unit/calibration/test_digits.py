@@ -4,7 +4,7 @@ from math import inf, nan
 
 import pytest
 
-from calibration.digits import condition_text, digits, in_mm, mm
+from calibration.errors import condition_text, digits, in_mm, mm
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from calibration.board.board import Board
-from calibration.passages.even_albedo import AWAY_PX, board_pixels, even_pixels
-from calibration.passages.finding import SweepCounts
-from calibration.passages.flux_picture import flux_picture
+from calibration.passages.find import SweepCounts
+from calibration.passages.flux_picture import AWAY_PX, board_pixels, even_pixels, flux_picture
 from calibration.views import Corners
 
 ROWS, WIDTH, COLUMNS = 24, 64, 80

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.board.board import load_board
-from calibration.guide.poses import candidates, next_pose, rough_camera, sequence
+from calibration.guide import candidates, next_pose, rough_camera, sequence
 from calibration.model.camera import Camera
 from calibration.views import BoardPose
 

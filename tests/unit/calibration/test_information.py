@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.guide.forecast import Forecast
+from calibration.guide import Forecast
 from calibration.rig_fit.fit import fit_rig
 from calibration.views import BoardPose
 from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view

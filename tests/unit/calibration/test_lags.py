@@ -6,13 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from calibration.diagnosis.rig import judge_fit, judge_sync
+from calibration.diagnosis.rules import lag_lack
 from calibration.errors import CalibrationError, Degenerate
-from calibration.judging.lags import lag_lack
-from calibration.judging.rig import judge_fit
-from calibration.judging.sync import judge_sync
-from calibration.model.covariance import Covariance
-from calibration.model.lag_speeds import SWEPT, alike_speeds, lag_groups, untold
-from calibration.model.rig_model import Lag
+from calibration.model.parameters import SWEPT, alike_speeds, lag_groups, untold
+from calibration.model.rig_model import Covariance, Lag
 from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.result import RigFit
 from calibration.sync.lag_fit import SyncFit, fit_sync

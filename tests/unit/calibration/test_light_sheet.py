@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from calibration import CalibrationError, PivotScanner, PlaneTable
-from calibration.model.light_sheet import light_sheets
-from calibration.model.triangulation import depth
+from calibration.model.light_sheet import depth, light_sheets
 from tests.unit.calibration.fans import Fan
 
 ANGLE = [0.1, 0.4, 0.02]

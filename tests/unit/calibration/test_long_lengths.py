@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from calibration.check.boards import CheckedBoard
-from calibration.judging.check import judge_check
-from calibration.judging.sync import judge_sync
+from calibration.check import CheckedBoard
+from calibration.diagnosis.camera import judge_check
+from calibration.diagnosis.rig import judge_sync
 from calibration.model.rig_model import Lag, RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.sync.lag_fit import SweepTiming, SyncFit

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.board.board import Board
-from calibration.board.marker_layout import Markers, contradiction
+from calibration.board.markers import Markers, contradiction
 
 BOARD = Board("charuco", (9, 7), 0.06, 0.047, "DICT_4X4_100")
 PICTURE = np.full((480, 640), 255, np.uint8)

@@ -4,11 +4,10 @@ import mpmath
 import numpy as np
 import pytest
 
-from calibration.passages import finding
-from calibration.passages.even_pixels import evenly
-from calibration.passages.finding import SweepCounts, find_passages
+from calibration.passages import find as finding
+from calibration.passages.find import SweepCounts, evenly, find_passages
+from calibration.passages.fit import fit_passages
 from calibration.passages.light import LineShape, light
-from calibration.passages.pixel_fit import fit_passages
 from tests.unit.calibration.passed_lines import Light, passed, sweep_of, true_at
 
 CASES = {

@@ -5,7 +5,7 @@ import pytest
 
 from calibration import Camera
 from calibration.board.board import Board
-from calibration.board.picture_map import fit_map
+from calibration.board.drawing import fit_map
 from calibration.views import BoardPose
 
 BOARD = Board("chessboard", (9, 7), 0.06)

@@ -9,19 +9,21 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.pixels.dark_tally import DarkTally
-from calibration.pixels.drift import pixel_drift
-from calibration.pixels.pixel_file import PixelVersion, load_pixels, save_pixels
-from calibration.pixels.pixel_map import (
+from calibration.pixel_map import (
     FALSE_ALARM,
     SIGNAL,
+    DarkTally,
     PixelMap,
+    PixelVersion,
     dead_pixels,
     flux_of,
     frames_for,
     hot_flux,
     judge_pixels,
     light_leak,
+    load_pixels,
+    pixel_drift,
+    save_pixels,
 )
 
 EXPOSURE_S = 1e-5

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.board.board import Board
-from calibration.board.detection import find_corners
+from calibration.board.detect import find_corners
 from calibration.board.drawing import Drawing
 from sim_backend.scenes.board import ShownBoard, board_scene
 from tests.reference.random_rigs import BOARD, random_poses, random_rig

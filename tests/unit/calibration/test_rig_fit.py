@@ -5,19 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.guide.forecast import Forecast
-from calibration.model.covariance import Covariance
+from calibration.guide import Forecast
+from calibration.model.rig_model import Covariance
 from calibration.rig_fit.fit import fit_rig
 from calibration.rig_fit.result import RigFit
-from tests.reference.calibration_data import (
-    BOARD,
-    Seen,
-    TrueRig,
-    random_pose,
-    random_rig,
-    rotation,
-    seen_view,
-)
+from tests.reference.calibration_data import BOARD, Seen, TrueRig, random_pose, random_rig, rotation, seen_view
 from tests.reference.fitted_depth import depth_errors
 from tests.unit.calibration.fitted_rigs import EXACT, RIG, SEEN, SIZE, fitted, true_camera
 

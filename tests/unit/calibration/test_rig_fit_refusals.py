@@ -7,17 +7,12 @@ import pytest
 
 from calibration.errors import CalibrationError, Degenerate
 from calibration.model.camera import Camera
-from calibration.model.covariance import Covariance
-from calibration.model.rig_model import RigModel
+from calibration.model.rig_model import Covariance, RigModel
 from calibration.model.scanner import PivotScanner
-from calibration.rig_fit.degenerate import check_depth
 from calibration.rig_fit.fit import fit_rig
+from calibration.rig_fit.start import check_depth
 from calibration.views import BoardPose, View
-from tests.reference.calibration_data import (
-    BOARD,
-    random_views,
-    seen_view,
-)
+from tests.reference.calibration_data import BOARD, random_views, seen_view
 from tests.reference.fitted_depth import depth_errors
 from tests.unit.calibration.fitted_rigs import RIG, SEEN, SIZE, fitted, true_camera
 

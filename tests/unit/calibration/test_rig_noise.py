@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calibration.rig_fit.noise import passage_noise, restated
-from calibration.rig_fit.sightings import Sighting
+from calibration.rig_fit.state import Sighting
 
 Array = NDArray[np.float64]
 

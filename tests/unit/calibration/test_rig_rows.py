@@ -9,8 +9,7 @@ from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner
 from calibration.rig_fit.rows import Rows, Terms
-from calibration.rig_fit.sightings import sighting
-from calibration.rig_fit.state import first_state
+from calibration.rig_fit.state import first_state, sighting
 from calibration.views import BoardPose
 from tests.reference.calibration_data import BOARD, Seen, TrueRig, rotation, seen_view
 

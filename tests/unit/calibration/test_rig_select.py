@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from calibration.rig_fit.misfit import TermDecision, best, first_order, tried, with_free
 from calibration.rig_fit.rows import Terms
-from calibration.rig_fit.select import Decision, best, first_order, tried, with_free
-from calibration.rig_fit.solve import Problem
+from calibration.rig_fit.solve import RigProblem
 
 
 def test_a_term_changes_all_that_it_would_with_those_that_come_along() -> None:
@@ -18,7 +18,7 @@ def test_a_term_changes_all_that_it_would_with_those_that_come_along() -> None:
     root = rng.normal(size=(len(names), 3 * len(names)))
     matrix, right = root @ root.T, np.zeros(len(names))
     right[terms.at(new)] = rng.normal(size=2)  # of what is free nothing is left to gain
-    problem = with_free(Problem((), terms, np.zeros((0, 0)), np.ones(0, bool)), free)
+    problem = with_free(RigProblem((), terms, np.zeros((0, 0)), np.ones(0, bool)), free)
     solution = SimpleNamespace(matrix=matrix, right=right)
     decision = tried(problem, solution, new, lambda gain: 1.0)
     everything = terms.at([*(name for (name,) in free), *new])
@@ -29,8 +29,8 @@ def test_a_term_changes_all_that_it_would_with_those_that_come_along() -> None:
 
 
 def test_the_term_that_leaves_least_unexplained_comes_in_first() -> None:
-    sure = Decision("offset_0", True, -0.76, 0.037, "", gain=98257.0)
-    right = Decision("angle_3", True, -0.0109, 0.0006, "", (("angle_2", -0.006),), 111647.0)
-    left_out = Decision("bow", False, 0.02, 0.015, "", gain=2e5)
+    sure = TermDecision("offset_0", True, -0.76, 0.037, "", gain=98257.0)
+    right = TermDecision("angle_3", True, -0.0109, 0.0006, "", (("angle_2", -0.006),), 111647.0)
+    left_out = TermDecision("bow", False, 0.02, 0.015, "", gain=2e5)
     assert best([sure, right, left_out]) == 1
     assert best([left_out]) is None

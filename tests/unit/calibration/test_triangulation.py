@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.model.triangulation import depth, depth_slope, inverse_depth, near_side
+from calibration.model.light_sheet import depth, depth_slope, inverse_depth, near_side
 from tests.unit.calibration.cameras import LENSES, camera
 
 TILT = st.floats(-0.6, 0.6)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration import CalibrationError, Covariance, Lag, PivotScanner, PlaneTable, RigModel
-from calibration.depth.uncertainty import (
+from calibration.depth_error import (
     GROUPS,
     command_at,
     depth_jacobian,

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from calibration.board.board import Board
+from calibration.diagnosis.evidence import PoseEvidence, ViewEvidence, pose_evidence, view_evidence
+from calibration.diagnosis.rig import judge_fit
+from calibration.diagnosis.rules import FitEvidence, judge, judge_refusal
+from calibration.diagnosis.sweep_waves import SweepResidual, sweep_waves
+from calibration.diagnosis.view_shifts import ViewShift, common_shift, counted, last_before_move
 from calibration.errors import Degenerate
-from calibration.judging.evidence import PoseEvidence, ViewEvidence, pose_evidence, view_evidence
-from calibration.judging.rig import judge_fit
-from calibration.judging.rules import FitEvidence, judge, judge_refusal
-from calibration.judging.sweep_waves import SweepResidual, sweep_waves
-from calibration.judging.view_shifts import ViewShift, common_shift, counted, last_before_move
 from calibration.rig_fit.fit import fit_rig
 from calibration.verdict import Asked, Verdict, unguided
 from calibration.views import BoardPose, Corners, View

@@ -9,15 +9,15 @@ import pytest
 
 from calibration.board.board import load_board
 from calibration.errors import CalibrationError
-from calibration.files import yaml_file
+from calibration.files import sections as yaml_file
 from calibration.files.camera_file import load_camera
 from calibration.files.rig_file import load_rig_model
-from calibration.files.yaml_file import MAX_DEPTH, load_yaml
+from calibration.files.sections import MAX_DEPTH, load_yaml
 from drivers.errors import DeviceError
-from rig.config_files import load_config, load_cube_plan
+from rig.config.files import load_config, load_cube_plan
 from rig.errors import UsageError
 from rig.recording.inputs import read_plan
-from sim_backend.scene import load_scene
+from sim_backend.scenes.scene import load_scene
 
 ROOT = Path(__file__).parents[3]
 LAUGHS = "\n".join(
@@ -69,7 +69,7 @@ def test_there_is_one_reader_of_yaml() -> None:
     calls = re.compile(r"yaml\.(safe_load|load|full_load|unsafe_load|compose|parse)\w*\(|\w*SafeLoader\b")
     files = (file for part in ("drivers", "calibration", "sim_backend", "rig") for file in (ROOT / part).rglob("*.py"))
     found = {str(file.relative_to(ROOT)) for file in files if calls.search(file.read_text(encoding="utf-8"))}
-    assert found == {"calibration/files/yaml_file.py"}
+    assert found == {"calibration/files/sections.py"}
 
 
 def test_a_chain_of_aliases_nests_as_deep_as_what_it_stands_for(tmp_path: Path) -> None:

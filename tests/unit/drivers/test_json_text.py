@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from calibration.errors import CalibrationError
-from calibration.pixels.pixel_file import load_pixels
+from calibration.pixel_map import load_pixels
 from drivers.errors import ProtocolError
 from drivers.json_text import MAX_DEPTH, parse_json
-from drivers.replay_info import recorded_device
+from drivers.replay.spad import recorded_device
 from drivers.transports.tap import read_taps
-from rig.calibrating.session import session_rig
+from rig.calibrate.session import session_rig
 from rig.errors import DamagedRecordingError, UsageError
-from rig.recording.manifest import read_manifest
+from rig.run_folder.manifest import read_manifest
 
 DEEP = "[" * 100_000 + "]" * 100_000
 LARGE = f'{{"a": {"9" * 400}}}'

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, ScannerLimits, ScanWaveform
 from drivers.interfaces.scanner import check_waveform
-from drivers.mirror_ramps import brake, ramp
-from drivers.point_source import park_from, scan_from
+from drivers.scanners.dac_scanner import park_from, scan_from
+from drivers.scanners.galvo import brake, ramp
 
 RATE_HZ = 25_000.0
 LIMITS = ScannerLimits(

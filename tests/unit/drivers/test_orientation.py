@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivers.orientation import QuarterTurn, turn_packed, turned_size
+from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
 
 
 @pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])

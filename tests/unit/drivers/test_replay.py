@@ -15,7 +15,7 @@ from drivers.errors import DeviceFault, DeviceNotFound, LimitExceeded
 from drivers.frames import BlockFlag, BlockHeader, FrameBlock, Mark
 from drivers.interfaces import SpadRequest, WindowTable
 from drivers.registry import Surroundings
-from drivers.replay import KIND, ReplaySpad, ReplaySpadConfig
+from drivers.replay.spad import KIND, ReplaySpad, ReplaySpadConfig
 from drivers.ring import BlockRing, OnFull
 from drivers.spb1 import BlockLayout, block_parts, block_views, seal_block
 

@@ -5,7 +5,7 @@ from fractions import Fraction
 import pytest
 
 from drivers.clock import VirtualClock
-from drivers.replay_pace import Pace, ReplayClock
+from drivers.replay.pace import Pace, ReplayClock
 
 
 def pace(text: str, clock: VirtualClock | None = None) -> Pace:

@@ -11,16 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import UnsupportedBlock
 from drivers.frames import BlockFlag, BlockHeader, FrameBlock
-from drivers.spb1 import (
-    ALIGN,
-    BlockLayout,
-    Damage,
-    block_views,
-    frames_per_block,
-    parse_block,
-    seal_block,
-    walk_blocks,
-)
+from drivers.spb1 import ALIGN, BlockLayout, Damage, block_views, frames_per_block, parse_block, seal_block, walk_blocks
 from tests.unit.drivers.spb1_bytes import PAYLOAD, golden_block, header_bytes, trailer_bytes
 
 FEW = settings(max_examples=150, deadline=None)

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from drivers.guard import watched_process
-from drivers.guard.watched_process import WatchedProcess
+from drivers.guard import watch as watched_process
+from drivers.guard.watch import WatchedProcess
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from sim_backend.effects.rare_bits import packed
 from sim_backend.effects.setting import BitEffect, FrameTimes, Setting
-from sim_backend.optics import Sensor
+from sim_backend.light.optics import Sensor
 from tests.unit.sim.rigs import rig, setting, wall
 
 TIMES = FrameTimes(exposure_s=10e-6, period_s=10e-6)

@@ -9,11 +9,11 @@ from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PivotScanner
 from sim_backend.effects.setting import Setting
-from sim_backend.flux import FluxModel
-from sim_backend.optics import Line, Optics, Sensor, detections_per_radiance
-from sim_backend.scene import SceneFile
+from sim_backend.frames.flux import FluxModel
+from sim_backend.light.optics import Line, Optics, Sensor, detections_per_radiance
+from sim_backend.light.view import make_view
+from sim_backend.scenes.scene import SceneFile
 from sim_backend.scenes.surfaces import Surfaces, checked
-from sim_backend.view import make_view
 
 Array = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ from calibration.model.rig_model import RigModel
 from drivers.clock import VirtualClock
 from drivers.registry import Surroundings
 from sim_backend.effects.setting import FrameTimes
-from sim_backend.flux import FluxModel
-from sim_backend.light_sheet import LightSheet
-from sim_backend.line_fan import ONE_LINE
-from sim_backend.photons import PhotonSource
+from sim_backend.frames.flux import FluxModel
+from sim_backend.frames.photons import PhotonSource
+from sim_backend.light.line import ONE_LINE
+from sim_backend.light.sheet import LightSheet
 from sim_backend.world import DEFAULT_GEOMETRY, SimulatedWorld, WorldConfig
 from tests.unit.calibration.fans import Fan
 from tests.unit.sim.rigs import rig, setting, wall

@@ -13,8 +13,8 @@ from calibration.views import BoardPose
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
 from drivers.registry import Surroundings
-from sim_backend.scene import SceneFile, load_scene
 from sim_backend.scenes.board import WALL_ALBEDO, ShownBoard, board_scene
+from sim_backend.scenes.scene import SceneFile, load_scene
 from sim_backend.world import KIND, SimulatedWorld, WorldConfig
 from tests.system.small_rig import calibration
 from tests.unit.sim.rigs import rig

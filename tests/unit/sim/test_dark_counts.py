@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_backend.effects.dark_counts import dark_rates
-from sim_backend.optics import Sensor
+from sim_backend.light.optics import Sensor
 
 MEASURED = Path(__file__).parents[4] / "shared" / "sensor-data" / "dark_counts_50x50.npy"
 MEASURED_FRAMES = 7650

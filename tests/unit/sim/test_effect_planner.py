@@ -11,11 +11,11 @@ from pydantic import ValidationError
 from drivers.clock import VirtualClock
 from drivers.registry import Surroundings
 from sim_backend import effect_planner
-from sim_backend.effect_planner import MOST, MOST_CHANGED, Decision, EffectPlan, _changed, plan_effects
+from sim_backend.effect_planner import MOST, MOST_CHANGED, EffectDecision, EffectPlan, _changed, plan_effects
 from sim_backend.effects.catalogue import CATALOGUE, Entry
 from sim_backend.effects.setting import PlannedFor, Setting
-from sim_backend.flux import FluxModel
-from sim_backend.optics import Sensor
+from sim_backend.frames.flux import FluxModel
+from sim_backend.light.optics import Sensor
 from sim_backend.world import KIND, WorldConfig
 from tests.unit.sim.rigs import rig, setting, wall
 
@@ -32,7 +32,7 @@ def _setting(extinction: str | None = None, **scene: object) -> Setting:
     return replace(made, sensor=Sensor(dark_rate="0 cps"))
 
 
-def _decisions(plan: EffectPlan) -> dict[str, Decision]:
+def _decisions(plan: EffectPlan) -> dict[str, EffectDecision]:
     return {decision.entry.name: decision for decision in plan.decisions}
 
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from calibration.model.rig_model import RigModel
 from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.effects.setting import Setting
-from sim_backend.flux import FluxModel
-from sim_backend.optics import ambient_irradiance
+from sim_backend.frames.flux import FluxModel
+from sim_backend.light.optics import ambient_irradiance
 from sim_backend.scenes.surfaces import Surfaces
 from tests.unit.sim.rigs import effect_rate, rig, setting
 

@@ -90,7 +90,7 @@ def test_haze_ends_in_the_shadow_of_a_body_and_does_not_come_back() -> None:
 
 def test_clear_air_has_no_haze_code_and_no_haze() -> None:
     model = rig()
-    from sim_backend.flux import FluxModel
+    from sim_backend.frames.flux import FluxModel
 
     assert "fog" not in FluxModel(setting(model, wall(model, (0.0, 0.0, 1.0), 3.0))).names
 

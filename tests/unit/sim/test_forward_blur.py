@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim_backend.effects.catalogue import CATALOGUE
-from sim_backend.medium import FORWARD_ANGLE
+from sim_backend.scenes.medium import FORWARD_ANGLE
 from tests.unit.sim.rigs import effect_rate, rig, setting, wall
 
 MEDIUM = {"extinction": "0.3 /m", "scattering_share": 0.9, "forward_share": 0.5}

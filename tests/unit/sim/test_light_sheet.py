@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.model.triangulation import depth
+from calibration.model.light_sheet import depth
 from sim_backend.scenes.surfaces import Surfaces
 from tests.unit.sim.rigs import rig, setting, wall
 

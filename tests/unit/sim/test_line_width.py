@@ -6,8 +6,8 @@ import pytest
 from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
 from drivers.registry import Surroundings
-from sim_backend.line_width import line_width, sigma_px
-from sim_backend.optics import Line, Optics, Sensor
+from sim_backend.light.line import line_width, sigma_px
+from sim_backend.light.optics import Line, Optics, Sensor
 from sim_backend.world import KIND, WorldConfig
 from tests.unit.sim.rigs import effect_rate, rig, setting, wall
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from sim_backend.medium import Medium, henyey_greenstein
+from sim_backend.scenes.medium import Medium, henyey_greenstein
 
 
 @pytest.mark.parametrize("g", [-0.5, 0.0, 0.65, 0.85, 0.9])

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from sim_backend.effects.motion import HOLD_S, MovingSurfaces, shifted
 from sim_backend.effects.setting import FrameTimes, Setting
 from sim_backend.effects.stripe import Stripe
-from sim_backend.flux import FluxModel
-from sim_backend.optics import Line
-from sim_backend.photons import PhotonSource
-from sim_backend.scene import SceneFile
+from sim_backend.frames.flux import FluxModel
+from sim_backend.frames.photons import PhotonSource
+from sim_backend.light.optics import Line
+from sim_backend.light.view import make_view
+from sim_backend.scenes.scene import SceneFile
 from sim_backend.scenes.surfaces import Surfaces
-from sim_backend.view import make_view
 from tests.unit.sim.rigs import Array, rig, setting, wall
 
 

@@ -6,9 +6,9 @@ import pytest
 from drivers.clock import VirtualClock
 from drivers.registry import Surroundings
 from sim_backend.effects.setting import FrameTimes
-from sim_backend.flux import FluxModel
-from sim_backend.line_fan import ONE_LINE, LineFan, line_fan
-from sim_backend.photons import PhotonSource
+from sim_backend.frames.flux import FluxModel
+from sim_backend.frames.photons import PhotonSource
+from sim_backend.light.line import ONE_LINE, LineFan, line_fan
 from sim_backend.world import SimulatedWorld, WorldConfig
 from tests.unit.sim.rigs import rig, setting, wall
 
@@ -72,7 +72,7 @@ def test_a_line_past_the_range_goes_nowhere():
 
 
 def test_speckle_of_one_line_leaves_the_others_alone():
-    from sim_backend.optics import Line
+    from sim_backend.light.optics import Line
 
     model = rig()
     setup = setting(model, wall(model, (0, 0, 1), 3.0), line=Line(speckle=True))

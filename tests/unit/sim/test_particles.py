@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_backend.effects.particle_kernels import find_pixel, share
-from sim_backend.effects.particles import MOST, Particles, make_particles
+from sim_backend.effects.particles import MOST, Particles, find_pixel, make_particles, share
 from sim_backend.effects.rain import RainDrops
 from sim_backend.effects.setting import Setting
 from sim_backend.effects.snow import SnowFlakes
-from sim_backend.optics import Line
+from sim_backend.light.optics import Line
+from sim_backend.scenes.medium import Rain
 from sim_backend.scenes.surfaces import Surfaces
-from sim_backend.weather import Rain
 from tests.unit.sim.rigs import pixel_solid_angle, rig, setting, wall
 
 CONE = np.array([[-0.5, 1.0], [-0.4, 0.8]])

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_backend.effects.setting import FrameTimes, Words
-from sim_backend.flux import FluxModel
-from sim_backend.photon_kernels import (
+from sim_backend.frames.flux import FluxModel
+from sim_backend.frames.photon_kernels import (
     CHANCE,
     LEVELS,
     NEVER,
@@ -18,9 +18,8 @@ from sim_backend.photon_kernels import (
     new_levels,
     set_levels,
 )
-from sim_backend.photons import PhotonSource
-from sim_backend.random_lanes import PLACE
-from sim_backend.split_mix import frame_key
+from sim_backend.frames.photons import PhotonSource
+from sim_backend.random_numbers import PLACE, frame_key
 from tests.unit.sim.rigs import rig, setting, wall
 
 TIMES = FrameTimes(1e-5, 1e-5)

@@ -10,8 +10,8 @@ from llvmlite import binding, ir
 from numba import types
 from numba.extending import intrinsic
 
-from sim_backend import random_lanes
-from sim_backend.random_lanes import PLACE, block_numbers, drawn_word, enciphered, place_levels, sure_word
+from sim_backend import random_numbers as random_lanes
+from sim_backend.random_numbers import PLACE, block_numbers, drawn_word, enciphered, place_levels, sure_word
 
 START_OF_ROUND = 0x193DE3BEA0F4E22B9AC68D2AE9F84808
 ROUND_KEY = 0xA0FAFE1788542CB123A339392A6C7605

@@ -14,10 +14,9 @@ from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
 from drivers.registry import Surroundings
 from sim_backend.effects.catalogue import CATALOGUE, Entry
-from sim_backend.optics import Line, Optics, Sensor, ambient_irradiance, detections_per_radiance
-from sim_backend.scene import SceneFile, bundled_scenes, load_scene, load_surfaces, with_fog
-from sim_backend.scenes.prepared import load_folder
-from sim_backend.scenes.stereo import prepare
+from sim_backend.light.optics import Line, Optics, Sensor, ambient_irradiance, detections_per_radiance
+from sim_backend.scenes.prepared import load_folder, prepare
+from sim_backend.scenes.scene import SceneFile, bundled_scenes, load_scene, load_surfaces, with_fog
 from sim_backend.scenes.street import street
 from sim_backend.world import KIND, WorldConfig
 from tests.system.small_rig import calibration

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_backend.effects.setting import FrameTimes, Setting
-from sim_backend.flux import FluxModel
-from sim_backend.photons import PhotonSource
+from sim_backend.frames.flux import FluxModel
+from sim_backend.frames.photons import PhotonSource
 from tests.unit.sim.bits import ROWS, WIDTH, sensor_setting
 from tests.unit.sim.rigs import rig
 

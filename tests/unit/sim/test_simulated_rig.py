@@ -31,7 +31,7 @@ from drivers.registry import Surroundings
 from drivers.ring import BlockRing, OnFull
 from drivers.spb1 import walk_blocks
 from sim_backend.devices import laser, scanner, spad, sync
-from sim_backend.optics import Sensor
+from sim_backend.light.optics import Sensor
 from sim_backend.world import KIND as WORLD
 from sim_backend.world import SimulatedWorld, WorldConfig
 from tests.unit.sim.rigs import rig

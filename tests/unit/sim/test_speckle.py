@@ -5,8 +5,8 @@ import pytest
 
 from sim_backend.effects.speckle import Speckle, gamma_of, grains
 from sim_backend.effects.stripe import Stripe
-from sim_backend.optics import Line, Optics, Sensor
-from sim_backend.split_mix import frame_key
+from sim_backend.light.optics import Line, Optics, Sensor
+from sim_backend.random_numbers import frame_key
 from tests.unit.sim.rigs import Array, rig, setting, wall
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim_backend.devices.tick_clock import STEP_S, TickClock
+from sim_backend.devices.spad import STEP_S, TickClock
 
 TICK_S, PERIOD = 1e-8, 1000
 START_S = 12.5

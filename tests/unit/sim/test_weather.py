@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_backend.scene import SceneFile
-from sim_backend.weather import Rain, Snow
+from sim_backend.scenes.medium import Rain, Snow
+from sim_backend.scenes.scene import SceneFile
 
 DIAMETER_MM = np.linspace(0, 40, 400_001)
 

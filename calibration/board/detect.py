@@ -1,0 +1,200 @@
+"""Finds a board's corners in a picture: from counts summed to flux, noisy as they are, or from an image file.
+
+OpenCV finds the markers, or the chessboard, in the picture as it is, enlarged and smoothed, whichever shows most; a
+smooth map through them says where all corners are, and each is then fitted on its own (corner_registration.py). What
+cannot be used is refused with the reason: no board, another one, half of one, its mirror image, two of them.
+
+Pixels that cannot be used, filled in from their neighbours so that a picture can be searched.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.board import Board
+from calibration.board.chessboard import find_chessboard
+from calibration.board.drawing import BoardMap, Drawing, fit_map
+from calibration.board.lattice import Sighting, find_markers, gray
+from calibration.board.markers import contradiction
+from calibration.board.registration import OWN, SUBPIXELS, WIDE, register, sides_px
+from calibration.errors import Degenerate
+from calibration.views import Corners
+
+_REACHES = (1, 2, 4)
+"""Half width of the neighbourhood, in pixels; the next one where all of it is unusable."""
+
+
+def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+    """The picture with defects (True = unusable) and values that are no number replaced by their neighbours' median."""
+    values: NDArray[np.float32] = np.array(picture, dtype=np.float32)
+    bad = ~np.isfinite(values)
+    if defects is not None:
+        bad |= defects
+    values[bad] = np.nan
+    for reach in _REACHES:
+        rows, columns = np.nonzero(np.isnan(values))
+        if len(rows) == 0:
+            return values
+        padded = np.pad(values, reach, constant_values=np.nan)
+        step = np.arange(2 * reach + 1)
+        around = padded[rows[:, None, None] + step[:, None], columns[:, None, None] + step].reshape(len(rows), -1)
+        known = ~np.isnan(around).all(axis=1)
+        values[rows[known], columns[known]] = np.nanmedian(around[known], axis=1)
+    return np.nan_to_num(values)
+
+
+Array = NDArray[np.float64]
+
+LEAST_SHARE = 0.5
+"""Of the board's corners; a view with no more is refused."""
+_SECOND_BOARD_MARKERS = 4
+"""As many that lie on a board of their own are no misreadings."""
+_MAP_OUTLIER_SQUARES = 0.4
+"""How far a lens may bend a board off its homography, and how far a misread marker never lies."""
+_GROWTH_SQUARES = 1.6
+"""From what is known of a far board to the next corners; beyond, a map through a few noisy markers leads astray."""
+_OUTLIER_SDS = 6.0
+"""Off the map through all corners, or as many pixels and squares as follow: a lens bends more than the map does."""
+_LEAST_OUTLIER_PX = 0.3
+_MOST_USUAL_SDS = 4.0
+"""A corner whose sd is more than that of its neighbours was not laid over what it should be."""
+_LEAST_OUTLIER_SQUARES = 0.02
+
+
+def find_corners(picture: NDArray[np.generic], board: Board, defects: NDArray[np.bool_] | None = None) -> Corners:
+    """The board's corners in a picture (height, width), float or uint8; defects: (height, width), True = unusable.
+
+    Raises Degenerate: no-board, wrong-board, board-half-out, mirrored, two-boards. A chessboard shows that it is
+    mirrored only with an even number of squares along both sides, and not the same number. About 0.2 s for 48 corners.
+    """
+    values = repaired(picture, defects)
+    shown = gray(values)
+    sighting = find_chessboard(shown, board) if board.kind == "chessboard" else find_markers(shown, board)
+    wrong = sighting.other if sighting.markers is None else contradiction(sighting.markers, board, shown)
+    if wrong is not None:
+        raise _wrong(wrong)
+    board_map = _map_of(sighting, board)
+    if sighting.chessboards > 1 or (board_map is not None and _another(sighting, board)):
+        raise Degenerate(
+            "two-boards",
+            f"the picture shows two boards alike ({len(sighting.points_m)} corners of squares or markers, more than "
+            "one board of them); show one at a time, or boards with different markers",
+        )
+    if sighting.mirrored:
+        raise Degenerate(
+            "mirrored",
+            "the board is mirrored: it is found only in the picture's mirror image; turn the print over, take the "
+            "mirror out of the path, or correct the sensor's orientation in the config",
+        )
+    if board_map is None:
+        raise _not_found(sighting, board)
+    ids, px, sd = _refined(values, board, board_map, sighting)
+    if len(ids) <= LEAST_SHARE * len(board.corners_m):
+        raise _too_few(len(ids), board, board_map, values.shape)
+    order = np.argsort(ids)
+    return Corners(ids[order], px[order], sd[order])
+
+
+def _map_of(sighting: Sighting, board: Board) -> BoardMap | None:
+    if len(sighting.points_m) < 4:
+        return None
+    found = fit_map(sighting.points_m, sighting.px, _MAP_OUTLIER_SQUARES * sighting.square_px(board), board.size_m)
+    return None if found is None else found[0]
+
+
+def _another(sighting: Sighting, board: Board) -> bool:
+    """True where points off the best board lie on a second one."""
+    limit = _MAP_OUTLIER_SQUARES * sighting.square_px(board)
+    found = fit_map(sighting.points_m, sighting.px, limit, board.size_m)
+    if found is None:
+        return False
+    rest = ~found[1]
+    if rest.sum() < 4 * _SECOND_BOARD_MARKERS:
+        return False
+    second = fit_map(sighting.points_m[rest], sighting.px[rest], limit, board.size_m)
+    return second is not None and int(second[1].sum()) >= 4 * _SECOND_BOARD_MARKERS
+
+
+def _refined(
+    values: NDArray[np.float32], board: Board, rough: BoardMap, sighting: Sighting
+) -> tuple[NDArray[np.int32], Array, Array]:
+    """All corners the picture shows: sought around the rough map first, then, growing, around the map through those;
+    last, each on pixels of its own.
+    """
+    corners_m = board.corners_m[:, :2]
+    side = sides_px(board, rough, np.array([board.size_m]) / 2)[0]
+    drawing = Drawing.of(board, SUBPIXELS * side)
+    board_map, wanted = rough, _close_to(sighting.points_m, board)
+    before, reach, search = 0, WIDE, True
+    while True:
+        ids, px, sd = register(values, drawing, board_map, wanted, reach, search)
+        better = fit_map(corners_m[ids], px, _MAP_OUTLIER_SQUARES * side, board.size_m)
+        if better is None:
+            return ids[:0], px[:0], sd[:0]
+        board_map = better[0]
+        off = np.hypot(*(px - board_map.to_px(corners_m[ids])).T)
+        usual_sd = np.median(sd) if len(sd) else 0.0
+        good = (sd <= _MOST_USUAL_SDS * usual_sd) & (
+            off <= np.maximum(_OUTLIER_SDS * sd, max(_LEAST_OUTLIER_PX, _LEAST_OUTLIER_SQUARES * side))
+        )
+        ids, px, sd = ids[good], px[good], sd[good]
+        if reach == OWN:
+            return ids, px, sd
+        wanted = _close_to(corners_m[ids], board)
+        if not search and (len(ids) <= before or len(ids) == len(corners_m)):
+            wanted, reach = ids, OWN
+        before, search = (0 if search else len(ids)), False
+
+
+def _close_to(known_m: Array, board: Board) -> NDArray[np.int32]:
+    """Ids of the corners so close to known points that the map through those holds there."""
+    away = np.linalg.norm(board.corners_m[:, None, :2] - known_m, axis=-1).min(axis=1, initial=np.inf)
+    return np.flatnonzero(away <= _GROWTH_SQUARES * board.square_m).astype(np.int32)
+
+
+def _wrong(how: str) -> Degenerate:
+    return Degenerate(
+        "wrong-board",
+        f"the picture shows another board than the one looked for: {how}; name the board that is shown (--board), or "
+        "print that one",
+    )
+
+
+def _not_found(sighting: Sighting, board: Board) -> Degenerate:
+    whole = len(board.charuco().getIds()) if board.kind == "charuco" else len(board.corners_m)
+    what = "markers" if board.kind == "charuco" else "corners"
+    if sighting.part is not None:
+        seen, all_of_them = (f"{max(grid)} x {min(grid)}" for grid in (sighting.part, board.grid))
+        return Degenerate(
+            "board-half-out",
+            f"the picture shows {seen} of the chessboard's {all_of_them} corners; all of them must be in it, with "
+            "white around: move the board in, name the board that is shown (--board), or print one with markers",
+        )
+    return Degenerate(
+        "no-board",
+        f"no board in the picture: {sighting.count} of {whole} {what} read; bring it closer, give it more light, or "
+        "name the board that is shown (--board)",
+    )
+
+
+def _too_few(found: int, board: Board, board_map: BoardMap, shape: tuple[int, ...]) -> Degenerate:
+    # Without the bend, which grows without limit beyond the points that it goes through.
+    expected = replace(board_map, bend_px=np.zeros_like(board_map.bend_px)).to_px(board.corners_m[:, :2])
+    height, width = shape
+    beyond = {
+        "left": expected[:, 0] < 0,
+        "right": expected[:, 0] > width - 1,
+        "upper": expected[:, 1] < 0,
+        "lower": expected[:, 1] > height - 1,
+    }
+    outside = np.any(list(beyond.values()), axis=0)
+    count, whole = int(outside.sum()), len(expected)
+    seen = f"{found} of {whole} corners found; more than {int(LEAST_SHARE * whole)} are needed"
+    if 2 * count >= whole - found:
+        border = max(beyond, key=lambda side: int(beyond[side].sum()))
+        return Degenerate(
+            "board-half-out",
+            f"the board is half out of the picture: {seen}, and {count} lie beyond the {border} border; move it in",
+        )
+    return Degenerate("no-board", f"the board can hardly be seen: {seen}; bring it closer or give it more light")

@@ -1,0 +1,403 @@
+"""The camera from corners of a board at several poses: OpenCV's calibration, made robust and told how well it knows.
+
+Three kinds of corners are left out and named: a view that does not fit the others (the board moved, its corners in
+another order), single corners that do not fit their view, and a view whose board is seen from behind, which is a
+mirror image. The fit is that of cv2.calibrateCamera on what is left. The covariance is s^2 (J^T J)^-1 with the poses
+free and s^2 the residuals' variance, so it counts what the lens model misses as noise.
+
+OpenCV's calibration of a camera from corners, and whether they determine it.
+
+What decides is the normal matrix: its condition number and the sd it gives the focal length. How far the boards are
+turned against each other only chooses the word for the refusal.
+
+The normal equations of a camera and its boards' poses: how well corners determine the camera, poses left free.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.board import Board, Coverage, coverage_of, spread_rad
+from calibration.errors import CalibrationError, Degenerate, condition_text
+from calibration.model.camera import TERM_COUNTS, Camera
+from calibration.model.parameters import DISTORTION, MATRIX
+from calibration.model.rig_model import Covariance
+from calibration.views import LEAST_ACROSS_PX, NO_POSE, BoardPose, Corners, View, robust_sd
+
+Array = NDArray[np.float64]
+
+_POSE = 6
+"""OpenCV's columns: rotation, position, then fx fy cx cy and the distortion."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Normal:
+    """matrix: (p, p) float64, J^T J of the camera's parameters with every pose free; pixels and natural units."""
+
+    names: tuple[str, ...]
+    matrix: Array
+
+    @property
+    def condition(self) -> float:
+        """Of the matrix scaled to a unit diagonal: what it would be in the parameters' best units; inf if singular."""
+        scale = np.sqrt(np.diag(self.matrix))
+        if not np.all(np.isfinite(scale)) or not np.all(scale > 0):
+            return float("inf")
+        eigen = np.linalg.eigvalsh(self.matrix / np.outer(scale, scale))
+        return float(eigen[-1] / eigen[0]) if eigen[0] > 0 else float("inf")
+
+    def first(self, count: int) -> "Normal":
+        """Of the first parameters alone, the others taken as known."""
+        return Normal(self.names[:count], self.matrix[:count, :count])
+
+    def covariance(self, variance_px2: float) -> Covariance:
+        """For corners of this variance. CalibrationError or LinAlgError where the matrix is singular."""
+        scale = np.sqrt(np.diag(self.matrix))
+        inverse = np.linalg.inv(self.matrix / np.outer(scale, scale)) / np.outer(scale, scale)
+        return Covariance(self.names, variance_px2 * (inverse + inverse.T) / 2)
+
+
+def camera_normal(
+    points_m: Sequence[Array], poses: Sequence[BoardPose], matrix: Array, distortion: Array, terms: int
+) -> Normal:
+    """Of points (n, 3) of the board seen at each of the poses, by a camera with `terms` free terms of distortion."""
+    total = np.zeros((4 + terms, 4 + terms))
+    given = np.zeros(max(len(distortion), 5)) if terms <= 5 else np.zeros(14 if terms > 8 else 8)
+    given[: len(distortion)] = distortion
+    for points, pose in zip(points_m, poses, strict=True):
+        _, slopes = cv2.projectPoints(points, pose.rotation, pose.position_m, matrix, given)
+        pose_part, camera_part = slopes[:, :_POSE], slopes[:, _POSE : _POSE + 4 + terms]
+        # What a change of the camera does that no change of the pose undoes (Schur complement by QR).
+        basis, _ = np.linalg.qr(pose_part)
+        rest = camera_part - basis @ (basis.T @ camera_part)
+        total += rest.T @ rest
+    return Normal((*MATRIX, *DISTORTION[:terms]), total)
+
+
+Mask = NDArray[np.bool_]
+
+LEAST_SD_PX = 0.01
+"""Corners are never better than this, however well they fit."""
+_MOST_FOCAL_SD = 0.05
+"""Of the focal length, relative: above, depth would be wrong by as much."""
+_MOST_CONDITION = 1e11
+"""Of the normal matrix at unit diagonal: beyond, doubles lose its smallest eigenvalue."""
+_PARALLEL_RAD = float(np.radians(3.0))
+_SAME_PLACE = 0.02
+"""Of the distance: boards nearer to each other than that, and parallel, are one pose."""
+_GUESSED_FOCAL = (1.2, 0.7, 2.5)
+"""Focal lengths, in widths of the picture, to start from where OpenCV's own start fails."""
+_FLAGS = {
+    0: cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
+    4: cv2.CALIB_FIX_K3,
+    5: 0,
+    8: cv2.CALIB_RATIONAL_MODEL,
+    12: cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL,
+    14: cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL,
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraSolution:
+    """A camera, and of every view the pose and the residuals (n, 2), projected less seen."""
+
+    matrix: Array
+    distortion: Array
+    poses: tuple[BoardPose, ...]
+    residual_px: tuple[Array, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraProblem:
+    """Corners of one board in pictures of `size` (width, height), and the number of distortion terms to find."""
+
+    board: Board
+    size: tuple[int, int]
+    terms: int
+    corners: Sequence[Corners]
+
+    def points_m(self, view: int) -> Array:
+        """(n, 3) float64 of the view's corners on the board."""
+        return self.board.corners_m[self.corners[view].ids]
+
+    def check(self, used: Sequence[Mask]) -> None:
+        """Raise Degenerate where there is one pose only."""
+        kept = [i for i, mask in enumerate(used) if mask.any()]
+        matrix = self._guess(_GUESSED_FOCAL[0])
+        poses = [self._pose(i, matrix, np.zeros(5)) for i in range(len(used))]
+        if len(kept) > 1 and not self._one_place([poses[i] for i in kept]):
+            return
+        condition = self._normal(used, CameraSolution(matrix, np.zeros(self.terms), tuple(poses), ())).condition
+        raise Degenerate(
+            "one-pose",
+            f"{len(kept)} view{'s' * (len(kept) > 1)} of the board, all at one pose (condition number "
+            f"{condition_text(condition)}): a camera takes three poses or more; show the board tilted to both sides, "
+            "near and far",
+        )
+
+    def solve(self, used: Sequence[Mask]) -> CameraSolution:
+        """The least squares camera of the corners used, and the poses of all views. Raises Degenerate."""
+        kept = [i for i, mask in enumerate(used) if mask.any()]
+        points = [self.points_m(i)[used[i]].astype(np.float32) for i in kept]
+        px = [self.corners[i].px[used[i]].astype(np.float32) for i in kept]
+        found = self._calibrated(points, px)
+        if found is None:
+            matrix = self._guess(_GUESSED_FOCAL[0])
+            poses = tuple(self._pose(i, matrix, np.zeros(5)) for i in range(len(used)))
+            normal = self._normal(used, CameraSolution(matrix, np.zeros(self.terms), poses, ()))
+            raise self._refusal(used, poses, normal, "no camera fits")
+        matrix, distortion, of_kept = found
+        at = dict(zip(kept, of_kept, strict=True))
+        poses = tuple(at[i] if i in at else self._pose(i, matrix, distortion) for i in range(len(used)))
+        residual = tuple(self._residual(i, matrix, distortion, pose) for i, pose in enumerate(poses))
+        return CameraSolution(matrix, distortion, poses, residual)
+
+    def judged(self, solution: CameraSolution, used: Sequence[Mask]) -> tuple[float, Normal]:
+        """(variance of a corner's coordinate in px^2, normal matrix); Degenerate where they determine no camera."""
+        normal = self._normal(used, solution)
+        off = np.concatenate([r[mask] for r, mask in zip(solution.residual_px, used, strict=True)])
+        free = off.size - 6 * sum(bool(mask.any()) for mask in used) - len(normal.names)
+        if free < 1 or not np.isfinite(off).all():
+            raise self._refusal(
+                used, solution.poses, normal, f"{off.size // 2} corners for {len(normal.names)} parameters"
+            )
+        variance = max(float(np.sum(off**2)) / free, LEAST_SD_PX**2)
+        if not normal.condition < _MOST_CONDITION:
+            if normal.first(4 + min(self.terms, 5)).condition < _MOST_CONDITION:
+                raise Degenerate(
+                    "too-few-poses",
+                    f"{self.terms} terms of distortion are more than these views determine (condition "
+                    f"number {condition_text(normal.condition)}, {condition_text(_MOST_CONDITION)} at most); take 5, "
+                    "or fill the picture",
+                )
+            raise self._refusal(used, solution.poses, normal, "the focal length cannot be told from the distance")
+        sd = np.sqrt(np.diag(normal.covariance(variance).matrix))[:2] / np.diag(solution.matrix)[:2]
+        if not sd.max() < _MOST_FOCAL_SD:
+            said = f"the focal length is known to {sd.max():.1%} only ({_MOST_FOCAL_SD:.0%} at most)"
+            raise self._refusal(used, solution.poses, normal, said)
+        return variance, normal
+
+    def _calibrated(
+        self, points: list[NDArray[np.float32]], px: list[NDArray[np.float32]]
+    ) -> tuple[Array, Array, list[BoardPose]] | None:
+        for focal in (None, *_GUESSED_FOCAL):
+            start = None if focal is None else self._guess(focal)
+            flags = _FLAGS[self.terms] | (0 if start is None else cv2.CALIB_USE_INTRINSIC_GUESS)
+            stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+            try:
+                _, matrix, distortion, turns, shifts = cv2.calibrateCamera(
+                    points, px, self.size, start, None, flags=flags, criteria=stop
+                )
+            except cv2.error:
+                continue
+            poses = [
+                BoardPose(np.ravel(r).astype(float), np.ravel(t).astype(float))
+                for r, t in zip(turns, shifts, strict=True)
+            ]
+            terms = np.ravel(distortion)[: self.terms].astype(np.float64)
+            sound = [matrix, terms, *(pose.rotation for pose in poses), *(pose.position_m for pose in poses)]
+            if all(np.isfinite(part).all() for part in sound) and min(matrix[0, 0], matrix[1, 1]) > 0:
+                return np.asarray(matrix, np.float64), terms, poses
+        return None
+
+    def _pose(self, view: int, matrix: Array, distortion: Array) -> BoardPose:
+        points, px = self.points_m(view), self.corners[view].px
+        try:
+            _, turn, shift = cv2.solvePnP(points, px, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
+            turn, shift = cv2.solvePnPRefineLM(points, px, matrix, distortion, turn, shift)
+        except cv2.error as error:
+            raise Degenerate("no-board", NO_POSE) from error
+        return BoardPose(np.ravel(turn), np.ravel(shift))
+
+    def _residual(self, view: int, matrix: Array, distortion: Array, pose: BoardPose) -> Array:
+        expected, _ = cv2.projectPoints(self.points_m(view), pose.rotation, pose.position_m, matrix, distortion)
+        return np.asarray(expected.reshape(-1, 2) - self.corners[view].px, np.float64)
+
+    def _normal(self, used: Sequence[Mask], solution: CameraSolution) -> Normal:
+        kept = [i for i, mask in enumerate(used) if mask.any()]
+        points = [self.points_m(i)[used[i]] for i in kept]
+        poses = [solution.poses[i] for i in kept]
+        return camera_normal(points, poses, solution.matrix, solution.distortion, self.terms)
+
+    def _guess(self, focal_widths: float) -> Array:
+        width, height = self.size
+        focal = focal_widths * width
+        return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], np.float64)
+
+    def _one_place(self, poses: Sequence[BoardPose]) -> bool:
+        """True where all boards are parallel and at the same place."""
+        places = np.stack([pose.to_camera(np.array([*self.board.size_m, 0.0]) / 2) for pose in poses])
+        off = np.linalg.norm(places - places[0], axis=1).max()
+        return spread_rad(poses) < _PARALLEL_RAD and bool(off < _SAME_PLACE * np.linalg.norm(places[0]))
+
+    def _refusal(self, used: Sequence[Mask], poses: Sequence[BoardPose], normal: Normal, why: str) -> Degenerate:
+        shown = [pose for pose, mask in zip(poses, used, strict=True) if mask.any()]
+        spread = spread_rad(shown)
+        said = f"{why} (condition number {condition_text(normal.condition)}) from {len(shown)} views, turned by up to "
+        said += f"{np.degrees(spread):.1f} degrees against each other"
+        if spread < 3 * _PARALLEL_RAD:
+            return Degenerate("coplanar", f"the boards are parallel: {said}; tilt the board by 30 degrees to all sides")
+        return Degenerate("too-few-poses", f"too few poses: {said}; show the board at more poses, all over the picture")
+
+
+def rms(residual_px: Array) -> float:
+    """Of the distance, as OpenCV has it: root of the mean of dx^2 + dy^2."""
+    return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=-1)))) if len(residual_px) else float("nan")
+
+
+_FEWEST_CORNERS = 8
+"""Of a view: four give the pose, the rest say whether it fits."""
+_VIEW_LIMIT = 2.5
+"""A view is an outlier where its residuals, in sds of its corners, are so many times those of the usual view."""
+_CORNER_LIMIT = 6.0
+"""Sds of either coordinate beyond which a corner is left out."""
+_FEW_CORNERS = 1
+"""Left out of a view without naming it."""
+_LEAST_CLOSE = 0.7
+"""Share of a view's corners; with fewer that fit, none is used."""
+_FEWEST_VIEWS = 3
+"""That stay when outliers leave."""
+_MAX_ROUNDS = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraFit:
+    """A camera and what it was made from. Sequences run over the views that have corners, named in `views`.
+
+    residual_px: (n, 2) float64 projected less seen, of every corner. used: (n,) bool, those in the fit. rms_px: of
+    those, of the distance. outliers: names of the views that do not fit, wholly or in more than one corner. condition:
+    of the normal equations at unit diagonal. coverage: of the views that are in the fit.
+    """
+
+    camera: Camera
+    views: tuple[str, ...]
+    poses: tuple[BoardPose, ...]
+    residual_px: tuple[Array, ...]
+    used: tuple[Mask, ...]
+    rms_px: float
+    covariance: Covariance
+    condition: float
+    outliers: tuple[str, ...]
+    coverage: Coverage
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Names of the views that are in the fit, if only with a part of their corners."""
+        return tuple(name for name, mask in zip(self.views, self.used, strict=True) if mask.any())
+
+    @property
+    def dropped(self) -> tuple[str, ...]:
+        """Names of the views of which no corner is in the fit."""
+        return tuple(name for name, mask in zip(self.views, self.used, strict=True) if not mask.any())
+
+    @property
+    def sd(self) -> dict[str, float]:
+        """Of every parameter, by name: fx fy cx cy in pixels, the distortion's in its own units."""
+        spread = np.sqrt(np.diag(self.covariance.matrix))
+        return dict(zip(self.covariance.names, spread.tolist(), strict=True))
+
+    @property
+    def view_rms_px(self) -> Array:
+        """(views,) float64 of all corners of each view, those left out too."""
+        return np.array([rms(residual) for residual in self.residual_px])
+
+
+def fit_camera(
+    views: Sequence[View], board: Board, size: tuple[int, int], *, distortion_terms: int = 5, robust: bool = True
+) -> CameraFit:
+    """The camera of pictures of `size` (width, height) from the corners in `views`.
+
+    distortion_terms: 0, 4, 5, 8, 12 or 14, OpenCV's. robust: leave out what does not fit; else every corner counts.
+    Raises Degenerate: no-board, mirrored, one-pose, coplanar, too-few-poses; the message has the condition number.
+    """
+    if distortion_terms not in (0, *TERM_COUNTS):
+        raise CalibrationError(f"distortion has {distortion_terms} terms; OpenCV defines 0, {str(TERM_COUNTS)[1:-1]}")
+    seen = [(view, view.corners) for view in views if view.corners is not None]
+    seen = [
+        (view, corners)
+        for view, corners in seen
+        if len(corners.ids) >= _FEWEST_CORNERS and corners.across_px >= LEAST_ACROSS_PX
+    ]
+    if not seen:
+        raise Degenerate(
+            "no-board", f"none of {len(views)} views shows the board; show all of it, closer or with more light"
+        )
+    names = [view.name for view, _ in seen]
+    corners = [found for _, found in seen]
+    behind = np.array([_is_mirrored(found, board) for found in corners])
+    if behind.all():
+        raise Degenerate("mirrored", "the board is mirrored in every view; turn the print or correct the orientation")
+    problem = CameraProblem(board, size, distortion_terms, corners)
+    used = [np.full(len(found.ids), not back) for found, back in zip(corners, behind, strict=True)]
+    problem.check(used)
+    solution = problem.solve(used)
+    if robust:
+        solution, used = _without_outliers(problem, solution, used)
+    variance, normal = problem.judged(solution, used)
+    kept = [i for i, mask in enumerate(used) if mask.any()]
+    shown = [seen[i][0] for i in kept]
+    return CameraFit(
+        camera=Camera(size[0], size[1], solution.matrix, solution.distortion),
+        views=tuple(names),
+        poses=solution.poses,
+        residual_px=solution.residual_px,
+        used=tuple(used),
+        rms_px=rms(np.concatenate([r[mask] for r, mask in zip(solution.residual_px, used, strict=True)])),
+        covariance=normal.covariance(variance),
+        condition=normal.condition,
+        outliers=tuple(n for n, mask in zip(names, used, strict=True) if (~mask).sum() > _FEW_CORNERS),
+        coverage=coverage_of(shown, [solution.poses[i] for i in kept], board, size),
+    )
+
+
+def _without_outliers(
+    problem: CameraProblem, solution: CameraSolution, used: list[Mask]
+) -> tuple[CameraSolution, list[Mask]]:
+    """The fit without what does not fit: the worst view at a time, then single corners, until nothing changes."""
+    dropped = {i for i, mask in enumerate(used) if not mask.any()}
+    behind = frozenset(dropped)
+    relative = _relative_sds(problem.corners)
+    for _ in range(_MAX_ROUNDS):
+        scaled = [residual / sd for residual, sd in zip(solution.residual_px, relative, strict=True)]
+        scale = np.array([robust_sd(residual) for residual in scaled])
+        inside = [i for i in range(len(used)) if i not in dropped]
+        usual = max(float(np.median(scale[inside])), LEAST_SD_PX)
+        worst = max(inside, key=lambda i: scale[i])
+        again = {i for i in dropped - behind if scale[i] <= _VIEW_LIMIT * usual}
+        if scale[worst] > _VIEW_LIMIT * usual and len(inside) > _FEWEST_VIEWS:
+            dropped = dropped | {worst}
+            new = [mask & (i != worst) for i, mask in enumerate(used)]
+        else:
+            dropped = dropped - again
+            new = [_close(residual, usual) & (i not in dropped) for i, residual in enumerate(scaled)]
+        if all(np.array_equal(one, other) for one, other in zip(new, used, strict=True)):
+            break
+        used = new
+        solution = problem.solve(used)
+    return solution, used
+
+
+def _relative_sds(corners: Sequence[Corners]) -> list[Array]:
+    """(n, 1) of every view: its corners' sds against the usual one."""
+    sds = [found.likely_sd_px for found in corners]
+    usual = float(np.median(np.concatenate(sds)))
+    return [(sd / usual)[:, None] for sd in sds]
+
+
+def _close(residual_px: Array, sd_px: float) -> Mask:
+    """Corners within the limit; none of a view that has more beyond it than it should."""
+    close: Mask = np.abs(residual_px).max(axis=1) <= _CORNER_LIMIT * sd_px
+    return close if close.mean() >= _LEAST_CLOSE else np.zeros_like(close)
+
+
+def _is_mirrored(corners: Corners, board: Board) -> bool:
+    """True where the numbering runs against the clock: the board seen from behind, or in a mirror."""
+    homography, _ = cv2.findHomography(board.corners_m[corners.ids, :2], corners.px)
+    if homography is None:
+        return False
+    middle = np.array([*board.size_m, 2.0]) / 2
+    # The sign of the map's Jacobian at the board's middle: det H / w^3.
+    return bool(np.linalg.det(homography) * (homography[2] @ middle) < 0)

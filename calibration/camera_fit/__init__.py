@@ -1,1 +1,0 @@
-"""The camera alone from the corners of many views."""

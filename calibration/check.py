@@ -1,0 +1,283 @@
+"""A calibration judged by boards that it was not made with: are they flat, as large and at the angle that they are?
+
+A board at an unknown pose is scanned. The scanned points of each of its squares are averaged; the deviations of these
+averages from their best plane are the flatness error. The board's corners, put on that plane along their rays, are as
+far apart as the board says or not: the scale error. Two boards give the error of the angle between them. What the
+model's covariance and the scan's noise let expect of each stands beside it. With m the deviations (cells,), C their
+expected covariance and P what takes a plane off,
+
+    chi2 = (P m)' (P C P)^+ (P m)    with cells - 3 degrees of freedom.
+
+A flat board as the line scanned it: mean pixel and mean command of each of its squares, and the points they give.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.board import Board
+from calibration.depth_error import propagated
+from calibration.errors import Degenerate
+from calibration.model.rig_model import RigModel
+from calibration.views import FEWEST_CORNERS, Passages, View
+
+Array = NDArray[np.float64]
+
+_FEWEST_CELLS = 8
+"""Scanned squares of a board; three of them already go into its plane."""
+_FEWEST_IN_CELL = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardCells:
+    """A board's squares as the sweeps passed them: mean pixel and mean command of each square and sweep."""
+
+    board_xy_m: Array  # (cells, 2)
+    x_px: Array  # (sweeps, cells)
+    y_px: Array
+    command: Array
+    velocity_per_s: Array  # (sweeps, 1)
+    sd: Array  # (sweeps, cells), of the mean command
+    at: tuple[NDArray[np.intp], NDArray[np.intp]]  # row and column of each cell on the board
+
+
+def cells_of(model: RigModel, view: View, board: Board) -> BoardCells:
+    """Means over the squares that every sweep passed often enough."""
+    if not view.passages:
+        raise Degenerate("no-board", f"view {view.name} has no passages of the line; scan the board with the laser on")
+    shape = (board.squares[1], board.squares[0])
+    sums = []
+    for sweep in view.passages:
+        xy = _on_board(model, view, board, sweep.x_px, sweep.y_px)
+        inside = np.isfinite(xy).all(axis=1) & np.isfinite(_scanned_points(model, sweep)[:, 2])
+        column, row = (np.floor(xy[inside] / board.square_m)).astype(np.intp).T
+        index = row * shape[1] + column
+        columns = [xy[inside, 0], xy[inside, 1], sweep.x_px[inside], sweep.y_px[inside], sweep.command[inside]]
+        columns += [sweep.sd[inside] ** 2, np.ones(index.size)]
+        sums.append(np.array([np.bincount(index, values, shape[0] * shape[1]) for values in columns]))
+    stacked = np.array(sums)  # (sweeps, 7, squares)
+    number = stacked[:, 6]
+    known = np.flatnonzero((number >= _FEWEST_IN_CELL).all(axis=0))
+    if known.size < _FEWEST_CELLS:
+        raise Degenerate(
+            "no-board",
+            f"view {view.name}: the line was found on {known.size} of the board's {shape[0] * shape[1]} squares, "
+            f"{_FEWEST_CELLS} are needed; show the whole board, in the depth range, and use more laser power",
+        )
+    mean = stacked[:, :, known] / number[:, None, known]
+    return BoardCells(
+        board_xy_m=mean[:, :2].mean(axis=0).T,
+        x_px=mean[:, 2],
+        y_px=mean[:, 3],
+        command=mean[:, 4],
+        velocity_per_s=np.array([[sweep.velocity_per_s] for sweep in view.passages]),
+        sd=np.sqrt(mean[:, 5] / number[:, known]),
+        at=np.unravel_index(known, shape),  # type: ignore[arg-type]
+    )
+
+
+def points_of(model: RigModel, cells: BoardCells) -> Array:
+    """(cells, 3): each square's point, the mean of the sweeps'."""
+    found = _triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s)
+    mean: Array = found.mean(axis=0)
+    return mean
+
+
+def noise_m2(model: RigModel, cells: BoardCells, normal: Array) -> float:
+    """Variance of a square's mean along the board's normal: from how far the sweeps differ, else as passages state."""
+    found = _triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s) @ normal
+    sweeps = len(found)
+    if sweeps > 1:
+        apart = (found - found.mean(axis=0)) @ off_plane(cells.board_xy_m)
+        return float(np.sum(apart**2) / ((sweeps - 1) * apart.shape[1] * sweeps))
+    ahead = _triangulated(model, cells.x_px, cells.y_px, cells.command + cells.sd, cells.velocity_per_s) @ normal
+    return float(np.nanmean((ahead - found) ** 2))
+
+
+def _triangulated(model: RigModel, x_px: Array, y_px: Array, command: Array, velocity_per_s: Array | float) -> Array:
+    u, v = model.camera.tangents_at(x_px, y_px)
+    mirror = np.asarray(model.mirror_command(command, y_px, velocity_per_s))
+    low, high = model.scanner.command_range
+    inside = (mirror >= low) & (mirror <= high)
+    z = np.where(inside, model.sheets(np.where(inside, mirror, (low + high) / 2)).depth(u, v), np.nan)
+    return np.stack([u * z, v * z, z], axis=-1)
+
+
+def _on_board(model: RigModel, view: View, board: Board, x_px: Array, y_px: Array) -> Array:
+    """(m, 2) where pixels lie on the board, metres; NaN off its squares. Rays see a plane by a homography."""
+    corners = corner_pixels(view)
+    assert view.corners is not None, "checked with the corner's pixels"
+    seen = np.stack(model.camera.tangents_at(corners[:, 0], corners[:, 1]), axis=-1)
+    to_board, _ = cv2.findHomography(seen, board.corners_m[view.corners.ids, :2])
+    rays = np.stack([*model.camera.tangents_at(x_px, y_px), np.ones(len(x_px))], axis=-1) @ to_board.T
+    xy = rays[:, :2] / rays[:, 2:]
+    inside = np.all((xy >= 0) & (xy < np.array(board.size_m)), axis=1)
+    return np.where(inside[:, None], xy, np.nan)
+
+
+def inside_points(model: RigModel, view: View, board: Board) -> Array:
+    """(m, 3) points of all passages on the board's squares; NaN outside the model's range of commands."""
+    found = []
+    for sweep in view.passages:
+        inside = np.isfinite(_on_board(model, view, board, sweep.x_px, sweep.y_px)).all(axis=1)
+        found.append(_scanned_points(model, sweep)[inside])
+    return np.concatenate(found)
+
+
+def corner_pixels(view: View) -> Array:
+    """(n, 2) the view's corners. Degenerate where they are too few to say where the board is."""
+    if view.corners is None or len(view.corners.ids) < FEWEST_CORNERS:
+        found = 0 if view.corners is None else len(view.corners.ids)
+        raise Degenerate(
+            "no-board",
+            f"view {view.name}: {found} corners of the board were found, {FEWEST_CORNERS} are needed; show the whole "
+            "board, lit evenly",
+        )
+    return view.corners.px
+
+
+def _scanned_points(model: RigModel, passages: Passages) -> Array:
+    """(m, 3) points of passages in the camera's frame; NaN where the command lies outside the model's range."""
+    return _triangulated(model, passages.x_px, passages.y_px, passages.command, passages.velocity_per_s)
+
+
+def off_plane(xy: Array) -> Array:
+    """(cells, cells - 3) orthonormal basis of what is no plane."""
+    full = np.linalg.qr(np.column_stack([np.ones(len(xy)), xy]), mode="complete")[0]
+    basis: Array = full[:, 3:]
+    return basis
+
+
+_PARALLEL = 1e-6
+"""Sine of the angle between boards that are not tilted towards each other in any direction."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckedBoard:
+    """What the scan of one board gives; lengths in metres.
+
+    distance_m: depth of its middle. flatness_rms_m, flatness_peak_m: of its squares' means off their plane; expected_m:
+    the rms that covariance and noise let expect. chi2, freedom: of the deviations. scale: size scanned over size
+    stated; scale_sd: as expected. cells_m: (squares down, across) deviations, NaN where a square was not scanned.
+    point_rms_m: of single passages off the plane. normal: (3,) unit, towards the camera.
+    """
+
+    name: str
+    distance_m: float
+    flatness_rms_m: float
+    flatness_peak_m: float
+    expected_m: float
+    chi2: float
+    freedom: int
+    scale: float
+    scale_sd: float
+    point_rms_m: float
+    cells_m: Array
+    normal: Array
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedAngle:
+    """Angle between two boards as scanned, its sd as expected; rad."""
+
+    angle_rad: float
+    sd_rad: float
+
+
+def check_boards(model: RigModel, views: Sequence[View], board: Board) -> tuple[CheckedBoard, ...]:
+    """Check every view's board. Raises Degenerate where a board or its passages are not there."""
+    return tuple(_check(model, view, board) for view in views)
+
+
+def check_angle(model: RigModel, first: View, second: View, board: Board) -> CheckedAngle:
+    """The angle between the boards of two views, 0 to pi/2."""
+    both = [(cells_of(model, view, board), view) for view in (first, second)]
+
+    def measure(tried: RigModel) -> Array:
+        one, other = (_plane(points_of(tried, cells))[0] for cells, _ in both)
+        return np.array([math.acos(min(1.0, abs(float(one @ other))))])
+
+    values, covariance = propagated(model, measure)
+    noise = sum(_tilt_noise(model, both[at][0], both[1 - at][0]) for at in (0, 1))
+    return CheckedAngle(float(values[0]), float(np.sqrt(covariance[0, 0] + noise)))
+
+
+def _tilt_noise(model: RigModel, cells: BoardCells, other: BoardCells) -> float:
+    """Variance (rad^2) by the noise of a board's scan of how far it is tilted towards another one."""
+    points = points_of(model, cells)
+    normal, _ = _plane(points)
+    towards = _plane(points_of(model, other))[0]
+    towards = towards - (towards @ normal) * normal
+    around = points - points.mean(axis=0)
+    around -= np.outer(around @ normal, normal)
+    spread = np.linalg.pinv(around.T @ around, rcond=1e-9, hermitian=True)  # of the slopes in the board's plane
+    length2 = float(towards @ towards)
+    share = float(towards @ spread @ towards) / length2 if length2 > _PARALLEL**2 else float(np.linalg.norm(spread, 2))
+    return noise_m2(model, cells, normal) * share
+
+
+def _check(model: RigModel, view: View, board: Board) -> CheckedBoard:
+    cells = cells_of(model, view, board)
+    points = points_of(model, cells)
+    corners = corner_pixels(view)
+    count = len(cells.board_xy_m)
+
+    def measure(tried: RigModel) -> Array:
+        found = points_of(tried, cells)
+        normal, offset = _plane(points)  # the same reference for all
+        return np.append(found @ normal - offset, _scale(tried, found, view, board, corners))
+
+    values, covariance = propagated(model, measure)
+    deviations, scale = values[:count], float(values[count])
+    normal, offset = _plane(points)
+    noise = noise_m2(model, cells, normal)
+    chi2, freedom = _chi2(deviations, covariance[:count, :count] + noise * np.eye(count), cells.board_xy_m)
+    basis = off_plane(cells.board_xy_m)
+    expected = basis.T @ (covariance[:count, :count] + noise * np.eye(count)) @ basis
+    field = np.full((board.squares[1], board.squares[0]), np.nan)
+    field[cells.at] = deviations
+    of_points = inside_points(model, view, board) @ normal - offset
+    return CheckedBoard(
+        name=view.name,
+        distance_m=float(points[:, 2].mean()),
+        flatness_rms_m=float(np.sqrt(np.mean(deviations**2))),
+        flatness_peak_m=float(np.abs(deviations).max()),
+        expected_m=float(np.sqrt(np.trace(expected) / count)),
+        chi2=chi2,
+        freedom=freedom,
+        scale=scale,
+        scale_sd=float(np.sqrt(covariance[count, count] + noise / count / offset**2)),
+        point_rms_m=float(np.sqrt(np.nanmean(of_points**2))),
+        cells_m=field,
+        normal=-normal if normal[2] > 0 else normal,
+    )
+
+
+def _scale(model: RigModel, points: Array, view: View, board: Board, corners: Array) -> float:
+    """Size of the corners' pattern, put on the scanned plane along their rays, over its size on the board."""
+    assert view.corners is not None, "checked with the corner's pixels"
+    normal, offset = _plane(points)
+    u, v = model.camera.tangents_at(corners[:, 0], corners[:, 1])
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1)
+    placed = rays * (offset / (rays @ normal))[:, None]
+    stated = board.corners_m[view.corners.ids]
+    spread = [float(np.sum((points_ - points_.mean(axis=0)) ** 2)) for points_ in (placed, stated)]
+    return math.sqrt(spread[0] / spread[1])
+
+
+def _plane(points: Array) -> tuple[Array, float]:
+    """n.X = d of the best plane through points (m, 3), |n| = 1, n_z > 0."""
+    middle = points.mean(axis=0)
+    normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
+    normal = normal if normal[2] >= 0 else -normal
+    return normal, float(normal @ middle)
+
+
+def _chi2(deviations: Array, covariance: Array, xy: Array) -> tuple[float, int]:
+    basis = off_plane(xy)
+    rest = basis.T @ deviations
+    return float(rest @ np.linalg.solve(basis.T @ covariance @ basis, rest)), basis.shape[1]

@@ -1,1 +1,0 @@
-"""A finished calibration against boards that it was not made of."""

@@ -1,1 +1,0 @@
-"""What errors of a calibration, a command or a pixel are worth in depth."""

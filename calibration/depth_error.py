@@ -1,0 +1,317 @@
+"""How well a depth is known, from the covariance of the calibration: first order, by pixel, and what it comes from.
+
+    var z = J C J',    J = dz / d(parameters) of the pixel's ray on the light sheet of its mirror command.
+
+A group's part of it is the variance that would go if the parameters of that group were known exactly,
+J C_.g C_gg^-1 C_g. J': 0 at the least, all at the most, and the group's own variance where it is correlated with no
+other. Groups that are correlated share what they have in common, so parts may add up to more than the whole.
+
+What an error of the mirror's command or of the stripe's place is worth in depth, and where there is any depth.
+
+How well a number is known that follows from a model: its covariance, from that of the model's parameters.
+
+A model beside the true one, where a simulation knows it: by how much it gets depths wrong.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.errors import CalibrationError, digits
+from calibration.model.light_sheet import depth_slope
+from calibration.model.parameters import DISTORTION, MATRIX, ROW_DELAY, TIMES, with_parameters
+from calibration.model.rig_model import Covariance, RigModel
+
+Array = NDArray[np.float64]
+
+_STEPS = dict.fromkeys(MATRIX, 1e-3) | dict.fromkeys(TIMES, 1e-9) | {ROW_DELAY: 1e-12}
+_STEP = 1e-6
+"""Of each parameter, in its own unit: small against what bends, large against rounding."""
+
+
+def propagated(model: RigModel, measure: Callable[[RigModel], Array]) -> tuple[Array, Array]:
+    """measure(model) (n,) and its covariance (n, n), to first order; of zeros for a model without a covariance."""
+    values = np.atleast_1d(measure(model)).astype(np.float64)
+    if model.covariance is None:
+        return values, np.zeros((values.size, values.size))
+    slopes = by_parameter(model, model.covariance.names, lambda tried: np.atleast_1d(measure(tried)))
+    covariance: Array = slopes @ model.covariance.matrix @ slopes.T
+    return values, covariance
+
+
+def by_parameter(model: RigModel, names: tuple[str, ...], measure: Callable[[RigModel], Array]) -> Array:
+    """(n, p): how measure(model) (n,) changes with the parameters `names`, by differences."""
+    slopes = np.empty((measure(model).size, len(names)))
+    for i, name in enumerate(names):
+        step = _STEPS.get(name, _STEP)
+        (above, more), (below, less) = (_changed(model, name, sign * step) for sign in (1, -1))
+        slopes[:, i] = (measure(more) - measure(less)) / (above - below)
+    return slopes
+
+
+def _changed(model: RigModel, name: str, step: float) -> tuple[float, RigModel]:
+    """The step taken and the model then; no step where a parameter is at its bound, as a lag of 0 s."""
+    try:
+        return step, with_parameters(model, [name], [step])
+    except CalibrationError:
+        return 0.0, model
+
+
+GROUPS: Final = ("baseline", "camera", "angle", "lag")
+_SAID = {"baseline": "the baseline", "camera": "the camera", "angle": "the mirror's angle", "lag": "the lag"}
+_GRID = 48
+"""Pixels looked at along the longer side of a map."""
+_SEARCH_STEPS = 60
+_FOUND_M = 1e-9
+"""A mirror command is found when its sheet passes the point within this: a thousandth of any calibration's error."""
+_INSIDE = 1e-6
+"""Of the command range: by so much differences stay within it."""
+_INDEPENDENT = 1e-12
+"""Eigenvalues of a correlation matrix below this are rounding."""
+
+
+def group_of(parameter: str) -> str:
+    """The group that a parameter counts to."""
+    if parameter in MATRIX or parameter in DISTORTION:
+        return "camera"
+    if parameter in TIMES:
+        return "lag"
+    return "baseline" if parameter.startswith(("axis_shift", "offset")) else "angle"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthUncertainty:
+    """Standard deviation of the depth at one depth, over the picture.
+
+    x_px (columns,), y_px (rows,): the pixels. sd_m: (rows, columns), NaN where no mirror command of the model lights
+    the pixel at this depth. part_m: by group, the square root of its part of the variance, the same shape.
+    """
+
+    depth_m: float
+    x_px: Array
+    y_px: Array
+    sd_m: Array
+    part_m: Mapping[str, Array]
+
+    def line(self) -> str:
+        """One line, 'at 5 m: 8 mm, 6 of them from the baseline': medians over the picture, of 8 the group's 6.
+
+        Without the group's part sqrt(8^2 - 6^2) would be left.
+        """
+        at = f"at {self.depth_m:g} m"
+        if not np.isfinite(self.sd_m).any():
+            return f"{at}: not lit"
+        sd = float(np.nanmedian(self.sd_m))
+        group, part = max(((name, float(np.nanmedian(m))) for name, m in self.part_m.items()), key=lambda item: item[1])
+        unit, scale = ("mm", 1e3) if sd >= 1e-3 or sd == 0 else ("um", 1e6)
+        whole, of_them = (digits(value * scale, 2) for value in (sd, part))
+        return f"{at}: {whole} {unit}, {of_them} of them from {_SAID[group]}"
+
+
+def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | None = None) -> DepthUncertainty:
+    """The uncertainty of a depth over the picture.
+
+    velocity_per_s: of the command, signed, by which the lag counts; None: the fastest rise that the lag was measured
+    at, 0 where it was not. Raises CalibrationError for a model without covariance.
+    """
+    covariance = _covariance(model)
+    if velocity_per_s is None:
+        velocity_per_s = 0.0 if model.speed_range_per_s is None else model.speed_range_per_s[1]
+    camera = model.camera
+    step = max(1, max(camera.width, camera.height) // _GRID)
+    x = np.arange(step // 2, camera.width, step, dtype=np.float64)
+    y = np.arange(step // 2, camera.height, step, dtype=np.float64)
+    command = command_at(model, x, y[:, None], depth_m)
+    jacobian = depth_jacobian(model, x, y[:, None], command, velocity_per_s)
+    names = covariance.names
+    parts = {g: np.sqrt(explained(jacobian, covariance, [n for n in names if group_of(n) == g])) for g in GROUPS}
+    return DepthUncertainty(depth_m, x, y, np.sqrt(_variance(jacobian, covariance)), parts)
+
+
+def depth_sd_m(
+    model: RigModel, x_px: ArrayLike, y_px: ArrayLike, command: ArrayLike, velocity_per_s: float = 0.0
+) -> Array:
+    """Standard deviation (m) of the depth at raw pixels where the mirror stands at `command`; all broadcast.
+
+    NaN where there is no depth. Raises CalibrationError for a model without covariance.
+    """
+    return np.sqrt(_variance(depth_jacobian(model, x_px, y_px, command, velocity_per_s), _covariance(model)))
+
+
+def command_at(model: RigModel, x_px: ArrayLike, y_px: ArrayLike, depth_m: ArrayLike) -> Array:
+    """Where the mirror stands when its light meets raw pixels at a depth; NaN where it does not within its range."""
+    z = np.asarray(depth_m, np.float64)
+    u, v = model.camera.tangents_at(x_px, y_px)
+    points = np.stack(np.broadcast_arrays(u * z, v * z, z), axis=-1)
+
+    def off(command: Array) -> Array:
+        return model.sheets(command).distance_m(points)
+
+    # False position, Illinois variant: an end that stays counts half the next time.
+    low, high = (np.full(points.shape[:-1], end) for end in model.scanner.command_range)
+    off_low, off_high = off(low), off(high)
+    with np.errstate(invalid="ignore"):
+        enclosed = off_low * off_high <= 0
+    off_low, off_high = np.where(enclosed, off_low, -1.0), np.where(enclosed, off_high, 1.0)
+    for _ in range(_SEARCH_STEPS):
+        share = np.divide(off_low, off_low - off_high, out=np.zeros_like(low), where=off_low != off_high)
+        command = low + share * (high - low)
+        here = np.where(enclosed, off(command), 0.0)
+        if not (np.abs(here) > _FOUND_M).any():
+            break
+        same = here * off_low > 0
+        low, high = np.where(same, command, low), np.where(same, high, command)
+        off_high = np.where(same, 0.5 * off_high, here)
+        off_low = np.where(same, here, 0.5 * off_low)
+    return np.where(enclosed, command, np.nan)
+
+
+def depth_jacobian(
+    model: RigModel, x_px: ArrayLike, y_px: ArrayLike, command: ArrayLike, velocity_per_s: float = 0.0
+) -> Array:
+    """dz (m) at raw pixels and mirror commands (broadcast) by the parameters of the covariance: (..., p).
+
+    The mirror stands at `command` for the model as it is; by the lag and the row delay it would stand elsewhere. NaN
+    where there is no depth. Raises CalibrationError for a model without covariance.
+    """
+    names = _covariance(model).names
+    x, y, at = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (x_px, y_px, command)))
+    lit = np.isfinite(at) & np.isfinite(y)
+    result = np.full((*x.shape, len(names)), np.nan)
+    x, y, at = x[lit], y[lit], at[lit]
+    rays = model.camera.tangents_at(x, y)
+    low, high = model.scanner.command_range
+    inside = _INSIDE * (high - low)
+    at = np.clip(at, low + inside, high - inside)
+    commanded = 2 * at - model.mirror_command(at, y, velocity_per_s)
+
+    def depth(tried: RigModel) -> Array:
+        u, v = rays if tried.camera is model.camera else tried.camera.tangents_at(x, y)
+        mirror = tried.mirror_command(commanded, y, velocity_per_s)
+        return tried.sheets(np.clip(mirror, low, high)).depth(u, v)
+
+    result[lit] = by_parameter(model, names, depth)
+    return result
+
+
+def explained(jacobian: Array, covariance: Covariance, names: list[str]) -> Array:
+    """Variance (...) that would go if the parameters `names` were known exactly. jacobian: (..., p)."""
+    if not names:
+        return np.zeros(jacobian.shape[:-1])
+    at = [covariance.names.index(name) for name in names]
+    inner = covariance.of(names)
+    sd = np.sqrt(np.diag(inner))
+    scale = np.divide(1.0, sd, out=np.zeros_like(sd), where=sd > 0)
+    inverse = np.linalg.pinv(inner * np.outer(scale, scale), rcond=_INDEPENDENT, hermitian=True)
+    shared = jacobian @ covariance.matrix[:, at] * scale
+    variance: Array = np.maximum(np.einsum("...i,ij,...j", shared, inverse, shared), 0.0)
+    return variance
+
+
+def _variance(jacobian: Array, covariance: Covariance) -> Array:
+    variance: Array = np.maximum(np.einsum("...i,ij,...j", jacobian, covariance.matrix, jacobian), 0.0)
+    return variance
+
+
+def _covariance(model: RigModel) -> Covariance:
+    if model.covariance is None:
+        raise CalibrationError(
+            "the calibration has no covariance, so its depth error is unknown; calibrate with 'rig calibrate planes'"
+        )
+    return model.covariance
+
+
+_SENSITIVITY_GRID: Final = 24
+"""Pixels looked at along each side."""
+LEAST_LIT_SHARE: Final = 0.05
+"""Of the picture, for a distance to be judged at: more than a border column or row."""
+_DISTANCES_M: Final = np.geomspace(0.05, 100.0, 60)
+
+
+@dataclass(frozen=True, slots=True)
+class Sensitivity:
+    """Depth at one depth by command (m per command unit) and by the stripe's place (m per pixel): medians over those
+    parts of the picture where the line reaches it."""
+
+    per_command_m: float
+    per_pixel_m: float
+
+
+def sensitivity(model: RigModel, at_m: float) -> Sensitivity:
+    """Look at a grid over the picture. CalibrationError where the line does not reach that depth."""
+    camera = model.camera
+    x = np.linspace(0, camera.width - 1, _SENSITIVITY_GRID)
+    y = np.linspace(0, camera.height - 1, _SENSITIVITY_GRID)[:, None]
+    command = command_at(model, x, y, at_m)
+    lit = np.isfinite(command)
+    if lit.mean() < LEAST_LIT_SHARE:
+        raise CalibrationError(
+            f"the line does not reach {at_m:g} m, {_said_reach(model, x, y)}; judge by another distance (--at)"
+        )
+    u, v = (tangent[lit] for tangent in camera.tangents_at(*np.broadcast_arrays(x, y)))
+    low, high = model.scanner.command_range
+    step = _STEP * (high - low)
+    below, above = (np.clip(command[lit] + change, low, high) for change in (-step, step))
+    change = model.sheets(above).depth(u, v) - model.sheets(below).depth(u, v)
+    slope = depth_slope(u, v, model.planes(command[lit]), camera)
+    return Sensitivity(
+        per_command_m=float(np.nanmedian(np.abs(change / (above - below)))),
+        per_pixel_m=float(np.nanmedian(np.abs(slope))),
+    )
+
+
+def _said_reach(model: RigModel, x: Array, y: Array) -> str:
+    """From where to where the line reaches."""
+    share = np.array([np.isfinite(command_at(model, x, y, at)).mean() for at in _DISTANCES_M])
+    lit = _DISTANCES_M[share >= LEAST_LIT_SHARE]
+    return f"it reaches {lit[0]:.2g} to {lit[-1]:.2g} m" if lit.size else "nor anything else within 100 m"
+
+
+_TRUTH_GRID = 32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthErrors:
+    """Over a grid of pixels that the true rig lights at one depth. error_m: (n,) signed; sd_m: (n,) as the model's
+    covariance predicts, NaN for a model without one.
+    """
+
+    depth_m: float
+    error_m: Array
+    sd_m: Array
+
+    @property
+    def median_m(self) -> float:
+        """Median of the absolute errors."""
+        return float(np.median(np.abs(self.error_m))) if self.error_m.size else np.nan
+
+    @property
+    def worst_m(self) -> float:
+        """Largest absolute error."""
+        return float(np.abs(self.error_m).max()) if self.error_m.size else np.nan
+
+    @property
+    def ratio(self) -> float:
+        """Root mean square of errors in units of their predicted sd: 1 where the covariance is right, on average."""
+        known = self.sd_m > 0
+        return float(np.sqrt(np.mean((self.error_m[known] / self.sd_m[known]) ** 2))) if known.any() else np.nan
+
+
+def depth_errors(model: RigModel, truth: RigModel, depth_m: float, velocity_per_s: float) -> DepthErrors:
+    """What `model` makes of pixels that see the light at `depth_m`. velocity_per_s: of the command, signed."""
+    camera = truth.camera
+    x, y = np.meshgrid(np.linspace(0, camera.width - 1, _TRUTH_GRID), np.linspace(0, camera.height - 1, _TRUTH_GRID))
+    mirror = command_at(truth, x, y, depth_m)
+    lag_s = truth.lag_s.backward if velocity_per_s < 0 else truth.lag_s.forward
+    commanded = mirror + velocity_per_s * (lag_s - truth.row_delay_s * y)
+    found = model.mirror_command(commanded, y, velocity_per_s)
+    low, high = model.scanner.command_range
+    lit = np.isfinite(found) & (found >= low) & (found <= high)
+    x, y, found = x[lit], y[lit], found[lit]
+    z = model.sheets(found).depth(*model.camera.tangents_at(x, y))
+    sd = np.full(z.shape, np.nan) if model.covariance is None else depth_sd_m(model, x, y, found, velocity_per_s)
+    known = np.isfinite(z)
+    return DepthErrors(depth_m, z[known] - depth_m, sd[known])

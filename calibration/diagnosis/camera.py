@@ -1,0 +1,157 @@
+"""From a fit of the camera alone to its verdict: how well it knows where rays go, in pixels.
+
+A camera whose rays are all turned by one angle is as good as before, since the mirror is calibrated with it. So the
+error of a pixel is what is left of J C J' when the best common rotation of all rays is taken off J.
+
+The verdict of a check: errors that are larger than the covariance lets expect and than depth can bear.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.board import Board
+from calibration.camera_fit import CameraFit
+from calibration.check import CheckedAngle, CheckedBoard
+from calibration.diagnosis.evidence import data_lack, hiding, pose_evidence, view_evidence
+from calibration.errors import digits, mm
+from calibration.model.camera import Camera
+from calibration.model.parameters import changed_camera
+from calibration.model.rig_model import Covariance
+from calibration.verdict import SIGMAS, WORST_TIMES, Asked, Reason, Verdict, more_poses, unguided
+from calibration.views import View
+
+Array = NDArray[np.float64]
+
+ACCURACY_PX = 0.1
+"""Good enough: no estimator finds the stripe better in fog."""
+_GRID = 16
+_STEP = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedCamera:
+    """A verdict and what it was made of: sd_px, worst_px: of a pixel's place along the row, median and 95 %. coverage:
+    share of the picture within the outline of all corners.
+    """
+
+    verdict: Verdict
+    sd_px: float
+    worst_px: float
+    coverage: float
+
+    def line(self) -> str:
+        """One line."""
+        return f"rays are known to {_px(self.sd_px)} (95 % of the picture: {_px(self.worst_px)})"
+
+
+def judge_camera(fit: CameraFit, views: Sequence[View], board: Board, *, photons: bool) -> JudgedCamera:
+    """Judge a fit of `views`. photons: whether their pictures count photons; grey levels tell nothing of the light."""
+    camera = fit.camera
+    sd = ray_sd_px(camera, fit.covariance)
+    median, worst = float(np.median(sd)), float(np.percentile(sd, 95))
+    imprecise = not (median <= ACCURACY_PX and worst <= WORST_TIMES * ACCURACY_PX)
+    pairs = zip(fit.views, fit.poses, strict=True)
+    evidence = view_evidence(views, (camera.width, camera.height), len(fit.kept), fit.dropped)
+    poses = pose_evidence([pose for name, pose in pairs if name in fit.kept], board)
+    lacking = data_lack(evidence, poses, imprecise=imprecise, photons=photons)
+    reasons = [*hiding(evidence, poses, photons=photons), *lacking]
+    if imprecise and not reasons:
+        found = median, worst
+        reasons = [more_poses(len(fit.kept), "rays are known to", found, ACCURACY_PX, _px)]
+    return JudgedCamera(unguided(Verdict(not reasons, tuple(reasons))), median, worst, evidence.coverage)
+
+
+def _px(length_px: float) -> str:
+    return f"{digits(length_px, 2)} px"
+
+
+def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:
+    """(n,) sd along the row of where rays of a grid over the picture are seen, a common rotation taken off."""
+    x, y = np.meshgrid(np.linspace(0, camera.width - 1, _GRID), np.linspace(0, camera.height - 1, _GRID))
+    u, v = camera.tangents_at(x.ravel(), y.ravel())
+    known = np.isfinite(u)
+    rays = np.stack([u[known], v[known], np.ones(np.count_nonzero(known))], axis=-1)
+
+    def seen(tried: Camera, points: Array) -> Array:
+        return np.concatenate(tried.project(points))
+
+    slopes = np.stack(
+        [
+            (seen(changed_camera(camera, {name: _STEP}), rays) - seen(changed_camera(camera, {name: -_STEP}), rays))
+            / (2 * _STEP)
+            for name in covariance.names
+        ],
+        axis=-1,
+    )
+    still = seen(camera, rays)
+    turned = np.stack(
+        [(seen(camera, rays + _STEP * np.cross(axis, rays)) - still) / _STEP for axis in np.eye(3)],
+        axis=-1,
+    )
+    sound = np.isfinite(slopes).all(axis=1) & np.isfinite(turned).all(axis=1)
+    basis = np.linalg.qr(turned[sound])[0]
+    left = slopes[sound] - basis @ (basis.T @ slopes[sound])
+    along_row = np.flatnonzero(sound) < len(rays)
+    variance = np.einsum("ni,ij,nj->n", left, covariance.matrix, left)[along_row]
+    result: Array = np.sqrt(np.maximum(variance, 0.0))
+    return result
+
+
+UNLIKELY_SDS: Final = 4.0
+"""Of chi2 about its number of degrees of freedom, by which deviations are no longer chance."""
+
+_AGAIN = "calibrate again"
+
+
+def judge_check(
+    boards: Sequence[CheckedBoard],
+    asked: Asked,
+    board_width_m: float,
+    angle: CheckedAngle | None = None,
+    stated_angle_rad: float | None = None,
+) -> Verdict:
+    """Judge checked boards. asked: depth error that is good enough; at other distances it goes with their square."""
+    found: list[Reason] = []
+    for board in boards:
+        bearable_m = asked.accuracy_m * (board.distance_m / asked.at_m) ** 2
+        found += _flatness(board, bearable_m)
+        found += _scale(board, asked)
+    if angle is not None and stated_angle_rad is not None and boards:
+        bearable_m = asked.accuracy_m * (boards[0].distance_m / asked.at_m) ** 2
+        limit = max(SIGMAS * angle.sd_rad, 2 * bearable_m / board_width_m)
+        error = angle.angle_rad - stated_angle_rad
+        if not abs(error) <= limit:
+            text = (
+                f"the angle between the boards is scanned as {math.degrees(angle.angle_rad):.2f} degrees, stated are "
+                f"{math.degrees(stated_angle_rad):.2f}; the limit is {math.degrees(limit):.2f} off"
+            )
+            step = f"measure the angle and check with it once more; where it stays so, {_AGAIN}"
+            found.append(Reason("wrong-angle", text, error, limit, step))
+    return Verdict(not found, tuple(found))
+
+
+def _flatness(board: CheckedBoard, bearable_m: float) -> list[Reason]:
+    likely = board.freedom + UNLIKELY_SDS * math.sqrt(2 * board.freedom)
+    if board.chi2 <= likely or board.flatness_rms_m <= bearable_m:
+        return []
+    text = (
+        f"view {board.name}: the board's squares lie {mm(board.flatness_rms_m)} (rms) off a plane, expected "
+        f"are {mm(board.expected_m)}, the limit at {board.distance_m:.2g} m is {mm(bearable_m)}"
+    )
+    step = f"check that the board is flat, then {_AGAIN}"
+    return [Reason("not-flat", text, board.flatness_rms_m, max(bearable_m, board.expected_m), step)]
+
+
+def _scale(board: CheckedBoard, asked: Asked) -> list[Reason]:
+    limit = max(SIGMAS * board.scale_sd, asked.accuracy_m / asked.at_m)
+    if abs(board.scale - 1) <= limit:
+        return []
+    text = (
+        f"view {board.name}: the board is scanned {board.scale - 1:+.2%} larger than stated, the limit is {limit:.2%}"
+    )
+    return [Reason("wrong-scale", text, board.scale - 1, limit, f"measure the board's squares, then {_AGAIN}")]

@@ -1,0 +1,308 @@
+"""Which pose of the board to show next, and why: the one after which the expected depth error is the least.
+
+Candidates stand on a grid of distance, place in the picture and tilt. What each would bring is forecast by the fit of
+the views so far (`calibration.guide`); before there is a fit, three poses begin that tell most about any
+camera. The same grid gives the sequence of poses that a simulated rig shows when nobody guides it.
+
+What one more pose of the board would bring: the depth error expected once it has been shown.
+
+A pose that nobody has shown yet has no data, but its equations need none: where its corners and passages would lie, and
+how they change with the parameters, follows from the fit so far; how noisy they would be, from the noise of the others.
+Added to the information that there is, they give the covariance to expect.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.board import Board
+from calibration.depth_error import command_at, depth_jacobian
+from calibration.errors import CalibrationError, Degenerate, mm
+from calibration.model.camera import Camera
+from calibration.model.rig_model import RigModel
+from calibration.rig_fit.noise import bin_starts
+from calibration.rig_fit.result import RigFit
+from calibration.rig_fit.rows import Terms
+from calibration.rig_fit.solve import scaled_inverse, view_normal
+from calibration.rig_fit.state import Sighting, first_state
+from calibration.views import FEWEST_CORNERS, BoardPose
+
+Array = NDArray[np.float64]
+
+FILLS = (0.6, 0.45, 0.32, 0.22)
+"""How much of the picture's width or height, whichever it meets first, the board fills: its distance, by name."""
+PLACES = {
+    (0, 0): "in the middle of the picture",
+    (-1, 0): "at the left border",
+    (1, 0): "at the right border",
+    (0, -1): "at the upper border",
+    (0, 1): "at the lower border",
+    (-1, -1): "in the upper left corner",
+    (1, -1): "in the upper right corner",
+    (-1, 1): "in the lower left corner",
+    (1, 1): "in the lower right corner",
+}
+TILT_RAD = math.radians(35)
+"""Enough for a strong perspective, little enough for corners to be found."""
+TILTS = {
+    (0, 0): "facing the camera",
+    (0, 1): "its left side turned away",
+    (0, -1): "its right side turned away",
+    (1, 0): "its lower side turned away",
+    (-1, 0): "its upper side turned away",
+}
+"""Rotations about (x, y) in units of TILT_RAD."""
+LEAST_MODULE_PX = 2.0
+"""Side of a marker's module in the picture; smaller ones are not read when tilted and noisy."""
+_BORDER_SHARE = 0.03
+"""Of the picture, left free around the board."""
+
+ExpectedError = Callable[[BoardPose], float]
+"""The expected depth error (m) once this pose has been shown too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A pose to show. fill: one of FILLS; distance_m: of the board's middle; place, tilt: keys of PLACES and TILTS."""
+
+    fill: float
+    distance_m: float
+    place: tuple[int, int]
+    tilt: tuple[int, int]
+    pose: BoardPose
+
+    def __str__(self) -> str:
+        """What to do with the board."""
+        if self.tilt == (0, 0):
+            what = "hold the board facing the camera"
+        else:
+            axis = "vertical" if self.tilt[1] else "horizontal"
+            what = f"tilt the board {math.degrees(TILT_RAD):.0f} degrees about the {axis} ({TILTS[self.tilt]})"
+        return f"{what}, {self.distance_m:.2g} m away, {PLACES[self.place]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """The next pose. before_m, after_m: expected depth error now and once it was shown; NaN before there is a fit."""
+
+    candidate: Candidate
+    at_m: float
+    before_m: float = math.nan
+    after_m: float = math.nan
+
+    def __str__(self) -> str:
+        """What to do and why."""
+        if not math.isfinite(self.after_m):
+            return str(self.candidate)
+        before = f"from {mm(self.before_m)} " if math.isfinite(self.before_m) else ""
+        return f"{self.candidate}: expected error at {self.at_m:g} m falls {before}to {mm(self.after_m)}"
+
+
+def candidates(camera: Camera, board: Board, depth_range_m: tuple[float, float]) -> tuple[Candidate, ...]:
+    """All poses of the grid that show the whole board, its markers readable, within the range of depth."""
+    found = []
+    readable_m = np.inf
+    if board.marker_m is not None:
+        module_m = board.marker_m / (board.charuco().getDictionary().markerSize + 2)
+        readable_m = camera.matrix[0, 0] * module_m * math.cos(TILT_RAD) / LEAST_MODULE_PX
+    for fill, place, tilt in product(FILLS, PLACES, TILTS):
+        candidate = _candidate(camera, board, fill, place, tilt)
+        if candidate is not None and depth_range_m[0] <= candidate.distance_m <= min(depth_range_m[1], readable_m):
+            found.append(candidate)
+    return tuple(found)
+
+
+def next_pose(
+    shown: int,
+    choices: Sequence[Candidate],
+    at_m: float,
+    now_m: float = math.nan,
+    forecast: ExpectedError | None = None,
+) -> Advice:
+    """What to show after `shown` poses: by the forecast, without one from the sequence that begins well."""
+    if not choices:
+        raise ValueError("no pose of the board fits into the picture")
+    if forecast is None:
+        return Advice(sequence(choices, shown + 1)[-1], at_m)
+    errors = [forecast(candidate.pose) for candidate in choices]
+    best = int(np.nanargmin(errors)) if np.isfinite(errors).any() else 0
+    return Advice(choices[best], at_m, now_m, float(errors[best]))
+
+
+def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[Candidate, ...]:
+    """So many poses that differ from one another as much as they can: near and far, all places, all tilts.
+
+    Each is the one farthest from those before it; the first is a tilted one, near. seed: which of equals comes first.
+    """
+    if not choices:
+        raise ValueError("no pose of the board fits into the picture")
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(len(choices)) if seed else np.arange(len(choices))
+    traits = np.array([_traits(choices[i]) for i in order])
+    tilted = [i for i in range(len(order)) if choices[order[i]].tilt != (0, 0)]
+    chosen = [min(tilted or [0], key=lambda i: traits[i, 0])]
+    nearest = np.full(len(order), np.inf)
+    while len(chosen) < poses:
+        away = np.sum((traits - traits[chosen[-1]]) ** 2, axis=1)
+        nearest = np.minimum(nearest, away)
+        if nearest.max() == 0:  # all were shown: from the beginning
+            nearest = np.sum((traits - traits[chosen[-1]]) ** 2, axis=1)
+        chosen.append(int(np.argmax(nearest)))
+    return tuple(choices[order[i]] for i in chosen[:poses])
+
+
+def rough_camera(size: tuple[int, int]) -> Camera:
+    """A camera to place boards with where none is known: 46 degrees across, no distortion."""
+    width, height = size
+    focal = 1.2 * width
+    matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    return Camera(width, height, matrix, np.zeros(0))
+
+
+def _candidate(
+    camera: Camera, board: Board, fill: float, place: tuple[int, int], tilt: tuple[int, int]
+) -> Candidate | None:
+    """The pose that brings the board to its place and no farther than the border; None where it does not fit."""
+    rotation = TILT_RAD * np.array([tilt[0], tilt[1], 0.0])
+    turn = cv2.Rodrigues(rotation)[0]
+    width, height = camera.width - 1, camera.height - 1
+    focal = camera.matrix[0, 0], camera.matrix[1, 1]
+    distance = max(focal[0] * board.size_m[0] / (fill * width), focal[1] * board.size_m[1] / (fill * height))
+    middle = np.array([board.size_m[0] / 2, board.size_m[1] / 2, 0.0])
+    outline = np.array([(x, y, 0.0) for x in (0, board.size_m[0]) for y in (0, board.size_m[1])])
+    spread = (outline - middle) @ turn.T
+    seen = spread[:, :2] / (distance + spread[:, 2:]) * focal
+    half = np.abs(seen).max(axis=0)
+    room = np.array([width, height]) * (0.5 - _BORDER_SHARE) - half
+    if np.any(room < 0) or (any(place) and np.any(room[np.array(place) != 0] < half[np.array(place) != 0] / 4)):
+        return None
+    centre = np.array([width, height]) / 2 + np.array(place) * room
+    u, v = camera.tangents_at(centre[0], centre[1])
+    at = distance * np.array([float(u), float(v), 1.0])
+    pose = BoardPose(rotation, at - turn @ middle)
+    x, y = camera.project(pose.to_camera(outline))
+    inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
+    return Candidate(fill, float(distance), place, tilt, pose) if inside.all() else None
+
+
+def _traits(candidate: Candidate) -> Array:
+    """Where a pose stands among others: distance, place, tilt, in steps that matter about as much."""
+    return np.array([1.5 * math.log(candidate.distance_m), *(0.7 * np.array(candidate.place)), *candidate.tilt])
+
+
+BOARD_POINTS = 14
+"""Along either side of the board, where passages are looked at; each stands for as many as there will be."""
+_CELLS = (9, 7)
+"""Of the picture, across and down, in whose middles the depth error is looked at."""
+BORDER_PX = 2.0
+"""Corners nearer to the picture's border are not found."""
+
+
+class Forecast:
+    """The depth error to expect after one more pose: call it with the pose. now_m: without it."""
+
+    def __init__(self, fit: RigFit, at_m: float) -> None:
+        """Of a fit, for a depth."""
+        self._fit = fit
+        self._terms = Terms(fit.model.camera.distortion.size)
+        self._tie = np.zeros((len(self._terms.names), len(fit.free)))
+        for column, group in enumerate(fit.free):
+            self._tie[self._terms.at(group), column] = 1.0
+        self._jacobian = _depth_by_free(fit, at_m)
+        sweeps = [sweep for view in fit.sweeps for sweep in view]
+        self._velocities = _next_velocities(fit)
+        self._sd = float(np.median(np.concatenate([sweep.sd for sweep in sweeps])))
+        self._count = float(np.median([sweep.sd.size for sweep in sweeps]))
+        self.now_m = self._expected(fit.information)
+
+    def __call__(self, pose: BoardPose) -> float:
+        """The median over the picture of the depth's expected sd in metres; NaN where the pose shows too little."""
+        seen = self._seen(pose)
+        if seen is None:
+            return math.nan
+        fit = self._fit
+        timing = np.array([*fit.model.lag_s, fit.model.row_delay_s])
+        corners, passages = first_state(fit.model, timing, [pose], [seen]).rows(0, seen, self._terms)
+        corner_weight = np.full(corners.residual.size, 1 / (fit.corner_scale * fit.noise.corner_sd_px) ** 2)
+        each = self._count * len(seen.sweeps) / max(seen.sd.size, 1)
+        weight = each / (fit.noise.passage_factor * seen.sd) ** 2
+        starts = bin_starts(seen, fit.noise.reach)
+        normal = view_normal(corners, passages, corner_weight, weight, starts, fit.noise.jitter_sd**2)
+        return self._expected(fit.information + self._tie.T @ normal.matrix @ self._tie / fit.misfit)
+
+    def _expected(self, information: Array) -> float:
+        try:
+            covariance, _ = scaled_inverse(information)
+        except Degenerate:
+            return math.nan
+        variance = np.einsum("ij,jk,ik->i", self._jacobian, covariance, self._jacobian)
+        return float(np.sqrt(np.median(variance))) if variance.size else math.nan
+
+    def _seen(self, pose: BoardPose) -> Sighting | None:
+        """What would be seen of the board there, without errors; None for too little."""
+        model, board = self._fit.model, self._fit.board
+        corners_m = board.corners_m
+        x, y, found = _inside(model, pose.to_camera(corners_m))
+        if found.sum() < FEWEST_CORNERS:
+            return None
+        along = (np.arange(BOARD_POINTS) + 0.5) / BOARD_POINTS
+        places = np.stack(np.meshgrid(along * board.size_m[0], along * board.size_m[1], [0.0]), axis=-1).reshape(-1, 3)
+        points = pose.to_camera(places)
+        px, py, inside = _inside(model, points)
+        mirror = np.full(len(places), np.nan)
+        mirror[inside] = command_at(model, px[inside], py[inside], points[inside, 2])
+        lit = np.flatnonzero(np.isfinite(mirror))
+        lit = lit[np.argsort(mirror[lit])]
+        repeats = len(self._velocities)
+        velocity = np.repeat(self._velocities, lit.size)
+        lag = np.where(velocity > 0, model.lag_s.forward, model.lag_s.backward)
+        row_y = np.tile(py[lit], repeats)
+        return Sighting(
+            name="",
+            corners_m=corners_m[found],
+            corner_px=np.stack([x[found], y[found]], axis=-1),
+            corner_scale=np.ones(int(found.sum())),
+            x_px=np.tile(px[lit], repeats),
+            y_px=row_y,
+            command=np.tile(mirror[lit], repeats) + velocity * (lag - model.row_delay_s * row_y),
+            sd=np.full(velocity.size, self._sd),
+            velocity_per_s=velocity,
+            starts=np.arange(repeats + 1) * lit.size if lit.size else np.zeros(1, np.int64),
+        )
+
+
+def _next_velocities(fit: RigFit) -> tuple[float, ...]:
+    """At which the next pose will be swept: poses take turns at the speeds, so as the one that had its turn first."""
+    shown = [tuple(sweep.direction * sweep.speed_per_s for sweep in view) for view in fit.sweeps if view]
+    last = {velocities: turn for turn, velocities in enumerate(shown)}
+    return min(last, key=lambda velocities: last[velocities])
+
+
+def _inside(model: RigModel, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """(x, y) of points in the picture and whether they are in it."""
+    x, y = model.camera.project(points)
+    with np.errstate(invalid="ignore"):
+        inside: NDArray[np.bool_] = (x > BORDER_PX) & (x < model.camera.width - 1 - BORDER_PX)
+        inside &= (y > BORDER_PX) & (y < model.camera.height - 1 - BORDER_PX)
+    return x, y, inside
+
+
+def _depth_by_free(fit: RigFit, at_m: float) -> Array:
+    """(points, free parameters): how the depth at places all over the picture changes with what was fitted."""
+    model = fit.model
+    if model.covariance is None:
+        raise CalibrationError("the fit has no covariance; fit the rig again")
+    names = model.covariance.names
+    across, down = ((np.arange(n) + 0.5) / n for n in _CELLS)
+    x, y = np.meshgrid(across * model.camera.width - 0.5, down * model.camera.height - 0.5)
+    command = command_at(model, x, y, at_m)
+    velocity = max((sweep.speed_per_s for view in fit.sweeps for sweep in view), default=0.0)
+    by_name = depth_jacobian(model, x, y, command, velocity)
+    by_name = by_name[np.isfinite(by_name).all(axis=-1)]
+    columns = [np.sum([by_name[:, names.index(name)] for name in group], axis=0) for group in fit.free]
+    return np.stack(columns, axis=-1)

@@ -1,1 +1,0 @@
-"""Verdicts: what the data and the fit show, held against limits; the first reason is the cause."""

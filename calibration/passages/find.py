@@ -1,0 +1,285 @@
+"""When the laser line passed over each pixel of a sweep, from the counts of its columns.
+
+For each of many pixels, spread evenly over the picture: where the line stands out most from what is on both sides, then
+the maximum likelihood of the columns around it (`calibration.passages.fit`). A pixel that tells nothing is left
+out, and what is given says how far it is to be trusted: the standard deviation of a passage within a flat top, where
+all frames are lit, is a long one. The line has to be seen in two columns or more: at columns wider than 2 pixels most
+pixels tell nothing, so calibrate with many columns of few exposures rather than few columns of many.
+
+10 000 pixels of 500 columns take about 0.5 s.
+
+Where in a pixel's columns the line stands out most, before anything is fitted: sums over columns, and their peak.
+
+Pixels of a picture in an order whose every beginning is spread evenly over it.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.passages.fit import PassageFit, fit_passages
+from calibration.passages.light import LineShape
+from calibration.views import Passages
+
+Array = NDArray[np.float64]
+
+CORES = (1, 3)
+"""Half widths, in columns, of what the line is looked for with."""
+RING = 8
+"""Columns on either side that it has to stand out from."""
+TOP = 0.95
+"""Columns that stand out by this much of the best are as good."""
+LEAST_SEEN = 3.0
+"""How far it stands out before it is fitted: as much as chance makes it along a few dozen columns."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColumnSums:
+    """1s and frames up to, but without, each column: (columns + 1, pixels) int32; frames (…, 1) where alike for all."""
+
+    ones: NDArray[np.int32]
+    frames: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, ones: NDArray[np.int32], frames: NDArray[np.int32]) -> "ColumnSums":
+        """Of counts (columns, pixels)."""
+        return cls(*(np.concatenate([np.zeros_like(a[:1]), a.cumsum(axis=0, dtype=np.int32)]) for a in (ones, frames)))
+
+    @property
+    def columns(self) -> int:
+        """So many there are."""
+        return len(self.ones) - 1
+
+    def some(self, which: "NDArray[np.bool_] | slice") -> "ColumnSums":
+        """Those of some pixels."""
+        return ColumnSums(self.ones[:, which], self.frames if self.frames.shape[1] == 1 else self.frames[:, which])
+
+    def between(self, begin: int, end: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Share of 1s (columns, pixels), NaN without frames, in the columns `begin` to `end` away; frames."""
+        edges = np.arange(self.columns)
+        first, last = (np.clip(edges + shift, 0, self.columns) for shift in (begin, end))
+        frames = (self.frames[last] - self.frames[first]).astype(np.float32)
+        ones = (self.ones[last] - self.ones[first]).astype(np.float32)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return ones / frames, frames
+
+    def ranges(self, begin: NDArray[np.int64], end: NDArray[np.int64]) -> tuple[Array, Array]:
+        """1s and frames (pixels, n) in columns begin up to end, both (pixels, n), of each pixel."""
+        first, last = (np.clip(edge, 0, self.columns) for edge in (begin, end))
+        pixel = np.arange(len(begin))[:, None]
+        alike = pixel if self.frames.shape[1] > 1 else 0
+        return (
+            (self.ones[last, pixel] - self.ones[first, pixel]).astype(np.float64),
+            (self.frames[last, alike] - self.frames[first, alike]).astype(np.float64),
+        )
+
+
+def brightest(sums: ColumnSums) -> tuple[Array, NDArray[np.bool_]]:
+    """Where the line stands out most (pixels,), and whether that is enough.
+
+    Flux within the core is compared with the brighter of two rings beside it: the haze has an edge there, but no peak.
+    """
+    pixels = sums.ones.shape[1]
+    best, at = np.full(pixels, -np.inf), np.zeros(pixels)
+    columns = np.arange(sums.columns)[:, None]
+    for core in CORES:
+        guard = 2 * core + 1
+        mean, count = sums.between(-core, core + 1)
+        ring = np.fmax(sums.between(-guard - RING, -guard)[0], sums.between(guard + 1, guard + RING + 1)[0])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            spread = np.sqrt((mean * (1 - mean) + ring * (1 - ring) + 1 / (count + RING)) / count)
+            score = np.nan_to_num((mean - ring) / spread, nan=-np.inf)
+        top = score.argmax(axis=0)
+        value = score[top, np.arange(pixels)]
+        # The middle of a flat top, of which the first column would be as good as any.
+        alike = (score >= TOP * value) & (np.abs(columns - top) <= RING)
+        middle = (alike * columns).sum(axis=0) / np.maximum(alike.sum(axis=0), 1)
+        better = value > best
+        best, at = np.where(better, value, best), np.where(better, middle, at)
+    return at, best > LEAST_SEEN
+
+
+def evenly(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(row, column) (n, 2) of the pixels in a mask (height, width), in the order of Bayer's dither matrix.
+
+    It visits every second, then every fourth pixel of both directions, and so on from coarse to fine: reading the bits
+    of y and of y xor x from the last to the first, in turn.
+    """
+    rows, columns = np.nonzero(mask)
+    bits = max(1, int(max(mask.shape) - 1).bit_length())
+    rank = np.zeros(len(rows), np.int64)
+    for bit in range(bits):
+        rank = (rank << 2) | (((rows ^ columns) >> bit & 1) << 1) | (rows >> bit & 1)
+    at = np.argsort(rank, kind="stable")
+    return np.stack([rows[at], columns[at]], axis=1)
+
+
+Counts = NDArray[np.unsignedinteger[Any]]
+
+MOST_PASSAGES = 2000
+"""Of a sweep; more say little more about a dozen parameters."""
+TRIES = 6
+"""So many times more pixels are looked at where few of them see the line."""
+CHUNK = 3000
+"""Pixels at a time."""
+NEAR_SIGMAS = 4.5
+"""How far from its centre the line still is, and a column: what is farther away tells of the levels only."""
+REACH = 14
+"""Columns on either side of the line that tell of the levels, and at least twice as many as it has itself."""
+FAR = 1e4
+SHAPES = (*(LineShape(box) for box in (0.0, 1.5, 2.5, 4.0)), LineShape(1.5, travels=True))
+"""That are tried: lines whose light is the same in all frames of a column, as on a DAC's stairs, and one that moves, of
+which the pixel's width hardly matters."""
+MOST_LOSS = 2.0
+"""Of a pixel's log-likelihood against its best shape: a single one whose fit went astray would choose for all."""
+LEAST_SAMPLE, SAMPLE = 50, 300
+"""Pixels that tell of the passage's shape: fewer than the first find one for themselves alone, more are not asked."""
+LEAST_SIGNIFICANCE = 5.0
+"""Of the line, in standard deviations."""
+MOST_MISFIT = 5.0
+"""Of what was fitted, in standard deviations of chi squared: another line, or something that moved."""
+MOST_SD = 1.0
+"""In columns."""
+GROUPS = 4
+"""Parts of the picture, in each direction, that have a line width of their own."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepCounts:
+    """What a sweep counted.
+
+    counts: (columns, rows, window), 1s of each pixel over the frames of a column. n_frames: (columns,), frames of each.
+    command: (columns,), mean mirror command of them, without any lag; NaN where there are none. x0: (columns,), first
+    pixel of each column's window. width: of the picture, in pixels.
+    """
+
+    counts: Counts
+    n_frames: NDArray[np.integer[Any]]
+    command: Array
+    x0: NDArray[np.integer[Any]]
+    width: int
+
+    @property
+    def step(self) -> float:
+        """Command from a column to the next."""
+        there = np.flatnonzero(np.isfinite(self.command))
+        if len(there) < 2:
+            return np.nan
+        return float((self.command[there[-1]] - self.command[there[0]]) / (there[-1] - there[0]))
+
+    @property
+    def position(self) -> Array:
+        """Of each column (columns,), in columns: its own number, as far as its frames lay evenly in it."""
+        number = np.arange(len(self.command), dtype=np.float64)
+        there = np.flatnonzero(np.isfinite(self.command))
+        if len(there) < 2:
+            return number
+        first = there[0]
+        return np.where(np.isfinite(self.command), first + (self.command - self.command[first]) / self.step, number)
+
+    def at_pixels(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """1s (columns, pixels) of pixels (n, 2), and frames (columns, pixels or 1), none where a window ends before."""
+        total, rows, window = self.counts.shape
+        ones = np.zeros((total, len(pixels)), np.int32)
+        n = self.n_frames.astype(np.int32)[:, None]
+        if np.all(self.x0 == self.x0[0]):  # the usual case, and the quicker one
+            at = pixels[:, 0] * window + pixels[:, 1] - int(self.x0[0])
+            for k in range(total):
+                ones[k] = self.counts[k].reshape(rows * window).take(at)
+            return ones, n
+        x = pixels[None, :, 1] - self.x0[:, None]
+        inside = (x >= 0) & (x < window)
+        for k in range(total):
+            here = inside[k]
+            ones[k, here] = self.counts[k, pixels[here, 0], x[k, here]]
+        return ones, inside * n
+
+
+def find_passages(
+    sweep: SweepCounts,
+    direction: int,
+    speed_per_s: float,
+    mask: NDArray[np.bool_] | None = None,
+    most: int = MOST_PASSAGES,
+) -> Passages:
+    """Passages of at most `most` pixels of a mask (rows, width), by default of any; none where the line is not seen."""
+    rows = sweep.counts.shape[1]
+    pixels = evenly(np.ones((rows, sweep.width), np.bool_) if mask is None else mask)
+    kept: list[tuple[NDArray[np.int64], Array, Array]] = [(pixels[:0], np.empty(0), np.empty(0))]
+    found, shape = 0, None
+    for first in range(0, min(len(pixels), TRIES * most), CHUNK):
+        good, shape = _passages(sweep, pixels[first : first + CHUNK], shape)
+        kept.append(good)
+        found += len(good[1])
+        if found >= most:
+            break
+    place, centre, sd = (np.concatenate(parts)[:most] for parts in zip(*kept, strict=True))
+    first_command = float(sweep.command[np.isfinite(sweep.command)][:1].sum())
+    begin = int(np.argmax(np.isfinite(sweep.command)))
+    return Passages(
+        x_px=place[:, 1].astype(np.float64),
+        y_px=place[:, 0].astype(np.float64),
+        command=first_command + (centre - begin) * sweep.step,
+        sd=sd * abs(sweep.step),
+        direction=direction,
+        speed_per_s=speed_per_s,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """Of the passages of a sweep. near: columns on either side of a line that it reaches."""
+
+    near: int
+    line: LineShape
+
+
+def _passages(
+    sweep: SweepCounts, pixels: NDArray[np.int64], shape: _Shape | None
+) -> tuple[tuple[NDArray[np.int64], Array, Array], _Shape | None]:
+    """The pixels (m, 2) of these that tell of a passage, its centre and sd (m,) in columns; and the passages' shape."""
+    ones, frames = sweep.at_pixels(pixels)
+    sums = ColumnSums.of(ones, frames)
+    start, seen = brightest(sums)
+    pixels, start, sums = pixels[seen], start[seen], sums.some(seen)
+    if not len(pixels):
+        return (pixels, np.empty(0), np.empty(0)), shape
+    group = _groups(pixels, (sweep.counts.shape[1], sweep.width))
+
+    def fit(shape: _Shape, first: int | None = None, *, exact: bool = True) -> PassageFit:
+        some = slice(None, first)
+        data = _around(sums.some(some), sweep.position, start[some], shape.near)
+        return fit_passages(*data, start[some], group[some], shape.line, exact=exact)
+
+    sure = shape is not None or len(pixels) >= LEAST_SAMPLE
+    if shape is None:
+        sigma = float(np.median(fit(_Shape(REACH, LineShape()), SAMPLE, exact=False).sigma))
+        shapes = [_Shape(int(np.ceil(NEAR_SIGMAS * sigma + 1)), line) for line in SHAPES]
+        likelihood = np.array([fit(one, SAMPLE, exact=False).likelihood for one in shapes])
+        loss = np.minimum(likelihood.max(axis=0) - likelihood, MOST_LOSS)
+        shape = shapes[int(loss.sum(axis=1).argmin())]
+    found = fit(shape)
+    good = found.settled & (found.sd < MOST_SD) & (found.significance > LEAST_SIGNIFICANCE)
+    good &= (found.misfit < MOST_MISFIT) & (np.abs(found.centre - start) < np.maximum(2, 2 * found.sigma))
+    return (pixels[good], found.centre[good], found.sd[good]), shape if sure else None
+
+
+def _around(sums: ColumnSums, position: Array, start: Array, near: int) -> tuple[Array, Array, Array]:
+    """1s, frames and positions (pixels, 2 near + 3) around the passages; what is farther away lies far on its side."""
+    middle = np.rint(start).astype(np.int64)[:, None]
+    far = max(REACH, 2 * near)
+    begin = np.concatenate([middle - far, middle + np.arange(-near, near + 2)], axis=1)
+    end = np.concatenate([begin[:, 1:], middle + far + 1], axis=1)
+    ones, frames = sums.ranges(begin, end)
+    at = position[np.clip(begin, 0, sums.columns - 1)]
+    at[:, 0], at[:, -1] = -FAR, FAR
+    return ones, frames, at
+
+
+def _groups(pixels: NDArray[np.int64], size: tuple[int, int]) -> NDArray[np.int64]:
+    """Part of the picture that each pixel is in."""
+    parts = pixels * GROUPS // np.array(size)
+    group: NDArray[np.int64] = parts[:, 0] * GROUPS + parts[:, 1]
+    return group

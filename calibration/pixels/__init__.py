@@ -1,1 +1,0 @@
-"""From dark frames to hot, noisy and dead pixels, and how they drift."""

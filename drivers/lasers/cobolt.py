@@ -1,0 +1,404 @@
+"""The Cobolt (Huebner) 06-01 line laser, gated by its digital modulation input.
+
+hardware.md section 4.1; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope `lights/cobolt.py`.
+115 200 baud, 8N1. Two languages: 06-MLD and the newer SCPI-like one; 06-DPL is refused, since its regulated power
+follows a gate up to about 1 kHz only. Never sent: whatever changes autostart, key switch or direct control (`@cobas x`,
+`@cobasky`, `@cobasdr`). The laser has no watchdog: where its port is lost it stays as it was, so treat it as on. Its
+temperatures it judges itself: fault 1.
+
+Pause = power 0 (and `las:paus 1`): no key is needed to resume. Disarm = the same, then `l0`: with autostart enabled the
+key must be turned off and on before the laser starts again.
+
+The two languages of Cobolt 06-01 lasers for the same few things: gate mode, power, dark, bright.
+
+hardware.md section 4.1 (cobolt-lasers/pycobolt 1333e53). Both keep the laser dark by a power of 0 and not by `l0`:
+after `l0` its key must be turned (pycobolt issue 6), and a power of 0 can be read back, by the next program too.
+
+Commands and replies of a Cobolt laser as bytes.
+
+hardware.md section 4.1 (cobolt-lasers/pycobolt 1333e53): a command ends with CR, its reply is one line that ends with
+CRLF: a value, `OK` or `Syntax error: illegal command`. Old firmware may put junk before a reply. Commands follow one
+another at 100 ms or more; a reply may take a second (0.1 s was too little: python-microscope issue 234).
+"""
+
+import logging
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Literal, Protocol
+
+from drivers.errors import DeviceError, DeviceFault, ProtocolError
+from drivers.interfaces import LaserLimits, LaserStatus
+from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
+from drivers.registry import Kind, Surroundings
+from drivers.transports.dialogue import DONE, FLAG, NUMBER, CommandRefused, Dialogue, LineTiming
+
+COUNT = re.compile(r"\d{1,4}")
+WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+NAME = re.compile(r"(?=.*\d)[A-Za-z0-9][A-Za-z0-9._/ -]*")
+"""Model and serial numbers: with a digit, which no other reply in words has."""
+USUAL_TIMING = LineTiming(gap_s=0.1)
+
+_REFUSED = re.compile(r"syntax error.*", re.IGNORECASE)
+_JUNK = re.compile(r"^[^A-Za-z0-9+-]+")
+_MOST_LINES = 3
+"""A reply, and lines of nothing but junk before it."""
+
+
+class CoboltFraming:
+    """A `Framing`."""
+
+    ping = "?"
+
+    def greets(self, reply: str) -> bool:
+        """`OK`."""
+        return reply == DONE
+
+    def encode(self, command: str) -> bytes:
+        """With CR."""
+        return command.encode("ascii") + b"\r"
+
+    def read(self, command: str, read_line: Callable[[], str]) -> str:
+        """The line that follows it, without junk, and without the echo, should it be on."""
+        for _ in range(_MOST_LINES):
+            reply = _JUNK.sub("", read_line().rpartition(command)[2].strip())
+            if reply:
+                return reply
+        return ""
+
+    def refusal(self, reply: str) -> str | None:
+        """Its own words."""
+        return reply if _REFUSED.fullmatch(reply) else None
+
+
+_POWER_STEP_W = 1e-4
+"""The finest power that every model keeps: 0.1 mW."""
+
+
+class Dialect(Protocol):
+    """What the driver needs said. All methods raise the errors of `Dialogue`."""
+
+    family: str
+
+    def mode(self) -> str:
+        """The mode as the laser calls it."""
+        ...
+
+    def input_mode(self, mode: str) -> str:
+        """What governs the light in it: "digital" under the gate; everything else shines without asking the gate."""
+        ...
+
+    def gate(self) -> None:
+        """Let the TTL input, and nothing else, govern the light. Read back; to be called in the dark."""
+        ...
+
+    def set_power(self, power_w: float) -> None:
+        """Power while the gate is high. Read back."""
+        ...
+
+    def power_w(self, mode: str) -> float | None:
+        """The power that the laser is set to in this mode. None: set by current, it cannot say."""
+        ...
+
+    def darken(self) -> None:
+        """No light in any mode that knows a power, at once and without the key."""
+        ...
+
+    def brighten(self) -> None:
+        """End what `darken` did besides the power."""
+        ...
+
+    def waits_for_key(self) -> bool:
+        """It starts once its key is turned off and on."""
+        ...
+
+
+def classify(model: str) -> str:
+    """The family that a model number means, as pycobolt sorts them: "06-01", "06-MLD", "06-DPL" or "unknown"."""
+    if re.search(r"-06-(5|9).*-\d{3,4}(-C)?$", model):
+        return "06-DPL"  # in either language its power follows a gate up to 1 kHz only
+    if re.search(r"-06-.*-1\d{3}(-C)?$", model):
+        return "06-01"
+    if re.search(r"-06-0", model):
+        return "06-MLD"
+    return "unknown"
+
+
+class MldDialect:
+    """06-MLD: `slmp`, `sdmes`, `em`."""
+
+    family = "06-MLD"
+    _MODES = ("constant current", "constant power")
+
+    def __init__(self, line: Dialogue) -> None:
+        self._line = line
+
+    def mode(self) -> str:
+        """`gam?`: 0 constant current, 1 constant power, 2 modulation."""
+        return self._line.ask("gam?", re.compile("[012]"))
+
+    def input_mode(self, mode: str) -> str:
+        """From `gdmes?` and `games?`."""
+        if mode != "2":
+            return self._MODES[int(mode)]
+        return _inputs(self._line.ask_flag("gdmes?"), self._line.ask_flag("games?"))
+
+    def gate(self) -> None:
+        """Digital modulation on, analog off, modulation mode."""
+        self._line.tell_and_check("sdmes 1", "gdmes?", FLAG, "1".__eq__)
+        self._line.tell_and_check("sames 0", "games?", FLAG, "0".__eq__)
+        self._line.tell_and_check("em", "gam?", COUNT, "2".__eq__)
+
+    def set_power(self, power_w: float) -> None:
+        """`slmp` takes milliwatts."""
+        self._power_mw(power_w * 1e3)
+
+    def power_w(self, mode: str) -> float | None:
+        """`glmp?` in milliwatts, `p?` in watts."""
+        if mode == "0":
+            return None
+        return self._line.ask_number("glmp?") * 1e-3 if mode == "2" else self._line.ask_number("p?")
+
+    def darken(self) -> None:
+        """The power of the present mode first: this may be an emergency."""
+        self._power_mw(0.0)
+        self._line.tell("p 0")
+
+    def brighten(self) -> None:
+        """Nothing besides the power."""
+
+    def waits_for_key(self) -> bool:
+        """`gom?` 1."""
+        return self._line.ask("gom?", COUNT) == "1"
+
+    def _power_mw(self, power_mw: float) -> None:
+        self._line.tell_and_check(f"slmp {power_mw:.4f}", "glmp?", NUMBER, _near(power_mw))
+
+
+class ScpiDialect:
+    """The newer 06-01 language: `laser:runmode`, `las:paus`."""
+
+    family = "06-01"
+    _POWER = "laser:powermodulation:power:setpoint"
+
+    def __init__(self, line: Dialogue) -> None:
+        self._line = line
+
+    def mode(self) -> str:
+        """The run mode."""
+        return self._line.ask("laser:runmode?", WORD).lower()
+
+    def input_mode(self, mode: str) -> str:
+        """From the inputs that are on."""
+        if mode != "powermodulation":
+            return mode
+        return _inputs(self._line.ask_flag("las:pm:dig:ena?"), self._line.ask_flag("las:pm:ana:ena?"))
+
+    def gate(self) -> None:
+        """The modulator must be the external one: as "command" it follows `!e` and `!d` without ever replying."""
+        self._line.tell_and_check("las:pm:dig:ena 1", "las:pm:dig:ena?", FLAG, "1".__eq__)
+        self._line.tell_and_check("las:pm:ana:ena 0", "las:pm:ana:ena?", FLAG, "0".__eq__)
+        self._line.tell("laser:pm:dig:modulator external")
+        self._line.tell_and_check("laser:runmode PowerModulation", "laser:runmode?", WORD, _is_modulation)
+
+    def set_power(self, power_w: float) -> None:
+        """Milliwatts."""
+        self._power_mw(power_w * 1e3)
+
+    def power_w(self, mode: str) -> float | None:
+        """Milliwatts in both modes that know a power."""
+        if mode == "powermodulation":
+            return self._line.ask_number(f"{self._POWER}?") * 1e-3
+        return self._line.ask_number("laser:cp:power:setpoint?") * 1e-3 if mode == "constantpower" else None
+
+    def darken(self) -> None:
+        """`las:paus 1` blanks it at once; the powers of 0 tell the next program so."""
+        self._line.tell("las:paus 1")
+        self._power_mw(0.0)
+        self._line.tell("laser:cp:power:setpoint 0")
+
+    def brighten(self) -> None:
+        """End the pause."""
+        self._line.tell("las:paus 0")
+
+    def waits_for_key(self) -> bool:
+        """`state?` AutostartWaitingForKeyOn."""
+        return "waitingforkey" in self._line.ask("state?", WORD).lower()
+
+    def _power_mw(self, power_mw: float) -> None:
+        self._line.tell_and_check(f"{self._POWER} {power_mw:.4f}", f"{self._POWER}?", NUMBER, _near(power_mw))
+
+
+def _inputs(digital: bool, analog: bool) -> str:
+    if digital and not analog:
+        return "digital"
+    return "mixed" if digital else "analog" if analog else "modulation without input"
+
+
+class _near:  # noqa: N801 - reads as what it says
+    """Whether a power read back in milliwatts is the one that was set."""
+
+    def __init__(self, power_mw: float) -> None:
+        self._power_mw = power_mw
+
+    def __call__(self, reply: str) -> bool:
+        return abs(float(reply) - self._power_mw) <= max(0.01 * self._power_mw, _POWER_STEP_W * 1e3 / 2)
+
+
+def _is_modulation(reply: str) -> bool:
+    return reply.lower() == "powermodulation"
+
+
+_log = logging.getLogger(__name__)
+
+FAULTS = {1: "temperature", 3: "interlock was open", 4: "constant power timed out"}
+"""Meaning of `f?`; 0 is none."""
+
+
+class CoboltConfig(SerialLaserConfig):
+    """Config of a Cobolt 06-01 laser."""
+
+    kind: Literal["cobolt"] = "cobolt"
+
+
+class CoboltLaser(SerialLaser):
+    """A Cobolt 06-01. `status` takes almost a second: at most ten commands a second are allowed."""
+
+    def __init__(self, line: Dialogue, dialect: Dialect, name: str, limits: LaserLimits, autostart: bool) -> None:
+        super().__init__(name, line, limits)
+        self._dialect = dialect
+        self._autostart = autostart
+        self._started = False
+
+    def _do_status(self) -> LaserStatus:
+        line, dialect = self._line, self._dialect
+        # A flipped bit is a false alarm: what ends a scan is asked twice. One that hides an alarm lasts for one poll.
+        interlock_open = line.ask_flag("ilk?") and line.ask_flag("ilk?")
+        fault = self._fault()
+        on = line.ask_flag("l?")
+        mode = dialect.mode()
+        input_mode = dialect.input_mode(mode)
+        set_w = dialect.power_w(mode) if on else 0.0
+        key_on = line.ask_flag("@cobasks?") if self._autostart else None
+        if not on and fault is None and dialect.waits_for_key():
+            fault = "it waits for its key: turn the key off and on"
+        return LaserStatus(
+            emission=on and (set_w is None or set_w > 0),
+            armed=self._armed,
+            interlock_closed=not interlock_open,
+            fault=fault,
+            key_on=key_on,
+            warming_up=self._started and not on and fault is None and not interlock_open,
+            input_mode=input_mode,
+            power_w=line.ask_number("pa?") if on else 0.0,
+        )
+
+    def _fault(self) -> str | None:
+        number = int(self._line.ask("f?", COUNT)) and int(self._line.ask("f?", COUNT))
+        return None if number == 0 else FAULTS.get(number, f"number {number}")
+
+    def _do_arm(self, power_w: float) -> None:
+        try:
+            self._enable(power_w)
+            self._require_no_stop()
+        except DeviceError:
+            with suppress(DeviceError):  # the first error is the one to tell
+                self._dialect.darken()
+            raise
+        self._armed = True
+
+    def _enable(self, power_w: float) -> None:
+        """Dark until the gate is known to govern the light; only then the power."""
+        dialect = self._dialect
+        gated = all(dialect.input_mode(dialect.mode()) == "digital" for _ in range(2))  # a flipped bit must not shine
+        on = self._line.ask_flag("l?")
+        if not (gated and on):
+            dialect.darken()  # whenever it comes on, it is dark until the power is set
+        if not gated:
+            dialect.gate()
+        # Each exchange takes a tenth of a second: a pause from another thread is heeded before what lights.
+        self._require_no_stop()
+        if not on:
+            self._start()
+        self._require_no_stop()
+        dialect.set_power(power_w)
+        self._require_no_stop()
+        dialect.brighten()
+
+    def _start(self) -> None:
+        """Switch on; emission follows once temperatures are reached."""
+        self._line.tell("@cob1" if self._autostart else "l1")
+        self._started = True
+        if not self._line.ask_flag("l?") and self._dialect.waits_for_key():
+            # The start is not called back: the key that is turned now leads to a laser that is on, and dark.
+            self._started = False
+            raise DeviceFault(f"{self._name} waits for its key; turn the key off and on, then start again")
+
+    def _do_pause(self) -> None:
+        try:
+            self._dialect.darken()
+            power_w = self._dialect.power_w(self._dialect.mode())
+        except (DeviceFault, ProtocolError) as error:
+            _log.warning("%s: pause failed (%s); switching off", self._name, error)
+            power_w = None
+        if power_w != 0 and self._line.ask_flag("l?"):
+            # A mode that knows no power, or a laser that keeps its own: off is the only dark that is sure.
+            self._switch_off()
+            _log.warning("%s: switched off, its key must be turned before it starts again", self._name)
+
+    def _do_disarm(self) -> None:
+        try:
+            self._dialect.darken()
+        finally:
+            self._switch_off()
+        self._armed = False
+
+    def _switch_off(self) -> None:
+        self._started = False
+        self._line.tell("@cob0")  # also a start that is under way
+        self._line.tell_and_check("l0", "l?", COUNT, "0".__eq__)
+
+
+def create(config: CoboltConfig, surroundings: Surroundings, timing: LineTiming = USUAL_TIMING) -> CoboltLaser:
+    """Open the laser and identify it; changes nothing about it."""
+    return open_laser("cobolt", config, surroundings, CoboltFraming(), timing, partial(_identify, config))
+
+
+def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
+    """As few questions as can be: each costs a tenth of a second, and a guard waits for them."""
+    try:
+        model = line.ask_surely("glm?", NAME)
+    except CommandRefused:
+        raise DeviceFault(
+            f"cobolt laser on {config.port} does not know its model, as -04- types do not; use an 06-01 laser"
+        ) from None
+    dialect = _dialect(line, model)
+    serial = line.ask_surely("sn?", NAME)
+    require_serial_number("cobolt", config, serial)
+    limit_w = float(line.ask_surely("gmlp?", NUMBER)) * 1e-3
+    if limit_w <= 0:
+        raise ProtocolError(f"{line.name} says that its most power is {limit_w:g} W; check its cable and firmware")
+    autostart = line.ask_surely("@cobas?", FLAG) == "1"
+    limits = LaserLimits(0.0, min(config.max_power, limit_w))
+    return CoboltLaser(line, dialect, f"Cobolt {model} {serial}", limits, autostart)
+
+
+def _dialect(line: Dialogue, model: str) -> Dialect:
+    family = classify(model)
+    for dialect in (MldDialect, ScpiDialect):
+        if dialect.family == family:
+            return dialect(line)
+    if family == "06-DPL":
+        raise DeviceFault(
+            f"cobolt laser {model} is an 06-DPL: its power follows a gate up to 1 kHz only; use an 06-MLD"
+        )
+    raise DeviceFault(f"cobolt laser {model} is no 06-01 type; this driver runs 06-MLD and newer 06-01 lasers")
+
+
+def _off(config: CoboltConfig) -> bytes:
+    """No line end before it: an empty command may count as one, and what follows within 0.1 s is not heeded."""
+    return b"l0\r"
+
+
+KIND = Kind(config=CoboltConfig, create=create, off=_off)

@@ -1,0 +1,362 @@
+"""The Coherent OBIS LX/LS line laser, gated by its digital modulation input (`SOUR:AM:EXT DIG`).
+
+hardware.md section 4.2; from python-microscope `lights/obis.py` (69625e0), the bit tables of `obis.h`, the operator's
+manual (appendix C) and mmCoreAndDevices PRs 645 and 531. 115 200 baud, 8N1 (over USB the rate is ignored). Limits of
+the base plate's temperature are read by `SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not in hardware.md but in
+`obis.cpp` beside `obis.h` and in Micro-Manager's `CoherentOBIS.cpp`.
+
+Traps: `AM:STAT ON` during warm-up is deferred, light may come minutes later. So `arm` waits until the laser is ready
+and only then says ON; whatever ends the wait says OFF. With CDRH the emission follows ON by 5 s. Modes cannot be
+changed while it is on. Never sent: CDRH OFF. The laser has no watchdog: where its port is lost it stays as it was, so
+treat it as on.
+
+Pause = `AM:STAT OFF`, confirmed by the emission bit; no key is needed to resume. Disarm = the same, and least power.
+
+Commands and replies of a Coherent OBIS laser as bytes, with its handshake on or off.
+
+hardware.md section 4.2 (OBIS operator's manual, appendix C; mmCoreAndDevices PR 645): commands end with CRLF. Handshake
+on: a set answers `OK`, a query its value and then `OK`, an error `ERR-nnn` in their place. Handshake off: a set answers
+nothing at all, a query its value. So the handshake is asked for first and never changed, and whatever is set is read
+back. Behind an OBIS Remote a number on SYST and SOUR addresses the laser; bare commands go to the Remote.
+"""
+
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import Field
+
+from drivers.clock import NS_PER_S, Clock
+from drivers.errors import DeviceError, DeviceFault, DeviceNotFound, DeviceTimeout, InterlockOpen, LimitExceeded
+from drivers.interfaces import LaserLimits, LaserStatus
+from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
+from drivers.registry import Kind, Surroundings
+from drivers.transports.dialogue import DONE, NUMBER, CommandRefused, Dialogue, LineTiming
+from drivers.units import Seconds
+
+SWITCH = re.compile(r"ON|OFF")
+CELSIUS = re.compile(r"([+-]?\d{1,4}(?:\.\d{1,6})?) ?C?")
+BITS = re.compile(r"[0-9A-Fa-f]{8}")
+TEXT = re.compile(r"[ -~]+")
+USUAL_TIMING = LineTiming()
+
+_ERROR = re.compile(r"ERR ?(-?\d{1,3})")
+_ADDRESSED = re.compile(r"^(SYST|SOUR)(?=:)")
+_HANDSHAKE = "SYST:COMM:HAND?"
+"""The setting is the port's, not a laser's behind a Remote."""
+
+ERRORS = {
+    -100: "unknown command",
+    -102: "syntax",
+    -109: "a parameter is missing",
+    -200: "not in this order, as while it is on",
+    -203: "protected",
+    -220: "bad parameter",
+    -221: "conflicts with a setting",
+    -241: "this unit does not have it",
+    -256: "file",
+    -257: "file",
+    -310: "system",
+    -321: "memory",
+    -350: "error queue is full",
+    -400: "query unavailable",
+    500: "CCB",
+    510: "I2C",
+    520: "controller timed out",
+    900: "CCB timed out",
+}
+"""Meaning of `ERR-nnn` (hardware.md section 4.2)."""
+
+
+class ObisFraming:
+    """A `Framing`. channel: slot of the laser in a Remote; None: it is on the port itself."""
+
+    def __init__(self, channel: int | None) -> None:
+        self._suffix = "" if channel is None else str(channel)
+        self._handshake: bool | None = None
+        self.identity = ""
+        """The reply to `*IDN?`, once it is known: from then on only the same one is in step."""
+
+    @property
+    def ping(self) -> str:
+        """Who it is; before all else, whether the handshake is on."""
+        return _HANDSHAKE if self._handshake is None else "*IDN?"
+
+    def greets(self, reply: str) -> bool:
+        """As `Framing`; learns about the handshake."""
+        if self._handshake is not None:
+            return reply == self.identity or (not self.identity and TEXT.fullmatch(reply) is not None)
+        if SWITCH.fullmatch(reply) is None:
+            return False
+        self._handshake = reply == "ON"
+        return True
+
+    def encode(self, command: str) -> bytes:
+        """Addressed, with CRLF."""
+        addressed = command if command == _HANDSHAKE else _ADDRESSED.sub(rf"\g<1>{self._suffix}", command)
+        return addressed.encode("ascii") + b"\r\n"
+
+    def read(self, command: str, read_line: Callable[[], str]) -> str:
+        """A set that answers nothing is done: how it reads back will tell."""
+        if not command.endswith("?"):
+            return read_line() if self._handshake else DONE
+        reply = read_line()
+        acknowledged = reply == "ON" if self._handshake is None else self._handshake
+        if acknowledged and not _ERROR.fullmatch(reply) and read_line() != DONE:
+            return ""
+        return reply
+
+    def refusal(self, reply: str) -> str | None:
+        """Number and meaning."""
+        error = _ERROR.fullmatch(reply)
+        return f"{reply} ({ERRORS.get(int(error[1]), 'no known number')})" if error is not None else None
+
+
+EMISSION = 0x2
+READY = 0x4
+CDRH_DELAY = 0x10
+WARM_UP = 0x100
+KEY_OFF = 0x0200_0000
+INTERLOCK = 0x0400_0000
+"""Bits of `SYST:STAT?`; the last two are inferred from samples (hardware.md section 4.2, confidence M)."""
+
+FAULTS = {
+    0x1: "base temperature",
+    0x2: "diode temperature",
+    0x4: "internal temperature",
+    0x8: "supply",
+    0x10: "I2C",
+    0x20: "over-current",
+    0x40: "checksum",
+    0x80: "checksum",
+    0x100: "buffer",
+    0x200: "warm-up took too long",
+    0x400: "TEC",
+    0x800: "CCB",
+    0x1000: "diode limit",
+    0x4000: "photodiode",
+    0x8000: "fatal",
+    0x2_0000: "watchdog reset",
+    0x10_0000: "over-power",
+}
+"""Bits of `SYST:FAUL?`."""
+FAULT = 0x1
+HARDWARE_FAULT = 0x20
+"""Bits of `SYST:STAT?` that say that there is a fault."""
+
+_LOCK = re.compile(r"ON|OK|OFF")
+"""`SYST:LOCK?`: OFF = open. Units say ON or OK for closed."""
+_MODE = re.compile(r"[A-Z]{3,7}")
+_DIGITAL = ("DIG", "DIGITAL")
+_MODES = {"CWP": "constant power", "CWC": "constant current"}
+_READY_POLL_S = 0.5
+
+
+class ObisConfig(SerialLaserConfig):
+    """Config of a Coherent OBIS laser."""
+
+    kind: Literal["obis"] = "obis"
+    channel: Annotated[int | None, Field(ge=1, le=6)] = None
+    """Slot of the laser in an OBIS Remote or Box. None: the laser itself is on the port."""
+    warm_up: Annotated[Seconds, Field(gt=0)] = 600.0
+    """Longest wait of `arm` for a laser that is not ready yet."""
+
+
+class TemperatureRange(NamedTuple):
+    """What the base plate may have, in degrees Celsius."""
+
+    low_c: float
+    high_c: float
+
+
+class ObisLaser(SerialLaser):
+    """An OBIS. `arm` waits while the laser warms up; `pause` and `disarm` from another thread end that wait."""
+
+    def __init__(
+        self,
+        line: Dialogue,
+        clock: Clock,
+        name: str,
+        limits: LaserLimits,
+        base_range: TemperatureRange | None,
+        warm_up_s: float,
+    ) -> None:
+        super().__init__(name, line, limits)
+        self._clock = clock
+        self._base_range = base_range
+        self._warm_up_s = warm_up_s
+        self._told_on = False
+
+    def _do_status(self) -> LaserStatus:
+        line = self._line
+        bits = self._bits()
+        closed = self._interlock_closed(bits)
+        base_c = _celsius(line.ask("SOUR:TEMP:BAS?", CELSIUS))
+        fault = self._fault(bits, base_c)
+        on = line.ask("SOUR:AM:STAT?", SWITCH) == "ON"
+        mode = line.ask("SOUR:AM:SOUR?", _MODE)
+        emits = bool(bits & EMISSION)
+        # An ON that somebody else left pending may turn into light at any moment: that is emission, to be paused.
+        pending = on and not emits
+        return LaserStatus(
+            emission=emits or (pending and not self._told_on),
+            armed=self._armed,
+            interlock_closed=closed,
+            fault=fault,
+            key_on=not bits & KEY_OFF,
+            warming_up=fault is None and closed and (bool(bits & (WARM_UP | CDRH_DELAY)) or pending),
+            input_mode="digital" if mode in _DIGITAL else _MODES.get(mode, mode),
+            temperature_c=base_c,
+            power_w=line.ask_number("SOUR:POW:LEV?"),
+        )
+
+    def _do_arm(self, power_w: float) -> None:
+        try:
+            if not (self._told_on and self._bits() & EMISSION and self._is_digital()):
+                self._prepare()
+                self._set_power(power_w)
+                self._await_ready()
+                self._told_on = True
+                self._line.tell_and_check("SOUR:AM:STAT ON", "SOUR:AM:STAT?", SWITCH, "ON".__eq__)
+            else:
+                self._set_power(power_w)
+        except DeviceError:
+            with suppress(DeviceError):  # the first error is the one to tell
+                self._switch_off()
+            raise
+        if self._stopped:  # a pause from another thread overtook the ON
+            self._switch_off()
+        self._require_no_stop()
+        self._armed = True
+
+    def _prepare(self) -> None:
+        """Off, and set up so that nothing but the gate governs the light, at no later power-up either."""
+        line = self._line
+        self._switch_off()
+        line.tell_and_check("SYST:CDRH ON", "SYST:CDRH?", SWITCH, "ON".__eq__)
+        line.tell_and_check("SYST:AUT OFF", "SYST:AUT?", SWITCH, "OFF".__eq__)
+        line.tell_and_check("SOUR:AM:EXT DIG", "SOUR:AM:SOUR?", _MODE, _DIGITAL.__contains__)
+        line.tell_and_check("SOUR:TEMP:APR ON", "SOUR:TEMP:APR?", SWITCH, "ON".__eq__)
+
+    def _set_power(self, power_w: float) -> None:
+        def is_power(reply: str) -> bool:
+            return abs(float(reply) - power_w) <= max(0.01 * power_w, 5e-5)  # they keep 0.1 mW
+
+        query = "SOUR:POW:LEV:IMM:AMPL?"
+        self._line.tell_and_check(f"SOUR:POW:LEV:IMM:AMPL {power_w:.5f}", query, NUMBER, is_power)
+
+    def _await_ready(self) -> None:
+        """Until an ON acts at once: said earlier it would be deferred, and light come when nobody expects it."""
+        give_up_ns = self._clock.now_ns() + round(self._warm_up_s * NS_PER_S)
+        while not (bits := self._bits()) & READY or bits & WARM_UP:
+            fault = self._fault(bits)
+            if fault is not None:
+                raise DeviceFault(f"{self._name}: fault {fault}; clear it at the laser and arm again")
+            if bits & KEY_OFF:
+                raise DeviceFault(f"{self._name}: its key is off; turn it on and arm again")
+            if not self._interlock_closed(bits):
+                raise InterlockOpen(f"{self._name}: the interlock is open; close it and arm again")
+            self._require_no_stop()
+            if self._clock.now_ns() >= give_up_ns:
+                raise DeviceTimeout(
+                    f"{self._name} is not ready after {self._warm_up_s:g} s (status 0x{bits:08X}); wait, or raise "
+                    "'warm_up'"
+                )
+            self._clock.sleep(_READY_POLL_S)
+
+    def _do_pause(self) -> None:
+        self._switch_off()
+
+    def _do_disarm(self) -> None:
+        self._armed = False
+        self._switch_off()
+        self._set_power(self._limits.min_power_w)
+
+    def _switch_off(self) -> None:
+        """Off, a deferred ON too. `DeviceFault` where it still emits."""
+        self._line.tell_and_check("SOUR:AM:STAT OFF", "SOUR:AM:STAT?", SWITCH, "OFF".__eq__)
+        self._told_on = False
+        if self._bits() & EMISSION:
+            raise DeviceFault(f"{self._name} still emits after OFF; turn its key off")
+
+    def _bits(self) -> int:
+        return int(self._line.ask_surely("SYST:STAT?", BITS), 16)
+
+    def _fault(self, bits: int, base_c: float | None = None) -> str | None:
+        """What the laser calls a fault, and a base plate outside its range."""
+        said = []
+        word = int(self._line.ask_surely("SYST:FAUL?", BITS), 16)
+        if word:
+            names = [name for bit, name in FAULTS.items() if word & bit]
+            said.append(f"0x{word:08X} ({', '.join(dict.fromkeys(names)) or 'unknown'})")
+        elif bits & (FAULT | HARDWARE_FAULT):
+            said.append(f"status 0x{bits:08X}")
+        if base_c is not None and self._out_of_range(base_c):
+            base_c = _celsius(self._line.ask_surely("SOUR:TEMP:BAS?", CELSIUS))  # a flipped bit ends no scan
+            if (allowed := self._out_of_range(base_c)) is not None:
+                said.append(f"base plate at {base_c:g} C, outside {allowed.low_c:g} to {allowed.high_c:g} C")
+        return "; ".join(said) or None
+
+    def _out_of_range(self, base_c: float) -> TemperatureRange | None:
+        """The range that it is outside of."""
+        allowed = self._base_range
+        return None if allowed is None or allowed.low_c <= base_c <= allowed.high_c else allowed
+
+    def _interlock_closed(self, bits: int) -> bool:
+        return self._line.ask_surely("SYST:LOCK?", _LOCK) != "OFF" and not bits & INTERLOCK
+
+    def _is_digital(self) -> bool:
+        return self._line.ask("SOUR:AM:SOUR?", _MODE) in _DIGITAL
+
+
+def create(config: ObisConfig, surroundings: Surroundings, timing: LineTiming = USUAL_TIMING) -> ObisLaser:
+    """Open the laser and identify it; changes nothing about it."""
+    framing = ObisFraming(config.channel)
+    identify = partial(_identify, config, surroundings.clock, framing)
+    return open_laser("obis", config, surroundings, framing, timing, identify)
+
+
+def _identify(config: ObisConfig, clock: Clock, framing: ObisFraming, line: Dialogue) -> ObisLaser:
+    where = f"obis laser on {config.port}"
+    framing.identity = line.ask_surely("*IDN?", TEXT)
+    if "OBIS" not in framing.identity.upper():
+        raise DeviceNotFound(f"{where}: {framing.identity[:60]!r} is no OBIS; correct 'port'")
+    if "REMOTE" in framing.identity.upper() and config.channel is None:
+        raise DeviceNotFound(f"{where} is an OBIS Remote; say which laser by 'channel: 1'")
+    model, serial = line.ask_surely("SYST:INF:MOD?", TEXT), line.ask_surely("SYST:INF:SNUM?", TEXT)
+    require_serial_number("obis", config, serial)
+    least_w = float(line.ask_surely("SOUR:POW:LIM:LOW?", NUMBER))
+    most_w = min(float(line.ask_surely("SOUR:POW:LIM:HIGH?", NUMBER)), config.max_power)
+    if most_w < least_w:
+        raise LimitExceeded(
+            f"{where}: max_power {config.max_power * 1e3:g} mW is below the least it can give, {least_w * 1e3:g} mW; "
+            "use a weaker laser or an attenuator"
+        )
+    limits = LaserLimits(least_w, most_w)
+    return ObisLaser(line, clock, f"{model} {serial}", limits, _base_range(line), config.warm_up)
+
+
+def _base_range(line: Dialogue) -> TemperatureRange | None:
+    """None: this unit does not say, or states no range; its own fault word judges then."""
+    try:
+        low, high = (line.ask_surely(f"SOUR:TEMP:PROT:BAS:{end}?", CELSIUS) for end in ("LOW", "HIGH"))
+    except CommandRefused:
+        return None
+    found = TemperatureRange(_celsius(low), _celsius(high))
+    return found if found.low_c < found.high_c else None
+
+
+def _celsius(reply: str) -> float:
+    match = CELSIUS.fullmatch(reply)
+    assert match is not None  # `ask` let no other reply through
+    return float(match[1])
+
+
+def _off(config: ObisConfig) -> bytes:
+    """The line end before it ends what a program that died had begun to say."""
+    return b"\r\n" + ObisFraming(config.channel).encode("SOUR:AM:STAT OFF")
+
+
+KIND = Kind(config=ObisConfig, create=create, off=_off)

@@ -1,0 +1,158 @@
+"""What every laser on a serial line has: a config with limits, a port that may get lost, a serial number to check.
+
+A line laser without key or warm-up, whose emission follows `arm` and `pause` at once: simulated, or recorded.
+"""
+
+from collections.abc import Callable
+from typing import Annotated, TypeVar
+
+from pydantic import Field
+
+from drivers.errors import DeviceNotFound, DeviceTimeout, ProtocolError, WrongState
+from drivers.interfaces import LaserLimits, LaserStatus, LineLaser
+from drivers.registry import KindConfig, Surroundings
+from drivers.transports.dialogue import Dialogue, Framing, LineTiming
+from drivers.transports.endpoints import resolve
+from drivers.transports.serial_port import SerialPort
+from drivers.units import Watts
+
+
+class SerialLaserConfig(KindConfig):
+    """What the config of each kind of them says."""
+
+    port: str
+    """Serial port: a path or COM port, "serial=..." or "usb=VVVV:PPPP" of its USB device, or "emulated:NAME"."""
+    max_power: Annotated[Watts, Field(gt=0)]
+    """The most this rig may ever send out; the laser's own maximum holds where it is smaller."""
+    serial_number: str | None = None
+    """Of the laser itself; another one is refused. None: any."""
+
+
+class SerialLaser(LineLaser):
+    """A laser that is spoken with over `self._line`."""
+
+    def __init__(self, name: str, line: Dialogue, limits: LaserLimits) -> None:
+        super().__init__(name)
+        line.name = name
+        self._line = line
+        self._limits = limits
+        self._armed = False
+        self._stopped = False
+        """Whether pause or disarm was called since arm began: other threads may."""
+
+    def arm(self, power_w: float) -> None:
+        """See `LineLaser`. `WrongState`: ended by a pause from another thread."""
+        self._stopped = False
+        super().arm(power_w)
+
+    def pause(self) -> None:
+        """See `LineLaser`. An `arm` under way on another thread ends."""
+        self._stopped = True
+        super().pause()
+
+    def disarm(self) -> None:
+        """See `LineLaser`. An `arm` under way on another thread ends."""
+        self._stopped = True
+        super().disarm()
+
+    def _require_no_stop(self) -> None:
+        """`WrongState` where a pause has come while arming: what is to be lit must stay dark."""
+        if self._stopped:
+            raise WrongState(f"{self._name}: arm was ended by a pause; arm again")
+
+    @property
+    def limits(self) -> LaserLimits:
+        """The laser's least power to the smaller of its own and the config's maximum."""
+        return self._limits
+
+    @property
+    def port_lost(self) -> bool:
+        """Whether the port is gone, told without a word on the wire. Any thread."""
+        return self._line.port_lost
+
+    def _do_close(self) -> None:
+        self._line.close()
+
+
+_Laser = TypeVar("_Laser", bound=SerialLaser)
+
+
+def open_laser(
+    make: str,
+    config: SerialLaserConfig,
+    surroundings: Surroundings,
+    framing: Framing,
+    timing: LineTiming,
+    identify: Callable[[Dialogue], _Laser],
+) -> _Laser:
+    """Open the port, get into step and identify the laser; gives the port back where any of it fails.
+
+    make: what messages call it. `DeviceNotFound` where nothing of that make answers; what `identify` raises.
+    """
+    port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports).address, tap=surroundings.tap)
+    try:
+        line = Dialogue(f"{make} laser", port, framing, surroundings.clock, timing)
+        try:
+            line.connect()
+        except (DeviceTimeout, ProtocolError):
+            raise DeviceNotFound(
+                f"{make} laser: nothing on port {config.port} answers as one; check 'port', power and cable"
+            ) from None
+        return identify(line)
+    except BaseException:
+        port.close()
+        raise
+
+
+def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> None:
+    """`DeviceNotFound` where the config names another laser than was found."""
+    if config.serial_number not in (None, found):
+        raise DeviceNotFound(
+            f"{make} laser on {config.port} has serial number {found}, not {config.serial_number}; correct "
+            "'serial_number' or 'port'"
+        )
+
+
+class PlainLaser(LineLaser):
+    """Any power up to `max_power_w`. emit: told how much it emits under the gate, in W, whenever that changes."""
+
+    def __init__(self, name: str, max_power_w: float, emit: Callable[[float], None] | None = None) -> None:
+        super().__init__(name)
+        self._limits = LaserLimits(0.0, max_power_w)
+        self._emit = emit
+        self._armed = self._emission = False
+
+    @property
+    def limits(self) -> LaserLimits:
+        """From 0 W on."""
+        return self._limits
+
+    def _do_status(self) -> LaserStatus:
+        return LaserStatus(
+            emission=self._emission,
+            armed=self._armed,
+            interlock_closed=True,
+            fault=None,
+            key_on=None,
+            warming_up=False,
+            input_mode="digital",
+        )
+
+    def _do_arm(self, power_w: float) -> None:
+        self._armed = True
+        self._set(power_w, emission=True)
+
+    def _do_pause(self) -> None:
+        self._set(0.0, emission=False)
+
+    def _do_disarm(self) -> None:
+        self._do_pause()
+        self._armed = False
+
+    def _do_close(self) -> None:
+        self._do_disarm()
+
+    def _set(self, power_w: float, *, emission: bool) -> None:
+        self._emission = emission
+        if self._emit is not None:
+            self._emit(power_w)

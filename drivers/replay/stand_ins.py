@@ -1,0 +1,121 @@
+"""Stand-ins for the scanner, laser and sync source of a recording: what they did is in the frames already.
+
+They take every verb, within wide limits, and do nothing: nothing moves, nothing shines.
+"""
+
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import ClassVar, Literal
+
+from drivers.clock import NS_PER_S, Clock
+from drivers.interfaces import BeamScanner, Pulse, ScannerLimits, ScannerStatus, ScanWaveform, SyncSource, SyncStatus
+from drivers.lasers.serial_laser import PlainLaser
+from drivers.registry import Kind, KindConfig, Surroundings
+
+LIMITS = ScannerLimits(
+    command_range=(-1.0, 1.0),
+    velocity_per_s=1e9,
+    acceleration_per_s2=1e15,
+    step=2.0,
+    rms_duty=1.0,
+    max_points=1 << 24,
+    point_rate_hz=(1e-3, 1e9),
+)
+"""Of a mirror that has followed already."""
+MAX_POWER_W = 1e3
+RESOLUTION_S = 1e-9
+_LARGEST_DIVISOR = 100_000
+"""Point clocks are quotients of whole numbers up to some 50 000; a float says which."""
+
+
+class StandInConfig(KindConfig):
+    """Config of a device whose part a recording plays."""
+
+    real_time: ClassVar[bool] = False
+
+    kind: Literal["replay"] = "replay"
+
+
+class RecordedScanner(BeamScanner):
+    """A scanner that has scanned already: it takes its time and moves nothing."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__("recorded scanner")
+        self._clock = clock
+        self._takes_s = 0.0
+        self._ends_s = 0.0
+
+    @property
+    def limits(self) -> ScannerLimits:
+        """Wide ones."""
+        return LIMITS
+
+    def _do_status(self) -> ScannerStatus:
+        return ScannerStatus(moving=self._now_s() < self._ends_s, fault=None, position=None)
+
+    def _do_point_clock(self, requested_hz: float) -> Fraction:
+        return Fraction(requested_hz).limit_denominator(_LARGEST_DIVISOR)
+
+    def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None:
+        self._takes_s = float(repeats * len(waveform.command) / clock_hz)
+
+    def _do_start(self) -> None:
+        self._ends_s = self._now_s() + self._takes_s
+
+    def _do_stop(self) -> None:
+        self._ends_s = 0.0
+
+    def _do_park(self) -> None:
+        pass  # `stop` came first
+
+    def _do_close(self) -> None:
+        pass  # no handles
+
+    def _now_s(self) -> float:
+        return self._clock.now_ns() / NS_PER_S
+
+
+class RecordedSync(SyncSource):
+    """A sync source whose program has run already."""
+
+    _running = False
+
+    @property
+    def resolution_s(self) -> float:
+        """Finer than any device's."""
+        return RESOLUTION_S
+
+    def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
+        pass
+
+    def _do_run(self) -> None:
+        self._running = True
+
+    def _do_gate_low(self) -> None:
+        pass  # it is low, always
+
+    def _do_abort(self) -> None:
+        self._running = False
+
+    def _do_status(self) -> SyncStatus:
+        return SyncStatus("waiting" if self._running else "stopped", 0)
+
+    def _do_close(self) -> None:
+        pass  # no handles
+
+
+def _scanner(config: StandInConfig, surroundings: Surroundings) -> RecordedScanner:
+    return RecordedScanner(surroundings.clock)
+
+
+def _laser(config: StandInConfig, surroundings: Surroundings) -> PlainLaser:
+    return PlainLaser("recorded laser", MAX_POWER_W)
+
+
+def _sync(config: StandInConfig, surroundings: Surroundings) -> RecordedSync:
+    return RecordedSync("recorded sync source")
+
+
+SCANNER = Kind(config=StandInConfig, create=_scanner)
+LASER = Kind(config=StandInConfig, create=_laser)
+SYNC = Kind(config=StandInConfig, create=_sync)

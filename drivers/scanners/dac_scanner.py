@@ -1,0 +1,333 @@
+"""A beam scanner that is a galvo behind a DAC on USB: all that is the same whatever the DAC.
+
+A `Dac` is one board with its link: it says at what rates it runs, and plays points. The mirror moves only when it is
+started or parked, always along ramps; opening a scanner asks the board who it is, no more.
+
+The points of one run of a scanner, taken slice by slice: the way to the first point, the waveform, the way to rest.
+
+Nothing is laid out beforehand: a waveform of a million points repeated for hours takes the memory of the waveform.
+
+Plays runs of points on a DAC that must be fed: in a thread while a scan runs, and knows where the mirror rests.
+"""
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import DeviceDisconnected, DeviceError
+from drivers.interfaces import BeamScanner, ScannerLimits, ScannerStatus, ScanWaveform
+from drivers.registry import Surroundings
+from drivers.scanners.galvo import GalvoConfig, brake, ramp
+from drivers.transports.endpoints import resolve
+from drivers.transports.usb_device import UsbDevice, UsbId, open_device
+
+_NO_WAVE = ScanWaveform(np.zeros(1), np.zeros(1, np.uint8), Fraction(1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointSlice:
+    """A slice. command: float64 (n,). markers: uint8 (n,). lit: bool (n,), part of the waveform, not of a ramp."""
+
+    command: NDArray[np.float64]
+    markers: NDArray[np.uint8]
+    lit: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        """Points of the slice."""
+        return len(self.command)
+
+
+class PointSource:
+    """Gives the points of a run in order: `repeats` of a waveform, or (None) the way alone. One thread."""
+
+    def __init__(
+        self,
+        way: NDArray[np.float64],
+        waveform: ScanWaveform | None,
+        repeats: int,
+        *,
+        position: float,
+        limits: ScannerLimits,
+        rate_hz: float,
+    ) -> None:
+        """Use `scan_from` and `park_from`. `position` is where the mirror rests now, `way` leads on from there."""
+        self._limits = limits
+        self._rate_hz = rate_hz
+        self._wave = _NO_WAVE if waveform is None else waveform
+        self._way = way
+        self._end = len(way) + repeats * len(self._wave.command)
+        self._at = 0
+        self._before = self.last = position
+        self._former = 0, position, position
+
+    @property
+    def left(self) -> int:
+        """Points not taken yet."""
+        return self._end - self._at
+
+    def pad_start(self, points: int = 1) -> None:
+        """More points at the very beginning, where the mirror rests. Before the first `take`."""
+        self._way = np.concatenate([np.full(points, self.last), self._way])
+        self._end += points
+
+    def pad_end(self) -> None:
+        """One more point at the end of a way to rest, where the mirror rests then. After `stop`, before `take`."""
+        self._way = np.append(self._way, self._way[-1])
+        self._end += 1
+
+    def take(self, most: int) -> PointSlice:
+        """The next points, at most so many."""
+        self._former = self._at, self._before, self.last
+        at = np.arange(self._at, min(self._at + most, self._end))
+        self._at += len(at)
+        lit = at >= len(self._way)
+        command, markers = np.empty(len(at)), np.zeros(len(at), np.uint8)
+        of_wave = (at[lit] - len(self._way)) % len(self._wave.command)
+        command[lit], markers[lit] = self._wave.command[of_wave], self._wave.markers[of_wave]
+        command[~lit] = self._way[at[~lit]]
+        self._note(command)
+        return PointSlice(command, markers, lit)
+
+    def give_back(self) -> None:
+        """Undo the last `take`: its points were not played."""
+        self._at, self._before, self.last = self._former
+
+    def stop(self) -> None:
+        """Replace what is left by the shortest way to rest."""
+        if self.left:
+            self._way = brake(self.last, (self.last - self._before) * self._rate_hz, self._limits, self._rate_hz)
+            self._at, self._end = 0, len(self._way)
+
+    def _note(self, command: NDArray[np.float64]) -> None:
+        if len(command):
+            self._before = float(command[-2]) if len(command) > 1 else self.last
+            self.last = float(command[-1])
+
+
+def scan_from(
+    position: float, waveform: ScanWaveform, repeats: int, limits: ScannerLimits, rate_hz: float
+) -> PointSource:
+    """From rest at `position` to the waveform's first point, and the waveform."""
+    way = ramp(position, float(waveform.command[0]), limits, rate_hz)
+    return PointSource(way, waveform, repeats, position=position, limits=limits, rate_hz=rate_hz)
+
+
+def park_from(position: float, end: float, limits: ScannerLimits, rate_hz: float) -> PointSource:
+    """From rest at `position` to rest at `end`; no points where that is the same."""
+    way = ramp(position, end, limits, rate_hz)
+    return PointSource(way, None, 0, position=position, limits=limits, rate_hz=rate_hz)
+
+
+_log = logging.getLogger(__name__)
+
+
+class DacRun(Protocol):
+    """One run on a certain device. Every wait inside has an end."""
+
+    source: PointSource
+
+    def begin(self) -> None:
+        """Send the first points; they play at once."""
+        ...
+
+    def feed(self, stopping: threading.Event) -> None:
+        """Send the rest; returns when the mirror rests. Brakes once `stopping` is set."""
+        ...
+
+
+class RunPlayer:
+    """One run at a time. `halt` ends whatever the device plays, in an emergency, and returns where the mirror rests."""
+
+    def __init__(self, name: str, halt: Callable[[], float], position: float) -> None:
+        self._name = name
+        self._halt = halt
+        self.position: float | None = position
+        """Where the mirror rests; None: moving, or unknown after a fault."""
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.error: DeviceError | None = None
+        """What ended the last run early."""
+
+    def status(self, ask: Callable[[], None]) -> ScannerStatus:
+        """The status; `ask` raises where the device at rest does not answer."""
+        moving = self._thread is not None and self._thread.is_alive()
+        if isinstance(self.error, DeviceDisconnected):
+            raise self.error
+        if not moving and self.error is None:
+            ask()
+        fault = None if self.error is None else str(self.error)
+        return ScannerStatus(moving=moving, fault=fault, position=None if moving else self.position)
+
+    def rest(self) -> float:
+        """Wait for a run that is ending; where the mirror rests. After a fault nobody knows, so that it is halted."""
+        self.join()
+        if self.position is None:
+            self.position = self._halt()
+        return self.position
+
+    def start(self, run: DacRun) -> None:
+        """Begin, and leave the rest to a thread."""
+        self.error = None
+        self._begin(run)
+        self._thread = threading.Thread(target=self._feed, args=(run,), name=self._name, daemon=True)
+        self._thread.start()
+
+    def play(self, run: DacRun) -> None:
+        """Play a run to its end. A run without points is none."""
+        if run.source.left:
+            self._begin(run)
+            run.feed(self._stopping)
+            self.position = run.source.last
+
+    def stop(self) -> None:
+        """Let the run brake; returns when the mirror rests."""
+        self._stopping.set()
+        self.rest()
+
+    def end(self) -> None:
+        """Before the device is closed: no thread talks to it afterwards."""
+        self._stopping.set()
+        self.join()
+
+    def join(self) -> None:
+        """Wait for the thread. Several may."""
+        thread = self._thread
+        if thread is not None:
+            thread.join()
+            if self._thread is thread:
+                self._thread = None
+
+    def _begin(self, run: DacRun) -> None:
+        self._stopping.clear()
+        self.position = None
+        run.begin()
+
+    def _feed(self, run: DacRun) -> None:
+        """The thread. What fails here is told by `status` and ends the run."""
+        try:
+            run.feed(self._stopping)
+            self.position = run.source.last
+        except DeviceError as error:
+            self.error = error
+            _log.error("%s", error)
+
+
+class Dac(Protocol):
+    """An open board. Powered up its mirror stands at the centre, drive 0."""
+
+    name: str
+    identity: str
+    """See `Device.identity`."""
+    serial: str | None
+    """See `Device.serial`."""
+    highest_rate_hz: float
+    closes_at: float | None
+    """Drive that giving the board back jumps to; None: it holds."""
+
+    def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
+        """The exact rate nearest to the requested one, within low to high."""
+        ...
+
+    def run(self, source: PointSource, clock_hz: Fraction) -> DacRun:
+        """These points at a rate that `point_clock` returned."""
+        ...
+
+    def check(self) -> None:
+        """Raise where it does not answer. Any thread."""
+        ...
+
+    def halt(self) -> float:
+        """End whatever it plays, in an emergency; where the mirror rests then."""
+        ...
+
+    def close(self) -> None:
+        """Outputs safe, and the board given back."""
+        ...
+
+
+class DacScanner(BeamScanner):
+    """One mirror axis. While a waveform is played a thread of its own does the talking."""
+
+    def __init__(self, dac: Dac, config: GalvoConfig) -> None:
+        """`dac` is its own from here on."""
+        super().__init__(dac.name)
+        self._dac = dac
+        self._park = config.park
+        self._limits = config.limits(dac.highest_rate_hz)
+        self._player = RunPlayer(dac.name, dac.halt, position=0.0)
+        self._loaded: tuple[ScanWaveform, int] | None = None
+
+    @property
+    def identity(self) -> str:
+        """What the board says of itself."""
+        return self._dac.identity
+
+    @property
+    def serial(self) -> str | None:
+        """Of the board: which mirror hangs on it nobody can ask."""
+        return self._dac.serial
+
+    @property
+    def limits(self) -> ScannerLimits:
+        """The config's, on the rates that the device allows."""
+        return self._limits
+
+    def _do_status(self) -> ScannerStatus:
+        return self._player.status(self._dac.check)
+
+    def _do_point_clock(self, requested_hz: float) -> Fraction:
+        return self._dac.point_clock(requested_hz, *self._limits.point_rate_hz)
+
+    def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None:
+        self._player.join()
+        self._loaded = (ScanWaveform(waveform.command.copy(), waveform.markers.copy(), clock_hz), repeats)
+
+    def _do_start(self) -> None:
+        assert self._loaded is not None, "the interface starts loaded scanners only"
+        waveform, repeats = self._loaded
+        clock_hz = waveform.point_rate_hz
+        source = scan_from(self._player.rest(), waveform, repeats, self._limits, float(clock_hz))
+        self._player.start(self._dac.run(source, clock_hz))
+
+    def _do_stop(self) -> None:
+        self._player.stop()
+
+    def _do_park(self) -> None:
+        self._go(self._park)
+
+    def _do_close(self) -> None:
+        self._player.end()  # nobody talks while the device is given back
+        try:
+            if self._dac.closes_at is not None and self._player.position is not None:
+                self._go(self._dac.closes_at)
+        finally:
+            self._dac.close()
+
+    def _go(self, command: float) -> None:
+        """To rest at `command`, as fast as the board plays."""
+        clock_hz = self._do_point_clock(self._limits.point_rate_hz[1])
+        source = park_from(self._player.rest(), command, self._limits, float(clock_hz))
+        self._player.play(self._dac.run(source, clock_hz))
+
+
+def open_scanner(
+    wanted: UsbId,
+    alternates: Mapping[int, int],
+    config: GalvoConfig,
+    surroundings: Surroundings,
+    identify: Callable[[UsbDevice], Dac],
+) -> DacScanner:
+    """The scanner at the config's port. identify: makes the `Dac` of an open device, or raises."""
+    endpoint = resolve(config.port, surroundings.ports)
+    usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, surroundings.tap)
+    try:
+        return DacScanner(identify(usb), config)
+    except BaseException:
+        usb.close()
+        raise

@@ -1,0 +1,444 @@
+"""Scanner kind `helios`: a galvo behind a Helios laser DAC on USB (hardware.md 3.1; vendor's firmware v6 and SDK v11).
+
+    config    kind: helios, port: usb or usb:path=1-2, max_velocity, max_acceleration of the galvo behind it
+    outputs   X (or Y): mirror. R: lit, i.e. a waveform is being played. G: line marker. B: scan marker. I: backward
+
+The device plays frames of up to 4095 points from two buffers, one playing and one pending, and has neither a trigger
+nor a clock output: synchronisation comes from the markers in the SPAD's stream. A thread keeps the pending buffer full.
+Every frame is SINGLE: a dead host leaves a mirror that stands after two frames, not one that scans for ever. STOP
+centres the mirror in one jump, so that it is for emergencies and for the end; scans end with a brake ramp. The shutter
+pin is never raised and flash is never written; opcode DE (bootloader) does not exist here.
+
+Frames of the Helios laser DAC and its point clock, as bytes and exact numbers (hardware.md 3.1).
+
+Sources there: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
+sdk/cpp/HeliosDac.cpp (read for facts; no code taken).
+
+    point (7 B)     x[11:4], x[3:0] << 4 | y[11:8], y[7:0], R, G, B, I       12 bit, centre 0x800
+    trailer (5 B)   u16 LE points per second, u16 LE points, u8 flags        1 start now, 2 single
+    clock           SysTick of 112 MHz, floor(112e6 / pps) + 1 cycles a point
+
+Commands of a Helios laser DAC over its USB link (hardware.md 3.1; firmware v6, `Grix/helios_dac` 0952a2a).
+
+Endpoints of alternate setting 1: interrupt OUT 0x06 commands, interrupt IN 0x83 replies, bulk OUT 0x02 frames.
+Only the opcodes below exist here: DE would jump to the bootloader, 06 wears the flash, and 02 is sent with 0 only.
+
+One run of a Helios: frames into its two buffers, and a judgement whether they ever ran dry (hardware.md 3.1).
+
+The host sees when the pending buffer falls free, no more. Between the last status 'full' and the first 'free' the
+pending frame began to play; that bounds when it ends. A frame that arrives after the earliest such end may have left
+the mirror standing: the run ends with a fault. A buffer that falls free before the playing frame can have ended means
+that the device dropped a frame in silence. What was really played only the markers in the SPAD's stream tell.
+"""
+
+import logging
+import math
+import struct
+import threading
+from fractions import Fraction
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from drivers.clock import NS_PER_S, Clock
+from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, ProtocolError
+from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
+from drivers.registry import Kind, Surroundings
+from drivers.scanners.dac_scanner import DacScanner, PointSlice, PointSource, open_scanner
+from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
+from drivers.transports.usb_device import UsbDevice, UsbId
+from drivers.units import Hertz, Seconds
+
+SYSTICK_HZ = 112_000_000
+LEAST_PPS, MOST_PPS = 7, 65535
+"""Beyond these the firmware clamps and the vendor's library drops points, both in silence: refused here."""
+MOST_POINTS = 4095
+"""Of a frame, by the vendor's library; the firmware's buffer holds one more."""
+
+FLAG_START, FLAG_SINGLE = 1, 2
+_CENTRE = 0x800
+_FULL_SCALE = 4095
+_HIGH = 255
+
+
+def rate_of(pps: int) -> Fraction:
+    """The rate that the device runs at when asked for `pps`: always a little slower, or a different one."""
+    return Fraction(SYSTICK_HZ, SYSTICK_HZ // pps + 1)
+
+
+def pps_of(rate_hz: Fraction) -> int:
+    """What to ask for so that the device runs at a rate that `rate_of` gave: 25 001 for 25 000 Hz."""
+    return math.floor(rate_hz) + 1
+
+
+def nearest_rate(requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
+    """The true rate nearest to `requested_hz`, within low to high."""
+    near = math.floor(requested_hz)
+    cycles = round(SYSTICK_HZ / requested_hz)
+    # n cycles are what floor(112e6 / (n - 1)) asks for, where any whole number does.
+    candidates = {near, near + 1} | {SYSTICK_HZ // (n - 1) for n in (cycles - 1, cycles, cycles + 1, cycles + 2)}
+    rates = [rate_of(pps) for pps in candidates if LEAST_PPS <= pps <= MOST_PPS]
+    return min((rate for rate in rates if low_hz <= rate <= high_hz), key=lambda rate: abs(float(rate) - requested_hz))
+
+
+def sendable(points: int) -> bool:
+    """Whether the firmware completes a frame of so many points.
+
+    7 n + 5 bytes are whole packets of 64 at n = 45, 109, 173 ...: no short packet ends the transfer, and the firmware
+    waits for ever (issue 6 of the vendor's repository).
+    """
+    return points % 64 != 45
+
+
+def slice_points(left: int, most: int) -> int:
+    """Points of the next frame out of `left`; `most` is sendable, and so is a `left` that is not more than `most`.
+
+    The last two frames share what is left: a short frame in the middle would end before its successor arrives.
+    """
+    if left <= most:
+        return left
+    points = most if left >= 2 * most else (left + 1) // 2
+    while not sendable(points) or (left - points <= most and not sendable(left - points)):
+        points -= 1
+    return points
+
+
+def encode(points: PointSlice, axis: str, pps: int, flags: int) -> bytes:
+    """One frame. R: lit, G: line marker, B: scan marker, I: backward; the axis that does not scan stands at centre."""
+    value = np.rint((points.command + 1) / 2 * _FULL_SCALE).astype(np.uint16)
+    centre = np.full(len(points), _CENTRE, np.uint16)
+    x, y = (value, centre) if axis == "x" else (centre, value)
+    frame = np.empty((len(points), 7), np.uint8)
+    frame[:, 0] = x >> 4
+    frame[:, 1] = (x & 0xF) << 4 | y >> 8
+    frame[:, 2] = y & 0xFF
+    frame[:, 3] = _level(points.lit)
+    frame[:, 4] = _level(points.markers & MARKER_LINE)
+    frame[:, 5] = _level(points.markers & MARKER_SCAN)
+    frame[:, 6] = _level(points.markers & LEVEL_BACKWARD)
+    return frame.tobytes() + struct.pack("<HHB", pps, len(points), flags)
+
+
+def _level(high: NDArray[Any]) -> NDArray[np.uint8]:
+    return np.where(high, _HIGH, 0).astype(np.uint8)
+
+
+HELIOS = UsbId("Helios laser DAC", 0x1209, 0xE500)
+INTERFACE, DISABLED, ENABLED = 0, 0, 1
+"""The only interface; its alternate settings without and with endpoints: the firmware's 'disable' and 'enable'."""
+
+_COMMANDS, _REPLIES, _FRAMES = 0x06, 0x83, 0x02
+_REPLY_BYTES = 32
+_STOP, _SHUTTER, _STATUS, _VERSION, _NAME, _SDK_VERSION = 0x01, 0x02, 0x03, 0x04, 0x05, 0x07
+_OUR_SDK_VERSION = 11
+"""Of the vendor's library whose frames these are."""
+
+_STATUSES = {b"\x83\x01": True, b"\x83\x00": False}
+
+_COMMAND_S = 0.1
+"""The vendor's 16 ms are too short for slow hosts (pull request 10)."""
+_FRAME_S = 0.5
+_SETTLE_S = 0.1
+"""From entering alternate setting 1 to the first command."""
+_DRAIN_S = 0.005
+_AFTER_STOP_S = 0.15
+"""Frames within 100 ms of STOP are refused."""
+
+
+class HeliosLink:
+    """Commands, one at a time. Any thread."""
+
+    def __init__(self, link: UsbDevice, clock: Clock) -> None:
+        """Wait until the firmware is enabled, drop old replies, learn version and name."""
+        self.name = link.label
+        self._link = link
+        self._clock = clock
+        self._lock = threading.RLock()
+        self._out_of_step = False
+        """A reply came late or was another's: what is read next may answer an older question."""
+        clock.sleep(_SETTLE_S)
+        link.drain(_REPLIES, _REPLY_BYTES, _DRAIN_S)
+        (version,) = struct.unpack("<I", self._ask(_VERSION, 0x84, 4)[:4])
+        self.firmware: int = version
+        self._send(_SDK_VERSION, _OUR_SDK_VERSION)
+        self.stored_name = self._ask(_NAME, 0x85, 1).split(b"\0")[0].decode("ascii", "replace")
+
+    def free(self) -> bool | None:
+        """Whether a frame can be sent; None where the device gave no proper status, which means no as well."""
+        with self._lock:
+            try:
+                if self._out_of_step:
+                    self._link.drain(_REPLIES, _REPLY_BYTES, _DRAIN_S)
+                self._out_of_step = True
+                self._send(_STATUS, 0)
+                answer = _STATUSES.get(self._link.read(_REPLIES, _REPLY_BYTES, _COMMAND_S))
+                self._out_of_step = answer is None
+            except DeviceTimeout:
+                return None
+        return answer
+
+    def send_frame(self, frame: bytes) -> None:
+        """One frame, after `free` said True."""
+        with self._lock:
+            self._link.write(_FRAMES, frame, _FRAME_S)
+
+    def stop(self) -> None:
+        """Blank at once, centre the mirror in one jump 100 ms later; returns when frames are taken again."""
+        self._send(_STOP, 0)
+        self._clock.sleep(_AFTER_STOP_S)
+
+    def close(self) -> None:
+        """Stop, shutter pin low (the firmware never lowers it), back to 'disabled', and the USB device given back."""
+        try:
+            self.stop()
+            self._send(_SHUTTER, 0)
+            self._link.set_alternate(INTERFACE, DISABLED)
+        finally:
+            self._link.close()
+
+    def _send(self, opcode: int, data: int) -> None:
+        with self._lock:
+            self._link.write(_COMMANDS, bytes((opcode, data)), _COMMAND_S)
+
+    def _ask(self, opcode: int, answer: int, least: int) -> bytes:
+        """What follows the answer's first byte. Two questions with three reads each, as in the vendor's library."""
+        heard = b""
+        with self._lock:
+            for _ in range(2):
+                self._send(opcode, 0)
+                for _ in range(3):
+                    try:
+                        heard = self._link.read(_REPLIES, _REPLY_BYTES, _COMMAND_S)
+                    except DeviceTimeout:
+                        break
+                    if heard[:1] == bytes((answer,)) and len(heard) > least:
+                        return heard[1:]
+        if not heard:
+            raise DeviceTimeout(f"{self.name}: no answer to command {opcode:02x}; unplug it and plug it in again")
+        raise ProtocolError(
+            f"{self.name}: answered command {opcode:02x} with {heard[:8].hex(' ')}; this is no Helios firmware"
+        )
+
+
+_POLL_S = 0.002
+_SILENT_S = 0.5
+"""So long no proper status: the device hangs."""
+_PATIENCE_S = 1.0
+"""Beyond the time its frames take, for the buffer to fall free."""
+_WIRE_BYTES_PER_S = 1.216e6
+"""Most that a full-speed bulk endpoint carries: 19 packets of 64 bytes a millisecond (USB 2.0, table 5-9)."""
+_DRIFT = 1e-3
+"""Most that the device's crystal and the host's clock differ."""
+
+
+class HeliosRun:
+    """Begin, then feed. Every wait has an end: at most two frames and two seconds."""
+
+    def __init__(
+        self, link: HeliosLink, clock: Clock, source: PointSource, clock_hz: Fraction, *, frame_s: float, axis: str
+    ) -> None:
+        self.source = source
+        self._link = link
+        self._clock = clock
+        self._pps = pps_of(clock_hz)
+        self._rate_hz = float(clock_hz)
+        self._axis = axis
+        most = min(MOST_POINTS, max(2, round(frame_s * self._rate_hz)))
+        self._most = most if sendable(most) else most - 1
+        self._sent = 0
+        self._playing_s = self._pending_s = 0.0
+        """Durations of the frames in the two buffers; 0: none."""
+        self._earliest_end_s = self._latest_end_s = 0.0
+        """When the playing frame ends, on the host's clock."""
+        self._next: tuple[bytes, float] | None = None
+        """The frame to be sent next and its duration: made while another plays, not when the time for it has come."""
+        if self._unsendable():
+            source.pad_start()
+
+    def begin(self) -> None:
+        """Send the first frame; it plays once it is whole."""
+        self._wait_until_idle()
+        first, duration_s = self._made(FLAG_SINGLE | FLAG_START)
+        earliest_s, arrived_s = self._send(first)
+        self._playing_s = duration_s
+        self._earliest_end_s = earliest_s + duration_s * (1 - _DRIFT)
+        self._latest_end_s = arrived_s + duration_s * (1 + _DRIFT)
+        self._next = self._made() if self.source.left else None
+
+    def feed(self, stopping: threading.Event) -> None:
+        """Send all that is left; returns when the mirror rests. Brakes once `stopping` is set."""
+        stopped = False
+        while self._next is not None:
+            if not stopped and stopping.is_set():
+                stopped = True
+                self._brake()
+            elif self._wait_until_free(None if stopped else stopping):
+                self._append(*self._next)
+            else:
+                continue
+            self._next = self._made() if self.source.left else None
+        latest_s = self._latest_end_s + self._pending_s * (1 + _DRIFT)
+        self._clock.sleep(latest_s - self._now_s())
+
+    def _append(self, frame: bytes, duration_s: float) -> None:
+        """One more frame, behind the playing one."""
+        _, arrived_s = self._send(frame)
+        late_s = arrived_s - self._earliest_end_s
+        if late_s > 0:
+            raise DeviceFault(
+                f"{self._link.name}: the points ran dry, frame {self._sent} came up to {1e3 * late_s:.1f} ms late; "
+                "lengthen frame or unload the host"
+            )
+        self._pending_s = duration_s
+        self._check_kept()
+
+    def _check_kept(self) -> None:
+        """A frame that was taken and kept means 'full' until the playing one ends."""
+        free = None
+        while free is None and self._now_s() < self._earliest_end_s:
+            free = self._link.free()
+        if free is False:
+            return
+        if self._now_s() < self._earliest_end_s:
+            self._raise_dropped()
+        raise DeviceFault(
+            f"{self._link.name}: answered too late to tell whether it kept frame {self._sent}; "
+            "lengthen frame or unload the host"
+        )
+
+    def _raise_dropped(self) -> None:
+        raise DeviceFault(f"{self._link.name}: dropped a frame in silence; check the cable, then start again")
+
+    def _made(self, flags: int = FLAG_SINGLE) -> tuple[bytes, float]:
+        """The next frame and its duration."""
+        points = self.source.take(slice_points(self.source.left, self._most))
+        return encode(points, self._axis, self._pps, flags), len(points) / self._rate_hz
+
+    def _send(self, frame: bytes) -> tuple[float, float]:
+        """The host's times between which the frame arrived."""
+        began_s = self._now_s()
+        self._link.send_frame(frame)
+        self._sent += 1
+        return began_s + len(frame) / _WIRE_BYTES_PER_S, self._now_s()
+
+    def _brake(self) -> None:
+        self.source.give_back()
+        self.source.stop()
+        if self._unsendable():
+            self.source.pad_end()
+
+    def _unsendable(self) -> bool:
+        return self.source.left <= self._most and not sendable(self.source.left)
+
+    def _wait_until_idle(self) -> None:
+        end_s = self._now_s() + _SILENT_S
+        while not self._link.free():
+            if self._now_s() > end_s:
+                raise DeviceTimeout(f"{self._link.name}: takes no frame; unplug it and plug it in again")
+            self._clock.sleep(_POLL_S)
+
+    def _wait_until_free(self, stopping: threading.Event | None) -> bool:
+        """True once the pending buffer is free; False where a stop came first."""
+        heard_s, full_s = self._now_s(), self._earliest_end_s
+        while stopping is None or not stopping.is_set():
+            asked_s = self._now_s()
+            free = self._link.free()
+            now_s = self._now_s()
+            if free:
+                self._note_swap(max(full_s, self._earliest_end_s), now_s)
+                return True
+            if free is None and now_s - heard_s > _SILENT_S:
+                raise DeviceTimeout(f"{self._link.name}: gives no status; unplug it and plug it in again")
+            if free is False:
+                heard_s, full_s = now_s, asked_s
+            if now_s > self._latest_end_s + _PATIENCE_S:
+                raise DeviceFault(f"{self._link.name}: its frame buffer stays full; unplug it and plug it in again")
+            self._clock.sleep(_POLL_S)
+        return False
+
+    def _note_swap(self, earliest_s: float, latest_s: float) -> None:
+        """The pending frame, if any, began to play between these times."""
+        if not self._pending_s:
+            return
+        if latest_s < self._earliest_end_s - _POLL_S:
+            self._raise_dropped()
+        self._playing_s, self._pending_s = self._pending_s, 0.0
+        self._earliest_end_s = earliest_s + self._playing_s * (1 - _DRIFT)
+        self._latest_end_s = min(latest_s, self._latest_end_s) + self._playing_s * (1 + _DRIFT)
+
+    def _now_s(self) -> float:
+        return self._clock.now_ns() / NS_PER_S
+
+
+_log = logging.getLogger(__name__)
+
+_TESTED_FIRMWARE = 6
+
+
+class HeliosConfig(GalvoConfig):
+    """Config of a Helios and of the galvo behind it."""
+
+    kind: Literal["helios"] = "helios"
+    name: str | None = None
+    """Name stored in the device; another one is refused."""
+    max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=MOST_PPS)] = 65535.0
+    """Lower it where the host's USB is busy: 40 kHz leaves a margin."""
+    frame: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
+    """Length of one frame: what the host may be late by, and half of what a stop takes."""
+
+
+class HeliosDac:
+    """A `Dac`. Where STOP and the alternate setting without endpoints leave the mirror is the centre."""
+
+    closes_at: float | None = 0.0
+
+    def __init__(self, config: HeliosConfig, link: HeliosLink, clock: Clock) -> None:
+        self.name = link.name
+        self.identity = f"{link.name}, {link.stored_name!r}, firmware {link.firmware}"
+        self.serial = link.stored_name or None
+        self.highest_rate_hz = config.max_point_rate
+        self._config = config
+        self._link = link
+        self._clock = clock
+
+    def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
+        """What the divider of its timer makes of it."""
+        return nearest_rate(requested_hz, low_hz, high_hz)
+
+    def run(self, source: PointSource, clock_hz: Fraction) -> HeliosRun:
+        """See `Dac`."""
+        config = self._config
+        return HeliosRun(self._link, self._clock, source, clock_hz, frame_s=config.frame, axis=config.axis)
+
+    def check(self) -> None:
+        """DeviceTimeout where it is asked twice in vain."""
+        if self._link.free() is None and self._link.free() is None:
+            raise DeviceTimeout(f"{self.name}: gives no status; unplug it and plug it in again")
+
+    def halt(self) -> float:
+        """STOP: at the centre, in one jump."""
+        self._link.stop()
+        return 0.0
+
+    def close(self) -> None:
+        """See `HeliosLink.close`."""
+        self._link.close()
+
+
+def create(config: HeliosConfig, surroundings: Surroundings) -> DacScanner:
+    """Open the Helios at the config's port."""
+
+    def identify(usb: UsbDevice) -> HeliosDac:
+        link = HeliosLink(usb, surroundings.clock)
+        if link.firmware < _TESTED_FIRMWARE:
+            _log.warning("%s: firmware %d is older than the tested %d", link.name, link.firmware, _TESTED_FIRMWARE)
+        if config.name not in (None, link.stored_name):
+            raise DeviceNotFound(f"{link.name}: its name is {link.stored_name!r}, not {config.name!r}; correct port")
+        return HeliosDac(config, link, surroundings.clock)
+
+    return open_scanner(HELIOS, {INTERFACE: ENABLED}, config, surroundings, identify)
+
+
+KIND = Kind(config=HeliosConfig, create=create)

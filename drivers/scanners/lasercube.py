@@ -1,0 +1,349 @@
+"""Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (hardware.md 3.2).
+
+    config    kind: lasercube, port: usb or usb:serial=ABC, max_velocity, max_acceleration of its galvo
+    outputs   X (or Y): mirror. With `colours: markers` R: backward. G: line marker. B: scan marker. X is not
+              turned round as the vendor's program does: which way a command leads is for the calibration to say
+
+The board has a ring of samples that is topped up by a thread: no frames, no seams. Its colour outputs drive lasers of
+its own unless these are unplugged, so that they stay off until the config says where they lead. Clear and disable are
+its only stop; nothing at all happens when the host dies, so that the gate must not depend on it.
+
+Commands and samples of a LaserCube / LaserDock over its USB link (hardware.md 3.2).
+
+Source there: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp (read for facts; no code taken).
+
+    command   interface 0, bulk OUT 0x01: opcode and 0 to 4 bytes; reply on bulk IN 0x81, 64 B: [1] = 0 is 'done', data
+              little-endian from [2]. [0] is not to be relied on
+    samples   interface 1 alternate 1, bulk OUT 0x03: 64 samples a transfer, each 4 x u16 LE: R | G << 8, B, X, Y
+
+The numbers are shared with Lasershark boards, so that the product string decides.
+
+One run of a LaserCube: samples into its ring, and a judgement whether each was played once (hardware.md 3.2).
+
+Every question 'how many are queued' says when the first sample must have been played, if none was lost, played twice
+or waited for: the moments that all answers allow must have one in common. Samples go out in whole transfers, so that a
+lost one stands out. A run begins with copies of its first point: what is lost before the first answer is one of them.
+It ends with copies of its last: what the device does when its ring runs empty is not documented (hold or repeat), so
+that the ring is cleared while they are played.
+"""
+
+import math
+import threading
+from fractions import Fraction
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from drivers.clock import NS_PER_S, Clock
+from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
+from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
+from drivers.registry import Kind, Surroundings
+from drivers.scanners.dac_scanner import DacScanner, PointSlice, PointSource, open_scanner
+from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
+from drivers.transports.usb_device import UsbDevice, UsbId
+from drivers.units import Hertz, Seconds
+
+LASERCUBE = UsbId("LaserCube", 0x1FC9, 0x04D8, ("LaserCube", "LaserDock"))
+ALTERNATES = {0: 0, 1: 1}
+
+_COMMANDS, _REPLIES, _SAMPLES = 0x01, 0x81, 0x03
+_REPLY_BYTES = 64
+SAMPLES_PER_TRANSFER = 64
+
+_ENABLE, _SET_RATE, _GET_RATE, _MAX_RATE = 0x80, 0x82, 0x83, 0x84
+_DAC_MIN, _DAC_MAX, _RING_SIZE, _RING_FREE, _CLEAR = 0x87, 0x88, 0x89, 0x8A, 0x8D
+_MAJOR, _MINOR = 0x8B, 0x8C
+
+_FULL_SCALE = 4095
+_CENTRE = 0x800
+_HIGH = 255
+_COMMAND_S = 0.1
+"""The vendor's library waits for ever."""
+_SAMPLES_S = 0.5
+_DRAIN_S = 0.005
+
+
+class LaserCubeLink:
+    """Commands, one at a time. Any thread."""
+
+    def __init__(self, link: UsbDevice, clock: Clock) -> None:
+        """Output off, ring empty, and what the device says of itself."""
+        self.name = link.label
+        self.serial = link.listing.serial
+        self.clock = clock
+        self._link = link
+        self._lock = threading.RLock()
+        self._out_of_step = True
+        """A reply came late, or an older program left one: what is read next may answer an older question."""
+        self.safe()
+        self.firmware = (self._number(_MAJOR, 1), self._number(_MINOR, 1))
+        self.highest_rate_hz = self._number(_MAX_RATE)
+        self.ring_points = self._number(_RING_SIZE)
+        scale = (self._number(_DAC_MIN), self._number(_DAC_MAX))
+        if scale != (0, _FULL_SCALE) or self.ring_points < 8 * SAMPLES_PER_TRANSFER or self.highest_rate_hz == 0:
+            raise ProtocolError(
+                f"{self.name}: says range {scale[0]} to {scale[1]}, {self.ring_points} samples of buffer, "
+                f"{self.highest_rate_hz} Hz at most; this is no LaserCube firmware"
+            )
+
+    def safe(self) -> None:
+        """Colours off, then nothing left to play."""
+        self.enable(False)
+        self.clear()
+
+    def enable(self, on: bool) -> None:
+        """The colour outputs."""
+        self._ask(bytes((_ENABLE, on)))
+
+    def clear(self) -> None:
+        """Empty the ring: the mirror stands where it is."""
+        self._ask(bytes((_CLEAR, 0)))
+
+    def set_rate(self, rate_hz: int) -> None:
+        """Set the sample rate and read it back; `DeviceFault` where it is another."""
+        self._ask(bytes((_SET_RATE,)) + rate_hz.to_bytes(4, "little"))
+        actual_hz = self._number(_GET_RATE)
+        if actual_hz != rate_hz:
+            raise DeviceFault(f"{self.name}: runs at {actual_hz} Hz instead of {rate_hz} Hz; choose another point rate")
+
+    def queued(self) -> int:
+        """Samples in the ring that were not played yet."""
+        free = self._number(_RING_FREE)
+        if free > self.ring_points:
+            raise ProtocolError(f"{self.name}: {free} of {self.ring_points} samples free; check the cable")
+        return self.ring_points - free
+
+    def send(self, samples: bytes) -> None:
+        """Append samples to the ring."""
+        step = 8 * SAMPLES_PER_TRANSFER
+        for at in range(0, len(samples), step):
+            self._link.write(_SAMPLES, samples[at : at + step], _SAMPLES_S)
+
+    def close(self) -> None:
+        """Safe, and the USB device given back."""
+        try:
+            self.safe()
+        finally:
+            self._link.close()
+
+    def _number(self, opcode: int, size: int = 4) -> int:
+        return int.from_bytes(self._ask(bytes((opcode,)))[:size], "little")
+
+    def _ask(self, command: bytes) -> bytes:
+        with self._lock:
+            if self._out_of_step:
+                self._link.drain(_REPLIES, _REPLY_BYTES, _DRAIN_S)
+            self._out_of_step = True
+            self._link.write(_COMMANDS, command, _COMMAND_S)
+            try:
+                reply = self._link.read(_REPLIES, _REPLY_BYTES, _COMMAND_S)
+            except DeviceTimeout:
+                raise DeviceTimeout(
+                    f"{self.name}: no answer to command {command[0]:02x}; unplug it and plug it in again"
+                ) from None
+            if len(reply) != _REPLY_BYTES:
+                raise ProtocolError(
+                    f"{self.name}: answered command {command[0]:02x} with {len(reply)} B instead of {_REPLY_BYTES}"
+                )
+            self._out_of_step = False
+        if reply[1] != 0:
+            raise DeviceFault(f"{self.name}: refused command {command[0]:02x} with code {reply[1]}")
+        return reply[2:]
+
+
+def encode(points: PointSlice, axis: str, *, markers: bool) -> bytes:
+    """Samples. With markers: R backward, G line marker, B scan marker; else dark."""
+    value = np.rint((points.command + 1) / 2 * _FULL_SCALE).astype("<u2")
+    red, green, blue = (
+        _level(points.markers, bit) if markers else np.zeros(len(points), "<u2")
+        for bit in (LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN)
+    )
+    samples = np.full((len(points), 4), _CENTRE, "<u2")
+    samples[:, 0] = red | green << 8
+    samples[:, 1] = blue
+    samples[:, 2 if axis == "x" else 3] = value
+    return samples.tobytes()
+
+
+def _level(markers: NDArray[np.uint8], bit: int) -> NDArray[np.uint16]:
+    return np.where(markers & bit, _HIGH, 0).astype("<u2")
+
+
+_POLL_S = 0.002
+_PATIENCE_S = 1.0
+_HOLD_S = 0.03
+"""Of the first and the last point, at least: the host may be late by this when it asks first and clears last."""
+_DRIFT = 1e-3
+"""Most that the device's crystal and the host's clock differ."""
+_TOLERANCE_POINTS = 48
+"""Less than a transfer, which is what gets lost as a whole; more than the device's own steps in counting."""
+
+
+class LaserCubeRun:
+    """Begin, then feed. Every wait has an end: what is queued and a second."""
+
+    def __init__(
+        self, link: LaserCubeLink, source: PointSource, rate_hz: int, *, buffer_s: float, axis: str, markers: bool
+    ) -> None:
+        self.source = source
+        self._link = link
+        self._rate_hz = rate_hz
+        self._axis = axis
+        self._markers = markers
+        wanted = math.ceil(max(_HOLD_S, buffer_s / 2) * rate_hz / SAMPLES_PER_TRANSFER)
+        # In whole transfers, and at most a quarter of the ring.
+        self._hold = max(1, min(wanted, link.ring_points // 4 // SAMPLES_PER_TRANSFER)) * SAMPLES_PER_TRANSFER
+        self._most = min(round(buffer_s * rate_hz), link.ring_points - 2 * self._hold)
+        if source.left:
+            source.pad_start(self._hold)
+        self._waiting = b""
+        """Samples short of a transfer."""
+        self._sent = 0
+        self._start_s = (-np.inf, np.inf)
+        """When the first sample was played, at the earliest and at the latest."""
+        self._asked_s = 0.0
+
+    def begin(self) -> None:
+        """Begin with copies of the first point; they play at once."""
+        self._link.clear()
+        self._link.set_rate(self._rate_hz)
+        self._link.enable(self._markers)
+        self._asked_s = self._now_s()
+        self._send(self.source.take(self._hold))
+        self._queued()
+        self._send(self.source.take(self._most - self._hold))
+
+    def feed(self, stopping: threading.Event) -> None:
+        """Send all that is left; returns when the mirror rests. Brakes once `stopping` is set."""
+        stopped = False
+        while self.source.left:
+            queued = self._queued()
+            if not stopped and stopping.is_set():
+                stopped = True
+                self.source.stop()
+            if queued < self._most:
+                self._send(self.source.take(self._most - queued))
+            self._link.clock.sleep(_POLL_S)
+        self._finish()
+
+    def _finish(self) -> None:
+        """Copies of the last point, and an end among them."""
+        hold = self._hold + -(len(self._waiting) // 8) % SAMPLES_PER_TRANSFER
+        self._send(PointSlice(np.full(hold, self.source.last), np.zeros(hold, np.uint8), np.zeros(hold, bool)))
+        end_s = self._now_s() + (self._most + hold) / self._rate_hz * (1 + _DRIFT) + _PATIENCE_S
+        seen = False
+        while True:
+            asked_s = self._now_s()
+            queued = self._queued()
+            # An answer that took long bounds nothing: one quick answer must have vouched for the last points.
+            seen = seen or self._now_s() - asked_s < _TOLERANCE_POINTS / self._rate_hz
+            if queued < self._hold - _TOLERANCE_POINTS:
+                break
+            if self._now_s() > end_s:
+                raise DeviceFault(f"{self._link.name}: its buffer does not empty; unplug it and plug it in again")
+            self._link.clock.sleep(_POLL_S)
+        self._link.safe()
+        if not seen:
+            raise DeviceFault(f"{self._link.name}: answered too late to tell how the run ended; unload the host")
+
+    def _send(self, points: PointSlice) -> None:
+        """Whole transfers; what is short of one waits."""
+        self._waiting += encode(points, self._axis, markers=self._markers)
+        whole = len(self._waiting) // (8 * SAMPLES_PER_TRANSFER) * 8 * SAMPLES_PER_TRANSFER
+        self._link.send(self._waiting[:whole])
+        empty_s = min(self._start_s) + self._sent / self._rate_hz
+        if whole and np.isfinite(empty_s) and self._now_s() > empty_s:
+            self._raise_dry()
+        self._waiting = self._waiting[whole:]
+        self._sent += whole // 8
+
+    def _raise_dry(self) -> None:
+        raise DeviceFault(f"{self._link.name}: the points ran dry; lengthen buffer or unload the host")
+
+    def _queued(self) -> int:
+        """Samples not yet played; `DeviceFault` where their number cannot be."""
+        before_s = self._now_s()
+        queued = self._link.queued()
+        after_s = self._now_s()
+        if queued == 0:
+            self._raise_dry()
+        played_s = (self._sent - queued) / self._rate_hz
+        slack_s = _DRIFT * (after_s - self._asked_s)
+        self._asked_s = after_s
+        earliest_s = max(self._start_s[0] - slack_s, before_s - played_s)
+        latest_s = min(self._start_s[1] + slack_s, after_s - played_s)
+        if earliest_s - latest_s > _TOLERANCE_POINTS / self._rate_hz:
+            raise DeviceFault(
+                f"{self._link.name}: {(earliest_s - latest_s) * self._rate_hz:.0f} points were lost or played late; "
+                "check the cable, then start again"
+            )
+        self._start_s = (earliest_s, latest_s)
+        return queued
+
+    def _now_s(self) -> float:
+        return self._link.clock.now_ns() / NS_PER_S
+
+
+class LaserCubeConfig(GalvoConfig):
+    """Config of a LaserCube and of its galvo."""
+
+    kind: Literal["lasercube"] = "lasercube"
+    colours: Literal["dark", "markers"] = "dark"
+    """markers: its lasers are unplugged and the colour outputs lead to the marker inputs. dark: never enabled."""
+    max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=100_000)] = 30_000.0
+    """The device may allow less."""
+    buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
+    """Samples queued in the device: what the host may be late by, and what a stop takes."""
+
+
+class LaserCubeDac:
+    """A `Dac`. Where its mirror stands when it is opened nobody can ask: the first run begins at the centre."""
+
+    closes_at: float | None = None
+
+    def __init__(self, config: LaserCubeConfig, link: LaserCubeLink) -> None:
+        self.name = link.name
+        self.identity = f"{link.name}, firmware {link.firmware[0]}.{link.firmware[1]}"
+        self.serial = link.serial
+        self.highest_rate_hz = min(config.max_point_rate, float(link.highest_rate_hz))
+        self._config = config
+        self._link = link
+
+    def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
+        """Whole numbers of Hz are what the device can be told; a run reads them back."""
+        return Fraction(min(max(round(requested_hz), int(low_hz)), int(high_hz)))
+
+    def run(self, source: PointSource, clock_hz: Fraction) -> LaserCubeRun:
+        """See `Dac`."""
+        config = self._config
+        markers = config.colours == "markers"
+        return LaserCubeRun(
+            self._link, source, int(clock_hz), buffer_s=config.buffer, axis=config.axis, markers=markers
+        )
+
+    def check(self) -> None:
+        """Any question will do."""
+        self._link.queued()
+
+    def halt(self) -> float:
+        """Clear the ring. Where that leaves the mirror nobody knows: the next run goes to the centre in one jump."""
+        self._link.safe()
+        return 0.0
+
+    def close(self) -> None:
+        """See `LaserCubeLink.close`."""
+        self._link.close()
+
+
+def create(config: LaserCubeConfig, surroundings: Surroundings) -> DacScanner:
+    """Open the LaserCube at the config's port."""
+
+    def identify(usb: UsbDevice) -> LaserCubeDac:
+        return LaserCubeDac(config, LaserCubeLink(usb, surroundings.clock))
+
+    return open_scanner(LASERCUBE, ALTERNATES, config, surroundings, identify)
+
+
+KIND = Kind(config=LaserCubeConfig, create=create)

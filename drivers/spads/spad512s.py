@@ -1,0 +1,429 @@
+"""Pi Imaging SPAD512S (SPAD512^2) through its vendor's program, which serves commands and pixels on a local TCP port.
+
+Facts and their sources: hardware.md section 2.1; `spad512s_line` and `drivers.spads.spad512s` speak with the program.
+In short:
+
+- The vendor's program must run, on this computer or behind a bridge; it serves one client.
+- `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit: tInt is in
+  microseconds at 1 and 4 bits, in milliseconds from 6 bits on, so this driver sends microseconds and 1 bit only.
+- The answer is 32 768 bytes a frame (65 536 of a 1M sensor), most significant bit first.
+- Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
+
+The sensor takes a run into its own memory (BURST). Its frames carry neither ticks nor markers: they say nothing of the
+scanner, the records' ticks are nominal. `STOP` is known from other people's code only; a run that does not end soon
+after it is left by closing the connection.
+
+One run of a SPAD512S as it comes over the vendor's line: pixels that may read like its ending (hardware.md 2.1).
+
+The answer to `I` is the pixels, then `DONE`; or text that ends with `ERROR`, anywhere. Pixels may well read `DONE` or
+`ERROR`: what counts is the exact length and what stands behind it. A block is given out once so much has come behind it
+that no error text can be part of it. Frames have neither number nor checksum: pixels handed over twice in place of
+others have the right length, so that no frame may be the very same as one before.
+"""
+
+import threading
+import time
+import zlib
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, LimitExceeded, ProtocolError
+from drivers.frames import BlockFlag, BlockHeader
+from drivers.interfaces import BurstMode, SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
+from drivers.registry import Kind, KindConfig, Surroundings
+from drivers.ring import BlockRing
+from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
+from drivers.spads.spad512s_line import DONE, ERROR, Deadlines, Spad512sIdentity, Spad512sLine
+from drivers.spb1 import BlockLayout, block_views, seal_block
+from drivers.transports.endpoints import Endpoint, resolve
+from drivers.transports.tap import Tap
+from drivers.units import BytesPerSecond, ExactHertz
+
+GUARD_BYTES = 512
+"""So much must come behind a block before it counts. The longest error text of the samples has 160 characters."""
+SLICE_S = 0.05
+"""One wait: how late a `stop` from another thread comes at most."""
+_ERROR_CHECK_S = 0.5
+"""After a silence of so long within a run the last bytes are looked at: they may be an error text."""
+_UNIFORM = (0x00, 0xFF)
+
+
+class Spad512sRun:
+    """Takes a run block by block; the memory it gives out is good until the next one is asked for."""
+
+    def __init__(self, name: str, line: Spad512sLine, n_frames: int, block_frames: int, frame_bytes: int) -> None:
+        """Allocates; the command that starts the run is the caller's."""
+        self.n_frames = n_frames
+        self.next_frame = 0
+        """First frame of the block that comes next."""
+        self.block_seq = 0
+        """Blocks published."""
+        self.just_lost = False
+        """The block before was dropped."""
+        self._name = name
+        self._line = line
+        self._block_frames, self._frame_bytes = block_frames, frame_bytes
+        self._memory = np.zeros(block_frames * frame_bytes + GUARD_BYTES, np.uint8)
+        self._got = 0
+        """Bytes of the present block and of what guards it that are here."""
+        self._heard_at = time.monotonic()
+        self._seen: dict[tuple[int, int], int] = {}
+        """Frames by the checksums of their halves: 64 bits, since 10 000 frames may well share one of 32."""
+
+    @property
+    def next_n(self) -> int:
+        """Frames of the block that comes next; 0: the run is over."""
+        return min(self._block_frames, self.n_frames - self.next_frame)
+
+    @property
+    def ends(self) -> bool:
+        """Whether the block that comes next is the last."""
+        return self.next_frame + self.next_n == self.n_frames
+
+    def receive(self, ends_at: float, timeout_s: float, stopped: Callable[[], bool]) -> NDArray[np.uint8] | None:
+        """Pixels of the next block, uint8 (n * frame bytes,), once it is safe; None: stopped. Goes on where it was.
+
+        `DeviceTimeout` at `ends_at` (of `time.monotonic`); `DeviceFault` with the device's own words; `ProtocolError`.
+        """
+        pixel_bytes = self.next_n * self._frame_bytes
+        wanted = pixel_bytes + (len(DONE) if self.ends else GUARD_BYTES)
+        while self._got < wanted:
+            if stopped():
+                return None
+            self._receive_some(self._memory[self._got : wanted], ends_at, timeout_s)
+        if self.ends:
+            self._require_done(pixel_bytes)
+        pixels = self._memory[:pixel_bytes]
+        self._require_new(pixels.reshape(self.next_n, 2, -1))
+        return pixels
+
+    def go_on(self) -> None:
+        """The block is dealt with: what guarded it begins the next one."""
+        used = self.next_n * self._frame_bytes
+        self._memory[: self._got - used] = self._memory[used : self._got]
+        self._got -= used
+        self.next_frame += self.next_n
+
+    def _receive_some(self, place: NDArray[np.uint8], ends_at: float, timeout_s: float) -> None:
+        n = self._line.receive_into(place.data, min(SLICE_S, max(0.0, ends_at - time.monotonic())))
+        now = time.monotonic()
+        if n:
+            self._heard_at = now
+            self._got += n
+            return
+        if now - self._heard_at >= _ERROR_CHECK_S:
+            self._refuse_error_text(b"")
+        if now >= ends_at:
+            raise DeviceTimeout(
+                f"{self._name} sent nothing for {timeout_s:g} s, {self.next_frame} of {self.n_frames} frames are "
+                "here; check trigger and the vendor's program"
+            )
+
+    def _require_done(self, pixel_bytes: int) -> None:
+        """DONE must stand exactly behind the last pixel, and nothing behind it."""
+        behind = self._memory[pixel_bytes : self._got].tobytes()
+        if behind == DONE:
+            return
+        self._refuse_error_text(self._line.rest())
+        raise ProtocolError(
+            f"{self._name}: 0x{behind.hex()} stands behind the last pixel, not DONE; the run is not to be trusted"
+        )
+
+    def _require_new(self, frames: NDArray[np.uint8]) -> None:
+        """ProtocolError for a frame that was there before, unless all dark or all bright. frames: (n, 2, half)."""
+        for number, (one, other) in enumerate(frames, self.next_frame):
+            before = self._seen.setdefault((zlib.crc32(one), zlib.crc32(other)), number)
+            if before != number and not (one[0] in _UNIFORM and (one == one[0]).all() and (other == one[0]).all()):
+                raise ProtocolError(
+                    f"{self._name}: frame {number} is the very same as frame {before}: pixels were handed over twice, "
+                    "or the sensor is saturated; start again, with less light"
+                )
+
+    def _refuse_error_text(self, rest: bytes) -> None:
+        """DeviceFault with the device's own words where what came last is text that ends with ERROR."""
+        tail = self._memory[max(0, self._got - 2 * GUARD_BYTES) : self._got].tobytes() + rest
+        text = tail.rstrip(b"\r\n\0 ").removesuffix(DONE).rstrip()
+        if not text.endswith(ERROR):
+            return
+        start = len(text)
+        while start and (32 <= text[start - 1] < 127 or text[start - 1] in b"\r\n\t"):
+            start -= 1
+        words = " ".join(text[start:].decode("ascii").split())
+        raise DeviceFault(
+            f"{self._name} ended the run: {words!r}; see the vendor's program (auto-protect?) before retrying"
+        )
+
+
+COLUMNS = 512
+ROW_BYTES = COLUMNS // 8
+TICK_HZ = 100_000_000
+"""Nominal: the vendor's stream carries no time. Where it does not divide the period, a multiple of the frame rate."""
+TICKS_PER_FRAME = 1024
+LISTENS_AGAIN_S = 1.0
+"""A program that serves one client may take so long to listen again once that one has left."""
+_TEMPERATURES = ("master FPGA", "slave FPGA", "board", "chip")
+"""What `R` measures first."""
+_US_SLACK = 1e-6
+"""Microseconds by which a whole number of them may miss as a float in seconds."""
+
+
+class Spad512sConfig(KindConfig):
+    """Config of a SPAD512S behind its vendor's program."""
+
+    kind: Literal["spad512s"] = "spad512s"
+    port: str = "127.0.0.1:9999"
+    """host:port of the vendor's program; its settings show the number (9999, in some set-ups 9998)."""
+    rotation: QuarterTurn = 90
+    """Degrees counter-clockwise by which frames are turned on their way in; 90 as in the vendor's samples."""
+    trigger: Literal["free", "external"] = "free"
+    """free: exposures follow one another; external: each starts at a pulse on the frame trigger input."""
+    max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000_000, 1024)
+    """97.7 kHz: the read-out of a frame takes 10.24 us, under the next exposure where that is as long."""
+    burst_frames: int = Field(default=10_000, ge=1)
+    """Frames that one run may have: what the memory of this unit holds, see its data sheet."""
+    readout: Annotated[BytesPerSecond, Field(gt=0)] = 100e6
+    """Rate at which the vendor's program hands a run over; `rig doctor` measures it."""
+
+
+class Spad512s(SpadArray):
+    """A SPAD512S, connected."""
+
+    def __init__(
+        self, config: Spad512sConfig, endpoint: Endpoint, deadlines: Deadlines | None = None, tap: Tap | None = None
+    ) -> None:
+        super().__init__("SPAD512S")
+        self._config = config
+        self._line = Spad512sLine(self.name, endpoint.address, deadlines or Deadlines(), tap)
+        self._busy = threading.Lock()
+        """Held while the line is in use, so that `stop` waits for `fill`."""
+        self._halt = threading.Event()
+        self._counters = SpadCounters(0, 0, 0, None, None)
+        self._run_id = 0
+        self._run: Spad512sRun | None = None
+        self._identity = self._line.connect()
+        width, height = turned_size(COLUMNS, self._identity.rows, config.rotation)
+        self._info = SpadInfo(
+            model=f"{self._identity.detector} {self._identity.flavour}".strip(),
+            serial=self._identity.master_serial,
+            width=width,
+            height=height,
+            rotation_deg=config.rotation,
+            max_frame_rate_hz=config.max_frame_rate,
+            burst=BurstMode(config.burst_frames, config.readout),
+            stream=None,
+            roi_step_px=64,
+            markers=False,
+            trigger_modes=(config.trigger,),
+            can_wait=True,  # a run lies in the device's memory and is handed over as fast as it is taken
+        )
+
+    @property
+    def info(self) -> SpadInfo:
+        """Geometry and abilities."""
+        return self._info
+
+    @property
+    def identity(self) -> str:
+        """Serial numbers and versions."""
+        return f"{self.name}: {self._identity}"
+
+    def _do_health(self) -> SpadHealth:
+        """`R`: four temperatures, the laser's clock and the frames'; `V`: quench and excess bias."""
+        with self._busy:
+            self._connect_where_lost()
+            *celsius, _, frame_clock_hz = self._line.ask_numbers("R", 6)
+            _, excess_v = self._line.ask_numbers("V", 2)
+        temperatures = dict(zip(_TEMPERATURES, celsius, strict=True))
+        return SpadHealth(temperatures, excess_bias_v=excess_v, frame_clock_hz=frame_clock_hz)
+
+    def _do_counters(self) -> SpadCounters:
+        return self._counters
+
+    def _do_configure(self, request: SpadRequest) -> SpadTiming:
+        exposure_us = round(request.exposure_s * 1e6)
+        if exposure_us < 1 or abs(request.exposure_s * 1e6 - exposure_us) > _US_SLACK:
+            raise LimitExceeded(
+                f"{self.name}: exposure {request.exposure_s * 1e6:g} us; it takes whole microseconds from 1 us on"
+            )
+        self._check_period(request, exposure_us)
+        ticks = TICK_HZ / request.frame_rate_hz
+        tick_hz = Fraction(TICK_HZ) if ticks.denominator == 1 else request.frame_rate_hz * TICKS_PER_FRAME
+        period = int(tick_hz / request.frame_rate_hz)
+        exposure = min(round(exposure_us * tick_hz / 1_000_000), period)
+        self._exposure_us = exposure_us
+        layout = BlockLayout(request.block_frames, self._info.width, self._info.height)
+        self._block_frames = request.block_frames
+        self._timing = SpadTiming(tick_hz, period, exposure, layout.min_stride)
+        return self._timing
+
+    def _check_period(self, request: SpadRequest, exposure_us: int) -> None:
+        """Running free, a frame follows the other as soon as it is exposed and the one before is read out."""
+        if self._config.trigger == "external":
+            return
+        period_s = max(Fraction(exposure_us, 1_000_000), 1 / self._info.max_frame_rate_hz)
+        if request.frame_rate_hz * period_s != 1:
+            raise LimitExceeded(
+                f"{self.name}: {float(request.frame_rate_hz):g} Hz with exposures of {exposure_us} us; running free "
+                f"that is {float(1 / period_s):g} Hz: set frame_rate or exposure to match, or use trigger: external"
+            )
+
+    def _do_start(self, n_frames: int | None) -> None:
+        assert n_frames is not None, "a burst has an end"
+        with self._busy:
+            self._connect_where_lost()
+            self._line.ask("PU,0")
+            self._halt.clear()
+            self._run_id = (self._run_id + 1) & 0xFFFF
+            self._counters = SpadCounters(n_frames, 0, 0, None, None)
+            frame_bytes = self._identity.rows * ROW_BYTES
+            self._run = Spad512sRun(self.name, self._line, n_frames, self._block_frames, frame_bytes)
+            external = int(self._config.trigger == "external")
+            # overlap 1: the next exposure runs while a frame is read out; sparse 0; stream 1 = pixels over TCP
+            self._line.tell(f"I,1,{self._exposure_us},{n_frames},{external},1,0,1\n")
+
+    def _connect_where_lost(self) -> None:
+        """The program was restarted, or left by hanging up. DeviceFault where another device answers now."""
+        if self._line.is_open:
+            return
+        again, before = self._connect_again().master_serial, self._identity.master_serial
+        if again != before:
+            self._line.hang_up()
+            raise DeviceFault(
+                f"{self.name}: another device ({again}) answers at {self._line.address} now, it was {before}; "
+                "open it again"
+            )
+
+    def _connect_again(self) -> Spad512sIdentity:
+        """The program serves one client, and listens again a moment after that one has left."""
+        ends_at = time.monotonic() + LISTENS_AGAIN_S
+        while True:
+            try:
+                return self._line.connect()
+            except DeviceNotFound:
+                if time.monotonic() >= ends_at:
+                    raise
+                time.sleep(0.02)
+
+    def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
+        with self._busy:
+            run = self._run
+            if run is None or self._halt.is_set():
+                return False
+            try:
+                more = self._fill(run, ring, timeout_s)
+            except DeviceTimeout:
+                raise
+            except BaseException:
+                # Nothing that still comes can be told from an answer, so the connection goes with the run.
+                self._run = None
+                self._rest_is_lost()
+                self._line.hang_up()
+                raise
+            if not more:
+                self._run = None
+            return more
+
+    def _fill(self, run: Spad512sRun, ring: BlockRing, timeout_s: float) -> bool:
+        """Receive one block and publish it."""
+        ends_at = time.monotonic() + timeout_s
+        pixels = run.receive(ends_at, timeout_s, self._halt.is_set)
+        if pixels is None:
+            return False
+        memory = self._claim(ring, ends_at, timeout_s)
+        if memory is None:
+            self._count(run.next_n, lost=True)
+            ring.mark_overflow(run.next_n)
+        else:
+            self._publish(run, ring, memory, pixels)
+            run.block_seq += 1
+        run.just_lost = memory is None
+        run.go_on()
+        return run.next_n > 0
+
+    def _publish(self, run: Spad512sRun, ring: BlockRing, memory: NDArray[np.uint8], pixels: NDArray[np.uint8]) -> None:
+        n = run.next_n
+        layout = BlockLayout(n, self._info.width, self._info.height)
+        records, bits = block_views(memory, layout)
+        turn_packed(pixels.reshape(n, self._identity.rows, ROW_BYTES), self._config.rotation, bits)
+        records[:] = np.zeros((), records.dtype)
+        records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._timing.frame_period_ticks)
+        block = seal_block(memory, self._header(run), layout, frames_lost=self._lost, payload_crc=False)
+        self._count(n, lost=False)
+        ring.publish(block)
+
+    def _claim(self, ring: BlockRing, ends_at: float, timeout_s: float) -> NDArray[np.uint8] | None:
+        """A free slot; None where there is none and the ring does not wait."""
+        while True:
+            memory = ring.claim(min(SLICE_S, max(0.0, ends_at - time.monotonic())))
+            if memory is not None or not ring.waits:
+                return memory
+            if time.monotonic() >= ends_at or self._halt.is_set():
+                raise DeviceTimeout(
+                    f"{self.name}: no free slot in the ring within {timeout_s:g} s; readers are too slow"
+                )
+
+    def _count(self, n: int, *, lost: bool) -> None:
+        old = self._counters
+        self._counters = SpadCounters(
+            old.exposed, old.delivered + (0 if lost else n), (old.lost or 0) + (n if lost else 0), None, None
+        )
+
+    @property
+    def _lost(self) -> int:
+        return self._counters.lost or 0
+
+    def _header(self, run: Spad512sRun) -> BlockHeader:
+        flags = BlockFlag.BURST
+        if run.block_seq == 0:
+            flags |= BlockFlag.FIRST
+        if run.ends:
+            flags |= BlockFlag.LAST
+        if run.just_lost:
+            flags |= BlockFlag.LOST_BEFORE
+        timing = self._timing
+        return BlockHeader(
+            flags=flags,
+            run_id=self._run_id,
+            block_seq=run.block_seq,
+            first_frame=run.next_frame,
+            t0_ticks=run.next_frame * timing.frame_period_ticks,
+            lost_before=self._lost,
+            tick_hz=timing.tick_hz,
+            frame_period_ticks=timing.frame_period_ticks,
+            exposure_ticks=timing.exposure_ticks,
+            sweep=0,
+            frame_step=1,
+            width=self._info.width,
+            height=self._info.height,
+            sensor_width=self._info.width,
+            sensor_height=self._info.height,
+        )
+
+    def _do_stop(self) -> None:
+        self._halt.set()
+        with self._busy:
+            run, self._run = self._run, None
+            if run is not None:
+                self._rest_is_lost()
+                self._line.leave_run()
+
+    def _rest_is_lost(self) -> None:
+        old = self._counters
+        exposed = old.exposed or 0
+        self._counters = SpadCounters(exposed, old.delivered, exposed - old.delivered, None, None)
+
+    def _do_close(self) -> None:
+        self._line.hang_up()
+
+
+def create(config: Spad512sConfig, surroundings: Surroundings) -> Spad512s:
+    """The SPAD512S at the config's port."""
+    return Spad512s(config, resolve(config.port, surroundings.ports), tap=surroundings.tap)
+
+
+KIND = Kind(config=Spad512sConfig, create=create)

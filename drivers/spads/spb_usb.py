@@ -1,0 +1,303 @@
+"""A SPAD array on USB that speaks SPB1 (hardware.md section 8, docs/spb1-usb.md): behind a Cypress FX3 or an FT601.
+
+Section 8 is this project's own proposal. Opening checks product string, identity registers and a test pattern. The
+device counts and time-stamps frames itself, follows its window table by the line markers, and drops its gate where no
+PING comes for `heartbeat`. Pings are sent by `fill`, between two blocks: a source thread that hangs ends the light.
+"""
+
+import logging
+import threading
+import time
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from drivers.errors import DeviceError, DeviceFault, DeviceTimeout, LimitExceeded
+from drivers.frames import frame_bytes
+from drivers.interfaces import SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
+from drivers.registry import Kind, KindConfig, Surroundings
+from drivers.ring import BlockRing
+from drivers.spads.spb_usb_setup import (
+    LABEL,
+    WIRINGS,
+    Chip,
+    RunSetup,
+    block_size,
+    identify,
+    require_order,
+    require_windows,
+    write_length,
+)
+from drivers.spb1.control import ControlChannel, Op, Register, SensorState
+from drivers.spb1.receiver import Armed, BlockReceiver, Took
+from drivers.transports.bulk_link import BulkLink, PlainLink
+from drivers.transports.endpoints import Endpoint, resolve
+from drivers.transports.queued_link import QueuedLink
+from drivers.transports.tap import Tap
+from drivers.transports.usb_device import UsbDevice, find_device
+from drivers.units import Seconds
+
+_log = logging.getLogger(__name__)
+
+_CHECKED_BYTES_PER_S = 0.5e9
+"""Up to so much, payload CRCs are checked live; above, the recorder and `verify` do (section 8.2)."""
+_SLICE_S = 0.05
+"""One wait inside `fill`: how late a `stop` from another thread comes at most."""
+_PINGS_PER_HEARTBEAT = 4
+_SILENCE_S = 0.5
+"""A run sends a heartbeat block every 100 ms: after a silence of so long the device is asked whether it still runs."""
+_STOP_S = 1.0
+"""Longest wait for the last block after ABORT."""
+
+
+class SpbUsbConfig(KindConfig):
+    """Config of an SPB1 SPAD on USB."""
+
+    kind: Literal["spb-usb"] = "spb-usb"
+    port: str = "usb"
+    """usb (the only one attached), usb:serial=ABC or usb:path=1-2."""
+    chip: Chip = "fx3"
+    """USB chip of the board: Cypress FX3, or FTDI FT601."""
+    reads: Literal["queued", "plain"] = "queued"
+    """queued: many reads in flight (libusb1); plain: one after the other (pyusb), for slow streams."""
+    silence: Annotated[Seconds, Field(ge=0.04, le=1.5)] = 0.04
+    """Asked in vain for so long while light may fall, it has failed: the guard takes the light. One that is emulated
+    shares this computer's processors and needs longer."""
+    heartbeat: Annotated[Seconds, Field(ge=0.02, le=60)] = 1.0
+    """The device ends a run and drops its gate where it hears nothing of this program for so long."""
+    test_pattern: bool = True
+    """Check bit order and row order with the device's test pattern when opening."""
+
+
+class SpbUsb(SpadArray):
+    """An SPB1 SPAD over an open link."""
+
+    def __init__(self, config: SpbUsbConfig, link: BulkLink, tap: Tap | None = None) -> None:
+        """Check who is there and, where asked for, its test pattern. The link is closed with the device.
+
+        tap: told of its control traffic.
+        """
+        super().__init__(link.label)
+        self._config = config
+        self._link = link
+        self._wiring = wiring = WIRINGS[config.chip]
+        self._busy = threading.Lock()
+        """Held while the link is in use, so that `stop` waits for `fill`."""
+        self._halt = threading.Event()
+        self._receiver: BlockReceiver | None = None
+        self._counters = SpadCounters(0, 0, 0, 0, 0)
+        self._waited_s = 0.0
+        """Asked in vain since the last frames."""
+        try:
+            wiring.open_session(link)
+            ack_in = wiring.ack_in if wiring.ack_in in link.endpoints else None
+            self._control = ControlChannel(link, wiring.command_out, ack_in, wiring.stream_in, tap)
+            self._control.on_wait = self._note_wait
+            self._identity = identify(self._control, self.name)
+            if config.test_pattern:
+                require_order(self._control, link, wiring.stream_in, self._identity, config.heartbeat)
+        except BaseException:
+            self._do_close()
+            raise
+
+    @property
+    def info(self) -> SpadInfo:
+        """Geometry and abilities."""
+        return self._identity.info
+
+    def _do_health(self) -> SpadHealth:
+        with self._busy:
+            return SpadHealth(memory_high_water_bytes=self._control.read(Register.FIFO_HIGH_WATER))
+
+    def _do_counters(self) -> SpadCounters:
+        return self._counters
+
+    def _do_configure(self, request: SpadRequest) -> SpadTiming:
+        tick_hz = self._identity.tick_hz
+        period = tick_hz / request.frame_rate_hz
+        if period.denominator != 1:
+            raise LimitExceeded(
+                f"{self.name}: {float(request.frame_rate_hz):g} Hz is no whole number of its ticks of "
+                f"{float(1 / tick_hz) * 1e9:g} ns; {tick_hz / round(period)} Hz is"
+            )
+        exposure = min(round(request.exposure_s * tick_hz), int(period))
+        if exposure < 1:
+            raise LimitExceeded(f"{self.name}: exposure {request.exposure_s:g} s is under one tick")
+        if request.window is not None:
+            require_windows(self._identity, request.window, self.name)
+        width = self.info.width if request.window is None else request.window.width_px
+        stride, n = block_size(self._identity, width, request.block_frames, self.name)
+        burst = request.mode == "burst"
+        setup = RunSetup(int(period), exposure, burst, stride, n, self._config.heartbeat, request.window)
+        with self._busy:
+            setup.write(self._control)
+        self._width = width
+        self._check_payload = self._bytes_per_s(request, width) <= _CHECKED_BYTES_PER_S
+        self._timing = SpadTiming(tick_hz, int(period), exposure, stride)
+        return self._timing
+
+    def _bytes_per_s(self, request: SpadRequest, width: int) -> float:
+        """Bytes a second that come in: of a burst, what the read-out gives."""
+        exposed = float(request.frame_rate_hz) * frame_bytes(width, self.info.height)
+        burst = self.info.burst if request.mode == "burst" else None
+        return exposed if burst is None else min(exposed, burst.readout_bytes_per_s)
+
+    def _do_start(self, n_frames: int | None) -> None:
+        with self._busy:
+            self._control.drain()
+            write_length(self._control, n_frames)
+            self._halt.clear()
+            run_id = self._control.send(Op.START).value
+            info = self.info
+            armed = Armed(
+                run_id,
+                self._timing.stride,
+                self._width,
+                info.height,
+                info.width,
+                info.height,
+                n_frames,
+                self._check_payload,
+            )
+            self._receiver = BlockReceiver(self._link, self._wiring.stream_in, armed, self.name)
+            self._counters = SpadCounters(0, 0, 0, 0, 0)
+            self._pinged_at = self._heard_at = time.monotonic()
+            self._waited_s = 0.0
+
+    def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
+        with self._busy:
+            receiver = self._receiver
+            if receiver is None or self._halt.is_set():
+                return False
+            try:
+                return self._fill(receiver, ring, timeout_s)
+            except DeviceTimeout:
+                raise
+            except BaseException:
+                self._end_run(receiver)
+                raise
+
+    def _fill(self, receiver: BlockReceiver, ring: BlockRing, timeout_s: float) -> bool:
+        ends_at = time.monotonic() + timeout_s
+        took = Took.NOTHING
+        while took is not Took.FRAMES and not receiver.ended:
+            self._ping_when_due(receiver)
+            asked_at = time.monotonic()
+            try:
+                took = receiver.take(ring, min(_SLICE_S, max(0.0, ends_at - asked_at)))
+            finally:
+                self._count(receiver)
+            if self._halt.is_set():
+                return False
+            now = time.monotonic()
+            if took is Took.FRAMES:
+                self._waited_s = 0.0
+            else:
+                self._note_wait(min(now - asked_at, _SLICE_S))
+            if took is not Took.NOTHING:
+                self._heard_at = now
+            elif now - self._heard_at >= _SILENCE_S and self._has_ended():
+                break
+            if took is not Took.FRAMES and now >= ends_at and not receiver.ended:
+                raise DeviceTimeout(
+                    f"{self.name} sent no frames for {timeout_s:g} s ({self._counters.crc_errors} damaged blocks so "
+                    "far); check trigger and cable"
+                )
+        if took is Took.FRAMES and not receiver.ended:
+            return True
+        self._finish(receiver)
+        return False
+
+    def _note_wait(self, seconds: float) -> None:
+        """Asked in vain for so long. A thread that comes late finds what is there: only waiting itself counts."""
+        self._waited_s += seconds
+        if self.on_wait is not None:
+            self.on_wait(self._waited_s)
+
+    def _has_ended(self) -> bool:
+        """Whether the device runs no more: then its last block got lost."""
+        self._heard_at = time.monotonic()
+        return self._control.has_acks and self._control.read(Register.STATE) not in (
+            SensorState.RUNNING,
+            SensorState.DRAINING,
+        )
+
+    def _ping_when_due(self, receiver: BlockReceiver) -> None:
+        now = time.monotonic()
+        if now - self._pinged_at >= self._config.heartbeat / _PINGS_PER_HEARTBEAT:
+            self._pinged_at = now
+            self._control.ping(max(0, receiver.next_frame - 1) & 0xFFFFFFFF)
+
+    def _count(self, receiver: BlockReceiver, exposed: int | None = None) -> None:
+        seen = receiver.next_frame if exposed is None else max(exposed, receiver.next_frame)
+        self._counters = SpadCounters(
+            seen, receiver.delivered, seen - receiver.delivered, receiver.crc_errors, receiver.resyncs
+        )
+
+    def _finish(self, receiver: BlockReceiver) -> None:
+        """The run is over: what the device exposed is asked for, since its last blocks may be lost."""
+        self._receiver = None
+        receiver.close()
+        try:
+            self._count(receiver, self._control.read64(Register.EXPOSED))
+        except DeviceTimeout:
+            if not receiver.ended:  # else the last block has told it
+                raise DeviceFault(
+                    f"{self.name}: the run ended without its last block and the device does not say how many frames it "
+                    "exposed; power-cycle it"
+                ) from None
+        if receiver.gate_forced_low:
+            raise DeviceFault(
+                f"{self.name} heard nothing of this program for {self._config.heartbeat:g} s, dropped its gate and "
+                "ended the run; free the computer, or set a longer heartbeat"
+            )
+
+    def _do_stop(self) -> None:
+        self._halt.set()
+        with self._busy:
+            receiver = self._receiver
+            if receiver is not None:
+                self._end_run(receiver)
+
+    def _end_run(self, receiver: BlockReceiver) -> None:
+        """Abort, wait for the last block so that none is left for the next run, give the queue back."""
+        self._receiver = None
+        exposed: int | None = None
+        try:
+            self._control.send_in_run(Op.ABORT)
+            ends_at = time.monotonic() + _STOP_S
+            while not receiver.drain(_SLICE_S) and time.monotonic() < ends_at:
+                pass
+        except DeviceError as error:
+            _log.warning("%s: while ending the run: %s", self.name, error)
+        receiver.close()
+        try:
+            exposed = self._control.read64(Register.EXPOSED)
+        except DeviceError as error:
+            _log.warning("%s: how many frames it exposed is not known: %s", self.name, error)
+        self._count(receiver, exposed)
+
+    def _do_close(self) -> None:
+        try:
+            self._wiring.close_session(self._link)
+        except DeviceError as error:
+            _log.warning("%s: while closing the session: %s", self.name, error)
+        finally:
+            self._link.close()
+
+
+def open_link(config: SpbUsbConfig, endpoint: Endpoint) -> BulkLink:
+    """The link to the device at an endpoint. An emulator's own backend can do plain reads only."""
+    wiring = WIRINGS[config.chip]
+    listing = find_device(wiring.usb, endpoint.address, endpoint.usb_backend)
+    if config.reads == "queued" and endpoint.usb_backend is None:
+        return QueuedLink(listing, LABEL, wiring.interfaces)
+    return PlainLink(UsbDevice(listing, LABEL, dict.fromkeys(wiring.interfaces, 0)))
+
+
+def create(config: SpbUsbConfig, surroundings: Surroundings) -> SpbUsb:
+    """The SPAD at the config's port."""
+    return SpbUsb(config, open_link(config, resolve(config.port, surroundings.ports)), surroundings.tap)
+
+
+KIND = Kind(config=SpbUsbConfig, create=create)

@@ -1,0 +1,303 @@
+"""PrawnDO, a pulse generator on a Raspberry Pi Pico: sixteen outputs, 10 ns steps, a trigger, text over USB serial.
+
+Facts: hardware.md section 5.1; from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd (BSD).
+Outputs as in hardware.md section 6: GPIO0 triggers the SPAD, GPIO1 is the laser's gate, GPIO2 marks records.
+
+The firmware has no loops and no watchdog. So programs are written out in full and end on two words that hold everything
+low, whatever happens to the host. It cannot read its pins while a program runs, nor tell a wait from play.
+
+Turns pulses into the words of a PrawnDO program, and refuses what the board would play otherwise than written.
+
+A word is 16 outputs and a number of cycles (hardware.md section 5.1): 0 cycles wait for the trigger, two such words in
+a row are the end, with the first one's outputs left on the pins. The trigger is a level, so that a wait passes at once
+while it is high: that is how a held pulse looks at the scan marker.
+"""
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError
+from drivers.interfaces import Pulse, SyncSource, SyncStatus, sliced
+from drivers.registry import Kind, KindConfig, Surroundings
+from drivers.sync.prawndo_line import (
+    ABORT_REQUESTED,
+    ABORTED,
+    ABORTING,
+    IDLE,
+    RUNNING,
+    STARTING,
+    STOPPED,
+    STOPPING,
+    USUAL_TIMING,
+    PrawnDoLine,
+    PrawnDoTiming,
+)
+from drivers.transports.endpoints import resolve
+from drivers.transports.serial_port import SerialPort
+from drivers.units import Hertz, Seconds
+
+MIN_CYCLES = 5
+MAX_CYCLES = 2**32 - 1
+"""Length of a word; from 1 to 4 cycles the firmware makes a wait, 0 is one (5.1, pitfall 2)."""
+WORD = np.dtype([("outputs", "<u2"), ("cycles", "<u4")])
+"""Six bytes, as `adm` takes them."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProgramLimits:
+    """What bounds a program. trigger_pulse_s: the longest scan marker of a program without held pulses."""
+
+    name: str
+    clock_hz: float
+    max_words: int
+    trigger_pulse_s: float
+
+
+def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits) -> NDArray[np.void]:
+    """The words of the whole program, repeats written out and the end with all outputs low. `LimitExceeded`."""
+    _check_waits(_words(pulses, board), repeats, board)
+    period = _words(sliced(pulses), board)
+    # A wait beside the end's own zeros would be the end, on that wait's outputs: a shortest word parts them.
+    end = np.array([(0, MIN_CYCLES), (0, 0), (0, 0)], WORD)[int(period["cycles"][-1] != 0) :]
+    n_words = repeats * len(period) + len(end)
+    if n_words > board.max_words:
+        raise LimitExceeded(
+            f"{board.name}: a program of {n_words} words, {repeats} times {len(period)} and the end; it holds "
+            f"{board.max_words}: scan fewer sweeps at a time"
+        )
+    return np.concatenate([np.tile(period, repeats), end])
+
+
+def most_repeats(pulses: Sequence[Pulse], board: ProgramLimits) -> int:
+    """How often a period fits into the board beside the end."""
+    return (board.max_words - 3) // len(sliced(pulses))
+
+
+def _words(pulses: Sequence[Pulse], board: ProgramLimits) -> NDArray[np.void]:
+    words = np.zeros(len(pulses), WORD)
+    for index, pulse in enumerate(pulses):
+        words[index] = pulse.outputs, _cycles(index, pulse, board)
+    return words
+
+
+def _cycles(index: int, pulse: Pulse, board: ProgramLimits) -> int:
+    if pulse.duration_s is None:
+        return 0
+    cycles = round(pulse.duration_s * board.clock_hz)
+    if not MIN_CYCLES <= cycles <= MAX_CYCLES:
+        raise LimitExceeded(
+            f"{board.name}: word {index} lasts {pulse.duration_s:g} s, outside {MIN_CYCLES / board.clock_hz:g} to "
+            f"{MAX_CYCLES / board.clock_hz:.6g} s; change it"
+        )
+    return cycles
+
+
+def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -> None:
+    """Between two waits the program plays longer than a scan marker, or one marker would end both (pitfall 1)."""
+    waits = np.flatnonzero(period["cycles"] == 0)
+    if len(waits) == 0:
+        return
+    played = np.concatenate([[0], np.cumsum(period["cycles"].astype(np.int64))])
+    between = np.diff(played[waits])
+    if repeats > 1:
+        between = np.append(between, played[-1] - played[waits[-1]] + played[waits[0]])
+    if len(between) and between.min() <= board.trigger_pulse_s * board.clock_hz:
+        index = int(waits[int(np.argmin(between))])
+        raise LimitExceeded(
+            f"{board.name}: the program plays {between.min() / board.clock_hz:g} s between the wait at word "
+            f"{index} and the next one, and a scan marker may last {board.trigger_pulse_s:g} s "
+            "(trigger_pulse): lengthen it"
+        )
+
+
+_log = logging.getLogger(__name__)
+
+INTERNAL_HZ = 100_000_000
+"""The board's own clock (5.1)."""
+MAX_WORDS = {"board: pico1": 30_000, "board: pico2": 60_000}
+OLDEST_FIRMWARE = (1, 3)
+"""`adm` takes a start address, and `brd` exists, from here on."""
+_CLOCK_CHANGE_S = 0.02
+"""Time for the board to find out that there is no clock on GPIO20."""
+_CLOCK_TOLERANCE = 0.01
+_STATES: dict[int, Literal["stopped", "running", "aborted"]] = {
+    STOPPED: "stopped",
+    STARTING: "running",
+    RUNNING: "running",
+    ABORT_REQUESTED: "aborted",
+    ABORTING: "aborted",
+    ABORTED: "aborted",
+    STOPPING: "stopped",
+}
+
+
+class PrawnDoConfig(KindConfig):
+    """Config of a PrawnDO board."""
+
+    kind: Literal["prawndo"] = "prawndo"
+    port: Annotated[
+        str,
+        Field(description="serial port: a path, serial=... or usb=VVVV:PPPP", examples=["/dev/ttyACM0"], min_length=1),
+    ]
+    trigger_pulse: Annotated[
+        Seconds,
+        Field(
+            gt=0,
+            description="longest scan marker without a held pulse: the trigger is a level, so waits are farther apart",
+            examples=["40 us"],
+        ),
+    ] = 40e-6
+    external_clock: Annotated[
+        Hertz | None,
+        Field(
+            gt=0, le=50e6, description="frequency of the clock on GPIO20; none: the board's own", examples=["10 MHz"]
+        ),
+    ] = None
+
+
+class PrawnDo(SyncSource):
+    """A PrawnDO board. Opening it takes all outputs low first, whatever the board was doing."""
+
+    def __init__(self, config: PrawnDoConfig, surroundings: Surroundings, timing: PrawnDoTiming = USUAL_TIMING) -> None:
+        super().__init__("PrawnDO")
+        self._config = config
+        self._confirmed = False
+        port = SerialPort(self.name, resolve(config.port, surroundings.ports).address, tap=surroundings.tap)
+        self._line = PrawnDoLine(self.name, port, timing)
+        try:
+            self._line.connect(max(MAX_WORDS.values()))
+            clock_hz = float(INTERNAL_HZ) if config.external_clock is None else config.external_clock
+            self._firmware, max_words = self._identify()
+            self._board = ProgramLimits(self.name, clock_hz, max_words, config.trigger_pulse)
+            self._set_clock()
+            self._line.command("cls")
+        except BaseException:
+            self._line.close()
+            raise
+
+    @property
+    def identity(self) -> str:
+        """Firmware, memory and clock; a board has no serial number of its own."""
+        board = self._board
+        return f"{self.name} firmware {self._firmware}, {board.max_words} words, {board.clock_hz / 1e6:g} MHz"
+
+    @property
+    def resolution_s(self) -> float:
+        """One cycle of the clock: 10 ns on the board's own."""
+        return 1 / self._board.clock_hz
+
+    @property
+    def port_lost(self) -> bool:
+        """Whether the port is gone, told without a word on the wire. Any thread."""
+        return self._line.port_lost
+
+    def most_repeats(self, pulses: Sequence[Pulse]) -> int:
+        """As often as they fit into the board's memory: there are no loops."""
+        return most_repeats(pulses, self._board)
+
+    def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
+        words = compile_program(pulses, repeats, self._board)
+        with self._line.lock:
+            self._check_clock()
+            self._confirmed = False
+            self._line.command("cls")
+            try:
+                self._line.load(words.tobytes())
+                self._require_length(len(words))
+            except DeviceError:
+                self._forget_program()
+                raise
+            self._confirmed = True
+
+    def _do_run(self) -> None:
+        with self._line.lock:
+            if not self._confirmed:
+                raise DeviceFault(f"{self.name}: its program did not arrive whole; program it again")
+            self._check_clock()
+            self._line.command("swr")  # `run` would wait for a scan marker before the first word
+
+    def _do_gate_low(self) -> None:
+        self._line.lower()
+
+    def _do_abort(self) -> None:
+        self._line.lower()
+
+    def _do_status(self) -> SyncStatus:
+        with self._line.lock:
+            state, _ = self._line.run_status()
+            return SyncStatus(_STATES[state], self._line.pins() if state in IDLE else None)
+
+    def _do_close(self) -> None:
+        self._line.close()
+
+    def _identify(self) -> tuple[str, int]:
+        """Firmware, and words that the board holds; ProtocolError where its firmware is too old."""
+        version = "".join(self._line.transact("ver")).removeprefix("Version: ")
+        try:
+            numbers = tuple(int(part) for part in version.split(".")[:2])
+        except ValueError:
+            raise ProtocolError(f"{self.name}: no version in {version!r}; is this a PrawnDO?") from None
+        if numbers < OLDEST_FIRMWARE:
+            raise ProtocolError(
+                f"{self.name}: firmware {version} is older than {'.'.join(map(str, OLDEST_FIRMWARE))}; install a "
+                "newer one"
+            )
+        board = "".join(self._line.transact("brd"))
+        if board not in MAX_WORDS:
+            raise ProtocolError(f"{self.name}: unknown board {board!r}; known are {', '.join(MAX_WORDS)}")
+        return version, MAX_WORDS[board]
+
+    def _set_clock(self) -> None:
+        wanted_hz = self._config.external_clock
+        if wanted_hz is None:
+            self._line.command(f"clk 0 {INTERNAL_HZ}")
+        else:
+            self._line.command(f"clk 1 {round(wanted_hz)}")  # says ok whether there is a clock or not
+            time.sleep(_CLOCK_CHANGE_S)
+        self._check_clock()
+        lines = self._line.transact("frq")
+        found = [line for line in lines if line.startswith("clk_sys = ") and line.endswith("kHz")]
+        digits = found[0][len("clk_sys = ") : -len("kHz")] if found else ""
+        if not digits.isdecimal():
+            raise ProtocolError(f"{self.name}: no system clock among {lines}")
+        hz = 1e3 * int(digits)
+        if abs(hz / self._board.clock_hz - 1) > _CLOCK_TOLERANCE:
+            raise DeviceFault(
+                f"{self.name}: its clock runs at {hz:g} Hz, not {self._board.clock_hz:g} Hz; check the clock on "
+                "GPIO20 and 'external_clock'"
+            )
+
+    def _require_length(self, n_words: int) -> None:
+        lines = self._line.transact("len")
+        if f"Number of instructions: {n_words}" not in lines:
+            raise DeviceFault(f"{self.name}: {lines} after a program of {n_words} words; load it again")
+
+    def _forget_program(self) -> None:
+        """Nothing of a program that did not arrive whole may ever be run."""
+        try:
+            self._line.command("cls")
+        except DeviceError as error:
+            _log.warning("%s: %s", self.name, error)
+
+    def _check_clock(self) -> None:
+        _, external = self._line.run_status()
+        if external != (self._config.external_clock is not None):
+            raise DeviceFault(
+                f"{self.name}: the clock on GPIO20 is lost and the board runs on its own; check that clock, then open "
+                "the device again"
+            )
+
+
+def create(config: PrawnDoConfig, surroundings: Surroundings, timing: PrawnDoTiming = USUAL_TIMING) -> PrawnDo:
+    """The board at the config's port."""
+    return PrawnDo(config, surroundings, timing)
+
+
+KIND = Kind(config=PrawnDoConfig, create=create)

@@ -1,0 +1,270 @@
+"""Commands and answers of a PrawnDO on its serial line, and the way to low outputs through whatever is under way.
+
+The firmware frames nothing (hardware.md section 5.1). So every command goes between two lines of nonsense that differ
+each time and that the firmware repeats in its complaint: an answer can be told from one that came late, twice or never.
+What decides about light is asked twice. Lowering the outputs overtakes all other commands.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+from drivers.errors import DeviceError, DeviceFault, DeviceTimeout, ProtocolError
+from drivers.transports.serial_port import SerialPort
+
+_log = logging.getLogger(__name__)
+_T = TypeVar("_T")
+
+STOPPED, STARTING, RUNNING, ABORT_REQUESTED, ABORTING, ABORTED, STOPPING = range(7)
+"""Values of `run-status` (5.1)."""
+IDLE = (STOPPED, ABORTED)
+"""States in which everything but `sts`, `abt`, `ver` and `brd` is executed."""
+BYTES_PER_WORD = 6
+
+_CRLF = b"\r\n"
+_LOWER = b"\nabt\nsts\nman 0\nsts\nman 0\n"
+"""The first line end completes whatever a former host began to say. While the board says its state, its second core
+does what `abt` asked for, without which it refuses `man`: low outputs need no round trip of a host that may be late."""
+_RESUSCITATED = "System Clock Resus'd"
+_CHUNK_BYTES = 4032
+"""Bytes per write while a program is loaded: sixteen of the firmware's own pieces of 42 words."""
+_SLICE_S = 0.02
+"""How soon a command under way gives way to the gate."""
+
+
+@dataclass(frozen=True, slots=True)
+class PrawnDoTiming:
+    """How long the line waits. Over USB a reply takes 1 ms; the rest is for a loaded host."""
+
+    reply_s: float = 0.5
+    """For a reply."""
+    hasty_s: float = 0.06
+    """The same on the way to low outputs, where asking again is better than waiting."""
+    lower_s: float = 0.5
+    """For outputs to be confirmed low."""
+    load_s: float = 5.0
+    """For the answer to a program: 360 kB at USB full speed, with much to spare."""
+
+
+USUAL_TIMING = PrawnDoTiming()
+
+
+class PrawnDoLine:
+    """Asks and tells, one command at a time, from any thread. Owns the port."""
+
+    def __init__(self, name: str, port: SerialPort, timing: PrawnDoTiming) -> None:
+        self._name = name
+        self._port = port
+        self._timing = timing
+        self.lock = threading.RLock()
+        """Hold it around commands that belong together."""
+        self._gate_first = threading.Event()
+        self._in_one_piece = threading.Lock()
+        self._serial_number = 0
+        self._owed_bytes = 0
+        self._last_heard = ""
+
+    @property
+    def port_lost(self) -> bool:
+        """Whether the port has hung up. Any thread."""
+        return self._port.lost
+
+    @property
+    def path(self) -> str:
+        """The port's path."""
+        return self._port.path
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._port.close()
+
+    def connect(self, most_words: int) -> None:
+        """All outputs low, before anything else is asked, whatever state a former host left the board in.
+
+        most_words: of any board. `ProtocolError` where something else answers, `DeviceTimeout` where nothing does.
+        """
+        try:
+            self.lower()
+        except DeviceTimeout:
+            if self._last_heard:
+                raise ProtocolError(
+                    f"{self._name}: what answers on {self.path} is no PrawnDO (it says {self._last_heard[:40]!r}); "
+                    "correct 'port'"
+                ) from None
+            self._free_wedged(most_words)
+
+    def transact(self, command: str) -> list[str]:
+        """Send a command; returns the lines of its answer, without blank ones."""
+        return self._transact(command, self._timing.reply_s, urgent=False)
+
+    def command(self, command: str) -> None:
+        """Send a command that answers `ok`. `DeviceFault` for any other answer."""
+        lines = self.transact(command)
+        if lines != ["ok"]:
+            raise DeviceFault(f"{self._name}: {command} was answered {lines}, not ok")
+
+    def run_status(self) -> tuple[int, bool]:
+        """`run-status`, and whether the external clock is in use."""
+        return self._run_status(self._timing.reply_s, urgent=False)
+
+    def pins(self) -> int:
+        """Levels of the outputs; only in a state of `IDLE`."""
+        return self._pins(self._timing.reply_s, urgent=False)
+
+    def load(self, payload: bytes) -> None:
+        """Replace the program by these words of six bytes. `DeviceFault` for any answer but `ok` (pitfall 2)."""
+        with self.lock:
+            lines = self._load(payload)
+        if lines != ["ok"]:
+            raise DeviceFault(f"{self._name}: the program was answered {lines}, not ok; load it again")
+
+    def lower(self) -> None:
+        """End the program and take all outputs low; returns as soon as they read back low.
+
+        `abt` alone leaves the outputs as they are, and `man` is executed only once the state machine has stopped
+        (pitfall 3). Both are sent before anybody waits for anything; then it is checked and said again until it is so.
+        `DeviceTimeout` where the board does not answer: whether the gate is low is then unknown.
+        """
+        self._gate_first.set()
+        try:
+            if self._in_one_piece.acquire(blocking=False):  # nothing runs while a program is being loaded
+                try:
+                    self._port.write(_LOWER)
+                finally:
+                    self._in_one_piece.release()
+            with self.lock:
+                self._gate_first.clear()
+                self._lower_surely()
+        finally:
+            self._gate_first.clear()
+
+    def _lower_surely(self) -> None:
+        ends_at = time.monotonic() + self._timing.lower_s
+        while True:
+            try:
+                if self._try_to_lower():
+                    return
+                trouble: DeviceError = DeviceFault(f"{self._name}: its outputs do not go low")
+            except (DeviceTimeout, ProtocolError) as error:
+                trouble = error
+            if time.monotonic() > ends_at:
+                raise trouble
+            self._port.write(_LOWER)
+
+    def _try_to_lower(self) -> bool:
+        """One round; each question has its own round trip, in which the board's second core does what it was told."""
+        hasty_s = self._timing.hasty_s
+        self._transact("abt", hasty_s, urgent=True)
+        if self._run_status(hasty_s, urgent=True)[0] not in IDLE:
+            return False
+        self._transact("man 0", hasty_s, urgent=True)
+        return self._pins(hasty_s, urgent=True) == 0 and self._run_status(hasty_s, urgent=True)[0] in IDLE
+
+    def _free_wedged(self, most_words: int) -> None:
+        """A program that another host never finished sending swallows all commands: give it what it waits for.
+
+        Zeros are words that wait with all outputs low (5.1, pitfall 4).
+        """
+        _log.warning("%s does not answer on %s; trying to end an unfinished program", self._name, self._port.path)
+        self._port.write(b"\nend\n")
+        piece = bytes(BYTES_PER_WORD * _CHUNK_BYTES)
+        for _ in range(BYTES_PER_WORD * most_words // len(piece) + 2):
+            self._port.write(piece + b"\n")
+            try:
+                self._transact("sts", 2 * self._timing.hasty_s, urgent=False)
+            except (DeviceTimeout, ProtocolError):
+                continue
+            self.lower()
+            return
+        raise DeviceTimeout(f"{self._name} does not answer on {self._port.path}; unplug it, plug it in and start again")
+
+    def _load(self, payload: bytes) -> list[str]:
+        before, after = self._token(), self._token()
+        self._pay_debt()
+        with self._in_one_piece:
+            self._owed_bytes = len(payload)  # `adm` cannot be left before all bytes have come
+            self._port.write(f"{before}\nadm 0 {len(payload) // BYTES_PER_WORD:x}\n".encode())
+            self._until(lambda lines: lines[-1] == "ready", before, self._timing.reply_s, urgent=False)
+            for at in range(0, len(payload), _CHUNK_BYTES):
+                piece = payload[at : at + _CHUNK_BYTES]
+                self._port.write(piece)
+                self._owed_bytes -= len(piece)
+            self._port.write(f"{after}\n".encode())
+        lines = self._until(lambda lines: after in lines[-1], None, self._timing.load_s, urgent=False)
+        return lines[:-1]
+
+    def _run_status(self, deadline_s: float, urgent: bool) -> tuple[int, bool]:
+        def parse(line: str) -> tuple[int, bool]:
+            run, clock = (part.split(":") for part in line.split(" "))
+            if run[0] != "run-status" or clock[0] != "clock-status" or int(run[1]) not in range(7):
+                raise ValueError(line)
+            return int(run[1]), {"0": False, "1": True}[clock[1]]
+
+        return self._ask_twice("sts", parse, deadline_s, urgent)
+
+    def _pins(self, deadline_s: float, urgent: bool) -> int:
+        return self._ask_twice("gto", lambda line: int(line, 16), deadline_s, urgent)
+
+    def _ask_twice(self, command: str, parse: Callable[[str], _T], deadline_s: float, urgent: bool) -> _T:
+        """A flipped bit makes a low gate of a high one: only two answers that agree are an answer."""
+        lines = self._transact(f"{command}\n{command}", deadline_s, urgent)
+        try:
+            first, second = (parse(line) for line in lines)
+        except (ValueError, KeyError):
+            raise ProtocolError(f"{self._name}: {command} was answered {lines}; check the cable") from None
+        if first != second:
+            raise ProtocolError(f"{self._name}: {command} was answered {lines}, which differ; check the cable")
+        return first
+
+    def _transact(self, command: str, deadline_s: float, urgent: bool) -> list[str]:
+        """Send a command; returns the lines of its answer, without blank ones."""
+        with self.lock:
+            self._pay_debt()
+            before, after = self._token(), self._token()
+            self._port.write(f"{before}\n{command}\n{after}\n".encode())
+            return self._until(lambda lines: bool(lines) and after in lines[-1], before, deadline_s, urgent)[:-1]
+
+    def _until(
+        self, done: Callable[[list[str]], bool], before: str | None, deadline_s: float, urgent: bool
+    ) -> list[str]:
+        """The lines that follow the one with `before` (None: all), up to and with the one that makes it `done`."""
+        ends_at = time.monotonic() + deadline_s
+        lines: list[str] = []
+        begun = before is None
+        while True:
+            line = self._line(ends_at, deadline_s, urgent)
+            if before is not None and before in line:
+                begun, lines = True, []
+            elif line and _RESUSCITATED not in line:
+                lines.append(line)
+                if done(lines):
+                    if not begun:
+                        raise ProtocolError(f"{self._name}: the beginning of an answer is missing: {lines}")
+                    return lines
+
+    def _line(self, ends_at: float, deadline_s: float, urgent: bool) -> str:
+        while True:
+            if self._gate_first.is_set() and not urgent:
+                raise DeviceFault(f"{self._name}: given up, since the gate has to go low")
+            try:
+                self._last_heard = self._port.read_line(_CRLF, _SLICE_S).decode("latin-1").strip()
+                return self._last_heard
+            except DeviceTimeout:
+                if time.monotonic() >= ends_at:
+                    raise DeviceTimeout(
+                        f"{self._name} did not answer within {deadline_s:g} s on {self._port.path}; check its cable"
+                    ) from None
+
+    def _token(self) -> str:
+        """A line that is no command and that no other line contains."""
+        self._serial_number += 1
+        return f"#{self._serial_number:08x}"
+
+    def _pay_debt(self) -> None:
+        """Fill up a program that was broken off, with words that wait low, so that commands are heard again."""
+        if self._owed_bytes:
+            owed, self._owed_bytes = self._owed_bytes, 0
+            self._port.write(bytes(owed) + b"\n")

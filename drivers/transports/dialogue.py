@@ -1,0 +1,213 @@
+"""A dialogue with a device that answers one command at a time: paced, checked, and back in step after a lost reply.
+
+Nothing on a laser's line checks or numbers a reply (hardware.md sections 4.1 and 4.2): one that comes late is taken for
+the answer to the next command. So the input is dropped before each command, each reply must have the form that its
+command calls for, and after one that has not, or none at all, the line is drained and a question asked whose answer is
+known. What a make's commands and replies look like is its `Framing`.
+
+A lock that serves threads in turn: whoever waits gets it before the thread that had it last gets it again.
+
+A thread that polls a slow device takes its lock again as soon as it gave it back; with a plain lock the thread that
+wants to switch the laser off may wait for ever.
+"""
+
+import re
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Protocol
+
+from drivers.clock import NS_PER_S, Clock
+from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
+from drivers.transports.serial_port import SerialPort
+
+
+class FairLock:
+    """To be used by `with`; not re-entrant."""
+
+    def __init__(self) -> None:
+        self._turn = threading.Lock()
+        self._held = threading.Lock()
+
+    def __enter__(self) -> None:
+        """Wait for the turn, then for the lock."""
+        with self._turn:
+            self._held.acquire()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Give it to whoever waits."""
+        self._held.release()
+
+
+DONE = "OK"
+"""The reply to a command that was done."""
+FLAG = re.compile(r"[01]")
+NUMBER = re.compile(r"[+-]?\d{1,9}(\.\d{1,9})?([eE][+-]?\d{1,2})?")
+_DONE = re.compile(DONE)
+_ATTEMPTS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class LineTiming:
+    """How long the line waits. The defaults suit a laser; the emulators' campaigns run the same code faster."""
+
+    gap_s: float = 0.0
+    """Between a reply and the next command, at least."""
+    reply_s: float = 1.0
+    """For each line of a reply."""
+    quiet_s: float = 0.3
+    """A line is drained once nothing came for so long..."""
+    drain_s: float = 1.0
+    """...or after this long at most."""
+
+
+class CommandRefused(ProtocolError):  # noqa: N818 - named after what happened, as all device errors
+    """Raised by a command that this device does not know, or not in its present state."""
+
+
+class Framing(Protocol):
+    """How one make writes commands and replies."""
+
+    @property
+    def ping(self) -> str:
+        """A question that may be asked at any time."""
+        ...
+
+    def greets(self, reply: str) -> bool:
+        """Whether `reply` answers the ping."""
+        ...
+
+    def encode(self, command: str) -> bytes:
+        """The bytes of a command."""
+        ...
+
+    def read(self, command: str, read_line: Callable[[], str]) -> str:
+        """The reply to a command, from as many lines as it has; "" where they do not go together."""
+        ...
+
+    def refusal(self, reply: str) -> str | None:
+        """What a reply means that refuses its command; None: it does not."""
+        ...
+
+
+class Dialogue:
+    """Asks and tells, one command at a time, from any thread. Owns the port."""
+
+    def __init__(self, name: str, port: SerialPort, framing: Framing, clock: Clock, timing: LineTiming) -> None:
+        self.name = name
+        self._port = port
+        self._framing = framing
+        self._clock = clock
+        self._timing = timing
+        self._lock = FairLock()
+        self._quiet_since_ns = clock.now_ns()
+
+    def connect(self) -> None:
+        """Get into step with the device. `DeviceTimeout` or `ProtocolError`: nothing of this make answers.
+
+        The port was just opened, so that nothing is owed: the line need not be quiet for as long as after a fault.
+        """
+        with self._lock:
+            self._resync(self._timing.quiet_s / 3)
+
+    def tell(self, command: str) -> None:
+        """Have something done. `CommandRefused`, `DeviceTimeout`, `ProtocolError`, `DeviceDisconnected`.
+
+        A command whose reply was lost is sent again: all commands of the drivers may come twice.
+        """
+        self.ask(command, _DONE)
+
+    def ask(self, command: str, form: re.Pattern[str]) -> str:
+        """The reply to a query. Errors as in `tell`."""
+        with self._lock:
+            reply = ""
+            for attempt in range(_ATTEMPTS):
+                if attempt:
+                    self._resync(self._timing.quiet_s)
+                try:
+                    reply = self._once(command)
+                except DeviceTimeout:
+                    if attempt == _ATTEMPTS - 1:
+                        raise
+                    continue
+                if form.fullmatch(reply):
+                    return reply
+                refusal = self._framing.refusal(reply)
+                if attempt and refusal is not None:
+                    raise CommandRefused(f"{self.name} refuses {command!r}: {refusal}; check its state and model")
+            raise ProtocolError(f"{self.name} answered {command!r} with {reply[:40]!r}; check its cable and firmware")
+
+    def ask_flag(self, command: str) -> bool:
+        """A reply of 0 or 1."""
+        return self.ask(command, FLAG) == "1"
+
+    def ask_number(self, command: str) -> float:
+        """A reply that is a number."""
+        return float(self.ask(command, NUMBER))
+
+    def ask_surely(self, command: str, form: re.Pattern[str]) -> str:
+        """As `ask`, until two replies in a row agree: for what is kept, or ends a scan; nothing else guards a bit."""
+        last = self.ask(command, form)
+        for _ in range(_ATTEMPTS):
+            reply = self.ask(command, form)
+            if reply == last:
+                return reply
+            last = reply
+        raise ProtocolError(f"{self.name} answers {command!r} differently each time; check its cable")
+
+    def tell_and_check(self, command: str, query: str, form: re.Pattern[str], wanted: Callable[[str], bool]) -> None:
+        """Set something and read it back, which alone counts. `DeviceFault` where it reads back as something else."""
+        reply = ""
+        for _ in range(_ATTEMPTS):  # a bit may flip in the answer as well as in the command
+            refused: CommandRefused | None = None
+            try:
+                self.tell(command)
+            except CommandRefused as error:
+                refused = error
+            reply = self.ask(query, form)
+            if wanted(reply):
+                return
+            if refused is not None:
+                raise refused
+        raise DeviceFault(f"{self.name}: told {command!r}, {query!r} says {reply}; power-cycle the device")
+
+    @property
+    def port_lost(self) -> bool:
+        """Whether the port has hung up. Any thread."""
+        return self._port.lost
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._port.close()
+
+    def _once(self, command: str) -> str:
+        """One command and its reply."""
+        passed_s = (self._clock.now_ns() - self._quiet_since_ns) / NS_PER_S
+        self._clock.sleep(self._timing.gap_s - passed_s)
+        if self._port.reset_input().strip():  # a reply that nobody asked for, and perhaps its other half comes yet
+            self._port.drain(self._timing.quiet_s, self._timing.drain_s)
+        self._port.write(self._framing.encode(command))
+        try:
+            return self._framing.read(command, self._read_line)
+        finally:
+            self._quiet_since_ns = self._clock.now_ns()
+
+    def _read_line(self) -> str:
+        return self._port.read_line(b"\n", self._timing.reply_s).decode("ascii", "replace").strip()
+
+    def _resync(self, quiet_s: float) -> None:
+        """Drop what comes late, then ask what only one reply can answer."""
+        for attempt in range(_ATTEMPTS):
+            self._port.drain(quiet_s, self._timing.drain_s)
+            ping = self._framing.ping
+            try:
+                # Quiet afterwards: that was the answer to this question and not to one before.
+                if self._framing.greets(self._once(ping)) and not self._port.drain(quiet_s, self._timing.drain_s):
+                    return
+            except DeviceTimeout:
+                if attempt == _ATTEMPTS - 1:
+                    raise
+        raise ProtocolError(f"{self.name} does not answer {ping!r} as it should; check 'port' and cable")

@@ -1,0 +1,141 @@
+"""The calls about a rig and its computer: what a scene calls for, what is attached, whether it could run, how fast."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rig.config.overrides import SIMULATED, Config, PathLike, configure
+from rig.errors import UsageError
+from rig.progress import Progress
+
+if TYPE_CHECKING:
+    from rig.bench.disk import DiskReport
+    from rig.bench.simulator import SimulatorReport
+    from rig.bench.soak import SoakReport
+    from rig.bench.speed import SpeedReport
+    from rig.config.models import RigConfig
+    from rig.devices.doctor import Attached, Finding
+    from rig.tradeoff.effects import Flux, SceneEffects
+
+
+def check_config(config: Config = SIMULATED) -> "RigConfig":
+    """The config, once every file that it names was opened as a scan opens it (`rig config check`).
+
+    Raises UsageError with one line per problem.
+    """
+    from rig.devices.open import check_files
+
+    checked = configure(config)
+    check_files(checked)
+    return checked
+
+
+def effects(
+    config: Config = SIMULATED, *, scene: str | None = None, trials: bool = True, progress: Progress | None = None
+) -> "SceneEffects":
+    """Which effects a simulated scene calls for, why, and what each is worth (`rig effects`).
+
+    trials: measure by how much each changes the stripe error, in pairs of short scans (seconds); progress: called with
+    those done and all.
+    """
+    from rig.tradeoff.effects import scene_effects
+
+    return scene_effects(configure(config, scene=scene), trials=trials, progress=progress)
+
+
+def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int | None, column: int | None) -> "Flux":
+    """Noise-free photons per exposure of one image row while the line is at a column's centre (`rig effects --row`).
+
+    Arrays (width,): x_px, total, and by name what each effect brings.
+    """
+    from rig.tradeoff.effects import flux_row as row_of
+
+    if row is None or column is None:
+        raise UsageError("the flux is that of one image row at one column of the scan; give both --row and --column")
+    return row_of(configure(config, scene=scene), row, column)
+
+
+def doctor(config: Config = SIMULATED, *, out: PathLike = "runs") -> "list[Finding]":
+    """Whether a scan could run (`rig doctor`): devices, plan, frames, markers, dark counts, disk; no light leaves.
+
+    The mirror moves. out: where a scan would write.
+    """
+    from rig.devices.doctor import examine
+
+    return examine(configure(config), Path(out))
+
+
+def devices() -> "list[Attached]":
+    """USB devices that a driver knows and serial ports, as far as can be seen without opening them (`rig devices`)."""
+    from rig.devices.doctor import attached
+
+    return attached()
+
+
+def laser_off(config: Config = SIMULATED) -> list[str]:
+    """Take the gate low and disarm the laser (`rig laser off`); says what was done. Raises DevicesError."""
+    from rig.devices.doctor import laser_off as switch_off
+
+    return switch_off(configure(config))
+
+
+def bench(*, threads: int | None = None, progress: Progress | None = None) -> "SpeedReport":
+    """How fast this machine counts and estimates, within a minute (`rig bench`).
+
+    threads: the most to measure, by default one for each core. progress: called with rows done and all, of all rounds.
+    """
+    from rig.bench.speed import measure_speed
+
+    if threads is not None and threads < 1:
+        raise UsageError(f"threads is {threads}; it must be at least 1")
+    return measure_speed(threads, progress=progress)
+
+
+def bench_disk(folder: PathLike, *, progress: Progress | None = None) -> "DiskReport":
+    """How fast recordings are written to and read from the disk of `folder`, beside what it does at its best.
+
+    Some 2 GB are written there and removed again. progress: called with measurements done and all.
+    """
+    from rig.bench.disk import measure_disk
+
+    return measure_disk(Path(folder), progress)
+
+
+def bench_simulator(config: Config = SIMULATED, *, progress: Progress | None = None) -> "SimulatorReport":
+    """How fast the simulator draws frames of a clear, a foggy and a crowded scene, beside plain numpy.
+
+    progress: called with rows done and all, of all rounds.
+    """
+    from rig.bench.simulator import measure_simulator
+
+    return measure_simulator(lambda scene: configure(config, scene=scene), progress=progress)
+
+
+def soak(
+    seconds: float = 60.0,
+    *,
+    threads: int | None = None,
+    window: bool = False,
+    slow_consumer_s: float = 0.0,
+    on_overload: str = "abort",
+    progress: Progress | None = None,
+) -> "SoakReport":
+    """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`).
+
+    window: windows that move with the line, instead of whole frames. slow_consumer_s: added to every map. on_overload:
+    as of `scan`; a stream that it ends is a report too. progress: called with frames done and planned.
+    """
+    from rig.bench.soak import SoakOptions
+    from rig.bench.soak import soak as play
+    from rig.scan.pipeline import Overload
+
+    return play(SoakOptions(seconds, window, Overload.parse(on_overload), slow_consumer_s, threads), progress)
+
+
+def warm_up(config: Config = SIMULATED) -> float:
+    """Compile every kernel that a scan with this config can need (`rig warmup`); the seconds it took.
+
+    Real devices are not opened.
+    """
+    from rig.bench.warm_up import warm_rig
+
+    return warm_rig(configure(config))

@@ -1,0 +1,63 @@
+"""Compiles every kernel that a rig's scans can need: estimators and filters, and, where it is simulated, its world's.
+
+Each is run once on little; what numba compiles it keeps on disk, so that a second time takes seconds.
+"""
+
+import time
+from contextlib import closing
+
+import numpy as np
+
+from rig.bench.speed import warm_bench
+from rig.config.models import RigConfig
+from rig.depth.reconstruct import Reconstructor
+from rig.depth.warm_up import warm_up
+from rig.devices.open import OpenRig, open_rig, prepare
+from rig.estimate.registry import ESTIMATORS
+from rig.progress import tell_stage
+from rig.scan.acquisition import Acquisition, ScanProgress, told_of
+
+ENOUGH_FRAMES = 1000
+"""Simulated frames, the first columns of a sweep among them."""
+
+
+def warm_rig(config: RigConfig) -> float:
+    """Compile everything; the seconds it took. Real devices are not opened."""
+    begun = time.perf_counter()
+    for done, estimator in enumerate(ESTIMATORS):
+        tell_stage("warming up", done, len(ESTIMATORS), "estimators")
+        for dark in (True, False):  # a scan has dark frames, a bare cube has none
+            warm_up(estimator, "median", config.scan.exposures, dark=dark)
+    tell_stage("warming up the bench")
+    warm_bench()
+    if config.world is not None:
+        with open_rig(config) as rig:
+            tell_stage("warming up the simulator")
+            _simulate(rig)
+    return time.perf_counter() - begun
+
+
+class _EnoughError(Exception):
+    """Enough frames were simulated."""
+
+
+def _simulate(rig: OpenRig) -> None:
+    """Let the world make the frames of a scan's beginning, bind and count them, and tell the truth of two columns."""
+    plan, timing = prepare(rig)
+    maker = Reconstructor(
+        rig.model, plan.commands, plan.depth_range_m, sensor=(plan.rows, plan.width), estimator="argmax", threads=1
+    )
+
+    def enough(done: ScanProgress) -> None:
+        if done.frames >= ENOUGH_FRAMES:
+            raise _EnoughError
+
+    running = Acquisition(rig, plan, timing, 1, maker, on_progress=told_of(enough)).run()
+    with closing(running):
+        try:
+            for _ in running:
+                pass
+        except _EnoughError:
+            pass
+    assert rig.world is not None, "only a simulated rig is asked for frames"
+    rig.world.truth(plan.command_at(np.arange(2.0)))

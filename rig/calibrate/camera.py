@@ -1,0 +1,127 @@
+"""`rig calibrate camera`: the camera alone, from views of a board or from picture files."""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from calibration.board.board import Board
+from calibration.camera_fit import CameraFit, fit_camera
+from calibration.diagnosis.camera import ACCURACY_PX, JudgedCamera, judge_camera
+from calibration.errors import Degenerate, condition_text, digits
+from calibration.files.camera_file import camera_content, camera_file_text, corners_digest
+from calibration.verdict import AT_M
+from rig.calibrate.capture import Ask, Tell, require_live
+from rig.calibrate.planes import POSES
+from rig.calibrate.report import camera_report
+from rig.calibrate.report_page import subject
+from rig.calibrate.session import CalibrationResult, Session, named
+from rig.calibrate.sources import ViewSources
+from rig.calibrate.views import Live, Taken, good_poses, refusal, require_poses, take_kept, take_live
+from rig.progress import tell_stage
+from rig.scan.run import OutFolder, versions
+
+CAMERA_FILE = "camera.yaml"
+FEWEST_VIEWS = 3
+"""Of a camera: of fewer the second takes up whatever is wrong with the first."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraAsked:
+    """poses: of a live rig. terms: of the lens model, as OpenCV counts them."""
+
+    poses: int = POSES
+    terms: int = 5
+    seed: int = 0
+    arm: bool = False
+
+
+def run_camera(
+    sources: ViewSources,
+    board: Board,
+    asked: CameraAsked,
+    *,
+    out: OutFolder = None,
+    ask: Ask | None = None,
+    tell: Tell | None = None,
+) -> CalibrationResult:
+    """Calibrate the camera; camera.yaml (`calibration.files.camera_file`) can be given to a calibration of the planes.
+
+    Raises Degenerate where the views make no camera; its notes say why, root cause first.
+    """
+    live, photons = sources.live, not sources.pictures
+    require_live(live, ask, asked.arm)
+    with Session(out, board) as session:
+        taken = Taken(session, tell)
+        take_kept(taken, sources, board)
+        if live is not None:
+            require_poses(taken, asked.poses)
+            choose = good_poses(live, board, asked.poses, AT_M, asked.seed, len(taken.views))
+            take_live(taken, Live(live, asked.poses, choose, ask, seed=asked.seed, arm=asked.arm, line=False), board)
+        tell_stage("fitting", len(taken.views), unit="views")
+        try:
+            fit = _fitted(taken, board, asked.terms)
+        except Degenerate as refused:
+            raise refusal(refused, taken, board, photons=photons, line=False) from refused
+        judged = judge_camera(fit, taken.views, board, photons=photons)
+        summary = {"command": "camera", **_summary(fit, judged, taken), "versions": versions()}
+        tell_stage("writing the report")
+        figures = tuple(_figures(fit, judged, taken))
+        used = [view for view in taken.views if view.name in fit.views]
+        about = subject(taken.identity, board, summary["versions"], datetime.now(UTC))
+        report = camera_report(fit, used, judged, board, figures, about)
+        digests = [corners_digest(view) for view in used if view.name in fit.kept]
+        session.write_text(CAMERA_FILE, camera_file_text(fit.camera, fit.covariance, digests, judged.verdict))
+        session.finish(summary, report, None)
+        return CalibrationResult(judged.verdict, judged.line(), figures, summary, None, session.path)
+
+
+def _fitted(taken: Taken, board: Board, terms: int) -> CameraFit:
+    """The camera; Degenerate where it would hang on so few views that they cannot contradict each other."""
+    fit = fit_camera(taken.views, board, taken.size, distortion_terms=terms)
+    if len(fit.kept) < FEWEST_VIEWS:
+        raise Degenerate(
+            "too-few-poses",
+            f"{len(fit.kept)} of {len(taken.views)} views could be used (condition number "
+            f"{condition_text(fit.condition)}): a camera takes {FEWEST_VIEWS} poses or more; show the board tilted to "
+            "both sides, near and far",
+        )
+    return fit
+
+
+def _summary(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> dict[str, Any]:
+    return {
+        "verdict": judged.verdict.as_json(),
+        "views": {
+            "shown": len(taken.views),
+            "used": len(fit.kept),
+            "outliers": list(fit.outliers),
+            "refused": {name: str(why) for name, why in taken.refused.items()},
+            "rms_px": dict(zip(fit.views, fit.view_rms_px.tolist(), strict=True)),
+        },
+        "camera": camera_content(fit.camera),
+        "sd": fit.sd,
+        "rms_px": fit.rms_px,
+        "ray_sd_px": {"median": judged.sd_px, "worst": judged.worst_px, "asked": ACCURACY_PX, "line": judged.line()},
+        "coverage": judged.coverage,
+        "condition": fit.condition,
+    }
+
+
+def _figures(fit: CameraFit, judged: JudgedCamera, taken: Taken) -> list[tuple[str, str]]:
+    matrix, sd, refused = fit.camera.matrix, fit.sd, tuple(taken.refused)
+    terms = ", ".join(digits(term, 4) for term in fit.camera.distortion) or "none"
+    return [
+        ("views", f"{len(fit.kept)} of {len(taken.views)} used, {named(fit.outliers)} outliers, {named(refused)} "
+                  "refused"),
+        ("rays", f"{digits(judged.sd_px, 2)} px, at the worst 5 % of the picture {digits(judged.worst_px, 2)} px, "
+                 f"asked {ACCURACY_PX:g} px"),
+        ("focal length", f"{matrix[0, 0]:.2f}, {matrix[1, 1]:.2f} px, sd {digits(sd['fx'], 2)}, {digits(sd['fy'], 2)}"),
+        ("centre", f"{matrix[0, 2]:.2f}, {matrix[1, 2]:.2f} px, sd {digits(sd['cx'], 2)}, {digits(sd['cy'], 2)}"),
+        ("distortion", terms),
+        ("residuals", f"{fit.rms_px:.3f} px rms"),
+        ("coverage", f"{judged.coverage:.0%} of the picture within the outline of all corners, boards up to "
+                     f"{np.degrees(fit.coverage.spread_rad):.0f} degrees apart"),
+        ("condition", condition_text(fit.condition)),
+    ]  # fmt: skip

@@ -1,0 +1,307 @@
+"""One view of the board, from a scan of it: the board's picture, its corners, and the passages of every sweep.
+
+The scan is done without the calibration that there is, so that nothing of it enters the new one: whole rows are
+counted, and a passage is the command at that instant as if the mirror had no lag. A SPAD that cannot send or keep whole
+frames fast enough sends the windows of that calibration, though, and the plan allows for its lag; both are of no
+consequence for the passages, but that a line outside the windows is not seen.
+
+Passages are kept of pixels spread evenly over the board, away from the edges of its print; over the whole picture where
+no board was found. The first half millisecond of a sweep is left out: the mirror, which follows late, is still
+accelerating then.
+
+At how many exposures per column a live rig is looked at, pose by pose, so that the mirror is seen at several speeds.
+
+A speed that the rig cannot do is left out. Where one does not show the line on the board, the pose is scanned again at
+the slowest, before the board is moved; a speed that never showed the line where the slowest did is left out too.
+
+How the board gets where it is wanted: a person is asked to hold it there, or the simulated world moves it.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from calibration.board.board import Board
+from calibration.errors import Degenerate
+from calibration.guide import Candidate
+from calibration.model.rig_model import Identity
+from calibration.passages.find import SweepCounts, find_passages
+from calibration.passages.flux_picture import board_pixels, even_pixels, flux_picture
+from calibration.views import BoardPose, Corners, Passages, View
+from drivers.units import format_quantity
+from rig.config.files import parse_config
+from rig.config.models import RigConfig
+from rig.count.sweeps import SweepData
+from rig.count.volume import CountVolume
+from rig.devices.calibration_use import identity_of
+from rig.devices.open import OpenRig, open_rig, prepare, require_simulated_or_armed
+from rig.errors import PlanError, UsageError
+from rig.plan.scan_plan import Leg, ScanPlan
+from rig.progress import tell_stage
+from rig.recording.inputs import read_plan
+from rig.recording.replay import ReplayOptions, replay_config
+from rig.run_folder.manifest import read_manifest
+from rig.run_folder.summary import MapTally
+from rig.scan.run import OutFolder, Run
+from rig.scan.scan import ScanOptions, run_scan
+
+MOST_LAG_S = 5e-4
+"""Longest lag that is allowed for: small galvos follow their command within 100 to 300 us."""
+MOST_SWEEPS = 4
+"""Of a recording that are looked at."""
+PLAIN = {"estimator": "argmax", "filter": "none", "temporal_prior": False}
+"""Estimate settings of a scan whose maps nobody wants."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capture:
+    """A view as it was taken. refused: why there are no corners in it. identity: of the rig that took it."""
+
+    view: View
+    refused: Degenerate | None
+    identity: Identity
+
+
+def capture_view(
+    config: RigConfig,
+    name: str,
+    board: Board | None,
+    *,
+    seed: int = 0,
+    exposures: int | None = None,
+    bidirectional: bool = True,
+    arm: bool = False,
+    defects: NDArray[np.bool_] | None = None,
+    out: OutFolder = None,
+) -> Capture:
+    """Scan once, in both directions, and give what calibrates.
+
+    board: None where none is to be looked for; passages are then of the whole picture. seed: of everything simulated.
+    exposures: per column, in place of the config's. arm: must be True where laser or gate are real. defects: (rows,
+    width), pixels not to be used. out: a folder to record the scan into; None: nothing is written. Raises UsageError
+    for what cannot be, DeviceError or DevicesError where devices fail, as `rig.api.scan`.
+    """
+    settings = _settings(config, exposures, bidirectional=bidirectional)
+    if problems := require_simulated_or_armed(settings, arm):
+        raise UsageError.of(problems)
+    for known in (None, config.calibration):
+        try:
+            with open_rig(settings.model_copy(update={"calibration": known}), seed=seed) as rig:
+                return _captured(rig, name, board, 2 if bidirectional else 1, seed, defects, out)
+        except PlanError:
+            if known == config.calibration:
+                raise
+    raise AssertionError("the second calibration is the config's")
+
+
+def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDArray[np.bool_] | None = None) -> Capture:
+    """The same from the first sweeps of a recorded run. UsageError where there is none."""
+    config = replay_config(run, ReplayOptions("max"), None, {"estimator": "argmax", "filter": "none"})
+    if not read_plan(run).windowed:
+        config = config.model_copy(update={"calibration": None})
+    maps = int((read_manifest(run) or {}).get("maps") or 1)
+    with open_rig(config) as rig:
+        return _captured(rig, name, board, min(maps, MOST_SWEEPS), 0, defects, None)
+
+
+def _settings(config: RigConfig, exposures: int | None, *, bidirectional: bool) -> RigConfig:
+    """The config of a capture. UsageError for a rig of several lines."""
+    if len(config.line_offsets) > 1:
+        raise UsageError(
+            f"{config.name} has {len(config.line_offsets)} lines (line_offsets); a pixel cannot tell which one passed: "
+            "cover all but one and set line_offsets to [0]"
+        )
+    scan = config.scan.model_copy(update={"bidirectional": bidirectional})
+    if exposures is not None:
+        try:
+            scan = type(scan).model_validate({**scan.model_dump(mode="json"), "exposures": exposures})
+        except ValidationError as error:
+            raise UsageError(f"exposures {exposures}: {error.errors()[0]['msg']}") from error
+    return config.model_copy(update={"scan": scan, "estimate": config.estimate.model_copy(update=PLAIN)})
+
+
+def _captured(
+    rig: OpenRig,
+    name: str,
+    board: Board | None,
+    maps: int,
+    seed: int,
+    defects: NDArray[np.bool_] | None,
+    out: OutFolder,
+) -> Capture:
+    # A simulated world is not asked for the truth, nor to hold its light within columns: it moves as the mirror does.
+    rig = replace(rig, world=None)
+    plan, _ = prepare(rig)
+    sweeps = _sweeps(rig, maps, seed, out)
+    counts = tuple(_sweep_counts(sweep, plan) for sweep in sweeps)
+    picture = flux_picture(counts)
+    bad = np.zeros(picture.shape, np.bool_) if defects is None else defects
+    if board is not None:
+        tell_stage("finding the board")
+    corners, refused = _corners(picture, board, defects)
+    mask = even_pixels(picture) & ~bad
+    if corners is not None and board is not None:
+        mask &= board_pixels(corners, board, picture.shape)
+    tell_stage("finding the line")
+    passages = tuple(
+        _steady(find_passages(count, sweep.direction, plan.speed_per_s, mask), plan)
+        for count, sweep in zip(counts, sweeps, strict=True)
+        if sweep.synchronised
+    )
+    return Capture(View(name, corners, passages, picture), refused, identity_of(rig))
+
+
+def _sweeps(rig: OpenRig, maps: int, seed: int, out: OutFolder) -> list[SweepData]:
+    """The counted sweeps of a scan. An interrupt is raised again, once the rig is safe."""
+    found: list[SweepData] = []
+    scan, estimate = rig.config.scan, rig.config.estimate
+    tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
+    options = ScanOptions(record=out is not None, sweeps=found.append, accept_calibration=True)
+    with Run(out, tally, record=out is not None) as run:
+        result = run_scan(rig, run, maps, seed, options)
+    result.uninterrupted()
+    return found
+
+
+def _sweep_counts(sweep: SweepData, plan: ScanPlan) -> SweepCounts:
+    """The counts of a sweep, with the commands of its columns as if the plan knew of no lag."""
+    volume = sweep.volume
+    assert isinstance(volume, CountVolume), "what argmax has counted"
+    lag_s = _leg(plan, sweep.direction).lag_s
+    command = plan.command_at(volume.column) + plan.velocity_per_s(sweep.direction) * lag_s
+    return SweepCounts(volume.counts, volume.n_frames, command, volume.x0, volume.width)
+
+
+def _leg(plan: ScanPlan, direction: int) -> Leg:
+    return next(leg for leg in plan.legs if leg.direction == direction)
+
+
+def _steady(passages: Passages, plan: ScanPlan) -> Passages:
+    """Those that came when the mirror had long been told to move as fast as it does."""
+    first = plan.command_range[0 if _leg(plan, passages.direction).columns_rise else 1]
+    since_s = passages.direction * (passages.command - first) / passages.speed_per_s
+    keep = since_s >= MOST_LAG_S
+    arrays = {part: getattr(passages, part)[keep] for part in ("x_px", "y_px", "command", "sd")}
+    return replace(passages, **arrays)
+
+
+def _corners(
+    picture: NDArray[np.float32], board: Board | None, defects: NDArray[np.bool_] | None
+) -> tuple[Corners | None, Degenerate | None]:
+    if board is None:
+        return None, None
+    from calibration.board.detect import find_corners
+
+    try:
+        return find_corners(picture, board, defects), None
+    except Degenerate as error:
+        return None, error
+
+
+Tell = Callable[[str], None]
+"""Takes a line for people."""
+Ask = Callable[[str], None]
+"""Says what to do with the board and returns once it is done; raises KeyboardInterrupt to end the session."""
+
+
+def world_moves_board(config: RigConfig) -> bool:
+    """Whether this rig's world holds the board itself."""
+    return config.world is not None and "board_pose" in type(config.world).model_fields
+
+
+def with_board_pose(config: RigConfig, pose: BoardPose) -> RigConfig:
+    """The config of a simulated rig whose world holds the board at `pose`."""
+    content = config.model_dump(mode="json")
+    content["world"]["board_pose"] = {
+        "rotation": [format_quantity(float(angle), "angle") for angle in pose.rotation],
+        "position": [format_quantity(float(length), "length") for length in pose.position_m],
+    }
+    return parse_config(content)
+
+
+def require_live(config: RigConfig | None, ask: Ask | None, arm: bool) -> None:
+    """UsageError where a live rig may not shine, or nobody is there to move its board; None: no live rig."""
+    if config is None:
+        return
+    problems = require_simulated_or_armed(config, arm)
+    if ask is None and not world_moves_board(config):
+        problems.append(
+            f"{config.name} is a real rig, and nobody is there to move the board; run this at a terminal, pass "
+            "ask=..., or give recorded runs as sources"
+        )
+    if problems:
+        raise UsageError.of(problems)
+
+
+def shown(config: RigConfig, what: str, pose: Candidate, ask: Ask | None, tell: Tell | None) -> RigConfig:
+    """The config to capture the next pose with, once the board is there; `what` says where."""
+    if world_moves_board(config):
+        if tell is not None:
+            tell(what)
+        return with_board_pose(config, pose.pose)
+    assert ask is not None, "required before the first pose"
+    ask(what)
+    return config
+
+
+Scan = Callable[[int | None], Capture]
+"""Takes a view at so many exposures per column; None: as the config says. PlanError where the rig cannot do that."""
+
+
+class SpeedTurns:
+    """Takes each view at the speed whose turn it is."""
+
+    def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: Tell | None = None) -> None:
+        """exposures: per column, by turns; none: as the config says. sees: whether a capture has what it is for."""
+        self.turns = list(exposures)
+        self._sees = sees
+        self._tell = tell
+        self._shown: set[int] = set()
+
+    def capture(self, pose: int, scan: Scan) -> Capture:
+        """The view of a pose, the number of which says whose turn it is."""
+        exposures, capture = self._in_turn(pose, scan)
+        if exposures is None or capture.refused is not None:
+            return capture
+        if self._sees(capture):
+            self._shown.add(exposures)
+            return capture
+        slowest = max(self.turns)
+        return capture if exposures >= slowest else self._again(capture, exposures, slowest, scan)
+
+    def _in_turn(self, pose: int, scan: Scan) -> tuple[int | None, Capture]:
+        while True:
+            exposures = self.turns[pose % len(self.turns)] if self.turns else None
+            try:
+                return exposures, scan(exposures)
+            except PlanError:
+                if exposures is None or len(self.turns) < 2:
+                    raise
+                self.turns.remove(exposures)
+
+    def _again(self, capture: Capture, exposures: int, slowest: int, scan: Scan) -> Capture:
+        """The same pose at the slowest speed; the first capture where the rig cannot do it."""
+        self._say(f"at {_of(exposures)} the line does not stand out on the board: again at {slowest}")
+        try:
+            again = scan(slowest)
+        except PlanError:
+            self.turns.remove(slowest)
+            return capture
+        if self._sees(again):
+            self._shown.add(slowest)
+            if exposures not in self._shown:
+                self.turns.remove(exposures)
+                self._say(f"scans at {_of(exposures)} are left out from now on")
+        return again
+
+    def _say(self, what: str) -> None:
+        if self._tell is not None:
+            self._tell(what)
+
+
+def _of(exposures: int) -> str:
+    return f"{exposures} exposure{'s' if exposures > 1 else ''} per column"

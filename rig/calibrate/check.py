@@ -1,0 +1,194 @@
+"""`rig calibrate check`: a calibration judged by scans of a flat board that it was not made with."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.board.board import Board
+from calibration.check import CheckedAngle, CheckedBoard, check_angle, check_boards
+from calibration.depth_error import DepthUncertainty, depth_uncertainty, sensitivity
+from calibration.diagnosis.camera import judge_check
+from calibration.diagnosis.rig import goal
+from calibration.errors import Degenerate, mm
+from calibration.files.camera_file import CORNERS, corners_digest
+from calibration.files.rig_file import load_rig_model
+from calibration.model.rig_model import RigModel
+from calibration.verdict import AT_M, Asked, Verdict
+from calibration.views import View
+from rig.calibrate.capture import Ask, Tell, require_live
+from rig.calibrate.report import check_report
+from rig.calibrate.report_page import subject
+from rig.calibrate.session import CalibrationResult, Session, true_errors, truth_content
+from rig.calibrate.sources import ViewSources
+from rig.calibrate.views import Live, Taken, good_poses, note_views, take_kept, take_live
+from rig.devices.calibration_use import note_check
+from rig.errors import UsageError
+from rig.progress import tell_stage
+from rig.scan.run import OutFolder, versions
+
+NO_COVARIANCE = "the calibration has no covariance: nothing tells what depth error to expect"
+SEED_APART = 1 << 20
+"""From that of a calibration: a simulated rig shows a check other poses, and other photons."""
+
+
+@dataclass(frozen=True, slots=True)
+class CheckAsked:
+    """What is to be checked. poses: of a live rig. angle_rad: between the boards of the first two views, as stated."""
+
+    poses: int = 1
+    accuracy_m: float | None = None
+    at_m: float = AT_M
+    angle_rad: float | None = None
+    seed: int = 0
+    arm: bool = False
+
+
+def run_check(
+    sources: ViewSources,
+    board: Board,
+    calibration: Path | None,
+    asked: CheckAsked,
+    *,
+    out: OutFolder = None,
+    ask: Ask | None = None,
+    tell: Tell | None = None,
+) -> CalibrationResult:
+    """Check a calibration, by default that of the live rig; how it ended is noted beside its file, if it is of a rig.
+
+    Raises Degenerate where the board was not scanned, UsageError where there is no calibration, or one made of these
+    very views.
+    """
+    live = sources.live
+    file = calibration or (None if live is None else live.calibration)
+    if file is None:
+        raise UsageError("there is no calibration to check; name one with --calibration")
+    model = load_rig_model(file)
+    poses = max(asked.poses, 2 if asked.angle_rad is not None else 1)
+    require_live(live, ask, asked.arm)
+    worth = sensitivity(model, asked.at_m)
+    wanted = goal(worth, asked.accuracy_m, asked.at_m)
+    with Session(out, board) as session:
+        taken = Taken(session, tell)
+        take_kept(taken, sources, board, model.defects)
+        _require_others(taken.views, model)
+        if live is not None:
+            seed = asked.seed + SEED_APART
+            choose = good_poses(live, board, poses, asked.at_m, seed)
+            take_live(taken, Live(live, poses, choose, ask, (), seed, asked.arm, model.defects), board)
+        views = _with_board(taken, 1 if asked.angle_rad is None else 2)
+        model.check_sensor(*taken.size)
+        tell_stage("judging", len(views), unit="views")
+        boards = check_boards(model, views, board)
+        angle = None if asked.angle_rad is None else check_angle(model, views[0], views[1], board)
+        verdict = judge_check(boards, wanted, board.size_m[0], angle, asked.angle_rad)
+        uncertainty = None if model.covariance is None else depth_uncertainty(model, asked.at_m)
+        line = NO_COVARIANCE if uncertainty is None else uncertainty.line()
+        truth = None if live is None else true_errors(model, live, asked.at_m)
+        summary = {
+            "command": "check",
+            **_summary(verdict, boards, angle, asked, wanted, uncertainty, file),
+            "scans_refuse_it": bool(_consequence(verdict, model, file)),
+            "truth": None if truth is None else truth_content(truth),
+            "versions": versions(),
+        }
+        tell_stage("writing the report")
+        figures = tuple(_figures(boards, angle) + _consequence(verdict, model, file))
+        about = subject(taken.identity or model.identity, board, summary["versions"], datetime.now(UTC))
+        session.finish(summary, check_report(boards, uncertainty, verdict, line, figures, about), None)
+        if model.identity is not None:
+            note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
+        return CalibrationResult(verdict, line, figures, summary, model, session.path)
+
+
+def _require_others(views: Sequence[View], model: RigModel) -> None:
+    """UsageError for views that the model was made of: it was fitted to their errors too."""
+    made_of = model.provenance.get(CORNERS) or ()
+    same = [view.name for view in views if corners_digest(view) in made_of]
+    if same:
+        raise UsageError(
+            f"view{'s' if len(same) > 1 else ''} {', '.join(same)}: the calibration was made of the same, which is no "
+            "check of it; name a rig, runs or views taken since"
+        )
+
+
+def _with_board(taken: Taken, least: int) -> list[View]:
+    """The views that show it. Degenerate, with what is wrong with each, where they are fewer."""
+    views = [view for view in taken.views if view.corners is not None]
+    if len(views) < least:
+        reason = next((why.reason for why in taken.refused.values()), "no-board")
+        few = "1 view shows" if len(views) == 1 else f"{len(views)} views show"
+        error = Degenerate(reason, f"{reason}: {few} the board, at least {least} must; show it again")
+        note_views(error, taken)
+        raise error
+    return views
+
+
+def _summary(
+    verdict: Verdict,
+    boards: Sequence[CheckedBoard],
+    angle: CheckedAngle | None,
+    asked: CheckAsked,
+    wanted: Asked,
+    uncertainty: DepthUncertainty | None,
+    file: Path,
+) -> dict[str, Any]:
+    return {
+        "verdict": verdict.as_json(),
+        "calibration": str(file),
+        "boards": [
+            {
+                "view": board.name,
+                "distance_m": board.distance_m,
+                "flatness_rms_m": board.flatness_rms_m,
+                "flatness_peak_m": board.flatness_peak_m,
+                "expected_m": board.expected_m,
+                "chi2": board.chi2,
+                "freedom": board.freedom,
+                "scale": board.scale,
+                "scale_sd": board.scale_sd,
+                "point_rms_m": board.point_rms_m,
+            }
+            for board in boards
+        ],
+        "angle": None
+        if angle is None
+        else {"rad": angle.angle_rad, "sd_rad": angle.sd_rad, "stated_rad": asked.angle_rad},
+        "depth_error": {
+            "at_m": wanted.at_m,
+            "asked_m": wanted.accuracy_m,
+            "median_m": None if uncertainty is None else float(np.nanmedian(uncertainty.sd_m)),
+            "line": None if uncertainty is None else uncertainty.line(),
+        },
+    }
+
+
+def _consequence(verdict: Verdict, model: RigModel, file: Path) -> list[tuple[str, str]]:
+    """What a check that failed means from now on, and how that is taken back; nothing without an identity."""
+    if verdict.passed or model.identity is None:
+        return []
+    said = (
+        f"scan, replay and reconstruct refuse {file} (or take it with --accept-calibration); a check of it that "
+        "passes, with the right angle or board, takes that back"
+    )
+    return [("from now on", said)]
+
+
+def _figures(boards: Sequence[CheckedBoard], angle: CheckedAngle | None) -> list[tuple[str, str]]:
+    rows = []
+    for board in boards:
+        rows.append(
+            (
+                f"view {board.name}",
+                f"{board.distance_m:.2f} m away, flat to {mm(board.flatness_rms_m)} rms "
+                f"({mm(board.expected_m)} expected), {mm(board.flatness_peak_m)} peak, scale "
+                f"{board.scale - 1:+.3%} (sd {board.scale_sd:.2%})",
+            )
+        )
+    if angle is not None:
+        rows.append(("angle", f"{math.degrees(angle.angle_rad):.3f} degrees, sd {math.degrees(angle.sd_rad):.2g}"))
+    return rows

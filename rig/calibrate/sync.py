@@ -1,0 +1,335 @@
+"""`rig calibrate sync`: lag of the mirror each way and delay of the rows, from one unmoved scene at several speeds.
+
+How late the light follows the gate, from the frames of a recorded run at the two ends of its sweeps.
+
+The plan says when the gate opens and closes after the scan marker; the frames say when the light does. A pattern
+generator, a long cable and a laser's driver each add to that. What is seen is the sum, on the SPAD's clock; the line
+has to be in the picture where the gate opens or closes.
+
+A line so bright that pixels saturate makes a frame that is lit for a part of its exposure look lit for more, and tells
+little of the moment within it. How much its pixels saturate is told by those that fire in two frames one after the
+other; by what the line moves from one to the next fewer do, which the frame after the next one tells.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.depth_error import sensitivity
+from calibration.diagnosis.rig import goal, judge_sync
+from calibration.errors import CalibrationError, Degenerate, digits
+from calibration.files.rig_file import load_rig_model
+from calibration.model.rig_model import RigModel
+from calibration.sync.gate_fit import Edge, edge_time, fit_edge
+from calibration.sync.lag_fit import SyncFit, fit_sync
+from calibration.sync.transfer import known_row_delay, with_lags
+from calibration.verdict import AT_M, Verdict
+from drivers.frames import FrameBlock
+from drivers.recorded import RunRecording
+from rig.calibrate.capture import Tell, capture_view
+from rig.calibrate.planes import speeds_of
+from rig.calibrate.report import sync_report
+from rig.calibrate.report_page import subject
+from rig.calibrate.session import CalibrationResult, Made, Session, true_model
+from rig.calibrate.sources import ViewSources
+from rig.calibrate.views import Taken, take_kept
+from rig.config.models import RigConfig
+from rig.count.bind import FrameBinder
+from rig.plan.scan_plan import ScanPlan
+from rig.progress import part, tell_stage
+from rig.recording.inputs import read_plan
+from rig.scan.run import OutFolder, versions
+
+Array = NDArray[np.float64]
+
+AROUND_FRAMES = 12
+"""Frames looked at on either side of where an edge is planned."""
+LEAST_FRAMES = 4
+"""On either side of it."""
+SETTLED_FRAMES = 3
+"""So far from the edge frames and the two that follow are all dark, or all lit."""
+MOST_LATE_FRAMES = 3
+"""A delay is looked for up to here: gates take microseconds; a line that comes into the picture later is no edge."""
+MOST_SCATTER = 10.0
+"""Ones that vary more than that around an edge, in units of photons' variance, are those of the scene."""
+STEPS = 32
+"""Delays tried per frame."""
+LEAST_BRIGHTNESS_SDS = 6.0
+"""Light that is no brighter is none."""
+MOST_SWEEPS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class GateDelay:
+    """opens_s, closes_s: how much later than planned, NaN where the line was not in the picture then; their sds.
+
+    edges: so many were seen.
+    """
+
+    opens_s: float
+    opens_sd_s: float
+    closes_s: float
+    closes_sd_s: float
+    edges: int
+
+    @property
+    def delay_s(self) -> float:
+        """The mean of both; NaN where one was not seen."""
+        return (self.opens_s + self.closes_s) / 2
+
+    @property
+    def sd_s(self) -> float:
+        """Its standard deviation, NaN likewise."""
+        return math.hypot(self.opens_sd_s, self.closes_sd_s) / 2
+
+
+def gate_delay(run: Path) -> GateDelay | None:
+    """Of a recorded run; None where its SPAD carries no markers: the light itself gives the time then.
+
+    UsageError where the run has no plan, ProtocolError where it has no frames.
+    """
+    plan = read_plan(run)
+    if plan.blanking is not None:
+        return None
+    steps = STEPS * MOST_LATE_FRAMES
+    late_s = np.arange(-steps, steps + 1) / (STEPS * float(plan.frame_rate_hz))
+    found: dict[bool, list[Edge]] = {True: [], False: []}
+    for sweep, ones, middle_s in _sweeps(run, plan):
+        leg = plan.leg(sweep)
+        for rises, planned_s in ((True, leg.gate_open_s), (False, leg.gate_close_s)):
+            edge = _edge(ones, middle_s - planned_s, late_s, plan, rises=rises)
+            if edge is not None and _is_told(edge):
+                found[rises].append(edge)
+    nan = math.nan, math.nan
+    opens, closes = (edge_time(found[rises], late_s) if found[rises] else nan for rises in (True, False))
+    return GateDelay(*opens, *closes, edges=len(found[True]) + len(found[False]))
+
+
+def _is_told(edge: Edge) -> bool:
+    return edge.brightness > LEAST_BRIGHTNESS_SDS * edge.brightness_sd and edge.scatter < MOST_SCATTER
+
+
+def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises: bool) -> Edge | None:
+    """The edge at delays (delays,) among the frames near where it is planned, at 0; None where some are not there.
+
+    ones: (frames, 3) as of `_ones`. middle_s: (frames,) of their exposures.
+    """
+    frame_s = float(1 / plan.frame_rate_hz)
+    near = np.abs(middle_s) < AROUND_FRAMES * frame_s
+    if min((near & (middle_s < 0)).sum(), (near & (middle_s > 0)).sum()) < LEAST_FRAMES:
+        return None
+    settled = near & (np.abs(middle_s) > SETTLED_FRAMES * frame_s) & np.isfinite(ones).all(axis=1)
+    lit = (middle_s > 0) == rises
+    starts_s, saturation = middle_s[near] - plan.exposure_s / 2, _saturation(ones[settled & lit], ones[settled & ~lit])
+    return fit_edge(ones[near, 0], starts_s, plan.exposure_s, late_s, rises=rises, saturation=saturation)
+
+
+def _saturation(lit: Array, dark: Array) -> float:
+    """Sum of p^2 over sum of p, of pixels that the line lights with probability p; 1, the worst, where none tell."""
+    if not (len(lit) and len(dark)):
+        return 1.0
+    whole, next_one, after = (lit.mean(axis=0) - dark.mean(axis=0)).tolist()
+    return min(max(2 * next_one - after, next_one, 0.0) / whole, 1.0) if whole > 0 else 1.0
+
+
+def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
+    """Number, ones (frames, 3) and middle of exposure (frames,) after the scan marker, of each of the first sweeps."""
+    recording = RunRecording(run)
+    found: list[tuple[int, Array, Array]] = []
+    for start in recording.runs:
+        binder = FrameBinder(plan)
+        parts: dict[int, list[tuple[Array, Array]]] = {}
+        for block in recording.blocks(start):
+            bound, _ = binder.bind(block)
+            ones = _ones(block)
+            for sweep in np.unique(bound.sweep[bound.sweep >= 0]).tolist():
+                here = bound.sweep == sweep
+                parts.setdefault(sweep, []).append((ones[here], _after_marker(bound.column[here], plan, sweep)))
+            if len(found) + len(parts) > MOST_SWEEPS:
+                break
+        for sweep, blocks in parts.items():
+            ones, middle_s = (np.concatenate(each) for each in zip(*blocks, strict=True))
+            found.append((sweep, ones, middle_s))
+    return found[:MOST_SWEEPS]
+
+
+def _ones(block: FrameBlock) -> Array:
+    """(frames, 3): 1s of each frame; those that are 1s of the next frame, too; and of the one after that.
+
+    NaN at the end of a block, and where the window has moved.
+    """
+    bits, x0 = block.bits, block.records["x0"]
+    ones = np.full((len(bits), 3), np.nan)
+    for apart in range(3):
+        n = len(bits) - apart
+        both = bits[:n] & bits[apart:]
+        ones[:n, apart] = np.bitwise_count(both).sum(axis=(1, 2), dtype=np.float64)
+        ones[:n, apart][x0[:n] != x0[apart:]] = np.nan
+    return ones
+
+
+def _after_marker(column: Array, plan: ScanPlan, sweep: int) -> Array:
+    """Time after the scan marker at which the mirror was due at fractional columns; undoes `ScanPlan.column`."""
+    leg = plan.leg(sweep)
+    done = column + 0.5 if leg.columns_rise else plan.places - 0.5 - column
+    after: Array = plan.lit_start_s(leg) + done * float(plan.column_s)
+    return after
+
+
+@dataclass(frozen=True, slots=True)
+class SyncAsked:
+    """exposures: per column, a speed each; none: those of `speeds_of`. accuracy_m: as for planes."""
+
+    exposures: tuple[int, ...] = ()
+    accuracy_m: float | None = None
+    at_m: float = AT_M
+    seed: int = 0
+    arm: bool = False
+
+
+def run_sync(
+    sources: ViewSources,
+    asked: SyncAsked,
+    *,
+    calibration: Path | None = None,
+    out: OutFolder = None,
+    tell: Tell | None = None,
+) -> CalibrationResult:
+    """Measure the lags. calibration: the file they go into, by default that of the live rig; without one nothing but
+    the figures is written. Raises Degenerate where the sweeps cannot tell, CalibrationError where the file cannot be
+    read or its line does not reach the distance asked.
+    """
+    live = sources.live
+    made_from = _own(live) if calibration is None else (calibration, load_rig_model(calibration))
+    base = None if made_from is None else made_from[1]
+    wanted = None if base is None else goal(sensitivity(base, asked.at_m), asked.accuracy_m, asked.at_m)
+    with Session(out) as session:
+        taken = Taken(session, tell)
+        take_kept(taken, sources, None)
+        gates = [gate_delay(run) for run in sources.recorded]
+        if live is not None:
+            gates.append(_scanned(live, asked, taken))
+        gate = min((one for one in gates if one is not None and one.sd_s > 0), key=lambda one: one.sd_s, default=None)
+        tell_stage("fitting", len(taken.views), unit="views")
+        fit = _fitted(taken, base)
+        given, changed = (None, None) if base is None else with_lags(base, fit)
+        verdict = judge_sync(fit, base, wanted, changed)
+        model = None if given is None else _signed(given, gate, verdict)
+        truth = None if live is None else true_model(live)
+        line = _line(fit)
+        summary = {"command": "sync", **_summary(fit, gate, verdict, truth), "versions": versions()}
+        figures = tuple(_figures(fit, gate, truth))
+        about = subject(taken.identity, None, summary["versions"], datetime.now(UTC))
+        written = session.finish(summary, sync_report(fit, verdict, line, figures, about), model, made_from)
+        return CalibrationResult(verdict, line, figures, summary, model, session.path, written)
+
+
+def _scanned(live: RigConfig, asked: SyncAsked, taken: Taken) -> GateDelay | None:
+    """Scan at every speed; the gate's delay comes from the fastest sweeps, which are recorded for it."""
+    speeds = asked.exposures or speeds_of(live)
+    gate = None
+    with TemporaryDirectory() as scratch:
+        for at, exposures in enumerate(speeds):
+            run = Path(scratch) / "run" if exposures == min(speeds) else None
+            name, seed = f"{exposures} exposures", asked.seed + at
+            with part(f"speed {at + 1} of {len(speeds)}"):
+                capture = capture_view(live, name, None, seed=seed, exposures=exposures, arm=asked.arm, out=run)
+            taken.add_capture(capture)
+            gate = gate if run is None else gate_delay(run)
+    return gate
+
+
+def _fitted(taken: Taken, base: RigModel | None) -> SyncFit:
+    known = (0.0, 0.0) if base is None else known_row_delay(base)
+    try:
+        return fit_sync([sweep for view in taken.views for sweep in view.passages], *known)
+    except Degenerate as refused:
+        raise Degenerate(refused.reason, f"{refused.reason}: {refused}") from refused
+
+
+def _own(live: RigConfig | None) -> Made | None:
+    if live is None or live.calibration is None:
+        return None
+    try:
+        return live.calibration, load_rig_model(live.calibration)
+    except CalibrationError:
+        return None  # what is wrong with it says the command that needs it
+
+
+def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigModel:
+    """The model with the lags found, the gate's delay and where they are from. It fails where they did."""
+    identity = model.identity
+    if identity is not None and not verdict.passed:
+        identity = replace(identity, verdict="failed", reasons=(*identity.reasons, *verdict.codes))
+    provenance = {
+        **model.provenance,
+        "sync": {
+            "by": "rig calibrate sync",
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+            "verdict": verdict.word,
+        },
+    }
+    return replace(
+        model,
+        gate_delay_s=model.gate_delay_s if gate is None else gate.delay_s,
+        identity=identity,
+        provenance=provenance,
+    )
+
+
+def _line(fit: SyncFit) -> str:
+    up, down = (
+        f"{lag * 1e6:.1f} us (sd {digits(sd * 1e6, 1)})" for lag, sd in zip(fit.lag_s, fit.sd_s[:2], strict=True)
+    )
+    return f"lag up {up}, down {down}" + (": their mean" if fit.common else "")
+
+
+def _summary(fit: SyncFit, gate: GateDelay | None, verdict: Verdict, truth: RigModel | None) -> dict[str, Any]:
+    sd = fit.sd_s
+    return {
+        "verdict": verdict.as_json(),
+        "lag_s": fit.lag_s._asdict(),
+        "lag_sd_s": {"forward": sd[0], "backward": sd[1]},
+        "row_delay_s": fit.row_delay_s,
+        "row_delay_sd_s": sd[2],
+        "gate_delay_s": None if gate is None else gate.delay_s,
+        "gate_delay_sd_s": None if gate is None else gate.sd_s,
+        "speed_range_per_s": fit.speed_range_per_s,
+        "common": fit.common,
+        "chi2": fit.chi2,
+        "freedom": fit.dof,
+        "noise": fit.noise,
+        "sweeps": [
+            {
+                "direction": sweep.direction,
+                "speed_per_s": sweep.speed_per_s,
+                "lag_s": sweep.lag_s,
+                "sd_s": sweep.sd_s,
+                "passages": sweep.passages,
+            }
+            for sweep in fit.sweeps
+        ],
+        "truth": None if truth is None else {"lag_s": truth.lag_s._asdict(), "row_delay_s": truth.row_delay_s},
+    }
+
+
+def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Sequence[tuple[str, str]]:
+    low, high = fit.speed_range_per_s
+    rows = [
+        ("row delay", f"{digits(fit.row_delay_s * 1e9)} ns a row, sd {digits(fit.sd_s[2] * 1e9, 2)}"),
+        ("speeds", f"{digits(low)} to {digits(high)} per second"),
+        ("sweeps", f"{len(fit.sweeps)}, chi2 {fit.chi2:.1f} of {fit.dof}"),
+    ]
+    if gate is not None:
+        rows.append(("gate", f"light follows it by {gate.delay_s * 1e6:.2f} us, sd {digits(gate.sd_s * 1e6, 2)}"))
+    if truth is not None:
+        lag = truth.lag_s
+        rows.append(("truth", f"lag {lag.forward * 1e6:.1f} us up, {lag.backward * 1e6:.1f} us down"))
+    return rows

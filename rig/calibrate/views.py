@@ -1,0 +1,358 @@
+"""Views that were taken, of whichever source: kept as they come, none of them twice, all of one rig.
+
+Views of a live rig, pose by pose: which poses, and until when.
+
+Views that need no live rig: those of earlier sessions, of recorded runs, and pictures.
+
+What is said of a view when it was taken.
+
+What is said where views make no calibration.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.board import Board
+from calibration.board.detect import find_corners
+from calibration.diagnosis.evidence import FEWEST_POSES, FEWEST_WHY
+from calibration.diagnosis.rig import judge_refused
+from calibration.errors import CalibrationError, Degenerate
+from calibration.files.camera_file import corners_digest
+from calibration.files.rig_file import load_rig_model
+from calibration.guide import Advice, candidates, rough_camera, sequence
+from calibration.model.camera import Camera
+from calibration.model.rig_model import Identity
+from calibration.rig_fit.state import FEWEST_PASSAGES, shows_line
+from calibration.views import View
+from rig.calibrate.capture import Ask, Capture, SpeedTurns, Tell, capture_recorded, capture_view, shown
+from rig.calibrate.session import BOARD_FILE, Session, load_views, session_board, session_rig
+from rig.calibrate.sources import VIEWS, ViewSources
+from rig.config.models import RigConfig
+from rig.devices.calibration_use import same_rig
+from rig.devices.open import open_rig
+from rig.errors import UsageError
+from rig.progress import part, tell_stage
+
+
+def told(view: View, refused: Degenerate | None) -> str:
+    """One line: what is seen in it, or why nothing is. refused: why there are no corners."""
+    if refused is not None:
+        return f"view {view.name}: {refused}"
+    parts = [] if view.corners is None else [f"{len(view.corners.ids)} corners"]
+    if view.passages:
+        counts = ", ".join(str(len(sweep.command)) for sweep in view.passages)
+        parts.append(f"{counts} passages of the line" + ("" if shows_line(view) else _too_few(view)))
+    return f"view {view.name}: {', '.join(parts) or 'neither corners nor passages'}"
+
+
+def _too_few(view: View) -> str:
+    """Why that is as good as none, and what to do about it."""
+    where = "" if view.corners is None else ", or hold the board where the line passes"
+    return (
+        f", too few to count (limit {FEWEST_PASSAGES} a sweep): the line does not stand out in single pixels; give it "
+        f"more exposures per column (2 to 5 do in a dark room) or more power{where}"
+    )
+
+
+class Taken:
+    """What was taken. views: all of them. refused: why some have no corners, by the view's name. identity: of the rig,
+    None: not known.
+    """
+
+    def __init__(self, session: Session, tell: Tell | None = None, of_camera: Collection[str] = ()) -> None:
+        """session: where views are kept; tell: is told of each; of_camera: `corners_digest` of the views that a camera
+        known from elsewhere was made of.
+        """
+        self.views: list[View] = []
+        self.refused: dict[str, Degenerate] = {}
+        self.identity: Identity | None = None
+        self._session = session
+        self.tell = tell
+        self._seen: dict[str, str] = {}
+        self._of_camera = of_camera
+
+    def add(
+        self,
+        view: View,
+        refused: Degenerate | None = None,
+        identity: Identity | None = None,
+        source: Path | None = None,
+    ) -> None:
+        """One more; a name that there is already gets a number. source: the file or run that it is from. UsageError for
+        one that there is already: it would count twice.
+        """
+        self._require_new(view, str(source or view.name))
+        if view.name in [known.name for known in self.views]:
+            view = replace(view, name=f"{view.name}-{len(self.views)}")
+        self.views.append(view)
+        if refused is not None:
+            self.refused[view.name] = refused
+        self._of_rig(identity)
+        self._session.add(view)
+        self.say(told(view, refused))
+
+    def say(self, line: str) -> None:
+        """Tell whoever listens."""
+        if self.tell is not None:
+            self.tell(line)
+
+    def _require_new(self, view: View, where: str) -> None:
+        if view.corners is None:
+            return
+        digest = corners_digest(view)
+        if digest in self._of_camera:
+            raise UsageError(
+                f"{where} holds a view that the camera was made of; a view must not count twice: give other views "
+                "(of a simulated rig: another --seed), or leave the camera out"
+            )
+        if digest in self._seen:
+            raise UsageError(
+                f"{where} holds the very corners of {self._seen[digest]}; a view must not count twice: name it once, "
+                "or show the board again"
+            )
+        self._seen[digest] = where
+
+    def _of_rig(self, identity: Identity | None) -> None:
+        if identity is None:
+            return
+        if self.identity is None:
+            self._session.note_rig(identity)
+        elif not same_rig(self.identity, identity):
+            raise UsageError(
+                f"views are of two rigs: {self.identity.name} ({_devices(self.identity)}) and {identity.name} "
+                f"({_devices(identity)}); calibrate each with its own"
+            )
+        self.identity = identity
+
+    def add_capture(self, capture: Capture, source: Path | None = None) -> None:
+        """The view of a scan, of a recorded one where a source is named."""
+        self.add(capture.view, capture.refused, capture.identity, source)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the pictures. UsageError where views are of different sizes."""
+        sizes = {view.picture.shape[::-1] for view in self.views if view.picture is not None}
+        if len(sizes) != 1:
+            named = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)) or "none"
+            raise UsageError(f"pictures of the views have sizes {named}; views of one sensor make a calibration")
+        width, height = sizes.pop()
+        return width, height
+
+
+def _devices(identity: Identity) -> str:
+    return ", ".join([*identity.kinds.values(), *identity.serials.values()])
+
+
+MISSED_SHARE = 0.5
+"""So many more poses than asked for are shown where the board is not found in some."""
+
+LASTING = (["wrong-board"] * 3, ["mirrored"] * 3)
+"""Why the first views of a session are refused where no pose of the board will change that."""
+
+
+class ChoosesPoses(Protocol):
+    """Says which pose to show next."""
+
+    def next(self, views: Sequence[View]) -> Advice | None:
+        """After these views; None: no more are needed."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class FixedPoses:
+    """Poses of a sequence that was chosen before."""
+
+    poses: Sequence[Advice]
+
+    def next(self, views: Sequence[View]) -> Advice | None:
+        """The one that follows."""
+        return self.poses[len(views)] if len(views) < len(self.poses) else None
+
+
+def require_poses(taken: Taken, poses: int) -> None:
+    """UsageError where so many poses of a live rig, and the views there are, can never pass, whatever they show."""
+    there = sum(view.corners is not None for view in taken.views)
+    if there + poses < FEWEST_POSES:
+        beside = f" and {there} view{'s' * (there > 1)} taken before" if there else ""
+        raise UsageError(
+            f"poses is {poses}{beside}; {FEWEST_POSES} {FEWEST_WHY}: ask for {FEWEST_POSES - there} or more"
+        )
+
+
+def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> FixedPoses:
+    """Poses that tell most about any rig, and a few more for those in which the board is missed.
+
+    behind: so many of the sequence were shown before, by an earlier session: the next tell more than the same again.
+    """
+    choices = candidates(first_camera(config), board, config.scan.depth_range)
+    if not choices:
+        raise UsageError(f"no pose of a board of {board.size_m[0]:g} x {board.size_m[1]:g} m fits the picture within "
+                         f"scan.depth_range; use a smaller board or widen the range")  # fmt: skip
+    chosen = sequence(choices, behind + poses + math.ceil(MISSED_SHARE * poses), seed)
+    return FixedPoses([Advice(candidate, at_m) for candidate in chosen[behind:]])
+
+
+def first_camera(config: RigConfig) -> Camera:
+    """A camera to place boards with: that of the config's calibration, else a rough one of the sensor's size."""
+    if config.calibration is not None:
+        try:
+            return load_rig_model(config.calibration).camera
+        except CalibrationError:
+            pass  # it is about to be replaced
+    with open_rig(config.model_copy(update={"calibration": None})) as rig:
+        return rough_camera((rig.spad.info.width, rig.spad.info.height))
+
+
+@dataclass(frozen=True, slots=True)
+class Live:
+    """How a live rig takes views. poses: good ones wanted; choose: which. ask: gets a person to move the board.
+
+    exposures: per column, by turns, so that the mirror is seen at several speeds; those that it cannot do are left out,
+    and those that never show the line where more exposures do; none: as the config says. line: whether it is to be seen
+    on the board. defects: (rows, width), pixels not to be used. seed: of everything simulated.
+    """
+
+    config: RigConfig
+    poses: int
+    choose: ChoosesPoses
+    ask: Ask | None = None
+    exposures: Sequence[int] = ()
+    seed: int = 0
+    arm: bool = False
+    defects: NDArray[np.bool_] | None = None
+    line: bool = True
+
+    def sees(self, capture: Capture) -> bool:
+        """Whether a capture has what it was taken for."""
+        return capture.refused is None and (not self.line or shows_line(capture.view))
+
+
+def take_live(taken: Taken, live: Live, board: Board) -> None:
+    """Take views of a board that is moved from pose to pose."""
+    good, seen, reasons = 0, list[View](), list[str]()
+    speeds = SpeedTurns(live.exposures, live.sees, taken.tell)
+    while good < live.poses and len(seen) < live.poses + math.ceil(MISSED_SHARE * live.poses):
+        advice = live.choose.next(seen)
+        if advice is None:
+            return
+        config = shown(
+            live.config, f"pose {good + 1} of {live.poses}: {advice}", advice.candidate, live.ask, taken.tell
+        )
+        with part(f"pose {good + 1} of {live.poses}"):
+            capture = speeds.capture(good, partial(_scan, taken, live, config, board))
+        taken.add_capture(capture)
+        seen.append(capture.view)
+        good += live.sees(capture)
+        reasons.append("" if capture.refused is None else capture.refused.reason)
+        if reasons in LASTING:
+            taken.say(f"{len(reasons)} views are {reasons[0]}, which no other pose will change: no more are taken")
+            return
+
+
+def _scan(taken: Taken, live: Live, config: RigConfig, board: Board, exposures: int | None) -> Capture:
+    """One view of the board as it stands."""
+    at = len(taken.views)
+    return capture_view(
+        config, f"{at:03d}", board, seed=live.seed + at, exposures=exposures, arm=live.arm, defects=live.defects
+    )
+
+
+def take_kept(
+    taken: Taken, sources: ViewSources, board: Board | None, defects: NDArray[np.bool_] | None = None
+) -> None:
+    """Take the views that need no live rig. board: None where nothing moves and none is looked for.
+
+    defects: (rows, width), pixels not to be used.
+    """
+    for note in sources.notes:
+        taken.say(note)
+    for folder in sources.sessions:
+        _require_alike(folder, board)
+        identity = session_rig(folder)
+        for view in load_views(folder / VIEWS):
+            taken.add(view, None, identity, folder / VIEWS / view.name)
+    for number, run in enumerate(sources.recorded, 1):
+        with part(f"run {number} of {len(sources.recorded)}"):
+            taken.add_capture(capture_recorded(run, run.name, board, defects=defects), run)
+    for done, file in enumerate(sources.pictures):
+        tell_stage("finding the board", done, len(sources.pictures), "pictures")
+        taken.add(*_pictured(file, board), source=file)
+
+
+def _require_alike(folder: Path, board: Board | None) -> None:
+    """UsageError where a session's views do not show what is looked for. The squares' side may be another now: it is
+    what is corrected where it was measured wrong.
+    """
+    known = session_board(folder)
+    if known is None:
+        return
+    if board is None:
+        raise UsageError(
+            f"{folder} holds views of a board that was moved, lags are told by what stands still; name a rig, runs of "
+            "one unmoved scene, or the folder of an earlier 'rig calibrate sync'"
+        )
+    if _print(known) != _print(board):
+        raise UsageError(
+            f"{folder} holds views of a {_print(known)}, looked for is a {_print(board)}; name the board that was "
+            f"shown: --board {folder / BOARD_FILE}"
+        )
+
+
+def _print(board: Board) -> str:
+    of = "" if board.dictionary is None else f" of {board.dictionary}"
+    return f"{board.kind} board of {board.squares[0]} x {board.squares[1]} squares{of}"
+
+
+def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]:
+    """A picture of the board, taken with anything."""
+    pixels = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if pixels is None:
+        raise UsageError(f"{file} cannot be read as a picture; convert it to PNG")
+    picture = np.asarray(pixels, np.float32)
+    try:
+        corners = None if board is None else find_corners(np.asarray(pixels), board)
+        return View(file.name, corners, (), picture), None
+    except Degenerate as error:
+        return View(file.name, None, (), picture), error
+
+
+def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = True, line: bool = True) -> Degenerate:
+    """The root cause; as notes what the fit said, the other reasons, and what was wrong with single views unless that
+    was told when they were taken.
+
+    photons: whether the pictures count photons; those from files do not. line: whether it was to be seen, or a camera
+    alone was asked for.
+    """
+    refused = _of_views(refused, taken)
+    reasons = judge_refused(refused, taken.views, board, taken.size, photons=photons, line=line).reasons
+    error = Degenerate(reasons[0].code, str(reasons[0]))
+    if str(refused) not in str(error):
+        error.add_note(f"{refused.reason}: {refused}")
+    for reason in reasons[1:]:
+        if reason.text != str(refused):
+            error.add_note(str(reason))
+    note_views(error, taken)
+    return error
+
+
+def note_views(error: Degenerate, taken: Taken) -> None:
+    """Add what was wrong with single views, unless that was told when they were taken."""
+    for name, why in taken.refused.items() if taken.tell is None else ():
+        error.add_note(f"view {name}: {why}")
+
+
+def _of_views(refused: Degenerate, taken: Taken) -> Degenerate:
+    """Why most views have no board, where that is why there is no model."""
+    if refused.reason != "no-board" or not taken.refused:
+        return refused
+    (reason, _), *_ = Counter(why.reason for why in taken.refused.values()).most_common()
+    return Degenerate(reason, f"none of {len(taken.views)} views shows the board as it should")

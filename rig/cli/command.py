@@ -1,0 +1,192 @@
+"""What all commands have in common: their errors become lines and exit codes, their results text or one JSON object."""
+
+import errno
+import functools
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
+
+import typer
+
+from rig.cli.completion import estimator_names, filter_names, one_of, rig_names, scene_names
+
+if TYPE_CHECKING:
+    from rig.recording.segment import Space
+    from rig.scan.run import RunResult
+
+EXIT_USAGE = 2
+EXIT_DEVICE = 3
+EXIT_ABORTED = 4
+EXIT_SOFTWARE = 70
+"""An error in the program itself: EX_SOFTWARE of sysexits.h."""
+
+P = ParamSpec("P")
+
+ConfigArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="[CONFIG]",
+        help="a bundled rig's name or a YAML file",
+        show_default=True,
+        autocompletion=one_of(rig_names),
+    ),
+]
+SceneOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scene",
+        help="a bundled scene, a scene file or a folder (simulated rigs)",
+        show_default=False,
+        autocompletion=one_of(scene_names),
+    ),
+]
+EstimatorOption = Annotated[
+    str | None,
+    typer.Option(
+        "--estimator",
+        help="argmax, edge, likelihood or joint",
+        show_default=False,
+        autocompletion=one_of(estimator_names),
+    ),
+]
+FilterOption = Annotated[
+    str | None,
+    typer.Option("--filter", help="none or median (5 x 5)", show_default=False, autocompletion=one_of(filter_names)),
+]
+ConfidenceOption = Annotated[
+    float | None,
+    typer.Option("--min-confidence", help="answers below this do not enter the depth map", show_default=False),
+]
+OutOption = Annotated[
+    Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="runs/DATE-TIME")
+]
+RecordOption = Annotated[bool, typer.Option("--record", help="write the frames into the folder too")]
+ArmOption = Annotated[bool, typer.Option("--arm", help="let a real laser shine: the beam path is clear")]
+AcceptOption = Annotated[
+    bool, typer.Option("--accept-calibration", help="use a calibration of another rig, failed or too old, all the same")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON object to stdout, errors too")]
+
+
+def command(function: Callable[P, int | None]) -> Callable[P, None]:
+    """Turns what a command raises for its user's mistakes and its devices' faults into lines and exit codes."""
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            code = function(*args, **kwargs)
+        except KeyboardInterrupt as interrupt:
+            code = fail(EXIT_ABORTED, [], ["aborted", *getattr(interrupt, "__notes__", [])], kwargs.get("as_json"))
+        except Exception as error:
+            refused = refused_file(error)
+            code = EXIT_USAGE if refused else _code_of(error)
+            if code is None:
+                raise
+            fail(code, (refused or str(error)).splitlines(), getattr(error, "__notes__", []), kwargs.get("as_json"))
+        raise typer.Exit(code or 0)
+
+    return wrapped
+
+
+def refused_file(error: BaseException) -> str | None:
+    """One line about a file or disk that the system refused to a command; None for every other error."""
+    if not isinstance(error, OSError) or (error.filename is None and error.errno not in _STEPS):
+        return None
+    step = _STEPS.get(error.errno or 0, "check the path")
+    path = "the disk" if error.filename is None else os.fsdecode(error.filename)
+    return f"cannot use {path}: {error.strerror}; {step}"
+
+
+_STEPS = {
+    errno.EACCES: "ask its owner for permission, or name another path",
+    errno.EPERM: "ask its owner for permission, or name another path",
+    errno.ENAMETOOLONG: "name a shorter path",
+    errno.EROFS: "name a folder on a disk that can be written",
+    errno.ENOSPC: "free some space, or name a folder on another disk",
+    errno.EDQUOT: "free some space, or name a folder on another disk",
+}
+
+
+def fail(code: int, problems: Sequence[str], notes: Sequence[str], as_json: object) -> int:
+    """Say why a command has no result, to people on stderr and to programs as its one JSON object; returns the code."""
+    for problem in problems:
+        say(f"error: {problem}")
+    for note in notes:
+        say(note)
+    if as_json:
+        print_json({"error": {"code": code, "problems": [*problems, *notes]}})
+    return code
+
+
+def _code_of(error: Exception) -> int | None:
+    from calibration.errors import CalibrationError
+    from drivers.errors import DeviceError
+    from rig.errors import RigError
+
+    if isinstance(error, RigError):
+        return error.exit_code
+    if isinstance(error, CalibrationError):
+        return EXIT_USAGE
+    return EXIT_DEVICE if isinstance(error, DeviceError) else None
+
+
+def report(result: "RunResult", as_json: bool) -> int:
+    """Print a run's summary, for programs or people; its exit code."""
+    from rig.run_folder.summary import RunVerdict
+
+    if result.summary.valid_fraction == 0 and result.summary.verdict is not RunVerdict.UNCALIBRATED:
+        say("warning: no pixel has a depth; raise --exposures, lower --min-confidence or check the depth range")
+    if as_json:
+        print_json(result.summary.as_json())
+    else:
+        from rig.cli.tables import run_table
+
+        run_table(result)
+    return result.summary.verdict.exit_code
+
+
+def print_json(content: Mapping[str, Any]) -> None:
+    """The one JSON object of a command, to stdout."""
+    from rig.run_folder.folder import json_text
+
+    print(json_text(content))
+
+
+def say_space(space: "Space") -> None:
+    """What a recording will take on the disk, before it begins."""
+    say(f"recording: {space}")
+
+
+def split_option(option: str, given: list[str] | None) -> list[str]:
+    """The parts of an option that may be given several times and with commas; UsageError where it names nothing."""
+    from rig.errors import UsageError
+
+    parts = (part.strip() for value in given or () for part in value.split(","))
+    named = list(dict.fromkeys(part for part in parts if part))
+    if given and not named:
+        raise UsageError(f"{option} is empty; name one or several with commas between them, or leave {option} out")
+    return named
+
+
+def whole_numbers(option: str, given: list[str] | None) -> list[int]:
+    """The same of an option that takes whole numbers."""
+    from rig.errors import UsageError
+
+    parts = split_option(option, given)
+    wrong = [part for part in parts if not part.isdecimal()]
+    if wrong:
+        raise UsageError(f"{option} has {wrong[0]!r}, which is no whole number; write e.g. {option} 1,3,10")
+    return [int(part) for part in parts]
+
+
+def default_out() -> Path:
+    """Where a run is written that names no folder."""
+    return Path("runs") / datetime.now().strftime("%Y%m%d-%H%M%S")
+
+
+def say(line: str) -> None:
+    """A line for people, to stderr."""
+    print(line, file=sys.stderr, flush=True)

@@ -1,0 +1,56 @@
+"""The names that a shell completes at Tab: bundled rigs and scenes, estimators, filters.
+
+Where no name fits, the shell completes files. Names come without the sentences of `rig scenes`: fish takes the second
+line of a long one for another name.
+"""
+
+from collections.abc import Callable, Iterable
+
+Names = Callable[[], Iterable[str]]
+
+
+def rig_names() -> Iterable[str]:
+    """The bundled rigs."""
+    from rig.config.bundled import bundled_rigs
+
+    return (one.name for one in bundled_rigs())
+
+
+def scene_names() -> Iterable[str]:
+    """The bundled scenes."""
+    from rig.config.bundled import bundled_scenes
+
+    return (one.name for one in bundled_scenes())
+
+
+def estimator_names() -> Iterable[str]:
+    """The estimators."""
+    from rig.estimate.registry import ESTIMATORS
+
+    return ESTIMATORS
+
+
+def filter_names() -> Iterable[str]:
+    """The filters."""
+    from rig.estimate.registry import FILTERS
+
+    return FILTERS
+
+
+def one_of(names: Names) -> Callable[[str], list[str]]:
+    """Completes a value that is one of `names`."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [name for name in names() if name.startswith(incomplete)]
+
+    return complete
+
+
+def some_of(names: Names) -> Callable[[str], list[str]]:
+    """Completes the last of several `names` with commas between them."""
+
+    def complete(incomplete: str) -> list[str]:
+        before, comma, last = incomplete.rpartition(",")
+        return [before + comma + name for name in one_of(names)(last)]
+
+    return complete

@@ -1,0 +1,200 @@
+"""The command line: its entry point; the commands are in `rig/cli_*.py`.
+
+Each command is one call of `rig.api` and some printing. Results go to stdout, everything else to stderr. Exit codes:
+0 done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted, 70 an error in the program itself.
+Nothing heavy is imported before a command runs.
+
+Where numba keeps compiled kernels when neither the package's folder nor the user's own can be written.
+
+Service accounts and containers often have neither, and numba then refuses to compile at all.
+"""
+
+import logging
+import os
+import signal
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli import bench, calibrate, devices, recordings, replay, scan, tradeoff
+from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, fail, refused_file, say
+
+VARIABLE = "NUMBA_CACHE_DIR"
+"""Numba's own setting, see its manual; a value that the user has set is left alone."""
+
+
+def ensure_kernel_cache() -> None:
+    """Name a private temporary folder to numba where it would find none; to be called before numba is imported."""
+    package = Path(__file__).parent
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+    if VARIABLE in os.environ or _writable(package / "__pycache__") or _writable(home):
+        return
+    os.environ[VARIABLE] = str(_private_folder())
+
+
+def _writable(folder: Path) -> bool:
+    """Whether the folder, or the nearest one above it that exists, can be written."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK)
+
+
+def _private_folder() -> Path:
+    """A folder that only this user can write: kernels are code, and temporary folders are everybody's."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = Path(tempfile.gettempdir()) / f"spadrig-kernels-{user}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    seen = folder.lstat()
+    if hasattr(os, "getuid") and (seen.st_uid != user or seen.st_mode & 0o077 or folder.is_symlink()):
+        return Path(tempfile.mkdtemp(prefix="spadrig-kernels-"))
+    return folder
+
+
+_ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
+"""Signals that end a program, beside Ctrl-C; no system has all of them."""
+_TYPER_INTERRUPTED = 130
+"""What typer returns where an interrupt reaches it."""
+
+app = typer.Typer(
+    name="rig",
+    help="Runs a single-photon structured-light scanner and returns depth through fog, rain and snow.",
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},  # of every command below as well
+)
+# In the order in which '--help' lists them; groups come last.
+for _register in (
+    devices.register_config,
+    recordings.register,
+    recordings.register_exchange,
+    replay.register,
+    scan.register,
+    tradeoff.register,
+    calibrate.register,
+    devices.register,
+    bench.register,
+):
+    _register(app)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of `rig`; ends the process with the exit code."""
+    arguments = _join_save(list(sys.argv[1:] if argv is None else argv))
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(levelname)s: %(message)s")
+    ensure_kernel_cache()
+    with _signals_interrupt():
+        try:
+            _require_no_empty(arguments)
+            code = app(args=arguments, prog_name="rig", standalone_mode=False)
+        except (KeyboardInterrupt, Exception) as error:
+            code = _say_why(error, arguments)
+        if code == _TYPER_INTERRUPTED:  # before a command had begun, or once more while one ended
+            code = fail(EXIT_ABORTED, [], ["aborted"], "--json" in arguments)
+    if argv is None and code == EXIT_ABORTED:
+        _ignore_interrupts()
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _ignore_interrupts() -> None:
+    """Let this process, over but for its threads, end with its exit code, however often it is interrupted."""
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGINT", *_ENDING):
+            if (number := getattr(signal, name, None)) is not None:
+                signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
+def _signals_interrupt() -> Iterator[None]:
+    """Let the signals that end a program raise KeyboardInterrupt, so that they make the rig safe as Ctrl-C does.
+
+    One that is ignored (nohup) stays ignored; threads other than the main one get none.
+    """
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for name in _ENDING:
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+                before[number] = signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _say_why(error: BaseException, arguments: list[str]) -> int:
+    """Say what ended a command that did not handle it: a usage error of click's, an interrupt or a mistake of ours."""
+    as_json = "--json" in arguments
+    if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
+        return _TYPER_INTERRUPTED
+    refused = refused_file(error)  # the shell's start-up files, by --install-completion
+    if refused is not None:
+        return fail(EXIT_USAGE, [refused], [], as_json)
+    # Typer carries click inside or beside itself, depending on its version.
+    if not hasattr(error, "format_message"):
+        traceback.print_exception(error)
+        return fail(EXIT_SOFTWARE, [f"the program failed with {type(error).__name__}: {error}; report it"], [], as_json)
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context is not None else "rig"
+    message = error.format_message().rstrip(".")
+    # What an error tells of its option's type differs between versions, these words do not.
+    steps = (
+        ("valid integer", "write a whole number or "),
+        ("valid float", "write a number or "),
+        ("valid number", "write a number or "),
+    )
+    wanted = next((step for words, step in steps if words in message), "")
+    names = getattr(getattr(error, "param", None), "opts", ())
+    given = [value for name in names for value in _values(name, arguments)]
+    if given and not any(value in message for value in given):
+        message = message.replace("Invalid value", f"Invalid value {given[-1]!r}", 1)
+    return fail(EXIT_USAGE, [f"{message}; {wanted}see '{command} --help'"], [], as_json)
+
+
+def _values(option: str, arguments: list[str]) -> list[str]:
+    """What the command line gives an option."""
+    after = [value for name, value in pairwise(arguments) if name == option]
+    return after + [word.removeprefix(f"{option}=") for word in arguments if word.startswith(f"{option}=")]
+
+
+def _require_no_empty(arguments: list[str]) -> None:
+    """UsageError for an argument without a character: a shell's variable that is not set, which would mean '.'."""
+    for before, word in pairwise(["rig", *arguments]):
+        if not word or (word.startswith("--") and word.endswith("=")):
+            place = f"the argument behind '{before}'" if not word else f"'{word}'"
+            raise typer.BadParameter(f"{place} is empty; give it a value or leave it out")
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="print the version and exit", is_eager=True)] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as installed
+
+        print(f"spadrig {installed('spadrig')}")
+        raise typer.Exit(0)
+    if context.invoked_subcommand is None:
+        say(context.get_help())
+        raise typer.Exit(EXIT_USAGE)
+
+
+def _join_save(arguments: list[str]) -> list[str]:
+    """`--save every 5` as one value, which is what an option takes."""
+    for i in range(len(arguments) - 2):
+        if arguments[i : i + 2] == ["--save", "every"]:
+            return [*arguments[: i + 1], f"every {arguments[i + 2]}", *arguments[i + 3 :]]
+    return arguments

@@ -1,0 +1,257 @@
+"""Commands for recordings: `rig verify`, `repair`, `info`, `cut`, `compress`.
+
+Commands that take frames from other programs and give runs to them: `rig import`, `rig export`.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.command import JsonOption, command, print_json, say
+from rig.cli.progress import progress
+
+if TYPE_CHECKING:
+    from rig.recording.open import RecordingInfo
+    from rig.recording.verify import Verification
+
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a recorded run", show_default=False)]
+
+MOST_LINES = 20
+"""Problems shown to people; `--json` has all."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    for name, function in (
+        ("verify", verify_command),
+        ("repair", repair_command),
+        ("info", info_command),
+        ("cut", cut_command),
+        ("compress", compress_command),
+    ):
+        app.command(name)(command(function))
+
+
+def verify_command(run: RunArgument, as_json: JsonOption = False) -> int:
+    """Read every byte of a recording and say whether it is what was recorded; exit code 1 where it is not."""
+    from rig import api
+
+    with progress(compiles=False):
+        found = api.verify(run)
+    if as_json:
+        print_json(found.as_json())
+    else:
+        _show_verification(found)
+    return found.exit_code
+
+
+def repair_command(run: RunArgument, as_json: JsonOption = False) -> int:
+    """Make a torn recording whole: cut torn tails off, write a lost index or manifest anew; frames stay as they are."""
+    from rig import api
+
+    with progress(compiles=False):
+        made = api.repair(run)
+    if as_json:
+        print_json({"done": made.done, "after": made.after.as_json()})
+    else:
+        for line in made.done or ["nothing was to be done"]:
+            print(line)
+        _show_verification(made.after)
+    return made.after.exit_code
+
+
+def info_command(run: RunArgument, as_json: JsonOption = False) -> int:
+    """What a recording holds."""
+    from rig import api
+
+    found = api.recording_info(run)
+    if as_json:
+        print_json(found.as_json())
+    else:
+        _show_info(found)
+    return 0
+
+
+def cut_command(
+    run: RunArgument,
+    out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
+    maps: Annotated[
+        str | None, typer.Option("--maps", metavar="A:B", help="maps A to before B, from 0", show_default=False)
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option("--frames", metavar="A:B", help="frames A to before B", show_default=False)
+    ] = None,
+    time: Annotated[
+        str | None,
+        typer.Option("--time", metavar="A:B", help="seconds A to B from the first frame", show_default=False),
+    ] = None,
+    start: Annotated[int, typer.Option("--start", help="of --frames and --time: which start of the SPAD, from 0")] = 0,
+    as_json: JsonOption = False,
+) -> int:
+    """Write a part of a recording to a folder of its own, with all that is needed to reconstruct it."""
+    from rig import api
+
+    with progress(compiles=False):
+        content = api.cut(run, out, maps=maps, frames=frames, time=time, start=start)
+    if as_json:
+        print_json({"out": str(out), "recording": content["recording"], "cut": content["cut"]})
+    else:
+        first, end = content["cut"]["maps"]
+        held = f"maps {first} to before {end}" if end > first else "no whole map"
+        print(f"{out}: {content['recording']['blocks']} blocks, {held}")
+    return 0
+
+
+def compress_command(run: RunArgument, as_json: JsonOption = False) -> int:
+    """Compress a recording with zstd; every command reads it as before."""
+    from rig import api
+
+    with progress(compiles=False):
+        made = api.compress(run)
+    if as_json:
+        print_json({"segments": made.segments, "bytes_before": made.bytes_before, "bytes_after": made.bytes_after})
+    else:
+        share = made.bytes_after / max(1, made.bytes_before)
+        print(f"{made.segments} segments, {_megabytes(made.bytes_after)} ({share:.0%} of before)")
+    return 0
+
+
+def _show_verification(found: "Verification") -> None:
+    for line in found.problems[:MOST_LINES]:
+        say(line)
+    if len(found.problems) > MOST_LINES:
+        say(f"and {len(found.problems) - MOST_LINES} more")
+    for run, first, last in found.gaps[:MOST_LINES]:
+        say(f"start {run}: frames {first} to {last} were lost")
+    if found.ended is not None:
+        say(f"the recording ended before the run: {found.ended}")
+    print(f"{found.frames} frames in {found.blocks} blocks of {found.segments} segments are sound, {found.lost} lost")
+    print(f"{found.verdict.value}: {_ADVICE[found.verdict.value]}")
+
+
+_ADVICE = {
+    "intact": "every frame that was recorded is there",
+    "gaps": "whole with gaps; frames were lost, and every other one is there",
+    "unfinished": "the recording is not over, or was cut short; 'rig repair' ends it behind its last whole block",
+    "damaged": "not all is there that was recorded; 'rig repair' keeps what is sound",
+}
+
+
+def _show_info(found: "RecordingInfo") -> None:
+    packed = f", {found.compressed} compressed" if found.compressed else ""
+    print(f"{found.folder}: run {found.verdict or 'of unknown verdict'}, {found.maps} maps, {found.frames} frames")
+    print(f"{found.segments} segments{packed}, {found.blocks} blocks, {_megabytes(found.bytes)}")
+    for number, run in enumerate(found.runs):
+        rate = "triggered from outside" if run.frame_rate_hz is None else f"{run.frame_rate_hz:.6g} Hz"
+        maps = "no whole map" if run.first_map is None else f"maps {run.first_map} to {(run.end_map or 0) - 1}"
+        gaps = f", {run.gaps} gaps of {run.lost} frames" if run.gaps else ""
+        print(
+            f"start {number}: frames {run.first_frame} to {run.end_frame - 1}{gaps}, {run.width} x {run.height} of "
+            f"{run.sensor_width} x {run.sensor_height}, {rate}, {run.duration_s:.6g} s, {maps}"
+        )
+    for slot, name in found.devices.items():
+        print(f"{slot}: {name}")
+    for line in found.problems:
+        say(line)
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:.1f} MB"
+
+
+def register_exchange(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    app.command("import")(import_command)
+    app.command("export")(export_command)
+
+
+@command
+def import_command(
+    kind: Annotated[
+        str, typer.Argument(metavar="KIND", help="pi-imaging, swissspad2 or photoncube", show_default=False)
+    ],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILES", help="files in order, or folders of them", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
+    form: Annotated[
+        str | None,
+        typer.Option(
+            "--form",
+            help="pi-imaging: packed or sparse; swissspad2: half or full; photoncube: packed",
+            show_default="as the file looks; half",
+        ),
+    ] = None,
+    frame_rate: Annotated[
+        str | None,
+        typer.Option("--frame-rate", metavar="RATE", help='such as "97.7 kHz"', show_default="not known"),
+    ] = None,
+    rotate: Annotated[
+        int | None,
+        typer.Option(
+            "--rotate",
+            metavar="DEGREES",
+            help="turn frames counter-clockwise by 0, 90, 180 or 270",
+            show_default="90 for pi-imaging, as its driver does, else 0",
+        ),
+    ] = None,
+    rows: Annotated[
+        int | None, typer.Option("--rows", help="pi-imaging: 512, or 1024 of the 1M sensor", show_default="512")
+    ] = None,
+    as_json: JsonOption = False,
+) -> int:
+    """Make a recording of the frames in another program's files."""
+    from rig import api
+
+    with progress(compiles=False):
+        result = api.import_frames(kind, files, out, form=form, frame_rate=frame_rate, turn_deg=rotate, rows=rows)
+    for hint in result.hints:
+        say(f"warning: {hint}")
+    if as_json:
+        print_json(result.as_json())
+    else:
+        rate = "no frame rate" if result.frame_rate_hz is None else f"{result.frame_rate_hz:g} Hz"
+        print(f"{result.frames} frames of {result.width} x {result.height} pixels, {rate}: {result.folder}")
+        for first, last in result.gaps:
+            print(f"frames {first} to {last} are missing")
+    return 0
+
+
+@command
+def export_command(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run", show_default=False)],
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="npy, hdf5, ply, png or mp4", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="RUN-KIND")
+    ] = None,
+    view: Annotated[
+        str | None,
+        typer.Option(
+            "--view",
+            help="png, mp4: depth, intensity or frames (sums of recorded frames)",
+            show_default="the first of them that there is",
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option("--frames", help="frames summed for a picture of view frames", show_default="100")
+    ] = None,
+    fps: Annotated[float | None, typer.Option("--fps", help="pictures of a film a second", show_default="25")] = None,
+    as_json: JsonOption = False,
+) -> int:
+    """Write a run in a form that other programs read."""
+    from rig import api
+
+    with progress(compiles=False):
+        result = api.export_run(run, kind, out=out, view=view, frames_per_picture=frames, pictures_per_s=fps)
+    for line in result.damage:
+        say(f"warning: {line}")
+    if as_json:
+        print_json(result.as_json())
+    else:
+        what = [f"{n} {name}" for n, name in ((result.frames, "frames"), (result.maps, "maps")) if n]
+        files = ", ".join(result.files) if len(result.files) <= 3 else f"{len(result.files)} files"
+        print(f"{' and '.join(what)} as {files}: {result.folder}")
+        for _, first, last in result.gaps:
+            print(f"frames {first} to {last} are missing")
+    return result.exit_code

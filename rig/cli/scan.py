@@ -1,0 +1,194 @@
+"""Commands that make depth maps, and what to expect of a scene: `rig scan`, `reconstruct`, `effects`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli.command import (
+    AcceptOption,
+    ArmOption,
+    ConfidenceOption,
+    ConfigArgument,
+    EstimatorOption,
+    FilterOption,
+    JsonOption,
+    OutOption,
+    RecordOption,
+    SceneOption,
+    command,
+    default_out,
+    print_json,
+    report,
+    say_space,
+)
+from rig.cli.completion import one_of, rig_names
+from rig.cli.progress import progress
+
+if TYPE_CHECKING:
+    from rig.plan.scan_plan import ScanPlan
+    from rig.recording.segment import Space
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `app`."""
+    app.command("scan")(scan_command)
+    app.command("reconstruct")(reconstruct_command)
+    app.command("effects")(effects_command)
+
+
+@command
+def scan_command(
+    config: ConfigArgument = "simulated",
+    scene: SceneOption = None,
+    maps: Annotated[int, typer.Option("--maps", help="depth maps to take")] = 1,
+    exposures: Annotated[
+        int | None, typer.Option("--exposures", help="frames per column (K)", show_default=False)
+    ] = None,
+    estimator: EstimatorOption = None,
+    filter: FilterOption = None,
+    min_confidence: ConfidenceOption = None,
+    temporal_prior: Annotated[
+        bool | None,
+        typer.Option(
+            "--temporal-prior/--no-temporal-prior",
+            help="joint: hold each map to the last one a little",
+            show_default=False,
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", help="of everything simulated")] = 0,
+    save: Annotated[str, typer.Option("--save", help="maps to write: all, last or every N")] = "all",
+    out: OutOption = None,
+    record: RecordOption = False,
+    on_overload: Annotated[
+        str, typer.Option("--on-overload", help="frames come too fast: abort, drop (and count) or block (wait)")
+    ] = "abort",
+    arm: ArmOption = False,
+    accept_calibration: AcceptOption = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="compile and print the plan; nothing moves")] = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Acquire and reconstruct depth maps."""
+    from rig import api
+
+    options: dict[str, Any] = {
+        "scene": scene,
+        "exposures": exposures,
+        "estimator": estimator,
+        "filter": filter,
+        "min_confidence": min_confidence,
+        "temporal_prior": temporal_prior,
+    }
+    out = default_out() if out is None else out
+    if dry_run:
+        checked: dict[str, Any] = {"maps": maps, "seed": seed, "save": save, "on_overload": on_overload}
+        checked |= {"out": out, "record": record, "accept_calibration": accept_calibration}
+        spaces: list[Space] = []
+        plan = api.plan_scan(config, on_space=spaces.append, **checked, **options)
+        return _show_plan(plan, spaces[0] if spaces else None, as_json)
+    with progress():
+        result = api.scan(
+            config,
+            maps=maps,
+            seed=seed,
+            save=save,
+            arm=arm,
+            out=out,
+            record=record,
+            on_overload=on_overload,
+            on_space=say_space,
+            accept_calibration=accept_calibration,
+            **options,
+        )
+    return report(result, as_json)
+
+
+def _show_plan(plan: "ScanPlan", space: "Space | None", as_json: bool) -> int:
+    from rig.plan.describe import plan_content, plan_text
+
+    if as_json:
+        recording = {} if space is None else {"recording": space.content()}
+        print_json({"plan": plan_content(plan), **recording})
+    else:
+        print(plan_text(plan))
+        if space is not None:
+            print(f"recording   {space}")
+    return 0
+
+
+@command
+def reconstruct_command(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN_OR_NPY", help="a run taken with --record, or imported or packed frames", show_default=False
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
+    plan: Annotated[
+        Path | None, typer.Option("--plan", help="plan.yaml of frames alone", show_default="the recording's own")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="calibration.yaml", show_default="the recording's own")
+    ] = None,
+    estimator: EstimatorOption = None,
+    filter: FilterOption = None,
+    min_confidence: ConfidenceOption = None,
+    accept_calibration: AcceptOption = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Depth from a recording, from imported frames or from a packed .npy cube of them."""
+    from rig import api
+
+    # Names that are none are refused by the call, which knows which there are.
+    options: dict[str, Any] = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
+    options["accept_calibration"] = accept_calibration
+    with progress():
+        result = api.reconstruct(source, plan, calibration, out=out, **options)
+    return report(result, as_json)
+
+
+@command
+def effects_command(
+    config: ConfigArgument = "simulated",
+    config_option: Annotated[
+        str | None,
+        typer.Option(
+            "--config",
+            metavar="CONFIG",
+            help="the same as CONFIG",
+            show_default=False,
+            autocompletion=one_of(rig_names),
+        ),
+    ] = None,
+    scene: SceneOption = None,
+    trials: Annotated[
+        bool, typer.Option(help="measure by how much each effect changes the stripe error, in short scans")
+    ] = True,
+    row: Annotated[
+        int | None, typer.Option("--row", help="with --column: noise-free flux of this image row", show_default=False)
+    ] = None,
+    column: Annotated[
+        int | None, typer.Option("--column", help="of the scan, from 0: where the line is", show_default=False)
+    ] = None,
+    as_json: JsonOption = False,
+) -> int:
+    """Which physical effects a scene calls for, why, and what each is worth; or the noise-free flux of an image row."""
+    from rig import api
+    from rig.cli.tables import effects_table, flux_table
+
+    chosen = config if config_option is None else config_option
+    if row is not None or column is not None:
+        flux = api.flux_row(chosen, scene=scene, row=row, column=column)
+        if as_json:
+            print_json(flux)
+        else:
+            flux_table(flux)
+        return 0
+    with progress():
+        effects = api.effects(chosen, scene=scene, trials=trials)
+    if as_json:
+        print_json(effects.as_json())
+    else:
+        effects_table(effects)
+    return 0

@@ -1,0 +1,490 @@
+"""Results for people: a run's pictures, errors and verdict; the effects of a scene.
+
+A trade-off for people: tables of at most 80 characters, the setting to use and where the files are.
+
+The figures of `rig bench` for people, in 100 columns.
+
+The result of a calibration for people at a terminal.
+"""
+
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Protocol
+
+from rich.console import Console
+from rich.table import Table
+
+from calibration.errors import digits
+from calibration.verdict import Verdict
+from drivers.replay.pace import PaceReport
+from rig.bench.disk import DiskReport
+from rig.bench.frames import COLUMNS
+from rig.bench.simulator import SimulatorReport
+from rig.bench.soak import SoakReport
+from rig.bench.speed import REAL_TIME_HZ, SpeedReport, SpeedRow
+from rig.run_folder.summary import PipelineStats, RunVerdict, Summary, Synchronisation
+from rig.scan.run import RunResult
+from rig.tradeoff.effects import Effect, Flux, SceneEffects
+from rig.tradeoff.rows import TradeoffRow
+from rig.tradeoff.trials import Tradeoff
+
+WIDE = 300
+"""Characters; wider than any line here."""
+
+_NAME_CELLS = 17
+"""Of an effect's name, on each of its lines."""
+LEAST_WAIT_S = 1e-3
+"""Shorter waits of the source are not worth words."""
+
+_NEXT_STEP = {
+    RunVerdict.GAPS: "frames were lost; lower frame_rate or free the computer, then scan again",
+    RunVerdict.UNSYNCHRONISED: "columns of frames are not sure; check marker cables or light in the run-in, and clocks",
+    RunVerdict.DOUBTFUL: "the frames themselves speak against the depth; see below",
+    RunVerdict.UNCALIBRATED: "there is no calibration, so no depth; name one in the config",
+    RunVerdict.ABORTED: "the run ended before its last map; whole maps are kept, and with --record every "
+    "frame that came",
+}
+
+
+def run_table(result: RunResult) -> None:
+    """Print the table to stdout."""
+    summary = result.summary
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="bold")
+    table.add_column()
+    for name, text in _rows(summary):
+        table.add_row(name, text)
+    if result.folder is not None:
+        for name, what in (("depth", "depth"), ("intensity", "counts"), ("cloud", "points")):
+            for file in sorted((result.folder / name).glob("*.p[nl][gy]"))[-1:]:
+                table.add_row(what, str(file))
+    verdict = summary.verdict.value
+    advice = _advice(result)
+    table.add_row("verdict", f"{verdict}: {advice}" if advice else verdict)
+    for doubt in summary.verdict_reasons:
+        table.add_row("because", f"{_of_maps(doubt.maps, summary.maps)}{doubt.reason}")
+    console().print(table)
+
+
+def _advice(result: RunResult) -> str | None:
+    """What follows from the verdict; of an aborted run what of it is there."""
+    summary = result.summary
+    if summary.verdict is not RunVerdict.ABORTED or (summary.maps and result.folder is not None):
+        return _NEXT_STEP.get(summary.verdict)
+    if summary.maps:
+        return "the run ended before its last map"
+    kept = "nothing is kept" if result.folder is None else f"the recorded frames are kept in {result.folder}"
+    return f"the run ended before its first map was whole; {kept}"
+
+
+def effects_table(scene: SceneEffects) -> None:
+    """Print which effects are on, what each is worth and why, to stdout."""
+    # Narrow enough that a terminal of 80 columns has room for the reasons, which are wrapped.
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("effect", max_width=_NAME_CELLS if sys.stdout.isatty() else None)
+    table.add_column("", no_wrap=True)
+    for name in ("photons", "stripe error\npx", "decisions\nchanged", "us per\nframe"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("why")
+    for effect in scene:
+        bound = effect.changed_decisions_bound
+        table.add_row(
+            effect.effect,
+            "on" if effect.on else "off",
+            f"{effect.share:.1%}" if effect.on else "-",
+            _error_change(effect),
+            "-" if bound is None or not (effect.on or bound) else f"<= {digits(bound, 2)}",
+            "-" if effect.cost_us_per_frame is None or not effect.on else f"{effect.cost_us_per_frame:.1f}",
+            effect.why,
+        )
+    console().print(table)
+    most = scene.planned_for
+    print(
+        f"left out together: <= {digits(scene.changed_decisions_bound, 2)} of decisions changed, for columns of up to "
+        f"{most['exposures']:g} frames, {most['exposure_s'] * 1e3:g} ms and {most['power_w'] * 1e3:g} mW"
+    )
+
+
+def flux_table(flux: Flux) -> None:
+    """Print the flux of a row, a line for each pixel and a column for each effect, to stdout."""
+    print("  ".join(f"{name:>12}" for name in flux))
+    for x, *parts in zip(*flux.values(), strict=True):
+        print("  ".join([f"{x:>12}", *(f"{part:>12.6g}" for part in parts)]))
+
+
+def _error_change(effect: Effect) -> str:
+    if effect.stripe_error_change_px is None:
+        return "-"
+    if effect.basis == "bound":
+        return f"<= {digits(effect.stripe_error_change_px, 2)}" if effect.stripe_error_change_px else "-"
+    return f"{effect.stripe_error_change_px:+.3f} +- {effect.stripe_error_change_sd_px or 0.0:.3f}"
+
+
+def _of_maps(maps: tuple[int, ...], of: int) -> str:
+    """Which maps a reason is about, where there are several."""
+    if of == 1:
+        return ""
+    return f"map {maps[0]}: " if len(maps) == 1 else f"{len(maps)} of {of} maps, the first is {maps[0]}: "
+
+
+def console() -> Console:
+    """Writes to stdout."""
+    # Into a file or a pipe nothing is wrapped.
+    return Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
+
+
+def _rows(summary: Summary) -> list[tuple[str, str]]:
+    frames = summary.frames
+    rows = [
+        ("maps", f"{summary.maps} of {summary.columns} columns x {summary.exposures} exposures, {summary.estimator}"),
+        ("frames", f"{frames.received} received, {frames.lost} lost, {frames.lit} on columns"),
+        (
+            "time",
+            f"{digits(summary.sensor_time_s)} s of sensor, {digits(summary.compute_time_s)} s of computing "
+            f"(real time x {_number(summary.realtime_factor)})",
+        ),
+        *(() if summary.sync is None else (("sync", _sync(summary.sync)),)),
+        *(() if summary.stages is None else (("stages", _stages(summary.stages)),)),
+        *(() if summary.replay is None or not summary.replay.blocks else (("clock", _clock(summary.replay)),)),
+        *(("calibration", f"accepted in spite of {reason}") for reason in summary.accepted_calibration),
+        ("filled", f"{_percent(summary.valid_fraction)} of the pixels have a depth"),
+    ]
+    fog = summary.fog
+    if fog.extinction_per_m is not None:
+        density = f"extinction {digits(fog.extinction_per_m)} +- {_number(fog.extinction_sd_per_m, 2)} /m"
+        rows.append(("fog", f"{density}, {fog.brief()}"))
+    if fog.ambient_per_exposure is not None:
+        veil = "" if fog.veil_per_exposure is None else f", veil {digits(fog.veil_per_exposure)}"
+        rows.append(("light", f"ambient {digits(fog.ambient_per_exposure)}{veil} photons per pixel and exposure"))
+    if summary.truth is not None:
+        stripe, depth = summary.truth.stripe_error_px, summary.truth.depth_error_m
+        rows += [
+            (
+                "stripe error",
+                f"mean {_number(stripe['mean_abs'])} px, median {_number(stripe['median_abs'])} px, "
+                f"{_percent(stripe['within_1px'])} within 1 px, {_percent(stripe['missing'])} missing",
+            ),
+            ("depth error", f"mean {_number(depth['mean_abs'])} m, median {_number(depth['median_abs'])} m"),
+        ]
+    return rows
+
+
+def _sync(sync: Synchronisation) -> str:
+    found = "" if sync.detection_probability is None else f", detected with p = {digits(sync.detection_probability, 6)}"
+    clock_ppm = digits(1e6 * sync.clock_error, 2)
+    return f"by {sync.by}{found}, residual {_number(sync.residual_columns, 2)} columns, clock {clock_ppm} ppm"
+
+
+def _clock(report: PaceReport) -> str:
+    held = "" if report.held_s < LEAST_WAIT_S else f"; held up for {digits(report.held_s)} s by a full ring"
+    return (
+        f"blocks late by {digits(report.late_mean_s * 1e3, 2)} +- {digits(report.late_sd_s * 1e3, 2)} ms, at most "
+        f"{digits(report.late_max_s * 1e3, 2)} ms{held}"
+    )
+
+
+def _stages(stages: PipelineStats) -> str:
+    source = f"source {digits(stages.source_fill_s)} s" + (
+        f" and {digits(stages.source_wait_s)} s of waiting" if stages.source_wait_s >= LEAST_WAIT_S else ""
+    )
+    parts = [
+        source,
+        f"ring {stages.ring_high_water} of {stages.ring_slots} slots",
+        f"counting {digits(stages.counting_s)} s",
+        f"estimation {digits(stages.estimation_s)} s",
+    ]
+    if stages.dropped_blocks:
+        parts.insert(2, f"{stages.dropped_blocks} blocks of {stages.dropped_frames} frames dropped")
+    if stages.recorder_s is not None:
+        parts.append(f"recorder {digits(stages.recorder_s)} s for {(stages.recorder_bytes or 0) / 1e6:.0f} MB")
+    return ", ".join(parts)
+
+
+def _number(value: float | None, count: int = 3) -> str:
+    return "-" if value is None else digits(value, count)
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1%}"
+
+
+WIDTH = 80
+"""Characters; no line here is longer but those that name files."""
+
+Column = tuple[str, Callable[[TradeoffRow], str]]
+"""Heading and cell."""
+
+_SETTING: tuple[Column, ...] = (
+    ("estimator", lambda row: row.estimator),
+    ("filter", lambda row: row.filter),
+    ("K", lambda row: str(row.exposures)),
+)
+_FIGURES: tuple[Column, ...] = (
+    *_SETTING,
+    ("sensor\nms", lambda row: _short(row.sensor_ms)),
+    ("compute\nms", lambda row: _short(row.compute_ms)),
+    ("error\npx", lambda row: _short(row.mean_abs_px) if row.counts else f"({_short(row.mean_abs_px)})"),
+    ("95 %\npx", lambda row: f"{_short(row.ci95[0])}..{_short(row.ci95[1])}"),
+    ("< 1 px\n%", lambda row: f"{100 * row.within_1px:.1f}"),
+    ("miss.\n%", lambda row: f"{100 * row.missing:.1f}"),
+    ("depth\nmm", lambda row: _short(row.depth_mm)),
+    ("", lambda row: ("*" if row.pareto else " ") + ("+" if row.pareto_compute else "")),
+)
+_LIMITS: tuple[Column, ...] = (
+    *_SETTING,
+    ("error\nx limit", lambda row: _times(row.times_limit)),
+    ("> 1 px\nx limit", lambda row: _times(row.times_wrong_limit)),
+    ("exponent\nnats", lambda row: _short(row.exponent_nats)),
+    ("sub-pixel\npx", lambda row: _short(row.local_sd_px)),
+    ("Cramer-Rao\npx", lambda row: _short(row.position_sd_px)),
+    ("sub-pixel\nx limit", lambda row: _times(row.times_position_limit)),
+)
+_LEFT = ("estimator", "filter", "")
+
+
+def tradeoff_table(done: Tradeoff) -> None:
+    """Print it to stdout, the setting to take first.
+
+    * marks what lies on the front of error over sensor time, + on that over compute time.
+    """
+    print(textwrap.fill(done.advice, WIDTH))
+    print()
+    for place in dict.fromkeys((row.scene, row.fog, row.lines) for row in done.rows):
+        rows = [row for row in done.rows if (row.scene, row.fog, row.lines) == place]
+        _print(_named(*place), _FIGURES, rows)
+        if any(row.times_limit is not None for row in rows):
+            _print(f"{_named(*place)}: beside what its light allows", _LIMITS, rows)
+    print("K: exposures of a column. < 1 px, miss.: answers so near, and missing ones.")
+    print(f"95 %: interval of the mean error, over {done.ci95_by}.")
+    print("*, +: nothing has less error in as little sensor time (*), compute time (+).")
+    if any(not row.counts for row in done.rows):
+        print("In brackets: more than 5 % of the answers are missing, such an error counts for\nnothing.")
+    for reason in done.accepted_calibration:
+        print(f"calibration accepted in spite of {reason}")
+    if done.folder is not None:
+        print(f"files: {done.folder}")
+
+
+def _named(scene: str, fog: str | None, lines: int) -> str:
+    air = "" if fog is None else ", clear air" if fog == "clear" else f", visibility {fog}"
+    return scene + air + ("" if lines == 1 else f", {lines} lines at once")
+
+
+def _print(title: str, columns: Sequence[Column], rows: Sequence[TradeoffRow]) -> None:
+    table = Table(title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for name, _ in columns:
+        table.add_column(name, justify="left" if name in _LEFT else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*(cell(row) for _, cell in columns))
+    console().print(title, style="bold", markup=False)
+    console().print(table)
+    print()
+
+
+def _short(value: float | None) -> str:
+    """At most five characters below 100 000, never with an exponent."""
+    if value is None:
+        return "-"
+    return f"{value:.{3 if value < 9.9995 else 1 if value < 999.95 else 0}f}"
+
+
+def _times(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
+
+
+BENCH_WIDTH = 100
+"""Characters; no line here is longer."""
+
+_TITLES = {
+    "count": "counting alone, frames of just the window",
+    "likelihood": "counting + likelihood, frames of just the window",
+    "likelihood-sweep": "the same with what is done once a sweep",
+    "count-full": "counting alone, whole frames",
+    "likelihood-full": "counting + likelihood in a window of whole frames",
+    "joint": "joint from counts, whole maps of 512 x 500; x sgbm: its time over that of sgbm, by turns",
+    "joint-sweep": "counting + joint, one after the other",
+    "sgbm": "OpenCV's StereoSGBM, MODE_HH4, as many disparities and pixels, two pictures",
+    "disk": "counting + likelihood from a recording (page cache), header checksums",
+    "disk-crc": "the same, payload checksums too",
+    "parse": "reading SPB1 blocks in memory, header checksums",
+    "parse-crc": "the same, payload checksums too",
+    "numpy": "numpy: unpackbits, sum, argmax",
+}
+
+
+def speed_table(report: SpeedReport) -> None:
+    """Print whether this machine keeps up, then the rows, grouped by stage, to stdout."""
+    console = Console(highlight=False, width=BENCH_WIDTH)
+    for point in report.working_points:
+        console.print(str(point))
+    console.print(f"(maps of {COLUMNS} columns at {REAL_TIME_HZ / 1e3:g} kHz, counting included)\n")
+    _print_machine(console, report.machine)
+    console.print(f"memory read, one thread: {report.memory_read_gb_per_s:.1f} GB/s")
+    order = list(_TITLES)
+    rows = sorted(report.rows, key=lambda row: (order.index(row.stage), row.window, row.exposures or 0, row.threads))
+    for stage, group in groupby(rows, key=lambda row: row.stage):
+        console.print(f"\n[bold]{stage}[/bold]: {_TITLES[stage]}")
+        console.print(_table(group))
+    latency = report.latency_us
+    console.print(
+        f"\nlatency of a column's estimate: median {latency.median:.0f} us, 99.9 % {latency.p999:.0f} us, "
+        f"most {latency.max:.0f} us"
+    )
+    console.print("(from its last frame on, waiting for its block of 5 ms to fill included)")
+    if not latency.kept_up:
+        console.print("the estimate did not keep up with 100 kHz: this is the latency of a full ring")
+    console.print(f"measured in {report.seconds:.0f} s")
+
+
+def disk_table(report: DiskReport) -> None:
+    """Print the disk's rows to stdout."""
+    console = Console(highlight=False, width=BENCH_WIDTH)
+    _print_machine(console, report.machine)
+    past = "past the page cache" if report.direct else "through the page cache, which this disk cannot be had without"
+    console.print(f"{report.gigabytes:.1f} GB in {report.folder}; plain: two threads {past}")
+    table = Table(box=None, pad_edge=False)
+    for title in ("row", "MB/s", "CPU s/GB", "of plain"):
+        table.add_column(title, justify="left" if title == "row" else "right")
+    for row in report.rows:
+        of_plain = "" if row.of_plain is None else f"{row.of_plain:.2f}"
+        table.add_row(row.stage, f"{row.mb_per_s:.0f}", f"{row.cpu_s_per_gb:.2f}", of_plain)
+    console.print(table)
+
+
+def simulator_table(report: SimulatorReport) -> None:
+    """Print the simulator's rows to stdout."""
+    console = Console(highlight=False, width=BENCH_WIDTH)
+    _print_machine(console, report.machine)
+    console.print(f"memory read, one thread: {report.memory_read_gb_per_s:.1f} GB/s")
+    rows, width = report.size
+    console.print(f"frames of {rows} x {width}; ready: one column's light stands; fresh: computed for every column")
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("row", "scene", "threads", "K", "kframes/s", "us/frame", "real time", "x numpy"):
+        table.add_column(name, justify="left" if name in ("row", "scene") else "right", no_wrap=True)
+    for row in report.rows:
+        table.add_row(
+            row.stage.removeprefix("simulator-"),
+            row.scene,
+            str(row.threads),
+            str(row.exposures),
+            f"{row.frames_per_s / 1e3:.4g}",
+            f"{row.us_per_frame:.4g}",
+            f"{row.times_real_time:.2g}",
+            _figure(row.times_numpy),
+        )
+    console.print(table)
+    console.print(f"x numpy: of whole-array numpy in the foggy scene, one thread; measured in {report.seconds:.0f} s")
+
+
+def soak_table(report: SoakReport) -> None:
+    """Print what a soak found to stdout."""
+    console = Console(highlight=False, width=BENCH_WIDTH)
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="bold")
+    table.add_column()
+    frames, stages = report.frames, report.stages
+    added = "adds up" if frames.agree else "does NOT add up"
+    table.add_row("stream", f"{report.seconds:.1f} s of frames {report.frame_width} pixels wide")
+    table.add_row(
+        "frames",
+        f"{frames.exposed} exposed, {frames.received} received, {frames.lost} lost: {added}",
+    )
+    table.add_row(
+        "in sweeps",
+        f"{frames.expected_in_sweeps} expected, {frames.received_in_sweeps} received, {frames.lost_in_sweeps} lost",
+    )
+    table.add_row("maps", f"{report.maps} of {report.maps_planned}, real time x {_figure(report.times_real_time)}")
+    table.add_row(
+        "ring",
+        f"{stages.ring_high_water} of {stages.ring_slots} slots used at most, {stages.dropped_blocks} blocks dropped",
+    )
+    table.add_row("source", f"{1e3 * report.source_late_max_s:.1f} ms late at most")
+    if report.resident_growth is not None and report.resident_end_bytes is not None:
+        table.add_row(
+            "memory", f"{report.resident_end_bytes / 1e6:.0f} MB at the end, {report.resident_growth:+.2%} since 10 %"
+        )
+    table.add_row("overload", f"{report.on_overload}, consumer slowed by {report.slow_consumer_ms:g} ms a map")
+    if report.ended_by is not None:
+        table.add_row("ended by", report.ended_by)
+    console.print(table)
+
+
+def _print_machine(console: Console, found: dict[str, object]) -> None:
+    caches = found["caches"]
+    assert isinstance(caches, dict)
+    named = ", ".join(f"{level} {size}" for level, size in caches.items())
+    console.print(f"{found['processor']}, {found['cores']} cores" + (f", {named}" if named else ""))
+    console.print(f"Python {found['python']}, numpy {found['numpy']}, numba {found['numba']}")
+
+
+def _table(rows: Iterable[SpeedRow]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in (
+        "window", "K", "threads", "kframes/s", "real time", "of memory", "x numpy", "error px", "median px", "ms/map",
+        "x sgbm",
+    ):  # fmt: skip
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(
+            str(row.window),
+            "-" if row.exposures is None else str(row.exposures),
+            str(row.threads),
+            "-" if row.frames_per_s is None else f"{row.frames_per_s / 1e3:.4g}",
+            "-" if row.times_real_time is None else f"{row.times_real_time:.2f}",
+            _figure(row.of_memory_bandwidth, 2),
+            _figure(row.times_numpy),
+            _figure(row.error_px),
+            _figure(row.median_error_px),
+            _figure(row.ms_per_map),
+            _figure(row.times_sgbm, 2),
+        )
+    return table
+
+
+def _figure(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}g}"
+
+
+class Printable(Protocol):
+    """A result of any of the calibrate commands."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether it may be used."""
+        ...
+
+    @property
+    def folder(self) -> Path | None:
+        """Where everything was written."""
+        ...
+
+    @property
+    def calibration(self) -> Path | None:
+        """The calibration's file."""
+        ...
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Figures by name."""
+        ...
+
+
+def print_result(result: Printable, line: str = "") -> None:
+    """The verdict and its reasons, the one line, the figures and the files, to stdout."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="bold")
+    table.add_column()
+    table.add_row("verdict", "passed" if result.verdict.passed else "failed")
+    for reason in result.verdict.reasons:
+        table.add_row("", str(reason))
+    if line:
+        table.add_row("in short", line)
+    for name, text in result.rows():
+        table.add_row(name, text)
+    if result.calibration is not None:
+        table.add_row("calibration", str(result.calibration))
+    if result.folder is not None:
+        table.add_row("report", str(result.folder / "report.html"))
+    console().print(table)

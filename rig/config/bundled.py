@@ -1,0 +1,56 @@
+"""The rigs and scenes that travel with the program: names, files, and what each file says of itself first.
+
+Light to import: shells ask for the names at every Tab.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+BUNDLED = Path(__file__).parents[2] / "config"
+"""Folder of the configs that travel with the program."""
+SCENES = BUNDLED / "scenes"
+"""Folder of its scenes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bundled:
+    """A rig or a scene that travels with the program; about: the first sentence of its file's first comment."""
+
+    name: str
+    about: str
+    file: Path
+
+    def as_json(self) -> dict[str, Any]:
+        """For programs."""
+        return {"name": self.name, "about": self.about, "file": str(self.file)}
+
+
+def bundled_rigs() -> tuple[Bundled, ...]:
+    """The rigs that a command takes by name as CONFIG, sorted."""
+    return tuple(_bundled(path) for path in _by_name(BUNDLED) if _is_rig(path))
+
+
+def bundled_scenes() -> tuple[Bundled, ...]:
+    """The scenes that simulated rigs take by name as --scene, sorted."""
+    return tuple(_bundled(path) for path in _by_name(SCENES))
+
+
+def _by_name(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.yaml"), key=lambda path: path.stem)
+
+
+def _bundled(path: Path) -> Bundled:
+    comment: list[str] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if not line.startswith("#"):
+            break
+        comment.append(line.removeprefix("#").strip())
+    first = re.match(r".*?\.(?=\s|$)", " ".join(comment))
+    return Bundled(path.stem, first.group() if first else "", path)
+
+
+def _is_rig(path: Path) -> bool:
+    """Whether it is a rig's config; boards and calibrations lie in the same folder."""
+    return re.search(r"^scan:", path.read_text(encoding="utf-8"), re.MULTILINE) is not None

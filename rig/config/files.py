@@ -1,0 +1,276 @@
+"""Finds and reads config files: bundled ones by name, others by path, options laid over them, all problems at once.
+
+What is particular to a rig's config when it is checked: options that stand for keys, kinds that slots name.
+"""
+
+import copy
+import difflib
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
+
+from calibration.errors import FileError
+from calibration.files.camera_file import CAMERA_FORMAT
+from calibration.files.problems import Key, ValueSources, plain_types, validated
+from calibration.files.sections import FORMAT, YamlFile, load_yaml, parse_yaml
+from drivers.errors import UnknownKind
+from drivers.registry import SLOTS, kinds, lookup
+from rig.config.bundled import BUNDLED, bundled_rigs, bundled_scenes
+from rig.config.completion import block_text, completed
+from rig.config.models import CubePlan, RigConfig
+from rig.errors import UsageError
+
+FLAGS: Mapping[Key, str] = {
+    ("world", "scene"): "--scene",
+    ("world", "fog"): "--fog",
+    ("scan", "exposures"): "--exposures",
+    ("estimate", "estimator"): "--estimator",
+    ("estimate", "filter"): "--filter",
+    ("estimate", "min_confidence"): "--min-confidence",
+    ("estimate", "temporal_prior"): "--temporal-prior",
+    ("estimate", "threads"): "--threads",
+}
+"""Keys that the command line has an option for."""
+
+
+def kind_of(slot: str, content: Any) -> type[BaseModel] | None:
+    """The config model of the kind that a slot's content names; None where it names none."""
+    if slot not in SLOTS or not isinstance(content, Mapping):
+        return None
+    try:
+        return lookup(slot, str(content.get("kind"))).config
+    except UnknownKind:
+        return None
+
+
+SUFFIXES = (".yaml", ".yml")
+PLAN_FORMAT = "spadrig-plan"
+"""`format` of the compiled plan that lies beside a recording's frames."""
+_OTHERS = {
+    PLAN_FORMAT: "the compiled plan of a recording, which is found beside its frames",
+    FORMAT: "a calibration",
+    CAMERA_FORMAT: "the calibration of a camera alone",
+}
+"""Files of ours that are taken for others, by their `format`."""
+_CONFIG = ("a config", "scan: {columns: 500}")
+MAX_PATH = 1000
+"""Longer text is no path, characters."""
+SCENE = ("world", "scene")
+"""A path, or a bundled scene's name."""
+NO_CONFIG = "no config"
+"""Begins what is said of a name that means none."""
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, object] | None = None) -> RigConfig:
+    """The rig config of a bundled name ("simulated") or a file, with `overrides` laid over it.
+
+    overrides: value by dotted key, e.g. {"scan.exposures": 4, "world.scene": "street"}; None values are skipped. Paths
+    in the file are relative to its folder, those in overrides to the working directory. Raises UsageError with one line
+    per problem, all problems at once.
+    """
+    path = find_config(name_or_path)
+    read = read_config(path)
+    content = read.content
+    _refuse_others(path, content, f"name the config of a rig, such as {bundled_configs()[0]}")
+    _anchor_paths(content, path.parent)
+    given = {key: value for key, value in (overrides or {}).items() if value is not None}
+    for key, value in given.items():
+        _lay_over(content, key, value)
+    sources = ValueSources(_shown(path), read.lines, _keys(given), FLAGS)
+    return _validated(RigConfig, content, sources, path.parent)
+
+
+def load_cube_plan(path: str | Path) -> CubePlan:
+    """The `plan.yaml` of a bare cube. Raises UsageError with one line per problem."""
+    read = _read(Path(path), "a plan", "columns: 500")
+    leave = "leave --plan out; " if read.content.get("format") == PLAN_FORMAT else ""
+    _refuse_others(path, read.content, f"{leave}the plan of frames alone has {', '.join(CubePlan.model_fields)}")
+    return _validated(CubePlan, read.content, ValueSources(_shown(Path(path)), read.lines), Path(path).parent)
+
+
+def completed_text(name_or_path: str | Path) -> str:
+    """A config as it is written, its comments with it, with every default filled in and every path absolute.
+
+    What it says is the same in a file of any folder. Where aliases or the like leave no place to fill defaults in, it
+    is written anew without comments. Raises UsageError as `load_config`.
+    """
+    path = find_config(name_or_path)
+    read = read_config(path)
+    anchored = copy.deepcopy(read.content)
+    _anchor_paths(anchored, path.parent)
+    full = portable_content(load_config(path))
+    if anchored.get("calibration") is not None:
+        anchored["calibration"] = full["calibration"]
+    text = completed(read.text, read.node, anchored, full)
+    try:
+        same = portable_content(parse_config(config_content(text))) == full
+    except UsageError:
+        same = False
+    if same:
+        return text
+    return f"# {_shown(path)}, written anew without its comments\n{block_text(full)}"
+
+
+def config_content(text: str) -> dict[str, Any]:
+    """The keys and values of a config's text. Raises UsageError."""
+    try:
+        return parse_yaml(text, *_CONFIG, "config").content
+    except FileError as error:
+        raise UsageError(*error.problems) from error
+
+
+def parse_config(content: Mapping[str, object], folder: Path | None = None, options: Iterable[str] = ()) -> RigConfig:
+    """A config from a mapping, such as a notebook's or a manifest's. Raises UsageError with one line per problem.
+
+    options: dotted keys whose values were given as options, for these problems.
+    """
+    return _validated(RigConfig, dict(content), ValueSources("config", options=_keys(options), flags=FLAGS), folder)
+
+
+def _keys(dotted: Iterable[str]) -> frozenset[Key]:
+    return frozenset(tuple(key.split(".")) for key in dotted)
+
+
+def portable_content(config: RigConfig) -> dict[str, Any]:
+    """A config as plain values that mean the same in a file of any folder: every path in it is absolute.
+
+    The paths of a loaded config are absolute or relative to the working directory.
+    """
+    content: dict[str, Any] = config.model_dump(mode="json")
+    here = Path.cwd()
+    _anchor_paths(content, here)
+    if config.calibration is not None:
+        content["calibration"] = _absolute(here / config.calibration)
+    return content
+
+
+def bundled_configs() -> tuple[str, ...]:
+    """Names of the rigs that travel with the program, sorted."""
+    return tuple(one.name for one in bundled_rigs())
+
+
+def find_config(name_or_path: str | Path) -> Path:
+    """The file that a name or path means. Raises UsageError where there is none."""
+    path = Path(name_or_path)
+    if os.path.isfile(path):  # unlike Path.is_file, it takes any text for a name
+        return path
+    plain = path.suffix not in SUFFIXES and path.parent == Path(".")
+    names = bundled_configs()
+    if plain and path.name in names:
+        return BUNDLED / f"{path.name}.yaml"
+    if os.path.isdir(path):
+        raise UsageError(f"config {path} is a folder; name the YAML file in it")
+    close = difflib.get_close_matches(path.stem, names, n=1)
+    meant = f"did you mean '{close[0]}'? " if close else ""
+    if path.name in (one.name for one in bundled_scenes()):
+        meant = f"it is a scene, which is chosen by --scene {path.name}; "
+    missing = "" if plain and not str(name_or_path).endswith(("/", os.sep)) else "that path does not exist; "
+    raise UsageError(
+        f"{NO_CONFIG} '{name_or_path}': {missing}{meant}bundled configs are {', '.join(names) or 'none'}; "
+        "anything else is the path of a YAML file"
+    )
+
+
+def config_schema() -> dict[str, Any]:
+    """JSON schema of a rig config, with the installed kinds of every slot."""
+    schema = RigConfig.model_json_schema()
+    definitions = schema.setdefault("$defs", {})
+    definitions.pop("KindConfig", None)
+    for slot in SLOTS:
+        choices = []
+        for name in kinds(slot):
+            kind = lookup(slot, name).config.model_json_schema(ref_template=f"#/$defs/{slot}.{name}.{{model}}")
+            for key, value in kind.pop("$defs", {}).items():
+                definitions[f"{slot}.{name}.{key}"] = value
+            kind["properties"]["kind"] = {"const": name}
+            definitions[f"{slot}.{name}"] = kind
+            choices.append({"$ref": f"#/$defs/{slot}.{name}"})
+        described = {k: v for k, v in schema["properties"][slot].items() if k in ("description", "default")}
+        schema["properties"][slot] = {**described, "oneOf": choices or [{"type": "object"}]}
+    return schema
+
+
+def read_config(path: Path) -> YamlFile:
+    """A config file as it is written. Raises UsageError; a key given twice is one."""
+    return _read(path, *_CONFIG)
+
+
+def _read(path: Path, what: str, example: str) -> YamlFile:
+    try:
+        return load_yaml(path, what, example, _shown(path))
+    except FileError as error:
+        raise UsageError(*error.problems) from error
+
+
+def _refuse_others(path: str | Path, content: Mapping[str, Any], then: str) -> None:
+    """UsageError for a file of ours that is neither a config nor the plan of a cube; then: the next step."""
+    if (what := _OTHERS.get(str(content.get("format")))) is not None:
+        raise UsageError(f"{path} is {what}; {then}")
+
+
+def _validated(model: type[Model], content: Mapping[str, Any], sources: ValueSources, folder: Path | None) -> Model:
+    try:
+        return validated(model, content, sources, kind_of, {"folder": folder})
+    except FileError as error:
+        raise UsageError(*error.problems) from error
+
+
+def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
+    """Make relative paths in the slots of devices absolute: their kinds do not know the file's folder.
+
+    A path is a scene that is not bundled, what a kind's config holds as a path, and text that begins with a dot, ends
+    in .yaml, or has a slash and exists beside the file.
+    """
+
+    def anchored(value: object) -> object:
+        if isinstance(value, str) and _is_path(value, folder):
+            return _absolute(folder / value)
+        if isinstance(value, dict):
+            return {key: anchored(part) for key, part in value.items()}
+        return value
+
+    for slot in SLOTS:
+        if slot in content:
+            content[slot] = anchored(content[slot])
+            kind = kind_of(slot, content[slot])
+            for name, info in ({} if kind is None else kind.model_fields).items():
+                value = content[slot].get(name)
+                named = Path in plain_types(info.annotation) or ((slot, name) == SCENE and not _is_bundled(value))
+                if named and isinstance(value, str) and not value.startswith("~"):
+                    content[slot][name] = _absolute(folder / value)
+
+
+def _absolute(path: Path) -> str:
+    """Without '..'; what is itself a link stays, as those of /dev/serial/by-id/ must."""
+    return str(path.parent.resolve() / path.name)
+
+
+def _is_path(value: str, folder: Path) -> bool:
+    if value.startswith("~") or len(value) >= MAX_PATH:
+        return False
+    return (
+        value.startswith(("./", "../")) or value.endswith(SUFFIXES) or ("/" in value and os.path.exists(folder / value))
+    )
+
+
+def _is_bundled(scene: object) -> bool:
+    return scene in {path.stem for path in (BUNDLED / "scenes").glob("*.yaml")}
+
+
+def _lay_over(content: dict[str, Any], key: str, value: object) -> None:
+    *parents, last = key.split(".")
+    place = content
+    for parent in parents:
+        below = place.get(parent)
+        place[parent] = dict(below) if isinstance(below, dict) else {}
+        place = place[parent]
+    place[last] = copy.deepcopy(value)
+
+
+def _shown(path: Path) -> str:
+    return path.name if path.parent == BUNDLED else str(path)

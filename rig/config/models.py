@@ -1,0 +1,295 @@
+"""The config of a rig: which devices, which calibration, what scan and which estimate; validated with units and limits.
+
+Times, rates and lengths are text with a unit in YAML ("10 us", "100 kHz", "8 m"). Slots of devices hold the config
+model of their kind, which stands beside its driver. Files are read by `rig.config.files`.
+
+Several lines at once, as a config says it: where they stand, whose power they have, and what is wrong with that.
+
+With L lines the mirror sweeps one L-th of the field, so a map takes one L-th of the frames. `scan.command_range` is
+what the mirror does, and line l's columns lie at its commands plus `line_offsets[l]`.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializeAsAny,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from drivers.errors import UnknownKind
+from drivers.registry import KindConfig, kinds, lookup
+from drivers.units import Age, ExactHertz, Metres, Seconds, Watts
+
+MOST_LINES = 16
+LEAST_FRESH = 0.5
+"""Share of the mirror's sweep by which neighbouring lines stand apart at least: closer ones light the same places."""
+
+LinePower = Literal["shared", "each"]
+
+
+def _in_order(value: tuple[float, ...]) -> tuple[float, ...]:
+    if not 1 <= len(value) <= MOST_LINES:
+        raise ValueError(f"names {len(value)} lines; a rig has 1 to {MOST_LINES}")
+    if len(value) == 1 and value[0] != 0:
+        raise ValueError(f"has the one offset {value[0]:g}; a single line stands at 0, add others or leave it out")
+    for first, second in pairwise(value):
+        if not first < second:
+            raise ValueError(f"has {second:g} behind {first:g}; it must ascend")
+    return value
+
+
+LineOffsets = Annotated[
+    tuple[Annotated[float, Field(ge=-2, le=2, allow_inf_nan=False)], ...],
+    AfterValidator(_in_order),
+    Field(
+        description="places of the lines that leave the mirror together, in units of its command, ascending",
+        examples=["[-0.22, 0.22]"],
+    ),
+]
+
+
+def line_problems(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> list[str]:
+    """What stands against a map of so many columns, taken by these lines while the mirror sweeps `command_range`."""
+    lines = len(offsets)
+    problems = []
+    if columns % lines:
+        below, above = columns // lines * lines, -(-columns // lines) * lines
+        fits = f"{above}" if below == 0 else f"{below} or {above}"
+        problems.append(f"scan.columns is {columns}, no multiple of the {lines} lines of line_offsets; make it {fits}")
+    span = abs(command_range[1] - command_range[0])
+    spare = span * lines / columns  # a column: beyond its neighbours' reach nothing is lit
+    for first, second in pairwise(offsets):
+        apart = second - first
+        told = f"line_offsets {first:g} and {second:g} are {apart:g} apart, scan.command_range spans {span:g}"
+        if apart > span + spare:
+            problems.append(
+                f"{told}: what lies between them is never lit; widen it to {apart:g} or bring the lines closer"
+            )
+        elif apart < LEAST_FRESH * span:
+            problems.append(f"{told}: most of it would be lit twice; narrow it to {apart:g}")
+    return problems
+
+
+def with_lines(config: "RigConfig", lines: int, power: LinePower = "shared") -> "RigConfig":
+    """The same rig and field with so many lines, evenly spaced, and the mirror sweeping the share that is left to it.
+
+    config: of one line. Columns are rounded down to a multiple of `lines`. Raises UsageError where that cannot be.
+    """
+    from rig.config.files import parse_config
+    from rig.errors import UsageError
+
+    if len(config.line_offsets) > 1:
+        raise UsageError(f"{config.name} has {len(config.line_offsets)} lines already; name a config with one")
+    if not 1 <= lines <= MOST_LINES:
+        raise UsageError(f"lines is {lines}; it must be 1 to {MOST_LINES}")
+    first, last = config.scan.command_range
+    pitch, middle = (last - first) / lines, (first + last) / 2
+    offsets = sorted((line - (lines - 1) / 2) * pitch for line in range(lines))
+    content = config.model_dump(mode="json")
+    content["scan"]["columns"] = max(1, config.scan.columns // lines) * lines
+    if lines > 1:
+        content["scan"]["command_range"] = [middle - pitch / 2, middle + pitch / 2]
+    return parse_config({**content, "line_offsets": offsets if lines > 1 else [0.0], "line_power": power})
+
+
+MIN_DARK_FRACTION = 0.05
+"""Share of a live sweep's frames that must be dark: the dark rate is learned from them."""
+
+Estimator = Literal["argmax", "edge", "likelihood", "joint"]
+Filter = Literal["none", "median"]
+
+
+class ConfigSection(BaseModel):
+    """Base of the config's sections: unknown keys are refused, values cannot change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _near_below_far(value: tuple[float, float]) -> tuple[float, float]:
+    near, far = value
+    if not 0 < near < far:
+        raise ValueError(f"runs from {near:g} m to {far:g} m; it must be [near, far] with 0 m < near < far")
+    return value
+
+
+def _two_ends(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] == value[1]:
+        raise ValueError(f"begins and ends at {value[0]:g}; the sweep needs two different ends")
+    return value
+
+
+DepthRange = Annotated[
+    tuple[Metres, Metres],
+    AfterValidator(_near_below_far),
+    Field(description="nearest and farthest depth to look for", examples=["[1 m, 8 m]"]),
+]
+Columns = Annotated[int, Field(ge=1, le=65535, description="laser line positions of a sweep", examples=[500])]
+Exposures = Annotated[int, Field(ge=1, le=65535, description="frames nominally taken per column (K)", examples=[10])]
+FrameRate = Annotated[ExactHertz, Field(gt=0, description="SPAD frames per second", examples=["100 kHz"])]
+Command = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
+
+
+class ScanConfig(ConfigSection):
+    """What one sweep does."""
+
+    columns: Columns = 500
+    exposures: Exposures = 10
+    frame_rate: FrameRate
+    depth_range: DepthRange
+    command_range: Annotated[
+        tuple[Command, Command],
+        AfterValidator(_two_ends),
+        Field(
+            description="mirror drive (-1 to 1) at the outer edges of the first and the last column; may run downward",
+            examples=["[-0.9, 0.9]"],
+        ),
+    ] = (-0.9, 0.9)
+    bidirectional: bool = Field(
+        default=False, description="use the mirror's way back as a sweep of its own", examples=["false"]
+    )
+    dark_fraction: float = Field(
+        default=MIN_DARK_FRACTION,
+        ge=MIN_DARK_FRACTION,
+        lt=1,
+        description="least share of a sweep's frames taken with the gate low",
+        examples=[0.05],
+    )
+    exposure: Annotated[Seconds, Field(gt=0)] | None = Field(
+        default=None, description="exposure of a frame; the whole frame period where not given", examples=["10 us"]
+    )
+    power: Annotated[Watts, Field(gt=0)] | None = Field(
+        default=None, description="laser power of the scan; the laser's limit where not given", examples=["20 mW"]
+    )
+
+    @property
+    def exposure_s(self) -> float:
+        """Exposure of a frame; without a setting the whole frame period."""
+        return float(1 / self.frame_rate) if self.exposure is None else self.exposure
+
+    @model_validator(mode="after")
+    def _exposure_fits(self) -> Self:
+        if self.exposure is not None and self.exposure > float(1 / self.frame_rate) * (1 + 1e-9):
+            raise ValueError(
+                f"exposure is {self.exposure * 1e6:g} us, longer than the {float(1e6 / self.frame_rate):g} us of a "
+                f"frame at {float(self.frame_rate):g} Hz; shorten exposure or lower frame_rate"
+            )
+        return self
+
+
+class EstimateConfig(ConfigSection):
+    """How depth is estimated from the counts."""
+
+    estimator: Estimator = Field(
+        default="likelihood", description="how the stripe is found on each row", examples=["likelihood"]
+    )
+    filter: Filter = Field(
+        default="none", description="what is done to the stripe positions afterwards", examples=["median"]
+    )
+    min_confidence: float = Field(
+        default=0.5, ge=0, le=1, description="answers below this confidence do not enter the depth map", examples=[0.5]
+    )
+    temporal_prior: bool = Field(
+        default=False,
+        description="hold each map to the last one a little, for scenes that mostly stand still; `joint` only",
+        examples=["true"],
+    )
+    threads: int | None = Field(
+        default=None,
+        ge=1,
+        le=256,
+        description="threads that count and estimate, null for one a core; results do not depend on it",
+        examples=[2],
+    )
+
+    @field_validator("temporal_prior")
+    @classmethod
+    def _prior_is_of_joint(cls, value: bool, info: ValidationInfo) -> bool:
+        estimator = info.data.get("estimator", "joint")  # absent where it is itself a problem
+        if value and estimator != "joint":
+            raise ValueError(
+                f"is for the estimator joint, this is {estimator}; choose estimator joint or leave the prior off"
+            )
+        return value
+
+
+def _of_slot(slot: str) -> BeforeValidator:
+    """Validates a mapping with the config model of the kind it names."""
+
+    def validate(value: object, info: ValidationInfo) -> object:
+        if isinstance(value, KindConfig):
+            value = value.model_dump(mode="json")
+        if not isinstance(value, dict):
+            raise ValueError(f"is {value!r}; it must be a mapping that names a kind, e.g. {{kind: {_a_kind(slot)}}}")
+        if "kind" not in value:
+            raise ValueError(f"has no 'kind'; add one of: {', '.join(kinds(slot))}")
+        try:
+            kind = lookup(slot, str(value["kind"]))
+        except UnknownKind as error:
+            raise ValueError(str(error).removeprefix(f"{slot}: ")) from error
+        return kind.config.model_validate(value, context=info.context)
+
+    return BeforeValidator(validate)
+
+
+def _a_kind(slot: str) -> str:
+    return next(iter(kinds(slot)), "simulated")
+
+
+def _beside_config(value: Path | None, info: ValidationInfo) -> Path | None:
+    folder = (info.context or {}).get("folder")
+    return value if value is None or folder is None else Path(folder) / value
+
+
+class RigConfig(ConfigSection):
+    """A whole rig and the scan it does."""
+
+    name: str = Field(min_length=1, description="name of the rig, for people", examples=["lab"])
+    calibration: Annotated[Path | None, AfterValidator(_beside_config)] = Field(
+        default=None, description="calibration file, relative to this file; without one there is no depth"
+    )
+    calibration_max_age: Annotated[Age, Field(gt=0)] | None = Field(
+        default=None,
+        description="age from which on a calibration that says when it was made is refused; null for any age",
+        examples=["90 d"],
+    )
+    world: Annotated[SerializeAsAny[KindConfig], _of_slot("world")] | None = Field(
+        default=None, description="what simulated devices look at; real rigs have none"
+    )
+    spad: Annotated[SerializeAsAny[KindConfig], _of_slot("spad")]
+    scanner: Annotated[SerializeAsAny[KindConfig], _of_slot("scanner")]
+    laser: Annotated[SerializeAsAny[KindConfig], _of_slot("laser")]
+    sync: Annotated[SerializeAsAny[KindConfig], _of_slot("sync")]
+    line_offsets: LineOffsets = (0.0,)
+    line_power: LinePower = Field(
+        default="shared",
+        description="whether lines share the laser's power (a diffractive element) or each has it (more lasers)",
+        examples=["shared"],
+    )
+    scan: ScanConfig
+    estimate: EstimateConfig = EstimateConfig()
+
+    @model_validator(mode="after")
+    def _lines_fit(self) -> Self:
+        problems = line_problems(self.line_offsets, self.scan.columns, self.scan.command_range)
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
+
+
+class CubePlan(ConfigSection):
+    """`plan.yaml` of `rig reconstruct`: how the frames of a bare cube were taken."""
+
+    columns: Columns
+    exposures: Exposures
+    frame_rate: FrameRate
+    depth_range: DepthRange

@@ -1,0 +1,70 @@
+"""The config that a call is made with: loaded, changed by the call's options, validated."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from rig.config.files import bundled_configs, load_config, parse_config
+from rig.config.models import Estimator, Filter, RigConfig
+from rig.errors import UsageError
+
+PathLike = str | os.PathLike[str]
+Config = RigConfig | PathLike
+
+SIMULATED = "simulated"
+"""Name of the bundled rig, and kind of the devices, that need no hardware."""
+MAX_SEED = 2**63 - 1
+"""Largest seed: the largest number that other programs read from the manifest as an integer."""
+
+
+def configure(
+    config: Config = SIMULATED,
+    *,
+    scene: str | None = None,
+    fog: str | None = None,
+    exposures: int | None = None,
+    estimator: Estimator | None = None,
+    filter: Filter | None = None,
+    min_confidence: float | None = None,
+    temporal_prior: bool | None = None,
+) -> RigConfig:
+    """The validated config that `scan` would use; options that are None stay as the config says.
+
+    config: a bundled rig's name, a file or a RigConfig. fog: in place of the scene's, a visibility such as '20 m', or
+    'clear'. temporal_prior: `joint` holds each map to the last one a little.
+    Raises UsageError with one line per problem.
+    """
+    options: dict[str, object | None] = {
+        "world.scene": scene,
+        "world.fog": fog,
+        "scan.exposures": exposures,
+        "estimate.estimator": estimator,
+        "estimate.filter": filter,
+        "estimate.min_confidence": min_confidence,
+        "estimate.temporal_prior": temporal_prior,
+    }
+    loaded = config if isinstance(config, RigConfig) else load_config(os.fspath(config))
+    for name, asked in (("scene", scene), ("fog", fog)):
+        if asked is not None and loaded.world is None:
+            raise UsageError(f"{name} {asked!r} was asked for, but {loaded.name} is a real rig; leave --{name} out")
+    if scene is not None and scene in bundled_configs() and not Path(scene).expanduser().exists():
+        raise UsageError(f"scene {scene!r} is a rig; give it as the config, without --scene")
+    given = {key: value for key, value in options.items() if value is not None}
+    if not given:
+        return loaded
+    return _changed(config, given) if isinstance(config, RigConfig) else load_config(os.fspath(config), given)
+
+
+def seed_problems(seed: int) -> list[str]:
+    """What is wrong with a seed."""
+    if 0 <= seed <= MAX_SEED:
+        return []
+    return [f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})"]
+
+
+def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
+    content = config.model_dump(mode="json")
+    for key, value in options.items():
+        section, name = key.split(".")
+        content[section][name] = value
+    return parse_config(content, options=options)

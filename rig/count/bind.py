@@ -1,0 +1,372 @@
+"""Binds frames to columns by the markers in their own stream, never by host time or by counting.
+
+Where the SPAD puts no markers into its frames, `rig.count.blanking` finds the sweeps in their light and marks them.
+
+Each frame is placed from the latest marker at or before it: that marker's point of the scanner clock is known from the
+plan, the way on from there is the SPAD's own clock times the ratio of the two clocks, which is fitted to the markers of
+every sweep and used in the next one. So a frame's column depends on earlier frames only and not on the size of blocks.
+
+    no sweep --scan marker--> sweep 0 --scan marker: its clock is fitted--> sweep 1 --> ...
+
+A compiled walk (`rig/count/bind_kernels.py`) places the frames; Python runs once a block and where a sweep begins.
+
+The lit frames of a sweep run through its columns in order. One that would fall back to a column already left, as it can
+by the residual where a marker corrects the way from the one before, is not used.
+"""
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import ProtocolError
+from drivers.frames import FRAME_RECORD, SUBFRAME_MASK, SUBFRAME_SHIFT, BlockHeader, FrameBlock, Mark
+from rig.count.blanking import BlankingSync
+from rig.count.volume import BIN_UNUSABLE, BYTE_EXPOSURES, BYTE_FRAMES
+from rig.plan.scan_plan import MAX_CLOCK_ERROR, ScanPlan
+
+MAX_RESIDUAL_COLUMNS = 0.05
+"""A sweep whose markers stray further from one straight line of time than this is not synchronised."""
+MOST_OUT_OF_TURN = 1000
+"""Frames of a sweep that may name one which cannot have begun; more are no flipped bits but a wrong line or link."""
+Places = tuple[NDArray[np.int32], NDArray[np.int8], NDArray[np.float64], NDArray[np.int32]]
+"""Sweep, direction, column and bin of each frame."""
+UNITS_PER_TICK = 2 * (SUBFRAME_MASK + 1)
+"""Times are kept as whole numbers of this part of a tick, in which markers and exposure middles are exact: a frame's
+column is then the same to the last bit in whatever block it comes. Good for 200 days at 1 GHz."""
+CARRIED = np.dtype(
+    [(name, np.int64) for name in ("sweep", "anchor_time", "anchor_point", "edges", "wrong_way", "column", "in_column")]
+)
+"""What the walk takes from block to block.
+
+sweep: the one that runs, -1 before the first marker. anchor_time, anchor_point: the latest marker, in units and in
+points since the first sweep; point -1: none yet. edges: markers of the sweep so far. wrong_way: as in `SweepClock`.
+column, in_column: the column that the sweep has come to, -1 before the first, and how many frames it has so far.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class BoundFrames:
+    """Where the frames of a block belong; one entry per frame.
+
+    sweep: int32, -1 before the first marker. direction: int8, +1 where the command rises, -1 where it falls, 0 unknown.
+    column: float64, fractional column at the middle of the exposure; NaN before the first marker, continued linearly
+    outside the lit part. bins: int32, column index, BIN_DARK or BIN_UNUSABLE. starts: index 0 and
+    those of the frames with which a sweep begins.
+    """
+
+    sweep: NDArray[np.int32]
+    direction: NDArray[np.int8]
+    column: NDArray[np.float64]
+    bins: NDArray[np.int32]
+    starts: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SweepClock:
+    """What the markers, or the blanking patterns, of one finished sweep say.
+
+    clock_error: relative excess of the scanner's clock over nominal, in the SPAD's time. residual_columns: largest
+    distance of a marker from the fitted line, in columns; NaN where there were fewer than two markers. Of blanking
+    patterns: of the one behind the sweep from the line of those before it, or its standard deviation where that is
+    more; NaN where it was not found. markers: how many of either it rests on. first_frame,
+    end_frame: frame numbers from this sweep's scan marker to the next one's. wrong_way: lit frames whose direction
+    level was not the plan's. detection: chance that a blanking pattern as bright as this sweep's is found, 0 where it
+    was not; None: bound by markers.
+    """
+
+    sweep: int
+    clock_error: float
+    residual_columns: float
+    markers: int
+    first_frame: int
+    end_frame: int
+    wrong_way: int
+    detection: float | None = None
+
+    @property
+    def synchronised(self) -> bool:
+        """Whether the columns of this sweep's frames can be trusted."""
+        return (
+            self.residual_columns <= MAX_RESIDUAL_COLUMNS
+            and abs(self.clock_error) <= MAX_CLOCK_ERROR
+            and self.wrong_way == 0
+        )
+
+
+class PlanTerms(NamedTuple):
+    """What the walk needs of a plan; arrays (legs,). most_in_column: frames that a column may use."""
+
+    columns: int
+    column_s: float
+    point_rate_hz: float
+    sweep_points: int
+    marker_points: NDArray[np.int64]
+    lit_start_s: NDArray[np.float64]
+    columns_rise: NDArray[np.bool_]
+    direction: NDArray[np.int8]
+    most_in_column: int
+
+
+class BlockTerms(NamedTuple):
+    """What the walk needs of a header. start_ticks: from the run's first frame. middle: of an exposure, in units."""
+
+    sweep: int
+    start_ticks: int
+    period_ticks: int
+    middle: int
+    points_per_unit: float
+
+
+class FrameBinder:
+    """Binds the blocks of one run, in order. Records count markers up to and including their own frame.
+
+    clock_ratio: of the scanner's clock to nominal, as of the sweep before the first, where that is known. first_sweep:
+    number of that first one; of those before it only a piece may be there, which fits no clock. end_sweep: one behind
+    the last sweep that is wanted; None: all that the frames tell of.
+    """
+
+    def __init__(
+        self, plan: ScanPlan, clock_ratio: float = 1.0, first_sweep: int = 0, end_sweep: int | None = None
+    ) -> None:
+        from rig.count.bind_kernels import walk
+
+        self._walk = walk
+        self._plan = plan
+        self._terms = _plan_terms(plan)
+        self._ratio = clock_ratio
+        self._end_sweep = end_sweep
+        self._first_sweep = first_sweep
+        self._nominal = math.nan
+        self._tick_hz: Fraction | None = None
+        self._t0: int | None = None
+        self._first_frame = 0
+        self._next_frame = 0
+        self._passed_over = 0
+        self._carried = np.zeros(1, CARRIED)
+        self._carried["sweep"] = self._carried["anchor_point"] = self._carried["column"] = -1
+        self._edges = np.empty((2, 2 * len(plan.marker_points) + 2), np.int64)
+        self._records = np.empty(0, FRAME_RECORD)
+        self._light = None if plan.blanking is None else BlankingSync(plan, end_sweep)
+
+    def bind(self, block: FrameBlock) -> tuple[BoundFrames, list[SweepClock]]:
+        """Places of the block's frames, and the clocks of the sweeps whose closing scan marker lies in the block."""
+        header, n = block.header, block.n_frames
+        if self._t0 is None:
+            self._t0 = header.t0_ticks
+        self._make_room(n)
+        records = self._records[:n]
+        # Always of one type, which memory of a ring, a file or a wire is not: each would be compiled by itself.
+        records.view(_WHOLE)[:] = block.records.view(_WHOLE)
+        if self._light is not None:
+            self._light.mark(block, records)
+        places = _new_places(n)
+        closed: list[SweepClock] = []
+        starts = [0]
+        at = 0
+        while True:
+            terms = self._block_terms(header)
+            at = self._walk(records, at, terms, self._terms, self._carried, self._edges, *places)
+            if at == n:
+                break
+            if self._light is None and self._out_of_turn(at, records, terms):
+                self._pass_over(at, places, header)
+                at += 1
+                continue
+            if at:
+                starts.append(at)
+            begin = self._begin if self._light is None else self._begin_in_light
+            closed += begin(at, records[at], terms, header)
+        self._next_frame = header.first_frame + n * header.frame_step
+        return BoundFrames(*places, tuple(starts)), closed
+
+    def compile(self) -> None:
+        """Compile the walk, by placing no frames."""
+        terms = BlockTerms(0, 0, 1, 1, 1.0)
+        self._walk(self._records[:0], 0, terms, self._terms, self._carried, self._edges, *_new_places(0))
+
+    def _out_of_turn(self, at: int, records: NDArray[np.void], terms: BlockTerms) -> bool:
+        """Whether frame `at` names a sweep that cannot have begun, as one flipped bit does.
+
+        Its own scan marker makes it the next sweep; else the frame behind must say the same, and where sweeps are left
+        out, or no frame is behind, so must the time since the latest marker.
+        """
+        now = self._carried[0]
+        running, number = int(now["sweep"]), _sweep_named(records[at], terms)
+        received = bool(records[at]["marks"] & Mark.SCAN)
+        if running >= 0 and received and number == running + 1:
+            return False
+        if at + 1 < len(records):
+            behind = _sweep_named(records[at + 1], terms)
+            if behind != number and not (behind == number + 1 and records[at + 1]["marks"] & Mark.SCAN):
+                return True
+            if running < 0 or number == running + 1:
+                return False
+        elif running < 0:
+            return at > 0 and not received
+        if now["anchor_point"] < 0:
+            return False
+        start = (int(records[at]["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
+        gone = (start - int(now["anchor_time"])) * terms.points_per_unit
+        spare = 2 * terms.period_ticks * UNITS_PER_TICK * terms.points_per_unit + MAX_CLOCK_ERROR * abs(gone)
+        return bool(gone + spare < number * self._plan.sweep_points - int(now["anchor_point"]))
+
+    def _pass_over(self, at: int, places: Places, header: BlockHeader) -> None:
+        """Leave out a frame that names a wrong sweep. Raises ProtocolError where that is no accident any more."""
+        self._passed_over += 1
+        if self._passed_over > MOST_OUT_OF_TURN:
+            raise ProtocolError(
+                f"frame {header.first_frame + at} and {MOST_OUT_OF_TURN} before it name sweeps that cannot have begun "
+                f"behind sweep {int(self._carried['sweep'][0])}; check the scan marker's line and the SPAD's link"
+            )
+        sweep, direction, column, bins = places
+        sweep[at], direction[at], column[at], bins[at] = int(self._carried["sweep"][0]), 0, np.nan, BIN_UNUSABLE
+
+    def _make_room(self, n: int) -> None:
+        """For n more frames, should there be a marker in each of them."""
+        if n > len(self._records):
+            self._records = np.empty(n, FRAME_RECORD)
+        have = self._edges.shape[1]
+        if self._carried["edges"][0] + n + 1 > have:
+            self._edges = np.concatenate([self._edges, np.empty((2, have + n), np.int64)], axis=1)
+
+    def _block_terms(self, header: BlockHeader) -> BlockTerms:
+        return BlockTerms(
+            header.sweep if self._light is None else self._markers_before,
+            header.t0_ticks - (self._t0 or 0),
+            _period(header),
+            header.exposure_ticks * (UNITS_PER_TICK // 2),
+            self._points_per_unit(header.tick_hz),
+        )
+
+    def _begin(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
+        """Close the sweep that ran, begin the next one at frame index `at`, where its scan marker is if received."""
+        now = self._carried[0]
+        running, number = int(now["sweep"]), _sweep_named(record, terms)
+        start = (int(record["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
+        received = bool(record["marks"] & Mark.SCAN)
+        closed = []
+        if running < 0:
+            # Where the first marker got lost, all frames that did with it may be of this sweep.
+            lost_with_it = not received and at == 0
+            self._first_frame = min(self._next_frame, header.first_frame) if lost_with_it else header.first_frame + at
+        elif received and number == running + 1 and not record["marks"] & Mark.GATE_EDGE:
+            position = (int(record["marks"]) >> SUBFRAME_SHIFT) & SUBFRAME_MASK
+            edge = number * self._plan.sweep_points, start + (2 * position + 1) * terms.period_ticks
+            self._edges[:, now["edges"]] = edge
+            now["edges"] += 1
+        end_sweep = number if self._end_sweep is None else min(number, self._end_sweep)
+        for missed in range(running, end_sweep) if running >= 0 else ():
+            exact = received and missed + 1 == number
+            end = header.first_frame + at if exact else self._boundary_frame(missed + 1, at, header, start)
+            closed.append(self._close(missed, end, header.tick_hz))
+        now["sweep"], now["edges"], now["column"] = number, 0, -1
+        self._passed_over = 0
+        return closed
+
+    def _begin_in_light(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
+        """As `_begin`, where the light has told at which frame sweeps begin and when their scan markers came."""
+        assert self._light is not None, "asked for by the caller"
+        now = self._carried[0]
+        running, number = int(now["sweep"]), _sweep_named(record, terms)
+        place = self._light.place(number)
+        closed = []
+        for missed in range(running, number) if running >= 0 else ():
+            detection, end = self._light.place(missed).detection, self._light.end(missed)
+            frame, residual = self._light.place(missed + 1).frame, end.residual_frames / self._plan.exposures
+            clock = end.clock_error, residual, end.patterns
+            closed.append(SweepClock(missed, *clock, self._first_frame, frame, int(now["wrong_way"]), detection))
+            self._first_frame, now["wrong_way"] = frame, 0
+        if running < 0:
+            self._first_frame = place.frame
+        start = (int(record["ticks"]) + terms.start_ticks) * UNITS_PER_TICK
+        back = place.scan_frame - (header.first_frame + at)
+        self._ratio = place.ratio
+        now["anchor_time"] = start + round(back * _period(header) * UNITS_PER_TICK)
+        now["anchor_point"] = number * self._plan.sweep_points
+        now["sweep"], now["edges"], now["column"] = number, 0, -1
+        return closed
+
+    @property
+    def _markers_before(self) -> int:
+        """Scan markers up to the frames that come next, of which records have the low 16 bits."""
+        return int(self._carried["sweep"][0]) + 1
+
+    def _boundary_frame(self, number: int, at: int, header: BlockHeader, start: int) -> int:
+        """Number of the frame in which sweep `number` began, from the scanner's clock where the marker was lost."""
+        here = header.first_frame + at
+        time, point = (int(self._carried[name][0]) for name in ("anchor_time", "anchor_point"))
+        if point < 0:
+            return here
+        ahead = (number * self._plan.sweep_points - point) / self._points_per_unit(header.tick_hz)
+        frame = here - math.ceil((start - time - ahead) / (_period(header) * UNITS_PER_TICK))
+        received = self._next_frame if at == 0 else here
+        return min(max(frame, self._first_frame, min(received, here)), here)
+
+    def _close(self, number: int, end_frame: int, tick_hz: Fraction) -> SweepClock:
+        now = self._carried[0]
+        nominal = self._points_per_unit(tick_hz) / self._ratio
+        point, time = self._edges[0, : now["edges"]], self._edges[1, : now["edges"]]
+        fit = _fit(point, time, nominal, float(self._plan.points_per_column))
+        clock = SweepClock(number, *fit, self._first_frame, end_frame, int(now["wrong_way"]))
+        if number >= self._first_sweep and fit[2] > 2 and clock.synchronised:
+            self._ratio = 1 + clock.clock_error
+        self._first_frame = end_frame
+        now["edges"] = now["wrong_way"] = 0
+        return clock
+
+    def _points_per_unit(self, tick_hz: Fraction) -> float:
+        if tick_hz != self._tick_hz:  # once a run: fractions take longer than all the rest of a block
+            self._tick_hz = tick_hz
+            self._nominal = float(self._plan.point_rate_hz / tick_hz / UNITS_PER_TICK)
+        return self._nominal * self._ratio
+
+
+_WHOLE = np.dtype((np.void, FRAME_RECORD.itemsize))
+"""A record as bytes, which numpy copies at once instead of field by field."""
+
+
+def _plan_terms(plan: ScanPlan) -> PlanTerms:
+    return PlanTerms(
+        plan.places,
+        float(plan.column_s),
+        float(plan.point_rate_hz),
+        plan.sweep_points,
+        np.array(plan.marker_points, np.int64),
+        np.array([plan.lit_start_s(leg) for leg in plan.legs], np.float64),
+        np.array([leg.columns_rise for leg in plan.legs], np.bool_),
+        np.array([leg.direction for leg in plan.legs], np.int8),
+        BYTE_FRAMES if plan.exposures <= BYTE_EXPOSURES else np.iinfo(np.int64).max,
+    )
+
+
+def _new_places(n: int) -> Places:
+    return np.empty(n, np.int32), np.empty(n, np.int8), np.empty(n, np.float64), np.empty(n, np.int32)
+
+
+def _sweep_named(record: np.void, terms: BlockTerms) -> int:
+    """Number of the sweep that a frame names, -1 before the first: one less than the scan markers it has seen.
+
+    Of those the record has the low 16 bits, continued from the header's 32.
+    """
+    return terms.sweep + ((int(record["sweep"]) - terms.sweep) & 0xFFFF) - 1
+
+
+def _period(header: BlockHeader) -> int:
+    return header.frame_period_ticks or header.exposure_ticks
+
+
+def _fit(
+    point: NDArray[np.int64], time: NDArray[np.int64], points_per_unit: float, points_per_column: float
+) -> tuple[float, float, int]:
+    """Relative clock error, largest residual in columns and number of markers of a sweep's marker points and times."""
+    count = len(point)
+    if count < 2:
+        return 0.0, math.nan, count
+    x, y = (values - values[0] - (values - values[0]).mean() for values in (point, time))
+    units_per_point = float(x @ y / (x @ x))
+    residual = float(np.abs(y - units_per_point * x).max())
+    return 1 / (units_per_point * points_per_unit) - 1, residual / (units_per_point * points_per_column), count

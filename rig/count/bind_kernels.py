@@ -1,0 +1,138 @@
+"""Compiled walk along the records of a block, which gives every frame its sweep, direction, column and bin.
+
+What it has to remember lies in one record (`CARRIED` in rig/count/bind.py), so it goes on in the next block where it
+left off in this one. Measured per block of 100 frames: 1.4 us and 4.5 us for the call, 13 us in all with what
+`FrameBinder.bind` does around it. The same with numpy's operations on whole blocks took 180 us, held the interpreter
+for as long, and could not tell from one frame what may be done with the next.
+"""
+
+from typing import Any, Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.frames import SUBFRAME_MASK, SUBFRAME_SHIFT, Mark
+from rig.count.bind import UNITS_PER_TICK, BlockTerms, PlanTerms
+from rig.count.volume import BIN_DARK, BIN_UNUSABLE
+
+_GATE_HIGH: Final = int(Mark.GATE_HIGH)
+_GATE_EDGE: Final = int(Mark.GATE_EDGE)
+_LINE: Final = int(Mark.LINE)
+_SCAN: Final = int(Mark.SCAN)
+_BACKWARD: Final = int(Mark.BACKWARD)
+_WINDOW_LOST: Final = int(Mark.WINDOW_LOST)
+
+
+@numba.njit(cache=True, nogil=True)
+def _marker_point(marks, line, number, plan):  # type: ignore[no-untyped-def]
+    """Point since the first sweep of the marker in a frame of sweep `number`; -1: none that is usable."""
+    # A record has room for one position, the latest edge's: beside a gate edge it is not surely the marker's.
+    if marks & _GATE_EDGE:
+        return -1
+    if marks & _LINE and 1 <= line <= len(plan.marker_points):
+        return number * plan.sweep_points + plan.marker_points[line - 1]
+    return number * plan.sweep_points if marks & _SCAN else -1
+
+
+@numba.njit(cache=True, nogil=True)
+def _bin(marks, column, columns):  # type: ignore[no-untyped-def]
+    """Bin of a frame by its marks and column alone."""
+    if np.isnan(column) or marks & (_GATE_EDGE | _WINDOW_LOST):
+        return BIN_UNUSABLE
+    if not marks & _GATE_HIGH:
+        return BIN_DARK
+    nearest = np.floor(column + 0.5)
+    return int(nearest) if 0 <= nearest < columns else BIN_UNUSABLE
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_order(bin, number, plan, carried):  # type: ignore[no-untyped-def]
+    """The bin of a lit frame, BIN_UNUSABLE where its sweep has left that column or has all the frames it may use."""
+    now = carried[0]
+    if number != now.sweep:
+        return BIN_UNUSABLE
+    if bin != now.column:
+        rises = plan.columns_rise[number % len(plan.columns_rise)]
+        if now.column >= 0 and (bin > now.column) != rises:
+            return BIN_UNUSABLE
+        now.column = bin
+        now.in_column = 0
+    if now.in_column >= plan.most_in_column:
+        return BIN_UNUSABLE
+    now.in_column += 1
+    return bin
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def walk(
+    records: NDArray[np.void],
+    at: int,
+    block: BlockTerms,
+    plan: PlanTerms,
+    carried: NDArray[np.void],
+    edges: NDArray[np.int64],
+    sweep: NDArray[np.int32],
+    direction: NDArray[np.int8],
+    column: NDArray[np.float64],
+    bins: NDArray[np.int32],
+) -> Any:
+    """Place frames `at` and on; returns the index of the first frame of a new sweep, or the number of records.
+
+    carried: (1,) of `CARRIED`. edges: (2, enough) point and time of the running sweep's markers. The others are
+    filled, as in `BoundFrames`.
+    """
+    now = carried[0]
+    for i in range(at, len(records)):
+        record = records[i]
+        marks = np.int64(record.marks)
+        number = block.sweep + ((np.int64(record.sweep) - block.sweep) & 0xFFFF) - 1
+        if number > now.sweep:
+            return i
+        sweep[i], direction[i], column[i], bins[i] = number, 0, np.nan, BIN_UNUSABLE
+        # Sweeps never go back: such a number is damaged, and so may be the marker beside it.
+        if number < 0 or number < now.sweep:
+            continue
+        start = (np.int64(record.ticks) + block.start_ticks) * UNITS_PER_TICK
+        point = _marker_point(marks, np.int64(record.line), number, plan)
+        if point >= 0:
+            # The middle of the 1/256 of the period that the position names.
+            position = (marks >> SUBFRAME_SHIFT) & SUBFRAME_MASK
+            now.anchor_time, now.anchor_point = start + (2 * position + 1) * block.period_ticks, point
+            edges[0, now.edges], edges[1, now.edges] = point, now.anchor_time
+            now.edges += 1
+        leg = number % len(plan.direction)
+        direction[i] = plan.direction[leg]
+        if marks & _GATE_HIGH and (marks & _BACKWARD != 0) != (plan.direction[leg] < 0):
+            now.wrong_way += 1
+        if now.anchor_point >= 0:
+            since = (start + block.middle - now.anchor_time) * block.points_per_unit
+            tau_s = (now.anchor_point - number * plan.sweep_points + since) / plan.point_rate_hz
+            done = (tau_s - plan.lit_start_s[leg]) / plan.column_s
+            column[i] = done - 0.5 if plan.columns_rise[leg] else plan.columns - 0.5 - done
+        bins[i] = _bin(marks, column[i], plan.columns)
+        if bins[i] >= 0:
+            bins[i] = _in_order(bins[i], number, plan, carried)
+    return len(records)
+
+
+@numba.njit(cache=True, nogil=True)
+def cover(
+    bins: NDArray[np.int32], x0: NDArray[np.int32], used_px: int, column_x0: NDArray[np.int32], window: int
+) -> tuple[int, int]:
+    """Take the bin of frames whose used pixels do not hold all that their column counts: none is counted in part.
+
+    x0: (n,) first of the `used_px` pixels of each frame. column_x0: (columns,) first of the `window` pixels of each
+    column. Returns the numbers of frames that are left on columns and in the dark.
+    """
+    lit = dark = 0
+    for i in range(len(bins)):
+        if bins[i] == BIN_DARK:
+            dark += 1
+        elif bins[i] >= 0:
+            first = column_x0[bins[i]]
+            if x0[i] <= first and first + window <= x0[i] + used_px:
+                lit += 1
+            else:
+                bins[i] = BIN_UNUSABLE
+    return lit, dark

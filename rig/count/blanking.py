@@ -1,0 +1,473 @@
+"""Writes marks and sweep numbers into the records of frames that carry none, from the blanking pattern in their light.
+
+    nothing known --a pattern, and the next one a sweep later--> sweep 0 --the pattern where it is expected--> sweep 1
+
+Scan markers lie on a straight line of time, which is fitted to all patterns found so far: one that is missing, because
+frames were lost or nothing was in the light's way, is taken from that line. A sweep begins, for those who count, with
+the frame at which its pattern has surely passed, just before the gate opens for the lit part. All of that depends on
+the frames before it only, not on the size of blocks, and never on the host's time or the device's word for its clock.
+
+Finds the blanking pattern in the ones of frames: where it begins, how sure that is, and how clearly it stands out.
+
+Model of the ones n_i in frame i, about a pattern that begins at t (in frames, frame i being exposed from i on):
+
+    n_i = level + drift i + brightness g_i(t),     g_i = share of frame i's exposure with the gate open
+
+For every t it is fitted by least squares; the best t is where it explains most. Photons of the laser, of daylight and
+of the dark all scatter alike here, so nothing needs to be known about them. `score` is brightness over its standard
+deviation; what remains beyond the scatter of photons must be less than what the pattern explains, which tells it from
+other light that comes and goes. Both are checked against a simulation in tests/unit/rig/count/test_blanking.py.
+
+The straight line of time on which the scanner's scan markers lie, fitted to those that were found.
+"""
+
+import logging
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from drivers.errors import DeviceFault
+from drivers.frames import BlockFlag, BlockHeader, FrameBlock, Mark
+from rig.geometry.windows import WORD_PX
+from rig.plan.scan_plan import MARGIN_FRAMES, MAX_CLOCK_ERROR, Blanking, ScanPlan
+
+Array = NDArray[np.float64]
+
+LEAST_SCORE = 4.0
+"""Standard deviations from which on it may be the pattern: by chance in every other burst, but twice at the right
+distance in one of some ten thousand, which the pattern behind the first map then does not bear out."""
+MOST_UNEXPLAINED = 1.0
+"""Most of what photons do not explain, as a share of what the pattern does. A pattern in the wrong place leaves 7."""
+LEAST_SHARE = 0.7
+"""Share of a search's frames that must have been received."""
+EDGE_FRAMES = 2
+"""Frames looked at before and behind the pattern."""
+STEPS = 8
+"""Places tried per frame; the best is then found between them."""
+PHASES = np.arange(4) / 4
+"""Places tried per frame while nothing is known."""
+_FIT_STEPS = 4
+_NO_LIGHT = 1e-300
+"""Ones per frame that no frame has: where there are none at all, nothing stands out by 0 standard deviations."""
+_GRAIN = 64
+"""The rough search takes shares of a frame in whole parts of this: its sums are exact, in whatever order."""
+
+
+@dataclass(frozen=True, slots=True)
+class PatternFit:
+    """place: frames, of the pattern's first edge; sd: its standard deviation. brightness: ones a lit frame has more."""
+
+    place: float
+    sd: float
+    score: float
+    brightness: float
+    level: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatternShape:
+    """flashes: (m, 2) open and close of each, in frames from the first edge. exposure: share of a frame's period."""
+
+    flashes: Array
+    exposure: float
+
+    @property
+    def length(self) -> float:
+        """Frames from the first edge to the last."""
+        return float(self.flashes[-1, 1])
+
+    def shares(self, places: Array, frames: Array) -> Array:
+        """Share of each frame's exposure with the gate open, (places, frames), of a pattern at each place."""
+        opened = places[:, None, None] + self.flashes[:, 0]
+        closed = places[:, None, None] + self.flashes[:, 1]
+        start = frames[None, :, None]
+        lit: Array = np.minimum(start + self.exposure, closed) - np.maximum(start, opened)
+        shares: Array = np.clip(lit, 0, None).sum(axis=2) / self.exposure
+        return shares
+
+
+class PatternSearch:
+    """Looks for one pattern in the ones of consecutive frames."""
+
+    def __init__(self, shape: PatternShape) -> None:
+        self._shape = shape
+        self.window = math.ceil(shape.length) + 1 + 2 * EDGE_FRAMES
+        """Frames that the rough search looks at together."""
+        frames = np.arange(self.window, dtype=np.float64)
+        shares = shape.shares(EDGE_FRAMES + PHASES, frames)
+        self._time = 2 * frames - (self.window - 1)
+        self._shares = np.round(shares * _GRAIN)
+
+    def scores(self, ones: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Score of the best place in each window of `ones` (n,), and whether it may be the pattern; (n - window + 1,).
+
+        NaN where a frame of the window is missing.
+        """
+        n = self.window
+        windows = sliding_window_view(ones, n)
+        mean, drift = windows.sum(axis=1) / n, windows @ self._time
+        time2 = float(self._time @ self._time)
+        total = (windows * windows).sum(axis=1) - n * mean**2 - drift**2 / time2
+        score = np.full(len(windows), np.nan)
+        unexplained = np.full(len(windows), np.nan)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            for g in self._shares:
+                along = float(g @ self._time)
+                left = float(g @ g) - float(g.sum()) ** 2 / n - along**2 / time2
+                cross = windows @ g - mean * float(g.sum()) - drift * along / time2
+                here, beyond = _judged(cross, left, total, mean, n)
+                better = ~(here <= score)
+                score, unexplained = np.where(better, here, score), np.where(better, beyond, unexplained)
+            return score, (score >= LEAST_SCORE) & (unexplained <= MOST_UNEXPLAINED)
+
+    def measure(self, ones: Array, first: int, place: float, radius: float) -> PatternFit | None:
+        """The pattern within `radius` frames of `place`; None where it is not there.
+
+        ones: of frames `first`, first + 1, ... , NaN where missing; they must span `span(place, radius)`.
+        """
+        begin, end = self.span(place, radius)
+        if begin < first or end > first + len(ones):
+            return None
+        here = ones[begin - first : end - first]
+        frames = np.arange(begin, end, dtype=np.float64)
+        got = np.isfinite(here)
+        if np.count_nonzero(got) < LEAST_SHARE * len(here):
+            return None
+        steps = math.ceil(radius * STEPS)
+        places = place + np.arange(-steps, steps + 1) / STEPS
+        return _best(self._shape.shares(places, frames[got]), places, frames[got], here[got])
+
+    def span(self, place: float, radius: float) -> tuple[int, int]:
+        """First frame, and the one behind the last, that `measure` needs."""
+        return (
+            math.floor(place - radius) - EDGE_FRAMES,
+            math.ceil(place + radius + self._shape.length) + EDGE_FRAMES,
+        )
+
+
+def _judged(cross: Array, left: float, total: Array, mean: Array, n: int) -> tuple[Array, Array]:
+    """Score, and what remains beyond the scatter of photons as a share of what is explained."""
+    explained = cross**2 / left
+    rest = np.maximum(total - explained, 0)
+    scatter = np.maximum(rest / (n - 4), np.maximum(mean, _NO_LIGHT))
+    return np.sign(cross) * np.sqrt(explained / scatter), np.maximum(rest - n * mean, 0) / explained
+
+
+def _best(shares: Array, places: Array, frames: Array, ones: Array) -> PatternFit | None:
+    basis, _ = np.linalg.qr(np.stack([np.ones(len(frames)), frames - frames.mean()], axis=1))
+    ones_left = ones - basis @ (basis.T @ ones)
+    left = shares - (shares @ basis) @ basis.T
+    size = np.einsum("pf,pf->p", left, left)
+    cross = left @ ones_left
+    explained = np.where((cross > 0) & (size > 0), cross**2 / np.where(size > 0, size, 1), 0.0)
+    at = int(np.argmax(explained))
+    a, b = max(at - _FIT_STEPS, 0), min(at + _FIT_STEPS + 1, len(places))
+    if explained[at] <= 0 or b - a < 2 * _FIT_STEPS + 1:  # at the rim of what was looked at: it is not in there
+        return None
+    n, mean = len(ones), np.array(ones.mean())
+    score, unexplained = _judged(cross[at], float(size[at]), np.array(ones_left @ ones_left), mean, n)
+    if not (score >= LEAST_SCORE and unexplained <= MOST_UNEXPLAINED):
+        return None
+    curve, slope, _ = np.polyfit(places[a:b] - places[at], explained[a:b], 2)
+    if curve >= 0:
+        return None
+    scatter = explained[at] / score**2
+    brightness = float(cross[at] / size[at])
+    level = float(mean) - brightness * float(shares[at].mean())
+    shift = float(np.clip(-slope / (2 * curve), -1 / 2, 1 / 2))
+    return PatternFit(float(places[at]) + shift, math.sqrt(scatter / -curve), float(score), brightness, level)
+
+
+def detection_probability(score: float) -> float:
+    """Chance that a pattern that stands out so clearly on average is found."""
+    return 0.5 * math.erfc((LEAST_SCORE - score) / math.sqrt(2))
+
+
+LEAST_SD_FRAMES = 1e-3
+"""No place is better known than this: one bright pattern must not outweigh all others."""
+
+
+@dataclass(slots=True)
+class MarkerLine:
+    """Scan markers found so far: index of each one's sweep, its place in frames, and that one's standard deviation."""
+
+    index: list[int] = field(default_factory=list)
+    place: list[float] = field(default_factory=list)
+    sd: list[float] = field(default_factory=list)
+
+    def add(self, index: int, place: float, sd: float) -> None:
+        """Take up one more."""
+        self.index.append(index)
+        self.place.append(place)
+        self.sd.append(max(sd, LEAST_SD_FRAMES))
+
+    def fit(self, index: int) -> tuple[float, float, float]:
+        """Place of the scan marker of sweep `index`, its standard deviation, and frames per sweep."""
+        weight = np.array(self.sd) ** -2.0
+        x = np.array(self.index, np.float64) - index
+        middle = float(weight @ x / weight.sum())
+        spread = float(weight @ (x - middle) ** 2)
+        place = np.array(self.place)
+        level = float(weight @ place / weight.sum())
+        slope = float((weight * (x - middle)) @ (place - level) / spread)
+        return level - slope * middle, math.sqrt(1 / weight.sum() + middle**2 / spread), slope
+
+
+_log = logging.getLogger(__name__)
+
+SEARCH_S = 10.0
+"""A stream without two patterns a sweep apart for so long, sweeps apart, is given up."""
+CLEAR_SCORE = 2 * LEAST_SCORE
+"""A pattern that stands out so clearly is one: light is not what is missing."""
+ASIDE_PX = 64
+"""In the run-in the stripe is a little beside the window of the first column."""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepPlace:
+    """Where a sweep lies. frame: from which it counts. scan_frame: place of its scan marker, in frames. ratio: of the
+    scanner's clock to nominal, in the SPAD's time. found: its pattern; None: taken from the line of the others."""
+
+    number: int
+    frame: int
+    scan_frame: float
+    ratio: float
+    found: PatternFit | None
+
+    @property
+    def detection(self) -> float:
+        """Chance that a pattern as bright as this one is found; 0: it was not."""
+        return 0.0 if self.found is None else detection_probability(self.found.score)
+
+
+@dataclass(frozen=True, slots=True)
+class SweepEnd:
+    """What the pattern behind a sweep says of it: relative clock error, distance of that pattern from where the ones
+    before it put it (or how surely it is known, where that is more), and how many patterns that rests on."""
+
+    clock_error: float
+    residual_frames: float
+    patterns: int
+
+
+class BlankingSync:
+    """Finds the sweeps of one run, block by block. Indices count sweeps of the waveform, numbers those of the maps.
+
+    end_sweep: number of the last sweep that is marked, the one behind all that are wanted; None: all are.
+    """
+
+    def __init__(self, plan: ScanPlan, end_sweep: int | None = None) -> None:
+        assert plan.blanking is not None, "only such a plan is bound by its light"
+        self._plan = plan
+        self._end_sweep = end_sweep
+        self._blanking: Blanking = plan.blanking
+        self._rate = float(plan.frame_rate_hz)
+        self._period = float(plan.frames_per_sweep)
+        self._tolerance = self._blanking.tolerance_s * self._rate
+        exposure = min(plan.exposure_s * self._rate, 1.0)
+        self._shapes = [
+            PatternShape(np.array(self._blanking.flashes_s(leg)) * self._rate, exposure) for leg in range(plan.pilots)
+        ]
+        self._searches = [PatternSearch(shape) for shape in self._shapes]
+        self._delay = [plan.pattern_s(leg) * self._rate for leg in plan.legs]
+        """Frames from the scan marker to the pattern, by leg."""
+        self._words = [_words(plan, leg.columns_rise) for leg in plan.legs]
+        self._kept = math.ceil(3 * self._shapes[0].length + 2 * self._tolerance) + 8 * math.ceil(MARGIN_FRAMES)
+        self._ones: Array = np.empty((len(plan.legs), 0))
+        self._ones_first = 0
+        self._origin: int | None = None
+        self._best: tuple[float, int, int] | None = None
+        """Score, frame and leg of the best window since it first looked like a pattern."""
+        self._most: tuple[float, int] = (0.0, 0)
+        """Highest score of all, and its frame: to be told where nothing is found."""
+        self._pilots: list[tuple[int, PatternFit]] = []
+        """Index and pattern of what may be the first ones."""
+        self._line = MarkerLine()
+        self._next: int | None = None
+        """Index of the sweep whose pattern is expected next; None: nothing is known yet."""
+        self._places: dict[int, SweepPlace] = {}
+        self._ends: dict[int, SweepEnd] = {}
+        self._now: SweepPlace | None = None
+
+    def mark(self, block: FrameBlock, records: NDArray[np.void]) -> None:
+        """Fill marks, line and sweep of the block's `records` (n,).
+
+        DeviceFault where the run, or `SEARCH_S`, ends without two patterns a sweep apart.
+        """
+        header, n = block.header, block.n_frames
+        self._count(block)
+        records["line"] = 0
+        at, last = header.first_frame, header.first_frame + n - 1
+        if self._next is None:
+            self._look(header.first_frame, last)
+        while (place := self._begin_next(last)) is not None:
+            begin = max(place.frame, at)  # later, where the frames in which it began were lost
+            self._write(records[at - header.first_frame : begin - header.first_frame], at)
+            self._now, at = place, begin
+        self._write(records[at - header.first_frame :], at)
+        if self._next is None:
+            self._give_up(header, last)
+
+    def place(self, number: int) -> SweepPlace:
+        """Where the sweep of map `number` lies; it is forgotten with the end of the sweep."""
+        return self._places[number]
+
+    def end(self, number: int) -> SweepEnd:
+        """What is known of that sweep, once the next one has begun."""
+        del self._places[number]
+        return self._ends.pop(number)
+
+    def _count(self, block: FrameBlock) -> None:
+        """The ones of each frame, where each leg's run-in is seen; lost frames are NaN."""
+        first = block.header.first_frame
+        if self._origin is None:
+            self._origin = self._ones_first = first
+        words = block.bits.view(np.uint64)
+        ones = np.stack([np.bitwise_count(words[:, :, a:b]).sum(axis=(1, 2), dtype=np.float64) for a, b in self._words])
+        gap = min(first - self._ones_first - self._ones.shape[1], self._kept)
+        lost = np.full((len(ones), gap), np.nan)
+        self._ones = np.concatenate([self._ones[:, max(0, self._ones.shape[1] - self._kept) :], lost, ones], axis=1)
+        self._ones_first = first + block.n_frames - self._ones.shape[1]
+
+    def _look(self, first: int, last: int) -> None:
+        """Take up patterns that lie anywhere in the frames so far."""
+        hits: list[tuple[int, float, int]] = []
+        for leg, search in enumerate(self._searches):
+            begin = max(first - search.window + 1, self._ones_first)
+            ones = self._ones[leg, begin - self._ones_first :]
+            if len(ones) < search.window:
+                continue
+            score, like = search.scores(ones)
+            frames = begin + np.arange(len(score)) + search.window - 1
+            highest = int(np.argmax(np.nan_to_num(score)))
+            if score[highest] > self._most[0]:
+                self._most = float(score[highest]), int(frames[highest]) - search.window + 1
+            hits += [(int(frames[i]), float(score[i]), leg) for i in np.flatnonzero(like)]
+        hold = math.ceil(self._shapes[0].length)
+        for frame, score_here, leg in [*sorted(hits), (last + 1, 0.0, 0)]:
+            if self._best is not None and frame > self._best[1] + hold:
+                self._take_up(*self._best[1:])
+                self._best = None
+            if score_here and (self._best is None or score_here > self._best[0]):
+                self._best = score_here, frame, leg
+
+    def _take_up(self, frame: int, leg: int) -> None:
+        search = self._searches[leg]
+        begin = frame - search.window + 1 + MARGIN_FRAMES
+        found = search.measure(self._ones[leg], self._ones_first, begin, math.ceil(self._shapes[leg].flashes[0, 1]) + 1)
+        if found is not None:
+            _log.info("blanking pattern at frame %.2f, %.1f sigma", found.place, found.score)
+            self._pilots.append((leg, found))
+
+    def _begin_next(self, last: int) -> SweepPlace | None:
+        """The next sweep that begins up to frame `last`; None: none does."""
+        if self._next is not None:
+            return self._expected(last)
+        for pilot in list(self._pilots):
+            index, found = pilot
+            scan = found.place - self._delay[index]
+            if self._known_at(index + 1, scan + self._period) > last:
+                continue
+            self._pilots.remove(pilot)
+            second = self._measure(index + 1, scan + self._period)
+            if second is None:
+                continue
+            self._line.add(index, scan, found.sd)
+            self._next = index + 1
+            return self._expected(last, first=True)
+        return None
+
+    def _expected(self, last: int, first: bool = False) -> SweepPlace | None:
+        index = self._next
+        assert index is not None, "asked for by the caller"
+        if self._end_sweep is not None and index - self._plan.pilots > self._end_sweep:
+            return None
+        if first:
+            expected, sd, period = self._line.place[-1] + self._period, math.nan, self._period
+        else:
+            expected, sd, period = self._line.fit(index)
+        frame = self._known_at(index, expected)
+        if frame > last:
+            return None
+        found = self._measure(index, expected)
+        number = index - self._plan.pilots
+        residual = math.nan
+        if found is not None:
+            scan = found.place - self._delay[index % len(self._delay)]
+            residual = max(abs(scan - expected), math.hypot(sd, found.sd))
+            self._line.add(index, scan, found.sd)
+        scan, _, period = self._line.fit(index)
+        ratio = self._period / period
+        if number > 0:
+            self._ends[number - 1] = SweepEnd(ratio - 1, residual, len(self._line.index))
+        self._next = index + 1
+        place = SweepPlace(number, frame, scan, ratio, found)
+        if number >= 0:
+            self._places[number] = place
+        self._tell(place)
+        return place
+
+    def _known_at(self, index: int, scan: float) -> int:
+        """The frame by which the pattern of a sweep has surely passed."""
+        leg = index % len(self._delay)
+        return self._searches[leg].span(scan + self._delay[leg], self._tolerance)[1] - 1
+
+    def _measure(self, index: int, scan: float) -> PatternFit | None:
+        leg = index % len(self._delay)
+        place = scan + self._delay[leg]
+        return self._searches[leg].measure(self._ones[leg], self._ones_first, place, self._tolerance)
+
+    def _write(self, records: NDArray[np.void], first: int) -> None:
+        """Marks of consecutive frames from `first` on, all of the present sweep."""
+        now = self._now
+        if now is None or now.number < 0:
+            records["sweep"], records["marks"] = 0, Mark.GATE_EDGE
+            return
+        leg = self._plan.leg(now.number)
+        since = first + np.arange(len(records)) - now.scan_frame
+        opened, closed = leg.gate_open_s * self._rate, leg.gate_close_s * self._rate
+        # The gate is on the sync source's clock, of which the light says nothing: half a frame, and what it may be off.
+        early, late = (0.5 + MAX_CLOCK_ERROR * at for at in (opened, closed))
+        upcoming = self._period / now.ratio + self._delay[(now.number + 1) % len(self._delay)] - self._tolerance
+        marks = np.full(len(records), int(Mark.GATE_EDGE), np.uint32)
+        marks[(since > closed + late) & (since + 1 < upcoming)] = 0
+        marks[(since >= opened + early) & (since + 1 <= closed - late)] = Mark.GATE_HIGH
+        records["marks"] = marks | np.uint32(Mark.BACKWARD if leg.direction < 0 else 0)
+        records["sweep"] = (now.number + 1) & 0xFFFF
+
+    def _tell(self, place: SweepPlace) -> None:
+        if place.found is None:
+            _log.warning("sweep %d: no blanking pattern where it was expected", place.number)
+            return
+        found = place.found
+        _log.info(
+            "sweep %d: blanking pattern at frame %.3f +- %.3f, %.1f sigma (%.4g over %.4g ones), detection probability "
+            "%.6f",
+            place.number, found.place, found.sd, found.score, found.brightness, found.level,
+            place.detection,
+        )  # fmt: skip
+
+    def _give_up(self, header: BlockHeader, last: int) -> None:
+        assert self._origin is not None, "frames were counted"
+        limit_s = SEARCH_S + 3 * self._period / self._rate
+        if not header.flags & BlockFlag.LAST and last - self._origin < limit_s * self._rate:
+            return
+        score, frame = self._most
+        step = "the laser's gate cable, and that the line is in the picture before the first column; raise scan.power"
+        if score >= CLEAR_SCORE:
+            step = "the scanner's scan marker at the sync source, and the clocks"
+        raise DeviceFault(
+            f"the blanking pattern of {self._shapes[0].length:.0f} frames was not found twice, {self._period:.0f} "
+            f"frames apart: among {last - self._origin + 1} frames it stood out by {score:.1f} sigma at most, at frame "
+            f"{frame} ({LEAST_SCORE:g} are needed, twice); frames cannot be bound to columns: check {step}"
+        )
+
+
+def _words(plan: ScanPlan, columns_rise: bool) -> tuple[int, int]:
+    """First word of a row, and the one behind the last, in which the run-in of a leg is seen."""
+    x0 = int(plan.x0[0 if columns_rise else -1])
+    row = -(-plan.width // WORD_PX)
+    return max(0, (x0 - ASIDE_PX) // WORD_PX), min(row, -(-(x0 + plan.window + ASIDE_PX) // WORD_PX))

@@ -1,0 +1,178 @@
+"""Counts of a row in lane order: what bit planes turn into with shifts and masks alone.
+
+Lane i of pair q holds the bytes of pixels 8 i + 2 q and 8 i + 2 q + 1, as the bits of packed bytes lie. A row of counts
+is uint8 (PAIRS, lanes + 2 PAD, 2): PAD zero lanes on both sides of each pair's, so that the pair before and behind any
+is one load away. Two neighbouring counts side by side are what an x86 processor multiplies and adds in one instruction.
+"""
+
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.simd.memory import load_bytes, load_two_rows, store_bytes, write_byte
+from rig.simd.shuffles import first_row_pairs, second_row_pairs
+from rig.simd.vectors import LANES, as_bytes, zero_bytes, zero_int16
+
+STEPS: Final = 8
+"""Pixels per lane."""
+PAIRS: Final = 4
+"""Pairs of pixels per lane."""
+PAD: Final = 8
+"""Zero lanes on both sides of each pair's."""
+
+
+@numba.njit(cache=True, nogil=True)
+def padded_lanes(pixels: int) -> int:
+    """Lanes of a row of so many pixels, whole vectors."""
+    return -(-pixels // (STEPS * LANES)) * LANES
+
+
+@numba.njit(forceinline=True)
+def pair_bytes(lanes: int) -> int:
+    """Bytes from one pair of a row of counts to the next."""
+    return 2 * (lanes + 2 * PAD)
+
+
+@numba.njit(cache=True, nogil=True)
+def new_counts(rows: int, lanes: int) -> NDArray[np.uint8]:
+    """Rows of `lanes` lanes (rows, bytes), all zero."""
+    return np.zeros((rows, PAIRS * pair_bytes(lanes)), np.uint8)
+
+
+@numba.njit(forceinline=True)
+def place_of(x, lanes):  # type: ignore[no-untyped-def]
+    """Index of pixel x in a row of counts of so many lanes; from -STEPS * PAD on."""
+    return ((x & 7) >> 1) * pair_bytes(lanes) + 2 * (PAD + (x >> 3)) + (x & 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def places_of(x: NDArray[np.int64], lanes: int) -> NDArray[np.int32]:
+    """The same of many pixels (n,)."""
+    places = np.empty(x.shape[0], np.int32)
+    for i in range(x.shape[0]):
+        places[i] = place_of(x[i], lanes)
+    return places
+
+
+@numba.njit(inline="always")
+def _nibbles(b0, b1, b2, b3):  # type: ignore[no-untyped-def]
+    """Counts of pixels 0 to 7 of each byte from four bit planes; the first pixel is the highest bit."""
+    even_01, odd_01 = (b0 & 0x55) | ((b1 & 0x55) << 1), ((b0 >> 1) & 0x55) | (b1 & 0xAA)
+    even_23, odd_23 = (b2 & 0x55) | ((b3 & 0x55) << 1), ((b2 >> 1) & 0x55) | (b3 & 0xAA)
+    a, b = (odd_01 & 0x33) | ((odd_23 & 0x33) << 2), ((odd_01 >> 2) & 0x33) | (odd_23 & 0xCC)
+    c, d = (even_01 & 0x33) | ((even_23 & 0x33) << 2), ((even_01 >> 2) & 0x33) | (even_23 & 0xCC)
+    return (b >> 4) & 15, (d >> 4) & 15, (a >> 4) & 15, (c >> 4) & 15, b & 15, d & 15, a & 15, c & 15
+
+
+@numba.njit(forceinline=True)
+def read_planes(
+    planes: int, first: int, second: int, plane_bytes: int, n_planes: int, window: int, n: int, lanes: int
+) -> None:
+    """Counts of two rows of `window` pixels, to n and to the row behind it, from their bit planes.
+
+    planes, n: addresses. first, second: bytes at which the rows begin; planes lie `plane_bytes` apart, n_planes: 1, 2,
+    4 or 8 of them. Reads 16 bytes at a time, whatever the window.
+    """
+    pair = pair_bytes(lanes)
+    for v in range(0, lanes, LANES):
+        a, b = first + v, second + v
+        b0 = load_two_rows(planes, a, b)
+        if n_planes == 1:
+            n0, n1, n2, n3 = (b0 >> 7) & 1, (b0 >> 6) & 1, (b0 >> 5) & 1, (b0 >> 4) & 1
+            n4, n5, n6, n7 = (b0 >> 3) & 1, (b0 >> 2) & 1, (b0 >> 1) & 1, b0 & 1
+        else:
+            b1 = load_two_rows(planes, a + plane_bytes, b + plane_bytes)
+            b2, b3 = zero_bytes(), zero_bytes()
+            if n_planes > 2:
+                b2 = load_two_rows(planes, a + 2 * plane_bytes, b + 2 * plane_bytes)
+                b3 = load_two_rows(planes, a + 3 * plane_bytes, b + 3 * plane_bytes)
+            n0, n1, n2, n3, n4, n5, n6, n7 = _nibbles(b0, b1, b2, b3)
+        if n_planes == 8:
+            a, b = a + 4 * plane_bytes, b + 4 * plane_bytes
+            b4, b5 = load_two_rows(planes, a, b), load_two_rows(planes, a + plane_bytes, b + plane_bytes)
+            b6 = load_two_rows(planes, a + 2 * plane_bytes, b + 2 * plane_bytes)
+            b7 = load_two_rows(planes, a + 3 * plane_bytes, b + 3 * plane_bytes)
+            h0, h1, h2, h3, h4, h5, h6, h7 = _nibbles(b4, b5, b6, b7)
+            n0, n1, n2, n3 = n0 | (h0 << 4), n1 | (h1 << 4), n2 | (h2 << 4), n3 | (h3 << 4)
+            n4, n5, n6, n7 = n4 | (h4 << 4), n5 | (h5 << 4), n6 | (h6 << 4), n7 | (h7 << 4)
+        to = 2 * (PAD + v)
+        behind = to + PAIRS * pair
+        store_bytes(n, to, first_row_pairs(n0, n1))
+        store_bytes(n, to + pair, first_row_pairs(n2, n3))
+        store_bytes(n, to + 2 * pair, first_row_pairs(n4, n5))
+        store_bytes(n, to + 3 * pair, first_row_pairs(n6, n7))
+        store_bytes(n, behind, second_row_pairs(n0, n1))
+        store_bytes(n, behind + pair, second_row_pairs(n2, n3))
+        store_bytes(n, behind + 2 * pair, second_row_pairs(n4, n5))
+        store_bytes(n, behind + 3 * pair, second_row_pairs(n6, n7))
+    if window < lanes * STEPS:
+        # What was read beyond the window belongs to other pixels.
+        for q in range(2 * PAIRS):
+            store_bytes(n, q * pair + 2 * (PAD + window // STEPS), zero_bytes())
+
+
+@numba.njit(inline="always")
+def _share(x, times):  # type: ignore[no-untyped-def]
+    """What is added to the count of pixel x before 2^times divide it: 0 to 2^times - 1 by turns."""
+    return ((x & 7) << times) >> 3
+
+
+@numba.njit(inline="always")
+def _fine_share(x, times, turn):  # type: ignore[no-untyped-def]
+    """Like `_share` in 2048 steps, others on every turn: what eight steps would leave of few counts is not their mean.
+
+    The multipliers are odd, so that 2048 pixels in a row, or turns, take every step once.
+    """
+    return ((x * 0x9E3 + turn * 0x4F1 & 2047) << times) >> 11
+
+
+@numba.njit(cache=True, nogil=True)
+def read_counts(counts: NDArray[np.unsignedinteger], halved: int, n: int, lanes: int, turn: int = 0) -> None:
+    """Counts of a row in pixel order (window,) to address n, divided by 2^halved, as `halve_counts` does up to 8.
+
+    turn: a number that differs between the columns in which a pixel is read.
+    """
+    for x in range(counts.shape[0]):
+        share = _share(x, halved) if halved <= 3 else _fine_share(x, halved, turn)
+        write_byte(n, place_of(x, lanes), np.uint8((np.int64(counts[x]) + share) >> halved))
+
+
+@numba.njit(cache=True, nogil=True)
+def write_counts(n: NDArray[np.uint8], counts: NDArray[np.unsignedinteger]) -> None:
+    """Add the counts of row n to a row in pixel order (window,)."""
+    pair = n.shape[0] // PAIRS
+    for i in range(counts.shape[0] // STEPS):
+        for q in range(PAIRS):
+            at = q * pair + 2 * (PAD + i)
+            counts[STEPS * i + 2 * q] += n[at]
+            counts[STEPS * i + 2 * q + 1] += n[at + 1]
+
+
+@numba.njit(cache=True, nogil=True)
+def halve_counts(n: int, lanes: int, times: int) -> None:
+    """Divide all counts of the row at address n by 2^times, rounded up or down by turns: few counts keep their mean."""
+    rest = (1 << times) - 1
+    for q in range(PAIRS):
+        # The sum of a byte and its share may not fit: what is left over is looked at by itself.
+        shares = as_bytes(zero_int16() + np.int16(_share(2 * q, times) | _share(2 * q + 1, times) << 8))
+        for v in range(0, 2 * lanes, 2 * LANES):
+            at = q * pair_bytes(lanes) + 2 * PAD + v
+            counts = load_bytes(n, at)
+            store_bytes(n, at, (counts >> times) + (((counts & rest) + shares) >> times))
+
+
+@numba.njit(forceinline=True)
+def sum_counts(n: int, lanes: int, sums: int) -> None:
+    """Add the counts of the row at address n to bytes (PAIRS, lanes, 2) at address `sums`."""
+    for v in range(0, 2 * lanes, 2 * LANES):
+        for q in range(PAIRS):
+            at = 2 * q * lanes + v
+            store_bytes(sums, at, load_bytes(sums, at) + load_bytes(n, q * pair_bytes(lanes) + 2 * PAD + v))
+
+
+def pixel_order(sums: NDArray[np.generic], width: int) -> NDArray[np.generic]:
+    """Sums in lane order (rows, PAIRS, lanes, 2) as (rows, width)."""
+    rows = sums.shape[0]
+    return np.ascontiguousarray(sums.transpose(0, 2, 1, 3).reshape(rows, -1)[:, :width])

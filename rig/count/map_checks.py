@@ -1,0 +1,274 @@
+"""Does a map's own light bear it out? Checks of counts and answers that no scene fails, whatever it looks like.
+
+They ask a few thousand points, each a row and column with two partners: the next row, and the column by whose time the
+line has moved about six pixels. A stripe is seen in all three, at places that the planes tell, and no noise is.
+
+- Pixels of a row: light falls on neighbours alike, so that no other order of the pixels is smoother than the right one.
+- Rows: a line of light stands where it stands on the next row.
+- Columns: it moves from column to column as the planes do.
+- Answers of estimators that know their confidence: an answer that is sure, 0.9 for one place of some 150, rests on
+  seven nats. At most 7 x 7 lines have a say in it, so that each brings a seventh at least, which is a mean of half a
+  standard deviation: so much light more must stand at the answers than behind them, on lines that did not give them.
+
+Every limit is in standard deviations, taken from the points themselves, or follows from such a count; where points are
+too few for it a check says nothing.
+"""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import CountVolume
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import MARGIN_PX, WORD_PX, SweepGeometry
+
+Array = NDArray[np.float64]
+
+POINTS: Final = 512
+"""Of a sweep whose counts are not kept: their lines are."""
+VOLUME_POINTS: Final = 8192
+"""Of a sweep whose counts are kept."""
+FEWEST_POINTS: Final = 128
+APART_PX: Final = 6.0
+"""The line's motion between a point's column and its partner: more than the line is wide."""
+LIMIT: Final = 4.0
+"""Standard deviations: one false alarm in 30 000 checks."""
+FEWEST_ROWS: Final = 24
+"""With fewer rows than this a mean over rows cannot be LIMIT deviations off."""
+LEAST_FOLLOWING: Final = 0.25
+"""Light in common with the other column, over that with the next row. Scenes have 0.8 and more, clutter as of fences
+half of it; columns that do not follow one another have none."""
+SATURATED: Final = 0.99
+DIMMEST: Final = 0.1
+"""Mean rate of a pixel over that of all, below which its noise is taken for that of so much."""
+SURE: Final = 0.9
+GROUPS: Final = 8
+"""Sure answers by distance: what is wrong is mostly wrong together, as one surface that is not there."""
+LEAST_CONTRAST: Final = 0.5
+LINE_PX, BEHIND_PX = (-1, 1), (3, 9)
+"""Pixels from an answer, away from the near side, that hold its light, and light behind it."""
+
+ORDERS: Final = {
+    "the bits of each byte": "most significant bit first",
+    "the bytes of 16-bit words": "bytes as they lie along the row",
+    "the bytes of 32-bit words": "bytes as they lie along the row",
+    "the bytes of 64-bit words": "bytes as they lie along the row",
+}
+
+
+class Points(NamedTuple):
+    """Rows and columns that are looked at, with their partners: on the next row, and a few columns on.
+
+    row, column: int32 (3, points). shift: int32 (2, points), pixels from a stripe to the partner's, on one surface.
+    """
+
+    row: NDArray[np.int32]
+    column: NDArray[np.int32]
+    shift: NDArray[np.int32]
+
+
+def check_points(geometry: SweepGeometry, most: int = POINTS) -> Points:
+    """Up to `most` points spread evenly over the map; none where no column has a partner."""
+    reference = geometry.reference_px()
+    steps = np.abs(np.diff(reference, axis=1))
+    step_px = float(np.median(steps)) if steps.size else 0.0
+    columns = geometry.columns
+    apart = min(max(round(APART_PX / step_px), 1), max(columns - 1, 1)) if step_px > 0 else 1
+    searched = geometry.x_lo <= geometry.x_hi
+    y, c = np.nonzero(searched[:-1, : columns - apart] & searched[1:, : columns - apart] & searched[:-1, apart:])
+    if len(y) > most:
+        # Golden-ratio steps cover rows and columns without beating against either.
+        i, each = np.arange(most), len(y) / most
+        pick = np.unique((i * each + (i * 0.6180339887) % 1 * each).astype(np.int64))
+        y, c = y[pick], c[pick]
+    here = reference[y, c]
+    shift = np.rint([reference[y + 1, c] - here, reference[y, c + apart] - here])
+    row, column = np.stack([y, y + 1, y]), np.stack([c, c, c + apart])
+    return Points(row.astype(np.int32), column.astype(np.int32), shift.astype(np.int32))
+
+
+class MapChecks:
+    """The checks of maps of one geometry.
+
+    calibrated: whether its planes are known. knows: whether the estimator's confidence is a probability, as of those
+    that learn what the light is like.
+    """
+
+    def __init__(self, geometry: SweepGeometry, *, calibrated: bool, knows: bool) -> None:
+        self._geometry = geometry
+        self._calibrated = calibrated
+        self._knows = knows
+        self._points = {most: check_points(geometry, most) for most in (POINTS, VOLUME_POINTS)}
+        self._orders = _orders()
+
+    def doubts(self, sweep: Any, intensity: NDArray[np.uint32], stripe: StripeTable) -> tuple[str, ...]:
+        """What speaks against a map, a sentence each that says what to look at; empty where nothing does.
+
+        sweep: a `CountVolume`, or one with `checked`, the counts of the POINTS. stripe: the estimator's own answers.
+        """
+        points = self._points[VOLUME_POINTS if isinstance(sweep, CountVolume) else POINTS]
+        counts = _Counts(sweep, self._geometry, points)
+        fired = float(intensity.sum()) / max(float(counts.exposures_seen().sum()) * self._geometry.rows, 1.0)
+        if fired == 0.0:
+            return ("no light: not one pixel fired in any frame; check lens cap, laser, gate and the sensor's power",)
+        if fired > SATURATED:
+            return (
+                f"saturated: {fired:.1%} of the pixels fired in every frame; shorten the exposure, darken the room, or "
+                "check that ones are photons",
+            )
+        usual = intensity / np.maximum(counts.exposures_seen(), 1)
+        usual[self._geometry.defects] = np.nan
+        wrong = self._of_counts(counts, usual.astype(np.float32), stripe)
+        if wrong is None and self._knows:
+            wrong = self._of_answers(counts, stripe)
+        return () if wrong is None else (wrong,)
+
+    def _of_counts(self, counts: "_Counts", usual: NDArray[np.float32], stripe: StripeTable) -> str | None:
+        lit = np.flatnonzero((counts.exposures > 0).all(axis=0))
+        if len(lit) < FEWEST_POINTS:
+            return None
+        few = lit[:: max(len(lit) // POINTS, 1)]
+        out = self._compared(counts, few, usual)
+        if len(few) < len(lit) and _deviations(out[:, 0] - out[:, 1] / LEAST_FOLLOWING) > -LIMIT:
+            out, few = self._compared(counts, lit, usual), lit  # what few points leave open
+        points = counts.points
+        _, of_row = np.unique(points.row[0, few], return_inverse=True)
+        if of_row.max() + 1 >= FEWEST_ROWS:
+            # Pixels that are always on are the same on every line of a row: rows are what is independent.
+            likeliest = int(out[:, 2:].sum(axis=0).argmax())
+            if _deviations(np.bincount(of_row, out[:, 2 + likeliest]).astype(np.float64)) > LIMIT:
+                what, expected = list(ORDERS.items())[likeliest]
+                return (
+                    f"{what} seem reversed: in that order neighbouring pixels agree better than as they come; frames "
+                    f"are expected as numpy.packbits makes them along the width, {expected}"
+                )
+        rows, columns = out[:, 0], out[:, 1]
+        if _deviations(rows) < LIMIT:
+            if self._knows and self._sure(counts, stripe)[0] and self._of_answers(counts, stripe) is None:
+                return None  # too faint for the points alone, but the answers have found it
+            return (
+                "no line: no light that one row shares with the next stands out of the noise; check laser, gate, power "
+                "and depth range, and that frames are height x width with the line across the rows"
+            )
+        if self._calibrated and _deviations(LEAST_FOLLOWING * rows - columns) > LIMIT:
+            return (
+                "columns do not follow one another: from column to column the line does not move as the calibration's "
+                "planes do; check the order of the frames (all exposures of a column, then the next column), columns "
+                "and exposures of the plan, the direction of the sweep, and that the planes are of this scan"
+            )
+        return None
+
+    def _compared(self, counts: "_Counts", chosen: NDArray[np.int64], usual: NDArray[np.float32]) -> Array:
+        """What `compare_lines` finds at chosen points."""
+        from rig.count.map_check_kernels import compare_lines
+
+        geometry, points = self._geometry, counts.points
+        out = np.zeros((len(chosen), 2 + len(self._orders)))
+        compare_lines(
+            counts.lines(chosen), counts.exposures[:, chosen], points.row[:, chosen], points.column[:, chosen],
+            points.shift[:, chosen], geometry.x0, geometry.x_lo, geometry.x_hi, usual,
+            DIMMEST * float(np.nanmean(usual)), self._orders, 0, len(chosen), out,
+        )  # fmt: skip
+        return out
+
+    def _sure(self, counts: "_Counts", stripe: StripeTable) -> tuple[int, NDArray[np.int64]]:
+        """Into how many groups the sure answers go, and which points they are at."""
+        y, c = counts.points.row[0], counts.points.column[0]
+        sure = np.flatnonzero((stripe.confidence[y, c] >= SURE) & (counts.exposures > 0).all(axis=0))
+        return min(len(sure) // FEWEST_POINTS, GROUPS), sure
+
+    def _of_answers(self, counts: "_Counts", stripe: StripeTable) -> str | None:
+        geometry, points = self._geometry, counts.points
+        groups, sure = self._sure(counts, stripe)
+        if not groups:
+            return None
+        y, c = points.row[0, sure], points.column[0, sure]
+        x = np.rint(stripe.x_px[y, c]).astype(np.int64)
+        away = 1 if geometry.near_is_left else -1
+        contrast, asked = np.zeros(len(sure)), np.zeros(len(sure), np.int64)
+        for partner in (1, 2):
+            at = x + points.shift[partner - 1, sure]
+            line = counts.mean(partner, sure, at, away, LINE_PX)
+            behind = counts.mean(partner, sure, at, away, BEHIND_PX)
+            known = np.isfinite(line) & np.isfinite(behind)
+            contrast[known] += (line - behind)[known]
+            asked += known
+        order = np.argsort(away * (x - geometry.x_lo[y, c]), kind="stable")
+        for group in np.array_split(order[asked[order] > 0], groups):
+            if len(group) >= FEWEST_POINTS // 2:
+                found = _deviations(contrast[group]) / np.sqrt(len(group))
+                if found + 1.0 / np.sqrt(len(group)) < LEAST_CONTRAST:
+                    middle = group[len(group) // 2]
+                    depth_m = self._depth_m(y[middle], c[middle], x[middle])
+                    where = f" at about {depth_m:.1f} m" if self._calibrated else ""
+                    return (
+                        f"answers without light: those of confidence {SURE:g} and more{where} "
+                        "hardly have more light than what is behind them; haze or halo may be learned wrong: compare "
+                        "with the other of likelihood and joint, other exposures, or a shorter depth range"
+                    )
+        return None
+
+    def _depth_m(self, y: int, c: int, x: int) -> float:
+        geometry = self._geometry
+        x = min(max(x, 0), geometry.width - 1)
+        return float(1.0 / (geometry.plane[c] @ (geometry.u[y, x], geometry.v[y, x], 1.0)))
+
+
+class _Counts:
+    """Counts of a sweep at points, wherever they are kept."""
+
+    def __init__(self, sweep: Any, geometry: SweepGeometry, points: Points) -> None:
+        self._sweep = sweep
+        self._geometry = geometry
+        self.points = points
+        self.of_volume = isinstance(sweep, CountVolume)
+        self.exposures: NDArray[np.int32] = sweep.n_frames[points.column]
+
+    def exposures_seen(self) -> Array:
+        """Frames in whose window each pixel of a row was, (width,)."""
+        geometry, n_frames = self._geometry, self._sweep.n_frames
+        steps = np.zeros(geometry.width + geometry.window + 1)
+        np.add.at(steps, np.minimum(geometry.x0, geometry.width), n_frames)
+        np.add.at(steps, np.minimum(geometry.x0 + geometry.window, len(steps) - 1), -n_frames)
+        return np.asarray(np.cumsum(steps)[: geometry.width])
+
+    def lines(self, chosen: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Whole lines of chosen points and their partners, (3, chosen, window)."""
+        if not self.of_volume:
+            return np.ascontiguousarray(self._sweep.checked[:, chosen], np.int32)
+        found = self._sweep.counts[self.points.column[:, chosen], self.points.row[:, chosen]]
+        return np.ascontiguousarray(found, np.int32)
+
+    def mean(
+        self, partner: int, chosen: NDArray[np.int64], x: NDArray[np.int64], away: int, reach_px: tuple[int, int]
+    ) -> Array:
+        """Mean ones per exposure around x, NaN where part of that was not searched; reach_px: first and last pixel."""
+        geometry = self._geometry
+        y, c = self.points.row[partner, chosen], self.points.column[partner, chosen]
+        px = x[:, None] + away * np.arange(reach_px[0], reach_px[1] + 1)
+        low = np.maximum(np.maximum(geometry.x_lo[y, c] - MARGIN_PX, geometry.x0[c]), 0)
+        high = np.minimum(geometry.x_hi[y, c] + MARGIN_PX, geometry.x0[c] + geometry.window - 1)
+        inside = (px >= low[:, None]) & (px <= np.minimum(high, geometry.width - 1)[:, None])
+        at = np.where(inside, px - geometry.x0[c][:, None], 0)
+        if self.of_volume:
+            ones = self._sweep.counts[c[:, None], y[:, None], at]
+        else:
+            ones = self._sweep.checked[partner][chosen[:, None], at]
+        mean = ones.mean(axis=1) / self.exposures[partner, chosen]
+        return np.where(inside.all(axis=1), mean, np.nan)
+
+
+def _deviations(values: Array) -> float:
+    """By how many of its standard deviations a sum of independent values is above 0."""
+    squares = float((values**2).sum())
+    return float(values.sum()) / np.sqrt(squares) if squares > 0 else 0.0
+
+
+def _orders() -> NDArray[np.int64]:
+    """Pixels of a word in the orders of ORDERS, (orders, WORD_PX)."""
+    x = np.arange(WORD_PX)
+    byte, bit = x // 8, x % 8
+    bits = 8 * byte + 7 - bit
+    swapped = [8 * (byte // n * n + n - 1 - byte % n) + bit for n in (2, 4, 8)]
+    return np.stack([bits, *swapped])

@@ -1,0 +1,73 @@
+"""Depth on the camera grid: a pixel's column is interpolated between the stripes of neighbouring columns on its row.
+
+Columns that are lit together may take one and the same stripe for theirs: at most one of them is right.
+
+An estimator looks at one column at a time. Where windows of several lines overlap it sees the others' stripes too, and
+the brightest wins in each. So answers of one row and place of the mirror that coincide share what they are worth.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.geometry.line_grid import LineGrid
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import SweepGeometry
+from rig.threads import RowWorkers
+
+
+def depth_map(
+    stripes: StripeTable, geometry: SweepGeometry, min_confidence: float, workers: RowWorkers | None = None
+) -> NDArray[np.float32]:
+    """Depth z in metres (rows, width) float32, NaN where two confident neighbouring stripes do not enclose the pixel.
+
+    Only stripes of at least `min_confidence` take part; nothing else is filled. Depth outside the depth range by more
+    than a tenth is no estimate either.
+    """
+    from rig.depth.kernels import fill_rows
+
+    near_m, far_m = geometry.depth_range_m
+    depth = np.full((geometry.rows, geometry.width), np.nan, np.float32)
+    light = geometry.light
+
+    def work(first: int, last: int) -> None:
+        rows = slice(first, last)
+        inverse_depth = np.full((last - first, geometry.width), np.nan, np.float32)
+        command = np.full(inverse_depth.shape if light is not None else (0, 0), np.nan)
+        fill_rows(
+            stripes.x_px[rows], stripes.confidence[rows], stripes.x_sd_px[rows], min_confidence, geometry.plane,
+            geometry.u[rows], geometry.v[rows], inverse_depth, np.full(inverse_depth.shape, -1.0, np.float32),
+            np.zeros(0) if light is None else light.commands, command,
+        )  # fmt: skip
+        if light is not None:
+            inverse_depth = light.inverse_depth(command, first)
+        with np.errstate(invalid="ignore"):
+            inside = (inverse_depth <= 1.1 / near_m) & (inverse_depth >= 0.9 / far_m)
+        depth[rows][inside] = 1.0 / inverse_depth[inside]
+
+    (workers or RowWorkers(1)).over(geometry.rows, work)
+    return depth
+
+
+SAME_PX = 1.5
+"""Answers this close mean the same stripe: each may be off by a pixel, and stripes that meet cannot be told apart."""
+
+
+def share_claims(stripes: StripeTable, grid: LineGrid) -> StripeTable:
+    """The table with confidences c of coinciding answers times c over the sum of theirs: of two that are as sure, half.
+
+    Positions stay as they are.
+    """
+    columns = grid.columns_at()
+    x, confidence = stripes.x_px[:, columns], stripes.confidence[:, columns]  # (rows, places, lines)
+    claimed = np.zeros_like(confidence)
+    for other in range(grid.lines):
+        with np.errstate(invalid="ignore"):
+            same = np.abs(x - x[:, :, other, None]) <= SAME_PX
+        claimed += np.where(same, confidence[:, :, other, None], np.float32(0))
+    shared = np.array(stripes.confidence)
+    shared[:, columns] = np.where(
+        claimed > confidence, confidence * (confidence / np.maximum(claimed, 1e-9)), confidence
+    )
+    return replace(stripes, confidence=shared)

@@ -1,0 +1,294 @@
+"""The fog meter: how dense the medium is and how much light it and the sun bring, from the counts of one map alone.
+
+The rows of a map whose stripe is beyond doubt say what lies before it and behind it; `rig.depth.fog_meter` says how.
+Nothing is carried on from map to map: a reading is that of its map, and the same whenever the map is estimated again.
+
+To the fit's error bars comes what no scatter shows: light scattered more than once flattens the decay all over the
+picture, so REST_SHARE of `rest` is added to the extinction's relative error. Where the fog lays a halo around the
+stripes (`halo`), its light falls off on both sides of them as haze would, and neither extinction nor veil is stated.
+Nor are they of several lines at once: the other lines' haze ends at stripes of their own, where is not known, and takes
+the form of the decay with it. 5 ms a map.
+
+The fog meter's fit: the decay of the haze before stripes and behind them, over the path of the light.
+
+With s the mean of the path lengths from scanner and camera, and G the geometry factor of `RowModel`,
+
+    flux = ambient + offset + haze G exp(-2 extinction s)           before the stripe
+         = ambient + offset + rest haze G exp(-2 extinction s)      behind it
+
+is fitted by maximum likelihood of the counts, binned by s: haze, extinction, the share `rest` that was scattered more
+than once, and by what the learned ambient light is off.
+
+Error bars are those of the sandwich, H^-1 (sum of g g^T) H^-1, g the likelihood's slope from each block of rows and
+columns: what the model leaves out shows as scatter between them, as in a jackknife, of which this is the first order.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import digits
+from rig.count.volume import CountVolume
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import SweepGeometry
+
+if TYPE_CHECKING:
+    from rig.estimate.row.inputs import Lines
+
+Array = NDArray[np.float64]
+
+LEAST_EXPOSURES: Final = 50.0
+"""Of a bin that takes part."""
+STARTS_PER_M: Final = (0.0, 0.05, 0.15, 0.5, 1.5)
+STEPS: Final = 40
+REST_PRIOR: Final = 25.0
+"""Inverse variance of `rest` before any count: 0.2, so that a map without pixels behind its stripes is solvable too."""
+RIDGE: Final = 1e-11
+"""Keeps the inverse of what says the same twice, as haze that is even and ambient light do, positive."""
+FLUX_MIN: Final = 1e-7
+FLUX_MAX: Final = 50.0
+"""Photons per exposure; between these all logarithms are finite."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FogFit:
+    """haze, extinction, offset and rest, (4,), and their covariance (4, 4); haze is that at the path `at_m`."""
+
+    value: Array
+    covariance: Array
+    at_m: float
+
+
+def fit_fog(sums: Array, path_m: Array) -> FogFit | None:
+    """Fit of block sums (blocks, 2, bins, 4) over bins of mean path; None where too little was seen before stripes.
+
+    Levenberg's steps from the likeliest of several extinctions. The covariance is that of the counts, widened number
+    by number to the sandwich's.
+    """
+    blocks, _, bins, _ = sums.shape
+    used = sums[..., 1].sum(0).ravel() > LEAST_EXPOSURES
+    if used[:bins].sum() < 4:
+        return None
+    ones, exposures, gain, ambient = np.moveaxis(sums.reshape(blocks, 2 * bins, 4)[:, used], 2, 0)
+    weight = np.maximum(exposures, 1.0)
+    data = _Data(ones, exposures, gain / weight, ambient / weight, np.zeros(0), np.repeat([False, True], bins)[used])
+    path = np.tile(path_m, 2)[used]
+    at_m = float(np.average(path, weights=exposures.sum(0)))
+    data = _Data(data.ones, data.exposures, data.gain, data.ambient, path - at_m, data.behind)
+    value = max((data.started(extinction) for extinction in STARTS_PER_M), key=data.evidence)
+    evidence, damping = data.evidence(value), 1e-3
+    for _ in range(STEPS):
+        score, information = data.slopes(value)
+        damped = information + damping * np.diag(np.diag(information))
+        step = np.linalg.solve(damped, score.sum(0) - data.prior(value))
+        tried = value + np.clip(step, -1.0, 1.0)
+        reached = data.evidence(tried)
+        if reached < evidence:
+            damping = 10.0 * damping + 1e-4
+            continue
+        settled, value, evidence, damping = reached - evidence < 1e-6, tried, reached, 0.1 * damping
+        if settled:
+            break
+    score, information = data.slopes(value)
+    inverse = _inverse(information)
+    seen = int(np.count_nonzero(exposures.sum(1)))
+    scatter = score.T @ score * (seen / max(seen - 1, 1))
+    wider = np.sqrt(np.maximum(np.diag(inverse @ scatter @ inverse) / np.diag(inverse), 1.0))
+    return FogFit(value, inverse * np.outer(wider, wider), at_m)
+
+
+def _inverse(information: Array) -> Array:
+    """Inverse of an information whose numbers may be of any size, and may depend on each other."""
+    size = np.sqrt(np.diag(information))
+    relative = information / np.outer(size, size) + RIDGE * np.eye(len(size))
+    return np.asarray(np.linalg.inv(relative) / np.outer(size, size))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Data:
+    """Sums of the fit, (blocks, cells) each; path_m, behind: (cells,), off the middle path, and side of the stripe."""
+
+    ones: Array
+    exposures: Array
+    gain: Array
+    ambient: Array
+    path_m: Array
+    behind: NDArray[np.bool_]
+
+    def started(self, extinction_per_m: float) -> Array:
+        """Parameters of this extinction with the haze that gives the ones before stripes."""
+        shape = self.gain * np.exp(np.minimum(-2.0 * extinction_per_m * self.path_m, 50.0))
+        shape, before = (each[:, ~self.behind] for each in (shape, self.exposures))
+        rate = np.minimum(self.ones[:, ~self.behind].sum() / before.sum(), 0.999)
+        level = -math.log1p(-rate) - float(np.average(self.ambient[:, ~self.behind], weights=before))
+        return np.array([max(level, 0.0) / max(float(np.average(shape, weights=before)), 1e-9), extinction_per_m, 0, 0])
+
+    def _light(self, value: Array) -> tuple[Array, Array, Array]:
+        """Shape of the haze, what of it each cell sees, and the flux."""
+        shape = self.gain * np.exp(np.minimum(-2.0 * value[1] * self.path_m, 50.0))
+        part = np.where(self.behind, value[3], 1.0)
+        return shape, part, np.clip(self.ambient + value[2] + value[0] * shape * part, FLUX_MIN, FLUX_MAX)
+
+    def evidence(self, value: Array) -> float:
+        """Log-likelihood of the counts, and of the weak prior."""
+        flux = self._light(value)[2]
+        return float(np.sum(self.ones * np.log(np.expm1(flux)) - self.exposures * flux)) - 0.5 * float(
+            self.prior(value) @ value
+        )
+
+    def prior(self, value: Array) -> Array:
+        """Its slope, downwards."""
+        return np.array([0.0, 1e-3, 0.0, REST_PRIOR]) * value
+
+    def slopes(self, value: Array) -> tuple[Array, Array]:
+        """Slope of each block's log-likelihood (blocks, 4), and the information (4, 4) with the prior's."""
+        shape, part, flux = self._light(value)
+        haze = value[0] * shape
+        design = np.stack([shape * part, -2.0 * self.path_m * haze * part, np.ones_like(flux), haze * self.behind])
+        odds = 1.0 / np.expm1(flux)
+        score = np.einsum("igb,gb->gi", design, self.ones * (1.0 + odds) - self.exposures)
+        information = np.einsum("igb,jgb,gb->ij", design, design, self.exposures * odds)
+        return score, information + np.diag([1e-12, 1e-3, 0.0, REST_PRIOR])
+
+
+VISIBILITY_CONTRAST: Final = 3.912
+"""-ln(0.02): visibility is the distance at which contrast falls to 2 %, 3.912 / extinction (Koschmieder)."""
+RESOLVED_SIGMAS: Final = 3.0
+"""A figure is stated where it is at least this many standard deviations above zero."""
+CLEAR: Final = 0.85
+CLEAR_PX: Final = 6.0
+"""Lines as certain as this, and pixels as far from their stripe, are read. With fewer and surer lines haze is told too
+thin, since at few exposures it is chance that makes a line sure; with more, stripes are taken for haze."""
+LEAST_LINES: Final = 30
+"""Clear lines below which a map says nothing."""
+BLOCKS: Final = 4
+"""Blocks along the rows, and along the columns."""
+MODEL_SHARE: Final = 0.02
+"""Relative error that the model's form brings: bins, gains of rows and columns, two path lengths taken as one."""
+REST_SHARE: Final = 1.0
+"""Relative error of the extinction over the share of light scattered more than once. Traced: in isotropic fog the decay
+is flatter by 25 to 40 % where `rest` is 0.35 to 0.45 (Mitsuba rows, docs/fog-meter.md)."""
+
+
+@dataclass(frozen=True, slots=True)
+class FogEstimate:
+    """What a map says of fog and light, each with its standard deviation; None where it is not resolved.
+
+    visibility_m: 3.912 / extinction; two of its deviations more are what two of the extinction's less would be.
+    ambient_per_exposure: photons per pixel and exposure that are not the laser's: surfaces, airlight and dark counts,
+    mean over the pixels read. veil_per_exposure: the laser's light that the medium sends back, per pixel just before
+    the stripe, mean over the rows read; veil_to_signal: over their stripes' light.
+    """
+
+    extinction_per_m: float | None = None
+    extinction_sd_per_m: float | None = None
+    visibility_m: float | None = None
+    visibility_sd_m: float | None = None
+    ambient_per_exposure: float | None = None
+    ambient_sd_per_exposure: float | None = None
+    veil_per_exposure: float | None = None
+    veil_sd_per_exposure: float | None = None
+    veil_to_signal: float | None = None
+
+    def brief(self) -> str:
+        """The visibility in three words, nothing where it is not resolved."""
+        if self.visibility_m is None or self.visibility_sd_m is None:
+            return ""
+        return f"visibility {digits(self.visibility_m)} +- {digits(self.visibility_sd_m, 2)} m"
+
+
+def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: Any) -> FogEstimate:
+    """The fog of one map.
+
+    sweep: what was counted, a `CountVolume` or one with `lines` of counts. stripe, state: what its estimator gave, and
+    the `RowModel` that it gave it with.
+    """
+    from rig.depth.kernels import SUMS, add_clear_rows
+    from rig.estimate.row.em import lines_of, next_lattice
+    from rig.estimate.row.inputs import state_of, sweep_of
+    from rig.estimate.row.model import BINS
+
+    lines: Lines = lines_of(sweep, next_lattice(geometry)) if isinstance(sweep, CountVolume) else sweep.lines
+    row, column = lines.row, lines.column
+    clear = (stripe.confidence[row, column] > CLEAR) & (lines.exposures > 0)
+    if np.count_nonzero(clear) < LEAST_LINES:
+        return FogEstimate()
+    block = row * BLOCKS // geometry.rows * BLOCKS + column * BLOCKS // geometry.columns
+    sums, at_stripe = np.zeros((BLOCKS**2, 2, BINS, SUMS)), np.zeros((len(row), 2))
+    hot_flux = 5.0 * float(np.median(state.ambient)) + 1e-3
+    add_clear_rows(
+        sweep_of(replace(geometry, others=None)), state_of(state), lines, stripe.x_px[row, column], clear,
+        block.astype(np.int32), CLEAR_PX, hot_flux, sums, at_stripe,
+    )  # fmt: skip
+    fit = fit_fog(sums, state.path_m())
+    if fit is None:
+        return FogEstimate()
+    dark = _dark_offset(sweep, state.ambient, hot_flux)
+    if state.halo.any() or geometry.others is not None:
+        return _dark_alone(sums, dark)
+    read = clear & (at_stripe[:, 1] > 0)
+    signal = float(np.mean(stripe.signal[row, column][read])) if read.any() else math.nan
+    return _stated(fit, sums, state.path_m(), dark, at_stripe[read], signal)
+
+
+def _dark_offset(sweep: Any, ambient: NDArray[np.float32], hot_flux: float) -> tuple[float, float] | None:
+    """By how much the dark frames lie above the learned ambient light, and the standard deviation; None without any."""
+    if sweep.dark_counts is None:
+        return None
+    frames = np.broadcast_to(sweep.n_dark if sweep.dark_frames is None else sweep.dark_frames, ambient.shape)
+    used = (frames > 0) & (ambient <= hot_flux)
+    exposures, ones = float(frames[used].sum()), float(sweep.dark_counts[used].sum())
+    if ones < 1.0 or ones >= exposures:
+        return None
+    level = -math.log1p(-ones / exposures)
+    return level - float(np.average(ambient[used], weights=frames[used])), level / math.sqrt(ones)
+
+
+def _dark_alone(sums: Array, dark: tuple[float, float] | None) -> FogEstimate:
+    """What is stated where light that is no haze of the line's own lies on all that is read, a halo or that of other
+    lines: the ambient light, if dark frames tell of it.
+    """
+    if dark is None:
+        return FogEstimate()
+    level = float(sums[..., 3].sum() / sums[..., 1].sum()) + dark[0]
+    return FogEstimate(**_ambient(level, math.hypot(dark[1], MODEL_SHARE * level)))
+
+
+def _ambient(level: float, sd: float) -> dict[str, float]:
+    return {"ambient_per_exposure": level, "ambient_sd_per_exposure": sd} if level > RESOLVED_SIGMAS * sd else {}
+
+
+def _stated(
+    fit: FogFit, sums: Array, path_m: Array, dark: tuple[float, float] | None, at_stripe: Array, signal: float
+) -> FogEstimate:
+    haze, extinction, offset, rest = fit.value
+    sd = np.sqrt(np.diag(fit.covariance))
+    exposures = sums[..., 1].sum()
+    ambient, ambient_sd = float(sums[..., 3].sum() / exposures), float(sd[2])
+    if dark is not None:
+        # The laser's light that is there on both sides of the stripe has been scattered more than once as well.
+        level = np.average(haze * np.exp(-2.0 * extinction * (path_m - fit.at_m)), weights=sums[:, 0, :, 2].sum(0))
+        rest = max(rest, 0.0) + max(float(offset) - dark[0], 0.0) / max(float(level), FLUX_MIN)
+        offset, ambient_sd = dark[0], math.hypot(dark[1], MODEL_SHARE * (ambient + dark[0]))
+    ambient += float(offset)
+    extinction_sd = math.hypot(sd[1], MODEL_SHARE * extinction, REST_SHARE * max(rest, 0.0) * extinction)
+    found: dict[str, float] = {}
+    if extinction > RESOLVED_SIGMAS * extinction_sd:
+        visibility_m, farther_m = (VISIBILITY_CONTRAST / float(extinction - n * extinction_sd) for n in (0.0, 2.0))
+        found |= {"extinction_per_m": float(extinction), "extinction_sd_per_m": extinction_sd}
+        # As far as the extinction's bar reaches on the side of clear air: the other side's is shorter.
+        found |= {"visibility_m": visibility_m, "visibility_sd_m": (farther_m - visibility_m) / 2.0}
+    found |= _ambient(ambient, ambient_sd)
+    if len(at_stripe):
+        off_m, gain = at_stripe[:, 0] - fit.at_m, at_stripe[:, 1]
+        shape = gain * np.exp(-2.0 * extinction * off_m)
+        slope = np.array([shape.mean(), -2.0 * haze * np.mean(off_m * shape), 0.0, 0.0])
+        veil = float(haze * shape.mean())
+        veil_sd = math.hypot(float(np.sqrt(slope @ fit.covariance @ slope)), MODEL_SHARE * veil)
+        if veil > RESOLVED_SIGMAS * veil_sd:
+            found |= {"veil_per_exposure": veil, "veil_sd_per_exposure": veil_sd}
+            found |= {"veil_to_signal": veil / signal} if signal > 0 else {}
+    return FogEstimate(**found)

@@ -1,0 +1,122 @@
+"""Compiled step from the stripe table to a depth map on the camera grid.
+
+Compiled sums of the fog meter: what lies clearly before and clearly behind the stripes of a sweep.
+"""
+
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.row.inputs import Lines, RowState, Sweep, row_buffers, row_fluxes
+
+MAX_COLUMN_GAP: Final = 2
+"""Stripes of columns farther apart than this are not joined to one surface."""
+SPACING_TOLERANCE_PX: Final = 1.0
+SPACING_SIGMAS: Final = 3.0
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_rows(
+    x_px: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    x_sd_px: NDArray[np.float32],
+    min_confidence: float,
+    plane: NDArray[np.float64],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    inverse_depth: NDArray[np.float32],
+    depth_confidence: NDArray[np.float32],
+    commands: NDArray[np.float64],
+    command: NDArray[np.float64],
+) -> None:
+    """Write inverse depth and its confidence (rows, width) for pixels between stripes of neighbouring columns.
+
+    And the mirror's command there, from the columns' `commands`, where `command` has room for any.
+
+    Two stripes of one row lie on one surface when their columns are at most MAX_COLUMN_GAP apart and their spacing is
+    that of equal depth within 1 px + 3 sd. Between them the column is linear in x. The more confident pair wins.
+    """
+    rows, columns = x_px.shape
+    width = u.shape[1]
+    for y in range(rows):
+        for c in range(columns - 1):
+            if not confidence[y, c] >= min_confidence or np.isnan(x_px[y, c]):
+                continue
+            for other in range(c + 1, min(c + MAX_COLUMN_GAP, columns - 1) + 1):
+                if not confidence[y, other] >= min_confidence or np.isnan(x_px[y, other]):
+                    continue
+                xa, xb = np.float64(x_px[y, c]), np.float64(x_px[y, other])
+                i = min(max(int(0.5 * (xa + xb)), 0), width - 2)
+                ux, vx = u[y, i], v[y, i]
+                slope = plane[c, 0] * (u[y, i + 1] - ux) + plane[c, 1] * (v[y, i + 1] - vx)
+                turn = (
+                    (plane[other, 0] - plane[c, 0]) * ux + (plane[other, 1] - plane[c, 1]) * vx
+                    + plane[other, 2] - plane[c, 2]
+                )  # fmt: skip
+                if not abs(slope) > 1e-12:
+                    continue
+                sd = np.sqrt(x_sd_px[y, c] ** 2 + x_sd_px[y, other] ** 2)
+                if not abs(xb - xa + turn / slope) <= SPACING_TOLERANCE_PX + SPACING_SIGMAS * sd:
+                    continue
+                sure = min(confidence[y, c], confidence[y, other])
+                for x in range(max(int(np.ceil(min(xa, xb))), 0), min(int(np.floor(max(xa, xb))), width - 1) + 1):
+                    if not sure > depth_confidence[y, x]:
+                        continue
+                    f = (x - xa) / (xb - xa) if xb != xa else 0.5
+                    ux, vx = u[y, x], v[y, x]
+                    wa = plane[c, 0] * ux + plane[c, 1] * vx + plane[c, 2]
+                    wb = plane[other, 0] * ux + plane[other, 1] * vx + plane[other, 2]
+                    w = (1.0 - f) * wa + f * wb
+                    if w > 1e-6:
+                        inverse_depth[y, x] = w
+                        depth_confidence[y, x] = sure
+                        if command.size:
+                            command[y, x] = (1.0 - f) * commands[c] + f * commands[other]
+                break
+
+
+SUMS: Final = 4
+"""Sums of a cell: ones, exposures, and exposures weighted with geometry factor and with flux that is no haze."""
+
+
+@numba.njit(cache=True, nogil=True)
+def add_clear_rows(
+    sweep: Sweep,
+    state: RowState,
+    lines: Lines,
+    x_px: NDArray[np.float32],
+    clear: NDArray[np.bool_],
+    block: NDArray[np.int32],
+    clear_px: float,
+    hot_flux: float,
+    sums: NDArray[np.float64],
+    at_stripe: NDArray[np.float64],
+) -> None:
+    """Add the pixels of clear lines that are clear_px and more before or behind their stripe at x_px.
+
+    sums: (blocks, 2, bins, SUMS), before and behind. at_stripe (lines, 2): path in metres and geometry factor of the
+    haze at the stripe, unchanged for other lines. Pixels of more ambient flux than hot_flux take no part.
+    """
+    row = row_buffers(sweep.window, state.amplitude.shape[0])
+    step = 1 if sweep.near_is_left else -1
+    for i in range(lines.row.shape[0]):
+        y, c, k = lines.row[i], lines.column[i], lines.exposures[i]
+        if not clear[i] or k == 0:
+            continue
+        length, _, _, start = row_fluxes(sweep, state, row, y, c)
+        for t in range(length):
+            x = start + step * t
+            ahead_px = (x_px[i] - x) * step
+            if abs(ahead_px) <= 0.5:
+                at_stripe[i, 0] = 1.0 / (state.w_lo + row.cell[t] / state.per_w)
+                at_stripe[i, 1] = row.gain[t]
+            ambient = state.ambient[y, x]
+            if ambient > hot_flux or abs(ahead_px) < clear_px:
+                continue
+            cell = sums[block[i], 0 if ahead_px > 0 else 1, row.cell[t]]
+            cell[0] += lines.counts[i, x - sweep.x0[c]]
+            cell[1] += k
+            cell[2] += k * row.gain[t]
+            cell[3] += k * (ambient + row.others[t])

@@ -1,0 +1,137 @@
+"""From the counts of a sweep to its stripe table and depth map."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model.rig_model import RigModel
+from rig.count.line_counter import LineCounter
+from rig.count.map_checks import MapChecks
+from rig.count.volume import Counter, FrameTally, SweepLayout
+from rig.depth.depth import depth_map, share_claims
+from rig.depth.fog_meter import FogEstimate, read_fog
+from rig.errors import UsageError
+from rig.estimate.registry import COUPLED, ESTIMATORS, FILTERS, LEARNING, Learned, create_estimator, recalling
+from rig.geometry.line_grid import LineGrid
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
+from rig.threads import RowWorkers
+
+
+@dataclass(frozen=True, slots=True)
+class MapResult:
+    """One reconstructed map: stripe table, depth_m (rows, width) float32 with NaN, intensity (rows, width) uint32.
+
+    learned: the state that the estimator used, None where it learns nothing. doubts: what its own light has against it,
+    a sentence each (`map_checks`).
+    """
+
+    stripe: StripeTable
+    depth_m: NDArray[np.float32]
+    intensity: NDArray[np.uint32]
+    fog: FogEstimate
+    compute_s: float
+    learned: Learned | None = None
+    doubts: tuple[str, ...] = ()
+
+
+class Reconstructor:
+    """Turns counted sweeps into maps, one after the other; estimators that learn carry their state from map to map.
+
+    model: rig model, None for an uncalibrated rig (stripes only). column_commands: (columns,) mirror command of each
+    column's centre. estimator, filter: of ESTIMATORS and FILTERS. lines: which line lights which column where there are
+    several. temporal_prior: of `joint`, see `EstimateConfig`. Raises UsageError for what does not fit.
+    """
+
+    def __init__(
+        self,
+        model: RigModel | None,
+        column_commands: Sequence[float] | NDArray[np.float64],
+        depth_range_m: tuple[float, float],
+        *,
+        sensor: tuple[int, int] | None = None,
+        estimator: str = "likelihood",
+        filter: str = "none",
+        min_confidence: float = 0.5,
+        threads: int = 2,
+        learned: Sequence[Learned] = (),
+        lines: LineGrid | None = None,
+        temporal_prior: bool = False,
+    ) -> None:
+        if estimator not in ESTIMATORS:
+            raise UsageError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+        if filter not in FILTERS:
+            raise UsageError(f"filter {filter!r} is unknown; choose one of {', '.join(FILTERS)}")
+        self._model = model
+        self._commands = np.asarray(column_commands, dtype=np.float64)
+        self._min_confidence = min_confidence
+        self._filter = filter
+        self._coupled = estimator in COUPLED
+        self._lines = lines
+        self._workers = RowWorkers(threads)
+        if learned:
+            self.estimator = recalling(estimator, learned, threads, temporal_prior=temporal_prior)
+        else:
+            self.estimator = create_estimator(estimator, threads, temporal_prior=temporal_prior)
+        if model is not None:
+            self.geometry = sweep_geometry(model, self._commands, depth_range_m)
+            if lines is not None:
+                self.geometry = replace(self.geometry, others=lines.others(self.geometry.plane))
+        elif sensor is not None:
+            self.geometry = uncalibrated_geometry(*sensor, len(self._commands))
+        else:
+            raise UsageError("without a calibration the sensor size (rows, width) must be given")
+        self._checks = MapChecks(self.geometry, calibrated=model is not None, knows=estimator in LEARNING)
+
+    def counter(self, layout: SweepLayout) -> Counter:
+        """A counter whose sweeps `map` takes, one after the other and each before frames of the next are added."""
+        if self._lines is not None:
+            return LineCounter(layout, self._lines, self._workers)
+        return self.estimator.counter(layout, self.geometry)
+
+    def map(self, sweep: Any) -> MapResult:
+        """Stripe table, depth and intensity of one counted sweep, with the time that estimation took.
+
+        sweep: what a `counter` gave, or a `CountVolume`.
+        """
+        begun = time.perf_counter()
+        stripe = self.estimator.estimate(sweep, self.geometry)
+        return self.complete(stripe, sweep, self._filter, time.perf_counter() - begun)
+
+    def complete(self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float) -> MapResult:
+        """The map of a sweep whose stripe table the estimator gave, in `estimate_s`: filter, depth and intensity."""
+        begun = time.perf_counter() - estimate_s
+        geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe), sweep.intensity()
+        doubts = self._checks.doubts(sweep, intensity, stripe)
+        if self._lines is not None:
+            stripe = share_claims(stripe, self._lines)
+        if filter == "median":
+            from rig.estimate.median import median_filter
+
+            stripe = median_filter(stripe, geometry.reference_px(), coupled=self._coupled)
+        if self._model is None:
+            depth = np.full((geometry.rows, geometry.width), np.nan, np.float32)
+        else:
+            depth = depth_map(stripe, geometry, self._min_confidence, self._workers)
+        compute_s = time.perf_counter() - begun
+        return MapResult(stripe, depth, intensity, fog, compute_s, self.estimator.used, doubts)
+
+    def _bound(self, sweep: FrameTally) -> SweepGeometry:
+        """Geometry with the planes where the frames of each column really were."""
+        if self._model is None:
+            return self.geometry
+        column = sweep.bound_column()
+        if self._lines is None:
+            commands = np.interp(column, np.arange(len(self._commands)), self._commands)
+        else:
+            commands = self._lines.bound_commands(self._commands, column)
+        return self.geometry.bound_to(self._model, commands, sweep.velocity_per_s)
+
+    def _fog(self, sweep: FrameTally, stripe: StripeTable) -> FogEstimate:
+        """What the map says of the medium; nothing where its estimator learns none, or without a geometry."""
+        state = self.estimator.used
+        return FogEstimate() if state is None or self._model is None else read_fog(sweep, stripe, self.geometry, state)

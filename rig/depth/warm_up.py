@@ -1,0 +1,60 @@
+"""Compiles the kernels of an estimate before a run, so that its times are those of the work alone (`rig warmup`)."""
+
+import numpy as np
+
+from rig.count.bind import FrameBinder
+from rig.count.map_checks import MapChecks
+from rig.count.volume import BIN_DARK, SweepLayout
+from rig.depth.depth import depth_map
+from rig.depth.fog_meter import read_fog
+from rig.estimate.registry import COUPLED, create_estimator
+from rig.geometry.windows import WORD_PX, uncalibrated_geometry
+from rig.plan.scan_plan import ScanPlan
+
+ROWS, COLUMNS = 16, 24
+"""Size of the made-up map; any would do."""
+MAPS = 2
+"""The first map is learned, the second one is judged as its frames come."""
+
+
+def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
+    """Estimate two small made-up maps at so many exposures, and throw them away.
+
+    dark: whether the run will have dark frames. Compiled code is kept on disk by numba: only the first run ever waits.
+    """
+    rng = np.random.default_rng(0)
+    geometry = uncalibrated_geometry(ROWS, WORD_PX, COLUMNS)
+    layout = SweepLayout(COLUMNS, ROWS, WORD_PX, geometry.x0, geometry.window, exposures, None, dark)
+    # What a prior compiles comes on top of what is compiled without one.
+    maker = create_estimator(estimator, 1, temporal_prior=True)
+    counter = maker.counter(layout, geometry)
+    bins = np.repeat(np.arange(-1 if dark else 0, COLUMNS, dtype=np.int32), exposures)
+    bins[bins < 0] = BIN_DARK
+    # A stripe that wanders from column to column: from noise alone nothing is learned, and nothing judged after it.
+    rate = np.full((len(bins), ROWS, WORD_PX), 0.05)
+    lit = np.flatnonzero(bins >= 0)
+    rate[lit, :, WORD_PX // 4 + bins[lit]] = 0.95
+    frames = np.packbits(rng.random(rate.shape) < rate, axis=2)
+    checks = MapChecks(geometry, calibrated=False, knows=maker.used is not None)
+    for _ in range(MAPS):
+        counter.reset()
+        counter.add(frames, bins, bins.astype(np.float64), np.zeros(len(bins), np.int32))
+        sweep = counter.finish()
+        stripe = maker.estimate(sweep, geometry)
+        checks.doubts(sweep, sweep.intensity(), stripe)
+        if maker.used is not None:
+            read_fog(sweep, stripe, geometry, maker.used)
+    if filter == "median":
+        from rig.estimate.median import median_filter
+
+        stripe = median_filter(stripe, geometry.reference_px(), coupled=estimator in COUPLED)
+    depth_map(stripe, geometry, 0.5)
+
+
+def warm_binding(plan: ScanPlan) -> None:
+    """Compile what binds frames to this plan's columns."""
+    from rig.count.bind_kernels import cover
+
+    FrameBinder(plan).compile()
+    none = np.zeros(0, np.int32)
+    cover(none, none, plan.width, np.array(plan.x0, np.int32), plan.window)

@@ -1,0 +1,309 @@
+"""Whether a calibration is that of this rig, and still good: what scan, replay and reconstruct ask before they use one.
+
+A calibration that was estimated says of which devices it is, when it was made and with what verdict
+(`calibration.Identity`); one written by hand says nothing, and is used unchecked. What depth depends on is compared:
+kinds and serial numbers of sensor and scanner, how they are mounted, the laser lines; of a simulated rig, its
+geometry. Settings of a scan are not. A recording is compared with the devices that it was taken with, at the date on
+which it was taken.
+
+A check that fails later is noted in a file beside the calibration (`rig.devices.calibration_use`), which itself stays
+as it is.
+
+Why a calibration is not to be used, said in a line each, or that it was accepted all the same.
+
+Of a rig's calibration (`rig.devices.calibration_use`), and of the file of a camera alone (`calibrating.camera_use`).
+
+How later checks of a calibration ended, noted in a file beside it: the calibration itself stays as it is.
+"""
+
+import hashlib
+import json
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, Protocol, runtime_checkable
+
+from calibration.files.rig_file import CALIBRATION_FILE
+from calibration.model.rig_model import Identity, RigModel
+from drivers.json_text import parse_json
+from rig.devices.open import OpenRig
+from rig.errors import UsageError
+from rig.recording.replay import PlaysRecording
+from rig.run_folder.manifest import read_manifest
+
+NEXT: Final = "calibrate again, or add --accept-calibration to use it all the same"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a calibration is not to be used. code: other-spad, other-scanner, other-world, other-lines, failed-verdict,
+    failed-check or too-old."""
+
+    code: str
+    text: str
+
+    def __str__(self) -> str:
+        """One line, as summaries have it."""
+        return f"{self.code}: {self.text}"
+
+
+def failed_verdict(verdict: str | None, reasons: Sequence[str]) -> list[Refusal]:
+    """What a calibration's own verdict says against it: nothing where it passed, or where nobody judged it (None)."""
+    if verdict != "failed":
+        return []
+    why = ", ".join(reasons) or "no reason noted"
+    return [Refusal("failed-verdict", f"its verdict is 'failed' ({why}), 'passed' is needed")]
+
+
+def require_accepted(name: str, found: Sequence[Refusal], accepted: Container[str]) -> None:
+    """UsageError, a line for each reason whose code is not among the accepted. name: of what, for these lines."""
+    if refused := [each for each in found if each.code not in accepted]:
+        raise UsageError.of(f"{name}: {each.text}; {NEXT}" for each in refused)
+
+
+def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
+    """How the check ended, for a manifest: `checked`, or 'accepted' and in spite of what."""
+    if not accepted:
+        return {"check": checked}
+    return {"check": "accepted", "accepted": [[each.code, each.text] for each in accepted]}
+
+
+def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons: tuple[str, ...] = ()) -> Path:
+    """Note beside a calibration file how a check of it ended; `what`: check or pixels. Raises OSError."""
+    beside = _beside(file)
+    notes = _read_notes(beside)
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    notes[what] = {"calibration": model.fingerprint(), "date": date, "passed": passed, "reasons": list(reasons)}
+    scratch = beside.with_name(f".{beside.name}.part")
+    scratch.write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
+    scratch.replace(beside)
+    return beside
+
+
+def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:
+    """Have what failed on a calibration speak against the one that was made from it. Raises OSError.
+
+    new_pixels: what was said of the old ones is no longer so.
+    """
+    failed = {what: note for what, note in notes_on(old, before).items() if not note.get("passed", True)}
+    if new_pixels:
+        failed.pop("pixels", None)
+    for what, note in failed.items():
+        note_check(new, after, what, passed=False, reasons=tuple(note.get("reasons") or ()))
+
+
+def _beside(file: Path) -> Path:
+    return file.with_name(f"{file.stem}-checks.json")
+
+
+def notes_on(file: Path | None, model: RigModel) -> dict[str, dict[str, Any]]:
+    """Notes on this very calibration, by what was checked; none where there is no file."""
+    if file is None:
+        return {}
+    notes = _read_notes(_beside(file))
+    return {what: note for what, note in notes.items() if note.get("calibration") == model.fingerprint()}
+
+
+def _read_notes(file: Path) -> dict[str, dict[str, Any]]:
+    try:
+        notes = parse_json(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{file} cannot be read ({error}); remove it and check the calibration again") from error
+    if not isinstance(notes, dict) or not all(isinstance(note, dict) for note in notes.values()):
+        raise UsageError(f"{file} holds no notes on a calibration; remove it and check the calibration again")
+    return notes
+
+
+DAY_S: Final = 86400.0
+_SLOTS: Final = ("spad", "scanner")
+"""Devices that depth depends on: laser and sync source only let the light out."""
+_NO_SERIAL: Final = ("", "none")
+_GEOMETRY: Final = "geometry"
+"""What a simulated rig really is like, by its numbers; `world` is the name of its file, which says less."""
+_CHECKS: Final = {"check": "rig calibrate check", "pixels": "rig calibrate pixels"}
+
+
+@runtime_checkable
+class KnowsRig(Protocol):
+    """A world that knows the rig as it truly is."""
+
+    def true_model(self) -> RigModel:
+        """Camera, scanner and lag of the rig, as a calibration is to find them."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationUse:
+    """The calibration of a run. checked: whether it says of which rig it is. accepted: what it was used in spite of."""
+
+    model: RigModel
+    checked: bool
+    accepted: tuple[Refusal, ...] = ()
+
+    def content(self) -> dict[str, Any]:
+        """For the manifest."""
+        return {
+            "id": self.model.fingerprint(),
+            "provenance": dict(self.model.provenance),
+            **check_content("matches" if self.checked else "unchecked", self.accepted),
+        }
+
+
+def identity_of(rig: OpenRig, created: datetime | None = None) -> Identity:
+    """Of an open rig, for a calibration of it that is made now. A rig that plays a recording is the one recorded."""
+    if isinstance(rig.spad, PlaysRecording):
+        return recorded_identity(rig.spad.recording.path)
+    config, info = rig.config, rig.spad.info
+    scanner = config.scanner
+    kinds = {
+        "spad": f"{config.spad.kind}, {info.width} x {info.height} px, turned by {info.rotation_deg} degrees",
+        "scanner": f"{scanner.kind}, axis {getattr(scanner, 'axis', 'x')}",
+        "lines": ", ".join(f"{offset:g}" for offset in config.line_offsets),
+    }
+    world = {} if config.world is None else dict(config.world)
+    if "geometry" in world:  # of a simulated rig: as it really is
+        kinds["world"] = Path(str(world["geometry"] or "bundled")).name
+    if isinstance(rig.world, KnowsRig):
+        kinds[_GEOMETRY] = replace(rig.world.true_model(), defects=None).fingerprint()
+    serials = {slot: serial for slot in _SLOTS if (serial := getattr(rig, slot).serial) and serial not in _NO_SERIAL}
+    return _identity(config.name, kinds, serials, (created or datetime.now(UTC)).isoformat(timespec="seconds"))
+
+
+def recorded_identity(run: Path) -> Identity:
+    """Of the rig that a recording was taken with, `created` when it was taken; as far as its manifest says."""
+    noted = (read_manifest(run) or {}).get("rig") or {}
+    kinds, serials = noted.get("kinds") or {}, noted.get("serials") or {}
+    return _identity(str(noted.get("name", "")), kinds, serials, str(noted.get("taken", "")))
+
+
+def same_rig(one: Identity, other: Identity) -> bool:
+    """Whether views of these two are of one rig."""
+    kinds, others = _comparable(one, other)
+    return kinds == others and one.serials == other.serials
+
+
+def rig_content(identity: Identity) -> dict[str, Any]:
+    """Of which rig a run is, for its manifest; `recorded_identity` reads it."""
+    return {
+        "name": identity.name,
+        "id": identity.rig,
+        "kinds": dict(identity.kinds),
+        "serials": dict(identity.serials),
+        "taken": identity.created,
+    }
+
+
+def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None = None) -> CalibrationUse | None:
+    """The calibration of an open rig, compared with it; None where it has none. UsageError, a line for each reason.
+
+    accept: use it in spite of them. here: of the rig, where the caller has it. What a recording's own calibration was
+    accepted in spite of when it was taken stays accepted.
+    """
+    if rig.model is None:
+        return None
+    here = here or identity_of(rig)
+    found = refusals(rig.model, rig.config.calibration, here, rig.config.calibration_max_age)
+    before = _accepted_before(rig) if isinstance(rig.spad, PlaysRecording) else frozenset[str]()
+    return _used(rig.model, rig.config.calibration, found, frozenset(r.code for r in found) if accept else before)
+
+
+def cube_calibration_use(model: RigModel, file: Path | None, *, accept: bool = False) -> CalibrationUse:
+    """The calibration of a bare cube, of whose rig nothing is known: its verdict and checks count. UsageError."""
+    found = refusals(model, file, None, None)
+    return _used(model, file, found, frozenset(r.code for r in found) if accept else frozenset())
+
+
+def refusals(
+    model: RigModel, file: Path | None, here: Identity | None, max_age_s: float | None = None
+) -> tuple[Refusal, ...]:
+    """What speaks against a calibration for the rig `here` at the time `here.created`; None: an unknown rig."""
+    found: list[Refusal] = []
+    identity = model.identity
+    if identity is not None:
+        if here is not None:
+            found += _foreign(identity, here)
+            found += _aged(identity, here, max_age_s)
+        found += failed_verdict(identity.verdict, identity.reasons)
+    for what, note in notes_on(file, model).items():
+        if not note.get("passed", True):
+            why = ", ".join(note.get("reasons") or ()) or "no reason noted"
+            said = f"'{_CHECKS.get(what, what)}' of {note.get('date', 'unknown date')} failed ({why}) since it was made"
+            found.append(Refusal("failed-check", said))
+    return tuple(found)
+
+
+def _identity(name: str, kinds: Mapping[str, str], serials: Mapping[str, str], created: str) -> Identity:
+    text = json.dumps([sorted(kinds.items()), sorted(serials.items())])
+    digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return Identity(rig=digest, created=created, name=name, kinds=kinds, serials=serials)
+
+
+def _used(model: RigModel, file: Path | None, found: tuple[Refusal, ...], accepted: frozenset[str]) -> CalibrationUse:
+    require_accepted("calibration" if file is None else f"calibration {file}", found, accepted)
+    return CalibrationUse(model, model.identity is not None, found)
+
+
+def _foreign(made: Identity, here: Identity) -> list[Refusal]:
+    """Parts that both know and that differ."""
+    of = f" of the rig '{made.name}'" if made.name else ""
+    found = []
+    for what, ours, theirs in (("", *_comparable(made, here)), (" serial number", made.serials, here.serials)):
+        for slot in [slot for slot in ours if slot in theirs and ours[slot] != theirs[slot]]:
+            said = f"is{of} with {slot}{what} '{ours[slot]}', this rig has '{theirs[slot]}'"
+            found.append(Refusal(f"other-{slot}", said))
+    return found
+
+
+def _comparable(made: Identity, here: Identity) -> tuple[dict[str, str], dict[str, str]]:
+    """Kinds of both; simulated worlds by their geometry, or by its file's name where one knows no more, as of old."""
+    both = dict(made.kinds), dict(here.kinds)
+    digests = [kinds.pop(_GEOMETRY, "") for kinds in both]
+    if all(digests):
+        alike = digests[0] == digests[1]
+        for kinds, digest in zip(both, digests, strict=True):
+            kinds["world"] = digest if alike else f"{kinds.get('world', '')} ({digest})"
+    return both
+
+
+def _aged(made: Identity, here: Identity, max_age_s: float | None) -> list[Refusal]:
+    begun, now = _date(made.created), _date(here.created)
+    if max_age_s is None or begun is None or now is None:
+        return []
+    age_s = (now - begun).total_seconds()
+    if age_s <= max_age_s:
+        return []
+    said = f"was made {_span(age_s)} ago ({made.created}), calibration_max_age is {_span(max_age_s)}"
+    return [Refusal("too-old", said)]
+
+
+def _span(time_s: float) -> str:
+    """In the largest unit that the config takes and of which there is one."""
+    units = (("days", DAY_S), ("hours", 3600.0))
+    unit, size = next((of for of in units if time_s >= of[1]), ("seconds", 1.0))
+    return f"{time_s / size:.4g} {unit}"
+
+
+def _date(text: str) -> datetime | None:
+    try:
+        found = datetime.fromisoformat(text)
+    except ValueError:
+        return None
+    return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
+
+
+def _accepted_before(rig: OpenRig) -> frozenset[str]:
+    """Codes of what a recording's own calibration was accepted in spite of."""
+    assert isinstance(rig.spad, PlaysRecording)
+    run = rig.spad.recording.path
+    if rig.config.calibration is None or rig.config.calibration.resolve() != (run / CALIBRATION_FILE).resolve():
+        return frozenset()
+    noted = (read_manifest(run) or {}).get("calibration") or {}
+    return frozenset(str(code) for code, _ in noted.get("accepted") or ())
+
+
+def accepted_by(use: CalibrationUse | None) -> tuple[str, ...]:
+    """What a run's calibration was used in spite of, for its summary."""
+    return () if use is None else tuple(map(str, use.accepted))

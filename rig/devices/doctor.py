@@ -1,0 +1,244 @@
+"""Could a scan run? Opens everything, looks at frames with the gate low, and says what was found (`rig doctor`).
+
+The mirror moves, as in a scan; no light leaves: the gate is low throughout and the laser is never armed.
+
+What is attached to this computer, and the laser's way to safety without a scan.
+"""
+
+import os
+import shutil
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from serial.tools import list_ports
+
+from calibration.errors import digits
+from drivers.errors import DeviceError
+from drivers.scanners.helios import HELIOS
+from drivers.scanners.lasercube import LASERCUBE
+from drivers.spads.spb_usb_setup import USB_IDS
+from drivers.transports.usb_device import attached as attached_usb
+from rig.config.models import RigConfig
+from rig.devices.calibration_use import NEXT, identity_of, refusals
+from rig.devices.dark_look import DarkLook, look
+from rig.devices.open import OpenRig, open_light, open_rig, prepare, require_memory
+from rig.errors import DevicesError, RigError
+from rig.plan.gate_pulses import sync_program
+from rig.plan.scan_plan import ScanPlan
+
+MOST_JITTER = 0.05
+"""Largest standard deviation of the line markers, in columns, with which frames can be bound to columns."""
+MOST_DARK = 0.05
+"""Largest share of ones with the gate low: more is daylight or a lamp on the sensor."""
+WRITE_BYTES = 64 * 2**20
+LEAST_FREE_BYTES = 2**30
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at. ok: False where a scan could not run like this."""
+
+    name: str
+    ok: bool
+    text: str
+
+    def as_json(self) -> dict[str, Any]:
+        """For programs."""
+        return asdict(self)
+
+
+def examine(config: RigConfig, folder: Path) -> list[Finding]:
+    """Look at everything; folder: where a scan would write. Raises nothing that a device can do wrong."""
+    findings: list[Finding] = []
+    try:
+        with open_rig(config) as rig:
+            findings += [*_devices(rig), _calibration(rig)]
+            plan, timing = prepare(rig)
+            require_memory(rig, plan)
+            rig.sync.program(*sync_program(plan, plan.sweeps_per_period))
+            findings.append(_plan(plan))
+            findings += _frames(look(rig, plan, timing.stride), plan)
+            findings += _memory(rig)
+    except (RigError, DeviceError) as error:
+        findings += [Finding("devices", False, line) for line in str(error).splitlines()]
+    findings.append(_disk(folder))
+    return findings
+
+
+def _devices(rig: OpenRig) -> list[Finding]:
+    info, scanner_fault = rig.spad.info, rig.scanner.status.fault
+    said = [rig.spad.identity, f"{info.width} x {info.height} px", *_health(rig)]
+    guard = "none: the laser is simulated" if rig.guard is None else f"process {rig.guard.pid} owns laser and gate"
+    return [
+        Finding("spad", True, ", ".join(said)),
+        Finding("scanner", scanner_fault is None, f"{rig.scanner.identity}: {scanner_fault or 'ready'}"),
+        Finding("sync", True, f"{rig.sync.identity}: resolution {rig.sync.resolution_s * 1e9:g} ns"),
+        _laser(rig),
+        Finding("guard", True, guard),
+    ]
+
+
+def _health(rig: OpenRig) -> list[str]:
+    health = rig.spad.health
+    said = [f"{place} {celsius:.1f} C" for place, celsius in health.temperatures_c.items()]
+    if health.excess_bias_v is not None:
+        said.append(f"excess bias {health.excess_bias_v:g} V")
+    if health.frame_clock_hz is not None:
+        said.append(f"frame clock {health.frame_clock_hz:.6g} Hz")
+    return said
+
+
+def _laser(rig: OpenRig) -> Finding:
+    status = rig.laser.status
+    trouble = [
+        text
+        for bad, text in (
+            (not status.interlock_closed, "interlock open"),
+            (status.fault is not None, f"fault {status.fault}"),
+            (status.key_on is False, "key off"),
+        )
+        if bad
+    ]
+    state = ", ".join(trouble) or f"interlock closed, no fault, input {status.input_mode}"
+    warm = "" if status.temperature_c is None else f", {status.temperature_c:.1f} C"
+    most = f", up to {rig.laser.limits.max_power_w * 1e3:g} mW"
+    return Finding("laser", not trouble, f"{rig.laser.identity}: {state}{warm}{most}")
+
+
+def _calibration(rig: OpenRig) -> Finding:
+    """A rig without one can scan: there are stripes then, and no depth."""
+    file, model = rig.config.calibration, rig.model
+    if model is None:
+        return Finding("calibration", True, "none: a scan gives stripes but no depth")
+    against = refusals(model, file, identity_of(rig), rig.config.calibration_max_age)
+    if against:
+        return Finding("calibration", False, f"{file}: {'; '.join(each.text for each in against)}; {NEXT}")
+    made = model.identity
+    said = "does not say of which rig it is: unchecked" if made is None else f"of this rig, made {made.created}"
+    return Finding("calibration", True, f"{file}: {said}")
+
+
+def _plan(plan: ScanPlan) -> Finding:
+    """A plan that the link cannot carry is refused before it comes here."""
+    link = f"{plan.bytes_per_s / 1e6:.0f} MB/s"
+    if plan.readout_bytes_per_s is not None:
+        link = f"read out at {plan.readout_bytes_per_s / 1e6:.0f} MB/s"
+    elif plan.link_bytes_per_s is not None:
+        link += f" of the link's {plan.link_bytes_per_s / 1e6:.0f} MB/s"
+    sweep = f"{plan.columns} columns x {plan.exposures} exposures in {digits(1e3 * float(plan.sweep_s))} ms"
+    return Finding("plan", True, f"{sweep}, {link}")
+
+
+def _frames(seen: DarkLook, plan: ScanPlan) -> list[Finding]:
+    if not len(seen.records):
+        text = f"no frame within {seen.seconds:.1f} s; check the SPAD's cable and trigger"
+        return [Finding("frames", False, text)]
+    lost, damaged = seen.counters.lost or 0, seen.counters.crc_errors or 0
+    rate = f"{len(seen.records)} received at {seen.n_bytes / seen.seconds / 1e6:.0f} MB/s"
+    return [
+        Finding("frames", not lost and not damaged, f"{rate}, {lost} lost, {damaged} damaged"),
+        Finding(
+            "dark counts", seen.dark_share < MOST_DARK, f"{seen.dark_share:.2%} of the pixels of a frame, gate low"
+        ),
+        _markers(seen, plan),
+        _trigger(seen),
+    ]
+
+
+def _markers(seen: DarkLook, plan: ScanPlan) -> Finding:
+    if plan.blanking is not None:
+        return Finding("markers", True, "none: a scan finds its columns by a blanking pattern of the laser")
+    lines = seen.lines(plan)
+    if lines is None:
+        text = f"{seen.scans} scan and {seen.line_markers} line markers seen; check the scanner's marker lines"
+        return Finding("markers", False, text)
+    return Finding(
+        "markers",
+        lines.jitter_columns <= MOST_JITTER and lines.clock_fits,
+        f"{seen.scans} scan and {seen.line_markers} line markers, {lines.rate_hz:.6g} lines a second, jitter "
+        f"{lines.jitter_columns:.3g} columns, scanner's clock {lines.clock_error * 1e6:+.0f} ppm against the SPAD's",
+    )
+
+
+def _trigger(seen: DarkLook) -> Finding:
+    if seen.triggered:
+        return Finding("trigger", True, "the scanner's scan marker starts the sync source's program")
+    text = "no scan marker came to the sync source's trigger input, its gate would stay low; check that line"
+    return Finding("trigger", False, text)
+
+
+def _memory(rig: OpenRig) -> list[Finding]:
+    most = rig.spad.health.memory_high_water_bytes
+    return [] if most is None else [Finding("memory", True, f"at most {digits(most / 1e6)} MB waited in the SPAD")]
+
+
+def _disk(folder: Path) -> Finding:
+    """Free space, and how fast a file is written there."""
+    here = folder.resolve()
+    while not here.exists():
+        here = here.parent
+    free = shutil.disk_usage(here).free
+    try:
+        with tempfile.NamedTemporaryFile(dir=here, prefix=".rig-doctor-") as file:
+            piece = os.urandom(2**20)
+            begun = time.perf_counter()
+            for _ in range(WRITE_BYTES // len(piece)):
+                file.write(piece)
+            file.flush()
+            os.fsync(file.fileno())
+            rate = WRITE_BYTES / (time.perf_counter() - begun)
+    except OSError as error:
+        return Finding("disk", False, f"{here} cannot be written: {error.strerror or error}; choose another folder")
+    room = "" if free >= LEAST_FREE_BYTES else f"; less than {LEAST_FREE_BYTES / 1e9:.1f} GB, make room"
+    return Finding("disk", not room, f"{here}: {free / 1e9:.1f} GB free, {rate / 1e6:.0f} MB/s{room}")
+
+
+KNOWN = (("helios", HELIOS), ("lasercube", LASERCUBE), *(("spb-usb", one) for one in USB_IDS))
+"""USB devices by the kind of their driver; those on serial ports say what they are only when asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attached:
+    """One device. address: what a config's `port` says to mean it; kind: its driver's, None: a port that may be any."""
+
+    address: str
+    what: str
+    kind: str | None
+
+    def as_json(self) -> dict[str, Any]:
+        """For programs."""
+        return asdict(self)
+
+
+def attached() -> list[Attached]:
+    """USB devices that a driver knows, then serial ports. Opens nothing."""
+    found = [
+        Attached(one.address, f"{kind}: {one.product_name or wanted.label}", kind)
+        for kind, wanted in KNOWN
+        for one in attached_usb(wanted)
+    ]
+    for port in list_ports.comports():
+        serial = f", serial={port.serial_number}" if port.serial_number else ""
+        found.append(Attached(port.device, f"serial port: {port.description}{serial}", None))
+    return found
+
+
+def laser_off(config: RigConfig) -> list[str]:
+    """Gate low, emission off; says what was done. Each is tried whatever the other did: DevicesError names failures."""
+    done: list[str] = []
+    trouble: list[str] = []
+    with open_light(config, trouble) as (sync, laser):
+        for slot, device, what in (("sync", sync, "all outputs low"), ("laser", laser, "emission off")):
+            if device is None:
+                continue
+            try:
+                (sync.abort if device is sync else laser.disarm)()  # type: ignore[union-attr]
+                done.append(f"{device.name}: {what}")
+            except DeviceError as error:
+                trouble.append(f"{slot}: {error}")
+    if trouble:
+        raise DevicesError("\n".join([*trouble, *done]))
+    return done

@@ -1,0 +1,347 @@
+"""Opens all devices of a rig together, lists every failure at once, and closes them gate first, whatever happens.
+
+Who may let light out: a real laser or gate needs the user's word, a simulated one none.
+
+A burst: what of a SPAD's memory goes to the time until the scanner has started, and whether the rest holds a map.
+"""
+
+import logging
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationError
+from calibration.files.rig_file import load_rig_model
+from calibration.model.rig_model import RigModel
+from drivers.clock import Clock, SystemClock, VirtualClock
+from drivers.errors import DeviceError
+from drivers.guard import Guard
+from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SpadTiming, SyncSource, World
+from drivers.registry import KindConfig, Surroundings, lookup
+from drivers.transports.endpoints import EMULATED_PREFIX, Endpoint
+from drivers.transports.tap import TapFile
+from rig.config.models import RigConfig, ScanConfig
+from rig.errors import DevicesError, PlanError, UsageError
+from rig.plan.compile import ColumnWindows, compile_plan, spad_request
+from rig.plan.gate_pulses import sync_program
+from rig.plan.scan_plan import ScanPlan
+from rig.recording.cube import cube_columns
+from rig.recording.replay import PlaysRecording, replay_plan
+
+_log = logging.getLogger(__name__)
+
+GUARDED = ("laser", "sync")
+"""Slots whose devices a process of its own owns, since they let light out."""
+DEVICES = ("spad", "scanner", "laser", "sync")
+"""Slots of devices, in the order in which they are opened."""
+HOLD_EXPOSURES = 10
+"""From so many frames per column on, simulated light is held within columns; with fewer, within parts of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpenRig:
+    """The open devices of a rig. world: None on a real rig; model: None where it is not calibrated."""
+
+    config: RigConfig
+    clock: Clock
+    world: World | None
+    spad: SpadArray
+    scanner: BeamScanner
+    laser: LineLaser
+    sync: SyncSource
+    model: RigModel | None
+    guard: Guard | None = None
+    """What owns the ports of a real laser and its gate."""
+
+
+@runtime_checkable
+class HoldsColumns(Protocol):
+    """A world that can give all frames of a column the same light, so that it is computed once for them."""
+
+    def hold_columns(self, commands: NDArray[np.float64]) -> None:
+        """Hold the light within columns of these mirror commands (columns,)."""
+        ...
+
+
+@runtime_checkable
+class ProjectsLines(Protocol):
+    """A world whose laser can send out several lines at once."""
+
+    def project_lines(self, offsets: Sequence[float], *, shared: bool) -> None:
+        """Send out a line at each of these offsets, in units of the mirror command."""
+        ...
+
+
+@runtime_checkable
+class PlansEffects(Protocol):
+    """A world that leaves out what makes no difference to a scan."""
+
+    def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
+        """Choose what is simulated, for frames of that exposure, so many to a column, at that power or less."""
+        ...
+
+
+@runtime_checkable
+class EmulatesDevices(Protocol):
+    """A world that plugs in devices of its own, until it is closed."""
+
+    @property
+    def ports(self) -> Mapping[str, Endpoint]:
+        """Where they are, by the names that `port: emulated:NAME` means."""
+        ...
+
+    def close(self) -> None:
+        """Unplug them."""
+        ...
+
+
+@contextmanager
+def open_rig(
+    config: RigConfig, clock: Clock | None = None, seed: int = 0, tap: TapFile | None = None
+) -> Iterator[OpenRig]:
+    """Open every device of the config; on exit the sync source is closed first, then laser, scanner and SPAD.
+
+    clock: by default virtual time for a simulated rig and the host's for a real one. seed: of everything simulated.
+    tap: records what passes the ports of all devices, of the SPAD's its control traffic.
+    Raises UsageError where config or calibration are at fault, DevicesError where devices are; each lists all problems.
+    """
+    with ExitStack() as stack:
+        yield _open(config, clock, seed, tap, stack)
+
+
+@contextmanager
+def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
+    """The gate and the laser alone, directly; None where one cannot be opened, which `trouble` then says."""
+    with ExitStack() as stack:
+        surroundings = _surroundings(config, None, 0, stack)
+        opened: dict[str, Any] = {"sync": None, "laser": None}
+        for slot in GUARDED:
+            try:
+                opened[slot] = stack.enter_context(_create(slot, getattr(config, slot), surroundings))
+            except DeviceError as error:
+                trouble.append(f"{slot}: {error}")
+        yield opened["sync"], opened["laser"]
+
+
+def check_files(config: RigConfig) -> None:
+    """Open every file that a config names, as `open_rig` does, but no device. UsageError with a line per problem."""
+    problems: list[str] = []
+    _load_model(config, problems)
+    with ExitStack() as stack:
+        _create_surroundings(config, None, 0, stack, problems)
+    for slot in DEVICES:
+        kind = getattr(config, slot)
+        check = lookup(slot, kind.kind).check_files
+        try:
+            if check is not None:
+                check(kind)
+        except DeviceError as error:
+            problems += [f"{slot}: {line}" for line in str(error).splitlines()]
+    if problems:
+        raise UsageError.of(problems)
+
+
+def prepare(
+    rig: OpenRig, scan: ScanConfig | None = None, windows: ColumnWindows | None = None
+) -> tuple[ScanPlan, SpadTiming]:
+    """Configure the SPAD and compile the plan; nothing moves and nothing lights. scan: the config's by default.
+
+    windows: of the columns where the scan is a part of another one, which has been prepared before; None: it is not.
+    """
+    scan = rig.config.scan if scan is None else scan
+    if isinstance(rig.spad, PlaysRecording):  # what was scanned is bound by the plan that it was scanned with
+        return replay_plan(rig.spad, rig.spad.recording, scan, rig.model)
+    most_w = rig.laser.limits.max_power_w
+    if scan.power is not None and scan.power > most_w:
+        raise PlanError(
+            f"scan.power is {scan.power * 1e3:g} mW, the most {rig.laser.name} may give is {most_w * 1e3:g} mW; "
+            "lower scan.power"
+        )
+    if isinstance(rig.world, PlansEffects) and windows is None:
+        rig.world.plan_for(most_w if scan.power is None else scan.power, scan.exposure_s, scan.exposures)
+    info, scanner = rig.spad.info, rig.scanner
+    lines = rig.config.line_offsets
+    nominal = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, None, lines, windows)
+    timing = rig.spad.configure(spad_request(scan, nominal))
+    plan = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, timing, lines, windows)
+    if plan.frame_rate_hz != nominal.frame_rate_hz:  # its windows may be others, its timing is the same again
+        timing = rig.spad.configure(spad_request(scan, plan))
+    if isinstance(rig.world, HoldsColumns):
+        # A frame's light may be held this far from where the mirror is; the mean over a column's frames is right.
+        parts = math.ceil(HOLD_EXPOSURES / plan.exposures)
+        rig.world.hold_columns(plan.command_at((np.arange(plan.places * parts) + 0.5) / parts - 0.5))
+    return plan, timing
+
+
+def _open(config: RigConfig, clock: Clock | None, seed: int, tap: TapFile | None, stack: ExitStack) -> OpenRig:
+    usage: list[str] = []
+    devices: list[str] = []
+    model = _load_model(config, usage)
+    surroundings = _create_surroundings(config, clock, seed, stack, usage)
+    opened: dict[str, Any] = {}
+    guard: Guard | None = None
+    if surroundings is not None:
+        guard = _guard_of(config, surroundings.ports, tap, stack)
+        # Closing runs backwards: the gate goes low before the laser pauses, the mirror parks and the SPAD stops.
+        for slot in DEVICES:
+            try:
+                opened[slot] = stack.enter_context(
+                    _open_device(slot, getattr(config, slot), _tapped(surroundings, slot, tap, stack), guard)
+                )
+            except DeviceError as error:
+                devices.append(f"{slot}: {error}")
+    if "laser" in opened:
+        devices += _pause_if_emitting(opened["laser"])
+    if usage:
+        raise UsageError(*usage, *devices)
+    if devices:
+        raise DevicesError("\n".join(devices))
+    assert surroundings is not None, "else there is trouble"
+    clock, world = surroundings.clock, surroundings.world
+    return OpenRig(config=config, clock=clock, world=world, model=model, guard=guard, **opened)
+
+
+def _create_surroundings(
+    config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack, problems: list[str]
+) -> Surroundings | None:
+    """Clock and world; None where there is no world, which `problems` then says."""
+    try:
+        return _surroundings(config, clock, seed, stack)
+    except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
+        problems += [f"world: {line}" for line in str(error).splitlines()]
+        return None
+
+
+def _surroundings(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -> Surroundings:
+    """Clock and world of the config, with the devices that the world plugs in. DeviceError where there is no world."""
+    virtual = config.world is not None and not config.world.real_time
+    clock = clock or (VirtualClock() if virtual else SystemClock())
+    bare = Surroundings(clock, None, seed)
+    if config.world is None:
+        return bare
+    world = _create("world", config.world, bare)
+    if isinstance(world, ProjectsLines):
+        world.project_lines(config.line_offsets, shared=config.line_power == "shared")
+    found = replace(bare, world=world)
+    if isinstance(world, EmulatesDevices):
+        stack.callback(world.close)
+        found = replace(found, ports=world.ports)
+    return found
+
+
+def _tapped(surroundings: Surroundings, slot: str, file: TapFile | None, stack: ExitStack) -> Surroundings:
+    """With a tap for the device of a slot, where its traffic is recorded; it is written once the device is closed."""
+    if file is None:
+        return surroundings
+    tap = file.tap(slot)
+    stack.callback(tap.flush)
+    return replace(surroundings, tap=tap)
+
+
+def _guard_of(config: RigConfig, ports: Mapping[str, Endpoint], tap: TapFile | None, stack: ExitStack) -> Guard | None:
+    """The guard of a laser and a gate that are not simulated, at work until the rig is closed; None: there are none."""
+    guarded = {slot: kind for slot in GUARDED if (kind := getattr(config, slot)).real_time}
+    return stack.enter_context(Guard(**guarded, ports=ports, tap=tap)) if guarded else None
+
+
+def _open_device(slot: str, kind: KindConfig, surroundings: Surroundings, guard: Guard | None) -> Any:
+    if guard is not None and slot in GUARDED and kind.real_time:
+        return guard.laser if slot == "laser" else guard.sync
+    return _create(slot, kind, surroundings)
+
+
+def _create(slot: str, kind: KindConfig, surroundings: Surroundings) -> Any:
+    return lookup(slot, kind.kind).create(kind, surroundings)
+
+
+def _load_model(config: RigConfig, problems: list[str]) -> RigModel | None:
+    if config.calibration is None:
+        return None
+    try:
+        model = load_rig_model(config.calibration)
+    except CalibrationError as error:
+        problems.append(f"calibration: {error}")
+        return None
+    if (cube_columns(model) or 0) > 2:  # commands 0 and 1 may as well be those of a mirror
+        problems.append(
+            f"calibration: {config.calibration} is for a bare cube ('planes', one per column); a scan needs a "
+            "calibration with 'scanner', which says where the plane is at any mirror command"
+        )
+        return None
+    return model
+
+
+def _pause_if_emitting(laser: LineLaser) -> list[str]:
+    """A laser that emits before anybody armed it is paused, and the scan refused: somebody else is using it."""
+    try:
+        if not laser.status.emission:
+            return []
+        laser.pause()
+    except DeviceError as error:
+        return [f"laser: {error}"]
+    return [f"laser: {laser.name} was found emitting and has been paused; find out who armed it, then start again"]
+
+
+def require_simulated_or_armed(config: RigConfig, arm: bool) -> list[str]:
+    """Problems with letting light out: every real laser and gate needs the user's word."""
+    real = [slot for slot in ("laser", "sync") if not _made_here(getattr(config, slot))]
+    if arm or not real:
+        return []
+    kinds = ", ".join(f"{slot} {getattr(config, slot).kind}" for slot in real)
+    return [f"{config.name} has real light ({kinds}); clear the beam path, then add --arm"]
+
+
+def _made_here(device: KindConfig) -> bool:
+    """Whether a device shines no real light: simulated, or at a port that this process emulates."""
+    return not device.real_time or str(getattr(device, "port", "")).startswith(EMULATED_PREFIX)
+
+
+BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
+"""Time between the SPAD's start and the first scan marker that a burst must have room for, on virtual time and where a
+host starts one device after the other over USB and serial ports."""
+
+SPARE_LEAD_S = 0.35
+"""More of it where the memory has it and reading ends with the last scan marker: a host that has much else to do starts
+its devices late."""
+
+
+def lead_s(rig: OpenRig) -> float:
+    """Seconds of a burst before its first scan marker."""
+    return BURST_LEAD_S if isinstance(rig.clock, VirtualClock) else HOST_LEAD_S
+
+
+def spare_lead_s(rig: OpenRig) -> float:
+    """More seconds, which a burst may have room for."""
+    return 0.0 if isinstance(rig.clock, VirtualClock) or not rig.spad.info.markers else SPARE_LEAD_S
+
+
+def most_sweeps(rig: OpenRig, plan: ScanPlan) -> int | None:
+    """Sweeps of one start: as many as the SPAD's memory holds in a burst and the sync source's program; None: any.
+
+    At least 1, which either may still refuse.
+    """
+    legs = plan.sweeps_per_period
+    repeats = rig.sync.most_repeats(sync_program(plan, legs)[0])
+    limits = [] if repeats is None else [repeats * legs]
+    if plan.burst_frames is not None:
+        spare = plan.burst_frames - lead_s(rig) * float(plan.frame_rate_hz) - plan.frames_for(0)
+        limits.append(int(spare / float(plan.frames_per_sweep)))
+    return max(1, min(limits)) if limits else None
+
+
+def require_memory(rig: OpenRig, plan: ScanPlan) -> None:
+    """PlanError where the SPAD's memory would be full before one map is whole."""
+    if plan.burst_frames is None:
+        return
+    need = math.ceil(plan.frames_for(1) + lead_s(rig) * float(plan.frame_rate_hz))
+    if need > plan.burst_frames:
+        raise PlanError(
+            f"a burst of one map takes {need} frames, with the {lead_s(rig):g} s until the scanner has started; "
+            f"the memory of {rig.spad.name} holds {plan.burst_frames}; lower scan.exposures, scan.columns or "
+            "scan.frame_rate"
+        )

@@ -1,0 +1,238 @@
+"""Estimators `argmax` (brightest pixel of the row, the naive reference) and `edge` (the report's).
+
+`argmax`: largest count inside the window, ties to the smallest x. `edge`: an exponential background fitted to the near
+side of the row, then the largest (count - background) weighted with the drop of the level from the 8 px before to the
+8 px behind. Both refine to sub-pixel with the two neighbours, and both are told nothing and learn nothing.
+
+Compiled rows of the simple estimators `argmax` and `edge`.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import Counter, CountVolume, SweepCounter, SweepLayout
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import MARGIN_PX, SweepGeometry
+from rig.threads import RowWorkers
+
+EDGE_REACH_PX: Final = 8
+"""Pixels on each side between which `edge` measures the drop of the level (the report's discontinuity)."""
+STRIPE_PX: Final = 2
+"""Pixels on each side of the peak that belong to the stripe: 3 sigma of a line of 0.6 px."""
+NO_STRIPE: Final = 0.1
+"""Prior of a row without stripe: shadows and borders take about a tenth of the rows of the scenes measured."""
+NEAR_SHARE: Final = 0.25
+"""Share of the row, from its near end, to which `edge` fits the decaying background."""
+
+
+@numba.njit(cache=True, nogil=True)
+def sub_pixel(weight: NDArray[np.float64], peak: int, length: int) -> float:
+    """Offset of the peak in -0.5..0.5 from its two neighbours: centroid of what rises above the lower of them.
+
+    A flat top or a peak at the end of the row has no offset.
+    """
+    if peak <= 0 or peak >= length - 1:
+        return 0.0
+    left, centre, right = weight[peak - 1], weight[peak], weight[peak + 1]
+    floor = min(left, right)
+    mass = left + centre + right - 3.0 * floor
+    if not mass > 0.0:
+        return 0.0
+    return float(min(max((right - left) / mass, -0.5), 0.5))
+
+
+@numba.njit(cache=True, nogil=True)
+def peak_confidence(
+    weight: NDArray[np.float64], counts: NDArray[np.float64], k: float, peak: int, length: int
+) -> tuple[float, float]:
+    """(P(the true peak is within 1 px of `peak`), mean count away from it).
+
+    The row is read as 'one pixel at the peak's rate, the others at the mean rate of the rest', whose likelihood at x is
+    weight[x] (logit p_peak - logit p_rest) + k log((1 - p_peak) / (1 - p_rest)) against 'no stripe', which has a prior
+    of NO_STRIPE; rates are kept off 0 and 1 by half a count. A row without a count is no stripe.
+    """
+    if counts[peak] <= 0.0:
+        return 0.0, 0.0
+    total = 0.0
+    for t in range(length):
+        total += counts[t]
+    around = counts[peak]
+    pixels = 1.0
+    for t in (peak - 1, peak + 1):
+        if 0 <= t < length:
+            around += counts[t]
+            pixels += 1.0
+    rest = (total - around) / max(length - pixels, 1.0)
+    # 1 - p from the counts themselves: at K = 10^6 half of its digits would be lost.
+    p_peak, q_peak = (counts[peak] + 0.5) / (k + 1.0), (k - counts[peak] + 0.5) / (k + 1.0)
+    rest_k = k + 1.0 / length
+    p_rest = min((max(rest, 0.0) + 0.5 / length) / rest_k, p_peak)
+    q_rest = max((k - max(rest, 0.0) + 0.5 / length) / rest_k, q_peak)
+    gain = np.log(p_peak / q_peak) - np.log(p_rest / q_rest)
+    evidence = gain * counts[peak] + k * (np.log(q_peak) - np.log(q_rest))
+    near = 0.0
+    everything = length * NO_STRIPE / (1.0 - NO_STRIPE) * np.exp(-min(max(evidence, -60.0), 60.0))
+    for t in range(length):
+        share = np.exp(min(max(gain * (weight[t] - weight[peak]), -60.0), 60.0))
+        everything += share
+        if abs(t - peak) <= 1:
+            near += share
+    return near / everything, rest
+
+
+@numba.njit(cache=True, nogil=True)
+def _near_fit(n: NDArray[np.float64], length: int) -> tuple[float, float]:
+    """Level and decay per pixel of an exponential through the near part of a row, by its two halves' sums."""
+    half = max(int(length * NEAR_SHARE) // 2, 2)
+    if 2 * half > length:
+        return 0.0, 0.0
+    a = 0.0
+    b = 0.0
+    for t in range(half):
+        a += n[t]
+        b += n[half + t]
+    if a <= 0.0:
+        return 0.0, 0.0
+    decay = np.log(a / b) / half if b > 0.0 else 0.0
+    decay = max(decay, 0.0)
+    if decay < 1e-6:
+        return (a + b) / (2 * half), 0.0
+    return a * -np.expm1(-decay) / -np.expm1(-decay * half), decay
+
+
+@numba.njit(cache=True, nogil=True)
+def peak_rows(
+    counts: NDArray[np.unsignedinteger],
+    n_frames: NDArray[np.int32],
+    x0: NDArray[np.int32],
+    x_lo: NDArray[np.int32],
+    x_hi: NDArray[np.int32],
+    near_is_left: bool,
+    defects: NDArray[np.bool_],
+    with_edge: bool,
+    first_row: int,
+    last_row: int,
+    out: NDArray[np.float32],
+) -> None:
+    """`argmax` (with_edge False) or `edge` on rows first_row..last_row-1; out (5, rows, columns) as in StripeTable."""
+    window = counts.shape[2]
+    n = np.empty(window + 2 * MARGIN_PX, np.float64)
+    score = np.empty(window + 2 * MARGIN_PX, np.float64)
+    step = 1 if near_is_left else -1
+    for c in range(counts.shape[0]):
+        if n_frames[c] == 0:
+            continue
+        k = np.float64(n_frames[c])
+        for y in range(first_row, last_row):
+            first, last = max(x_lo[y, c], x0[c]), min(x_hi[y, c], x0[c] + window - 1)
+            if first > last:
+                continue
+            # Pixels beyond the search window say what lies before and behind; none of them can be the answer.
+            low = max(first - EDGE_REACH_PX, x0[c], 0)
+            high = min(last + EDGE_REACH_PX, x0[c] + window - 1, defects.shape[1] - 1)
+            start = low if near_is_left else high
+            for t in range(high - low + 1):
+                x = start + step * t
+                n[t] = 0.0 if defects[y, x] else counts[c, y, x - x0[c]]
+            begin = first - low if near_is_left else high - last
+            length = last - first + 1
+            inside = n[begin : begin + length]
+            background = 0.0
+            decay = 0.0
+            if with_edge:
+                background, decay = _near_fit(inside, length)
+                _edge_scores(n[: high - low + 1], begin, length, background, decay, score)
+            weights = score[:length] if with_edge else inside
+            peak = -1
+            for i in range(length):
+                # Ties go to the smallest x, whatever side is near.
+                t = i if near_is_left else length - 1 - i
+                if peak < 0 or weights[t] > weights[peak]:
+                    peak = t
+            if with_edge:
+                # A stripe's far flank has its own light before it and scores high: climb back to the top.
+                top = peak
+                for t in range(max(0, peak - STRIPE_PX), min(length, peak + STRIPE_PX + 1)):
+                    if inside[t] > inside[top]:
+                        top = t
+                peak = top
+            offset = sub_pixel(inside, peak, length)
+            near, rest = peak_confidence(inside, inside, k, peak, length)
+            level = background * np.exp(-decay * peak) if with_edge else rest
+            net = max(inside[peak] - level, 0.0)
+            out[0, y, c] = start + step * (begin + peak + offset)
+            out[1, y, c] = near
+            out[2, y, c] = np.sqrt(1.0 / 12.0 + 0.5 / max(net, 1.0))
+            haze = _flux(min(level, k), k)
+            signal = 0.0
+            for t in range(max(0, peak - STRIPE_PX), min(length, peak + STRIPE_PX + 1)):
+                signal += _flux(inside[t], k) - haze
+            out[3, y, c] = max(signal, 0.0)
+            out[4, y, c] = haze
+
+
+@numba.njit(cache=True, nogil=True)
+def _edge_scores(
+    n: NDArray[np.float64], begin: int, length: int, background: float, decay: float, score: NDArray[np.float64]
+) -> None:
+    """(count - background) times the drop of the mean level from the 8 px before to the 8 px behind, both cut at 0.
+
+    n: counts with whatever lies beyond the window; score (length,) is of pixels begin..begin + length - 1.
+    """
+    for t in range(length):
+        at = begin + t
+        before = 0.0
+        behind = 0.0
+        near, far = max(0, at - EDGE_REACH_PX), min(n.shape[0], at + 1 + EDGE_REACH_PX)
+        for i in range(near, at):
+            before += n[i]
+        for i in range(at + 1, far):
+            behind += n[i]
+        expected = background * np.exp(-decay * t)
+        before = before / (at - near) if at > near else expected
+        behind = behind / (far - at - 1) if far > at + 1 else before
+        rise = max(n[at] - expected, 0.0)
+        # A small constant keeps the peak decisive where there is no haze to drop.
+        score[t] = rise * (max(before - behind, 0.0) + 0.05)
+
+
+@numba.njit(cache=True, nogil=True)
+def _flux(count: float, k: float) -> float:
+    """Photons per exposure from a mean count over k exposures, finite at saturation."""
+    return float(np.log1p(count / (k - count + 0.5)))  # ln((k + 0.5) / (k - count + 0.5)), exact for few counts too
+
+
+@dataclass(frozen=True, slots=True)
+class Peaks:
+    """Peak search on every row; `with_edge` weighs peaks with the drop behind them."""
+
+    with_edge: bool
+    threads: int = 2
+
+    @property
+    def used(self) -> None:
+        """Nothing is learned."""
+        return None
+
+    def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
+        """A counter of whole sweeps."""
+        return SweepCounter(layout, RowWorkers(self.threads))
+
+    def estimate(self, volume: CountVolume, geometry: SweepGeometry) -> StripeTable:
+        """Stripe table of one sweep."""
+        out = np.full((5, geometry.rows, geometry.columns), np.nan, np.float32)
+        out[1] = 0.0
+
+        def work(first: int, last: int) -> None:
+            peak_rows(
+                volume.counts, volume.n_frames, volume.x0, geometry.x_lo, geometry.x_hi, geometry.near_is_left,
+                geometry.defects, self.with_edge, first, last, out,
+            )  # fmt: skip
+
+        with RowWorkers(self.threads) as workers:
+            workers.over(geometry.rows, work)
+        return StripeTable(*out)

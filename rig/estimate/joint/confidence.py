@@ -1,0 +1,398 @@
+"""Compiled: how probably an answer of `joint` lies within a pixel of a stripe, from three things that can be wrong.
+
+    confidence = erf(1 / (sqrt 2 WIDER sd))                    the stripe is farther off than it should be
+               / (1 + exp(A - B margin + G apart))             another position is the right one
+               / (1 + exp(C - D ln contrast' + hole            there is no stripe: haze ends, nothing shines
+                          + g (E - F ln odds) + H ((1 - g)^2 missing + e unseen)))
+
+margin: by how much the next best place is worse, or what neighbours say for it where there was a vote, over UNITS of
+cost. apart: share of the pairs of opposite neighbours that put the answer elsewhere (`rig.estimate.joint.confidence`).
+contrast' = max(contrast + 3, 1), contrast: light that 3 x 3 neighbours on the surface have in common above the *whole*
+haze before the stripe, over its noise; where haze just ends an answer can lie a little before the end, and half of the
+haze would pass for light. hole: by how much contrast is below -6, 30 at most. odds: of answers around that agree to
+those that do not. They count as far as there is haze, g = k / (k + SOME_HAZE), k photons of it in all exposures: in
+clear air nothing but a stripe makes a margin, and small things, whose surroundings do not agree, are as sure as others.
+
+missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), light: photons of all that contrast
+sums, bright: what the model's largest amplitude would bring. Where a dark stripe would still shine, no light is no
+stripe, which light over its noise cannot tell. unseen: max(AT_END - CLEARLY max(contrast, 0), 0), with e = 1 up to 1 px
+from the far end of the depth range and 0 from 3 px on: haze that goes on ends there for want of places, so evenly that
+answers agree; a stripe so far away has to shine by itself.
+
+A and G are chosen, on random scenes 50 to 57 of the tests' simulator beside the five prepared ones: fitted (1.9 and
+1.5, B 0.66) they believe stripes too little where there is no doubt about haze. The others are fitted (maximum
+likelihood) to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, all answers counted, also
+those where there is no stripe. H, DARKER, CLEARLY and AT_END are of a few that were tried: by the likelihood of random
+scenes 120 to 160 of the tests' simulator, most of them open to the sky in part (`tests.reference.open_scenes`); larger
+ones took too much from dim stripes of the prepared scenes in clear air, or lost what is dark beside what is bright.
+
+The stripe table of `joint`: places, light, and how sure each answer is.
+
+Compiled: how far a map's answers agree with those around them, which is what tells a surface from nothing at all.
+
+Where a stripe is, answers lie on a surface. Where there is none, in a shadow or behind the end of the haze, every row
+finds what its noise looks most like; four paths tie those answers into streaks, but not into surfaces. So each answer
+is asked how many of its 5 x 5 neighbours are on the same surface (`count_neighbours`), and a place how many of all
+such pairs there are among the 7 x 7 answers around it (`agreement_row`). Only the former are stored, 16 bits each.
+Thin things have few such neighbours, slanted ones fewer; but an answer that is wrong is mostly not where those opposite
+each other put it, whatever the slope (`apart_row`).
+
+Speed: 0.5 ms for 512 x 500 answers, with all that `rig.estimate.joint.confidence` does 2.1 (Zen 3, AVX2, one thread).
+"""
+
+import math
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.joint.labels.tables import signed_address
+from rig.estimate.joint.place.places import LIGHT_PX, Places
+from rig.estimate.joint.place.pool import COPIED_ROWS, MARGIN, SAME_PX, with_margin
+from rig.estimate.joint.winner import UNITS, LabelAnswers
+from rig.estimate.row.model import RowModel
+from rig.geometry.stripe_table import StripeTable
+from rig.simd.functions import error_function, exponential, logarithm
+from rig.simd.memory import copy_floats, load_float32, load_int16, store_float32, store_int16
+from rig.simd.vectors import (
+    LANES,
+    larger_float,
+    smaller_float,
+    square_root,
+    to_float32,
+    to_int16,
+    where_small,
+    zero_float32,
+    zero_int16,
+)
+from rig.threads import RowWorkers
+
+NEIGHBOURS: Final = 2
+"""Rows and columns to either side in which neighbours are counted."""
+AROUND: Final = 3
+"""The same of the answers whose neighbours are counted."""
+OPPOSITE: Final = 2, 4
+"""Rows and columns to the neighbours that lie opposite each other."""
+ASKED: Final = 4 * len(OPPOSITE)
+"""Pairs of them: along rows, columns and both diagonals."""
+_ANYWHERE: Final = np.float32(1e6)
+
+
+class Neighbours(NamedTuple):
+    """How many neighbours of each answer lie on its surface, and how many there are to ask.
+
+    number: int16 (rows, columns) with AROUND rows and LANES columns around, 0 there. pairs: of `pairs_to_ask`.
+    """
+
+    number: NDArray[np.int16]
+    pairs: NDArray[np.float32]
+
+
+def new_neighbours(pairs: NDArray[np.float32]) -> Neighbours:
+    """Room for a map with so many pairs to ask."""
+    rows, columns = pairs.shape
+    return Neighbours(np.zeros((rows + 2 * AROUND, (-(-columns // LANES) + 2) * LANES), np.int16), pairs)
+
+
+def pairs_to_ask(there: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """How many pairs of neighbours there are around each place (rows, columns), both of them there; at least 1.
+
+    there: whether a place is searched and has frames; others have no say.
+    """
+    weight = there.astype(np.int16)
+    return np.maximum(_around(weight * _around(weight, NEIGHBOURS), AROUND), 1).astype(np.float32)
+
+
+def _around(number: NDArray[np.int16], reach: int) -> NDArray[np.int16]:
+    """Sums over so many rows and columns to either side."""
+    (rows, columns), wide = number.shape, np.pad(number, reach)
+    tall = wide[:rows].copy()
+    for i in range(1, 2 * reach + 1):
+        tall += wide[i : i + rows]
+    total = tall[:, :columns].copy()
+    for i in range(1, 2 * reach + 1):
+        total += tall[:, i : i + columns]
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def count_neighbours(distance: NDArray[np.float32], first_row: int, last_row: int, out: Neighbours) -> None:
+    """Fill number of rows first_row..last_row-1; distance: (rows, columns) of answers from the far end, NaN: none."""
+    for band in range(first_row, last_row, COPIED_ROWS):
+        end = min(band + COPIED_ROWS, last_row)
+        copy = with_margin(distance, band, end)
+        at, to, width = signed_address(copy), signed_address(out.number), copy.shape[1]
+        for y in range(band, end):
+            _count_row(at, (y - band + MARGIN) * width + LANES, width, to, (y + AROUND) * width + LANES)
+        copy[:1] = 0.0  # it lives until here
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_row(distance: int, here: int, width: int, number: int, there: int) -> None:
+    """A row's numbers, from element `there` on, of the distances from element `here` on; both of addresses."""
+    one = zero_float32() + np.float32(1.0)
+    for c in range(0, width - 2 * LANES, LANES):
+        own, same = load_float32(distance, here + c), zero_float32()
+        for away in range(-NEIGHBOURS, NEIGHBOURS + 1):
+            line = here + c + away * width
+            for i in range(line - NEIGHBOURS, line + NEIGHBOURS + 1):
+                same = same + where_small(one, load_float32(distance, i) - own, SAME_PX)
+        store_int16(number, there + c, to_int16(same))
+
+
+@numba.njit(cache=True, nogil=True)
+def agreement_row(number: int, width: int, y: int, line: int, out: int) -> None:
+    """Pairs that agree around each answer of row y, float32 to `out`.
+
+    All but numbers addresses: number and its width as in `Neighbours`; line: int16 (width,), whose margins are 0.
+    """
+    for c in range(0, width - 2 * LANES, LANES):
+        pairs = zero_int16()
+        for row in range(y, y + 2 * AROUND + 1):
+            pairs = pairs + load_int16(number, row * width + LANES + c)
+        store_int16(line, LANES + c, pairs)
+    for c in range(0, width - 2 * LANES, LANES):
+        pairs = zero_int16()
+        for i in range(c - AROUND, c + AROUND + 1):
+            pairs = pairs + load_int16(line, LANES + i)
+        store_float32(out, c, to_float32(pairs))
+
+
+@numba.njit(cache=True, nogil=True)
+def apart_row(placed: int, width: int, here: int, out: int) -> None:
+    """Pairs of opposite neighbours whose mean is not within SAME_PX of the answer between them, float32 to `out`.
+
+    placed: address of a copy `with_margin` of final distances, width wide; here: the row's first answer in it.
+    """
+    one, half = zero_float32() + np.float32(1.0), np.float32(0.5)
+    for c in range(0, width - 2 * LANES, LANES):
+        own, apart = load_float32(placed, here + c), zero_float32()
+        for step in OPPOSITE:
+            for away in (1, width - 1, width, width + 1):
+                before, behind = here + c - step * away, here + c + step * away
+                off = (load_float32(placed, before) + load_float32(placed, behind)) * half - own
+                apart = apart + where_small(one, off, _ANYWHERE) - where_small(one, off, SAME_PX)
+        store_float32(out, c, apart)
+
+
+@numba.njit(cache=True, nogil=True)
+def light_row(at: tuple[int, int], width: int, here: int, out: int, apart: int) -> None:
+    """Numbers of 3 x 3 neighbours on the surface of each answer of a row, and `apart` further on their light.
+
+    at: addresses of distances and light, copies `with_margin`, width wide; here: the row's first answer in them.
+    """
+    one = zero_float32() + np.float32(1.0)
+    for c in range(0, width - 2 * LANES, LANES):
+        own, number, total = load_float32(at[0], here + c), zero_float32(), zero_float32()
+        for line in range(here + c - width, here + c + width + 1, width):
+            for i in range(line - 1, line + 2):
+                off = load_float32(at[0], i) - own
+                number = number + where_small(one, off, SAME_PX)
+                total = total + where_small(load_float32(at[1], i), off, SAME_PX)
+        store_float32(out, c, number)
+        store_float32(out, apart + c, total)
+
+
+Float32 = NDArray[np.float32]
+
+WIDER: Final = 1.556
+"""The noise of the counts is not all that moves a stripe: surfaces bend, and neighbours are shared."""
+A: Final = 1.0
+B: Final = 0.890
+G: Final = 2.0
+C: Final = -1.539
+D: Final = 1.569
+E: Final = 5.871
+F: Final = 2.585
+H: Final = 4.0
+DARKER: Final = 2.0
+"""Natural logarithm of how much less light than a bright stripe a dark one may bring."""
+CLEARLY: Final = 1.2
+"""What a standard deviation of light above its noise makes up for."""
+AT_END: Final = 3.0
+"""`unseen` of an answer without any light."""
+NEAR_END_PX: Final = 1.0, 3.0
+SOME_HAZE: Final = 0.05
+"""Photons of haze per pixel, over all exposures, from which on its end can be taken for a stripe."""
+FAR_BELOW: Final = 6.0
+"""Standard deviations below the haze from which on no agreement around makes up for a hole where light should be, as in
+counts that are all ones."""
+_HALF_PX: Final = LIGHT_PX + 0.5
+"""Half the pixels that a stripe's light is summed over."""
+_LEAST_ODDS: Final = 1e-3
+_MOST_AGREE: Final = 1.02
+"""Odds of agreement stay between 0.001 and 50."""
+(
+    _PAIRS, _LIT, _LIGHT_SUM, _SD, _SCALE, _LIGHT, _HAZE, _REST, _MARGIN, _FRAMES, _ALL, _APART, _OFF, _CONFIDENCE
+) = range(14)  # fmt: skip
+_LINES: Final = 14
+
+
+class Brightness(NamedTuple):
+    """Smallest and largest amplitude of a stripe, and the usual ambient light in photons per exposure and pixel."""
+
+    faintest: float
+    brightest: float
+    ambient: float
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def confidences(
+    x_px: Float32,
+    sd_px: Float32,
+    n_frames: NDArray[np.int32],
+    answer: LabelAnswers,
+    places: Places,
+    neighbours: Neighbours,
+    bright: Brightness,
+    first_row: int,
+    last_row: int,
+    confidence: Float32,
+    signal: Float32,
+    haze: Float32,
+) -> None:
+    """Fill confidence, signal and haze of rows first_row..last_row-1, all (rows, columns).
+
+    Where x_px is NaN the confidence is 0 and the others, sd_px too, are made NaN. The neighbours of all rows must have
+    been counted before.
+    """
+    nothing = np.float32(np.nan)
+    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
+    scales, lights, hazes, rests = places.scale, places.light, places.haze, places.rest
+    number, margins, columns = neighbours.number, answer.margin, x_px.shape[1]
+    # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
+    width, wide = (-(-columns // LANES) | 1) * LANES, number.shape[1]
+    lines, pairs = np.zeros((_LINES, width), np.float32), np.zeros(wide, np.int16)
+    at, to_number, to_pairs = signed_address(lines), signed_address(number), signed_address(pairs)
+    sources = (
+        (signed_address(sd_px), _SD), (signed_address(scales), _SCALE), (signed_address(lights), _LIGHT),
+        (signed_address(hazes), _HAZE), (signed_address(rests), _REST), (signed_address(neighbours.pairs), _ALL),
+    )  # fmt: skip
+    targets = (
+        (signed_address(confidence), _CONFIDENCE), (signed_address(signal), _LIGHT), (signed_address(haze), _HAZE),
+    )  # fmt: skip
+    for c in range(columns):
+        lines[_FRAMES, c] = max(n_frames[c], 1)
+    for band in range(first_row, last_row, COPIED_ROWS):
+        end = min(band + COPIED_ROWS, last_row)
+        distance, light = with_margin(places.distance, band, end), with_margin(lights, band, end)
+        placed = with_margin(places.placed, band, end)
+        around = signed_address(distance), signed_address(light)
+        for y in range(band, end):
+            agreement_row(to_number, wide, y, to_pairs, at + 4 * _PAIRS * width)
+            here = (y - band + MARGIN) * wide + LANES
+            light_row(around, wide, here, at + 4 * _LIT * width, width)
+            apart_row(signed_address(placed), wide, here, at + 4 * _APART * width)
+            copy_floats(around[0] + 4 * here, at + 4 * _OFF * width, columns)
+            for source, line in sources:
+                copy_floats(source + 4 * columns * y, at + 4 * line * width, columns)
+            for c in range(columns):
+                lines[_MARGIN, c] = margins[y, c]
+            _judge(at, width, bright)
+            for target, line in targets:
+                copy_floats(at + 4 * line * width, target + 4 * columns * y, columns)
+            for c in range(columns):
+                if np.isnan(x_px[y, c]):
+                    confidence[y, c] = 0.0
+                    signal[y, c] = haze[y, c] = sd_px[y, c] = nothing
+        distance[:1] = light[:1] = placed[:1] = 0.0
+    # They live until here: what is known by its address alone would be freed.
+    lines[:1], pairs[:1] = 0.0, 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _judge(at: int, width: int, bright: Brightness) -> None:
+    """Fill the confidence of a line of stripes, and cut their light."""
+    one, none = zero_float32() + 1.0, zero_float32()
+    for c in range(0, width, LANES):
+        scale, light = load_float32(at, _SCALE * width + c), load_float32(at, _LIGHT * width + c)
+        light = smaller_float(larger_float(light, scale * bright.faintest), scale * bright.brightest)
+        store_float32(at, _LIGHT * width + c, light)
+        contrast = _contrast(at, width, c, bright.ambient)
+        shines = logarithm(larger_float(contrast + 3.0, one))
+        hole = smaller_float(larger_float(none - FAR_BELOW - contrast, none), none + 30.0)
+        pairs = larger_float(load_float32(at, _ALL * width + c), one)
+        agree = load_float32(at, _PAIRS * width + c) / pairs
+        agree = logarithm(agree / (none + _MOST_AGREE - agree) + _LEAST_ODDS)
+        haze = load_float32(at, _FRAMES * width + c) * _ending(at, width, c)
+        hazy = haze / (haze + SOME_HAZE)
+        unlit = _unlit(at, width, c, larger_float(contrast, none) * CLEARLY, one - hazy, bright.brightest)
+        dark = exponential(none + C - shines * D + hole + hazy * (none + E - agree * F) + unlit * H)
+        margin = load_float32(at, _MARGIN * width + c)
+        apart = load_float32(at, _APART * width + c)
+        rival = exponential(none + A - margin * (B / UNITS) + apart * (G / ASKED))
+        sd = larger_float(load_float32(at, _SD * width + c), none + 1e-3)
+        within = error_function(one / (sd * (WIDER * math.sqrt(2.0))))
+        store_float32(at, _CONFIDENCE * width + c, within / ((rival + 1.0) * (dark + 1.0)))
+
+
+@numba.njit(forceinline=True)
+def _ending(at, width, c):  # type: ignore[no-untyped-def]
+    """Haze that ends at a stripe: what is before it less what is behind."""
+    ends = load_float32(at, _HAZE * width + c) - load_float32(at, _REST * width + c)
+    return larger_float(ends, zero_float32())
+
+
+@numba.njit(forceinline=True)
+def _number(at, width, c):  # type: ignore[no-untyped-def]
+    """Of 3 x 3 answers on the surface, this one counted."""
+    return larger_float(load_float32(at, _LIT * width + c), zero_float32() + 1.0)
+
+
+@numba.njit(forceinline=True)
+def _above_haze(at, width, c):  # type: ignore[no-untyped-def]
+    """Light of these answers, photons per exposure, less the whole haze before them."""
+    return load_float32(at, _LIGHT_SUM * width + c) - _ending(at, width, c) * _HALF_PX * _number(at, width, c)
+
+
+@numba.njit(forceinline=True)
+def _unlit(at, width, c, shines, clear, brightest):  # type: ignore[no-untyped-def]
+    """Light that a stripe would bring and that is not there: in clear air, and at the far end of the depth range."""
+    one, none = zero_float32() + 1.0, zero_float32()
+    exposures, number = load_float32(at, _FRAMES * width + c), _number(at, width, c)
+    light, most = _above_haze(at, width, c), load_float32(at, _SCALE * width + c) * brightest * number
+    less = logarithm((most * exposures + one) / (larger_float(light, none) * exposures + one))
+    missing = larger_float(less - DARKER - shines, none)
+    off = load_float32(at, _OFF * width + c)
+    first, last = NEAR_END_PX
+    at_end = smaller_float(larger_float((larger_float(off, none - off) - last) * (1.0 / (first - last)), none), one)
+    return clear * clear * missing + at_end * larger_float(none + AT_END - shines, none)
+
+
+@numba.njit(forceinline=True)
+def _contrast(at, width, c, ambient):  # type: ignore[no-untyped-def]
+    """Light that stripes share with neighbours above the whole haze before them, over its noise."""
+    one, none = zero_float32() + 1.0, zero_float32()
+    haze, rest = load_float32(at, _HAZE * width + c), load_float32(at, _REST * width + c)
+    number, exposures = _number(at, width, c), load_float32(at, _FRAMES * width + c)
+    light = load_float32(at, _LIGHT_SUM * width + c) / number
+    noise = larger_float(light, none) + (haze + rest + 2.0 * ambient) * _HALF_PX + one / (exposures * 9.0)
+    return _above_haze(at, width, c) * square_root(exposures / (number * noise))
+
+
+def brightness_of(model: RowModel) -> Brightness:
+    """What `stripe_table` takes of a learned state."""
+    return Brightness(float(model.amplitude[0]), float(model.amplitude[-1]), float(np.median(model.ambient)))
+
+
+def stripe_table(
+    x_px: NDArray[np.float32],
+    sd_px: NDArray[np.float32],
+    n_frames: NDArray[np.int32],
+    answer: LabelAnswers,
+    places: Places,
+    pairs: NDArray[np.float32],
+    bright: Brightness,
+    workers: RowWorkers,
+) -> StripeTable:
+    """The table of a map; arrays (rows, columns), x_px NaN where there are no data. pairs: of `pairs_to_ask`."""
+    confidence, signal, haze = (np.empty_like(x_px) for _ in range(3))
+    neighbours = new_neighbours(pairs)
+
+    def work(first: int, last: int) -> None:
+        confidences(x_px, sd_px, n_frames, answer, places, neighbours, bright, first, last, confidence, signal, haze)
+
+    workers.over(len(x_px), lambda first, last: count_neighbours(places.distance, first, last, neighbours))
+    workers.over(len(x_px), work)
+    return StripeTable(x_px, confidence, sd_px, signal, haze)

@@ -1,0 +1,422 @@
+"""Learns haze and halo from the stripes of a sweep, in one weighted fit of least squares.
+
+What is counted beside a stripe is haze, pedestal, halo and ambient light: each of them a sum of known shapes, so that
+one linear fit tells them apart where averages behind and before the stripe cannot: the halo follows the brightness of
+each stripe, haze does not. On its own a row cannot tell a stripe's brightness: neighbours are asked too, and stripes
+that do not agree with theirs teach nothing (`rig.estimate.joint.halo`). Later maps are asked whether there still is a
+halo, or one now.
+
+Compiled sums of the fit of haze and halo, and its solution in numbers that are not negative.
+
+Compiled light of stripes for the fit of the halo: the likeliest one, of a stripe and its neighbours together.
+
+A halo is told by what a stripe brings beside itself, over its own light. The light of `rig.estimate.joint.place.light`
+adds up each pixel's own flux, which ends where pixels are full: bright stripes would pass for dimmer ones with so much
+more halo. Here the counts n of K frames of all pixels around a stripe and around its neighbours on the same surface are
+explained by one amplitude a,
+
+    flux = base + a scale (share + glow),   log-likelihood = sum n log(1 - exp(-flux)) - (K - n) flux
+
+with haze and ambient light as base. It is concave in a; Newton's steps come from below, since the slope is convex. What
+full pixels cannot tell those beside them do.
+
+Where that amplitude is hardly more than its noise there may be no stripe, and where neighbours do not agree on it some
+are brighter, or in a shadow: the light of such stripes is not known.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import CountVolume
+from rig.estimate.joint.place.places import BLIND_FLUX, REACH_PX, Places
+from rig.estimate.joint.place.pool import SAME_PX
+from rig.estimate.joint.place.score import FRACTIONS
+from rig.estimate.joint.tables import JointTables
+from rig.estimate.row.em import LATTICE_LINES, PIECES, lattice, lines_of
+from rig.estimate.row.inputs import (
+    Float32,
+    Lines,
+    RowState,
+    Sweep,
+    halo_shares,
+    over_bins,
+    row_buffers,
+    row_fluxes,
+    state_of,
+    sweep_of,
+)
+from rig.estimate.row.model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, fit_haze
+from rig.estimate.search.online_learning import LearningSetting
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import SweepGeometry
+from rig.threads import RowWorkers
+
+LEAST_FLUX: Final = 2e-3
+"""Flux that a pixel is taken to have at least where its counts are weighed."""
+LINE_PX: Final = 4.5
+"""Pixels so far from a stripe show nothing of the line itself."""
+SETTLED: Final = 1e-6
+MOST_SWEEPS: Final = 3000
+
+
+@numba.njit(cache=True, nogil=True)
+def add_equations(
+    lines: Lines,
+    light: Float32,
+    sweep: Sweep,
+    state: RowState,
+    halo: Float32,
+    reaches: NDArray[np.float64],
+    nodes: int,
+    hot_flux: float,
+    first_line: int,
+    last_line: int,
+    matrix: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> None:
+    """Add the normal equations of lines first_line..last_line-1, weighted as the present state expects counts.
+
+    Unknown: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; ambient
+    light that the state has too little of. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its
+    x_px, photons. Only one half of the matrix is filled, rows from columns on.
+    """
+    bins, number = state.profile.shape[0], len(reaches)
+    first_share, first_halo, last = bins, bins + nodes, matrix.shape[0] - 1
+    terms = 3 + 2 * number
+    index, value = np.empty(terms + 1, np.int64), np.empty(terms + 1)
+    row, side = row_buffers(sweep.window, 1), 1 if sweep.near_is_left else -1
+    per_bin = (nodes - 1) / (bins - 1)
+    for i in range(first_line, last_line):
+        y, c = lines.row[i], lines.column[i]
+        length, _, _, start = row_fluxes(sweep, state, row, y, c)
+        if length == 0 or lines.exposures[i] == 0:
+            continue
+        frames, s = np.float64(lines.exposures[i]), np.float64(light[i])
+        place = side * (np.float64(lines.x_px[i]) - start)
+        own = row.cell[min(max(int(np.rint(place)), 0), length - 1)]
+        low = min(int(own * per_bin), nodes - 2)
+        part = own * per_bin - low
+        for t in range(length):
+            away = abs(t - place)
+            ambient = np.float64(state.ambient[y, start + side * t])
+            if away < LINE_PX or ambient > hot_flux:
+                continue
+            before, cell, gain = t < place, row.cell[t], np.float64(row.gain[t])
+            expected = (row.before[t] if before else row.behind[t]) + s * halo[own, min(int(away), halo.shape[1] - 1)]
+            dark = np.exp(-max(expected, LEAST_FLUX))
+            weight = frames * dark / (1.0 - dark)
+            n = np.float64(lines.counts[i, start + side * t - sweep.x0[c]])
+            # The flux that would make these counts the expected ones, near the present state.
+            flux = (n / frames - 1.0 + dark) / dark - np.log(dark) - ambient - row.others[t]
+            if before:
+                index[0], value[0], used = cell, gain, 1
+            else:
+                node = min(int(cell * per_bin), nodes - 2)
+                haze = gain * state.profile[cell, 0]
+                index[0], index[1] = first_share + node, first_share + node + 1
+                value[1] = haze * (cell * per_bin - node)
+                value[0] = haze - value[1]
+                used = 2
+            for k in range(number):
+                there = s * np.exp(-away / reaches[k]) / (2 * reaches[k])
+                index[used], index[used + 1] = first_halo + low * number + k, first_halo + (low + 1) * number + k
+                value[used], value[used + 1] = (1.0 - part) * there, part * there
+                used += 2
+            index[used], value[used] = last, 1.0
+            for a in range(used + 1):
+                for b in range(used + 1):
+                    if index[a] >= index[b]:
+                        matrix[index[a], index[b]] += weight * value[a] * value[b]
+                right[index[a]] += weight * value[a] * flux
+
+
+@numba.njit(cache=True, nogil=True)
+def solve(matrix: NDArray[np.float64], right: NDArray[np.float64], free: int) -> NDArray[np.float64]:
+    """What minimises x' matrix x - 2 right' x with no number below 0, one at a time; number `free` may be."""
+    x, slope = np.zeros_like(right), -right
+    for _ in range(MOST_SWEEPS):
+        largest = 0.0
+        for i in range(len(x)):
+            if matrix[i, i] <= 0.0:
+                continue
+            to = x[i] - slope[i] / matrix[i, i]
+            step = (to if i == free else max(to, 0.0)) - x[i]
+            if step != 0.0:
+                x[i] += step
+                for j in range(len(x)):
+                    slope[j] += step * matrix[j, i]
+                largest = max(largest, step * step * matrix[i, i])
+        if largest < SETTLED:
+            break
+    return x
+
+
+REACH: Final = 2
+"""Rows and columns to either side whose stripes are asked."""
+LEAST_ASKED: Final = 10
+"""Stripes, of 25, that lie on the same surface where light is known."""
+LEAST_SURE: Final = 4.0
+"""Standard deviations of its noise that the light is more than."""
+DISAGREED: Final = 3.0
+"""Standard deviations by which the stripes' misfit may exceed what chance brings. Of the stripes that the trust of
+`rig.estimate.joint.lesson` lets through 17 to 19 % are none, and light adds up to 0.6 of the true one; of those that
+pass these limits under 1 %, and 0.8 to 0.9 (random scenes 45 and 50, five exposures)."""
+MOST_STEPS: Final = 8
+MOST_GROWTH: Final = 4.0
+"""By so much an amplitude may grow or shrink in a step."""
+LIGHT_SETTLED: Final = 1e-2
+LIGHT_LEAST_FLUX: Final = 1e-4
+MOST_FLUX: Final = 20.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def likeliest_light(
+    counts: NDArray[np.unsignedinteger],
+    n_frames: NDArray[np.int32],
+    sweep: Sweep,
+    state: RowState,
+    shares: Float32,
+    x_px: Float32,
+    places: Places,
+    rows: NDArray[np.int32],
+    columns: NDArray[np.int32],
+    first_line: int,
+    last_line: int,
+    light: Float32,
+    known: NDArray[np.bool_],
+) -> None:
+    """Fill light, photons per exposure, and known of stripes first_line..last_line-1 of those at (rows, columns).
+
+    counts: (columns, rows, window); shares: of `placing.profile_table`; x_px: (rows, columns), of all stripes.
+    """
+    for i in range(first_line, last_line):
+        y, c = rows[i], columns[i]
+        a, information, misfit, asked, settled = np.float64(places.amplitude[y, c]), 0.0, 0.0, 0, False
+        for _ in range(MOST_STEPS):
+            score, information, misfit, asked = _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a)
+            if asked < LEAST_ASKED or information <= 0.0:
+                break
+            before = a
+            a = min(max(a + score / information, a / MOST_GROWTH), a * MOST_GROWTH)
+            settled = abs(a - before) < LIGHT_SETTLED * before
+            if settled:
+                break
+        light[i] = a * places.scale[y, c]
+        known[i] = settled and asked >= LEAST_ASKED and a * math.sqrt(information) > LEAST_SURE
+        known[i] = known[i] and misfit < asked + DISAGREED * math.sqrt(2.0 * asked)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a):  # type: ignore[no-untyped-def]
+    """Slope of the log-likelihood in the amplitude and how fast it falls; misfit of the stripes, and their number.
+
+    misfit: sum of each stripe's own slope squared, over its variance.
+    """
+    side, pixels = 1 if sweep.near_is_left else -1, sweep.u.shape[1]
+    score, information, misfit, asked = 0.0, 0.0, 0.0, 0
+    for v in range(max(y - REACH, 0), min(y + REACH + 1, x_px.shape[0])):
+        for q in range(max(c - REACH, 0), min(c + REACH + 1, x_px.shape[1])):
+            # NaN where there is no stripe.
+            if not abs(places.distance[v, q] - places.distance[y, c]) <= SAME_PX or n_frames[q] == 0:
+                continue
+            x, frames = int(np.floor(x_px[v, q] + 0.5)), np.float64(n_frames[q])
+            part = x_px[v, q] + 0.5 - x
+            fraction = min(int(part * FRACTIONS), FRACTIONS - 1)
+            own_score, own_variance = 0.0, 0.0
+            for d in range(-REACH_PX, REACH_PX + 1):
+                t = x + d
+                if not max(sweep.x0[q], 0) <= t < min(sweep.x0[q] + sweep.window, pixels):
+                    continue
+                ambient = np.float64(state.ambient[v, t])
+                if ambient >= BLIND_FLUX:
+                    continue
+                # The pixel that holds the centre is in haze on its near part only.
+                lit = (part if side > 0 else 1.0 - part) if d == 0 else 1.0 if d * side < 0 else 0.0
+                base = ambient + lit * places.haze[v, q] + (1.0 - lit) * places.rest[v, q]
+                slope = places.scale[v, q] * np.float64(shares[fraction, 0, d + REACH_PX] + places.glow[v, q])
+                flux = min(max(base + a * slope, LIGHT_LEAST_FLUX), MOST_FLUX)
+                dark = 1.0 / np.expm1(flux)
+                n = min(np.float64(counts[q, v, t - sweep.x0[q]]), frames)
+                own_score += slope * (n * dark - (frames - n))
+                own_variance += frames * slope * slope * dark
+                information += n * slope * slope * dark * (1.0 + dark)
+            asked += 1
+            score += own_score
+            if own_variance > 0.0:
+                misfit += own_score * own_score / own_variance
+    return score, information, misfit, asked
+
+
+CLEAR: Final = np.float32(0.5)
+"""Confidence of stripes that teach."""
+FIRST_LINES: Final = LATTICE_LINES // 4
+"""Rows x columns that tell whether there is a halo at all, and of later maps; once there is one in the first map, twice
+LATTICE_LINES measure it."""
+LEAST_EVIDENCE: Final = 50.0
+"""By how much a halo must better the fit, in chi squared: without one it does by 2 to 10, in fog of optical depth 1 by
+4000 to 30000."""
+SMOOTH_HAZE, SMOOTH_SHARE, SMOOTH_HALO, SMALL_HALO = 3e4, 300.0, 3.0, 0.1
+"""What bends of the haze, steps of its share behind the stripe, steps of the halo and the halo itself cost, over their
+squares: they decide only where there are no data."""
+_SHARE, _HALO = BINS, BINS + HALO_NODES
+_SIZE = _HALO + HALO_NODES * len(HALO_REACHES_PX) + 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BrightLines:
+    """Lines with a clear stripe, and the light of each, photons: what can teach of a halo."""
+
+    lines: Lines
+    light: NDArray[np.float32]
+
+
+def bright_lines(
+    volume: CountVolume,
+    geometry: SweepGeometry,
+    tables: JointTables,
+    stripes: StripeTable,
+    places: Places,
+    workers: RowWorkers,
+    number: int = FIRST_LINES,
+) -> BrightLines:
+    """Those of about so many lines of a map whose light is known; tables: it was made with, places: of its stripes."""
+    rows, columns = lattice(geometry, number)
+    clear = stripes.confidence[rows, columns] > CLEAR
+    rows, columns = rows[clear], columns[clear]
+    light, known = np.empty(len(rows), np.float32), np.empty(len(rows), np.bool_)
+    seen = (
+        volume.counts,
+        volume.n_frames,
+        tables.sweep,
+        tables.state,
+        tables.shares,
+        stripes.x_px,
+        places,
+        rows,
+        columns,
+    )
+    workers.over(len(rows), lambda first, last: likeliest_light(*seen, first, last, light, known))
+    return BrightLines(lines_of(volume, (rows[known], columns[known]), stripes), light[known])
+
+
+def learn_first_halo(
+    volume: CountVolume,
+    geometry: SweepGeometry,
+    model: RowModel,
+    ambient: NDArray[np.float32],
+    tables: JointTables,
+    stripes: StripeTable,
+    places: Places,
+    workers: RowWorkers,
+) -> RowModel:
+    """What `learn_halo` gives for the first map; to be called again with the map that is made under it.
+
+    Of several lines at once the model stays as it is: what the others bring would be taken for a halo.
+    """
+    if geometry.others is not None:
+        return model
+    number = 2 * LATTICE_LINES if model.halo.any() else FIRST_LINES
+    seen = bright_lines(volume, geometry, tables, stripes, places, workers, number)
+    return learn_halo(seen, geometry, model, ambient, workers, dark=volume.dark_counts is not None)
+
+
+def learn_next_halo(setting: LearningSetting, seen: BrightLines, workers: RowWorkers) -> RowModel:
+    """The model of a later lesson: with a halo where the map begins to show one, without where it does not any more.
+
+    One that stays is left as it was found. Told again from so few lines, lesson after lesson, halo, haze and the rest
+    behind stripes shift among each other: over eight maps in steady fog errors grew by 10 to 25 %.
+    """
+    model = setting.model
+    if setting.geometry.others is not None or (not model.halo.any() and np.isnan(model.extinction_per_m)):
+        return model
+    found = learn_halo(seen, setting.geometry, model, model.ambient, workers, dark=setting.dark)
+    return model if found.halo.any() == model.halo.any() else found
+
+
+def learn_halo(
+    seen: BrightLines,
+    geometry: SweepGeometry,
+    model: RowModel,
+    ambient: NDArray[np.float32],
+    workers: RowWorkers,
+    *,
+    dark: bool,
+) -> RowModel:
+    """The model with the halo that these stripes have, and the haze under it; as it is where they have none.
+
+    The scale of stripes stays that of the model, which their light goes by. ambient: of each pixel, (rows, width), that
+    the fit begins with. dark: whether there are dark frames.
+    """
+    matrix, right = _equations(seen, geometry, replace(model, ambient=ambient), workers)
+    free = -1 if dark else _SIZE - 1
+    if free < 0:
+        # Dark frames have measured the ambient light.
+        matrix[-1], matrix[:, -1], right[-1] = 0.0, 0.0, 0.0
+    smoothed = matrix + _smoothness()
+    found = solve(smoothed, right, free)
+    plain = np.r_[0:_HALO, _SIZE - 1]
+    without = np.zeros(_SIZE)
+    without[plain] = solve(smoothed[np.ix_(plain, plain)], right[plain], len(plain) - 1 if free >= 0 else -1)
+    if _misfit(matrix, right, without) - _misfit(matrix, right, found) < LEAST_EVIDENCE:
+        return replace(model, halo=np.zeros_like(model.halo))
+    halo = found[_HALO:-1].reshape(HALO_NODES, -1).astype(np.float32)
+    profile = model.profile.copy()
+    profile[:, 0] = found[:_SHARE]
+    profile[:, 1] = model.profile[:, 0] * over_bins(np.minimum(found[_SHARE:_HALO, None], 1.0), BINS)[:, 0]
+    haze = np.diagonal(matrix)[:BINS]
+    known = haze > 0
+    variance = np.where(known, 1.0 / np.where(known, haze, 1.0), np.nan)
+    fit = fit_haze(model.path_m(), np.where(known, found[:BINS], np.nan), variance)
+    return replace(
+        model, profile=profile, halo=halo, ambient=np.maximum(ambient + np.float32(found[-1]), np.float32(1e-6)),
+        extinction_per_m=fit.extinction_per_m if fit else np.nan,
+        extinction_sd_per_m=fit.extinction_sd_per_m if fit else np.nan,
+    )  # fmt: skip
+
+
+def _equations(
+    seen: BrightLines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    sweep, state = sweep_of(geometry), state_of(model)
+    shares, reaches = halo_shares(model, geometry.width), np.array(HALO_REACHES_PX)
+    hot_flux = 5.0 * float(np.median(model.ambient)) + 1e-3
+    # Fixed pieces, added in order: the sums do not depend on the number of threads.
+    edges = np.linspace(0, len(seen.light), PIECES + 1).astype(int)
+    matrices, rights = np.zeros((PIECES, _SIZE, _SIZE)), np.zeros((PIECES, _SIZE))
+
+    def work(first: int, last: int) -> None:
+        for i in range(first, last):
+            add_equations(
+                seen.lines, seen.light, sweep, state, shares, reaches, HALO_NODES, hot_flux, edges[i], edges[i + 1],
+                matrices[i], rights[i],
+            )  # fmt: skip
+
+    workers.over(PIECES, work)
+    half = matrices.sum(axis=0)
+    return half + np.tril(half, -1).T, rights.sum(axis=0)
+
+
+def _smoothness() -> NDArray[np.float64]:
+    out = np.zeros((_SIZE, _SIZE))
+
+    def add(places: list[int], taps: list[float], strength: float) -> None:
+        out[np.ix_(places, places)] += strength * np.outer(taps, taps)
+
+    for i in range(1, BINS - 1):
+        add([i - 1, i, i + 1], [1, -2, 1], SMOOTH_HAZE)
+    for i in range(_SHARE, _HALO - 1):
+        add([i, i + 1], [1, -1], SMOOTH_SHARE)
+    for i in range(_HALO, _SIZE - 1):
+        add([i], [1], SMALL_HALO)
+        if i + len(HALO_REACHES_PX) < _SIZE - 1:
+            add([i, i + len(HALO_REACHES_PX)], [1, -1], SMOOTH_HALO)
+    return out
+
+
+def _misfit(matrix: NDArray[np.float64], right: NDArray[np.float64], x: NDArray[np.float64]) -> float:
+    return float(x @ matrix @ x - 2 * right @ x)

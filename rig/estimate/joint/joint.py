@@ -1,0 +1,210 @@
+"""Estimator `joint`: the row likelihood tied across rows and columns, for a whole map at a time.
+
+Each label of a row and column (`label_grid`) gets a cost from the counts (`rig.estimate.joint.labels.costs`), with the
+halo where there is one (`halo_tables`) and the map before where that is asked for (`temporal`). Costs are tied to those
+of the neighbours along four paths (`rig.estimate.joint.paths`); weak answers are put to the vote of all neighbours
+(`rig.estimate.joint.vote`); the best label of each is placed between labels by what neighbours on its surface know
+(`rig.estimate.joint.place.place`), judged (`rig.estimate.joint.confidence`) and searched for a second line
+(`rig.estimate.joint.second_returns`). What the rows know of light and medium is learned as by `likelihood`, then from
+the map's own stripes.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import Counter, CountVolume, SweepCounter, SweepLayout
+from rig.estimate.joint.confidence import pairs_to_ask, stripe_table
+from rig.estimate.joint.halo import bright_lines, learn_first_halo, learn_next_halo
+from rig.estimate.joint.labels.costs import BAND_ROWS
+from rig.estimate.joint.labels.grid import LabelGrid
+from rig.estimate.joint.lesson import add_quiet, fill_trust, read_positions
+from rig.estimate.joint.paths import Penalties, along_columns, along_rows
+from rig.estimate.joint.place.place import amplitudes_of, line_width, place, weigh_light
+from rig.estimate.joint.second_returns import second_returns
+from rig.estimate.joint.tables import JointTables, Memory, grid_of, memory_for, tables_of
+from rig.estimate.joint.temporal import TemporalPrior
+from rig.estimate.joint.vote import NEIGHBOURS_PX, collect, vote
+from rig.estimate.joint.winner import answer_settings
+from rig.estimate.row.ambient import ambient_map
+from rig.estimate.row.em import learn_again, lines_of, next_lattice
+from rig.estimate.row.inputs import state_of
+from rig.estimate.row.model import RowModel
+from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
+from rig.estimate.search.stream import nominal_exposures
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import SweepGeometry
+from rig.threads import RowWorkers
+
+FIRST_ROUNDS = 3
+"""Times that the first map's stripes teach what they are then estimated with again."""
+QUIET_COLUMNS = 8
+"""Every so manieth column teaches the ambient light where there are dark frames too."""
+
+
+class Joint:
+    """The row likelihood tied to the neighbours', with the state it has learned so far.
+
+    Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
+    learns: whether later maps change that state. temporal_prior: whether each map is held to the last one a little.
+    """
+
+    def __init__(
+        self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True, temporal_prior: bool = False
+    ) -> None:
+        self._workers = RowWorkers(threads)
+        self._lessons = OnlineLearner(tables_of, None, learns=learns, learn_more=learn_next_halo)
+        self._prior = TemporalPrior(temporal_prior)
+        self._memory: Memory | None = None
+        self.used: RowModel | None = None
+        """The state that the last map was estimated with."""
+        if model is not None:
+            self.model = model
+
+    @property
+    def model(self) -> RowModel | None:
+        """The state that the next map will be estimated with."""
+        model, before = self._lessons.model, self._prior.before
+        return model if model is None or before is None else replace(model, before=before)
+
+    @model.setter
+    def model(self, model: RowModel) -> None:
+        self._prior.recall(model.before)
+        self._lessons.model = model if model.before is None else replace(model, before=None)
+
+    def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
+        """A counter whose sweeps `estimate` takes; geometry: nominal, as of every sweep.
+
+        UsageError where its maps would take too much memory: before any light is let out.
+        """
+        grid_of(geometry)
+        return SweepCounter(layout, self._workers)
+
+    def estimate(self, sweep: CountVolume, geometry: SweepGeometry) -> StripeTable:
+        """Stripe table of one sweep; afterwards `model` is what the next sweep will be estimated with."""
+        model = self._lessons.model_for(lambda: self._first_model(sweep, geometry))
+        setting = LearningSetting(model, geometry, nominal_exposures(sweep), sweep.dark_counts is not None)
+        tables = self._lessons.tables(setting, self._workers)
+        self._prior.begin(geometry, tables.grid)
+        self.used = model if self._prior.before is None else replace(model, before=self._prior.before)
+        stripes = self._with_seconds(sweep, tables, self._stripes(sweep, tables))
+        self._prior.leave(stripes, tables.grid, self._workers)
+        # Whether the first map has taught anything is for the trust of its lessons to say.
+        known = self._lessons.model is not None
+        judged = stripes if known else self._teaching(sweep, tables, stripes)
+        self._lessons.attend(
+            judged, model, int(sweep.n_frames.sum()), lambda: self._seen(sweep, geometry, tables, stripes)
+        )
+        return stripes
+
+    def _first_model(self, volume: CountVolume, geometry: SweepGeometry) -> RowModel:
+        """Learn from the first sweep: row by row, then from stripes that all rows together show far better."""
+        self._prior.recall(None)  # of maps that taught nothing
+        model = first_model(volume, geometry, self._workers)
+        exposures, dark = nominal_exposures(volume), volume.dark_counts is not None
+        for _ in range(FIRST_ROUNDS):
+            tables = tables_of(LearningSetting(model, geometry, exposures, dark), self._workers)
+            stripes = self._teaching(volume, tables, self._stripes(volume, tables, lesson=True))
+            quiet = self._quiet(volume, geometry, tables, stripes)
+            ambient = ambient_map(volume, volume.intensity(), geometry, quiet)
+            width = line_width(volume, tables.sweep, tables.state, stripes, self._workers)
+            model = replace(model, line_sigma_px=width or model.line_sigma_px)
+            model = learn_again(volume, geometry, model, ambient, stripes, self._workers)
+            assert self._memory is not None, "a map has been estimated"
+            places = self._memory.places
+            model = learn_first_halo(volume, geometry, model, ambient, tables, stripes, places, self._workers)
+            # Amplitudes are relative to the scale of the model that they are written into.
+            weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
+            self._workers.settle()
+            amplitude, weight = amplitudes_of(places)
+            model = replace(model, amplitude=amplitude, weight=weight)
+        return model
+
+    def _teaching(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
+        """The table with the trust that lessons put into each answer instead of its confidence."""
+        memory, trust = self._room(tables.grid), np.empty_like(stripes.confidence)
+        self._workers.over(
+            len(trust),
+            lambda first, last: fill_trust(
+                stripes.x_px, stripes.x_sd_px, volume.n_frames, memory.answer.margin, memory.places,
+                tables.bright.ambient, first, last, trust,
+            ),
+        )  # fmt: skip
+        return replace(stripes, confidence=trust)
+
+    def _stripes(self, volume: CountVolume, tables: JointTables, *, lesson: bool = False) -> StripeTable:
+        grid, workers = tables.grid, self._workers
+        rows, columns = grid.x_far.shape
+        memory = self._room(grid)
+        settings, penalties = answer_settings(grid.stripes), Penalties()
+
+        def tie_rows(first: int, last: int) -> None:
+            # Rows that share tables: those are fetched once, and costs are tied along rows while the cache has them.
+            for band in range(first, last, BAND_ROWS):
+                end = min(band + BAND_ROWS, last)
+                tables.costs.fill(volume, band, end, memory.cost)
+                self._prior.add(volume, band, end, memory.cost)
+                along_rows(memory.cost, memory.message, penalties, band, end)
+
+        def tie_columns(first: int, last: int) -> None:
+            along_columns(memory.cost, memory.message, penalties, settings, first, last, memory.answer)
+
+        x_px = np.empty((rows, columns), np.float32)
+
+        neighbours = grid.column_px <= NEIGHBOURS_PX
+
+        def read(first: int, last: int) -> None:
+            if neighbours:
+                vote(memory.ballots, memory.cost, first, last, memory.answer)
+            read_positions(
+                grid.x_far, volume.n_frames, grid.side, tables.sweep.u.shape[1], memory.answer, first, last, x_px,
+                memory.places.distance,
+            )  # fmt: skip
+
+        workers.over(rows, tie_rows)
+        workers.post(columns, tie_columns)
+        if neighbours:
+            workers.post(columns, lambda first, last: collect(memory.answer, first, last, memory.ballots))
+        workers.settle()
+        workers.post(rows, read)  # what is placed next is of the same rows
+        seen = volume, tables.sweep, tables.state
+        sd = place(*seen, tables.shares, x_px, memory.places, workers, lesson=lesson)
+        lit = volume.n_frames > 0
+        pairs = tables.pairs if lit.all() else pairs_to_ask(np.isfinite(grid.x_far) & lit)
+        return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, pairs, tables.bright, workers)
+
+    def _with_seconds(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
+        room = self._room(tables.grid).seconds
+        x2_px, confidence2 = second_returns(
+            volume, tables.grid, tables.sweep, tables.light, stripes.x_px, room, self._workers
+        )
+        return replace(stripes, x2_px=x2_px, confidence2=confidence2)
+
+    def _room(self, grid: LabelGrid) -> Memory:
+        memory = self._memory
+        if memory is None or not memory.fits(grid):
+            memory = self._memory = memory_for(grid)
+        return memory
+
+    def _seen(self, volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable) -> Seen:
+        assert self._memory is not None, "a map has been estimated"
+        quiet = self._quiet(volume, geometry, tables, stripes)
+        lines = lines_of(volume, next_lattice(geometry), stripes)
+        bright = bright_lines(volume, geometry, tables, stripes, self._memory.places, self._workers)
+        return Seen(volume, volume.intensity(), quiet, lines, bright)
+
+    def _quiet(
+        self, volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable
+    ) -> NDArray[np.float64]:
+        quiet = np.zeros((2, geometry.rows, geometry.width))
+        most_light = float(np.median(tables.state.ambient))
+
+        def work(first: int, last: int) -> None:
+            add_quiet(
+                volume.counts, volume.n_frames, tables.sweep, tables.state, tables.halo, stripes.x_px, stripes.signal,
+                stripes.confidence, QUIET_COLUMNS if tables.dark else 1, most_light, first, last, quiet,
+            )  # fmt: skip
+
+        self._workers.over(geometry.rows, work)
+        return quiet

@@ -1,0 +1,455 @@
+"""Compiled parts of the label costs that a batch of rows goes through: sums, scores, costs.
+
+Running sums carry the evidence of all pixels behind a label, taps that of the pixels around it; scores are saturating
+16-bit numbers. The two phases of a pixel make the low and the high byte of the same 16 bits, which is their order.
+Each part is a function of its own, not inlined: all in one, the compiler keeps a register for every address.
+
+Compiled label costs: every label of a row at once, sixteen to a vector, from counts and
+`rig.estimate.joint.labels.tables`.
+
+A column's rows go through each part of the work (`rig.estimate.joint.labels.cost_rows`) sixteen together. A row of 128
+labels and five taps takes 250 cycles on one thread of a busy core (Zen 3), a fifth of them to wait for memory, 765
+instructions: the loop over taps unrolled, which took 105 off. Asking for costs and places ahead: 20 cycles less; for
+tables and counts earlier, or two rows of one table at once: nothing. All parts in one function took 1.6 times as long.
+"""
+
+from typing import Any, Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.joint.labels.grid import (
+    FAR_PX,
+    LABEL,
+    LABEL_END,
+    MEND,
+    ODD,
+    PLACES,
+    START,
+    VALID,
+    VALID_END,
+    VARIANT,
+    VARIANTS,
+)
+from rig.estimate.joint.labels.halo_rows import HaloTables, fit_halo, halo_at, halo_rows
+from rig.estimate.joint.labels.tables import (
+    BATCH,
+    POSITION,
+    SUMS_FROM,
+    At,
+    Buffers,
+    Fitted,
+    LabelTables,
+    Ways,
+    buffers_at,
+    signed_address,
+)
+from rig.simd.memory import (
+    CACHE_LINE,
+    load_bytes,
+    load_float32,
+    load_int16,
+    load_widened,
+    prefetch,
+    prefetch_to_write,
+    read_byte,
+    read_float32,
+    read_int16,
+    read_int32,
+    store_bytes,
+    store_int16,
+    write_byte,
+    write_int16,
+    write_int32,
+)
+from rig.simd.shuffles import largest_of_rows, last_everywhere, reversed_lanes, running_sum
+from rig.simd.vectors import (
+    LANES,
+    add_saturated,
+    as_bytes,
+    larger,
+    larger_float,
+    scaled,
+    smaller,
+    smaller_float,
+    sub_saturated,
+    to_int16,
+    zero_bytes,
+    zero_int16,
+)
+
+COST_LIMIT: Final = 160
+"""Largest cost of a label that is not excluded."""
+EXCLUDED: Final = 255
+"""Cost of a label that cannot be: outside the picture, more than a pixel outside the row's search window."""
+BASE: Final = -8000
+"""Score of 'everything is before the stripe': most of the range lies above it."""
+HIGHEST: Final = 30000
+"""Scores and their parts are cut there."""
+_USUAL_TAPS: Final = 5
+"""Pixels around a position where the line is as narrow as it mostly is."""
+COUNT_BITS: Final = 15
+"""Counts are kept as fractions of 2^15 of what they can be."""
+
+
+@numba.njit(cache=True, nogil=True)
+def read_bytes(
+    counts: int, begin: int, places: int, stored: tuple[int, int, int, int], side: int, pixels: int, times: int,
+    b: Buffers, batch: int,
+) -> None:  # fmt: skip
+    """Fill n, from far to near; what lies outside the stored pixels is of any value.
+
+    counts: address of the first of all, begin: place of the first row's. stored: first pixel, pixels of a row, all
+    counts, counts of a column. times: what counts are multiplied with.
+    """
+    x0, window, size, column = stored
+    factor = np.int16(times)
+    for r in range(batch):
+        if read_int32(b.here, r) < 0:
+            continue
+        n, start = b.n + 2 * r * b.n_row, read_int16(places, PLACES * r + START) - x0
+        first = begin + r * window + start
+        low = first - pixels if side > 0 else first
+        if low < 0 or low + pixels + LANES > size:
+            for p in range(pixels):
+                x = start - side * p
+                count = np.int64(read_byte(counts + begin + r * window, x)) if 0 <= x < window else np.int64(0)
+                write_int16(n, p, np.int16(count * times))
+            continue
+        # The next column's counts will be wanted when this one's last row has been read; the rest the next row asks
+        # for.
+        for line in range(0, min(pixels + LANES, window), CACHE_LINE):
+            prefetch(counts + low + column + line)
+        if side > 0:
+            for p in range(0, pixels, LANES):
+                store_int16(n, p, reversed_lanes(load_widened(counts + first - p, 1 - LANES)) * factor)
+        else:
+            for p in range(0, pixels, LANES):
+                store_int16(n, p, load_widened(counts + first, p) * factor)
+
+
+@numba.njit(cache=True, nogil=True)
+def mend_rows(at: At, places: int, y: int, per_nat: float, side: int, b: Buffers, batch: int) -> None:
+    """Give pixels that the table weighs, but that the row lacks, or that are hot, a count that says nothing.
+
+    y: row of the first; per_nat: units times exposures.
+    """
+    for r in range(batch):
+        i, place = read_int32(b.here, r), places + 2 * PLACES * r
+        if i < 0 or not read_int16(place, MEND):
+            continue
+        n, start = b.n + 2 * r * b.n_row, read_int16(place, START)
+        begin, end = read_int16(at.span, 2 * i), read_int16(at.span, 2 * i + 1)
+        for p in range(begin, min(read_int16(place, VALID), end)):
+            write_int16(n, p, _neutral(at, i, p, per_nat))
+        for p in range(max(read_int16(place, VALID_END), begin), end):
+            write_int16(n, p, _neutral(at, i, p, per_nat))
+        for h in range(read_int32(at.hot_start, y + r), read_int32(at.hot_start, y + r + 1)):
+            p = side * (start - read_int16(at.hot_x, h))
+            if begin <= p < end:
+                write_int16(n, p, _neutral(at, i, p, per_nat))
+
+
+@numba.njit(forceinline=True)
+def _neutral(at, i, p, per_nat):  # type: ignore[no-untyped-def]
+    """The count at which a pixel is as likely before the stripe as behind it."""
+    weight = np.float32(read_int16(at.edge, i * at.pixels + p))
+    constant = read_float32(at.edge_sum, i * at.pixels + p)
+    if p > 0:
+        constant -= read_float32(at.edge_sum, i * at.pixels + p - 1)
+    if weight == 0.0:
+        return np.int16(0)
+    count = -constant * np.float32(per_nat) / weight * np.float32(1 << COUNT_BITS)
+    return np.int16(min(max(count, np.float32(0.0)), np.float32(HIGHEST)))
+
+
+@numba.njit(cache=True, nogil=True)
+def sum_edges(at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
+    """Fill sums, as far as there are labels."""
+    pixels = at.pixels
+    for r in range(batch):
+        i = read_int32(b.here, r)
+        if i < 0:
+            continue
+        n, sums = b.n + 2 * r * b.n_row, b.sums + 2 * r * b.n_row
+        edge, constant = at.edge + 2 * pixels * i, fitted.edge + 2 * pixels * read_int32(b.fitted, r)
+        carry = zero_int16() + np.int16(BASE)
+        write_int16(sums, SUMS_FROM, np.int16(BASE))
+        for p in range(0, min(pixels, FAR_PX + LANES * read_int16(at.used, i)), LANES):
+            rise = running_sum(add_saturated(scaled(load_int16(n, p), load_int16(edge, p)), load_int16(constant, p)))
+            store_int16(sums, p + LANES, add_saturated(rise, carry))
+            carry = add_saturated(carry, last_everywhere(rise))
+
+
+@numba.njit(forceinline=True)
+def _score_row(sums, n, tap, constant, score, vectors, taps):  # type: ignore[no-untyped-def]
+    """The scores of a row, and the largest one of each lane."""
+    best = zero_int16() + np.int16(-32768)
+    for _ in range(vectors):
+        far_dim, far_bright = load_int16(constant, 0), load_int16(constant, LANES)
+        near_dim, near_bright = load_int16(constant, 2 * LANES), load_int16(constant, 3 * LANES)
+        for d in range(taps):
+            counts, of_tap = load_int16(n, d), d * POSITION
+            far_dim = far_dim + scaled(counts, load_int16(tap, of_tap))
+            far_bright = far_bright + scaled(counts, load_int16(tap, of_tap + LANES))
+            near_dim = near_dim + scaled(counts, load_int16(tap, of_tap + 2 * LANES))
+            near_bright = near_bright + scaled(counts, load_int16(tap, of_tap + 3 * LANES))
+        level = load_int16(sums, 0)
+        far = add_saturated(level, larger(far_dim, far_bright))
+        near = add_saturated(level, larger(near_dim, near_bright))
+        store_int16(score, 0, far)
+        store_int16(score, LANES, near)
+        best = larger(best, larger(far, near))
+        n, sums, score, constant = n + 2 * LANES, sums + 2 * LANES, score + 4 * LANES, constant + 2 * POSITION
+        tap += 2 * POSITION * taps
+    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch: int) -> None:
+    """Fill score and top; constants: address of those of positions, which: of what each row's number there is.
+
+    taps: pixels around a position.
+    """
+    for r in range(batch):
+        i = read_int32(b.here, r)
+        if i < 0:
+            continue
+        sums, score = b.sums + 2 * (r * b.n_row + SUMS_FROM + FAR_PX), b.score + 2 * r * b.score_row
+        n, tap = b.n + 2 * (r * b.n_row + FAR_PX - taps // 2), at.tap + 2 * at.taps * i
+        constant = constants + 2 * at.constants * read_int32(which, r)
+        vectors = read_int16(at.used, i)
+        # With a usual width of the line the loop over its taps is unrolled.
+        if taps == _USUAL_TAPS:
+            best = _score_row(sums, n, tap, constant, score, vectors, _USUAL_TAPS)
+        else:
+            best = _score_row(sums, n, tap, constant, score, vectors, taps)
+        store_int16(b.top, r * LANES, best)
+    store_int16(b.top, 0, largest_of_rows(b.top))
+
+
+@numba.njit(cache=True, nogil=True)
+def cost_rows(at: At, ways: Ways, b: Buffers, batch: int) -> None:
+    """Fill cost of all that may be a label."""
+    half = (1 << ways.down) >> 1
+    for r in range(batch):
+        cost, score = b.cost + r * b.cost_row, b.score + 2 * r * b.score_row
+        i = read_int32(b.here, r)
+        if i < 0:
+            for label in range(0, b.labels, 2 * LANES):
+                store_bytes(cost, label, zero_bytes())
+            continue
+        level = add_saturated(zero_int16() + read_int16(b.top, r), np.int16(half))
+        for v in range(read_int16(at.used, i)):
+            far = smaller(sub_saturated(level, load_int16(score, 2 * v * LANES)) >> ways.down, np.int16(COST_LIMIT))
+            near = sub_saturated(level, load_int16(score, (2 * v + 1) * LANES)) >> ways.down
+            store_bytes(cost, 2 * v * LANES, as_bytes(far | smaller(near, np.int16(COST_LIMIT)) << 8))
+
+
+@numba.njit(cache=True, nogil=True)
+def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_bytes: int) -> None:
+    """Write the costs of labels to address out, rows `row_bytes` apart."""
+    for r in range(batch):
+        here, cost, to = places + 2 * PLACES * r, b.cost + r * b.cost_row, out + r * row_bytes
+        low, high = read_int16(here, LABEL), read_int16(here, LABEL_END)
+        if read_int32(b.here, r) < 0:
+            low, high = 0, ways.stripes
+        else:
+            cost += read_int16(here, ODD)
+        if read_int32(b.shown, 0) != low or read_int32(b.shown, 1) != high:
+            write_int32(b.shown, 0, np.int32(low))
+            write_int32(b.shown, 1, np.int32(high))
+            for label in range(b.labels):
+                write_byte(b.mask, label, np.uint8(0) if low <= label < high else np.uint8(EXCLUDED))
+        for label in range(0, b.labels, 2 * LANES):
+            store_bytes(to, label, load_bytes(cost, label) | load_bytes(b.mask, label))
+
+
+_LIMIT: Final = np.float32(HIGHEST)
+_TO_UNSIGNED: Final = np.float32(32768.5)
+
+
+@numba.njit(cache=True, nogil=True)
+def room_for(tables: LabelTables, halo: HaloTables, labels: int) -> NDArray[np.uint8]:
+    """Memory that `fill_costs` and `fit_tables` work in."""
+    _, size = buffers_at(0, tables.edge.shape[1], tables.tap.shape[1], labels)
+    if halo.weight.size > 0:
+        _, size = halo_at(halo, size, tables.constant[:1].size)
+    return np.zeros(size + CACHE_LINE, np.uint8)
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_costs(
+    counts: NDArray[np.unsignedinteger[Any]],
+    n_frames: NDArray[np.int32],
+    x0: NDArray[np.int32],
+    place: NDArray[np.int16],
+    tables: LabelTables,
+    halo: HaloTables,
+    hot_start: NDArray[np.int32],
+    hot_x: NDArray[np.int16],
+    ways: Ways,
+    first_row: int,
+    last_row: int,
+    memory: NDArray[np.uint8],
+    out: NDArray[np.uint8],
+) -> None:
+    """Costs of rows first_row..last_row-1, see `label_volume.Costs.fill`.
+
+    hot_x: hot pixels, those of row y from hot_start[y] to hot_start[y + 1]. memory: of `room_for`, kept by the caller,
+    since what is known by its address alone would be freed in here.
+    """
+    pixels, vectors, labels = tables.edge.shape[1], tables.tap.shape[1], out.shape[2]
+    begin = signed_address(memory)
+    b, end_of_buffers = buffers_at(begin + -begin % CACHE_LINE, pixels, vectors, labels)
+    around, _ = halo_at(halo, end_of_buffers, tables.constant[:1].size)
+    rows, columns, band_rows = out.shape[0], out.shape[1], ways.band_rows
+    at = _at(tables, hot_start, hot_x)
+    usually = _usually(tables)
+    room = Fitted(b.constant, b.edge)
+    place_at, out_at, counts_at = signed_address(place), signed_address(out), signed_address(counts)
+    window, in_bytes = counts.shape[2], counts.itemsize == 1
+    # Of no label are pixels beyond the last vector of any table, and the taps of that; halos weigh all.
+    read = pixels
+    if halo.weight.size == 0 and tables.used.size > 0:
+        read = min(pixels, -(-(FAR_PX + LANES * int(tables.used.max()) + ways.reach) // LANES) * LANES)
+    write_int32(b.table, 0, np.int32(-1))
+    write_int32(b.shown, 0, np.int32(-1))
+    for band in range(first_row // band_rows, -(-last_row // band_rows)):
+        top, end = max(first_row, band * band_rows), min(last_row, (band + 1) * band_rows)
+        for c in range(columns):
+            exposures = int(n_frames[c])
+            stored = int(x0[c]), window, counts.size, window * rows
+            times = _times(exposures, ways)
+            per_nat = ways.units * exposures * times / 2.0 ** (COUNT_BITS - ways.bits)
+            usual = exposures == ways.exposures
+            fitted = usually if usual else room
+            for variant in range(VARIANTS):
+                i = int(tables.at[band, c, variant]) if exposures > 0 else -1
+                write_int32(b.table, 1 + variant, np.int32(i))
+                if i >= 0 and not usual:
+                    _fit_table(at, i, variant, per_nat, fitted, b.through)
+                if c + 1 < columns and tables.at[band, c + 1, variant] >= 0:
+                    _fetch_table(at, int(tables.at[band, c + 1, variant]), usually)
+            column = band * columns + c
+            if halo.weight.size > 0:
+                fit_halo(around, column, per_nat)
+            for y in range(top, end, BATCH):
+                batch = min(BATCH, end - y)
+                to = out_at + (y * columns + c) * labels
+                places = place_at + 2 * PLACES * (c * rows + y)
+                # Costs of one row after the other, and places of one column after the other, are not foreseen.
+                for r in range(batch):
+                    for line in range(0, labels, CACHE_LINE):
+                        prefetch_to_write(to + r * columns * labels + line)
+                _fetch(places + 2 * PLACES * rows, 2 * PLACES * batch)
+                mend = 0
+                for r in range(batch):
+                    mend |= read_int16(places, PLACES * r + MEND)
+                    variant = read_int16(places, PLACES * r + VARIANT)
+                    i = read_int32(b.table, 1 + variant)
+                    write_int32(b.here, r, i)
+                    write_int32(b.fitted, r, i if usual else np.int32(variant))
+                if in_bytes and times >= 1.0:
+                    at_row = (c * rows + y) * window
+                    read_bytes(counts_at, at_row, places, stored, ways.side, read, int(times), b, batch)
+                else:
+                    _read_any(counts, c, y, places, stored[0], ways.side, read, times, b, batch)
+                if mend:
+                    mend_rows(at, places, y, per_nat, ways.side, b, batch)
+                sum_edges(at, fitted, b, batch)
+                if halo.weight.size > 0:
+                    halo_rows(around, column, at, fitted, b, batch)
+                    score_rows(at, around.constant, around.which, 2 * ways.reach + 1, b, batch)
+                else:
+                    score_rows(at, fitted.constant, b.fitted, 2 * ways.reach + 1, b, batch)
+                cost_rows(at, ways, b, batch)
+                write_rows(places, ways, b, batch, to, columns * labels)
+
+
+@numba.njit(cache=True, nogil=True)
+def _times(exposures: int, ways: Ways) -> float:
+    """What counts of a column are multiplied with, a whole number where it is not below 1; products fit 16 bits.
+
+    A nat of more exposures is worth fewer units, as it would be in a map where all columns had so many: else columns
+    with few would count for less beside others with many, and the penalties between neighbours for more.
+    """
+    full = 2.0 ** (COUNT_BITS - ways.bits)
+    worth = (ways.sharp + ways.exposures) / (ways.sharp + exposures)
+    times = full * min(worth, ways.most / max(exposures, 1))
+    # Rounded down: a product must not exceed that of `most` exposures.
+    return np.floor(times) if times >= 1.0 else times
+
+
+@numba.njit(forceinline=True)
+def _fetch(begin, size):  # type: ignore[no-untyped-def]
+    for line in range(0, size, CACHE_LINE):
+        prefetch(begin + line)
+
+
+@numba.njit(cache=True, nogil=True)
+def _fetch_table(at: At, i: int, fitted: Fitted) -> None:
+    _fetch(at.tap + 2 * i * at.taps, 2 * at.taps)
+    _fetch(at.edge + 2 * i * at.pixels, 2 * at.pixels)
+    _fetch(fitted.constant + 2 * i * at.constants, 2 * at.constants)
+    _fetch(fitted.edge + 2 * i * at.pixels, 2 * at.pixels)
+
+
+@numba.njit(cache=True, nogil=True)
+def fit_tables(tables: LabelTables, ways: Ways, first: int, last: int, memory: NDArray[np.uint8]) -> None:
+    """Fill the fitted parts of tables first..last-1: what they say at the usual number of exposures."""
+    at = _at(tables, tables.span, tables.span)
+    fitted = _usually(tables)
+    for i in range(first, last):
+        _fit_table(at, i, i, ways.units * ways.exposures, fitted, signed_address(memory))
+
+
+@numba.njit(forceinline=True)
+def _usually(tables):  # type: ignore[no-untyped-def]
+    """What the tables say at the usual number of exposures."""
+    return Fitted(signed_address(tables.fitted_constant), signed_address(tables.fitted_edge))
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_table(at: At, i: int, j: int, per_nat: float, to: Fitted, through: int) -> None:
+    """Constants of table i for a number of exposures, as number j; per_nat: units times exposures."""
+    source, constant = at.constant + 4 * i * at.constants, to.constant + 2 * j * at.constants
+    for k in range(0, at.constants, LANES):
+        store_int16(constant, k, _rounded(load_float32(source, k) * np.float32(per_nat)))
+    source, edge = at.edge_sum + 4 * i * at.pixels, to.edge + 2 * j * at.pixels
+    # Differences of rounded sums: rounding each pixel would drift along the row.
+    write_int16(through, LANES - 1, np.int16(0))
+    for k in range(0, at.pixels, LANES):
+        store_int16(through, LANES + k, _rounded(load_float32(source, k) * np.float32(per_nat)))
+    for k in range(0, at.pixels, LANES):
+        store_int16(edge, k, load_int16(through, LANES + k) - load_int16(through, LANES - 1 + k))
+
+
+@numba.njit(forceinline=True)
+def _at(tables, hot_start, hot_x):  # type: ignore[no-untyped-def]
+    return At(
+        signed_address(tables.edge), signed_address(tables.edge_sum), tables.edge.shape[1], signed_address(tables.tap),
+        tables.tap[:1].size, signed_address(tables.constant), tables.constant[:1].size,
+        signed_address(tables.span), signed_address(tables.used), signed_address(hot_start), signed_address(hot_x),
+    )  # fmt: skip
+
+
+@numba.njit(forceinline=True)
+def _rounded(a):  # type: ignore[no-untyped-def]
+    a = larger_float(smaller_float(a, _LIMIT), -_LIMIT)
+    return to_int16(a + _TO_UNSIGNED) + np.int16(-32768)
+
+
+@numba.njit(cache=True, nogil=True)
+def _read_any(
+    counts: NDArray[np.unsignedinteger[Any]], c: int, y: int, places: int, x0: int, side: int, pixels: int,
+    times: float, b: Buffers, batch: int,
+) -> None:  # fmt: skip
+    """The same as `read_bytes` of counts of any size."""
+    for r in range(batch):
+        start = read_int16(places, PLACES * r + START) - x0
+        for p in range(pixels):
+            x = start - side * p
+            count = np.int64(counts[c, y + r, x]) if 0 <= x < counts.shape[2] else np.int64(0)
+            write_int16(b.n + 2 * r * b.n_row, p, np.int16(count * times))

@@ -1,0 +1,224 @@
+"""Cost of every label on every row of every column: how much less likely than the best one its counts make it.
+
+A label is a position of the stripe half a pixel nearer than the one before (`label_grid`); that there is none is not
+among the answers, since a row that is taken for empty would pass nothing on from its neighbours. The likelihood is that
+of `rig.estimate.row.likelihood`, with the line's profile at the label's own fraction of a pixel, from tables that the
+rows of a band share (`rig.estimate.joint.labels.tables`).
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import CountVolume
+from rig.estimate.joint.labels.cost_rows import fill_costs, fit_tables, room_for
+from rig.estimate.joint.labels.grid import FAR_PX, FRACTIONS, PHASES, VARIANTS, LabelGrid, label_pixels, places_of
+from rig.estimate.joint.labels.halo_rows import BLOCK_PX, HaloTables, fill_halo, halo_tables
+from rig.estimate.joint.labels.tables import LIGHTS, LabelTables, Ways, fill_tables, mark_rows, number_tables
+from rig.estimate.joint.winner import UNITS
+from rig.estimate.row.inputs import (
+    RowBuffers,
+    RowState,
+    Sweep,
+    halo_shares,
+    row_buffers,
+    row_fluxes,
+    state_of,
+    sweep_of,
+)
+from rig.estimate.row.likelihood import FLUX_MAX, cell_of
+from rig.estimate.row.model import RowModel, pixel_shares
+from rig.estimate.search.prepare import HOT_FACTOR, HOT_FLUX
+from rig.geometry.windows import MARGIN_PX, SweepGeometry
+from rig.simd.memory import aligned_zeros
+from rig.simd.vectors import LANES
+from rig.threads import RowWorkers
+
+SHARP: Final = 8.0
+"""Exposures at which a nat is worth half as many: with sharp rows the labels beside the best one must still count. In
+maps taken in passes that goes by each column's own."""
+BAND_ROWS: Final = 64
+"""Rows that share tables."""
+FINEST: Final = 64.0
+"""Most units of scores per nat."""
+WEIGHT_BITS: Final = 12
+"""Weights of 2^WEIGHT_BITS units per nat reach to 8 nats per count."""
+RISE_LIMIT: Final = 22000
+"""Most that the score of a change may rise along a row, of a range of 40000."""
+TAPS_LIMIT: Final = 28000
+"""Most that the pixels around a position may add to its score."""
+FRAMES_OVER_HALF_MORE: Final = 4
+"""Half more than the nominal exposures and so many on top is the most that the counts of a column may say."""
+LOOKED_AT: Final = 32
+"""Columns, and rows, whose rise says in which units to keep those of all."""
+QUARTILES: Final = (0.25, 0.75)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Costs:
+    """Gives the costs of a sweep's counts under one model; made once per model by `costs_of`.
+
+    units_per_nat: of cost; UNITS / (1 + exposures / SHARP), or less where 16 bits do not hold what haze says.
+    """
+
+    grid: LabelGrid
+    tables: LabelTables
+    halo: HaloTables
+    place: NDArray[np.int16]
+    hot_start: NDArray[np.int32]
+    hot_x: NDArray[np.int16]
+    ways: Ways
+    units_per_nat: float
+
+    def fill(self, volume: CountVolume, first: int, last: int, out: NDArray[np.uint8]) -> None:
+        """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows.
+
+        Cost: by how much a label is less likely than the best one of that row and column (of all that the band has), at
+        most COST_LIMIT; EXCLUDED where it cannot be. Rows without frames, or with nothing to search, cost 0 everywhere.
+        Best called with 16 rows or more at a time; threads may fill different rows at once.
+        """
+        memory = room_for(self.tables, self.halo, self.grid.labels)
+        fill_costs(
+            volume.counts, volume.n_frames, volume.x0, self.place, self.tables, self.halo, self.hot_start, self.hot_x,
+            self.ways, first, last, memory, out,
+        )  # fmt: skip
+
+
+def costs_of(model: RowModel, geometry: SweepGeometry, grid: LabelGrid, exposures: int, workers: RowWorkers) -> Costs:
+    """All that `Costs.fill` reads, for columns of about `exposures` frames under `model`."""
+    sweep, state = sweep_of(geometry), state_of(model)
+    reach = len(state.psi) - 1
+    light = _lights(model)
+    ways, units_per_nat = _ways(sweep, state, grid, exposures, light, reach)
+    place = places_of(sweep, grid)
+    bands = -(-geometry.rows // BAND_ROWS)
+    at = np.empty((bands, geometry.columns, VARIANTS), np.int32)
+    tables = _empty_tables(at, number_tables(place, BAND_ROWS, at), grid, 2 * reach + 1)
+    ambient, hot = model.ambient, hot_in_bands(model.ambient)
+    distance = np.arange(-reach, reach + 1) - (np.arange(FRACTIONS)[:, None] - FRACTIONS // 2) / FRACTIONS
+    shares = pixel_shares(model.line_sigma_px, distance)
+    beside = np.ascontiguousarray(halo_shares(model, BLOCK_PX // 2 + 1)[:, -1])
+    dark = state._replace(ambient=np.zeros_like(ambient), row_gain=_band_means(state.row_gain))
+    scale = 2.0**ways.bits
+
+    def work(first: int, last: int) -> None:
+        fill_tables(
+            sweep,
+            dark,
+            place,
+            ambient,
+            hot,
+            light,
+            shares,
+            beside,
+            ways.units * scale,
+            TAPS_LIMIT * scale / ways.most,
+            BAND_ROWS,
+            first,
+            last,
+            tables,
+        )
+
+    workers.over(bands, work)
+    halo = halo_tables(tables, bool(model.halo.any()))
+
+    def around(first: int, last: int) -> None:
+        fill_halo(
+            sweep, dark, shares_of_halo, place, ambient, hot, light, ways.units * scale, BAND_ROWS, first, last, tables,
+            halo,
+        )  # fmt: skip
+
+    if halo.weight.size > 0:
+        shares_of_halo = halo_shares(model, tables.edge.shape[1] + FAR_PX)
+        workers.over(bands, around)
+
+    def fit(first: int, last: int) -> None:
+        fit_tables(tables, ways, first, last, room_for(tables, halo, grid.labels))
+
+    workers.over(len(tables.span), fit)
+    mark_rows(place, hot, grid.side, BAND_ROWS, tables)
+    y, x = np.nonzero(hot)
+    hot_start = np.searchsorted(y, np.arange(geometry.rows + 1)).astype(np.int32)
+    return Costs(grid, tables, halo, place, hot_start, x.astype(np.int16), ways, units_per_nat)
+
+
+def _ways(
+    sweep: Sweep, state: RowState, grid: LabelGrid, exposures: int, light: NDArray[np.float32], reach: int
+) -> tuple[Ways, float]:
+    most = exposures + exposures // 2 + FRAMES_OVER_HALF_MORE
+    bits = most.bit_length()
+    rise, gain = _largest(sweep, state, row_buffers(sweep.window, 1), light[-1])
+    # Where pixels say nothing at all, any unit will do.
+    largest = max(rise / RISE_LIMIT, gain / TAPS_LIMIT, 1e-9)
+    finest = min(FINEST, 2.0 ** (WEIGHT_BITS - bits), 1.0 / (most * largest))
+    wanted = UNITS / (1.0 + exposures / SHARP)
+    down = max(int(np.floor(np.log2(finest / wanted))), 0)
+    units_per_nat = min(wanted, finest)
+    ways = Ways(
+        units=units_per_nat * 2.0**down, bits=bits, exposures=exposures, most=most, sharp=SHARP, down=down,
+        reach=reach, side=grid.side, stripes=grid.stripes, band_rows=BAND_ROWS,
+    )  # fmt: skip
+    return ways, units_per_nat
+
+
+@numba.njit(cache=True, nogil=True)
+def _largest(sweep: Sweep, state: RowState, row: RowBuffers, light: float) -> tuple[float, float]:
+    """Largest sums along some rows, in nats.
+
+    Per exposure, what all pixels of a row say by lying behind the stripe instead of before it; per count, what the
+    pixels that a stripe of this light falls on say.
+    """
+    rise = gain = 0.0
+    rows, columns = sweep.x_lo.shape
+    for y in range(0, rows, max(rows // LOOKED_AT, 1)):
+        for c in range(0, columns, max(columns // LOOKED_AT, 1)):
+            length, _, _, _ = row_fluxes(sweep, state, row, y, c)
+            total = 0.0
+            for t in range(length):
+                dark = cell_of(row.behind[t])
+                total += abs(state.table[1, dark] - state.table[1, cell_of(row.before[t])])
+                taps = 0.0
+                for d in range(1 - state.psi.shape[0], state.psi.shape[0]):
+                    flux = np.float32(row.behind[t] + light * row.scale[t] * state.psi[abs(d)])
+                    taps += state.table[0, cell_of(min(flux, FLUX_MAX))] - state.table[0, dark]
+                gain = max(gain, taps)
+            rise = max(rise, total)
+    return rise, gain
+
+
+def _empty_tables(at: NDArray[np.int32], tables: int, grid: LabelGrid, taps: int) -> LabelTables:
+    vectors = -(-label_pixels(grid) // LANES)
+    pixels = -(-(FAR_PX + label_pixels(grid) + MARGIN_PX) // LANES) * LANES
+    return LabelTables(
+        at=at,
+        edge=aligned_zeros((tables, pixels), np.int16),
+        edge_sum=aligned_zeros((tables, pixels), np.float32),
+        tap=aligned_zeros((tables, vectors, taps, PHASES, LIGHTS, LANES), np.int16),
+        constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.float32),
+        span=np.zeros((tables, 2), np.int16),
+        used=np.zeros(tables, np.int16),
+        fitted_constant=aligned_zeros((tables, vectors, PHASES, LIGHTS, LANES), np.int16),
+        fitted_edge=aligned_zeros((tables, pixels), np.int16),
+    )
+
+
+def _lights(model: RowModel) -> NDArray[np.float32]:
+    """The quartiles of the learned amplitudes."""
+    weight = np.maximum(model.weight, 1e-6)
+    middle = (np.cumsum(weight) - 0.5 * weight) / weight.sum()
+    return np.exp(np.interp(QUARTILES, middle, np.log(model.amplitude.astype(np.float64)))).astype(np.float32)
+
+
+def hot_in_bands(ambient: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Pixels (rows, width) that are far brighter than those of their column in the band."""
+    bands = np.arange(BAND_ROWS, ambient.shape[0], BAND_ROWS)
+    return np.concatenate([part > HOT_FACTOR * np.median(part, axis=0) + HOT_FLUX for part in np.split(ambient, bands)])
+
+
+def _band_means(gain: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Each row's gain as the mean of its band's."""
+    parts = np.split(gain, np.arange(BAND_ROWS, len(gain), BAND_ROWS))
+    return np.concatenate([np.full_like(part, part.mean()) for part in parts])

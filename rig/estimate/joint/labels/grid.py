@@ -1,0 +1,165 @@
+"""Positions as labels that neighbours on one surface share: steps of disparity from the far end of the depth range.
+
+On a surface of even depth the stripe of the next column stands one column spacing further on, so that positions in
+pixels tell nothing about neighbours; distances from where the stripe would stand at the far end do.
+
+Where the labels of each row and column lie in its pixels: a table of small numbers, made once per geometry.
+
+Pixels are numbered from far to near: pixel p of a row is at x = START - side * p, and FAR_PX of them come before the
+one that label 0 is in, so that neighbouring rows of a leaning line have the same depth at the same p. A pixel holds two
+labels, half a pixel apart, of phase 0 (its far half) and 1 (its near half); where between the pixels they lie is the
+variant, in eighths of a pixel: 0 to 3.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.row.inputs import Sweep, with_rays
+from rig.geometry.windows import MARGIN_PX, SweepGeometry
+
+PER_PX: Final = 2
+"""Labels a pixel: at whole pixels the stripe's place between two of them costs 0.05 px of error at 10 exposures."""
+SPARE: Final = 1
+"""Labels beyond the searched pixels at either end, for the mean of a peak there."""
+VECTOR: Final = 32
+_ROWS_APART: Final = 8
+"""Rows that are looked at for the distance of columns."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelGrid:
+    """Label l of a row and column is at x_far - side * l / PER_PX, for l from 0 to stripes - 1.
+
+    x_far: float64 (rows, columns), NaN where nothing is searched; x may lie outside the picture there. side: 1 where
+    near is left, else -1. labels: a multiple of VECTOR; those from stripes on mean nothing. column_px: from a column to
+    the next, as a rule.
+    """
+
+    x_far: NDArray[np.float64]
+    side: int
+    stripes: int
+    labels: int
+    column_px: float
+
+
+def label_grid(geometry: SweepGeometry) -> LabelGrid:
+    """The labels of a sweep: as many as the widest row needs."""
+    x_far = far_ends(
+        geometry.u, geometry.v, geometry.plane, geometry.x_lo, geometry.x_hi, 1 / geometry.depth_range_m[1]
+    )
+    side = 1 if geometry.near_is_left else -1
+    nearest = geometry.x_lo if geometry.near_is_left else geometry.x_hi
+    seen = np.isfinite(x_far)
+    span = (side * (x_far - nearest))[seen].max(initial=1.0)
+    stripes = int(np.ceil(PER_PX * span)) + 1 + SPARE
+    steps = np.abs(np.diff(x_far[::_ROWS_APART], axis=1))
+    steps = steps[np.isfinite(steps)]
+    column_px = float(np.median(steps)) if steps.size else 1.0
+    return LabelGrid(x_far, side, stripes, -(-stripes // VECTOR) * VECTOR, column_px)
+
+
+@numba.njit(cache=True, nogil=True)
+def far_ends(
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    plane: NDArray[np.float64],
+    x_lo: NDArray[np.int32],
+    x_hi: NDArray[np.int32],
+    w_far: float,
+) -> NDArray[np.float64]:
+    """Where each column's line would stand on each row at inverse depth w_far: (rows, columns) pixels.
+
+    Between pixels by straight lines, outside the picture by that through the last two; NaN where x_lo > x_hi.
+    """
+    rows, columns = x_lo.shape
+    width = u.shape[1]
+    out = np.full((rows, columns), np.nan)
+    for y in range(rows):
+        for c in range(columns):
+            lo, hi = x_lo[y, c], x_hi[y, c]
+            if lo > hi:
+                continue
+            px, py, pz = plane[c, 0], plane[c, 1], plane[c, 2]
+            w_lo = px * u[y, lo] + py * v[y, lo] + pz
+            w_hi = px * u[y, hi] + py * v[y, hi] + pz
+            # From the searched pixel that is farthest towards the far end, one pixel beyond it where there is one.
+            at = hi if w_hi < w_lo else lo
+            beyond = at + 1 if w_hi < w_lo else at - 1
+            if lo == hi:
+                beyond = at + 1 if px * (u[y, min(at + 1, width - 1)] - u[y, max(at - 1, 0)]) < 0 else at - 1
+            if beyond < 0 or beyond >= width or np.isnan(u[y, beyond]):
+                beyond = 2 * at - beyond
+            if beyond < 0 or beyond >= width or np.isnan(u[y, beyond]):
+                out[y, c] = at
+                continue
+            w_at = px * u[y, at] + py * v[y, at] + pz
+            w_beyond = px * u[y, beyond] + py * v[y, beyond] + pz
+            out[y, c] = at + (w_at - w_far) / (w_at - w_beyond) * (beyond - at)
+    return out
+
+
+FRACTIONS: Final = 8
+"""Parts of a pixel that the centre of a line is told apart in."""
+VARIANTS: Final = FRACTIONS // 2
+PHASES: Final = 2
+FAR_PX: Final = MARGIN_PX
+SLACK_PX: Final = 1
+"""How far outside the row's search window a label may lie: the mean of a peak at its end needs both sides."""
+START, VARIANT, ODD, LABEL, LABEL_END, VALID, VALID_END, MEND = range(8)
+"""START: x of pixel 0; VARIANT: -1 where nothing is searched; ODD: 1 where label 0 is of phase 1; LABEL, LABEL_END:
+labels that can be, from and up to; VALID, VALID_END: pixels p that were stored and are looked at; MEND: 1 where some
+pixel that the row's table weighs is not among those, or is hot (`rig.estimate.joint.labels.tables`)."""
+PLACES: Final = 8
+
+
+def label_pixels(grid: LabelGrid) -> int:
+    """Pixels that labels lie in."""
+    return grid.stripes // PHASES + 1
+
+
+def places_of(sweep: Sweep, grid: LabelGrid) -> NDArray[np.int16]:
+    """The numbers of each row of each column, int16 (columns, rows, PLACES)."""
+    out = np.zeros((*grid.x_far.T.shape, PLACES), np.int16)
+    _fill_places(sweep, grid.x_far, grid.side, grid.stripes, label_pixels(grid), out)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_places(
+    sweep: Sweep, x_far: NDArray[np.float64], side: int, stripes: int, pixels: int, out: NDArray[np.int16]
+) -> None:
+    rows, columns = x_far.shape
+    width = sweep.u.shape[1]
+    for c in range(columns):
+        for y in range(rows):
+            place = out[c, y]
+            place[VARIANT] = -1
+            lo, hi, x0 = sweep.x_lo[y, c], sweep.x_hi[y, c], sweep.x0[c]
+            first, last = with_rays(
+                sweep.u, y, max(lo - MARGIN_PX, x0, 0), min(hi + MARGIN_PX, x0 + sweep.window - 1, width - 1)
+            )
+            if lo > hi or max(lo, first) > min(hi, last):
+                continue
+            # In eighths of a pixel towards near: label 0, and from there to the pixel that holds it.
+            at = -int(np.floor(FRACTIONS * side * x_far[y, c] + 0.5))
+            pixel = (at + FRACTIONS // 2) // FRACTIONS
+            place[VARIANT] = at % VARIANTS
+            place[ODD] = 1 if at >= FRACTIONS * pixel else 0
+            start = -side * (pixel - FAR_PX)
+            place[START] = start
+            far, near = (last, first) if side > 0 else (first, last)
+            place[VALID] = max(side * (start - far), 0)
+            place[VALID_END] = side * (start - near) + 1
+            far, near = (min(hi, last), max(lo, first)) if side > 0 else (max(lo, first), min(hi, last))
+            step = FRACTIONS // PHASES
+            # Of the pixels that were stored, all eighths that are nearest to them.
+            low = max(-side * far - SLACK_PX, -side * (last if side > 0 else first) - 4 / FRACTIONS)
+            high = min(-side * near + SLACK_PX, -side * (first if side > 0 else last) + 3 / FRACTIONS)
+            place[LABEL] = min(max(int(np.ceil((FRACTIONS * low - at) / step)), 0), stripes)
+            # The pixel of the last label is one that tables have.
+            high_label = int(np.floor((FRACTIONS * high - at) / step))
+            place[LABEL_END] = min(max(high_label + 1, place[LABEL]), stripes, PHASES * pixels - place[ODD])

@@ -1,0 +1,252 @@
+"""Compiled part of the label costs: what the halo says, added to the constants of each row of a batch.
+
+What the halo adds to the label costs: tables over blocks of pixels, per column and band of rows.
+
+The tables of `rig.estimate.joint.labels.tables` take the halo for as bright everywhere as it is where the stripe
+stands: right where the stripe's place is decided. What it is less beyond varies slowly with the stripe's place and from
+pixel to pixel. So it is told for stripes BLOCK_PX apart, in between by straight lines, from the mean counts of as many
+pixels.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.joint.labels.grid import FAR_PX, PHASES, START, VARIANT, VARIANTS
+from rig.estimate.joint.labels.tables import (
+    BATCH,
+    LIGHTS,
+    POSITION,
+    WEIGHT_LIMIT,
+    At,
+    Buffers,
+    Fitted,
+    LabelTables,
+    mean_ambient,
+    signed_address,
+)
+from rig.estimate.row.inputs import Float32, RowState, Sweep, row_buffers, row_fluxes
+from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN, cell_of
+from rig.simd.memory import (
+    aligned_zeros,
+    load_float32,
+    load_int16,
+    read_int16,
+    read_int32,
+    store_int16,
+    write_int16,
+    write_int32,
+)
+from rig.simd.vectors import LANES, add_saturated, larger_float, scaled, smaller, smaller_float, to_int16, zero_int16
+
+BLOCK_PX: Final = 8
+FIRST_PX: Final = FAR_PX % BLOCK_PX - BLOCK_PX
+"""Pixel that the first block begins at, before the row: the first label's pixel begins a block."""
+AHEAD: Final = (FAR_PX - FIRST_PX) // BLOCK_PX
+"""Blocks behind a stripe at place 0."""
+_FULL: Final = 32768.0
+
+
+class HaloTables(NamedTuple):
+    """Blocks of pixels are counted from FIRST_PX on; places of the stripe from the far end of the first label's pixel.
+
+    weight: int16 (bands, columns, blocks, LIGHTS, places), of the counts of a block over BLOCK_PX. constant: float32
+    (bands, columns, LIGHTS, places), nats per exposure. ramp: int16 (phases, 3, LANES), parts that the three places
+    around a vector of labels have in each, of 2^15. Without a halo all but `ramp` are empty.
+    """
+
+    weight: NDArray[np.int16]
+    constant: NDArray[np.float32]
+    ramp: NDArray[np.int16]
+
+
+def halo_tables(tables: LabelTables, there: bool) -> HaloTables:
+    """Room for the tables of a halo, if there is one."""
+    bands, columns, _ = tables.at.shape
+    blocks = -(-(tables.edge.shape[1] - FIRST_PX) // BLOCK_PX)
+    places = -(-(LANES // BLOCK_PX * tables.tap.shape[1] + 1) // LANES) * LANES
+    if not there:
+        bands = blocks = places = 0
+    weight = aligned_zeros((bands, columns, blocks, LIGHTS, places), np.int16)
+    return HaloTables(weight, aligned_zeros((bands, columns, LIGHTS, places), np.float32), _ramps())
+
+
+def _ramps() -> NDArray[np.int16]:
+    pixel = np.arange(LANES) + 0.5
+    # A pixel's labels lie about a quarter of it to either side of its middle.
+    at = (pixel + np.array([-0.25, 0.25])[:, None]) / BLOCK_PX
+    parts = np.maximum(1.0 - np.abs(at[:, None] - np.arange(3)[:, None]), 0.0)
+    return np.asarray(np.minimum(np.rint(_FULL * parts), _FULL - 1), np.int16)
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_halo(
+    sweep: Sweep,
+    state: RowState,
+    halo: Float32,
+    place: NDArray[np.int16],
+    ambient: Float32,
+    hot: NDArray[np.bool_],
+    light: Float32,
+    per_nat: float,
+    band_rows: int,
+    first_band: int,
+    last_band: int,
+    tables: LabelTables,
+    out: HaloTables,
+) -> None:
+    """Tables of bands first_band..last_band-1, as `label_tables.fill_tables`; halo: (BINS, pixels) of `halo_shares`."""
+    side = 1 if sweep.near_is_left else -1
+    pixels = tables.edge.shape[1]
+    row, middle_light = row_buffers(sweep.window, 1), np.sqrt(light[0] * light[-1])
+    mean, number = np.empty(pixels, np.float32), np.empty(pixels, np.int32)
+    # Of the blocks: flux before and behind the stripe, and of the halo as the tables of labels have it.
+    level, size = np.empty((3, out.weight.shape[2]), np.float32), np.empty(out.weight.shape[2], np.int64)
+    for b in range(first_band, last_band):
+        rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
+        for c in range(place.shape[0]):
+            y = _middle(place, c, rows)
+            if y < 0:
+                continue
+            mean_ambient(place, ambient, hot, side, c, rows, mean, number)
+            length, _, _, start = row_fluxes(sweep, state, row, y, c)
+            to_t = side * (place[c, y, START] - start)
+            first_px, end_px = max(0, to_t - length + 1), min(pixels, to_t + 1)
+            for variant in range(VARIANTS):
+                i = tables.at[b, c, variant]
+                if i >= 0:
+                    first_px = max(first_px, int(tables.span[i, 0]))
+                    end_px = min(end_px, int(tables.span[i, 1]))
+            for k in range(level.shape[1]):
+                level[:, k] = 0.0
+                begin = max(FIRST_PX + BLOCK_PX * k, first_px)
+                size[k] = max(min(FIRST_PX + BLOCK_PX * (k + 1), end_px) - begin, 0)
+                for p in range(begin, begin + size[k]):
+                    t = to_t - p
+                    level[0, k] += (row.before[t] + mean[p]) / size[k]
+                    level[1, k] += (row.behind[t] + mean[p]) / size[k]
+                    level[2, k] += middle_light * row.scale[t] * state.glow[row.cell[t]] / size[k]
+            out.weight[b, c] = 0
+            out.constant[b, c] = 0.0
+            # No label lies around the places behind these, which fill up a vector: `halo` need not reach so far.
+            for j in range(LANES // BLOCK_PX * tables.tap.shape[1] + 1):
+                t = min(max(to_t - FAR_PX - BLOCK_PX * j, 0), length - 1)
+                for m in range(LIGHTS):
+                    s = light[m] * row.scale[t]
+                    for k in range(level.shape[1]):
+                        if size[k] == 0:
+                            continue
+                        # The middle of a block is half a block from its ends.
+                        away = abs(BLOCK_PX * (k - j - AHEAD) + BLOCK_PX // 2)
+                        base = level[1 if k < j + AHEAD else 0, k]
+                        told = min(max(base + level[2, k], FLUX_MIN), FLUX_MAX)
+                        flux = min(max(base + s * halo[row.cell[t], away], FLUX_MIN), FLUX_MAX)
+                        other, own = cell_of(told), cell_of(flux)
+                        weight = BLOCK_PX * per_nat * (state.table[0, own] - state.table[0, other])
+                        out.weight[b, c, k, m, j] = round(min(max(weight, -WEIGHT_LIMIT), WEIGHT_LIMIT))
+                        out.constant[b, c, m, j] += size[k] * (state.table[1, own] - state.table[1, other])
+
+
+@numba.njit(cache=True, nogil=True)
+def _middle(place: NDArray[np.int16], c: int, rows: tuple[int, int]) -> int:
+    """The row nearest the band's middle that has labels; -1: none."""
+    best, middle = -1, (rows[0] + rows[1]) // 2
+    for y in range(rows[0], rows[1]):
+        if place[c, y, VARIANT] >= 0 and (best < 0 or abs(y - middle) < abs(best - middle)):
+            best = y
+    return best
+
+
+_LIMIT: Final = np.float32(30000)
+_TO_UNSIGNED: Final = np.float32(32768.5)
+_POSSIBLE: Final = np.int16(28000)
+"""Constants of positions without a label lie below the negative of this, others above."""
+
+
+class HaloAt(NamedTuple):
+    """Addresses, for `rig.simd.memory`, and numbers of elements: tables, see there, and room.
+
+    fitted: constants of all places for a column's exposures; mean: counts of blocks; level: what the halo says of a
+    stripe at each place; constant: of the positions, of each row of a batch; which: int32, its number there.
+    """
+
+    weight: int
+    per_column: int
+    constants: int
+    ramp: int
+    blocks: int
+    places: int
+    fitted: int
+    mean: int
+    level: int
+    constant: int
+    which: int
+
+
+@numba.njit(forceinline=True)
+def halo_at(tables, begin, constants):  # type: ignore[no-untyped-def]
+    """Where all of it lies, with room from an address on, and where that ends; constants: of positions of a row."""
+    blocks, places = tables.weight.shape[2], tables.weight.shape[4]
+    mean = begin + 2 * LIGHTS * places
+    level = mean + 2 * (blocks + LANES)
+    constant = level + 2 * LIGHTS * places
+    which = constant + 2 * BATCH * constants
+    at = HaloAt(
+        signed_address(tables.weight), blocks * LIGHTS * places, signed_address(tables.constant),
+        signed_address(tables.ramp), blocks, places, begin, mean, level, constant, which,
+    )  # fmt: skip
+    return at, which + 4 * BATCH
+
+
+@numba.njit(cache=True, nogil=True)
+def fit_halo(halo: HaloAt, column: int, per_nat: float) -> None:
+    """Fill fitted for a column's exposures, and which; column: its number in its band, per_nat: units x exposures."""
+    numbers = LIGHTS * halo.places
+    for j in range(0, numbers, LANES):
+        nats = load_float32(halo.constants + 4 * column * numbers, j) * np.float32(per_nat)
+        nats = larger_float(smaller_float(nats, _LIMIT), -_LIMIT)
+        store_int16(halo.fitted, j, to_int16(nats + _TO_UNSIGNED) + np.int16(-32768))
+    for r in range(BATCH):
+        write_int32(halo.which, r, np.int32(r))
+
+
+@numba.njit(cache=True, nogil=True)
+def halo_rows(halo: HaloAt, column: int, at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
+    """Fill constant: those of the rows' tables and what the halo says."""
+    vectors = b.score_row // (PHASES * LANES)
+    weights = halo.weight + 2 * column * halo.per_column
+    for r in range(batch):
+        i = read_int32(b.here, r)
+        if i < 0:
+            continue
+        n, first, end = b.n + 2 * r * b.n_row, read_int16(at.span, 2 * i), read_int16(at.span, 2 * i + 1)
+        for k in range(halo.blocks):
+            begin, total = FIRST_PX + BLOCK_PX * k, 0
+            for p in range(max(begin, first), min(begin + BLOCK_PX, end)):
+                total += read_int16(n, p)
+            write_int16(halo.mean, k, np.int16(total // BLOCK_PX))
+        for j in range(0, LIGHTS * halo.places, LANES):
+            says = load_int16(halo.fitted, j)
+            for k in range(halo.blocks):
+                mean = zero_int16() + read_int16(halo.mean, k)
+                says = add_saturated(says, scaled(mean, load_int16(weights, k * LIGHTS * halo.places + j)))
+            store_int16(halo.level, j, says)
+        source = fitted.constant + 2 * at.constants * read_int32(b.fitted, r)
+        to = halo.constant + 2 * at.constants * r
+        for v in range(vectors):
+            for m in range(LIGHTS):
+                place = m * halo.places + LANES // BLOCK_PX * v
+                first = zero_int16() + read_int16(halo.level, place)
+                second = zero_int16() + read_int16(halo.level, place + 1)
+                third = zero_int16() + read_int16(halo.level, place + 2)
+                for phase in range(PHASES):
+                    ramp = halo.ramp + 2 * 3 * LANES * phase
+                    says = scaled(first, load_int16(ramp, 0)) + scaled(second, load_int16(ramp, LANES))
+                    says = says + scaled(third, load_int16(ramp, 2 * LANES))
+                    j = v * POSITION + (phase * LIGHTS + m) * LANES
+                    constant = load_int16(source, j)
+                    # Positions without a label stay so whatever the halo says.
+                    never = smaller(constant + _POSSIBLE, np.int16(0)) << 4
+                    store_int16(to, j, add_saturated(add_saturated(constant, says), never))

@@ -1,0 +1,387 @@
+"""Tables of the label costs: what a count at each pixel says of every label, per column, band of rows and variant.
+
+Haze, pedestal and ambient light vary slowly along a line, so the rows of a band share a table for each variant of
+`rig.estimate.joint.labels.grid` that occurs among them. Scores are relative to 'everything is before the stripe': a
+pixel behind it adds its edge weight, the pixels around a label their taps. Weights are for counts as `scaled`
+multiplies them; what does not depend on the counts is kept per exposure, since the number of frames differs from column
+to column.
+
+The stripe's brightness is not known: of two lights, the quartiles of what was learned, the likelier one counts, both
+as probable. After aggregation that errs by 0.251, 0.155 and 0.117 px at 1, 3 and 10 exposures (`cones`); the mean over
+all four learned ones, weighted, by 0.264, 0.170 and 0.116, a single light by 0.303, 0.216 and 0.210. The learned depth
+histogram as a prior made it 3 to 7 % worse.
+
+Where the compiled label costs find their tables and keep what they work on: addresses, for `rig.simd.memory`.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.joint.labels.grid import (
+    FAR_PX,
+    FRACTIONS,
+    LABEL,
+    LABEL_END,
+    MEND,
+    ODD,
+    PHASES,
+    START,
+    VALID,
+    VALID_END,
+    VARIANT,
+    VARIANTS,
+)
+from rig.estimate.row.inputs import RowState, Sweep, row_buffers, row_fluxes
+from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN, cell_of
+from rig.simd.memory import CACHE_LINE, address_of
+from rig.simd.vectors import LANES
+
+LIGHTS: Final = 2
+"""Stripe brightnesses that are tried."""
+WEIGHT_LIMIT: Final = 32767
+"""Weights are cut there: a count that would say more says this much."""
+IMPOSSIBLE: Final = np.float32(-1e9)
+"""Constant of a position where no row of the band has a label."""
+_NEAR, _FAR = 0, 1
+
+
+class LabelTables(NamedTuple):
+    """See the module. P: pixels of a row, V: vectors of pixels that hold labels, the first one being pixel FAR_PX.
+
+    at: int32 (bands, columns, VARIANTS), index of the table, -1 where there is none.
+    edge: int16 (tables, P), weight of a count behind the stripe. edge_sum: float32 (tables, P), nats per exposure of
+    the pixels up to and including each lying behind.
+    tap: int16 (tables, V, taps, PHASES, LIGHTS, LANES), weight of the counts of the pixels around each position.
+    constant: float32 (tables, V, PHASES, LIGHTS, LANES), nats per exposure of each position.
+    span: int16 (tables, 2), pixels whose weights are not 0: from and up to.
+    used: int16 (tables,), vectors up to the last one that holds a label of any row.
+    fitted_constant, fitted_edge: int16, units of constant and of each pixel's share of edge_sum, for the usual number
+    of exposures.
+    """
+
+    at: NDArray[np.int32]
+    edge: NDArray[np.int16]
+    edge_sum: NDArray[np.float32]
+    tap: NDArray[np.int16]
+    constant: NDArray[np.float32]
+    span: NDArray[np.int16]
+    used: NDArray[np.int16]
+    fitted_constant: NDArray[np.int16]
+    fitted_edge: NDArray[np.int16]
+
+
+@numba.njit(cache=True, nogil=True)
+def number_tables(place: NDArray[np.int16], band_rows: int, at: NDArray[np.int32]) -> int:
+    """Fill `at` of LabelTables with the numbers of the tables that the rows need; returns how many those are."""
+    tables = 0
+    at[:] = -1
+    for b in range(at.shape[0]):
+        for c in range(at.shape[1]):
+            for y in range(b * band_rows, min((b + 1) * band_rows, place.shape[1])):
+                variant = place[c, y, VARIANT]
+                if variant >= 0 and at[b, c, variant] < 0:
+                    at[b, c, variant] = tables
+                    tables += 1
+    return tables
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_tables(
+    sweep: Sweep,
+    state: RowState,
+    place: NDArray[np.int16],
+    ambient: NDArray[np.float32],
+    hot: NDArray[np.bool_],
+    light: NDArray[np.float32],
+    shares: NDArray[np.float32],
+    beside: NDArray[np.float32],
+    per_nat: float,
+    most: float,
+    band_rows: int,
+    first_band: int,
+    last_band: int,
+    out: LabelTables,
+) -> None:
+    """Tables of bands first_band..last_band-1.
+
+    state: without ambient light, which is in `ambient` (rows, width), of pixels that are not `hot`. light: (LIGHTS,)
+    photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around centres -4/8 to 3/8 px off.
+    per_nat: units of weight; most: largest sum of a position's weights.
+    """
+    side = 1 if sweep.near_is_left else -1
+    pixels = out.edge.shape[1]
+    row, middle_light = row_buffers(sweep.window, 1), np.sqrt(light[0] * light[-1])
+    mean, number = np.empty(pixels, np.float32), np.empty(pixels, np.int32)
+    flux, level = np.empty((2, pixels), np.float32), np.empty((4, pixels), np.float32)
+    glow, near_glow = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+    for b in range(first_band, last_band):
+        rows = b * band_rows, min((b + 1) * band_rows, place.shape[1])
+        for c in range(place.shape[0]):
+            if out.at[b, c].max() < 0:
+                continue
+            mean_ambient(place, ambient, hot, side, c, rows, mean, number)
+            for variant in range(VARIANTS):
+                i = out.at[b, c, variant]
+                if i < 0:
+                    continue
+                y, label, label_end = _middle_row(place, c, rows, variant)
+                here = place[c, y]
+                length, _, _, start = row_fluxes(sweep, state, row, y, c)
+                to_t = side * (here[START] - start)
+                span = max(to_t - length + 1, 0), min(to_t + 1, pixels)
+                out.span[i, 0], out.span[i, 1] = span
+                out.used[i] = -(-label_end // (PHASES * LANES))
+                for p in range(span[0], span[1]):
+                    # Around its middle the halo is level; `halo_tables` tell what it is elsewhere.
+                    glow[p] = state.glow[row.cell[to_t - p]]
+                    near_glow[p] = beside[row.cell[to_t - p]]
+                    for near in (_NEAR, _FAR):
+                        light_there = row.before[to_t - p] if near == _NEAR else row.behind[to_t - p]
+                        light_there += middle_light * row.scale[to_t - p] * glow[p]
+                        flux[near, p] = min(max(light_there + mean[p], FLUX_MIN), FLUX_MAX)
+                        cell = cell_of(flux[near, p])
+                        level[near, p], level[2 + near, p] = state.table[0, cell], state.table[1, cell]
+                _fill_edges(level, span, per_nat, out.edge[i], out.edge_sum[i])
+                _fill_taps(
+                    state.table, row.scale, glow, near_glow, to_t, span, flux, light, shares, variant, per_nat, most,
+                    (label, label_end), out.tap[i], out.constant[i],
+                )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def mark_rows(place: NDArray[np.int16], hot: NDArray[np.bool_], side: int, band_rows: int, tables: LabelTables) -> None:
+    """Fill MEND of the rows: their tables weigh pixels that they do not have, or that are hot."""
+    for c in range(place.shape[0]):
+        for y in range(place.shape[1]):
+            here = place[c, y]
+            if here[VARIANT] < 0:
+                continue
+            span = tables.span[tables.at[y // band_rows, c, here[VARIANT]]]
+            here[MEND] = 1 if here[VALID] > span[0] or here[VALID_END] < span[1] else 0
+            for p in range(max(here[VALID], span[0]), min(here[VALID_END], span[1])):
+                if hot[y, here[START] - side * p]:
+                    here[MEND] = 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _middle_row(place: NDArray[np.int16], c: int, rows: tuple[int, int], variant: int) -> tuple[int, int, int]:
+    """The row of that variant nearest the band's middle; first position and the one behind the last, of all its rows.
+
+    Positions count two a pixel, from the pixel that holds label 0 on.
+    """
+    middle = (rows[0] + rows[1]) // 2
+    best, first, end = -1, 1 << 15, 0
+    for y in range(rows[0], rows[1]):
+        here = place[c, y]
+        if here[VARIANT] == variant:
+            if best < 0 or abs(y - middle) < abs(best - middle):
+                best = y
+            first = min(first, int(here[LABEL] + here[ODD]))
+            end = max(end, int(here[LABEL_END] + here[ODD]))
+    return best, first, end
+
+
+@numba.njit(cache=True, nogil=True)
+def mean_ambient(
+    place: NDArray[np.int16], ambient: NDArray[np.float32], hot: NDArray[np.bool_], side: int, c: int,
+    rows: tuple[int, int], mean: NDArray[np.float32], number: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Mean ambient light of the band's rows at each pixel p; where none is to be had, that of the pixel before."""
+    mean[:] = 0.0
+    number[:] = 0
+    for y in range(rows[0], rows[1]):
+        here = place[c, y]
+        if here[VARIANT] < 0:
+            continue
+        for p in range(here[VALID], min(here[VALID_END], mean.shape[0])):
+            x = here[START] - side * p
+            if not hot[y, x]:
+                mean[p] += ambient[y, x]
+                number[p] += 1
+    last = FLUX_MIN
+    for p in range(mean.shape[0]):
+        if number[p]:
+            last = mean[p] / np.float32(number[p])
+        mean[p] = last
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_edges(
+    level: NDArray[np.float32], span: tuple[int, int], per_nat: float, edge: NDArray[np.int16],
+    edge_sum: NDArray[np.float32],
+) -> None:  # fmt: skip
+    total = 0.0
+    for p in range(edge.shape[0]):
+        edge[p] = 0
+        if span[0] <= p < span[1]:
+            edge[p] = _weight((level[_FAR, p] - level[_NEAR, p]) * per_nat)
+            total += level[2 + _FAR, p] - level[2 + _NEAR, p]
+        edge_sum[p] = total
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_taps(
+    table: NDArray[np.float32], scale: NDArray[np.float32], glow: NDArray[np.float32], near_glow: NDArray[np.float32],
+    to_t: int, span: tuple[int, int], flux: NDArray[np.float32], light: NDArray[np.float32],
+    shares: NDArray[np.float32], variant: int, per_nat: float, most: float, labels: tuple[int, int],
+    tap: NDArray[np.int16], constant: NDArray[np.float32],
+) -> None:  # fmt: skip
+    reach = shares.shape[1] // 2
+    half, middle_light = np.float32(0.5), np.sqrt(light[0] * light[-1])
+    for q in range(LANES * tap.shape[0]):
+        p, vector, lane = FAR_PX + q, q // LANES, q % LANES
+        for phase in range(PHASES):
+            inside = span[0] <= p < span[1] and labels[0] <= PHASES * q + phase < labels[1]
+            off = variant - VARIANTS * (1 - phase)
+            for m in range(LIGHTS):
+                total, largest = np.float32(0.0), 0.0
+                for d in range(2 * reach + 1):
+                    tap[vector, d, phase, m, lane] = 0
+                constant[vector, phase, m, lane] = IMPOSSIBLE
+                if not inside:
+                    continue
+                halo = (light[m] - middle_light) * scale[to_t - p] * glow[p]
+                for d in range(max(-reach, span[0] - p), min(reach + 1, span[1] - p)):
+                    at = p + d
+                    # Relative to what the running sum takes the pixel for: behind up to here, before from here on.
+                    own = _FAR if d < 0 else _NEAR
+                    base = flux[own, at]
+                    if d == 0:
+                        nearer = half - np.float32(off) / np.float32(FRACTIONS)
+                        base = flux[_FAR, at] + nearer * (flux[_NEAR, at] - flux[_FAR, at])
+                    extra = light[m] * scale[to_t - p] * shares[off + VARIANTS, d + reach] + halo
+                    cell = cell_of(min(max(base + extra, FLUX_MIN), FLUX_MAX))
+                    # `halo_tables` tell the light around of a pixel that holds the line too: as if it had none of it.
+                    around = light[m] * scale[to_t - p] * near_glow[p] - middle_light * scale[to_t - at] * glow[at]
+                    told = cell_of(min(max(flux[own, at] + around, FLUX_MIN), FLUX_MAX))
+                    weight = _weight((table[0, cell] - table[0, told]) * per_nat)
+                    tap[vector, d + reach, phase, m, lane] = weight
+                    largest += abs(weight)
+                    total += table[1, cell] - table[1, told]
+                constant[vector, phase, m, lane] = total
+                if largest > most:
+                    for d in range(2 * reach + 1):
+                        tap[vector, d, phase, m, lane] = np.int16(tap[vector, d, phase, m, lane] * most / largest)
+
+
+@numba.njit(inline="always")
+def _weight(value):  # type: ignore[no-untyped-def]
+    return np.int16(round(min(max(value, np.float64(-WEIGHT_LIMIT)), np.float64(WEIGHT_LIMIT))))
+
+
+BATCH: Final = LANES
+"""Rows that go through each part of the work together: what one waits for, the others fill."""
+SUMS_FROM: Final = LANES - 1
+"""Sums up to and including a pixel belong to the next one: so they are written at whole vectors."""
+POSITION: Final = PHASES * LIGHTS * LANES
+"""Numbers that a vector of pixels has in a table."""
+
+
+class Ways(NamedTuple):
+    """How scores and costs are counted.
+
+    units: of scores per nat, of columns with the usual number of `exposures`; bits: of the largest count; most: what a
+    column's exposures may count as; sharp: exposures at which a nat is worth half as many units; down: power of two
+    that scores are divided by to be costs; reach: taps on either side; side, stripes: as in `LabelGrid`; band_rows:
+    rows that share tables.
+    """
+
+    units: float
+    bits: int
+    exposures: int
+    most: int
+    sharp: float
+    down: int
+    reach: int
+    side: int
+    stripes: int
+    band_rows: int
+
+
+class At(NamedTuple):
+    """Addresses of what tables and places hold, see there, and the elements from table to table."""
+
+    edge: int
+    edge_sum: int
+    pixels: int
+    tap: int
+    taps: int
+    constant: int
+    constants: int
+    span: int
+    used: int
+    hot_start: int
+    hot_x: int
+
+
+class Fitted(NamedTuple):
+    """Addresses of what tables say at a number of exposures, int16: of all tables, or of a column's variants."""
+
+    constant: int
+    edge: int
+
+
+class Buffers(NamedTuple):
+    """Addresses; of BATCH rows, int16 unless said, with the elements from row to row.
+
+    n: counts of pixels from far to near; sums: score of a change at each pixel from SUMS_FROM on, the first one BASE;
+    score: of pixel and phase; top: largest ones of some lanes each, later of all.
+    cost: bytes of labels, from that of the first pixel's phase 0 on. Of all rows: mask: bytes, EXCLUDED or 0 for each
+    label; constant: of positions, edge: of pixels, for each variant; through: room for sums. As
+    int32, table: of variants from -1 on, -1 where there is none; here: of each row of the batch, fitted: place of it in
+    `Fitted`; shown: labels that the mask is for, from and up to. labels: how many there are.
+    """
+
+    n: int
+    n_row: int
+    sums: int
+    score: int
+    score_row: int
+    top: int
+    cost: int
+    cost_row: int
+    mask: int
+    constant: int
+    edge: int
+    through: int
+    table: int
+    here: int
+    fitted: int
+    shown: int
+    labels: int
+
+
+@numba.njit(forceinline=True)
+def buffers_at(begin, pixels, vectors, labels):  # type: ignore[no-untyped-def]
+    """The buffers from an address on, and where they end."""
+    n_row = _whole(max(pixels, FAR_PX + vectors * LANES + LANES) + LANES)
+    score_row = vectors * PHASES * LANES
+    cost_row = _whole(max(labels, score_row) + 2 * 2 * LANES)
+    sums = begin + 2 * BATCH * n_row
+    score = sums + 2 * BATCH * n_row
+    top = score + 2 * BATCH * score_row
+    cost = top + 2 * BATCH * LANES
+    mask = cost + BATCH * cost_row
+    constant = mask + _whole(labels)
+    edge = constant + 2 * VARIANTS * vectors * POSITION
+    through = edge + 2 * VARIANTS * pixels
+    table = through + 2 * (pixels + 2 * LANES)
+    here = table + 4 * (VARIANTS + 1)
+    buffers = Buffers(begin, n_row, sums, score, score_row, top, cost, cost_row, mask, constant, edge,
+                       through, table, here, here + 4 * BATCH, here + 8 * BATCH, labels)  # fmt: skip
+    return buffers, here + 4 * (2 * BATCH + 2)
+
+
+@numba.njit(forceinline=True)
+def signed_address(array):  # type: ignore[no-untyped-def]
+    """Address of an array's first element, signed: sums of both kinds would be floats."""
+    return np.int64(address_of(array))
+
+
+@numba.njit(inline="always")
+def _whole(number):  # type: ignore[no-untyped-def]
+    """The next multiple of a cache line's bytes."""
+    return -(-number // CACHE_LINE) * CACHE_LINE

@@ -1,0 +1,250 @@
+"""Compiled four-path aggregation: the cost of each label, tied to the labels of the neighbours on rows and columns.
+
+Along a path, L(p, l) = C(p, l) + m(p, l) with the message m(p, l) = min(L(q, l), L(q, l +- 1) + P1, L(q, l +- 2) + P2,
+L(q, l +- 3) + P3, min L(q) + J) - min L(q) from the pixel q before p (Hirschmueller, PAMI 30, 2008, with steps of up to
+three labels). All numbers are unsigned bytes that stop at 255.
+
+Speed: 512 x 500 pixels of 128 labels, cycles per pixel (Zen 3, AVX2, one thread): rows 66, columns 95 and their
+answers another 105; instructions 214, 267 and 290. What was tried for two paths:
+- labels in order, neighbours by unaligned loads from the first cache (as it is): 66 with two paths under way, 80 where
+  the addresses did not fit the registers, 65 with the loop unrolled for one number of labels (a kernel for each);
+- in registers, neighbours by shuffles: 70; by turns with loads, so that none crosses a cache line: 61;
+- lane i of vector v holding label i V + v, so that most neighbours are the next vector: 61, and 45 to reorder a cost;
+- up and down with 4, 8, 16, 64 and 250 columns at once: 88, 82, 83, 89, 92; sums of messages beside them instead of in
+  place: 82. Without asking for memory ahead: 10 to 25 more.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.joint.winner import (
+    LARGEST,
+    VECTOR,
+    AnswerSettings,
+    LabelAnswers,
+    ReadoutPointers,
+    answer_columns,
+    desk_memory,
+    desk_of,
+    fetch_answers,
+)
+from rig.simd.memory import address_of, load_bytes, prefetch, read_byte, store_bytes, write_byte
+from rig.simd.vectors import add_saturated_unsigned, smaller_unsigned, smallest_byte, sub_saturated_unsigned, zero_bytes
+
+_SIDE: Final = 2 * VECTOR
+"""Bytes before and behind the labels of a path, whole cache lines: labels beyond the ends, and its least L."""
+_LEAST_AT: Final = -VECTOR
+_CHUNK: Final = 16
+"""Columns that go down and up together: enough that none waits for its own last step, few enough for the caches."""
+_AHEAD: Final = 3
+"""Rows ahead of which memory is asked for: each lies on a page of its own, which the processor does not foresee."""
+_SET, _ADD, _TOTAL = 0, 1, 2
+
+
+class Penalties(NamedTuple):
+    """What a change of label between neighbours costs, in units: a step of 1, 2 or 3 labels, or any other.
+
+    Units of `rig.estimate.joint.labels.costs`, 8 / (1 + K / 8) to a nat of K exposures: in nats a change costs more the
+    more there are.
+    """
+
+    one: int = 16
+    two: int = 24
+    three: int = 30
+    jump: int = 40
+
+
+@numba.njit(cache=True, nogil=True)
+def _path_memory(paths: int, labels: int) -> NDArray[np.uint8]:
+    """Memory for L of the last pixel and of this one on so many paths; must live as long as the paths."""
+    return np.full(2 * paths * (labels + 2 * _SIDE) + _SIDE, LARGEST, np.uint8)
+
+
+@numba.njit(forceinline=True)
+def _paths_in(memory):  # type: ignore[no-untyped-def]
+    """Address of the first path's labels, at a whole cache line."""
+    return -(-address_of(memory) // _SIDE) * _SIDE + _SIDE
+
+
+@numba.njit(forceinline=True)
+def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
+    """Make so many paths begin: no message to their first pixel."""
+    for _ in range(2 * paths):
+        for v in range(0, labels, VECTOR):
+            store_bytes(path, v, zero_bytes())
+        write_byte(path, _LEAST_AT, np.uint8(0))
+        path += labels + 2 * _SIDE
+
+
+@numba.njit(forceinline=True)
+def _vectors(penalties):  # type: ignore[no-untyped-def]
+    """Each penalty as a vector."""
+    none = zero_bytes()
+    return none + penalties.one, none + penalties.two, none + penalties.three, none + penalties.jump
+
+
+@numba.njit(forceinline=True)
+def _step(before, after, cost, message, total, hidden, labels, ahead, penalties, use):  # type: ignore[no-untyped-def]
+    """One pixel of a path: L of its last pixel at `before` to that of this one at `after`; all of these addresses.
+
+    use: whether the message is written to `message`, added to it, or all of them and the cost make up `total`, without
+    the labels that are `hidden`. ahead: bytes to the cost and message that are to be fetched into the cache; 0: none.
+    """
+    one, two, three, jump = penalties
+    least = zero_bytes() + read_byte(before, _LEAST_AT)
+    most = add_saturated_unsigned(least, jump)
+    next_least = zero_bytes() + LARGEST
+    for v in range(0, labels, VECTOR):
+        if ahead != 0 and v & VECTOR == 0:
+            prefetch(cost + ahead + v)
+            prefetch(message + ahead + v)
+        # Both sides at once; what lies beyond the ends is as large as can be.
+        by_one = smaller_unsigned(load_bytes(before, v - 1), load_bytes(before, v + 1))
+        by_two = smaller_unsigned(load_bytes(before, v - 2), load_bytes(before, v + 2))
+        by_three = smaller_unsigned(load_bytes(before, v - 3), load_bytes(before, v + 3))
+        by_one = add_saturated_unsigned(by_one, one)
+        by_two = add_saturated_unsigned(by_two, two)
+        by_three = add_saturated_unsigned(by_three, three)
+        best = smaller_unsigned(smaller_unsigned(by_one, by_two), smaller_unsigned(by_three, load_bytes(before, v)))
+        # L is as it is, not less its least: what is subtracted at the end need not be waited for before.
+        sent = sub_saturated_unsigned(smaller_unsigned(best, most), least)
+        here = add_saturated_unsigned(load_bytes(cost, v), sent)
+        next_least = smaller_unsigned(next_least, here)
+        store_bytes(after, v, here)
+        if use == _SET:
+            store_bytes(message, v, sent)
+        elif use == _ADD:
+            store_bytes(message, v, add_saturated_unsigned(load_bytes(message, v), sent))
+        else:
+            whole = add_saturated_unsigned(load_bytes(message, v), here)
+            store_bytes(total, v, whole | load_bytes(hidden, v))
+    write_byte(after, _LEAST_AT, smallest_byte(next_least))
+
+
+@numba.njit(forceinline=True)
+def _both_ways(cost, message, paths, columns, labels, first, last, penalties, use):  # type: ignore[no-untyped-def]
+    """Steps first..last-1 from both ends of a row; cost, message, paths: addresses."""
+    size = labels + 2 * _SIDE
+    to_right, to_left = first * labels, (columns - 1 - first) * labels
+    before, after = paths + 2 * size * (first & 1), paths + 2 * size * (1 - (first & 1))
+    for _ in range(first, last):
+        _step(before, after, cost + to_right, message + to_right, 0, 0, labels, 0, penalties, use)
+        _step(before + size, after + size, cost + to_left, message + to_left, 0, 0, labels, 0, penalties, use)
+        to_right += labels
+        to_left -= labels
+        before, after = after, before
+
+
+@numba.njit(cache=True, nogil=True)
+def _along_row(cost: int, message: int, columns: int, labels: int, penalties: Penalties, paths: int) -> None:
+    """Messages of both ways along one row; all but numbers addresses."""
+    _begin(paths, 2, labels)
+    vectors, half = _vectors(penalties), columns // 2
+    # From both ends at once, two paths that do not wait for each other: to the middle there is nothing to add to.
+    _both_ways(cost, message, paths, columns, labels, 0, half, vectors, _SET)
+    for v in range(half * labels, (columns - half) * labels, VECTOR):
+        store_bytes(message, v, zero_bytes())
+    _both_ways(cost, message, paths, columns, labels, half, columns, vectors, _ADD)
+
+
+@numba.njit(cache=True, nogil=True)
+def along_rows(
+    cost: NDArray[np.uint8], message: NDArray[np.uint8], penalties: Penalties, first_row: int, last_row: int
+) -> None:
+    """Sums of the messages from the left and from the right, for rows first_row..last_row-1.
+
+    cost, message: (rows, columns, labels), C-contiguous; labels: a multiple of VECTOR.
+    """
+    columns, labels = cost.shape[1], cost.shape[2]
+    memory = _path_memory(2, labels)
+    for row in range(first_row, last_row):
+        at = row * columns * labels
+        _along_row(address_of(cost) + at, address_of(message) + at, columns, labels, penalties, _paths_in(memory))
+    memory[:1] = 0  # it lives until here
+
+
+@numba.njit(cache=True, nogil=True)
+def _step_down(
+    before: int, after: int, cost: int, message: int, labels: int, columns: int, ahead: int, penalties: Penalties
+) -> None:
+    """Some columns of a row on their way down; all but numbers addresses."""
+    # Apart from what surrounds it: all that the loop needs finds room in the registers.
+    vectors = _vectors(penalties)
+    for _ in range(columns):
+        _step(before, after, cost, message, 0, 0, labels, ahead, vectors, _ADD)
+        before, after = before + labels + 2 * _SIDE, after + labels + 2 * _SIDE
+        cost, message = cost + labels, message + labels
+
+
+@numba.njit(cache=True, nogil=True)
+def _step_up(
+    before: int, after: int, cost: int, message: int, labels: int, columns: int, ahead: int, penalties: Penalties,
+    total: int, total_bytes: int, hidden: int,
+) -> None:  # fmt: skip
+    """The same on their way up; writes totals, total_bytes from column to column."""
+    vectors = _vectors(penalties)
+    for _ in range(columns):
+        _step(before, after, cost, message, total, hidden, labels, ahead, vectors, _TOTAL)
+        before, after = before + labels + 2 * _SIDE, after + labels + 2 * _SIDE
+        cost, message, total = cost + labels, message + labels, total + total_bytes
+
+
+@numba.njit(cache=True, nogil=True)
+def _go_down(
+    cost: int, message: int, rows: int, row_bytes: int, labels: int, columns: int, penalties: Penalties, paths: int
+) -> None:
+    """Add the messages from above to those of some columns; cost, message, paths: addresses."""
+    before, after = paths, paths + _CHUNK * (labels + 2 * _SIDE)
+    _begin(paths, _CHUNK, labels)
+    for _ in range(rows):
+        _step_down(before, after, cost, message, labels, columns, _AHEAD * row_bytes, penalties)
+        before, after = after, before
+        cost, message = cost + row_bytes, message + row_bytes
+
+
+@numba.njit(cache=True, nogil=True)
+def _go_up(
+    cost: int, message: int, rows: int, row_bytes: int, columns: int, penalties: Penalties, paths: int, pixel: int,
+    desk: ReadoutPointers,
+) -> None:  # fmt: skip
+    """Totals of some columns and their answers, from the last row on; pixel: place of the first among the answers."""
+    labels = desk.labels
+    width = row_bytes // labels
+    before, after = paths, paths + _CHUNK * (labels + 2 * _SIDE)
+    _begin(paths, _CHUNK, labels)
+    for row in range(rows - 1, -1, -1):
+        costs, messages, here = cost + row * row_bytes, message + row * row_bytes, pixel + row * width
+        fetch_answers(here - _AHEAD * width, columns, desk)
+        _step_up(before, after, costs, messages, labels, columns, -_AHEAD * row_bytes, penalties, desk.totals,
+                 desk.size, desk.hidden)  # fmt: skip
+        answer_columns(here, columns, desk)
+        before, after = after, before
+
+
+@numba.njit(cache=True, nogil=True)
+def along_columns(
+    cost: NDArray[np.uint8],
+    message: NDArray[np.uint8],
+    penalties: Penalties,
+    settings: AnswerSettings,
+    first_column: int,
+    last_column: int,
+    out: LabelAnswers,
+) -> None:
+    """The answers of columns first_column..last_column-1, from what `along_rows` left in all rows of message.
+
+    Adds the messages from above to message.
+    """
+    rows, columns, labels = cost.shape
+    memory, desk_bytes = _path_memory(_CHUNK, labels), desk_memory(settings, _CHUNK, labels)
+    desk = desk_of(settings, out, desk_bytes, _CHUNK, labels)
+    paths, row_bytes = _paths_in(memory), columns * labels
+    for column in range(first_column, last_column, _CHUNK):
+        count, at = min(_CHUNK, last_column - column), column * labels
+        costs, messages = address_of(cost) + at, address_of(message) + at
+        _go_down(costs, messages, rows, row_bytes, labels, count, penalties, paths)
+        _go_up(costs, messages, rows, row_bytes, count, penalties, paths, column, desk)
+    memory[:1] = desk_bytes[:1] = 0  # they live until here

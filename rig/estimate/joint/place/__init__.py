@@ -1,0 +1,1 @@
+"""Sub-pixel positions: each stripe is placed by its own counts and by those of neighbours on the same surface."""

@@ -1,0 +1,197 @@
+"""Compiled light of stripes, see `rig.estimate.joint.place.places`, sixteen stripes to a vector.
+
+Light is the sum over the pixels around a stripe of log (K + 1/2) / (K - n + 1/2): one logarithm of a product. Haze is
+looked up between bins of its profile, from a table with all that is wanted of a bin beside one another.
+"""
+
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.joint.labels.tables import signed_address
+from rig.estimate.joint.place.places import (
+    BLIND_FLUX,
+    LIGHT_PX,
+    MOST_FLUX,
+    REACH_PX,
+    Counts,
+    Places,
+    ambient_place,
+    counts_of,
+    nearest_pixel,
+)
+from rig.estimate.row.inputs import RowState, Sweep, others_at
+from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN
+from rig.simd.functions import logarithm
+from rig.simd.memory import (
+    CACHE_LINE,
+    copy_floats,
+    load_float32,
+    prefetch,
+    read_float32,
+    read_int32,
+    store_float32,
+    write_float32,
+    write_int64,
+)
+from rig.simd.shuffles import EIGHT, fetch_eights
+from rig.simd.vectors import LANES, larger_float, smaller_float, square_root, where_below, where_small, zero_float32
+
+Float32 = NDArray[np.float32]
+
+_SHOWS: Final = np.nextafter(BLIND_FLUX, np.float32(0.0))
+"""Most ambient light of a pixel that still shows something."""
+_LEAST: Final = np.float32(1e-37)
+_PX, _PY, _PZ, _GAIN, _U, _V, _BIN, _PATHS, _PART, _OTHERS, _FRAMES = range(11)
+_LIGHT, _SCALE, _HAZE, _REST, _GLOW, _FIELDS = range(11, 17)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def measure_light(
+    n_frames: NDArray[np.int32],
+    sweep: Sweep,
+    state: RowState,
+    around: Counts,
+    x_px: Float32,
+    first_row: int,
+    last_row: int,
+    out: Places,
+) -> None:
+    """Fill light, scale, haze, rest and glow of rows first_row..last_row-1 for stripes at x_px; zeros where none is.
+
+    around: of `fetch_counts`. Haze is that of the nearest pixel that is searched.
+    """
+    columns, (pixels, last_bin) = x_px.shape[1], (sweep.u.shape[1], np.float32(state.profile.shape[0] - 1.001))
+    window, several, bins = sweep.window, sweep.others.shape[1] > 0, _bins(state.profile, state.glow)
+    # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
+    width = (-(-columns // LANES) | 1) * LANES
+    lines, spare = np.zeros((_FIELDS, width), np.float32), np.full((width, EIGHT), MOST_FLUX, np.float32)
+    taps, ambient_places, bin_places = (
+        np.zeros((2, EIGHT, LANES), np.float32),
+        np.empty(width, np.int64),
+        np.empty(width, np.int64),
+    )
+    # Addresses: threads that count references to the same array wait for one another.
+    at, spare_at, bins_at, taps_at = (
+        signed_address(lines),
+        signed_address(spare),
+        signed_address(bins),
+        signed_address(taps),
+    )
+    ambient_at, bin_at = signed_address(ambient_places), signed_address(bin_places)
+    at_x, at_x0 = signed_address(x_px), signed_address(sweep.x0)
+    at_u, at_v, ambient = signed_address(sweep.u), signed_address(sweep.v), signed_address(state.ambient)
+    at_lo, at_hi, around_at = signed_address(sweep.x_lo), signed_address(sweep.x_hi), signed_address(around)
+    found = (signed_address(out.light), signed_address(out.scale), signed_address(out.haze), signed_address(out.rest),
+             signed_address(out.glow))  # fmt: skip
+    ambient_places[:], bin_places[:], lines[_PX] = spare_at + 4 * EIGHT * (width - 1), bins_at, 1.0
+    for c in range(columns):
+        lines[_PX, c], lines[_PY, c], lines[_PZ, c] = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]
+        lines[_GAIN, c] = state.column_gain[c]
+    for y in range(first_row, last_row):
+        # The next row's, which lies on other pages: not foreseen.
+        for line in range(4 * pixels * (y + 1), 4 * pixels * (y + 2), CACHE_LINE):
+            prefetch(at_u + line)
+            prefetch(at_v + line)
+            prefetch(ambient + line)
+        for c in range(columns):
+            x_line, frames = read_float32(at_x, y * columns + c), n_frames[c]
+            if np.isnan(x_line) or frames == 0:
+                write_float32(at, _FRAMES * width + c, np.float32(0.0))
+                continue
+            x = nearest_pixel(x_line)
+            searched = max(x, int(read_int32(at_lo, y * columns + c)))
+            searched = min(searched, int(read_int32(at_hi, y * columns + c)))
+            write_float32(at, _U * width + c, read_float32(at_u, y * pixels + searched))
+            write_float32(at, _V * width + c, read_float32(at_v, y * pixels + searched))
+            write_float32(at, _FRAMES * width + c, np.float32(frames))
+            own, x0 = spare_at + 4 * EIGHT * c, int(read_int32(at_x0, c))
+            write_int64(ambient_at, c, ambient_place(ambient, pixels, y, x, x0, window, own))
+            if several:
+                lines[_OTHERS, c] = others_at(sweep, state, y, c, searched)
+        _find_bins(at, width, state.row_gain[y], np.float32(state.w_lo), np.float32(state.per_w), last_bin)
+        for c in range(columns):
+            place = read_float32(at, _BIN * width + c)
+            i = int(place)
+            write_float32(at, _PART * width + c, place - np.float32(i))
+            write_int64(bin_at, c, bins_at + 4 * EIGHT * i)
+        for c in range(0, columns, LANES):
+            counts_of(around, around_at, y, c, taps_at)
+            _measure(at + 4 * c, width, taps_at, ambient_at + 8 * c, bin_at + 8 * c)
+        for i in range(len(found)):
+            copy_floats(at + 4 * width * (_LIGHT + i), found[i] + 4 * columns * y, columns)
+    # They live until here: what is known by its address alone would be freed.
+    spare[:1] = bins[:1] = taps[:1] = lines[:1] = 0.0
+    ambient_places[:1] = bin_places[:1] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _bins(profile: Float32, glow: Float32) -> Float32:
+    """Of each bin haze before and behind a stripe, its scale and the halo's glow, and what the next bin has more."""
+    bins = np.zeros((profile.shape[0], EIGHT), np.float32)
+    half = EIGHT // 2
+    bins[:, : half - 1], bins[:, half - 1] = profile[:, : half - 1], glow
+    bins[:-1, half:] = bins[1:, :half] - bins[:-1, :half]
+    return bins
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_bins(at: int, width: int, gain: np.float32, w_lo: np.float32, per_w: np.float32, last: np.float32) -> None:
+    """Where stripes lie among the profile's bins, and the strength of haze there."""
+    for c in range(0, width, LANES):
+        px, py = load_float32(at, _PX * width + c), load_float32(at, _PY * width + c)
+        pz, u, v = load_float32(at, _PZ * width + c), load_float32(at, _U * width + c), load_float32(at, _V * width + c)
+        down = v * v + np.float32(1.0)
+        along = (py * v + pz) / px
+        path_p, path_c = square_root(down + along * along), square_root(down + u * u)
+        w = px * u + (py * v + pz)
+        place = (w * np.float32(2.0) / (path_p + path_c) - w_lo) * per_w
+        store_float32(at, _BIN * width + c, smaller_float(larger_float(place, np.float32(0.0)), last))
+        store_float32(at, _PATHS * width + c, path_p * path_c * load_float32(at, _GAIN * width + c) * gain)
+
+
+@numba.njit(cache=True, nogil=True)
+def _measure(at: int, width: int, taps: int, ambient: int, bins: int) -> None:
+    """Light of LANES stripes and all that is wanted of haze; taps: address of their counts, and room behind them."""
+    near = taps + 4 * EIGHT * LANES
+    one, none, half = zero_float32() + np.float32(1.0), zero_float32(), np.float32(0.5)
+    fetch_eights(ambient, 0, near)
+    frames = load_float32(at, _FRAMES * width)
+    inverse = one / (frames + half)
+    dark, shown, light = one, none, none
+    for d in range(REACH_PX - LIGHT_PX, REACH_PX + LIGHT_PX + 1):
+        own, unlit = (
+            load_float32(near, d * LANES),
+            larger_float(frames - load_float32(taps, d * LANES), np.float32(0.0)),
+        )
+        shows = where_small(one, own, _SHOWS)
+        dark = dark * ((unlit + half) * inverse * shows + (one - shows))
+        shown, light = shown + shows, light - where_small(own, own, _SHOWS)
+    own = load_float32(near, REACH_PX * LANES)
+    own = where_small(own, own, _SHOWS)
+    fetch_eights(bins, 0, near)
+    part, paths, others = (
+        load_float32(at, _PART * width),
+        load_float32(at, _PATHS * width),
+        load_float32(at, _OTHERS * width),
+    )
+    before = _flux(own + paths * (load_float32(near, 0) + part * load_float32(near, 4 * LANES)), others)
+    behind = _flux(own + paths * (load_float32(near, LANES) + part * load_float32(near, 5 * LANES)), others)
+    halo = load_float32(near, 3 * LANES) + part * load_float32(near, 7 * LANES)
+    # A pixel that the picture does not have, or that is blind, counts as one of just the expected light.
+    light = light - logarithm(larger_float(dark, _LEAST)) - shown * ((before + behind) * half - own)
+    # What the halo adds to the light of the line grows with it.
+    light = light / (one + halo * np.float32(2 * LIGHT_PX + 1))
+    scale = load_float32(near, 2 * LANES) + part * load_float32(near, 6 * LANES)
+    store_float32(at, _LIGHT * width, where_below(light, none, none, frames))
+    store_float32(at, _SCALE * width, where_below(scale, none, none, frames))
+    store_float32(at, _HAZE * width, where_below(larger_float(before - own, none), none, none, frames))
+    store_float32(at, _REST * width, where_below(larger_float(behind - own, none), none, none, frames))
+    store_float32(at, _GLOW * width, where_below(halo, none, none, frames))
+
+
+@numba.njit(forceinline=True)
+def _flux(own, others):  # type: ignore[no-untyped-def]
+    return smaller_float(smaller_float(larger_float(own, FLUX_MIN), FLUX_MAX) + others, FLUX_MAX)

@@ -1,0 +1,154 @@
+"""Sub-pixel places of stripes whose labels are known; see `rig.estimate.joint.place.places`."""
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import CountVolume
+from rig.estimate.joint.place.light import measure_light
+from rig.estimate.joint.place.places import REACH_PX, TAPS, Counts, Places, add_moments, fetch_counts
+from rig.estimate.joint.place.pool import join_pairs, pool_amplitude, pool_places
+from rig.estimate.joint.place.score import FRACTIONS, score_places
+from rig.estimate.row.inputs import RowState, Sweep
+from rig.estimate.row.model import pixel_shares
+from rig.geometry.stripe_table import StripeTable
+from rig.simd.memory import aligned_zeros
+from rig.simd.shuffles import EIGHT
+from rig.threads import RowWorkers
+
+LIGHT_REACH = 3
+"""Rows and columns to either side that a stripe's brightness is pooled over."""
+REACHES = (1, 2)
+"""The same of its place: as many as it takes to know it."""
+LESSON_REACHES = (1, 2, 3, 4)
+"""The same for the lessons of the first map, whose places no pairs join: those of weak stripes are so smooth that their
+brightness was learned too dark, and behind a halo `motorcycle` then erred by 1.22 instead of 0.68 px."""
+ENOUGH = 1 / 0.06**2
+"""Information, 1/px^2, from which a place is known well enough: surfaces bend over more neighbours."""
+PAIRS = ((4, 0.576), (6, 0.280))
+"""Rows and columns to the pairs of neighbours that place a stripe further where that is not enough, round by round, and
+the share that they know of what each knows: 5 x 5 neighbours count as 25 stripes, joined with eight such as 140, and
+with eight of those as 454, since these overlap."""
+MOST_MOVED_PX = 0.9
+"""By which a stripe moves, all rounds together: labels, half a pixel apart, end a pixel beyond what is searched, and
+answers 2 px beyond it. Pictures with full pixels alone were moved by more."""
+BEYOND = 3.0
+"""Brightness may exceed the learned amplitudes by this factor either way."""
+DARKEST = 300.0
+"""Stripes are taken to be no darker than the bright ones by this factor."""
+SLOPE_STEP_PX = 0.05
+LEAST_PHOTONS = 100.0
+"""Photons per exposure, over all stripes, that can tell the width of the line."""
+LINE_SIGMA_PX = np.array([0.25, 2.4])
+"""Widths that are looked for."""
+
+
+def profile_table(sigma_px: float) -> NDArray[np.float32]:
+    """Shares of the line and their slopes as `score_places` takes them."""
+    centre = (np.arange(FRACTIONS) + 0.5) / FRACTIONS - 0.5
+    distance = np.arange(-REACH_PX, REACH_PX + 1) - centre[:, None]
+    on, back = (pixel_shares(sigma_px, distance - step) for step in (SLOPE_STEP_PX, -SLOPE_STEP_PX))
+    slope = (on - back) / np.float32(2 * SLOPE_STEP_PX)
+    return np.pad(np.stack([pixel_shares(sigma_px, distance), slope], axis=1), ((0, 0), (0, 0), (0, EIGHT - TAPS)))
+
+
+def new_places(rows: int, columns: int) -> Places:
+    """Room for the places of a map: one piece, so that the system gives it large pages.
+
+    Kernels may read a vector that goes beyond the end of any field but the last.
+    """
+    return Places(*aligned_zeros((len(Places._fields), rows, columns), np.float32))
+
+
+def place(
+    volume: CountVolume,
+    sweep: Sweep,
+    state: RowState,
+    shares: NDArray[np.float32],
+    x_px: NDArray[np.float32],
+    places: Places,
+    workers: RowWorkers,
+    *,
+    lesson: bool = False,
+) -> NDArray[np.float32]:
+    """Move x_px, whose distances from the far end are in `places`, to where neighbours together put it.
+
+    lesson: whether they are to teach the first map. Returns its standard deviation in px; light and haze are left in
+    `places`, with all that was found on the way. The last steps are only posted, see `weigh_light`.
+    """
+    sd = np.empty_like(x_px)
+    around = weigh_light(volume, sweep, state, x_px, places, workers)
+    seen = volume.n_frames, sweep, state, shares, around, x_px
+    distance, placed, joined, joined_sd = places.distance, places.placed, places.joined, places.joined_sd
+    (near, near_share), (far, far_share) = PAIRS
+
+    def pool(first: int, last: int) -> None:
+        pool_places(places, LESSON_REACHES if lesson else REACHES, ENOUGH, first, last, placed, sd)
+        placed[first:last] += distance[first:last]
+
+    def join_near(first: int, last: int) -> None:
+        join_pairs(placed, sd, near, near_share, ENOUGH, first, last, joined, joined_sd)
+
+    def join_far(first: int, last: int) -> None:
+        join_pairs(joined, joined_sd, far, far_share, ENOUGH, first, last, placed, sd)
+
+    def move(first: int, last: int) -> None:
+        moved = placed[first:last] - distance[first:last]
+        x_px[first:last] += np.clip(moved, -MOST_MOVED_PX, MOST_MOVED_PX, out=moved)
+
+    rows = len(x_px)
+    workers.over(rows, lambda first, last: score_places(*seen, first, last, places))
+    workers.over(rows, pool)
+    if not lesson:
+        workers.over(rows, join_near)
+        workers.post(rows, join_far)
+    workers.post(rows, move)
+    return sd
+
+
+def weigh_light(
+    volume: CountVolume, sweep: Sweep, state: RowState, x_px: NDArray[np.float32], places: Places, workers: RowWorkers
+) -> Counts:
+    """Fill light, scale, haze and amplitude of `places` for stripes at x_px, as `state` sees them.
+
+    Returns the counts around the stripes, see `fetch_counts`. Amplitudes are only posted: the same rows' next work can
+    go by them, others settle first.
+    """
+    faintest, brightest = float(state.amplitude[0]) / BEYOND, float(state.amplitude[-1]) * BEYOND
+    around = np.empty((*x_px.shape, EIGHT), volume.counts.dtype)
+    seen = volume.n_frames, sweep, state, around, x_px
+
+    def measure(first: int, last: int) -> None:
+        fetch_counts(volume.counts, sweep.x0, x_px, first, last, around)
+        measure_light(*seen, first, last, places)
+
+    workers.over(len(x_px), measure)
+    workers.post(len(x_px), lambda first, last: pool_amplitude(LIGHT_REACH, faintest, brightest, first, last, places))
+    return around
+
+
+def line_width(
+    volume: CountVolume, sweep: Sweep, state: RowState, stripes: StripeTable, workers: RowWorkers
+) -> float | None:
+    """Standard deviation of the line in px, from the light of clear stripes around their places; None: too little."""
+    sums = np.zeros((stripes.x_px.shape[0], 2))
+    clear = stripes.x_px, stripes.x_sd_px, stripes.confidence, stripes.signal
+    seen = volume.counts, volume.n_frames, sweep, state, *clear
+    workers.over(len(sums), lambda first, last: add_moments(*seen, first, last, sums))
+    light, moment = sums.sum(axis=0)
+    if light < LEAST_PHOTONS:
+        return None
+    pixel_variance = 1 / 12
+    return float(np.sqrt(np.clip(moment / light - pixel_variance, *LINE_SIGMA_PX**2)))
+
+
+def amplitudes_of(places: Places) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Four amplitudes that stand for those of a map's stripes, pooled over neighbours, and their shares."""
+    found = places.amplitude[places.scale > 0]
+    edges, shares = (0.0, 0.2, 0.5, 0.8, 1.0), np.array([0.2, 0.3, 0.3, 0.2])
+    if len(found) == 0:
+        return np.ones(4, np.float32), shares
+    middle = [0.5 * (a + b) for a, b in pairwise(edges)]
+    amplitude = np.quantile(found, middle)
+    return np.maximum(amplitude, amplitude[-1] / DARKEST).astype(np.float32), shares

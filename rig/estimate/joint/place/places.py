@@ -1,0 +1,213 @@
+"""Compiled sub-pixel placing of stripes: one step of Fisher scoring, pooled over neighbours on the same surface.
+
+At its answer each row says how much likelier its counts become with the stripe a little further on (the score g), and
+how much it knows of that at all (the information h). Neighbours on one surface share its distance d from the far end:
+
+    d = sum (h d_n + g_n) / sum h
+
+over them is as good as the maximum of their common likelihood, and 1 / sqrt(sum h) its standard deviation. A stripe's
+brightness is pooled in the same way before: on its own a dark row is taken for a brighter one that stands on haze.
+
+Compiled fetching of what lies around stripes: counts and ambient light of the pixels to both sides.
+
+Counts lie column by column, answers are worked on row by row, sixteen columns to a vector: in tiles of rows and columns
+the counts around all stripes are brought into the order of the answers once, for all that asks for them afterwards.
+"""
+
+from typing import Any, Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.joint.labels.tables import signed_address
+from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light
+from rig.simd.memory import prefetch, read_float32, read_int64, write_float32, write_int64
+from rig.simd.shuffles import EIGHT, spread_eights
+from rig.simd.vectors import LANES
+
+Float32 = NDArray[np.float32]
+
+REACH_PX: Final = 3
+"""Pixels to either side of a stripe that say where it is."""
+LIGHT_PX: Final = 2
+"""Pixels to either side that its light is summed over."""
+CLEAR: Final = 0.9
+CLEAR_SD_PX: Final = 0.2
+"""Stripes this clear, and placed this well, tell the width of the line."""
+BESIDE_PX: Final = 5, 6
+"""Pixels to either side, from and to, that show how much of a halo is under a line, and nothing of the line."""
+BLIND_FLUX: Final = np.float32(3.0)
+"""A pixel with so much ambient light fires in 95 % of all frames and shows no more; so does one not to be used."""
+LEAST_FRAMES: Final = 2.0
+"""With fewer, light beside a line in a halo is told so badly that the line seems far too narrow."""
+FEW_FRAMES: Final = 3.0
+"""Up to so many frames counts are taken as they are: the flux of a full pixel would be a guess."""
+DARK_FRAMES: Final = 1.5
+FEW_FRAMES_FLUX: Final = 0.5
+"""A pixel of FEW_FRAMES is taken to be full from here on."""
+
+
+class Places(NamedTuple):
+    """Room for what is known of each stripe, float32 (rows, columns) each.
+
+    distance: x from the far end in px, NaN where there is none; light: photons per exposure above haze and ambient;
+    scale: those of amplitude 1; haze, rest: before and behind it; glow: of the halo at the stripe, photons per pixel
+    over those of the stripe; known: h of the module; score: h times distance, plus g; placed: the final distance;
+    joined, joined_sd: distance and its standard deviation on the way there.
+    """
+
+    distance: Float32
+    light: Float32
+    scale: Float32
+    amplitude: Float32
+    haze: Float32
+    rest: Float32
+    glow: Float32
+    score: Float32
+    known: Float32
+    placed: Float32
+    joined: Float32
+    joined_sd: Float32
+
+
+@numba.njit(inline="always")
+def most_shown(frames):  # type: ignore[no-untyped-def]
+    """Flux up to which the counts of so many frames tell well how bright a pixel is: DARK_FRAMES of them stay dark."""
+    return np.log(frames / DARK_FRAMES) if frames > FEW_FRAMES else FEW_FRAMES_FLUX
+
+
+@numba.njit(cache=True, nogil=True)
+def add_moments(
+    counts: NDArray[np.unsignedinteger],
+    n_frames: NDArray[np.int32],
+    sweep: Sweep,
+    state: RowState,
+    x_px: Float32,
+    sd_px: Float32,
+    confidence: Float32,
+    signal: Float32,
+    first_row: int,
+    last_row: int,
+    sums: NDArray[np.float64],
+) -> None:
+    """Add to sums (rows, 2) the light of clear stripes within REACH_PX, and that times its squared distance less sd^2.
+
+    Light above haze, halo and ambient, photons; what is added to a row of sums comes from that row of the picture.
+    Where there is a halo stripes that fill their pixels are left out: it would pass for the flanks that they lack.
+    """
+    for y in range(first_row, last_row):
+        for c in range(x_px.shape[1]):
+            if not (confidence[y, c] > CLEAR and sd_px[y, c] < CLEAR_SD_PX and n_frames[c] > 0):
+                continue
+            x = int(np.rint(x_px[y, c]))
+            begin, end = x - BESIDE_PX[1], x + BESIDE_PX[1]
+            if begin < max(sweep.x0[c], 0) or end >= min(sweep.x0[c] + sweep.window, sweep.u.shape[1]):
+                continue
+            # Pixels without a ray lie at the ends of a row.
+            if np.isnan(sweep.u[y, begin]) or np.isnan(sweep.u[y, end]):
+                continue
+            if state.ambient[y, begin : end + 1].max() >= BLIND_FLUX:
+                continue
+            path_p, strength = line_light(sweep, state, y, c, x)
+            before, behind, _, _, _, cell, _ = fluxes_at(sweep, state, y, x, c, path_p, strength)
+            reach, frames = REACH_PX, np.float64(n_frames[c])
+            if state.glow[cell] > 0.0:
+                reach = BESIDE_PX[1]
+                if frames < LEAST_FRAMES or signal[y, c] * state.psi[0] > most_shown(frames):
+                    continue
+            side = 1 if sweep.near_is_left else -1
+            halo, level, wide = 0.0, 0.0, 0.0
+            for t in range(x - reach, x + reach + 1):
+                if REACH_PX < abs(t - x) < BESIDE_PX[0]:
+                    continue
+                away = t - np.float64(x_px[y, c])
+                lit = min(max(0.5 - side * away, 0.0), 1.0)
+                base = state.ambient[y, t] - state.ambient[y, x] + behind + lit * (before - behind)
+                n = min(np.float64(counts[c, y, t - sweep.x0[c]]), frames)
+                light = np.log((frames + 0.5) / (frames - n + 0.5)) if frames > FEW_FRAMES else n / frames
+                light -= base if frames > FEW_FRAMES else -np.expm1(-base)
+                if abs(t - x) > REACH_PX:
+                    halo += light / (2 * (BESIDE_PX[1] - BESIDE_PX[0] + 1))
+                    continue
+                spread = away * away - sd_px[y, c] * sd_px[y, c]
+                sums[y, 0] += light
+                sums[y, 1] += light * spread
+                level += 1.0
+                wide += spread
+            sums[y, 0] -= halo * level
+            sums[y, 1] -= halo * wide
+
+
+Counts = NDArray[np.unsignedinteger[Any]]
+
+TAPS: Final = 2 * REACH_PX + 1
+"""Pixels around a stripe that are looked at; EIGHT are fetched."""
+MOST_FLUX: Final = np.float32(20.0)
+"""In more light no pixel stays dark in a thousand million exposures; ambient light of pixels that there are not."""
+_TILE: Final = 16
+
+
+@numba.njit(cache=True, nogil=True)
+def fetch_counts(
+    counts: Counts, x0: NDArray[np.int32], x_px: Float32, first_row: int, last_row: int, around: Counts
+) -> None:
+    """Fill around (rows, columns, EIGHT) of rows first_row..last_row-1: counts from REACH_PX before each stripe on.
+
+    counts: (columns, rows, window), C-contiguous; around: of the same type. 0 where no pixel was stored, of any value
+    where there is no stripe.
+    """
+    columns, rows, window = counts.shape
+    size, column = counts.itemsize, rows * window * counts.itemsize
+    source, to = signed_address(counts), signed_address(around)
+    for top in range(first_row, last_row, _TILE):
+        for left in range(0, columns, _TILE):
+            for c in range(left, min(left + _TILE, columns)):
+                for y in range(top, min(top + _TILE, last_row)):
+                    if np.isnan(x_px[y, c]):
+                        continue
+                    first = nearest_pixel(x_px[y, c]) - REACH_PX - int(x0[c])
+                    if 0 <= first <= window - EIGHT:
+                        at = source + ((c * rows + y) * window + first) * size
+                        # Counts of one column after the other are not what a processor foresees.
+                        prefetch(at + column)
+                        for i in range(size):
+                            write_int64(to + (y * columns + c) * EIGHT * size, i, read_int64(at, i))
+                    else:
+                        for d in range(EIGHT):
+                            stored = 0 <= first + d < window
+                            around[y, c, d] = counts[c, y, first + d] if stored else 0
+
+
+@numba.njit(inline="always")
+def nearest_pixel(x):  # type: ignore[no-untyped-def]
+    """The pixel that holds x."""
+    return int(np.floor(x + np.float32(0.5)))
+
+
+@numba.njit(forceinline=True)
+def ambient_place(ambient, width, y, x, x0, window, spare):  # type: ignore[no-untyped-def]
+    """Address of the ambient light from REACH_PX before pixel x on; it is written to `spare` where it is not all there.
+
+    ambient: address of rows of `width` pixels; spare: that of EIGHT numbers, given MOST_FLUX at pixels that were not
+    stored or that the picture does not have.
+    """
+    first, low, high = x - REACH_PX, max(x0, 0), min(x0 + window, width)
+    if low <= first <= high - EIGHT:
+        return ambient + 4 * (y * width + first)
+    for d in range(EIGHT):
+        there = low <= first + d < high
+        write_float32(spare, d, read_float32(ambient, y * width + first + d) if there else MOST_FLUX)
+    return spare
+
+
+@numba.njit(forceinline=True)
+def counts_of(around, at, y, c, to):  # type: ignore[no-untyped-def]
+    """Write EIGHT vectors of the counts of stripes c..c+LANES-1, see `fetch_counts`, to address `to`; at: of around."""
+    if around.itemsize == 1 and c + LANES <= around.shape[1]:
+        spread_eights(at + (y * around.shape[1] + c) * EIGHT, to)
+        return
+    for i in range(LANES):
+        for d in range(EIGHT):
+            count = np.float32(around[y, c + i, d]) if c + i < around.shape[1] else np.float32(0.0)
+            write_float32(to, d * LANES + i, count)

@@ -1,0 +1,257 @@
+"""Compiled sums over neighbours on the same surface, sixteen stripes to a vector.
+
+Neighbours whose distances from the far end differ by too much are left out one by one, so that no running sums will do.
+Rows are worked on in copies with a margin of stripes that lie nowhere: no neighbour has to be asked for.
+
+Compiled placing by pairs of neighbours opposite each other, sixteen stripes to a vector.
+
+The mean of two places that lie opposite each other on a plane is the place between them, whatever the plane's slope. So
+a stripe is joined by its opposite neighbours some stripes away, each placed with its own neighbourhood before, where
+their mean m agrees with its own place d: within SAME_PX, and within SIGMAS of what the standard deviations of both let
+expect,
+
+    d' = (d / s^2 + sum m / v) / (1 / s^2 + sum 1 / v),    v = (s1^2 + s2^2) / 4
+
+Where a surface ends or bends they do not agree, and the stripe stays where it is. Two such rounds reach as far as 25 x
+25 neighbours for the work of 16: with as many summed one by one (`rig.estimate.joint.place.pool`) slopes have to be
+less than SAME_PX over the whole reach, and half a neighbourhood at an edge is off by its slope.
+
+Neighbourhoods overlap, so that pairs know less than the sum of what each knows: `share` of it, which is what makes the
+standard deviation right where all agree.
+"""
+
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.joint.labels.tables import signed_address
+from rig.estimate.joint.place.places import Places
+from rig.simd.memory import copy_floats, load_float32, store_float32
+from rig.simd.vectors import (
+    LANES,
+    larger_float,
+    largest_float,
+    smaller_float,
+    smallest_float,
+    square_root,
+    where_below,
+    where_small,
+    zero_float32,
+)
+
+Float32 = NDArray[np.float32]
+
+SAME_PX: Final = np.float32(1.0)
+"""Neighbours whose distances from the far end differ by no more lie on the same surface."""
+MARGIN: Final = 6
+"""Rows above and below that copies have more, as far as anything is pooled; to both sides they have LANES columns."""
+COPIED_ROWS: Final = 32
+"""Rows that are copied at once where that leaves the copies in the cache."""
+_LEAST: Final = np.float32(1e-12)
+
+
+@numba.njit(cache=True, nogil=True)
+def with_margin(array: Float32, first_row: int, last_row: int) -> Float32:
+    """Copy of rows first_row..last_row-1 with the rows and columns around them, NaN where there are none."""
+    rows, columns = array.shape
+    top, end = max(first_row - MARGIN, 0), min(last_row + MARGIN, rows)
+    width = (-(-columns // LANES) + 2) * LANES
+    copy, nowhere = np.empty((last_row - first_row + 2 * MARGIN, width), np.float32), np.float32(np.nan)
+    source, to = signed_address(array), signed_address(copy)
+    for y in range(first_row - MARGIN, last_row + MARGIN):
+        line = copy[y - first_row + MARGIN]
+        if top <= y < end:
+            line[:LANES], line[LANES + columns :] = nowhere, nowhere
+            copy_floats(source + 4 * columns * y, to + 4 * (width * (y - first_row + MARGIN) + LANES), columns)
+        else:
+            line[:] = nowhere
+    return copy
+
+
+@numba.njit(cache=True, nogil=True)
+def pool_row(distance: Float32, first: Float32, second: Float32, y: int, reach: int, sums: Float32) -> None:
+    """Sums of `first` and `second` over the neighbours of row y on the same surface, itself included.
+
+    distance, first, second: of `with_margin`, y: counted from their first row that is no margin. sums: (2, columns), of
+    a number of columns that is a multiple of LANES.
+    """
+    sums[:] = 0.0
+    at = signed_address(distance), signed_address(first), signed_address(second)
+    widen_row(at, distance.shape[1], y, -1, reach, np.inf, signed_address(sums))
+
+
+@numba.njit(cache=True, nogil=True)
+def widen_row(at: tuple[int, int, int], width: int, y: int, inner: int, reach: int, enough: float, sums: int) -> None:
+    """Add those neighbours that are more than `inner` rows or columns away, up to `reach`.
+
+    Stripes whose second sum is `enough` already may be left as they are. at, sums: addresses; width: of copies.
+    """
+    columns = width - 2 * LANES
+    for c in range(0, columns, LANES):
+        if smallest_float(load_float32(sums, columns + c)) < enough:
+            _widen_block(at, sums, width, (y + MARGIN) * width + LANES + c, c, inner, reach)
+
+
+@numba.njit(cache=True, nogil=True)
+def _widen_block(at: tuple[int, int, int], to: int, width: int, here: int, c: int, inner: int, reach: int) -> None:
+    """The same of LANES stripes from number `here` of the copies on, whose sums are those from c on."""
+    own, columns = load_float32(at[0], here), width - 2 * LANES
+    a, b = load_float32(to, c), load_float32(to, columns + c)
+    for away in range(-reach, reach + 1):
+        line = here + away * width
+        nearest = inner if abs(away) <= inner else -1
+        for i in range(line - reach, line - max(nearest, 0)):
+            off = load_float32(at[0], i) - own
+            a = a + where_small(load_float32(at[1], i), off, SAME_PX)
+            b = b + where_small(load_float32(at[2], i), off, SAME_PX)
+        for i in range(line + nearest + 1, line + reach + 1):
+            off = load_float32(at[0], i) - own
+            a = a + where_small(load_float32(at[1], i), off, SAME_PX)
+            b = b + where_small(load_float32(at[2], i), off, SAME_PX)
+    store_float32(to, c, a)
+    store_float32(to, columns + c, b)
+
+
+@numba.njit(cache=True, nogil=True)
+def pool_amplitude(
+    reach: int, faintest: float, brightest: float, first_row: int, last_row: int, places: Places
+) -> None:
+    """Fill amplitude: brightness of each stripe over that of its scale, pooled over neighbours, between two limits."""
+    amplitude, columns = signed_address(places.amplitude), places.amplitude.shape[1]
+    sums = np.empty((2, -(-columns // LANES) * LANES), np.float32)
+    at, width = signed_address(sums), sums.shape[1]
+    for band in range(first_row, last_row, COPIED_ROWS):
+        end = min(band + COPIED_ROWS, last_row)
+        distance = with_margin(places.distance, band, end)
+        light, scale = with_margin(places.light, band, end), with_margin(places.scale, band, end)
+        for y in range(band, end):
+            pool_row(distance, light, scale, y - band, reach, sums)
+            for c in range(0, width, LANES):
+                own = load_float32(at, c) / larger_float(load_float32(at, width + c), _LEAST)
+                store_float32(at, c, smaller_float(larger_float(own, faintest), brightest))
+            copy_floats(at, amplitude + 4 * columns * y, columns)
+    sums[:1] = 0.0  # it lives until here: what is known by its address alone would be freed
+
+
+@numba.njit(cache=True, nogil=True)
+def pool_places(
+    places: Places, reaches: tuple[int, ...], enough: float, first_row: int, last_row: int, moved: Float32, sd: Float32
+) -> None:
+    """By how far in x each stripe is to move, and the standard deviation of where it is then, in px.
+
+    reaches: sizes of the neighbourhood, smallest first; the first one that knows `enough` (1/px^2) is taken.
+    """
+    columns = moved.shape[1]
+    # Two sums, by how far to move, and the standard deviation, negative where it is not known yet.
+    lines = np.empty((4, -(-columns // LANES) * LANES), np.float32)
+    to, to_moved, to_sd = signed_address(lines), signed_address(moved), signed_address(sd)
+    for band in range(first_row, last_row, COPIED_ROWS):
+        end = min(band + COPIED_ROWS, last_row)
+        distance = with_margin(places.distance, band, end)
+        score, known = with_margin(places.score, band, end), with_margin(places.known, band, end)
+        at, width = (signed_address(distance), signed_address(score), signed_address(known)), distance.shape[1]
+        for y in range(band, end):
+            lines[:3], lines[3] = 0.0, -1.0
+            lines[1, columns:] = np.inf  # nothing to look for beyond the last column
+            own = at[0] + 4 * ((y - band + MARGIN) * width + LANES)
+            for i in range(len(reaches)):
+                inner, last = reaches[i - 1] if i > 0 else -1, i == len(reaches) - 1
+                widen_row(at, width, y - band, inner, reaches[i], enough, to)
+                if not _settle(to, width - 2 * LANES, own, -np.inf if last else enough):
+                    break
+            copy_floats(to + 8 * (width - 2 * LANES), to_moved + 4 * columns * y, columns)
+            copy_floats(to + 12 * (width - 2 * LANES), to_sd + 4 * columns * y, columns)
+        # They live until here: what is known by its address alone would be freed.
+        distance[:1] = score[:1] = known[:1] = 0.0
+    lines[:1] = 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _settle(lines: int, columns: int, distance: int, enough: float) -> bool:
+    """Place the stripes that are not placed yet and know enough; whether any others are left."""
+    one, none, least = zero_float32() + np.float32(1.0), zero_float32(), zero_float32()
+    for c in range(0, columns, LANES):
+        known, before = load_float32(lines, columns + c), load_float32(lines, 3 * columns + c)
+        information = larger_float(known, _LEAST)
+        step = load_float32(lines, c) / information - load_float32(distance, c)
+        step = smaller_float(larger_float(step, np.float32(-1.0)), np.float32(1.0))
+        step = where_below(step, none, none, known)
+        sd = smaller_float(one / square_root(information), np.float32(1.0))
+        sd = where_below(none - one, sd, known, enough)
+        store_float32(lines, 2 * columns + c, where_below(step, load_float32(lines, 2 * columns + c), before, none))
+        sd = where_below(sd, before, before, none)
+        least = smaller_float(least, sd)
+        store_float32(lines, 3 * columns + c, sd)
+    return bool(smallest_float(least) < 0.0)
+
+
+SIGMAS: Final = 2.0
+"""Standard deviations by which a pair may differ from the stripe between it: what belongs together nearly always does,
+and a surface that bends by more than its noise is left as it is."""
+
+
+@numba.njit(cache=True, nogil=True)
+def join_pairs(
+    distance: Float32,
+    sd_px: Float32,
+    step: int,
+    share: float,
+    enough: float,
+    first_row: int,
+    last_row: int,
+    out_distance: Float32,
+    out_sd_px: Float32,
+) -> None:
+    """Fill the outputs, (rows, columns) as the inputs, of rows first_row..last_row-1.
+
+    distance: from the far end in px, NaN where there is no stripe; sd_px: at most 1, which is to know nothing. step:
+    rows and columns to the neighbours, at most MARGIN. enough: 1/px^2, from which on a stripe stays where it is.
+    """
+    columns = distance.shape[1]
+    to_distance, to_sd = signed_address(out_distance), signed_address(out_sd_px)
+    lines = np.empty((2, (-(-columns // LANES) + 2) * LANES), np.float32)
+    at = signed_address(lines)
+    for band in range(first_row, last_row, COPIED_ROWS):
+        end = min(band + COPIED_ROWS, last_row)
+        places, sds = with_margin(distance, band, end), with_margin(sd_px, band, end)
+        around, width = (signed_address(places), signed_address(sds)), places.shape[1]
+        for y in range(band, end):
+            _join_row(around, width, (y - band + MARGIN) * width + LANES, step, share, 1.0 / enough, at)
+            copy_floats(at, to_distance + 4 * columns * y, columns)
+            copy_floats(at + 4 * width, to_sd + 4 * columns * y, columns)
+        # They live until here: what is known by its address alone would be freed.
+        places[:1] = sds[:1] = 0.0
+    lines[:1] = 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _join_row(at: tuple[int, int], width: int, here: int, step: int, share: float, known: float, out: int) -> None:
+    """One row, whose first stripe is element `here` of the copies; known: variance from which on stripes stay."""
+    one, none = zero_float32() + np.float32(1.0), zero_float32()
+    quarter, sigmas, shared = np.float32(0.25), np.float32(SIGMAS * SIGMAS), np.float32(share)
+    enough = np.float32(known)
+    for c in range(0, width - 2 * LANES, LANES):
+        own, sd = load_float32(at[0], here + c), load_float32(at[1], here + c)
+        variance = sd * sd
+        if largest_float(variance) <= enough:
+            store_float32(out, c, own)
+            store_float32(out, width + c, sd)
+            continue
+        information = one / variance
+        pull, joined = none, none
+        for away in (1, width - 1, width, width + 1):
+            a, b = here + c - step * away, here + c + step * away
+            first, second = load_float32(at[1], a), load_float32(at[1], b)
+            first, second = first * first, second * second
+            both = (first + second) * quarter
+            off = (load_float32(at[0], a) + load_float32(at[0], b)) * np.float32(0.5) - own
+            weight = where_below(one / both, none, off * off, (both + variance) * sigmas)
+            weight = where_below(where_small(weight, off, SAME_PX), none, larger_float(first, second), one)
+            pull = pull + where_small(off, off, SAME_PX) * weight
+            joined = joined + weight
+        moved = own + pull / (information + joined)
+        store_float32(out, c, where_below(moved, own, none + enough, variance))
+        told = one / square_root(information + joined * shared)
+        store_float32(out, width + c, where_below(told, sd, none + enough, variance))

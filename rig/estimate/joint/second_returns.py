@@ -1,0 +1,376 @@
+"""Second returns: where the counts themselves show another line beside the stripe, and how probably so.
+
+In haze a row cannot answer with both: the light behind the nearer one excludes that it ends there, so that the best
+rival of an answer is hardly ever the second surface. `rig.estimate.joint.second_returns` looks for its light instead.
+
+Compiled search for light of a second surface beside each stripe: a pane before a wall, a twig, a flake of snow.
+
+Such light stands off the haze by too little for a row alone, and rows that see both surfaces answer with one of them.
+So light is summed over blocks of rows and columns at equal distances from the far end first
+(`rig.estimate.joint.second_return_blocks`), pixel by pixel of distance, and compared with what haze and ambient light
+bring; then each row is asked itself, with its neighbours.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import CountVolume
+from rig.estimate.joint.labels.costs import hot_in_bands
+from rig.estimate.joint.labels.grid import PER_PX, LabelGrid
+from rig.estimate.joint.labels.tables import signed_address
+from rig.estimate.joint.place.pool import pool_row, with_margin
+from rig.estimate.joint.second_return_blocks import BLOCK, HAZE_STEP, LEFT_OUT, Blocks, line_places, sum_blocks
+from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light, with_rays
+from rig.simd.memory import aligned_zeros, load_float32, store_float32
+from rig.simd.vectors import LANES, larger_float, largest_float, square_root, zero_float32
+from rig.threads import RowWorkers, Work
+
+Float32 = NDArray[np.float32]
+
+RING_PX: Final = 4
+"""Pixels to either side of where light is looked for that tell whether haze is as strong as was learned."""
+GAP_PX: Final = 1
+"""Pixels between the two."""
+LEAST_RING: Final = 0.25
+"""Share of those pixels that must be seen on each side."""
+STEEPER: Final = 1.5
+"""Haze that the ring shows beyond the learned one may be this much more between its two sides: it is not straight."""
+CANDIDATE: Final = np.float32(4.0)
+"""Standard deviations from which a block's light is looked at more closely."""
+REACH: Final = 3
+"""Rows and columns to either side that light is pooled over in the end."""
+LOG_ODDS: Final = -16.0, 0.4, 3.0
+"""Log odds that a candidate is right: these times 1, and the standard deviations of its own light and its block's.
+
+Between what maps with a pane over a third of them ask for and what those without any do: fitted to both, rounded."""
+_AROUND: Final = -(-(RING_PX + GAP_PX + 6) // LANES) * LANES
+"""Room beside the pixels of distance: whatever the line's reach, up to 6 px."""
+
+
+class Candidates(NamedTuple):
+    """What stands out most in each block and its neighbours, float32 (block rows, block columns) each.
+
+    distance: from the far end in px, NaN where nothing does; sure: standard deviations by which its light does; haze:
+    how much stronger haze is there than was learned, at least 1.
+    """
+
+    distance: Float32
+    sure: Float32
+    haze: Float32
+
+
+class Seconds(NamedTuple):
+    """What is known of second returns, float32 (rows, columns) each.
+
+    distance: from the far end in px, NaN where there is no candidate; ones, expected: within the line's reach of it;
+    light, moment: ones above those expected, and that times the distance in px.
+    """
+
+    distance: Float32
+    ones: Float32
+    expected: Float32
+    light: Float32
+    moment: Float32
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, last_block: int, out: Candidates) -> None:
+    """Fill rows of blocks first_block..last_block-1. reach: of the line's light, px."""
+    rows, columns, pixels = blocks.ones.shape
+    three = np.zeros((2, columns, pixels), np.float32)
+    nine, above = np.zeros((2, pixels + 2 * _AROUND), np.float32), np.empty(pixels, np.float32)
+    room, excess, row = signed_address(nine), signed_address(above), 4 * pixels * columns
+    of_three, of_nine = signed_address(three), room + 4 * _AROUND
+    ones, expected = signed_address(blocks.ones), signed_address(blocks.expected)
+    for by in range(first_block, last_block):
+        lines = max(by - 1, 0), min(by + 2, rows)
+        _add_lines(ones + row * lines[0], row, lines[1] - lines[0], pixels * columns, of_three)
+        _add_lines(expected + row * lines[0], row, lines[1] - lines[0], pixels * columns, of_three + row)
+        for bx in range(columns):
+            first, number = max(bx - 1, 0), min(bx + 2, columns) - max(bx - 1, 0)
+            _add_lines(of_three + 4 * pixels * first, 4 * pixels, number, pixels, of_nine)
+            _add_lines(of_three + row + 4 * pixels * first, 4 * pixels, number, pixels, of_nine + 4 * nine[0].size)
+            out.distance[by, bx], out.sure[by, bx], out.haze[by, bx] = np.nan, CANDIDATE, 1.0
+            if not _light_above(room, pixels, reach, excess) > 0.0:
+                continue
+            for i in range(pixels):
+                if above[i] > 0.0:
+                    sure, more = _stands_out(nine, i + _AROUND, reach)
+                    if sure > out.sure[by, bx]:
+                        out.distance[by, bx] = i - (pixels - 1 if side > 0 else 0)
+                        out.sure[by, bx], out.haze[by, bx] = sure, more
+    three[:1] = 0.0  # it lives until here: what is known by its address alone would be freed
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_lines(first: int, apart: int, number: int, size: int, total: int) -> None:
+    """The sum of some lines of `size` numbers, `apart` bytes from one another; first, total: addresses."""
+    for i in range(0, size, LANES):
+        lines = load_float32(first, i)
+        for k in range(1, number):
+            lines = lines + load_float32(first + k * apart, i)
+        store_float32(total, i, lines)
+
+
+@numba.njit(cache=True, nogil=True)
+def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
+    """By how much the light around each pixel exceeds what CANDIDATE allows, and the most; room, excess: addresses."""
+    row, most = pixels + 2 * _AROUND, zero_float32()
+    for i in range(0, pixels, LANES):
+        ones, expected = zero_float32(), zero_float32()
+        for k in range(_AROUND - reach, _AROUND + reach + 1):
+            ones = ones + load_float32(room, i + k)
+            expected = expected + load_float32(room, row + i + k)
+        noise = square_root(expected + np.float32(1.0)) * CANDIDATE
+        above = ones - expected - noise
+        most = larger_float(most, above)
+        store_float32(excess, i, above)
+    return np.float32(largest_float(most))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _stands_out(sums: Float32, i: int, reach: int) -> tuple[float, float]:
+    """Standard deviations by which the light around i exceeds what its ring expects of haze; how much more that is."""
+    n, e = sums[0, i - reach : i + reach + 1].sum(), sums[1, i - reach : i + reach + 1].sum()
+    more = 1.0
+    # Light that only falls off to one side is a halo of the stripe or haze that was learned too weak.
+    for start in (i - reach - GAP_PX - RING_PX, i + reach + 1 + GAP_PX):
+        ring, asked = sums[0, start : start + RING_PX].sum(), sums[1, start : start + RING_PX].sum()
+        if not asked > LEAST_RING * e * RING_PX / (2 * reach + 1):
+            return 0.0, 1.0
+        more = max(more, (ring + 1.0) / (asked + 1.0))
+    more = 1.0 + STEEPER * (more - 1.0)
+    return (n - e * more) / np.sqrt(e * more + 1.0), more
+
+
+@numba.njit(cache=True, nogil=True)
+def begin_seconds(candidates: Candidates, first_row: int, last_row: int, out: Seconds) -> None:
+    """Give each of rows first_row..last_row-1 the distances of its blocks' candidates."""
+    for y in range(first_row, last_row):
+        for c in range(out.distance.shape[1]):
+            out.distance[y, c] = candidates.distance[y // BLOCK, c // BLOCK]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def measure_seconds(
+    counts: NDArray[np.unsignedinteger],
+    n_frames: NDArray[np.int32],
+    sweep: Sweep,
+    state: RowState,
+    still: Float32,
+    x_far: NDArray[np.float64],
+    side: int,
+    apart: float,
+    reach: int,
+    x_px: Float32,
+    haze: Float32,
+    first_row: int,
+    last_row: int,
+    out: Seconds,
+) -> None:
+    """Fill all but distance of candidates of rows first_row..last_row-1; zeros near a stripe and where none is asked.
+
+    state, still: see `SecondLight`; haze: of `Candidates`.
+    """
+    width = sweep.u.shape[1]
+    alone = still[LANES:-LANES].reshape(sweep.u.shape)
+    for y in range(first_row, last_row):
+        for c in range(x_px.shape[1]):
+            # Whatever an earlier map left there: neighbours pool it where the distance is known, searched or not.
+            out.ones[y, c] = out.expected[y, c] = out.light[y, c] = out.moment[y, c] = 0.0
+            place = np.float32(x_far[y, c]) + out.distance[y, c]
+            if np.isnan(place) or np.isnan(x_px[y, c]) or sweep.x_lo[y, c] > sweep.x_hi[y, c]:
+                continue
+            lo, hi = with_rays(sweep.u, y, max(sweep.x0[c], 0), min(sweep.x0[c] + sweep.window, width) - 1)
+            x, frames = int(np.rint(place)), np.float32(n_frames[c])
+            at = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
+            path_p, strength = line_light(sweep, state, y, c, at)
+            # Of both sides: what the lesson of the haze took for haze may be light of the second surface itself.
+            near, far = max(at - HAZE_STEP // 2, lo), min(at + HAZE_STEP // 2, hi)
+            before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, near, c, path_p, strength)
+            before_too, behind_too, _, _, _, _, _ = fluxes_at(sweep, state, y, far, c, path_p, strength)
+            more = haze[y // BLOCK, c // BLOCK]
+            before = np.exp(np.float32(-0.5) * more * (before + before_too))
+            behind = np.exp(np.float32(-0.5) * more * (behind + behind_too))
+            for t in range(max(x - reach, lo), min(x + reach, hi) + 1):
+                if abs(t - x_px[y, c]) < apart or alone[y, t] == LEFT_OUT:
+                    continue
+                clear = before if (t - x_px[y, c]) * side < 0 else behind
+                n = np.float32(counts[c, y, t - sweep.x0[c]])
+                e = (np.float32(1.0) - clear * alone[y, t]) * frames
+                out.ones[y, c] += n
+                out.expected[y, c] += e
+                out.light[y, c] += n - e
+                out.moment[y, c] += (n - e) * (t - place)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds, moved: Float32) -> None:
+    """Distance of each candidate, moved to the middle of the light around it, pooled over neighbours."""
+    distance = with_margin(seconds.distance, first_row, last_row)
+    moment, light = with_margin(seconds.moment, first_row, last_row), with_margin(seconds.light, first_row, last_row)
+    sums = np.empty((2, distance.shape[1] - 2 * LANES), np.float32)
+    for y in range(first_row, last_row):
+        if np.isnan(seconds.distance[y]).all():
+            moved[y] = np.nan
+            continue
+        pool_row(distance, moment, light, y - first_row, REACH, sums)
+        for c in range(moved.shape[1]):
+            step = sums[0, c] / sums[1, c] if sums[1, c] > 0.0 else np.float32(0.0)
+            moved[y, c] = seconds.distance[y, c] + min(max(step, np.float32(-reach)), np.float32(reach))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def judge_seconds(
+    x_far: NDArray[np.float64],
+    x_px: Float32,
+    sure: Float32,
+    first_row: int,
+    last_row: int,
+    seconds: Seconds,
+    x2_px: Float32,
+    confidence2: Float32,
+) -> None:
+    """Fill x2_px and confidence2 of rows first_row..last_row-1; NaN and 0 where nothing stands out.
+
+    A candidate's light, pooled over neighbours, stands out by the signed root of twice the gain in log-likelihood of
+    Poisson counts, in standard deviations: right for few photons, too. sure: of `Candidates`.
+    """
+    distance = with_margin(seconds.distance, first_row, last_row)
+    ones, expected = with_margin(seconds.ones, first_row, last_row), with_margin(seconds.expected, first_row, last_row)
+    sums = np.empty((2, distance.shape[1] - 2 * LANES), np.float32)
+    for y in range(first_row, last_row):
+        x2_px[y], confidence2[y] = np.nan, 0.0
+        if np.isnan(seconds.distance[y]).all():
+            continue
+        pool_row(distance, ones, expected, y - first_row, REACH, sums)
+        for c in range(x_px.shape[1]):
+            n, e = sums[0, c], max(sums[1, c], np.float32(1e-3))
+            if n > e and not np.isnan(x_px[y, c]):
+                own = np.sqrt(2.0 * max(n * np.log(n / e) - (n - e), 0.0))
+                odds = LOG_ODDS[0] + LOG_ODDS[1] * own + LOG_ODDS[2] * sure[y // BLOCK, c // BLOCK]
+                x2_px[y, c], confidence2[y, c] = x_far[y, c] + seconds.distance[y, c], 1.0 / (1.0 + np.exp(-odds))
+
+
+APART_PX = 2.0
+"""Light so far from a stripe, and further by LINE_SIGMAS widths of the line, is not its own."""
+LINE_SIGMAS = 2.5
+LIGHT_SIGMAS = 1.5
+"""Widths of the line to either side that its light is looked for in."""
+
+
+class SecondLight(NamedTuple):
+    """What the search for second returns takes of a model; made once per model by `second_light`.
+
+    state: without ambient light. still: float32, (rows x width) between LANES numbers at either end, probability of no
+    one by ambient light alone; LEFT_OUT of pixels that always fire or are not to be used, which show nothing of
+    haze or stripes. place: of `line_places`. apart: px from a stripe within which light is its own. reach: px to
+    either side of a line.
+    """
+
+    state: RowState
+    still: NDArray[np.float32]
+    place: NDArray[np.int16]
+    apart: float
+    reach: int
+
+
+def second_light(state: RowState, line_sigma_px: float, grid: LabelGrid, sweep: Sweep) -> SecondLight:
+    """The light that haze and ambient bring under `state`."""
+    still = np.where(hot_in_bands(state.ambient), LEFT_OUT, np.exp(-state.ambient))
+    return SecondLight(
+        state._replace(ambient=np.zeros_like(state.ambient)),
+        np.pad(still.ravel(), LANES),
+        line_places(sweep, grid.x_far, grid.side, distance_pixels(grid)),
+        APART_PX + LINE_SIGMAS * line_sigma_px,
+        max(int(np.rint(LIGHT_SIGMAS * line_sigma_px)), 1),
+    )
+
+
+def distance_pixels(grid: LabelGrid) -> int:
+    """Pixels of distance that sums are made of, a multiple of LANES."""
+    return grid.labels // PER_PX
+
+
+class SecondRoom(NamedTuple):
+    """Room for the search in one map after the other: memory that is new is slow."""
+
+    blocks: Blocks
+    candidates: Candidates
+    seconds: Seconds
+    moved: NDArray[np.float32]
+
+
+def second_room(grid: LabelGrid) -> SecondRoom:
+    """Room for maps of these labels."""
+    rows, columns = grid.x_far.shape
+    shape = -(-rows // BLOCK), -(-columns // BLOCK)
+    return SecondRoom(
+        Blocks(*(aligned_zeros((*shape, distance_pixels(grid)), np.float32) for _ in Blocks._fields)),
+        Candidates(*(np.empty(shape, np.float32) for _ in Candidates._fields)),
+        Seconds(*(np.empty((rows, columns), np.float32) for _ in Seconds._fields)),
+        np.empty((rows, columns), np.float32),
+    )
+
+
+def second_returns(
+    volume: CountVolume,
+    grid: LabelGrid,
+    sweep: Sweep,
+    light: SecondLight,
+    x_px: NDArray[np.float32],
+    room: SecondRoom,
+    workers: RowWorkers,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """x2_px and confidence2 (rows, columns) beside stripes at x_px: NaN and 0 where nothing stands out."""
+    rows, columns = x_px.shape
+    blocks, candidates, seconds, moved = room
+    # Read by address: another kind of number would be read as nonsense.
+    n_frames = np.ascontiguousarray(volume.n_frames, np.int32)
+    seen = volume.counts, n_frames, sweep, light.state, light.still
+    reach, side, apart, block_rows = light.reach, grid.side, light.apart, len(candidates.distance)
+
+    x2_px, confidence2 = (np.empty((rows, columns), np.float32) for _ in range(2))
+
+    def look(first: int, last: int) -> None:
+        sum_blocks(*seen, light.place, side, apart, x_px, first, last, blocks)
+        here = slice(first * BLOCK, last * BLOCK)
+        seconds.distance[here] = x2_px[here] = np.nan  # of neighbours of those that are asked, too
+        confidence2[here] = 0.0
+
+    workers.over(block_rows, look)
+    workers.over(block_rows, lambda first, last: find_candidates(blocks, reach, side, first, last, candidates))
+    # One row of blocks at least: nothing may be left to compile for the first second return of a scan.
+    asked = np.flatnonzero(np.isfinite(candidates.distance).any(axis=1))
+    asked = asked if len(asked) else np.array([0])
+
+    def of_asked(work: Work) -> None:
+        def each(first: int, last: int) -> None:
+            for run in np.split(asked[first:last], np.flatnonzero(np.diff(asked[first:last]) > 1) + 1):
+                work(int(run[0]) * BLOCK, min((int(run[-1]) + 1) * BLOCK, rows))
+
+        workers.over(len(asked), each)
+
+    def measure(first: int, last: int) -> None:
+        measure_seconds(*seen, grid.x_far, side, apart, reach, x_px, candidates.haze, first, last, seconds)
+
+    def begin(first: int, last: int) -> None:
+        begin_seconds(candidates, first, last, seconds)
+        measure(first, last)
+
+    def move(first: int, last: int) -> None:
+        move_seconds(reach, first, last, seconds, moved)
+
+    def measure_moved(first: int, last: int) -> None:
+        seconds.distance[first:last] = moved[first:last]
+        measure(first, last)
+
+    def judge(first: int, last: int) -> None:
+        judge_seconds(grid.x_far, x_px, candidates.sure, first, last, seconds, x2_px, confidence2)
+
+    for work in (begin, move, measure_moved, judge):
+        of_asked(work)
+    return x2_px, confidence2

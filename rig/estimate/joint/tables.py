@@ -1,0 +1,90 @@
+"""What `joint` makes once per model, and the room that it keeps from map to map."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.errors import UsageError
+from rig.estimate.joint.confidence import Brightness, brightness_of, pairs_to_ask
+from rig.estimate.joint.labels.costs import Costs, costs_of
+from rig.estimate.joint.labels.grid import LabelGrid, label_grid
+from rig.estimate.joint.place.place import new_places, profile_table
+from rig.estimate.joint.place.places import Places
+from rig.estimate.joint.second_returns import SecondLight, SecondRoom, second_light, second_room
+from rig.estimate.joint.vote import Ballots, new_ballots
+from rig.estimate.joint.winner import LabelAnswers, new_answer
+from rig.estimate.row.inputs import RowState, Sweep, halo_shares, state_of, sweep_of
+from rig.estimate.search.online_learning import LearningSetting
+from rig.geometry.windows import SweepGeometry
+from rig.simd.memory import aligned_zeros
+from rig.threads import RowWorkers
+
+MOST_BYTES = 4 << 30
+"""Costs and messages of a map may take so much: room for 1000 columns, each searched over all of 1024 x 1024 pixels."""
+
+
+class JointTables(NamedTuple):
+    """What is made once per model."""
+
+    grid: LabelGrid
+    costs: Costs
+    sweep: Sweep
+    state: RowState
+    shares: NDArray[np.float32]
+    halo: NDArray[np.float32]
+    light: SecondLight
+    bright: Brightness
+    dark: bool
+    pairs: NDArray[np.float32]
+    """Of maps whose columns all have frames."""
+
+
+class Memory(NamedTuple):
+    """Room for one map after the other: costs and messages (rows, columns, labels) uint8, and the answers."""
+
+    cost: NDArray[np.uint8]
+    message: NDArray[np.uint8]
+    answer: LabelAnswers
+    ballots: Ballots
+    places: Places
+    seconds: SecondRoom
+
+    def fits(self, grid: LabelGrid) -> bool:
+        """Whether maps of this grid have their room in it."""
+        return self.cost.shape == (*grid.x_far.shape, grid.labels)
+
+
+def memory_for(grid: LabelGrid) -> Memory:
+    """Room for maps of a grid."""
+    rows, columns = grid.x_far.shape
+    cost, message = (aligned_zeros((rows, columns, grid.labels), np.uint8) for _ in range(2))
+    return Memory(
+        cost, message, new_answer(rows, columns), new_ballots(rows, columns), new_places(rows, columns),
+        second_room(grid),
+    )  # fmt: skip
+
+
+def grid_of(geometry: SweepGeometry) -> LabelGrid:
+    """The labels of a geometry. UsageError where their costs would take too much memory."""
+    grid = label_grid(geometry)
+    rows, columns = grid.x_far.shape
+    if (needed := 2 * rows * columns * grid.labels) > MOST_BYTES:
+        raise UsageError(
+            f"joint weighs {grid.labels} places on each of {rows} rows of {columns} columns, which takes "
+            f"{needed / 2**30:.1f} GiB; it may take {MOST_BYTES / 2**30:.3g}: narrow depth_range, or use the estimator "
+            "likelihood"
+        )
+    return grid
+
+
+def tables_of(setting: LearningSetting, workers: RowWorkers) -> JointTables:
+    """The tables of a model, for a geometry and so many exposures a column."""
+    grid = grid_of(setting.geometry)
+    costs = costs_of(setting.model, setting.geometry, grid, setting.exposures, workers)
+    state, sigma_px, sweep = state_of(setting.model), setting.model.line_sigma_px, sweep_of(setting.geometry)
+    halo = halo_shares(setting.model, setting.geometry.width if setting.model.halo.any() else 0)
+    return JointTables(
+        grid, costs, sweep, state, profile_table(sigma_px), halo, second_light(state, sigma_px, grid, sweep),
+        brightness_of(setting.model), setting.dark, pairs_to_ask(np.isfinite(grid.x_far)),
+    )  # fmt: skip

@@ -1,0 +1,128 @@
+"""Temporal prior of `joint`: where a surface was clear in the last map, places far from it cost a little more.
+
+A label l costs min(SLOPE max(|l - b| - FREE, 0), c MOST) more than the last map's label b, c from 0 to 1 with the
+confidence that the last answer had. At most MOST, far less than a jump between neighbours and than what the photons of
+a stripe say: where something has moved, its rows outvote what they are told of before. Nothing adds up over maps.
+"""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import CountVolume
+from rig.estimate.joint.labels.grid import PER_PX, LabelGrid
+from rig.estimate.joint.winner import VECTOR
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import SweepGeometry
+from rig.simd.memory import address_of, load_bytes, store_bytes
+from rig.simd.vectors import add_saturated_unsigned
+from rig.threads import RowWorkers
+
+MOST = 3
+"""Most that a label costs more, in units as all costs (`UNITS`). With 6, dark things that move are held back."""
+SLOPE = 2
+"""Units for each label farther off."""
+FREE = 1
+"""Labels from the last one that cost nothing: its own error, and surfaces that drift."""
+LEAST_SURE = 0.5
+"""Confidence up to which an answer leaves nothing."""
+
+
+class TemporalPrior:
+    """What the last map leaves to the next one; `on`: whether maps leave anything.
+
+    before: uint16 (2, rows, columns), the last map's labels and what others cost more at most (0: nothing is known);
+    None where there is nothing, as behind a map without frames and before the first of a geometry.
+    """
+
+    def __init__(self, on: bool) -> None:
+        self.on = on
+        self.before: NDArray[np.uint16] | None = None
+        self._of: SweepGeometry | None = None
+        self._ramps: NDArray[np.uint8] | None = None
+
+    def recall(self, before: NDArray[np.uint16] | None) -> None:
+        """Go on from what was kept with a map."""
+        self.before, self._of = before, None
+
+    def begin(self, geometry: SweepGeometry, grid: LabelGrid) -> None:
+        """Before a map's costs are made: forget what is of another geometry."""
+        if self.before is not None:
+            other = self._of is not None and self._of is not geometry
+            if other or self.before.shape[1:] != grid.x_far.shape:
+                self.before = None
+        self._of = geometry
+        if self._ramps is None or self._ramps.shape[1] != 2 * grid.labels:
+            self._ramps = _ramps(grid.labels)
+
+    def add(self, volume: CountVolume, first: int, last: int, cost: NDArray[np.uint8]) -> None:
+        """Add to the costs (rows, columns, labels) of rows first..last-1."""
+        if self.before is not None and self._ramps is not None:
+            _add_ramps(self.before, volume.n_frames, self._ramps, first, last, cost)
+
+    def leave(self, stripes: StripeTable, grid: LabelGrid, workers: RowWorkers) -> None:
+        """After a map: what it leaves to the next."""
+        if not self.on:
+            self.before = None
+            return
+        # A new one each time: the last one is part of the state that its map was estimated with.
+        before = np.zeros((2, *grid.x_far.shape), np.uint16)
+        workers.over(
+            before.shape[1],
+            lambda first, last: _leave(
+                stripes.x_px, stripes.confidence, grid.x_far, grid.side, grid.stripes, first, last, before
+            ),
+        )
+        self.before = before if before[1].any() else None
+
+
+def _ramps(labels: int) -> NDArray[np.uint8]:
+    """(MOST + 1, 2 labels): what the label i - labels beyond the last one costs more, for each most that it may be."""
+    away = np.abs(np.arange(2 * labels) - labels)
+    ramp = SLOPE * np.maximum(away - FREE, 0)
+    return np.asarray(np.minimum(ramp, np.arange(MOST + 1)[:, None]), np.uint8)
+
+
+@numba.njit(cache=True, nogil=True)
+def _leave(
+    x_px: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    x_far: NDArray[np.float64],
+    side: int,
+    stripes: int,
+    first_row: int,
+    last_row: int,
+    before: NDArray[np.uint16],
+) -> None:
+    """Fill rows first_row..last_row-1 of `before`."""
+    for y in range(first_row, last_row):
+        for c in range(x_px.shape[1]):
+            sure = (confidence[y, c] - LEAST_SURE) / (1.0 - LEAST_SURE)
+            off = side * (x_far[y, c] - x_px[y, c]) * PER_PX
+            if sure > 0.0 and np.isfinite(off):
+                before[0, y, c] = min(max(int(np.rint(off)), 0), stripes - 1)
+                before[1, y, c] = int(np.rint(min(sure, 1.0) * MOST))
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_ramps(
+    before: NDArray[np.uint16],
+    n_frames: NDArray[np.int32],
+    ramps: NDArray[np.uint8],
+    first_row: int,
+    last_row: int,
+    cost: NDArray[np.uint8],
+) -> None:
+    """Add each pixel's ramp to its costs; labels: a multiple of VECTOR."""
+    _, columns, labels = cost.shape
+    costs, table = address_of(cost), address_of(ramps)
+    for y in range(first_row, last_row):
+        for c in range(columns):
+            most = min(int(before[1, y, c]), ramps.shape[0] - 1)
+            if most == 0 or n_frames[c] == 0:
+                continue
+            at = (y * columns + c) * labels
+            ramp = most * 2 * labels + labels - min(int(before[0, y, c]), labels - 1)
+            for v in range(0, labels, VECTOR):
+                more = load_bytes(table, ramp + v)
+                store_bytes(costs, at + v, add_saturated_unsigned(load_bytes(costs, at + v), more))

@@ -1,0 +1,238 @@
+"""Compiled reading of answers off the totals of all labels, some columns of a row at a time.
+
+In rounds over the columns, each short: what one column waits for, others fill. All arrays come by their addresses, see
+`rig.simd.memory`.
+
+What the aggregation answers for each pixel, and the tables that its answers are read off with.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.simd.memory import (
+    address_of,
+    load_block,
+    load_bytes,
+    load_four,
+    prefetch,
+    read_byte,
+    read_float32,
+    read_int32,
+    store_bytes,
+    store_four,
+    write_byte,
+    write_float32,
+    write_int32,
+)
+from rig.simd.shuffles import equal_bytes, first_equal
+from rig.simd.vectors import BLOCK, smaller_unsigned, smallest_byte, zero_four
+
+REACH: Final = 4
+"""Labels to each side of the winner that its sub-label position is the mean of."""
+MARGIN_FROM: Final = 3
+"""Labels from the winner at which the margin's rivals begin: 1.5 pixels."""
+LARGEST: Final = 255
+"""Largest cost and total: of a label that is excluded."""
+TAPS: Final = 2 * REACH + 1
+POWERS: Final = 4
+"""Numbers that are summed at once: powers 0 and 1 of the distance, and nothing."""
+VECTOR: Final = 32
+"""Labels that are worked on at once."""
+MIDDLE: Final = VECTOR // 2
+UNITS: Final = 8.0
+"""Units of cost per nat of very few exposures; of K exposures UNITS / (1 + K / SHARP), see
+`rig.estimate.joint.labels.costs`.
+"""
+
+
+class AnswerSettings(NamedTuple):
+    """Which labels there are, stripes at 0..stripes-1, and tables of `answer_settings`.
+
+    weights: float32 (256,), of a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), for each
+    reach those of the taps within it. reach: uint8 (2^TAPS,), how far labels reach to both sides where the taps of the
+    set bits are excluded. near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST at labels that do not count for the
+    margin.
+    """
+
+    stripes: int
+    weights: NDArray[np.float32]
+    powers: NDArray[np.float32]
+    reach: NDArray[np.uint8]
+    near: NDArray[np.uint8]
+
+
+class LabelAnswers(NamedTuple):
+    """Per (row, column). Labels are counted in labels, costs in units (`UNITS`).
+
+    label: float32, mean of the labels around the winner, the stripe of the least total (ties: the smaller label), only
+    as far as both sides have labels: one side alone would draw every answer to it. margin: uint8, the least total at
+    least MARGIN_FROM labels away less the winner's.
+    """
+
+    label: NDArray[np.float32]
+    margin: NDArray[np.uint8]
+
+
+def new_answer(rows: int, columns: int) -> LabelAnswers:
+    """Room for the answers of a map."""
+    return LabelAnswers(np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.uint8))
+
+
+def answer_settings(stripes: int, beta: float = 0.5) -> AnswerSettings:
+    """Settings for so many stripe labels; a label weighs exp(-beta * excess of its total / UNITS)."""
+    weights = np.exp(-beta / UNITS * np.arange(LARGEST + 1)).astype(np.float32)
+    distance = np.arange(-REACH, REACH + 1)
+    powers = np.zeros((REACH + 1, TAPS, POWERS), np.float32)
+    for reach in range(REACH + 1):
+        powers[reach, :, :2] = (np.abs(distance) <= reach)[:, None] * distance[:, None] ** np.arange(2.0)
+    excluded = np.arange(1 << TAPS)[:, None] >> np.arange(TAPS) & 1
+    pairs = excluded[:, REACH + 1 :] | excluded[:, REACH - 1 :: -1]
+    reach_of = np.where(pairs.any(axis=1), pairs.argmax(axis=1), REACH).astype(np.uint8)
+    away = np.abs(np.arange(VECTOR) - MIDDLE)
+    near = np.where(away < MARGIN_FROM, LARGEST, 0).astype(np.uint8)
+    return AnswerSettings(stripes, weights, powers, reach_of, near)
+
+
+_BLOCK: Final = BLOCK.count
+
+
+class Fields(NamedTuple):
+    """Addresses of what `Answer` has."""
+
+    label: int
+    margin: int
+
+
+class ColumnAnswers(NamedTuple):
+    """Addresses of what was found in each column: label, int32; its total, uint8; moments, float32 (POWERS,)."""
+
+    label: int
+    total: int
+    moments: int
+
+
+class ReadoutPointers(NamedTuple):
+    """What columns are answered with: numbers (labels, end, size) and addresses.
+
+    totals: uint8, `size` bytes from column to column, at least a vector of LARGEST before and behind each. end: labels
+    up to the end of the last block with stripes. ring: uint8 of each column, the least total of labels that count for
+    the margin, but may be no rival. hidden: uint8 (labels,), LARGEST where there is no stripe. The tables are those of
+    `AnswerSettings`.
+    """
+
+    labels: int
+    end: int
+    size: int
+    totals: int
+    hidden: int
+    weights: int
+    powers: int
+    reach: int
+    near: int
+    winner: ColumnAnswers
+    answer: Fields
+
+
+@numba.njit(cache=True, nogil=True)
+def desk_memory(settings: AnswerSettings, columns: int, labels: int) -> NDArray[np.uint8]:
+    """Memory of a desk for so many columns; must live as long as the desk."""
+    memory = np.full(labels + columns * (labels + 2 * _BLOCK) + 2 * VECTOR, LARGEST, np.uint8)
+    memory[: settings.stripes] = 0
+    return memory
+
+
+@numba.njit(cache=True, nogil=True)
+def desk_of(
+    settings: AnswerSettings, out: LabelAnswers, memory: NDArray[np.uint8], columns: int, labels: int
+) -> ReadoutPointers:
+    """A desk for so many columns; its totals begin at a multiple of their vectors."""
+    hidden = address_of(memory)
+    totals = -(-(hidden + labels) // VECTOR) * VECTOR + VECTOR
+    size = -(-labels // _BLOCK) * _BLOCK + 2 * VECTOR
+    moments = totals + columns * size - VECTOR
+    rest = moments + 4 * POWERS * columns
+    return ReadoutPointers(
+        labels, -(-settings.stripes // _BLOCK) * _BLOCK, size, totals, hidden,
+        address_of(settings.weights), address_of(settings.powers), address_of(settings.reach),
+        address_of(settings.near), ColumnAnswers(rest, rest + 4 * columns, moments),
+        Fields(address_of(out.label), address_of(out.margin)),
+    )  # fmt: skip
+
+
+@numba.njit(forceinline=True)
+def _least_of(totals, desk):  # type: ignore[no-untyped-def]
+    """The least total of a column."""
+    low = load_block(totals, 0)
+    for block in range(_BLOCK, desk.end, _BLOCK):
+        low = smaller_unsigned(low, load_block(totals, block))
+    return smallest_byte(low)
+
+
+@numba.njit(forceinline=True)
+def _find_winners(columns, desk):  # type: ignore[no-untyped-def]
+    """The least total of each column and its label, the smallest such one."""
+    for c in range(columns):
+        totals = desk.totals + c * desk.size
+        least, label = _least_of(totals, desk), 0
+        for block in range(desk.end - _BLOCK, -1, -_BLOCK):
+            place = first_equal(load_block(totals, block), least)
+            label = block + place if place < _BLOCK else label
+        write_int32(desk.winner.label, c, np.int32(label))
+        write_byte(desk.winner.total, c, least)
+
+
+@numba.njit(forceinline=True)
+def _weigh(columns, desk):  # type: ignore[no-untyped-def]
+    """Sums of weight times each power over the labels around the winners, as far as both sides have some."""
+    found = desk.winner
+    for c in range(columns):
+        around = desk.totals + c * desk.size + read_int32(found.label, c)
+        excluded = np.int64(equal_bytes(load_bytes(around, -MIDDLE), LARGEST)) >> (MIDDLE - REACH)
+        reach = np.int64(read_byte(desk.reach, excluded & ((1 << TAPS) - 1)))
+        powers = desk.powers + 4 * POWERS * (TAPS * reach + REACH)
+        weights = desk.weights - 4 * np.int64(read_byte(found.total, c))
+        below, above = load_four(powers, 0) * read_float32(weights, np.int64(read_byte(around, 0))), zero_four()
+        for k in range(1, REACH + 1):
+            below = below + load_four(powers, -POWERS * k) * read_float32(weights, np.int64(read_byte(around, -k)))
+            above = above + load_four(powers, POWERS * k) * read_float32(weights, np.int64(read_byte(around, k)))
+        store_four(found.moments, POWERS * c, below + above)
+
+
+@numba.njit(forceinline=True)
+def _hide_winners(columns, desk):  # type: ignore[no-untyped-def]
+    """Take the winners, and what does not count for the margin, out of the totals."""
+    near = load_bytes(desk.near, 0)
+    for c in range(columns):
+        around = desk.totals + c * desk.size + read_int32(desk.winner.label, c)
+        store_bytes(around, -MIDDLE, load_bytes(around, -MIDDLE) | near)
+
+
+@numba.njit(forceinline=True)
+def _write_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
+    answer, found = desk.answer, desk.winner
+    for c in range(columns):
+        mean = read_float32(found.moments, POWERS * c + 1) / read_float32(found.moments, POWERS * c)
+        write_float32(answer.label, pixel + c, np.float32(read_int32(found.label, c)) + mean)
+        rival = _least_of(desk.totals + c * desk.size, desk)
+        write_byte(answer.margin, pixel + c, np.uint8(rival - read_byte(found.total, c)))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def answer_columns(pixel: int, columns: int, desk: ReadoutPointers) -> None:
+    """Answer columns from the desk's totals, which are not the same afterwards; pixel: the first one's answer."""
+    _find_winners(columns, desk)
+    _weigh(columns, desk)
+    _hide_winners(columns, desk)
+    _write_answers(pixel, columns, desk)
+
+
+@numba.njit(forceinline=True)
+def fetch_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
+    """Have the places of answers brought into the cache."""
+    answer = desk.answer
+    for at in (pixel, pixel + columns - 1):
+        prefetch(answer.label + 4 * at)
+        prefetch(answer.margin + at)

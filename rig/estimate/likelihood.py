@@ -1,0 +1,120 @@
+"""Estimator `likelihood`: maximum likelihood of 'haze, stripe, then less' on every row, told nothing of the medium.
+
+Search along a row: `rig.estimate.search.rows`; what it knows and how that is learned: `rig.estimate.row.model`,
+`rig.estimate.row.em`, `lessons`. The first map is counted whole and estimated twice (the first pass finds which pixels
+were quiet behind the stripe). Every later map is judged column by column while its frames come in, with what earlier
+maps taught: it depends on nothing inside itself.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import BYTE_EXPOSURES, Counter, CountVolume, SweepCounter, SweepLayout
+from rig.estimate.row.em import lines_of, next_lattice
+from rig.estimate.row.model import RowModel
+from rig.estimate.search.inputs import SearchTables
+from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
+from rig.estimate.search.prepare import judge_of
+from rig.estimate.search.stream import ColumnJudge, SearchedSweep, nominal_exposures, search_volume
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import SweepGeometry
+from rig.threads import RowWorkers
+
+
+class Likelihood:
+    """Row likelihood with the state it has learned so far; `model` is None before a map that taught.
+
+    Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
+    learns: whether later maps change that state.
+    """
+
+    def __init__(self, threads: int = 2, model: RowModel | None = None, *, learns: bool = True) -> None:
+        self._workers = RowWorkers(threads)
+        self._lessons = OnlineLearner(_judge, model, learns=learns)
+        self.used: RowModel | None = None
+        """The state that the last map was estimated with."""
+
+    @property
+    def model(self) -> RowModel | None:
+        """The state that the next map will be estimated with."""
+        return self._lessons.model
+
+    @model.setter
+    def model(self, model: RowModel) -> None:
+        self._lessons.model = model
+
+    def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
+        """A counter whose sweeps `estimate` takes; geometry: nominal, as of every sweep."""
+        return _LikelihoodCounter(self, layout, geometry, self._workers)
+
+    def estimate(self, sweep: CountVolume | SearchedSweep, geometry: SweepGeometry) -> StripeTable:
+        """Stripe table of one sweep; afterwards `model` is what the next sweep will be estimated with."""
+        if isinstance(sweep, SearchedSweep):
+            assert self.model is not None, "a sweep is judged under a model"
+            used, stripes = self.model, sweep.stripe
+            quiet, lines = sweep.quiet, sweep.lines
+        else:
+            used = self._lessons.model_for(lambda: first_model(sweep, geometry, self._workers))
+            setting = LearningSetting(used, geometry, nominal_exposures(sweep), sweep.dark_counts is not None)
+            stripes, quiet = search_volume(sweep, geometry, self._lessons.tables(setting, self._workers), self._workers)
+            lines = lines_of(sweep, next_lattice(geometry))
+        self.used = used
+        self._lessons.attend(
+            stripes, used, int(sweep.n_frames.sum()), lambda: Seen(sweep, sweep.intensity(), quiet, lines)
+        )
+        return stripes
+
+    def judge(self, geometry: SweepGeometry, exposures: int, *, dark: bool) -> SearchTables:
+        """What the search under the present model reads; made once per model."""
+        assert self.model is not None, "the first map is learned from counts"
+        return self._lessons.tables(LearningSetting(self.model, geometry, exposures, dark), self._workers)
+
+
+def _judge(setting: LearningSetting, workers: RowWorkers) -> SearchTables:
+    return judge_of(setting.model, setting.geometry, setting.exposures, workers, dark=setting.dark)
+
+
+class _LikelihoodCounter:
+    """Counts the first sweep whole; judges the columns of every later one as they come."""
+
+    def __init__(self, of: Likelihood, layout: SweepLayout, geometry: SweepGeometry, workers: RowWorkers) -> None:
+        self._of = of
+        self._layout = layout
+        self._geometry = geometry
+        self._workers = workers
+        self._counter: SweepCounter | ColumnJudge | None = None
+        self._memory: ColumnJudge | None = None
+
+    def reset(self) -> None:
+        """Begin the next sweep."""
+        self._counter = None
+
+    def add(
+        self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
+    ) -> None:
+        """Add frames, see `Counter`."""
+        self._present().add(bits, bins, column, x0)
+
+    def settle(self, under_way: int = 0) -> None:
+        """See `Counter`."""
+        if self._counter is not None:
+            self._counter.settle(under_way)
+
+    def finish(self) -> CountVolume | SearchedSweep:
+        """What the sweep gave."""
+        return self._present().finish()
+
+    def _present(self) -> SweepCounter | ColumnJudge:
+        # Chosen with the first frames: only then has the sweep before this one been estimated and has taught.
+        if self._counter is None:
+            layout = self._layout
+            if self._of.model is None or layout.exposures > BYTE_EXPOSURES:
+                self._counter = SweepCounter(layout, self._workers)
+            else:
+                judge = self._of.judge(self._geometry, layout.exposures, dark=layout.dark)
+                if self._memory is None:
+                    self._memory = ColumnJudge(layout, self._geometry, judge, self._workers)
+                else:
+                    self._memory.begin(judge)
+                self._counter = self._memory
+        return self._counter

@@ -1,0 +1,79 @@
+"""Filter `median`: the report's 5x5 median, taken on disparity so that the slant of columns does not matter.
+
+Disparity is x minus the mean position of its column; missing answers (NaN) take no part, and none is filled in.
+"""
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.geometry.stripe_table import StripeTable
+
+REACH = 2
+MEDIAN_EFFICIENCY = 1.2533
+"""Standard deviation of a median over that of a mean, sqrt(pi / 2), for normal errors."""
+SURE = np.float32(0.999999)
+"""No answer is believed more than that where several are counted together."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _median_rows(
+    disparity: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    coupled: bool,
+    out: NDArray[np.float32],
+) -> None:
+    """Write median, agreement and standard deviation of every answer to out (3, rows, columns)."""
+    rows, columns = disparity.shape
+    values = np.empty((2 * REACH + 1) ** 2, np.float32)
+    weights = np.empty((2 * REACH + 1) ** 2, np.float32)
+    for y in range(rows):
+        for c in range(columns):
+            if np.isnan(disparity[y, c]):
+                continue
+            m = 0
+            for yy in range(max(0, y - REACH), min(rows, y + REACH + 1)):
+                for cc in range(max(0, c - REACH), min(columns, c + REACH + 1)):
+                    if not np.isnan(disparity[yy, cc]):
+                        # Insertion keeps the few values in order.
+                        i = m
+                        while i > 0 and values[i - 1] > disparity[yy, cc]:
+                            values[i], weights[i] = values[i - 1], weights[i - 1]
+                            i -= 1
+                        values[i], weights[i] = disparity[yy, cc], confidence[yy, cc]
+                        m += 1
+            median = values[m // 2] if m % 2 else np.float32(0.5) * (values[m // 2 - 1] + values[m // 2])
+            total = 0.0
+            agreeing = 0.0
+            none_right = 0.0
+            number = 0
+            spread = 0.0
+            for i in range(m):
+                total += weights[i]
+                if abs(values[i] - median) <= 1.0:
+                    agreeing += weights[i]
+                    none_right += np.log1p(-min(weights[i], SURE))
+                    number += 1
+                    spread += (values[i] - median) ** 2
+            out[0, y, c] = median
+            right = agreeing / max(number, 1) if coupled else -np.expm1(none_right)
+            out[1, y, c] = right * agreeing / total if total > 0.0 else 0.0
+            out[2, y, c] = MEDIAN_EFFICIENCY * np.sqrt((spread / max(number, 1) + 1.0 / 12.0) / max(number, 1))
+
+
+def median_filter(stripes: StripeTable, reference_px: NDArray[np.float64], *, coupled: bool = False) -> StripeTable:
+    """Stripe table with x_px replaced by the 5x5 median of its disparity; reference_px (rows, columns), NaN allowed.
+
+    The reference is where the column's line stands at a fixed depth: smooth over rows and columns. Confidence becomes
+    the share of the neighbours' confidence that lies within 1 px of the median, times the probability that those are
+    right: one of them at least, where each goes by its own row; coupled: their mean, since answers that go by each
+    other agree where nothing is lit too. x_sd_px becomes the standard deviation of a median of those neighbours; signal
+    and haze stay.
+    """
+    reference = reference_px.astype(np.float32)
+    out = np.full((3, *stripes.x_px.shape), np.nan, np.float32)
+    out[1] = 0.0
+    _median_rows(stripes.x_px - reference, stripes.confidence, coupled, out)
+    return replace(stripes, x_px=out[0] + reference, confidence=out[1], x_sd_px=out[2])

@@ -1,0 +1,127 @@
+"""Stripe estimators by name: counts of a sweep in, a stripe table out.
+
+An estimator with the states that maps were once estimated with, one for each map: it gives the same bit for bit.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rig.count.volume import Counter, SweepLayout
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import SweepGeometry
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rig.count.volume import Counter, SweepLayout
+    from rig.geometry.stripe_table import StripeTable
+    from rig.geometry.windows import SweepGeometry
+
+ESTIMATORS = ("argmax", "edge", "likelihood", "joint")
+FILTERS = ("none", "median")
+LEARNING = frozenset({"likelihood", "joint"})
+"""Estimators that learn from the stream, for which the first map takes much longer than those after it."""
+COUPLED = frozenset({"joint"})
+"""Estimators whose answers already go by their neighbours', so that neighbours who agree are no further evidence."""
+
+
+class Learned(Protocol):
+    """State that an estimator has learned; fog in it where the haze resolves it, else NaN."""
+
+    @property
+    def extinction_per_m(self) -> float:
+        """Extinction of the medium."""
+        ...
+
+    @property
+    def extinction_sd_per_m(self) -> float:
+        """Its standard deviation."""
+        ...
+
+    def arrays(self) -> "dict[str, NDArray[np.generic]]":
+        """Every field as an array, enough to estimate the map again bit for bit."""
+        ...
+
+
+class Estimator(Protocol):
+    """What every estimator offers. used: the state the last map was estimated with, None where none is learned."""
+
+    @property
+    def used(self) -> Learned | None:
+        """State of the last map."""
+        ...
+
+    def counter(self, layout: "SweepLayout", geometry: "SweepGeometry") -> "Counter":
+        """A counter whose sweeps `estimate` takes; geometry: as of every sweep, with columns at their centres."""
+        ...
+
+    def estimate(self, sweep: Any, geometry: "SweepGeometry") -> "StripeTable":
+        """Stripe table of what `counter` gave of one sweep, or of a `CountVolume`."""
+        ...
+
+
+class LearnsFromStream(Estimator, Protocol):
+    """What those in LEARNING offer besides."""
+
+    model: Any
+    """The state that the next map will be estimated with, None before a map that taught."""
+
+
+def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
+    """The estimator of a name in LEARNING that learned these states, to estimate the map of each again as with it.
+
+    It learns nothing.
+    """
+
+    return Recalled(_learning(name, threads, learns=False, temporal_prior=temporal_prior), learned)
+
+
+def create_estimator(name: str, threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
+    """Estimator of a name out of ESTIMATORS, fresh, for up to `threads` threads; KeyError for any other name.
+
+    temporal_prior: whether `joint` holds each map to the last one a little; the others estimate every map by itself.
+    """
+    if name in LEARNING:
+        return _learning(name, threads, learns=True, temporal_prior=temporal_prior)
+    from rig.estimate.argmax_edge import Peaks
+
+    return {"argmax": Peaks(False, threads), "edge": Peaks(True, threads)}[name]
+
+
+def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool) -> LearnsFromStream:
+    if name == "likelihood":
+        from rig.estimate.likelihood import Likelihood
+
+        return Likelihood(threads, learns=learns)
+    from rig.estimate.joint.joint import Joint
+
+    return Joint(threads, learns=learns, temporal_prior=temporal_prior)
+
+
+class Recalled:
+    """Estimates each map with the state of its own, those behind the last with that of the last.
+
+    of: an estimator that learns nothing by itself.
+    """
+
+    def __init__(self, of: LearnsFromStream, states: Sequence[Learned]) -> None:
+        self._states = list(states)
+        self._of = of
+        self._of.model = self._states.pop(0)
+
+    @property
+    def used(self) -> Learned | None:
+        """State of the last map."""
+        return self._of.used
+
+    def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
+        """See the estimator."""
+        return self._of.counter(layout, geometry)
+
+    def estimate(self, sweep: Any, geometry: SweepGeometry) -> StripeTable:
+        """See the estimator."""
+        stripes = self._of.estimate(sweep, geometry)
+        if self._states:
+            self._of.model = self._states.pop(0)
+        return stripes

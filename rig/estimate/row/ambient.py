@@ -1,0 +1,108 @@
+"""Ambient light and dark counts of every pixel, from dark frames, the quiet side of the stripe and the pixel view.
+
+Both are constant for a pixel over the columns (the pixel view of the counts): a pixel that fires far more often than
+its neighbours while the laser crosses the whole picture is hot, whatever the scene. Few counts are drawn to the local
+mean.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import FrameTally
+from rig.estimate.row.likelihood import FLUX_MAX
+from rig.geometry.windows import SweepGeometry
+
+NEIGHBOURHOOD_PX = 31
+DEFECT_FLUX = float(FLUX_MAX)
+"""Ambient given to pixels not to be used: one that is always lit says the same of every hypothesis, nothing."""
+HOT_SIGMA = 6.0
+"""Excess over the neighbours, in standard deviations, that makes a pixel hot: 1e-9 of good pixels pass."""
+
+
+def ambient_map(
+    tally: FrameTally, intensity: NDArray[np.uint32], geometry: SweepGeometry, quiet: NDArray[np.float64] | None
+) -> NDArray[np.float32]:
+    """Photons per exposure (rows, width) float32 from dark frames, `quiet` (2, rows, width) counts and hot pixels.
+
+    intensity: (rows, width), ones of each pixel within the windows. quiet: ones and exposures of each pixel while
+    clearly behind the stripe; None before any stripe is known. Ones less the light of a halo may lie below 0.
+    """
+    ones = np.zeros((geometry.rows, geometry.width))
+    exposures = np.zeros_like(ones)
+    if tally.dark_counts is not None:
+        ones += tally.dark_counts
+        exposures += tally.n_dark if tally.dark_frames is None else tally.dark_frames
+    # Behind its stripe a pixel is not dark where other lines are lit together with it.
+    if quiet is not None and geometry.others is None:
+        # What a halo is expected to add has been taken off: chance may leave less than nothing.
+        ones += np.maximum(quiet[0], 0.0)
+        exposures += quiet[1]
+    totals = np.stack([intensity, np.broadcast_to(_window_exposures(tally, geometry), intensity.shape)])
+    if exposures.sum() < ones.size:
+        level = _lowest_level(totals)
+        base = np.full(ones.shape, level)
+    else:
+        base = _shrunk(ones, exposures)
+    ambient: NDArray[np.float32] = np.maximum(base, hot_pixels(totals)).astype(np.float32)
+    ambient[geometry.defects] = DEFECT_FLUX
+    return ambient
+
+
+def _window_exposures(tally: FrameTally, geometry: SweepGeometry) -> NDArray[np.uint32]:
+    """Exposures of each pixel of a row while it lay within the stored window (width,)."""
+    reached = int(geometry.x0.max(initial=0)) + geometry.window
+    change = np.zeros(max(geometry.width, reached) + 1, np.int64)
+    np.add.at(change, geometry.x0, tally.n_frames)
+    np.add.at(change, geometry.x0 + geometry.window, -tally.n_frames)
+    return np.cumsum(change)[: geometry.width].astype(np.uint32)
+
+
+def _lowest_level(totals: NDArray[np.uint32]) -> float:
+    """A level that hardly any pixel lies below: 2nd percentile of the mean flux over the window."""
+    seen = totals[1] > 0
+    if not seen.any():
+        return 1e-5
+    rate = np.minimum((totals[0][seen] + 0.5) / (totals[1][seen] + 1.0), 0.999)
+    return float(max(-np.log1p(-np.percentile(rate, 2.0)) * 0.5, 1e-5))
+
+
+def _shrunk(ones: NDArray[np.float64], exposures: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Flux per pixel: its own counts drawn to the local mean by as much as pixels are alike (empirical Bayes)."""
+    row_rates = ones.sum(1)[exposures.sum(1) > 0] / exposures.sum(1)[exposures.sum(1) > 0]
+    overall = max(float(np.median(row_rates)), 1e-6)
+    mean = np.full(ones.shape, overall)
+    for _ in range(2):
+        # Hot pixels must not lift their neighbourhood: they take no part in the mean.
+        usual = ones <= mean * exposures + 4.0 * np.sqrt(mean * exposures) + 4.0
+        local_ones, local_exposures = (
+            cv2.blur(np.where(usual, a, 0.0), (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), borderType=cv2.BORDER_REFLECT)
+            for a in (ones, exposures)
+        )
+        # Neighbourhoods without data take the picture's level.
+        mean = np.maximum(local_ones + overall, 0.0) / (local_exposures + 1.0)
+    expected = mean * exposures
+    outlier = ones > expected + 4.0 * np.sqrt(expected) + 4.0
+    usual = ~outlier & (exposures > 0)
+    # Variance between pixels beyond that of counting, as the shape of a gamma prior: mean^2 / variance.
+    spread = float(np.sum(((ones - expected) ** 2 - expected)[usual]) / max(np.sum(expected[usual] ** 2), 1e-9))
+    prior_counts = 1.0 / min(max(spread, 1e-3), 1.0)
+    rate = (ones + prior_counts) / (exposures + prior_counts / np.maximum(mean, 1e-7))
+    rate = np.where(outlier, ones / np.maximum(exposures, 1.0), rate)
+    return np.asarray(-np.log1p(-np.minimum(rate, 0.9999)))
+
+
+def hot_pixels(totals: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Flux (rows, width) of pixels far above their neighbours over the whole sweep, 0 elsewhere.
+
+    totals: (2, rows, width), ones and exposures of each pixel while inside the stored window.
+    """
+    ones, exposures = totals[0].astype(np.float64), totals[1].astype(np.float64)
+    rate = np.minimum(ones / np.maximum(exposures, 1.0), 1.0).astype(np.float32)
+    around = cv2.medianBlur(rate, 5).astype(np.float64)
+    expected = around * exposures
+    excess = ones - expected
+    # A stripe brighter than its neighbours' may cross the pixel once: allow it as much light again as the median pixel.
+    hot = excess > HOT_SIGMA * np.sqrt(expected + 1.0) + 0.5 * expected.clip(max=np.median(expected))
+    excess_rate = np.clip(excess / np.maximum(exposures, 1.0), 0.0, 0.9999)
+    return np.where(hot & (exposures > 0), -np.log1p(-excess_rate), 0.0)

@@ -1,0 +1,330 @@
+"""What the compiled row likelihood reads: the sweep, the learned state, and one row of it in near-to-far order.
+
+Light of the stripe that the fog scatters once more: a halo on both sides of it, part of each position's hypothesis.
+
+At the distance d along the row from a stripe of s photons stand, per pixel,
+
+    s rho(w, d),   rho(w, d) = sum over k of halo(w, k) exp(-|d| / HALO_REACHES_PX[k]) / (2 HALO_REACHES_PX[k])
+
+photons; halo(w, k) is learned (`rig.estimate.joint.halo`) at HALO_NODES path inverse depths, in between by straight
+lines.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.row.likelihood import FLUX_MAX, FLUX_MIN, logit_table, none_prior, row_posterior, row_scores
+from rig.estimate.row.model import HALO_REACHES_PX, RowModel, fine_profiles, line_profile
+from rig.geometry.windows import MARGIN_PX, SweepGeometry
+
+
+def halo_shares(model: RowModel, pixels: int) -> NDArray[np.float32]:
+    """rho at each profile bin and 0 to pixels - 1 px from the stripe, (BINS, pixels); zeros where there is no halo."""
+    reach = np.array(HALO_REACHES_PX)[:, None]
+    shape = np.exp(-np.arange(pixels) / reach) / (2 * reach)
+    return np.asarray(over_bins(np.asarray(model.halo), len(model.profile)) @ shape, np.float32)
+
+
+def over_bins(values: NDArray[np.floating], bins: int) -> NDArray[np.float64]:
+    """What stands at HALO_NODES nodes (nodes, n) at each profile bin, (bins, n)."""
+    at = np.linspace(0, len(values) - 1, bins)
+    low = np.minimum(at.astype(int), len(values) - 2)
+    part = (at - low)[:, None]
+    return np.asarray((1 - part) * values[low] + part * values[low + 1])
+
+
+TABLE = logit_table()
+
+Float32 = NDArray[np.float32]
+
+
+class Sweep(NamedTuple):
+    """Geometry of a sweep; arrays as in SweepGeometry, depth range as inverse depths."""
+
+    window: int
+    x0: NDArray[np.int32]
+    x_lo: NDArray[np.int32]
+    x_hi: NDArray[np.int32]
+    near_is_left: bool
+    plane: NDArray[np.float64]
+    u: Float32
+    v: Float32
+    w_near: float
+    w_far: float
+    others: NDArray[np.float64]
+
+
+class Lines(NamedTuple):
+    """Some rows of some columns, with their counts.
+
+    counts: (lines, window) integers; row, column: int32 (lines,); exposures: int32 (lines,). x_px, trust: float32
+    (lines,), where neighbours say the stripe is and how probably so; with a trust of 0 the line stands alone.
+    """
+
+    counts: NDArray[np.integer]
+    row: NDArray[np.int32]
+    column: NDArray[np.int32]
+    exposures: NDArray[np.int32]
+    x_px: Float32
+    trust: Float32
+
+
+class RowState(NamedTuple):
+    """A RowModel as the kernels read it: log weights instead of weights, the line's profiles instead of its width.
+
+    glow: (BINS,) of the halo at the stripe itself, photons per pixel over those of the stripe.
+    """
+
+    profile: Float32
+    w_lo: float
+    per_w: float
+    row_gain: Float32
+    column_gain: Float32
+    ambient: Float32
+    amplitude: Float32
+    log_weight: Float32
+    none_weight: float
+    psi: Float32
+    fine: Float32
+    table: Float32
+    glow: Float32
+
+
+class RowBuffers(NamedTuple):
+    """Buffers of one row, filled by `row_fluxes` and `judge_line`, nearest pixel first; made once per thread.
+
+    n: ones; before, behind: flux of each pixel in front of and behind the stripe; scale: stripe photons at amplitude 1;
+    cell: nearest profile bin; gain: geometry factor of the haze; others: flux of other lines' haze, in before and
+    behind; w: inverse depth; log_prior: of positions; taps, edge, score, posterior, by_amplitude: see `row_scores` and
+    `row_posterior`.
+    """
+
+    n: Float32
+    before: Float32
+    behind: Float32
+    scale: Float32
+    cell: NDArray[np.int32]
+    gain: Float32
+    others: Float32
+    w: Float32
+    log_prior: Float32
+    taps: Float32
+    edge: Float32
+    score: Float32
+    posterior: Float32
+    by_amplitude: NDArray[np.float64]
+
+
+def sweep_of(geometry: SweepGeometry) -> Sweep:
+    """Kernel input of a sweep's geometry."""
+    near_m, far_m = geometry.depth_range_m
+    # Kernels read most of them by their addresses.
+    x0, x_lo, x_hi = (np.ascontiguousarray(a, np.int32) for a in (geometry.x0, geometry.x_lo, geometry.x_hi))
+    u, v = (np.ascontiguousarray(a, np.float32) for a in (geometry.u, geometry.v))
+    return Sweep(
+        geometry.window, x0, x_lo, x_hi, geometry.near_is_left, geometry.plane, u, v, 1.0 / near_m, 1.0 / far_m,
+        np.zeros((geometry.columns, 0, 3)) if geometry.others is None else geometry.others,
+    )  # fmt: skip
+
+
+def state_of(model: RowModel) -> RowState:
+    """Kernel input of a learned state."""
+    return RowState(
+        model.profile, model.w_lo, model.per_w, model.row_gain, model.column_gain, model.ambient, model.amplitude,
+        np.log(np.maximum(model.weight, 1e-6)).astype(np.float32), model.none_weight, line_profile(model.line_sigma_px),
+        fine_profiles(model.line_sigma_px), TABLE, halo_shares(model, 1)[:, 0].copy(),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def row_buffers(window: int, amplitudes: int) -> RowBuffers:
+    """Buffers for rows of up to `window` pixels."""
+    return RowBuffers(
+        np.empty(window, np.float32), np.empty(window, np.float32), np.empty(window, np.float32),
+        np.empty(window, np.float32), np.empty(window, np.int32), np.empty(window, np.float32),
+        np.empty(window, np.float32), np.empty(window, np.float32), np.empty(window, np.float32),
+        np.empty((3, window), np.float32),
+        np.empty(window + 1, np.float32), np.empty((amplitudes, window), np.float32), np.empty(window, np.float32),
+        np.empty(amplitudes, np.float64),
+    )  # fmt: skip
+
+
+@numba.njit(inline="always")
+def path_to_plane(px, py, pz, vy):  # type: ignore[no-untyped-def]
+    """Length of the light's path to a plane's points on a row of tangent vy, per unit of depth."""
+    # Tangent at which this row meets the plane infinitely far away: the direction of the light in the row.
+    path_u = -(py * vy + pz) / px
+    return np.sqrt(1.0 + path_u * path_u + vy * vy)
+
+
+@numba.njit(inline="always")
+def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignore[no-untyped-def]
+    """Path from the camera to a plane's point in a pixel's direction, per unit of depth; its inverse depth; its place
+    among the profile's bins.
+    """
+    path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
+    w = px * ux + py * vx + pz
+    return path_c, w, min(max((w * 2.0 / (path_p + path_c) - w_lo) * per_w, 0.0), bins - 1.001)
+
+
+@numba.njit(inline="always")
+def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-def]
+    """Ambient light, and what the profile brings that is `one` in a bin and `other` in the next."""
+    return min(max(ambient + gain * (one + part * (other - one)), FLUX_MIN), FLUX_MAX)
+
+
+@numba.njit(inline="always")
+def with_rays(u, y, first, last):  # type: ignore[no-untyped-def]
+    """First and last of those pixels of a row, without the ones at its ends that have no ray; one is always left."""
+    while first < last and np.isnan(u[y, first]):
+        first += 1
+    while last > first and np.isnan(u[y, last]):
+        last -= 1
+    return first, last
+
+
+@numba.njit(inline="always")
+def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
+    """Length of the light's path to the plane's points on row y per unit of depth, and the strength of the haze there.
+
+    middle: pixel of the row that its v is taken from.
+    """
+    plane = sweep.plane[c]
+    path_p = path_to_plane(plane[0], plane[1], plane[2], sweep.v[y, middle])
+    return path_p, state.row_gain[y] * state.column_gain[c] * path_p
+
+
+@numba.njit(inline="always")
+def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
+    """Haze of the lines that are lit together with column c, at one pixel, whichever side of c's stripe it lies on.
+
+    Where their own stripes lie is not known: their haze has not ended with the share of the depth range that lies
+    behind the pixel's point on their plane, surely where that is nearer than the range begins.
+    """
+    profile, light = state.profile, 0.0
+    ux, vx = np.float64(sweep.u[y, x]), np.float64(sweep.v[y, x])
+    path_c = np.sqrt(1.0 + ux * ux + vx * vx)
+    for other in range(sweep.others.shape[1]):
+        plane = sweep.others[c, other]
+        path_u = -(plane[1] * vx + plane[2]) / plane[0]
+        path_p = np.sqrt(1.0 + path_u * path_u + vx * vx)
+        w = plane[0] * ux + plane[1] * vx + plane[2]
+        there = min(max((w - sweep.w_far) / (sweep.w_near - sweep.w_far), 0.0), 1.0)
+        b = min(max((w * 2.0 / (path_p + path_c) - state.w_lo) * state.per_w, 0.0), profile.shape[0] - 1.001)
+        i = int(b)
+        haze = profile[i, 0] + (b - i) * (profile[i + 1, 0] - profile[i, 0])
+        rest = profile[i, 1] + (b - i) * (profile[i + 1, 1] - profile[i, 1])
+        light += path_p * (there * haze + (1.0 - there) * rest)
+    return np.float32(state.row_gain[y] * path_c * light)
+
+
+@numba.njit(inline="always")
+def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyped-def]
+    """Flux before and behind the stripe of column c, the stripe's scale, geometry factor, inverse depth and profile bin
+    of one pixel, and what other lines' haze brings to both fluxes.
+    """
+    plane, profile = sweep.plane[c], state.profile
+    path_c, w, b = profile_place(
+        plane[0], plane[1], plane[2], sweep.u[y, x], sweep.v[y, x], path_p, state.w_lo, state.per_w, profile.shape[0]
+    )
+    i = int(b)
+    f = np.float32(b - i)
+    gain = strength * path_c
+    ambient = state.ambient[y, x]
+    before = flux_between(ambient, gain, profile[i, 0], profile[i + 1, 0], f)
+    behind = flux_between(ambient, gain, profile[i, 1], profile[i + 1, 1], f)
+    others = np.float32(0.0)
+    if sweep.others.shape[1] > 0:
+        others = others_at(sweep, state, y, c, x)
+        before, behind = min(before + others, FLUX_MAX), min(behind + others, FLUX_MAX)
+    return before, behind, profile[i, 2] + f * (profile[i + 1, 2] - profile[i, 2]), gain, w, int(b + 0.5), others
+
+
+@numba.njit(cache=True, nogil=True)
+def row_fluxes(sweep: Sweep, state: RowState, row: RowBuffers, y: int, c: int) -> tuple[int, int, int, int]:
+    """Fill before to log_prior of `row` for row y of column c: what is expected there, whatever was counted.
+
+    Returns (length, first and last index that a stripe may have, x of index 0); pixel t is x + t where near is left,
+    else x - t. The length is 0 where there is nothing to search.
+    """
+    lo, hi, x0 = sweep.x_lo[y, c], sweep.x_hi[y, c], sweep.x0[c]
+    if lo > hi:
+        return 0, 0, -1, 0
+    u, profile = sweep.u, state.profile
+    first, last = with_rays(
+        u, y, max(lo - MARGIN_PX, x0, 0), min(hi + MARGIN_PX, x0 + sweep.window - 1, u.shape[1] - 1)
+    )
+    length = last - first + 1
+    start, step = (first, 1) if sweep.near_is_left else (last, -1)
+    begin = lo - first if sweep.near_is_left else last - hi
+    end = min(begin + hi - lo, length - 1)
+    begin = max(begin, 0)
+    if begin > end:
+        return 0, 0, -1, 0
+    path_p, strength = line_light(sweep, state, y, c, (first + last) // 2)
+    for t in range(length):
+        x = start + step * t
+        before, behind, scale, gain, w, cell, others = fluxes_at(sweep, state, y, x, c, path_p, strength)
+        row.before[t] = before
+        row.behind[t] = behind
+        row.scale[t] = scale
+        row.cell[t] = cell
+        row.gain[t] = gain
+        row.others[t] = others
+        row.w[t] = w
+        row.log_prior[t] = profile[cell, 3]
+    return length, begin, end, start
+
+
+@numba.njit(cache=True, nogil=True)
+def judge_line(
+    sweep: Sweep, state: RowState, row: RowBuffers, lines: Lines, i: int
+) -> tuple[int, int, int, int, float, float, float]:
+    """Posterior of line i, in `row`.
+
+    Returns what `row_fluxes` does, then the probability of 'no stripe', the share of its prior that the picture's
+    border accounts for, and the log evidence.
+    """
+    c = lines.column[i]
+    length, first, last, start = row_fluxes(sweep, state, row, lines.row[i], c)
+    if length == 0 or lines.exposures[i] == 0:
+        return 0, 0, -1, 0, 1.0, 0.0, 0.0
+    step = 1 if sweep.near_is_left else -1
+    for t in range(length):
+        row.n[t] = lines.counts[i, start + step * t - sweep.x0[c]]
+    row_scores(
+        row.n, np.float32(lines.exposures[i]), row.before, row.behind, row.scale, length, state.amplitude, state.psi,
+        state.table, row.taps, row.edge, row.score,
+    )  # fmt: skip
+    if lines.trust[i] > 0.0:
+        _heed_neighbours(row, first, last, (lines.x_px[i] - start) * step, lines.trust[i])
+    prior = none_prior(sweep.w_near, sweep.w_far, row.w[first], row.w[last], state.none_weight)
+    none, evidence = row_posterior(
+        row.score,
+        row.edge,
+        length,
+        first,
+        last,
+        state.log_weight,
+        row.log_prior,
+        prior,
+        row.posterior,
+        row.by_amplitude,
+    )
+    for t in range(length):
+        evidence += row.taps[1, t]
+    return length, first, last, start, none, prior[0] + prior[1] - 2.0 * prior[2], evidence
+
+
+@numba.njit(cache=True, nogil=True)
+def _heed_neighbours(row: RowBuffers, first: int, last: int, place: float, trust: float) -> None:
+    """Change the prior of positions for a stripe that lies within about a pixel of `place` with probability `trust`."""
+    mass = 0.0
+    for t in range(first, last + 1):
+        mass += np.exp(row.log_prior[t])
+    for t in range(first, last + 1):
+        near = np.exp(-0.5 * (t - place) ** 2) / np.sqrt(2.0 * np.pi)
+        row.log_prior[t] = np.log((1.0 - trust) * np.exp(row.log_prior[t]) / mass + trust * near + 1e-9)

@@ -1,0 +1,165 @@
+"""What the row likelihood knows of light and medium, all of it learned from counts.
+
+Haze is one profile over path inverse depth (its single-scattering form depends on the two path lengths only) times a
+gain per row; the level behind the stripe is a second profile. Amplitudes are powers q of 1 m-normalised reflectance:
+the stripe at inverse depth w carries q S(w) photons, S = w^2 exp(-2 extinction / w).
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
+from dataclasses import field as field_of
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.row.likelihood import LABEL_PX, LABELS
+
+BINS = 64
+AMPLITUDES = 4
+EXTINCTION_MAX_PER_M = 5.0
+HALO_NODES = 12
+HALO_REACHES_PX = (8.0, 16.0, 32.0, 64.0, 128.0)
+"""Reaches of the exponentials that make up a halo: no line is as wide, and the last one is even over most windows."""
+OPTICAL_DEPTH_MAX = 50.0
+"""Most extinction times path at which haze is looked for: e^-100 of it would come back."""
+
+
+@dataclass(frozen=True, slots=True)
+class RowModel:
+    """Learned state of the row likelihood, enough to estimate any map again bit for bit.
+
+    profile: (BINS, 4) float32 over path inverse depth from w_lo in steps 1/per_w: haze before the stripe and level
+    behind it in photons per exposure and pixel at unit geometry factor, the stripe scale S, and the log prior of
+    positions. row_gain: (rows,) and column_gain: (columns,) float32, strength of the haze on each. ambient: (rows,
+    width) float32, photons per exposure of ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at
+    S = 1 and their probability. none_weight: probability of a row without stripe. line_sigma_px: width of the line.
+    extinction_per_m and its standard deviation: NaN where the haze does not resolve it. halo: (HALO_NODES, reaches)
+    float32, light of the stripe's halo over its own (`halo`), zeros where there is none. before: what the map before
+    left to this one (`temporal`), None where that is nothing.
+    """
+
+    profile: NDArray[np.float32]
+    w_lo: float
+    per_w: float
+    row_gain: NDArray[np.float32]
+    column_gain: NDArray[np.float32]
+    ambient: NDArray[np.float32]
+    amplitude: NDArray[np.float32]
+    weight: NDArray[np.float64]
+    none_weight: float
+    line_sigma_px: float
+    extinction_per_m: float
+    extinction_sd_per_m: float
+    halo: NDArray[np.float32] = field_of(
+        default_factory=lambda: np.zeros((HALO_NODES, len(HALO_REACHES_PX)), np.float32)
+    )
+    before: NDArray[np.uint16] | None = None
+
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Every field that there is as an array, to be kept with the map."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: np.asarray(value) for name, value in values.items() if value is not None}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "RowModel":
+        """The state that `arrays` gave, bit for bit. KeyError where one is missing that was always there."""
+        kept = {
+            field.name: arrays[field.name]
+            for field in fields(cls)
+            if field.name in arrays or (field.default is MISSING and field.default_factory is MISSING)
+        }
+        values: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in kept.items()}
+        return cls(**values)
+
+    def path_m(self) -> NDArray[np.float64]:
+        """Mean of the two path lengths at each profile bin, (BINS,) metres."""
+        return 1.0 / (self.w_lo + np.arange(BINS) / self.per_w)
+
+
+def stripe_scale(path_m: NDArray[np.float64], extinction_per_m: float) -> NDArray[np.float64]:
+    """Relative strength of a stripe of given reflectance over distance, 1 at the middle of the inverse depth range."""
+    log_scale = -2.0 * np.log(path_m) - 2.0 * extinction_per_m * path_m
+    middle = len(path_m) // 2
+    return np.asarray(np.exp(np.clip(log_scale - log_scale[middle], -30.0, 30.0)))
+
+
+def line_profile(sigma_px: float) -> NDArray[np.float32]:
+    """Share of a Gaussian line in the pixels 0, 1, ... T px from its centre; T = 2 to 6 covers 2.5 sigma."""
+    return pixel_shares(sigma_px, np.arange(_reach(sigma_px) + 1, dtype=np.float64))
+
+
+def fine_profiles(sigma_px: float) -> NDArray[np.float32]:
+    """Share of the line in pixels -R..R for centres a quarter pixel apart around 0, (LABELS, 2R + 1) float32."""
+    reach = _reach(sigma_px) + 1
+    centres = (np.arange(LABELS) - LABELS // 2) * LABEL_PX
+    return pixel_shares(sigma_px, np.arange(-reach, reach + 1) - centres[:, None])
+
+
+def _reach(sigma_px: float) -> int:
+    return int(min(max(2, math.ceil(2.5 * sigma_px)), 6))
+
+
+def pixel_shares(sigma_px: float, distance_px: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Integral of a unit Gaussian over the pixels at the given distances."""
+    erf = np.vectorize(math.erf, otypes=[np.float64])
+    scale = 1.0 / (math.sqrt(2.0) * sigma_px)
+    shares = erf((distance_px + 0.5) * scale) - erf((distance_px - 0.5) * scale)
+    return np.asarray(0.5 * shares, dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class HazeFit:
+    """Exponential haze amplitude * exp(-2 extinction path), with the standard deviation of the extinction."""
+
+    amplitude: float
+    extinction_per_m: float
+    extinction_sd_per_m: float
+
+
+def fit_haze(path_m: NDArray[np.float64], flux: NDArray[np.float64], variance: NDArray[np.float64]) -> HazeFit | None:
+    """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,); None where there is no haze.
+
+    Gauss-Newton on amplitude and extinction, the latter kept in 0 to EXTINCTION_MAX_PER_M and OPTICAL_DEPTH_MAX at the
+    nearest haze.
+    """
+    used = np.isfinite(flux) & np.isfinite(variance) & (variance > 0)
+    if used.sum() < 4:
+        return None
+    s, h, weight = path_m[used], flux[used], 1.0 / variance[used]
+    total = float(np.sum(weight * h) / np.sum(weight))
+    if total <= 0 or total**2 * np.sum(weight) < 25.0:
+        return None
+    most = min(EXTINCTION_MAX_PER_M, OPTICAL_DEPTH_MAX / float(s.min()))
+    candidates = np.concatenate([[0.0], np.geomspace(min(0.005, most), most, 60)])
+
+    def residual(extinction: float) -> tuple[float, float]:
+        shape = np.exp(-2.0 * extinction * (s - s.min()))
+        amplitude = float(np.sum(weight * shape * h) / np.sum(weight * shape**2))
+        return float(np.sum(weight * (h - amplitude * shape) ** 2)), amplitude
+
+    extinction = float(candidates[int(np.argmin([residual(float(e))[0] for e in candidates]))])
+    for _ in range(20):
+        amplitude = residual(extinction)[1]
+        shape = np.exp(-2.0 * extinction * (s - s.min()))
+        slope = -2.0 * (s - s.min()) * amplitude * shape
+        design = np.stack([shape, slope])
+        normal = (design * weight) @ design.T
+        if np.linalg.det(normal) <= 1e-12 * normal[0, 0] * max(normal[1, 1], 1e-300):
+            break
+        step = float(np.linalg.solve(normal, (design * weight) @ (h - amplitude * shape))[1])
+        extinction = float(
+            np.clip(extinction + np.clip(step, -0.5 * extinction - 0.01, 0.5 * extinction + 0.01), 0.0, most)
+        )
+        if abs(step) < 1e-7:
+            break
+    misfit, amplitude = residual(extinction)
+    shape = np.exp(-2.0 * extinction * (s - s.min()))
+    slope = -2.0 * (s - s.min()) * amplitude * shape
+    normal = (np.stack([shape, slope]) * weight) @ np.stack([shape, slope]).T
+    determinant = float(np.linalg.det(normal))
+    sd = (
+        np.inf if determinant <= 0 else float(np.sqrt(normal[0, 0] / determinant * max(misfit / (used.sum() - 2), 1.0)))
+    )
+    return HazeFit(amplitude * float(np.exp(2.0 * extinction * s.min())), extinction, sd)

@@ -1,0 +1,172 @@
+"""What the search along a row reads and writes: a sweep's `SearchTables`, what is `RowAnswers`, and a thread's
+`SearchPointers` for both.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.estimate.search.closeup import Closeup
+from rig.estimate.search.tables import ScreenTables
+from rig.simd.memory import address_of
+
+COUNT_LIMIT: Final = 63
+"""Largest count the search works with; counts of more exposures are halved until they fit."""
+EXPOSURE_PARTS: Final = 4
+"""Exposures whose counts were halved are broken numbers: 65 become 32.5, 65535 become 63.999."""
+FIELDS: Final = 5
+"""x_px, confidence, x_sd_px, signal, haze: see `StripeTable`."""
+
+
+class SearchTables(NamedTuple):
+    """All that is needed to judge the rows of a sweep; fixed while the sweep lasts.
+
+    x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, 2, rows + LANES), first and
+    last stored pixel of each search window, the first behind the last where there is none. rows: of the picture.
+    ambient: float32 (bands, width padded to whole words). hot_start: int32 (words, rows + 1), for windows that begin at
+    each word the first entry of each row in hot_at, int16, stored pixels whose counts say nothing, and hot_place,
+    int32, their places in the counts of all rows of the picture. nominal: exposures the tables are for. faintest,
+    brightest: photons of a stripe at scale 1. reach: half the line's width in px. shift: units of the scores are
+    128 >> shift an octave, close_shift: of the close-up's. most: largest count. quiet_step: every so manieth column
+    teaches the ambient light. flux: see `count_fluxes`.
+    """
+
+    tables: ScreenTables
+    closeup: Closeup
+    band_rows: int
+    x0: NDArray[np.int32]
+    window: int
+    rows: int
+    limits: NDArray[np.int16]
+    near_is_left: bool
+    ambient: NDArray[np.float32]
+    hot_start: NDArray[np.int32]
+    hot_at: NDArray[np.int16]
+    hot_place: NDArray[np.int32]
+    nominal: float
+    faintest: float
+    brightest: float
+    reach: int
+    shift: int
+    close_shift: int
+    most: int
+    quiet_step: int
+    flux: NDArray[np.float32]
+
+
+class RowAnswers(NamedTuple):
+    """What a sweep gives, to be filled.
+
+    stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 where there is nothing. quiet: int32 (rows, PAIRS,
+    lanes of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
+    (rows, lanes + 1), their exposures in 1/EXPOSURE_PARTS as steps up and down. light: int32, like quiet, ones of every
+    pixel within the windows. The last ones of both are still in quiet_here and light_here, uint8 (rows, PAIRS, lanes of
+    the window, 2). lines: int32 (lines, window), counts of the rows that the learning reads; line_start:
+    int32 (columns + 1,) and line_row: int32, the rows of each column in order.
+    """
+
+    stripe: NDArray[np.float32]
+    quiet: NDArray[np.int32]
+    quiet_exposures: NDArray[np.int32]
+    light: NDArray[np.int32]
+    quiet_here: NDArray[np.uint8]
+    light_here: NDArray[np.uint8]
+    lines: NDArray[np.int32]
+    line_start: NDArray[np.int32]
+    line_row: NDArray[np.int32]
+
+
+class SearchPointers(NamedTuple):
+    """Judge, Found and a thread's own memory as addresses and sizes: see `rig.simd.vectors` for why."""
+
+    memory: int
+    lanes: int
+    columns: int
+    rows: int
+    bands: int
+    taps: int
+    edge: int
+    tap: int
+    position: int
+    slope: int
+    lane: int
+    none: int
+    neutral: int
+    before: int
+    scale: int
+    first: int
+    last: int
+    weight: int
+    weight_constant: int
+    weight_pairs: int
+    label: int
+    square: int
+    x0: int
+    limits: int
+    limit_rows: int
+    ambient: int
+    ambient_px: int
+    several_lines: bool
+    hot_start: int
+    hot_at: int
+    hot_place: int
+    flux: int
+    stripe: int
+    quiet: int
+    quiet_exposures: int
+    light: int
+    quiet_sum: int
+    light_sum: int
+    sum_lanes: int
+    lines: int
+    line_start: int
+    line_row: int
+    band_rows: int
+    window: int
+    reach: int
+    shift: int
+    close_shift: int
+    most: int
+    quiet_step: int
+    near_is_left: bool
+    nominal: np.float32
+    faintest: np.float32
+    brightest: np.float32
+
+
+@numba.njit(cache=True, nogil=True)
+def desk_of(judge: SearchTables, found: RowAnswers, memory: NDArray[np.uint8]) -> SearchPointers:
+    """Addresses of everything; the arrays must outlive it. memory: of a thread, see `search_memory`."""
+    tables, closeup = judge.tables, judge.closeup
+    several_lines = tables.ambient.shape[0] > 0
+    ambient = address_of(tables.ambient) if several_lines else address_of(judge.ambient)
+    return SearchPointers(
+        address_of(memory), tables.lane.shape[2], judge.x0.shape[0], judge.rows, tables.lane.shape[1],
+        tables.tap.shape[4], address_of(tables.edge), address_of(tables.tap), address_of(tables.position),
+        address_of(tables.slope), address_of(tables.lane), address_of(tables.none), address_of(tables.neutral),
+        address_of(tables.before), address_of(tables.scale), address_of(tables.first), address_of(tables.last),
+        address_of(closeup.weight), address_of(closeup.constant), closeup.weight.shape[3],
+        address_of(closeup.label), address_of(closeup.square), address_of(judge.x0), address_of(judge.limits),
+        judge.limits.shape[2], ambient, judge.ambient.shape[1], several_lines, address_of(judge.hot_start),
+        address_of(judge.hot_at), address_of(judge.hot_place),
+        address_of(judge.flux), address_of(found.stripe), address_of(found.quiet_here),
+        address_of(found.quiet_exposures), address_of(found.light_here), address_of(found.quiet),
+        address_of(found.light), found.light.shape[2],
+        address_of(found.lines), address_of(found.line_start), address_of(found.line_row), judge.band_rows,
+        judge.window, judge.reach, judge.shift, judge.close_shift, judge.most, judge.quiet_step, judge.near_is_left,
+        np.float32(judge.nominal), np.float32(judge.faintest), np.float32(judge.brightest),
+    )  # fmt: skip
+
+
+def count_fluxes() -> NDArray[np.float32]:
+    """Photons per exposure that n ones in k exposures speak for, float32: nearly unbiased, finite also at n = k.
+
+    Rows are k in steps of 1/EXPOSURE_PARTS, columns n.
+
+    Halved counts are rounded up, so that n may exceed the limit by one.
+    """
+    parts, n = np.mgrid[: EXPOSURE_PARTS * (COUNT_LIMIT + 1), : COUNT_LIMIT + 2]
+    k = parts / EXPOSURE_PARTS
+    return np.log((k + 0.5) / (np.maximum(k - n, 0) + 0.5)).astype(np.float32)

@@ -1,0 +1,171 @@
+"""When an estimator learns, and what it goes by until then.
+
+The first map is learned from before it is estimated. Now and then a later map teaches, on a thread beside the stream,
+and is heeded a fixed number of frames later, so that a live scan never waits and results do not depend on speed.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import CountVolume, FrameTally
+from rig.errors import UsageError
+from rig.estimate.row.ambient import ambient_map
+from rig.estimate.row.em import Expectation, learn_first, learn_next, lines_of, next_lattice
+from rig.estimate.row.inputs import Lines
+from rig.estimate.row.model import RowModel
+from rig.estimate.search.prepare import judge_of
+from rig.estimate.search.stream import nominal_exposures, search_volume
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import SweepGeometry
+from rig.threads import RowWorkers, yield_to_others
+
+LEAST_SURE = 0.02
+"""Share of confident answers below which a map teaches nothing: a closed shutter must not spoil the maps after it."""
+TEACH_FRAMES = 100_000
+"""Lit frames from one map that teaches to the next: a second at 100 kHz. Learning costs some 0.2 s of one core, with
+the tables of `joint` twice that."""
+LAG_FRAMES = 50_000
+"""Lit frames from a map that teaches to the first one that heeds it: time to learn beside the stream."""
+KEPT = 2
+"""Tables that are kept under one model: passes of a map are looked at with all of their counts and half of them."""
+
+Tables = TypeVar("Tables")
+"""What an estimator makes ready under a model, for sweeps of one geometry."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LearningSetting:
+    """What tables are made for. exposures: of most columns; dark: whether sweeps have dark frames.
+
+    UsageError where the model was learned from a sweep of another size.
+    """
+
+    model: RowModel
+    geometry: SweepGeometry
+    exposures: int
+    dark: bool
+
+    def __post_init__(self) -> None:
+        """Kernels look nothing up twice: what the model has too little of would be read beyond its end."""
+        model, geometry = self.model, self.geometry
+        learned = *model.ambient.shape, len(model.column_gain)
+        here = geometry.rows, geometry.width, geometry.columns
+        if learned != here or len(model.row_gain) != geometry.rows:
+            raise UsageError(
+                f"the learned state is of {_size(*learned)}, the sweep of {_size(*here)}; estimate it with a state of "
+                "its own, or with none, to learn one from it"
+            )
+
+    def same(self, other: "LearningSetting") -> bool:
+        """Whether the other's tables would be the same ones."""
+        return self.akin(other) and (self.exposures, self.dark) == (other.exposures, other.dark)
+
+    def akin(self, other: "LearningSetting") -> bool:
+        """Whether the other is of the same model and geometry."""
+        return self.model is other.model and self.geometry is other.geometry
+
+
+def _size(rows: int, pixels: int, columns: int) -> str:
+    return f"{rows} rows of {pixels} pixels and {columns} columns"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """What a sweep can teach: its tally, ones and exposures of pixels behind clear stripes, some lines of counts.
+
+    intensity: of the tally, taken at once: counts may grow by another pass while the lesson is learned. more: what the
+    estimator itself learns from, see `OnlineLearner`.
+    """
+
+    tally: FrameTally
+    intensity: NDArray[np.uint32]
+    quiet: NDArray[np.float64]
+    lines: Lines
+    more: Any = None
+
+
+class OnlineLearner(Generic[Tables]):
+    """The model that an estimator goes by, `None` before a map that taught, and the tables it made under it.
+
+    make: makes tables; called on the thread beside the stream too, as is learn_more: it learns from what `Seen` has for
+    it in `more`, on top of what every estimator does. learns: whether later maps change the model.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[LearningSetting, RowWorkers], Tables],
+        model: RowModel | None,
+        *,
+        learns: bool,
+        learn_more: Callable[[LearningSetting, Any, RowWorkers], RowModel] | None = None,
+    ) -> None:
+        self._make = make
+        self._learn_more = learn_more
+        self._learns = learns
+        self.model = model
+        self._made: list[tuple[LearningSetting, Tables]] = []
+        """Those of one model and geometry, the last used last."""
+        self._taught: Expectation | None = None
+        self._lesson: Future[tuple[LearningSetting, Expectation, Tables]] | None = None
+        self._tutor = ThreadPoolExecutor(1, thread_name_prefix="learning", initializer=yield_to_others)
+        self._frames_since = 0
+        """Lit frames since the last map that taught."""
+
+    def model_for(self, first: Callable[[], RowModel]) -> RowModel:
+        """The model to estimate a sweep with; first: learns it from the sweep where there is none yet."""
+        return self.model if self.model is not None else first()
+
+    def tables(self, setting: LearningSetting, workers: RowWorkers) -> Tables:
+        """Tables for a setting; made once while it, and at most one other that it takes turns with, stay the same."""
+        kept = [made for made in self._made if made[0].akin(setting)]
+        found = next((made for made in kept if made[0].same(setting)), None)
+        self._made = [made for made in kept if made is not found][1 - KEPT :]  # the rest may go before more is made
+        self._made.append(found or (setting, self._make(setting, workers)))
+        return self._made[-1][1]
+
+    def attend(self, stripes: StripeTable, used: RowModel, frames: int, see: Callable[[], Seen]) -> None:
+        """After a map of so many lit frames, estimated with `used`; see: called where the map is to teach."""
+        self._frames_since += frames
+        sure = bool(np.mean(stripes.confidence > 0.5) >= LEAST_SURE)
+        if sure and self.model is None:
+            self.model = used
+        if self._lesson is None:
+            if self._learns and sure and self._frames_since >= TEACH_FRAMES:
+                self._frames_since = 0
+                assert self._made, "a map has been estimated"
+                self._lesson = self._tutor.submit(self._teach, self._made[-1][0], see(), self._taught)
+        elif self._frames_since >= LAG_FRAMES:
+            # Waits where the lesson is not over: which map is estimated with what never depends on speed.
+            setting, self._taught, tables = self._lesson.result()
+            self.model, self._made = setting.model, [(setting, tables)]
+            self._lesson = None
+
+    def _teach(
+        self, setting: LearningSetting, seen: Seen, before: Expectation | None
+    ) -> tuple[LearningSetting, Expectation, Tables]:
+        """The setting carried on by one sweep, and the tables that follow from it, on one thread beside the stream."""
+        ambient = ambient_map(seen.tally, seen.intensity, setting.geometry, seen.quiet)
+        with RowWorkers(1) as workers:
+            model, taught = learn_next(
+                seen.lines, setting.geometry, replace(setting.model, ambient=ambient), before, workers
+            )
+            setting = replace(setting, model=model)
+            if self._learn_more is not None:
+                setting = replace(setting, model=self._learn_more(setting, seen.more, workers))
+            return setting, taught, self._make(setting, workers)
+
+
+def first_model(volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> RowModel:
+    """Learn from the first sweep; it is searched once to find which pixels were quiet behind the stripe."""
+    intensity = volume.intensity()
+    model = learn_first(volume, geometry, ambient_map(volume, intensity, geometry, None), workers)
+    dark = volume.dark_counts is not None
+    judge = judge_of(model, geometry, nominal_exposures(volume), workers, dark=dark)
+    _, quiet = search_volume(volume, geometry, judge, workers)
+    model = replace(model, ambient=ambient_map(volume, intensity, geometry, quiet))
+    return learn_next(lines_of(volume, next_lattice(geometry)), geometry, model, None, workers)[0]

@@ -1,0 +1,270 @@
+"""Makes ready what the compiled search reads: tables per column and band of rows, from model and geometry."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.lane_order import PAIRS, STEPS, padded_lanes, pair_bytes, pixel_order, places_of
+from rig.estimate.row.inputs import TABLE, RowState, Sweep, state_of, sweep_of
+from rig.estimate.row.model import RowModel
+from rig.estimate.search.closeup import closeup_tables, label_weights, largest_score
+from rig.estimate.search.inputs import COUNT_LIMIT, EXPOSURE_PARTS, FIELDS, RowAnswers, SearchTables, count_fluxes
+from rig.estimate.search.rows import QUIET_STEP, SIGNAL_REACH_PX, halvings, turned
+from rig.estimate.search.tables import NONE, SCREENS, WEIGHT_LIMIT, ScreenTables, fill_tables
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import WORD_PX, SweepGeometry
+from rig.simd.memory import aligned_zeros
+from rig.simd.vectors import LANES
+from rig.threads import RowWorkers
+
+BAND_ROWS = (64, 32, 16, 8, 4)
+"""Rows that share a table: as many as a line crosses without leaving a pixel."""
+BAND_SHEAR_PX = 1
+TAP_SHARE = 0.06
+"""Share of the line in a pixel from which it takes part in the search."""
+SCORE_LIMIT = 12500
+"""Largest sum of taps times counts: less than half of the range of 16 bits, so that no sum of two wraps round."""
+MOST_HALVINGS = 6
+CLOSE_SHIFT = 3
+"""Weights of the close-up are of 16 units an octave: what 8 bits then cut says as much as 8 octaves."""
+CLOSE_LIMIT = 60000
+"""Largest sum of a label's weights times counts if all pixels were full, which no line's are. Sums saturate at half."""
+LOOKED_AT = 32
+"""Columns whose weights say in which units to keep those of all."""
+ROUGH_UNITS = 4.0
+"""Units per octave in which no weight reaches its limit: a logit lies within 11 octaves of 0 either way."""
+CUT = 1.25
+"""By so much the largest weights may exceed their limit, where they are cut."""
+FRAMES_OVER_TWICE = 8
+"""A column may have this many frames more than twice the nominal number before its counts are halved."""
+HOT_FACTOR, HOT_FLUX = 4.0, 0.02
+"""A pixel is hot for the search from this many times its neighbours' ambient light, and so much more, on."""
+LEAST_VEIL = 0.1
+"""Haze of other lines, over the ambient light, from which it is more than the close-up can overlook."""
+
+
+def judge_of(
+    model: RowModel, geometry: SweepGeometry, exposures: int, workers: RowWorkers, *, dark: bool
+) -> SearchTables:
+    """All that the search needs to judge a sweep under `model`, for columns of about `exposures` frames.
+
+    dark: whether the sweep has dark frames, so that fewer columns need to teach the ambient light.
+    """
+    band_rows = rows_of_band(geometry)
+    sweep, state = _banded(sweep_of(geometry), state_of(model), band_rows)
+    light, log_share = _lights(model)
+    reach = max(1, int(np.count_nonzero(state.psi[1:] > TAP_SHARE)))
+    bands, columns = state.ambient.shape[0], geometry.columns
+    veil = geometry.others is not None and model.profile[:, 0].max() > LEAST_VEIL * np.median(model.ambient)
+    tables = _empty_tables(columns, bands, padded_lanes(geometry.window), reach, others=bool(veil))
+    most = min(2 * exposures + FRAMES_OVER_TWICE, COUNT_LIMIT)
+    nominal = exposures / 2.0 ** halvings(exposures, most)
+    largest_sum, largest = _largest(sweep, state, light, reach)
+    for shift in range(MOST_HALVINGS + 1):
+        units = 128 >> shift
+        if most * largest_sum * units <= SCORE_LIMIT and largest * units <= CUT * WEIGHT_LIMIT:
+            break
+
+    def work(first: int, last: int) -> None:
+        fill_tables(sweep, state, light, log_share, float(128 >> shift), nominal, first, last, tables)
+
+    workers.over(bands, work)
+    haze, rest = model.profile[:, 0], model.profile[:, 1]
+    share = float(rest.sum() / max(haze.sum(), 1e-9))
+    weight, constant = label_weights(float(np.median(state.ambient)), share, geometry.near_is_left, state.fine, TABLE)
+    close_shift = next(
+        i for i in range(CLOSE_SHIFT, MOST_HALVINGS + 1)
+        if most * largest_score(weight, 128 >> i) <= CLOSE_LIMIT or i == MOST_HALVINGS
+    )  # fmt: skip
+    closeup = closeup_tables(weight, constant, 128 >> close_shift)
+    expected = np.repeat(state.ambient, band_rows, axis=0)[: geometry.rows]
+    hot_start, hot_at, hot_place = _hot_of_windows(model.ambient > HOT_FACTOR * expected + HOT_FLUX, geometry)
+    padded = np.zeros((bands, int(geometry.x0.max(initial=0)) + geometry.window), np.float32)
+    padded[:, : geometry.width] = state.ambient[:, : padded.shape[1]]
+    return SearchTables(
+        tables=tables,
+        closeup=closeup,
+        band_rows=band_rows,
+        x0=geometry.x0,
+        window=geometry.window,
+        rows=geometry.rows,
+        limits=_limits(geometry),
+        near_is_left=geometry.near_is_left,
+        ambient=padded,
+        hot_start=hot_start,
+        hot_at=hot_at,
+        hot_place=hot_place,
+        nominal=nominal,
+        faintest=float(model.amplitude[0]),
+        brightest=float(model.amplitude[-1]),
+        reach=max(SIGNAL_REACH_PX, reach),
+        shift=shift,
+        close_shift=close_shift,
+        most=most,
+        quiet_step=QUIET_STEP if dark else 1,
+        flux=count_fluxes(),
+    )
+
+
+def _hot_of_windows(
+    hot: NDArray[np.bool_], geometry: SweepGeometry
+) -> tuple[NDArray[np.int32], NDArray[np.int16], NDArray[np.int32]]:
+    """hot_start, hot_at and hot_place of a `Judge`; hot: (rows, width)."""
+    lanes, rows = padded_lanes(geometry.window), geometry.rows
+    starts, at, places = [], [np.zeros(0, np.int16)], [np.zeros(0, np.int32)]
+    before = 0
+    for x0 in range(0, int(geometry.x0.max(initial=0)) + 1, WORD_PX):
+        # Hot pixels of windows that no column has are left out.
+        inside = hot[:, x0 : x0 + geometry.window] if x0 in geometry.x0 else hot[:, :0]
+        y, x = (np.ascontiguousarray(index) for index in np.nonzero(inside))  # else: another kernel, compiled when used
+        starts.append(before + np.searchsorted(y, np.arange(rows + 1)))
+        at.append(x.astype(np.int16))
+        places.append(PAIRS * pair_bytes(lanes) * y.astype(np.int32) + places_of(x, lanes))
+        before += len(y)
+    return np.array(starts, np.int32), np.concatenate(at), np.concatenate(places)
+
+
+def nothing_found(geometry: SweepGeometry, lines: tuple[NDArray[np.int32], NDArray[np.int32]] | None) -> RowAnswers:
+    """Empty results of a sweep; lines: (rows, columns) whose counts are to be kept, sorted by column."""
+    rows, columns = geometry.rows, geometry.columns
+    lanes = -(-geometry.width // WORD_PX) * WORD_PX // STEPS + LANES
+    stripe = np.full((columns, FIELDS, rows), np.nan, np.float32)
+    stripe[:, 1] = 0.0
+    line_row, line_column = (np.zeros(0, np.int32),) * 2 if lines is None else lines
+    return RowAnswers(
+        stripe=stripe,
+        quiet=np.zeros((rows, PAIRS, lanes, 2), np.int32),
+        quiet_exposures=np.zeros((rows, lanes + 1), np.int32),
+        light=np.zeros((rows, PAIRS, lanes, 2), np.int32),
+        quiet_here=aligned_zeros((rows, PAIRS, padded_lanes(geometry.window), 2), np.uint8),
+        light_here=aligned_zeros((rows, PAIRS, padded_lanes(geometry.window), 2), np.uint8),
+        lines=np.zeros((len(line_row), geometry.window), np.int32),
+        line_start=np.searchsorted(line_column, np.arange(columns + 1)).astype(np.int32),
+        line_row=np.ascontiguousarray(line_row),
+    )
+
+
+def clear_found(found: RowAnswers) -> None:
+    """Make `found` as `nothing_found` gave it."""
+    found.stripe.fill(np.nan)
+    found.stripe[:, 1] = 0.0
+    for sums in (found.quiet, found.quiet_exposures, found.light, found.quiet_here, found.light_here, found.lines):
+        sums.fill(0)
+
+
+def stripes_of(found: RowAnswers, judge: SearchTables, workers: RowWorkers) -> StripeTable:
+    """The stripe table of a sweep that has been judged by `judge`."""
+    columns, fields, rows = found.stripe.shape
+    out = np.empty((fields, rows, columns), np.float32)
+    workers.over(rows, lambda first, last: turned(found.stripe, judge.limits, first, last, out))
+    return StripeTable(*out)
+
+
+def quiet_of(found: RowAnswers, width: int) -> NDArray[np.float64]:
+    """Ones and exposures of pixels while clearly behind a stripe, float64 (2, rows, width); both as halved."""
+    exposures = np.repeat(np.cumsum(found.quiet_exposures[:, :-1], axis=1), STEPS, axis=1)[:, :width]
+    return np.stack([pixel_order(found.quiet, width), exposures / EXPOSURE_PARTS])
+
+
+def _limits(geometry: SweepGeometry) -> NDArray[np.int16]:
+    low = np.maximum(geometry.x_lo - geometry.x0, 0)
+    high = np.minimum(geometry.x_hi - geometry.x0, geometry.window - 1)
+    limits = np.zeros((geometry.columns, 2, geometry.rows + LANES), np.int16)
+    limits[:, 0] = 1
+    both = np.where(geometry.x_lo <= geometry.x_hi, np.stack([low, high]), [[[1]], [[0]]])
+    limits[:, :, : geometry.rows] = both.transpose(2, 0, 1)
+    return limits
+
+
+def rows_of_band(geometry: SweepGeometry) -> int:
+    """The most rows out of BAND_ROWS that a column's window crosses without shifting by more than BAND_SHEAR_PX."""
+    inside = (geometry.x_lo <= geometry.x_hi) & (geometry.x_lo > 0) & (geometry.x_hi < geometry.width - 1)
+    for rows in BAND_ROWS:
+        first = np.arange(0, geometry.rows, rows)
+        last = np.minimum(first + rows, geometry.rows) - 1
+        both = inside[first] & inside[last]
+        shear = np.abs(geometry.x_lo[first] - geometry.x_lo[last])
+        if not both.any() or np.percentile(shear[both], 99) <= BAND_SHEAR_PX:
+            return rows
+    return BAND_ROWS[-1]
+
+
+def _lights(model: RowModel) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Amplitudes of the search and the logarithm of their shares: the dim and the bright half of the learned ones."""
+    log_q, weight = np.log(model.amplitude.astype(np.float64)), np.maximum(model.weight, 1e-6)
+    halves = np.array_split(np.arange(len(log_q)), SCREENS)
+    shares = np.array([weight[half].sum() for half in halves])
+    means = np.array([(log_q[half] * weight[half]).sum() for half in halves]) / shares
+    return np.exp(means).astype(np.float32), np.log(shares).astype(np.float32)
+
+
+def _banded(sweep: Sweep, state: RowState, band_rows: int) -> tuple[Sweep, RowState]:
+    """Sweep and state as if each band were one row: geometry of its middle row, windows of all, mean ambient light."""
+    rows = sweep.u.shape[0]
+    first = np.arange(0, rows, band_rows)
+    middle = np.minimum(first + band_rows // 2, rows - 1)
+    seen = sweep.x_lo <= sweep.x_hi
+    x_lo = np.minimum.reduceat(np.where(seen, sweep.x_lo, np.iinfo(np.int32).max), first, axis=0)
+    x_hi = np.maximum.reduceat(np.where(seen, sweep.x_hi, -1), first, axis=0)
+    ambient = np.stack([_usual_mean(state.ambient[a : a + band_rows]) for a in first])
+    gain = np.add.reduceat(state.row_gain, first) / np.diff(np.append(first, rows))
+    return (
+        sweep._replace(
+            u=np.ascontiguousarray(sweep.u[middle]), v=np.ascontiguousarray(sweep.v[middle]),
+            x_lo=x_lo.astype(np.int32), x_hi=x_hi.astype(np.int32),
+        ),
+        state._replace(ambient=ambient, row_gain=gain.astype(np.float32)),
+    )  # fmt: skip
+
+
+def _usual_mean(ambient: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mean over the rows (rows, width) of pixels that are not hot."""
+    usual = ambient <= HOT_FACTOR * np.median(ambient, axis=0) + HOT_FLUX
+    return np.asarray((np.where(usual, ambient, 0.0).sum(0) / usual.sum(0)).astype(np.float32))
+
+
+def _empty_tables(columns: int, bands: int, lanes: int, reach: int, *, others: bool = False) -> ScreenTables:
+    pixels = lanes * STEPS
+
+    def of(*shape: int, dtype: type = np.float32) -> Any:
+        return aligned_zeros((columns, bands, *shape), dtype)
+
+    return ScreenTables(
+        edge=of(PAIRS, lanes, 2, dtype=np.int8),
+        tap=of(SCREENS, STEPS, reach + 1, lanes, 2, dtype=np.int8),
+        position=of(SCREENS, pixels, dtype=np.int16),
+        slope=of(SCREENS, pixels, dtype=np.int16),
+        lane=of(lanes),
+        none=of(NONE),
+        neutral=of(pixels),
+        before=of(pixels),
+        scale=of(pixels),
+        first=of(dtype=np.int32),
+        last=of(dtype=np.int32),
+        ambient=of(pixels) if others else aligned_zeros((0, bands, pixels), np.float32),
+    )
+
+
+def _largest(sweep: Sweep, state: RowState, light: NDArray[np.float32], reach: int) -> tuple[float, float]:
+    """Largest sum of a position's taps, or half of that of a lane's edge weights, which stand alone, and largest tap.
+
+    In octaves, from the tables of one band in the middle of some columns.
+    """
+    columns = np.unique(np.linspace(0, sweep.plane.shape[0] - 1, LOOKED_AT).astype(np.int64))
+    middle = slice(sweep.u.shape[0] // 2, sweep.u.shape[0] // 2 + 1)
+    few = sweep._replace(
+        x0=sweep.x0[columns], plane=np.ascontiguousarray(sweep.plane[columns]),
+        x_lo=np.ascontiguousarray(sweep.x_lo[middle, columns]), x_hi=np.ascontiguousarray(sweep.x_hi[middle, columns]),
+        u=np.ascontiguousarray(sweep.u[middle]), v=np.ascontiguousarray(sweep.v[middle]), others=sweep.others[columns],
+    )  # fmt: skip
+    part = state._replace(
+        ambient=np.ascontiguousarray(state.ambient[middle]), row_gain=np.ascontiguousarray(state.row_gain[middle]),
+        column_gain=np.ascontiguousarray(state.column_gain[columns]),
+    )  # fmt: skip
+    tables = _empty_tables(len(columns), 1, padded_lanes(sweep.window), reach)
+    fill_tables(few, part, light, np.zeros(SCREENS, np.float32), ROUGH_UNITS, 1.0, 0, 1, tables)
+    tap, edge = np.abs(tables.tap.astype(np.int64)), np.abs(tables.edge.astype(np.int64))
+    taps = tap.sum(axis=(4, 6)).max(initial=1)
+    edges = edge.sum(axis=(2, 4)).max(initial=1)
+    return float(max(taps, edges / 2)) / ROUGH_UNITS, float(tap.max(initial=1)) / ROUGH_UNITS

@@ -1,0 +1,327 @@
+"""Compiled estimate of one image row: search, close look, and what the row teaches of the light.
+
+The same `judge_rows` serves frames as they come and counts that are there already (`rig.estimate.search.stream`): the
+answers are the same bit for bit.
+"""
+
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.lane_order import PAD, PAIRS, STEPS, pair_bytes, place_of
+from rig.estimate.row.likelihood import LABEL_PX
+from rig.estimate.search.closeup import label_scores, levels_of, offsets
+from rig.estimate.search.inputs import COUNT_LIMIT, EXPOSURE_PARTS, FIELDS, SearchPointers
+from rig.estimate.search.scores import (
+    NOTHING,
+    START,
+    add_likelihoods,
+    certainties,
+    find_best,
+    fit_lanes,
+    fit_positions,
+    score_rows,
+)
+from rig.estimate.search.tables import BATCH, NONE, OUTSIDE, SCREENS, ScreenTable, Search, count_place
+from rig.geometry.windows import WORD_PX
+from rig.simd.functions import lift_to_powers, powers, powers_in_order
+from rig.simd.memory import (
+    CACHE_LINE,
+    load_bytes,
+    load_float32,
+    load_int16,
+    prefetch,
+    read_byte,
+    read_float32,
+    read_int16,
+    read_int32,
+    store_bytes,
+    store_float32,
+    store_int16,
+    write_byte,
+    write_float32,
+    write_int32,
+)
+from rig.simd.shuffles import lanes_between, largest_of_rows, store_folded, totals_of_rows
+from rig.simd.vectors import LANES, as_bytes, larger, larger_float, smaller, smaller_float, to_float32
+
+QUIET: Final = 0.9
+"""Probability within 1 px from which the pixels behind the stripe teach the ambient light."""
+QUIET_STEP: Final = 8
+"""Every 8th column does so where there are dark frames as well, else every one."""
+SIGNAL_REACH_PX: Final = 2
+"""Pixels on either side whose light is the stripe's, where the line is narrower."""
+FEW_EXPOSURES: Final = 1
+"""Up to so many a close look says no more than the scores of the neighbours, which are there already."""
+USUAL_PAIRS: Final = 4
+"""Pairs of pixels that the close-up looks at, where the line is no wider than usual."""
+
+
+@numba.njit(cache=True, nogil=True)
+def halvings(exposures: int, most: int) -> int:
+    """How often counts of so many exposures are halved."""
+    times = 0
+    while (exposures >> times) > most:
+        times += 1
+    return times
+
+
+@numba.njit(forceinline=True)
+def _fetch_ahead(desk: SearchPointers, pixels: int, table: int) -> None:
+    """Have a table on its way into the cache: few of its numbers are read in order, which no processor foresees.
+
+    The next column's; it saves about 3 % of the time.
+    """
+    taps = 2 * SCREENS * desk.taps * pixels
+    for at in range(0, taps, CACHE_LINE):
+        prefetch(desk.tap + taps * table + at)
+    for at in range(0, pixels, CACHE_LINE):
+        prefetch(desk.edge + pixels * table + at)
+    for at in range(0, 4 * pixels, CACHE_LINE):
+        here = 4 * pixels * table + at
+        prefetch(desk.position + here)
+        prefetch(desk.before + here)
+        prefetch(desk.scale + here)
+        prefetch(desk.neutral + here)
+
+
+@numba.njit(forceinline=True)
+def table_for(desk: SearchPointers, search: Search, c: int, b: int, exposures: float) -> ScreenTable:
+    """Make the table of column c and band b ready for columns of so many exposures."""
+    pixels, table = STEPS * search.lanes, c * desk.bands + b
+    constant = desk.position + 2 * SCREENS * pixels * table
+    if exposures != desk.nominal:
+        slope = desk.slope + 2 * SCREENS * pixels * table
+        fit_positions(constant, slope, SCREENS * pixels, exposures - desk.nominal, search.constant)
+        constant = search.constant
+    _fetch_ahead(desk, pixels, table + desk.bands)
+    none = desk.none + 4 * NONE * table
+    fit_lanes(
+        desk.lane + 4 * search.lanes * table, exposures, max(read_float32(none, 2), np.float32(OUTSIDE)),
+        np.int64(read_float32(none, 3)), np.int64(read_float32(none, 4)), search,
+    )  # fmt: skip
+    x0, neutral = np.int64(read_int32(desk.x0, c)), desk.neutral + 4 * pixels * table
+    band_end = min((b + 1) * desk.band_rows, desk.rows)
+    if _hot_of_row(desk, x0, b * desk.band_rows) < _hot_of_row(desk, x0, band_end):
+        _neutral_counts(neutral, exposures, c, desk.window, search.neutral)
+    lowest = np.float32(OUTSIDE)
+    ambient = pixels * table if desk.several_lines else b * desk.ambient_px + x0
+    all_right = max(read_float32(none, 0) + np.float32(START), lowest)
+    return ScreenTable(
+        desk.edge + pixels * table, desk.tap + 2 * SCREENS * desk.taps * pixels * table, constant,
+        desk.before + 4 * pixels * table, desk.scale + 4 * pixels * table,
+        desk.ambient + 4 * ambient, np.int16(all_right),
+        np.int16(max(read_float32(none, 1), lowest)),
+        read_int32(desk.first, table) <= read_int32(desk.last, table),
+    )  # fmt: skip
+
+
+@numba.njit(forceinline=True)
+def _hot_of_row(desk, x0, y):  # type: ignore[no-untyped-def]
+    """The first hot pixel of row y, and where those before it end, among all of windows that begin at x0."""
+    return np.int64(read_int32(desk.hot_start, (x0 // WORD_PX) * (desk.rows + 1) + y))
+
+
+@numba.njit(cache=True, nogil=True)
+def _neutral_counts(neutral: int, exposures: float, c: int, window: int, to: int) -> None:
+    """Write counts that speak for no position, a byte for each stored pixel; neutral, to: addresses."""
+    for x in range(window):
+        # Rounded up or down as by chance, so that hot pixels lean to neither side on average.
+        chance = np.float32((np.int32(x) * np.int32(40503) + np.int32(c) * np.int32(20011)) & np.int32(0xFFFF))
+        count = np.float32(exposures) * read_float32(neutral, x) + chance * np.float32(1.0 / 65536.0)
+        write_byte(to, x, np.uint8(count))
+
+
+@numba.njit(forceinline=True)
+def _mute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
+    """Give the hot pixels of the batch's rows counts that speak for no position; their own are kept in `muted`."""
+    n, begin = search.n - first * search.n_bytes, _hot_of_row(desk, x0, first)
+    for h in range(begin, _hot_of_row(desk, x0, first + rows)):
+        place = read_int32(desk.hot_place, h)
+        write_byte(search.muted, h - begin, read_byte(n, place))
+        write_byte(n, place, read_byte(search.neutral, read_int16(desk.hot_at, h)))
+
+
+@numba.njit(forceinline=True)
+def _unmute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
+    """Give them back: what teaches the ambient light must be what was counted."""
+    n, begin = search.n - first * search.n_bytes, _hot_of_row(desk, x0, first)
+    for h in range(begin, _hot_of_row(desk, x0, first + rows)):
+        write_byte(n, read_int32(desk.hot_place, h), read_byte(search.muted, h - begin))
+
+
+@numba.njit(forceinline=True)
+def judge_rows(
+    desk: SearchPointers, search: Search, table: ScreenTable, first: int, rows: int, c: int, exposures: float
+) -> None:
+    """Estimate rows first..first+rows-1 (at most BATCH) of column c, all of the band that `table` is of.
+
+    Their counts are the rows of the batch.
+    """
+    if not table.searched:
+        return
+    _mute_hot(desk, search, first, rows, np.int64(read_int32(desk.x0, c)))
+    # Each part for all rows before the next: one row's parts wait for one another, different rows' do not.
+    score_rows(table, desk.taps - 1, search, rows)
+    find_best(search, rows, desk.shift)
+    add_likelihoods(table, search, rows, desk.window, desk.shift)
+    stripe = desk.stripe + 4 * (FIELDS * desk.rows * c + first)
+    certainty = certainties(table, search, desk.shift)
+    _answer(certainty, stripe + 4 * desk.rows, rows, search)
+    _measure_light(desk, search, table, first, rows, c, exposures, stripe)
+    # The close-up knows one level behind the stripe for all columns; other lines' haze makes it as many as there are.
+    if exposures <= FEW_EXPOSURES or desk.several_lines:
+        _place_by_neighbours(desk, search, rows, c, stripe)
+    else:
+        _look_closely(desk, search, rows, c, exposures, stripe)
+    if c % desk.quiet_step == 0:
+        _unmute_hot(desk, search, first, rows, np.int64(read_int32(desk.x0, c)))
+        for r in range(rows):
+            if read_float32(stripe, desk.rows + r) > QUIET:
+                n, x = search.n + r * search.n_bytes, np.int64(read_int16(search.x, r))
+                _learn_quiet(desk, search.lanes, n, first + r, c, x, exposures)
+
+
+@numba.njit(forceinline=True)
+def _answer(lanes, to, rows, search):  # type: ignore[no-untyped-def]
+    """Write one field of the answers for so many rows to address `to`."""
+    if rows == BATCH:
+        store_float32(to, 0, lanes)
+    else:
+        # What lies behind may be another thread's.
+        store_float32(search.answer, 0, lanes)
+        for r in range(rows):
+            write_float32(to, r, read_float32(search.answer, r))
+
+
+@numba.njit(forceinline=True)
+def _measure_light(desk, search, table, first, rows, c, exposures, stripe):  # type: ignore[no-untyped-def]
+    """Signal and haze of the batch's rows, from row `first` of the picture on, for answers and close-up."""
+    limits = desk.limits + 4 * desk.limit_rows * c
+    low, high = load_int16(limits, first), load_int16(limits, desk.limit_rows + first)
+    store_int16(search.x, 0, smaller(larger(load_int16(search.x, 0), low), high))
+    # The usual reach as a constant: its loop is unrolled.
+    if desk.reach == SIGNAL_REACH_PX:
+        _read_light(desk, search, table, rows, exposures, SIGNAL_REACH_PX)
+    else:
+        _read_light(desk, search, table, rows, exposures, desk.reach)
+    before, ambient = load_float32(search.before, 0), load_float32(search.ambient, 0)
+    scale = load_float32(search.scale, 0)
+    light = load_float32(search.light, 0) - (before + ambient) * np.float32(desk.reach + 0.5)
+    signal = smaller_float(larger_float(light, scale * desk.faintest), scale * desk.brightest)
+    store_int16(search.levels, 0, levels_of(before, signal))
+    _answer(signal, stripe + 12 * desk.rows, rows, search)
+    _answer(larger_float(before - ambient, np.float32(0.0)), stripe + 16 * desk.rows, rows, search)
+
+
+@numba.njit(forceinline=True)
+def _read_light(desk, search, table, rows, exposures, reach):  # type: ignore[no-untyped-def]
+    flux = desk.flux + 4 * (COUNT_LIMIT + 2) * np.int64(EXPOSURE_PARTS * exposures)
+    for r in range(rows):
+        n, x = search.n + r * search.n_bytes, np.int64(read_int16(search.x, r))
+        light = np.float32(0.0)
+        for t in range(-reach, reach + 1):
+            light += read_float32(flux, np.int64(read_byte(n, count_place(search, x + t))))
+        write_float32(search.light, r, light)
+        write_float32(search.before, r, read_float32(table.before, x))
+        write_float32(search.scale, r, read_float32(table.scale, x))
+        write_float32(search.ambient, r, read_float32(table.ambient, x))
+
+
+@numba.njit(forceinline=True)
+def _place_by_neighbours(desk, search, rows, c, stripe):  # type: ignore[no-untyped-def]
+    """Place the lines of the batch's rows by the scores beside the best ones, and write the answers."""
+    lift = load_int16(search.lift, 0)
+    own = powers_in_order(load_int16(search.best, 0), lift, desk.shift)
+    left = powers_in_order(load_int16(search.left, 0), lift, desk.shift)
+    right = powers_in_order(load_int16(search.right, 0), lift, desk.shift)
+    beside = left + right
+    # Labels a pixel apart instead of a quarter.
+    offset, sd = offsets(larger_float(own + beside, NOTHING), right - left, beside, 1.0)
+    x = to_float32(load_int16(search.x, 0)) + np.float32(read_int32(desk.x0, c))
+    _answer(x + offset, stripe, rows, search)
+    _answer(sd, stripe + 8 * desk.rows, rows, search)
+
+
+@numba.njit(forceinline=True)
+def _look_closely(desk, search, rows, c, exposures, stripe):  # type: ignore[no-untyped-def]
+    """Place the lines of the batch's rows, and write the answers."""
+    # The usual width as a constant: its loop is unrolled.
+    if desk.weight_pairs == USUAL_PAIRS:
+        _compare_labels(desk, search, rows, exposures, USUAL_PAIRS)
+    else:
+        _compare_labels(desk, search, rows, exposures, desk.weight_pairs)
+    lift = lift_to_powers(largest_of_rows(search.label), desk.close_shift)
+    store_int16(search.lift, 0, lift)
+    for r in range(rows):
+        likelihood = powers(load_int16(search.label, r * LANES), read_int16(search.lift, r), desk.close_shift)
+        store_folded(search.mass, r, likelihood)
+        store_folded(search.moment, r, likelihood * load_float32(desk.label, 0))
+        store_folded(search.square, r, likelihood * load_float32(desk.square, 0))
+    mass, moment, square = (totals_of_rows(search.mass), totals_of_rows(search.moment), totals_of_rows(search.square))
+    offset, sd = offsets(mass, moment, square, LABEL_PX)
+    x = to_float32(load_int16(search.x, 0)) + np.float32(read_int32(desk.x0, c))
+    _answer(x + offset, stripe, rows, search)
+    _answer(sd, stripe + 8 * desk.rows, rows, search)
+
+
+@numba.njit(forceinline=True)
+def _compare_labels(desk, search, rows, exposures, pairs):  # type: ignore[no-untyped-def]
+    for r in range(rows):
+        x, levels = np.int64(read_int16(search.x, r)), np.int64(read_int16(search.levels, r))
+        weight, constant = desk.weight + 4 * LANES * pairs * levels, desk.weight_constant + 4 * LANES * levels
+        store_int16(search.label, r * LANES, label_scores(search, r, x, exposures, weight, constant, pairs))
+
+
+@numba.njit(cache=True, nogil=True)
+def _learn_quiet(desk: SearchPointers, lanes: int, n: int, y: int, c: int, x: int, exposures: float) -> None:
+    """Add the whole lanes behind the stripe at stored pixel x to the quiet counts."""
+    limits = desk.limits + 4 * desk.limit_rows * c
+    if read_int16(limits, y) > read_int16(limits, desk.limit_rows + y):
+        return
+    begin, end = 0, desk.window // STEPS
+    if desk.near_is_left:
+        begin = ((x + desk.reach + 1) >> 3) + 1
+    else:
+        end = (x - desk.reach) >> 3
+    if begin >= end:
+        return
+    sums = desk.quiet + 2 * PAIRS * lanes * y
+    for v in range(0, lanes, LANES):
+        quiet = as_bytes(lanes_between(begin - v, end - v))
+        for q in range(PAIRS):
+            at = 2 * (q * lanes + v)
+            counts = load_bytes(n, q * pair_bytes(lanes) + 2 * (PAD + v)) & quiet
+            store_bytes(sums, at, load_bytes(sums, at) + counts)
+    steps = desk.quiet_exposures + 4 * (y * (desk.sum_lanes + 1) + np.int64(read_int32(desk.x0, c)) // STEPS)
+    parts = np.int32(EXPOSURE_PARTS * exposures)
+    write_int32(steps, begin, read_int32(steps, begin) + parts)
+    write_int32(steps, end, read_int32(steps, end) - parts)
+
+
+@numba.njit(cache=True, nogil=True)
+def keep_line(n: int, lanes: int, window: int, to: int) -> None:
+    """Write the counts of a row in pixel order, int32, where the learning reads them; n, to: addresses."""
+    for x in range(window):
+        write_int32(to, x, np.int32(read_byte(n, place_of(x, lanes))))
+
+
+@numba.njit(cache=True, nogil=True)
+def turned(
+    stripe: NDArray[np.float32], limits: NDArray[np.int16], first_row: int, last_row: int, out: NDArray[np.float32]
+) -> None:
+    """Rows first_row..last_row-1 of answers (columns, FIELDS, rows) as (FIELDS, rows, columns).
+
+    limits: as of `Judge`; rows without a search window have no answer.
+    """
+    columns, fields, _ = stripe.shape
+    for y0 in range(first_row, last_row, 16):
+        for c0 in range(0, columns, 16):
+            for f in range(fields):
+                nothing = np.float32(0.0) if f == 1 else np.float32(np.nan)
+                for y in range(y0, min(y0 + 16, last_row)):
+                    for c in range(c0, min(c0 + 16, columns)):
+                        asked = limits[c, 0, y] <= limits[c, 1, y]
+                        out[f, y, c] = stripe[c, f, y] if asked else nothing

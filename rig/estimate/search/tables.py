@@ -1,0 +1,339 @@
+"""Tables of the search along a row: what a count at each pixel says of every stripe position, per column and band.
+
+Haze and pedestal vary slowly from row to row, so the rows of a band share one table per column. Weights are whole
+numbers of 1 / `units` octaves of likelihood, of 8 bits, for what a processor multiplies and adds at once; what does not
+depend on the counts is kept per exposure, since the number of frames differs from column to column.
+
+Left and right: the flux of a pixel left and right of the stripe. Where near is left, left is haze and ambient light,
+right is the pedestal; with the scanner on the other side it is the other way round. Scores are relative to 'everything
+is as right of the stripe', in units; a pixel left of position x adds its edge weight, the pixels around x their taps.
+
+What the search along a row works with: a table made ready for a column, and a thread's buffers.
+"""
+
+from typing import Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.lane_order import PAIRS, STEPS, pair_bytes, place_of
+from rig.estimate.row.inputs import RowState, Sweep, row_buffers, row_fluxes
+from rig.estimate.row.likelihood import FLUX_MAX, cell_of, none_prior
+from rig.simd.memory import CACHE_LINE, address_of, read_int16, write_int16
+from rig.simd.shuffles import FOLDED
+from rig.simd.vectors import LANES
+
+SCREENS: Final = 2
+"""Stripe amplitudes of the search; all of them take part in what follows it."""
+OUTSIDE: Final = -32000
+"""Score of a position where the column's stripe cannot lie."""
+NONE: Final = 5
+SLOPE: Final = 8
+WEIGHT_LIMIT: Final = 127
+"""Weights are cut there: a count that would say more says this much."""
+LN2: Final = 0.6931471805599453
+FLUX_LEFT, FLUX_RIGHT, GAIN_LEFT, GAIN_RIGHT, LOSS_LEFT, LOSS_RIGHT = range(6)
+"""Rows of what is kept of each pixel: flux on either side of a stripe, and its entries of the logit table."""
+
+
+class ScreenTables(NamedTuple):
+    """See the module. P: stored pixels per row, padded to whole vectors; in order of step and lane unless said.
+
+    edge: int8 (columns, bands, PAIRS, lanes, 2), weight of a count left of the stripe.
+    tap: int8 (columns, bands, SCREENS, STEPS, T + 1, lanes, 2), weights at each position of the counts of T + 1 pairs
+    from `first_pair` on, which hold those T px around it; at odd positions that of the pixel before as left as well.
+    position: int16 (columns, bands, SCREENS, P), units of position x at the nominal number of exposures, its prior
+    included; slope: int16, the same shape, by how many 1 / SLOPE of a unit it grows with each exposure more.
+    lane: float32 (columns, bands, lanes), units per exposure of all pixels up to a lane's last lying left.
+    none: float32 (columns, bands, NONE), units of 'no stripe': all as right, all as left, a change somewhere (per
+    lane); first and last lane with pixels of the column.
+    neutral: float32 (columns, bands, P), ones per exposure that say nothing, in pixel order.
+    before, scale: float32 (columns, bands, P) as in `Row`, in pixel order.
+    first, last: int32 (columns, bands), first and last position in stored pixels.
+    ambient: float32 (columns, bands, P), ambient light and other lines' haze where there are any, else no columns.
+    """
+
+    edge: NDArray[np.int8]
+    tap: NDArray[np.int8]
+    position: NDArray[np.int16]
+    slope: NDArray[np.int16]
+    lane: NDArray[np.float32]
+    none: NDArray[np.float32]
+    neutral: NDArray[np.float32]
+    before: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    first: NDArray[np.int32]
+    last: NDArray[np.int32]
+    ambient: NDArray[np.float32]
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_tables(
+    sweep: Sweep,
+    state: RowState,
+    light: NDArray[np.float32],
+    log_share: NDArray[np.float32],
+    units: float,
+    nominal: float,
+    first_band: int,
+    last_band: int,
+    out: ScreenTables,
+) -> None:
+    """Tables of bands first_band..last_band-1.
+
+    sweep, state: as of a sweep whose rows are the bands (see `banded`), its counts unused. light, log_share:
+    (SCREENS,), amplitudes of the search and the logarithm of their probability. units: per octave. nominal: exposures.
+    """
+    columns = sweep.plane.shape[0]
+    lanes = out.lane.shape[2]
+    pixels = STEPS * lanes
+    per_nat = np.float32(units / LN2)
+    row = row_buffers(pixels + 2, 1)
+    levels = np.empty((6, pixels), np.float32)
+    gain, loss = state.table[0], state.table[1]
+    for b in range(first_band, last_band):
+        for c in range(columns):
+            edge, tap = out.edge[c, b], out.tap[c, b]
+            edge[:] = 0
+            tap[:] = 0
+            out.position[c, b] = OUTSIDE
+            out.slope[c, b] = 0
+            out.lane[c, b] = 0.0
+            out.neutral[c, b] = 0.0
+            out.none[c, b] = np.float32(OUTSIDE)
+            out.first[c, b], out.last[c, b] = 0, -1
+            length, begin, end, start = row_fluxes(sweep, state, row, b, c)
+            if length == 0:
+                continue
+            low = (start if sweep.near_is_left else start - length + 1) - sweep.x0[c]
+            over = np.float32(0.0)
+            for i in range(length):
+                t = i if sweep.near_is_left else length - 1 - i
+                x = low + i
+                near, far = row.before[t], row.behind[t]
+                levels[FLUX_LEFT, x], levels[FLUX_RIGHT, x] = (near, far) if sweep.near_is_left else (far, near)
+                out.before[c, b, x], out.scale[c, b, x] = near, row.scale[t]
+                if out.ambient.shape[0] > 0:
+                    out.ambient[c, b, x] = state.ambient[b, x + sweep.x0[c]] + row.others[t]
+                at = cell_of(levels[FLUX_LEFT, x])
+                levels[GAIN_LEFT, x], levels[LOSS_LEFT, x] = gain[at], loss[at]
+                at = cell_of(levels[FLUX_RIGHT, x])
+                levels[GAIN_RIGHT, x], levels[LOSS_RIGHT, x] = gain[at], loss[at]
+                weight = levels[GAIN_LEFT, x] - levels[GAIN_RIGHT, x]
+                constant = levels[LOSS_LEFT, x] - levels[LOSS_RIGHT, x]
+                # What rounding leaves over goes to the next pixel: sums over many pixels must not drift.
+                wanted = weight * per_nat + over
+                edge[_pair(x), x // STEPS, x & 1] = _weight(wanted)
+                over = wanted - edge[_pair(x), x // STEPS, x & 1] if abs(wanted) < WEIGHT_LIMIT else np.float32(0.0)
+                if abs(weight) > 1e-3:
+                    out.neutral[c, b, x] = min(max(-constant / weight, np.float32(0.0)), np.float32(1.0))
+            span = low, length, begin, end, start
+            _positions(sweep, state, light, log_share, per_nat, nominal, b, c, span, row, levels, out)
+
+
+@numba.njit(cache=True, nogil=True)
+def _positions(sweep, state, light, log_share, per_nat, nominal, b, c, span, row, levels, out):  # type: ignore[no-untyped-def]
+    """Taps, constants and priors of every position of one table."""
+    low, length, begin, end, start = span
+    step = 1 if sweep.near_is_left else -1
+    gain, loss = state.table[0], state.table[1]
+    lanes, reach = out.lane.shape[2], out.tap.shape[4] - 1
+    edge, tap = out.edge[c, b], out.tap[c, b]
+    first = (start + step * (begin if step > 0 else end)) - sweep.x0[c]
+    last = (start + step * (end if step > 0 else begin)) - sweep.x0[c]
+    out.first[c, b], out.last[c, b] = first, last
+    within = np.float32(0.0)
+    for x in range(low, low + length):
+        if x % STEPS == 0:
+            within = np.float32(0.0)
+        s, lane = x % STEPS, x // STEPS
+        place = s * lanes + lane
+        # Of the first one of the pairs that the taps are of.
+        first_px = 2 * (x // 2 + first_pair(s, reach))
+        for m in range(light.shape[0]):
+            constant = within
+            weights = tap[m, s, :, lane]
+            if s & 1:
+                weights[(x - 1 - first_px) >> 1, 0] = edge[_pair(x - 1), lane, 0]
+            for d in range(-reach, reach + 1):
+                at = x + d
+                if at < low or at >= low + length:
+                    continue
+                extra = light[m] * state.psi[abs(d)] * out.scale[c, b, at]
+                if d < 0:
+                    base, own_gain, own_loss = levels[FLUX_LEFT, at], levels[GAIN_LEFT, at], levels[LOSS_LEFT, at]
+                else:
+                    base, own_gain, own_loss = levels[FLUX_RIGHT, at], levels[GAIN_RIGHT, at], levels[LOSS_RIGHT, at]
+                if d == 0:
+                    base = np.float32(0.5) * (levels[FLUX_LEFT, at] + levels[FLUX_RIGHT, at])
+                cell = cell_of(min(base + extra, FLUX_MAX))
+                here = (at - first_px) >> 1
+                before = np.float32(weights[here, at & 1])
+                weights[here, at & 1] = _weight(before + (gain[cell] - own_gain) * per_nat)
+                constant += (loss[cell] - own_loss) * per_nat
+            if first <= x <= last:
+                t = x - low if step > 0 else length - 1 - (x - low)
+                prior = (row.log_prior[t] + log_share[m]) * per_nat
+                out.position[c, b, m, place] = _within(nominal * constant + prior, OUTSIDE, -OUTSIDE)
+                out.slope[c, b, m, place] = _within(SLOPE * constant, -32767.0, 32767.0)
+        own = (levels[LOSS_LEFT, x] - levels[LOSS_RIGHT, x]) * per_nat
+        within += own
+        out.lane[c, b, x // STEPS] += own
+    for i in range(1, lanes):
+        out.lane[c, b, i] += out.lane[c, b, i - 1]
+    mass = 0.0
+    for t in range(begin, end + 1):
+        mass += np.exp(row.log_prior[t])
+    behind, before, change = none_prior(sweep.w_near, sweep.w_far, row.w[begin], row.w[end], state.none_weight)
+    share = np.log((1.0 - behind - before - change) / mass)
+    all_right, all_left = (behind, before) if step > 0 else (before, behind)
+    out.none[c, b, 0] = (np.log(all_right) - share) * per_nat
+    out.none[c, b, 1] = (np.log(all_left) - share) * per_nat
+    out.none[c, b, 2] = (np.log(change * STEPS / (length + 1)) - share) * per_nat
+    out.none[c, b, 3], out.none[c, b, 4] = low // STEPS, (low + length - 1) // STEPS
+
+
+@numba.njit(inline="always")
+def _within(value, low, high):  # type: ignore[no-untyped-def]
+    return np.int16(round(min(max(value, low), high)))
+
+
+@numba.njit(inline="always")
+def _weight(value):  # type: ignore[no-untyped-def]
+    return np.int8(round(min(max(value, np.float32(-WEIGHT_LIMIT)), np.float32(WEIGHT_LIMIT))))
+
+
+@numba.njit(inline="always")
+def _pair(x):  # type: ignore[no-untyped-def]
+    return (x % STEPS) // 2
+
+
+@numba.njit(inline="always")
+def first_pair(s, reach):  # type: ignore[no-untyped-def]
+    """Where the taps of step s begin, in pairs from that of the step itself on."""
+    return ((s - reach) >> 1) - (s >> 1)
+
+
+BATCH: Final = LANES
+"""Rows that go through each part of the search together: what one row waits for, the others fill, and what is one
+number a row fills the lanes."""
+PLACE_BEFORE: Final = 8
+"""Pixels before the first one, and behind the last one, of which the place is known."""
+
+
+class ScreenTable(NamedTuple):
+    """One table made ready for a number of exposures.
+
+    Addresses, in lane order: edge, tap as in `Tables`, constant as in `Search`; in pixel order, float32 of the stored
+    pixels: before, scale, ambient. Numbers: all_right, all_left: scores of 'no stripe' as of
+    `Tables.none`, that of all pixels lying right complete. searched: whether there is any position to find.
+    """
+
+    edge: int
+    tap: int
+    constant: int
+    before: int
+    scale: int
+    ambient: int
+    all_right: np.int16
+    all_left: np.int16
+    searched: bool
+
+
+class Search(NamedTuple):
+    """Addresses of a thread's buffers for BATCH rows of `lanes` lanes, and the bytes from row to row of each.
+
+    n: counts, see `rig.count.lane_order`. int16: score (STEPS, lanes); start (lanes,), score of a change at the lane's
+    first pixel; tops (LANES,), best scores of some lanes each; constant (SCREENS, STEPS, lanes), the tables' part per
+    exposure times the exposures; lane (lanes,), the same; change (lanes,), what a change without a stripe in the lane
+    adds; label (LANES,), scores of the close-up; place: index of pixel -PLACE_BEFORE on in a row of counts. neutral,
+    muted: bytes, counts of hot pixels, see `rig.estimate.search.rows`. Of each row of the batch, int16: all_left, score
+    of all pixels lying left; best, x: best score and its pixel; left, right: the scores beside it; levels: of the
+    close-up; lift: what makes a score a power; ceiling: what no score exceeds. float32: light, before, scale, ambient:
+    see `rig.estimate.search.rows`; answer: one field of the answers on its way out. Folded (`rig.simd.shuffles`): mass,
+    sum of all likelihoods; moment, square: sums of the close-up.
+    """
+
+    lanes: int
+    n: int
+    n_bytes: int
+    score: int
+    score_bytes: int
+    start: int
+    tops: int
+    constant: int
+    lane: int
+    change: int
+    label: int
+    place: int
+    neutral: int
+    muted: int
+    all_left: int
+    best: int
+    x: int
+    left: int
+    right: int
+    levels: int
+    lift: int
+    ceiling: int
+    light: int
+    before: int
+    scale: int
+    ambient: int
+    answer: int
+    mass: int
+    moment: int
+    square: int
+
+
+@numba.njit(forceinline=True)
+def _search_at(n, lanes):  # type: ignore[no-untyped-def]
+    """The buffers from address n on, and where they end."""
+    n_bytes, score_bytes = PAIRS * pair_bytes(lanes), 2 * STEPS * lanes
+    score = n + BATCH * n_bytes
+    start = score + BATCH * score_bytes
+    tops = start + BATCH * 2 * lanes
+    constant = tops + BATCH * 2 * LANES
+    lane = constant + 2 * SCREENS * STEPS * lanes
+    change = lane + 2 * lanes
+    label = change + 2 * lanes
+    row = label + BATCH * 2 * LANES
+    number = row + 8 * 2 * BATCH
+    folded = number + 5 * 4 * BATCH
+    fold = 4 * FOLDED * BATCH
+    place = folded + 3 * fold
+    neutral = place + 2 * (STEPS * lanes + 2 * PLACE_BEFORE)
+    search = Search(
+        lanes, n, n_bytes, score, score_bytes, start, tops, constant, lane, change, label, place, neutral,
+        neutral + STEPS * lanes, row, row + 2 * BATCH,
+        row + 4 * BATCH, row + 6 * BATCH, row + 8 * BATCH, row + 10 * BATCH, row + 12 * BATCH, row + 14 * BATCH, number,
+        number + 4 * BATCH, number + 8 * BATCH, number + 12 * BATCH, number + 16 * BATCH, folded, folded + fold,
+        folded + 2 * fold,
+    )  # fmt: skip
+    return search, neutral + (1 + BATCH) * STEPS * lanes
+
+
+@numba.njit(cache=True, nogil=True)
+def search_memory(lanes: int) -> NDArray[np.uint8]:
+    """Memory for the buffers of a `Search`, at whole cache lines."""
+    _, end = _search_at(0, lanes)
+    whole = np.zeros(end + CACHE_LINE, np.uint8)
+    begin = -address_of(whole) % CACHE_LINE
+    memory = whole[begin : begin + end]
+    search = search_in(address_of(memory), lanes)
+    for i in range(STEPS * lanes + 2 * PLACE_BEFORE):
+        write_int16(search.place, i, np.int16(place_of(i - PLACE_BEFORE, lanes)))
+    return memory
+
+
+@numba.njit(forceinline=True)
+def search_in(memory: int, lanes: int) -> Search:
+    """The buffers in `search_memory` at that address."""
+    return _search_at(memory, lanes)[0]
+
+
+@numba.njit(forceinline=True)
+def count_place(search: Search, x: int) -> int:
+    """Index of pixel x in a row of counts, from -PLACE_BEFORE on."""
+    return np.int64(read_int16(search.place, x + PLACE_BEFORE))

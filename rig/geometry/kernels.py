@@ -1,0 +1,116 @@
+"""Compiled search of the pixel interval that a depth range leaves on a row.
+
+Compiled depth of pixels on bowed sheets of light, see `calibration.model.light_sheet` for the formula.
+"""
+
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+
+@numba.njit(cache=True, nogil=True)
+def row_windows(
+    u: NDArray[np.float32], v: NDArray[np.float32], plane: NDArray[np.float64], w_far: float, w_near: float
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """First and last pixel (rows, columns) int32 whose inverse depth p.(u, v, 1) lies in [w_far, w_near].
+
+    Pixels without a ray (NaN) are outside. Inverse depth is monotone between the first and the last valid pixel of a
+    row, so both ends are found by bisection.
+    """
+    rows, width = u.shape
+    columns = plane.shape[0]
+    x_lo = np.zeros((rows, columns), np.int32)
+    x_hi = np.full((rows, columns), -1, np.int32)
+    for y in range(rows):
+        first = 0
+        while first < width and np.isnan(u[y, first]):
+            first += 1
+        last = width - 1
+        while last > first and np.isnan(u[y, last]):
+            last -= 1
+        if first >= last:
+            continue
+        for c in range(columns):
+            px, py, pz = plane[c, 0], plane[c, 1], plane[c, 2]
+            w_first = px * u[y, first] + py * v[y, first] + pz
+            w_last = px * u[y, last] + py * v[y, last] + pz
+            falling = w_first > w_last
+            # Lowest x at which w has passed the first limit, in the sense of travel.
+            enter, leave = (w_near, w_far) if falling else (w_far, w_near)
+            lo, hi = first, last + 1
+            while lo < hi:
+                mid = (lo + hi) // 2
+                w = px * u[y, mid] + py * v[y, mid] + pz
+                inside = w <= enter if falling else w >= enter
+                if inside:
+                    hi = mid
+                else:
+                    lo = mid + 1
+            x_lo[y, c] = lo
+            lo, hi = first, last + 1
+            while lo < hi:
+                mid = (lo + hi) // 2
+                w = px * u[y, mid] + py * v[y, mid] + pz
+                beyond = w < leave if falling else w > leave
+                if beyond:
+                    hi = mid
+                else:
+                    lo = mid + 1
+            x_hi[y, c] = lo - 1
+    return x_lo, x_hi
+
+
+NEWTON_STEPS: Final = 2
+"""From the plane on: they leave the rounding of float32, also where sheets bow ten times as much as a bad lens's."""
+
+
+@numba.njit(cache=True, nogil=True)
+def bent_inverse_depth(
+    command: NDArray[np.float64],
+    ahead: NDArray[np.float64],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    sheets: NDArray[np.float64],
+    low: float,
+    high: float,
+    origin: NDArray[np.float64],
+    bow: float,
+    inverse_depth: NDArray[np.float32],
+) -> None:
+    """Write inverse depth (rows, width) where the mirror was bound to `command`; NaN where there is none.
+
+    ahead: (rows,) by how much the command is past that. sheets: (samples, 10) float64, n, d, middle and across of the
+    sheets at even steps of the command from low to high; in between they are linear, for closely enough spaced ones.
+    """
+    rows, width = command.shape
+    per_command = (len(sheets) - 1) / (high - low)
+    for y in range(rows):
+        for x in range(width):
+            at = command[y, x] + ahead[y]
+            if np.isnan(at):
+                inverse_depth[y, x] = np.nan
+                continue
+            place = min(max((at - low) * per_command, 0.0), len(sheets) - 1.0)
+            i = min(int(place), len(sheets) - 2)
+            f = place - i
+            a, b = sheets[i], sheets[i + 1]
+            ux, vx = np.float64(u[y, x]), np.float64(v[y, x])
+            nx, ny, nz = a[0] + f * (b[0] - a[0]), a[1] + f * (b[1] - a[1]), a[2] + f * (b[2] - a[2])
+            along, d = nx * ux + ny * vx + nz, a[3] + f * (b[3] - a[3])
+            w = along / d
+            if bow != 0.0:
+                mx, my, mz = a[4] + f * (b[4] - a[4]), a[5] + f * (b[5] - a[5]), a[6] + f * (b[6] - a[6])
+                tx, ty, tz = a[7] + f * (b[7] - a[7]), a[8] + f * (b[8] - a[8]), a[9] + f * (b[9] - a[9])
+                dp = -(mx * origin[0] + my * origin[1] + mz * origin[2])
+                dq = -(tx * origin[0] + ty * origin[1] + tz * origin[2])
+                p0, q0 = mx * ux + my * vx + mz, tx * ux + ty * vx + tz
+                for _ in range(NEWTON_STEPS):
+                    p, q = p0 + w * dp, q0 + w * dq
+                    reach, phi = np.sqrt(p * p + q * q), np.arctan2(q, p)
+                    tangent = np.tan(bow * phi * phi)
+                    turn = 2.0 * bow * phi * (p * dq - q * dp) / reach
+                    slope = tangent * (p * dp + q * dq) / reach + (1.0 + tangent * tangent) * turn
+                    w += (along - d * w - tangent * reach) / (d + slope)
+            inverse_depth[y, x] = w

@@ -1,0 +1,83 @@
+"""The stripe table: for every row and column where the laser line was seen, and how sure that is.
+
+Errors of a map against a truth that a world or a test knows.
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class StripeTable:
+    """Result of an estimator for one sweep; all arrays float32 (rows, columns).
+
+    x_px: sub-pixel stripe position in raw pixels, centres at integers; NaN only where the row has no data there.
+    confidence: probability that x_px is within 1 px of the truth, 0 to 1 (0 where x_px is NaN).
+    x_sd_px: standard deviation of x_px given that it is the right stripe.
+    signal: photons per exposure of the stripe, summed across it; haze: photons per exposure and pixel just before it.
+    x2_px: position of a second stripe beside it, nearer or farther (a pane before a wall), NaN where no light stands
+    out; confidence2: probability that there is one within 1 px of it, 0 where it is NaN. Both are None where an
+    estimator looks for none.
+    """
+
+    x_px: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    x_sd_px: NDArray[np.float32]
+    signal: NDArray[np.float32]
+    haze: NDArray[np.float32]
+    x2_px: NDArray[np.float32] | None = None
+    confidence2: NDArray[np.float32] | None = None
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """Every array that there is, by its name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
+    @classmethod
+    def empty(cls, rows: int, columns: int) -> "StripeTable":
+        """A table without any estimate."""
+        nan = [np.full((rows, columns), np.nan, np.float32) for _ in range(4)]
+        return cls(nan[0], np.zeros((rows, columns), np.float32), nan[1], nan[2], nan[3])
+
+
+MISSING_PX = 10.0
+"""What a missing answer is charged, where leaving answers out must not help."""
+
+
+def stripe_errors(x_px: NDArray[np.float32], true_x_px: NDArray[np.float32]) -> dict[str, float | None]:
+    """Errors in pixels over the (row, column) that have a true stripe; both arrays (rows, columns), NaN = none.
+
+    `missing`: share of those without an estimate; `mean_abs`, `median_abs`: over the estimated (None where there are
+    none); `within_1px`: over all, a missing one counts as wrong.
+    """
+    scored = np.isfinite(true_x_px)
+    if not scored.any():
+        return {"mean_abs": None, "median_abs": None, "within_1px": None, "missing": None}
+    error = np.abs(x_px[scored].astype(np.float64) - true_x_px[scored])
+    given = error[np.isfinite(error)]
+    return {
+        "mean_abs": float(given.mean()) if given.size else None,
+        "median_abs": float(np.median(given)) if given.size else None,
+        "within_1px": float(np.count_nonzero(given <= 1.0) / error.size),
+        "missing": float(1.0 - given.size / error.size),
+    }
+
+
+def charged_errors(x_px: NDArray[np.float32], true_x_px: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Error of every (row, column) in pixels, NaN where there is no true stripe; a missing answer, or one farther off,
+    counts as `MISSING_PX`.
+    """
+    error = np.abs(x_px.astype(np.float64) - true_x_px)
+    charged = np.where(np.isfinite(x_px), np.minimum(error, MISSING_PX), MISSING_PX)
+    return np.where(np.isfinite(true_x_px), charged, np.nan)
+
+
+def depth_errors(depth_m: NDArray[np.float32], true_depth_m: NDArray[np.float32]) -> dict[str, float | None]:
+    """Mean and median absolute depth error in metres over pixels that have both; None where no pixel has."""
+    error = np.abs(depth_m.astype(np.float64) - true_depth_m)
+    error = error[np.isfinite(error)]
+    if not error.size:
+        return {"mean_abs": None, "median_abs": None}
+    return {"mean_abs": float(error.mean()), "median_abs": float(np.median(error))}

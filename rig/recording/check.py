@@ -1,0 +1,344 @@
+"""Reading every byte of a recording: which blocks are sound, what is damaged, and whether frames follow on frames.
+
+Frames that a recording had before its first and behind its last sound blocks, as index, manifest and part tell.
+
+A gap between two blocks shows in their numbers; one at an end only in what else is known of the run.
+"""
+
+import zlib
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.frames import BlockHeader
+from drivers.recorded.contents import INDEX_RECORD, MOST_FRAMES, Contents, damage_line, index_of
+from drivers.recorded.order import Entries, in_order
+from drivers.recorded.segments import SegmentReader
+from drivers.spb1 import HEADER_BYTES, TRAILER_BYTES, BlockLayout, Placed
+from drivers.spb1.layout import TRAILER
+from rig.progress import tell_stage
+from rig.run_folder.manifest import device_counters, ended_early
+
+CHECKING: Final = "checking every block"
+"""The stage's name."""
+CHECKERS: Final = 2
+"""Segments checked at a time."""
+_STEP_BYTES: Final = 64 * 2**20
+_CLOCK_SHARE: Final = 0.01
+"""Ticks may be so far from those that the frame numbers say, as a share of them, beside half a frame."""
+_NEIGHBOURS: Final = 2
+"""Blocks before and behind that one is compared with."""
+_FEW: Final = 4
+"""One in so many blocks of a run at most is left out for its ticks or sweep."""
+
+
+@dataclass(frozen=True, slots=True)
+class SoundBlock:
+    """A block whose every byte is right. entry: its index record. lost_before: as the device counted. sweep,
+    last_sweep: scan markers up to its first and its last frame.
+
+    header: what holds for it. first_tick, last_tick: of its frames, 0 where it has none. repeated: (first, last)
+    numbers of frames whose ticks do not rise: they count as lost. objection: why it cannot be what was recorded; else
+    None.
+    """
+
+    entry: bytes
+    header: BlockHeader
+    run_id: int
+    block_seq: int
+    first_frame: int
+    n_frames: int
+    lost_before: int
+    sweep: int
+    last_sweep: int
+    first_tick: int
+    last_tick: int
+    repeated: tuple[tuple[int, int], ...]
+    objection: str | None
+
+    @property
+    def end_frame(self) -> int:
+        """One behind its last frame."""
+        return self.first_frame + self.n_frames
+
+
+def check_segments(segments: Sequence[SegmentReader]) -> tuple[list[SoundBlock], list[str]]:
+    """All sound blocks by place, and a line for each piece that is damaged."""
+    if sum(segment.size for segment in segments) < _STEP_BYTES:  # threads would take longer to start
+        found = list(map(_check, segments))
+    else:
+        with ThreadPoolExecutor(CHECKERS, "recording checker") as pool:
+            found = []
+            for done, each in enumerate(pool.map(_check, segments), 1):
+                found.append(each)
+                tell_stage(CHECKING, done, len(segments), "segments")
+    return [block for blocks, _ in found for block in blocks], [line for _, lines in found for line in lines]
+
+
+Gap = tuple[int, int, int]
+"""Number of the run, first and last frame that is not there."""
+
+
+@dataclass(slots=True)
+class Continuity:
+    """What joins the blocks of a recording. gaps: frames that the device lost, or that a repair found missing, and said
+    so; missing: others.
+    """
+
+    gaps: list[Gap] = field(default_factory=list)
+    missing: list[Gap] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def lost(self) -> int:
+        """Frames in the gaps, each counted once."""
+        lost, reached = 0, (-1, -1)
+        for number, first, last in sorted(self.gaps):
+            begin = max(first, reached[1] + 1) if reached[0] == number else first
+            lost += max(0, last + 1 - begin)
+            reached = number, max(last, reached[1] if reached[0] == number else -1)
+        return lost
+
+
+def continuity(runs: Iterable[Sequence[SoundBlock]], *, is_part: bool, known: Collection[Gap] | None) -> Continuity:
+    """Whether the blocks of each run follow on each other, but for what the device says that it lost.
+
+    is_part: the recording was cut from another one, so that it need not begin with the first block. known: what a
+    repair found missing, and said so; None where there was none.
+    """
+    found = Continuity()
+    for number, run in enumerate(runs):
+        _follow(number, run, is_part, known, found)
+    return found
+
+
+def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
+    """Whether so many frames can be so many ticks apart; anything can where they are triggered from outside."""
+    period = header.frame_period_ticks
+    return not period or abs(ticks - frames * period) <= period * (0.5 + _CLOCK_SHARE * abs(frames))
+
+
+def out_of_step(run: Sequence[SoundBlock]) -> list[SoundBlock]:
+    """Blocks of a run whose ticks or sweep cannot be those of their frames, as their neighbours have them.
+
+    None where those would be more than a few: then it is how the device counts.
+    """
+    votes = [0] * len(run)
+    for i, block in enumerate(run):
+        for j in range(max(0, i - _NEIGHBOURS), i):
+            votes_each = _go_together(run[j], block)
+            votes[i] += votes_each
+            votes[j] += votes_each
+    alone = [block for block, vote in zip(run, votes, strict=True) if not vote]
+    return alone if len(run) > 2 and len(alone) * _FEW <= max(len(run), _FEW) else []
+
+
+def _go_together(before: SoundBlock, block: SoundBlock) -> bool:
+    frames = block.first_frame - before.first_frame
+    ticks = block.header.t0_ticks - before.header.t0_ticks
+    return 0 <= block.sweep - before.sweep <= frames and in_step(frames, ticks, block.header)
+
+
+def _check(segment: SegmentReader) -> tuple[list[SoundBlock], list[str]]:
+    blocks: list[SoundBlock] = []
+    lines: list[str] = []
+    told = 0
+    for item in segment.walk(0, segment.size, check_payload=True):
+        if item.offset + _STEP_BYTES > told:
+            segment.expect(told, _STEP_BYTES)
+            told += _STEP_BYTES
+        if isinstance(item, Placed):
+            blocks.append(_sound(segment, item))
+        else:
+            lines.append(damage_line(segment, item))
+    return blocks, lines
+
+
+def _sound(segment: SegmentReader, placed: Placed) -> SoundBlock:
+    block, header = placed.block, placed.block.header
+    ticks = block.start_ticks
+    entry = np.frombuffer(index_of(block, segment.number, placed.offset, placed.length), INDEX_RECORD)[0]
+    return SoundBlock(
+        entry.tobytes(),
+        header,
+        header.run_id,
+        int(entry["block_seq"]),
+        header.first_frame,
+        block.n_frames,
+        header.lost_before,
+        header.sweep,
+        header.sweep + ((int(block.records["sweep"][-1]) - header.sweep) & 0xFFFF if len(ticks) else 0),
+        int(ticks[0]) if len(ticks) else 0,
+        int(ticks[-1]) if len(ticks) else 0,
+        tuple(_stretches(header.first_frame + 1 + np.flatnonzero(np.diff(ticks) <= 0))),
+        _objection(segment, placed),
+    )
+
+
+def _stretches(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+    """(first, last) of each piece of numbers that follow on each other."""
+    for piece in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1):
+        if len(piece):
+            yield int(piece[0]), int(piece[-1])
+
+
+def _objection(segment: SegmentReader, placed: Placed) -> str | None:
+    """Why a block with all its checksums cannot be what was recorded; None where it can."""
+    if not _has_checksum(segment, placed):
+        return "has no checksum of its pixels"
+    block = placed.block
+    markers = (block.records["sweep"].astype(np.int64) - block.header.sweep) & 0xFFFF
+    if block.n_frames and int(np.sort(markers)[(block.n_frames - 1) // 2]) > block.n_frames:
+        return f"says that it begins in sweep {block.header.sweep}, its frames do not"
+    return None
+
+
+def _has_checksum(segment: SegmentReader, placed: Placed) -> bool:
+    """Whether the trailer states a payload CRC: 0 says none, unless it is 0."""
+    trailer = segment.at(placed.offset + placed.length - TRAILER_BYTES, TRAILER_BYTES)
+    if TRAILER.unpack(trailer.tobytes())[4]:
+        return True
+    payload = segment.at(placed.offset + HEADER_BYTES, placed.length - HEADER_BYTES - TRAILER_BYTES)
+    return zlib.crc32(payload.tobytes()) == 0
+
+
+def _follow(
+    number: int, run: Sequence[SoundBlock], is_part: bool, known: Collection[Gap] | None, found: Continuity
+) -> None:
+    first = run[0]
+    found.gaps += [
+        gap
+        for gap in dict.fromkeys(known or ())
+        if gap[0] == number and (gap[2] < first.first_frame or gap[1] >= run[-1].end_frame)
+    ]
+    if not is_part and not any(gap[0] == number and gap[2] == first.first_frame - 1 for gap in found.gaps):
+        _join(number, (0, 0, -1), first, known, found)
+    for before, block in pairwise(run):
+        _join(number, (before.end_frame, before.lost_before, before.block_seq), block, known, found)
+        if before.n_frames and block.n_frames and block.first_tick <= before.last_tick:
+            _repeat(number, block.first_frame, block.first_frame, f"at frame {block.first_frame}", known, found)
+    for block in run:
+        for frames in block.repeated:
+            _repeat(number, *frames, f"within block {block.block_seq}", known, found)
+
+
+def _repeat(number: int, first: int, last: int, where: str, known: Collection[Gap] | None, found: Continuity) -> None:
+    """Frames whose ticks do not rise are there, and count as lost all the same."""
+    gap = number, first, last
+    if known is not None and gap in known:
+        found.gaps.append(gap)
+        return
+    found.missing.append(gap)
+    found.problems.append(f"run {number}: the clock goes back {where}")
+
+
+def _join(
+    number: int, before: tuple[int, int, int], block: SoundBlock, known: Collection[Gap] | None, found: Continuity
+) -> None:
+    """Whether `block` can come behind what was before: its end, the frames lost by then, the number of its block.
+
+    What a repair found missing takes the place of the device's counts, which may be of blocks that are gone.
+    """
+    end_frame, lost_before, block_seq = before
+    missing, lost = block.first_frame - end_frame, block.lost_before - lost_before
+    gap = number, end_frame, block.first_frame - 1
+    if (known is not None and gap in known) or missing == lost > 0:
+        found.gaps.append(gap)
+    elif missing > 0:
+        found.missing.append(gap)
+        found.problems.append(
+            f"run {number}: frames {end_frame} to {block.first_frame - 1} are missing, of which the device lost "
+            f"{min(max(0, lost), missing)}"
+        )
+    elif lost and known is None:
+        found.problems.append(
+            f"run {number}: block {block.block_seq} counts {block.lost_before} lost frames, the one before "
+            f"{lost_before}, and none is missing between them"
+        )
+    gone = block.block_seq - block_seq - 1
+    if gone and known is None and missing in (0, lost):
+        found.problems.append(f"run {number}: {gone} blocks are missing before block {block.block_seq}")
+
+
+Run = Sequence[SoundBlock]
+
+
+def lost_ends(
+    contents: Contents, runs: Sequence[Run], joined: Continuity, manifest: dict[str, Any] | None
+) -> list[Gap]:
+    """What is gone at either end of each run; starts of which nothing is left come behind the others.
+
+    The index tells, then, where blocks are gone that it does not tell of, the range of frames of a part and the frames
+    that the device delivered.
+    """
+    cut = (manifest or {}).get("cut")
+    ranges = _told_ranges(contents, runs)
+    if cut is not None and _blocks_are_gone(manifest or {}, runs):
+        for run_id, first, end in cut["frames"]:
+            began, ended = ranges.get(run_id, (first, end))
+            ranges[run_id] = min(began, first), max(ended, end)
+    gaps: list[Gap] = []
+    for number, run in enumerate(runs):
+        first, end = ranges.pop(run[0].run_id, (run[0].first_frame, run[-1].end_frame))
+        if cut is not None and first < run[0].first_frame:  # of a whole run the first frame is number 0
+            gaps.append((number, first, run[0].first_frame - 1))
+        if end > run[-1].end_frame:
+            gaps.append((number, run[-1].end_frame, end - 1))
+    for number, (first, end) in enumerate(ranges.values(), len(runs)):
+        gaps.append((number, first if cut is not None else 0, end - 1))
+    return gaps + _delivered_behind(runs, [*joined.missing, *gaps], manifest)
+
+
+def _told_ranges(contents: Contents, runs: Sequence[Run]) -> dict[int, tuple[int, int]]:
+    """First and end frame of each run as the index tells; none where most of its records are of something else."""
+    sound = {block.entry for run in runs for block in run}
+    if len(contents.told) == 0 or 2 * sum(entry.tobytes() in sound for entry in contents.told) < len(sound):
+        return {}
+    of_run = {run[0].run_id: run for run in runs}
+    ranges: dict[int, tuple[int, int]] = {}
+    for entry in in_order(_believed(contents.told), contents.told, [], folder=True)[0]:
+        run_id, first = int(entry["run_id"]), int(entry["first_frame"])
+        end = first + int(entry["n_frames"])
+        if run_id in of_run and not _reaches_beyond(entry, of_run[run_id]):
+            continue
+        began, ended = ranges.get(run_id, (first, end))
+        ranges[run_id] = min(began, first), max(ended, end)
+    return ranges
+
+
+def _believed(told: Entries) -> Entries:
+    return told[(told["first_frame"] < 1 << 62) & (told["t0_ticks"] < 1 << 62)]
+
+
+def _reaches_beyond(entry: Any, run: Run) -> bool:
+    """Whether the index tells here of frames beyond the ends of a run, of the right size and at the right time."""
+    n_frames, first = int(entry["n_frames"]), int(entry["first_frame"])
+    near = run[-1] if first >= run[-1].end_frame else run[0]
+    if near is run[0] and first + n_frames > near.first_frame:
+        return False
+    header = near.header
+    if n_frames > MOST_FRAMES or int(entry["length"]) != BlockLayout(n_frames, header.width, header.height).block_bytes:
+        return False
+    return in_step(first - near.first_frame, int(entry["t0_ticks"]) - header.t0_ticks, header)
+
+
+def _blocks_are_gone(manifest: dict[str, Any], runs: Sequence[Run]) -> bool:
+    stated = (manifest.get("recording") or {}).get("blocks")
+    return isinstance(stated, int) and stated > sum(map(len, runs))
+
+
+def _delivered_behind(runs: Sequence[Run], missing: Sequence[Gap], manifest: dict[str, Any] | None) -> list[Gap]:
+    """Frames that the device delivered and nobody else tells of: behind the end of the last run."""
+    if manifest is None or not runs or ended_early(manifest) is not None:
+        return []
+    delivered = device_counters(manifest)[0].get("delivered", 0)
+    there = sum(block.n_frames for run in runs for block in run)
+    left = delivered - there - sum(last + 1 - first for _, first, last in missing)
+    number = len(runs) - 1
+    end = max([runs[-1][-1].end_frame, *(last + 1 for of, _, last in missing if of == number)])
+    return [(number, end, end + left - 1)] if left > 0 else []

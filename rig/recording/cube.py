@@ -1,0 +1,355 @@
+"""A bare cube of packed frames, made by any program: checked against its plan, counted map by map.
+
+In a .npy file: uint8 (maps x columns x exposures, height, ceil(width/8)), most significant bit first (numpy packbits).
+Or in a recording of frames alone, as `rig import` writes it, whose frames may have gaps in their numbers. Frame f of a
+map belongs to column f // exposures, exactly; there are no dark frames.
+
+Arrays of frames in `.npy` files: opened, or refused with the line of numpy that makes what is wanted.
+
+Wanted is uint8 (frames, height, ceil(width / 8)), packed along the width, most significant bit first
+(`numpy.packbits(frames, axis=2)`). Nothing in an array tells which end of a byte is the left one.
+"""
+
+import io
+import math
+import os
+import tokenize
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations
+from pathlib import Path
+from typing import Any, BinaryIO, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model.camera import Camera
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PlaneTable
+from drivers.recorded import RecordedRun, RunRecording
+from rig.config.models import CubePlan
+from rig.count.volume import Counter, FrameTally
+from rig.errors import UsageError
+from rig.recording.open import open_recording
+
+PACK: Final = "numpy.packbits(frames, axis=2)"
+"""What packs frames of one byte or number a pixel."""
+LOOK_BYTES: Final = 16 << 20
+_HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+_UNREADABLE: Final = (ValueError, EOFError, SyntaxError, OverflowError, MemoryError, tokenize.TokenError)
+"""What numpy raises for bytes that are no array."""
+
+
+def open_array(file: Path) -> NDArray[Any]:
+    """The array of a `.npy` file, mapped into memory. UsageError, one line, where it holds none."""
+    try:
+        if zipfile.is_zipfile(file):
+            raise UsageError(_archive(file))
+        array: NDArray[Any] = np.lib.format.open_memmap(file, mode="r")
+    except OSError as error:
+        raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
+    except _UNREADABLE as error:
+        raise UsageError(f"{file} {_why_unreadable(file)}") from error
+    return array
+
+
+def _archive(file: Path) -> str:
+    """What a file of several arrays is, and how one of them is taken out."""
+    with zipfile.ZipFile(file) as archive:
+        names = [name.removesuffix(".npy") for name in archive.namelist()]
+    one = f": numpy.save('cube.npy', numpy.load('{file.name}')['{names[0]}'])" if names else ""
+    return (
+        f"{file} is an archive of arrays ({', '.join(names) or 'none'}); a cube is one array, written with numpy.save"
+        f"{one}"
+    )
+
+
+def holds_bits(frames: NDArray[Any]) -> bool:
+    """Whether every value is 0 or 1, and one is 1, as in frames that are not packed."""
+    step = max(1, LOOK_BYTES // max(1, frames[:1].nbytes))
+    seen = False
+    for first in range(0, len(frames), step):
+        part = frames[first : first + step]
+        if not ((part == 0) | (part == 1)).all():
+            return False
+        seen = seen or bool(part.any())
+    return seen
+
+
+def numpy_line(frames: NDArray[Any], height: int, width: int) -> str | None:
+    """What numpy makes uint8 (frames, height, ceil(width / 8)) of such an array with; None where its size is another.
+
+    Of several ways the one that changes least.
+    """
+    line, shape = "frames", frames.shape
+    packed, whole = (height, -(-width // 8)), (height, width)
+    if len(shape) == 4 and shape[3] == 1:
+        line, shape = "frames[..., 0]", shape[:3]
+    elif shape in (packed, whole):
+        line, shape = "frames[None]", (1, *shape)
+    elif len(shape) in (1, 2):
+        per_frame = shape[1] if len(shape) == 2 else frames.size
+        sizes = [size for size in (packed, whole) if per_frame % math.prod(size) == 0]
+        sizes = [size for size in sizes if len(shape) == 1 or math.prod(size) == per_frame]
+        if not sizes:
+            return None
+        size = sizes[0] if frames.dtype in (np.uint8, np.int8) and not holds_bits(frames) else sizes[-1]
+        line, shape = f"frames.reshape(-1, {size[0]}, {size[1]})", (frames.size // math.prod(size), *size)
+    if len(shape) != 3:
+        return None
+    for axes in sorted(permutations(range(3)), key=lambda axes: (axes != (0, 1, 2), axes != (2, 0, 1))):
+        turned = line if axes == (0, 1, 2) else f"numpy.transpose({line}, {axes})"
+        size = (shape[axes[1]], shape[axes[2]])
+        if size == packed and (packed != whole or frames.dtype == np.uint8):
+            made = _as_bytes(turned, frames.dtype)
+            if made is not None:
+                return made
+        if size == whole:
+            return _pack(turned, frames.dtype)
+    if shape[1:] == (-(-height // 8), width) and frames.dtype == np.uint8:
+        return f"numpy.packbits(numpy.unpackbits({line}, axis=1, count={height}), axis=2)"
+    return None
+
+
+def _as_bytes(line: str, dtype: np.dtype[Any]) -> str | None:
+    """Packed frames of another type as bytes; None where that holds no bytes."""
+    if dtype == np.uint8:
+        return line
+    if dtype == np.int8:
+        return f"{line}.view(numpy.uint8)"
+    return f"{line}.astype(numpy.uint8)" if dtype.kind in "iuf" else None
+
+
+def _pack(line: str, dtype: np.dtype[Any]) -> str:
+    return f"numpy.packbits({line}, axis=2)" if dtype.kind in "biu" else f"numpy.packbits({line} != 0, axis=2)"
+
+
+def _why_unreadable(file: Path) -> str:
+    """What is wrong with a file that numpy does not load, and the next step."""
+    with file.open("rb") as opened:
+        header = _header(opened)
+        begin, end = opened.tell(), opened.seek(0, io.SEEK_END)
+    if header is not None:
+        shape, _, dtype = header
+        if dtype.hasobject:
+            return (
+                f"holds Python objects of shape {shape}, which are not read; make one array of numbers of them: "
+                "frames = numpy.stack(list(objects))"
+            )
+        size = math.prod(shape) * dtype.itemsize
+        if size > end - begin:
+            return (
+                f"is no whole .npy file: {dtype} of shape {shape} takes {size} bytes, {end - begin} are there; "
+                "copy or write it again"
+            )
+    return "is no whole .npy file of numbers; write it with numpy.save"
+
+
+def _header(opened: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]] | None:
+    try:
+        return _HEADERS[np.lib.format.read_magic(opened)](opened)
+    except (*_UNREADABLE, KeyError):
+        return None
+
+
+CHUNK_BYTES = 16 << 20
+"""Frames are read in pieces of this size; larger ones only cost memory."""
+RATE_TOLERANCE: Final = 1e-3
+"""Relative. Rates are written with three digits or so."""
+
+Piece = tuple[int, NDArray[np.uint8]]
+"""Number of the first frame, and uint8 (n, height, ceil(width/8) or more) of it and those that follow it."""
+Gap = tuple[int, int]
+"""First and last number of frames that are not there."""
+
+
+class Frames(Protocol):
+    """Where a cube's frames lie."""
+
+    def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
+        """The frames there are from number `first` to before `end`, at most `step` at a time."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrayFrames:
+    """Frames in an array (n, height, row bytes), numbered from 0, read from disk as needed."""
+
+    array: NDArray[np.uint8]
+
+    def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
+        """The frames from `first` to before `end`."""
+        for start in range(first, end, step):
+            yield start, self.array[start : min(start + step, end)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedFrames:
+    """Frames of a recording's one run, by their own numbers. Those of damaged blocks are left out."""
+
+    recording: RunRecording
+    run: RecordedRun
+
+    def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
+        """The frames there are from `first` to before `end`, in the blocks they lie in."""
+        for block in self.recording.blocks(self.run, first, end):
+            for start in range(0, block.n_frames, step):
+                yield block.header.first_frame + start, block.bits[start : start + step]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cube:
+    """Checked frames of whole maps. first_frame: number of the first map's first one. maps: whole sweeps."""
+
+    path: Path
+    frames: Frames
+    plan: CubePlan
+    width: int
+    height: int
+    maps: int
+    first_frame: int = 0
+
+    @property
+    def frames_per_map(self) -> int:
+        """Frames of one sweep, lost ones included."""
+        return self.plan.columns * self.plan.exposures
+
+
+def open_cube(path: str | os.PathLike[str], plan: CubePlan, model: RigModel) -> Cube:
+    """Open a .npy file, or the folder of a recording, and check it against its plan and calibration.
+
+    UsageError where they disagree.
+    """
+    file = Path(path)
+    camera = model.camera
+    frames: Frames
+    if file.is_dir():
+        recording = open_recording(file)
+        run = recording.runs[0]
+        problems = _recording_problems(recording, plan, camera)
+        frames, first, n = RecordedFrames(recording, run), run.first_frame, run.end_frame - run.first_frame
+    else:
+        array = open_array(file)
+        problems = _array_problems(file, array, plan, camera)
+        frames, first, n = ArrayFrames(array), 0, len(array) if array.ndim else 0
+    problems += _plane_problems(plan, model)
+    if problems:
+        raise UsageError.of(problems)
+    return Cube(file, frames, plan, camera.width, camera.height, n // (plan.columns * plan.exposures), first)
+
+
+def cube_columns(model: RigModel) -> int | None:
+    """Columns of the bare cube that a model with `planes` is for; None where its commands are a mirror's."""
+    scanner = model.scanner
+    if isinstance(scanner, PlaneTable) and np.array_equal(scanner.command, np.arange(len(scanner.command))):
+        return len(scanner.command)
+    return None
+
+
+def column_commands(plan: CubePlan) -> NDArray[np.float64]:
+    """Commands of a cube's columns: their index, which is what the `planes` of its calibration are sampled at."""
+    return np.arange(plan.columns, dtype=np.float64)
+
+
+def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, list[Gap]]:
+    """Counts of one map, and its frames that are not there. `counter` is made for the cube's columns and size.
+
+    The counter is reset first.
+    """
+    counter.reset()
+    first = cube.first_frame + index * cube.frames_per_map
+    end = first + cube.frames_per_map
+    row_bytes = -(-cube.width // 8)
+    padded = -(-row_bytes // 8) * 8
+    step = max(1, CHUNK_BYTES // (cube.height * padded))
+    # Programs may leave anything in the bits past the width; they are no pixels.
+    last_byte = np.uint8(0xFF << (-cube.width % 8) & 0xFF)
+    gaps: list[Gap] = []
+    following = first
+    for start, piece in cube.frames.between(first, end, step):
+        if start > following:
+            gaps.append((following, start - 1))
+        following = start + len(piece)
+        bits = np.zeros((len(piece), cube.height, padded), np.uint8)
+        bits[:, :, :row_bytes] = piece[:, :, :row_bytes]
+        bits[:, :, row_bytes - 1] &= last_byte
+        column = (np.arange(start - first, following - first) // cube.plan.exposures).astype(np.int32)
+        counter.add(bits, column, column.astype(np.float64), np.zeros(len(bits), np.int32))
+        counter.settle(1)  # frames wait in memory until they are counted
+    if following < end:
+        gaps.append((following, end - 1))
+    return counter.finish(), gaps
+
+
+def _array_problems(file: Path, array: NDArray[Any], plan: CubePlan, camera: Camera) -> list[str]:
+    size = (camera.height, -(-camera.width // 8))
+    if array.dtype == np.uint8 and array.ndim == 3 and array.shape[1:] == size:
+        return _length_problems(f"{file} has {len(array)} frames", len(array), plan)
+    line = numpy_line(array, camera.height, camera.width)
+    if line is None:
+        then = "use the calibration made with this sensor"
+    else:
+        then = f"make it with {line}"
+        if "packbits" in line and "unpackbits" not in line and array.dtype != bool and not holds_bits(array):
+            then += " (every value but 0 becomes 1; sums of several exposures are no frames)"
+    return [
+        f"{file} holds {array.dtype} of shape {array.shape}; the calibration's {camera.width} x {camera.height} sensor "
+        f"needs (frames, {size[0]}, {size[1]}) of uint8, eight pixels a byte; {then}"
+    ]
+
+
+def _recording_problems(recording: RunRecording, plan: CubePlan, camera: Camera) -> list[str]:
+    """Why the frames of a recording are not those of the plan."""
+    path, run, header = recording.path, recording.runs[0], recording.runs[0].header
+    if len(recording.runs) > 1:
+        return [
+            f"{path} holds {len(recording.runs)} starts of the SPAD, a cube is of one; 'rig export' its frames as npy"
+        ]
+    size = (header.width, header.height)
+    if size != (header.sensor_width, header.sensor_height) or size != (camera.width, camera.height):
+        return [
+            f"{path} holds frames of {header.width} x {header.height} pixels, the calibration is of a sensor of "
+            f"{camera.width} x {camera.height}; use the calibration made with this sensor"
+        ]
+    problems = []
+    if header.frame_period_ticks:
+        rate_hz = header.tick_hz / header.frame_period_ticks
+        if abs(rate_hz / plan.frame_rate - 1) > RATE_TOLERANCE:
+            problems.append(
+                f"{path} was taken at {float(rate_hz):g} Hz, the plan says {float(plan.frame_rate):g} Hz; correct "
+                "frame_rate in the plan"
+            )
+    first, n = run.first_frame, run.end_frame - run.first_frame
+    per_map = plan.columns * plan.exposures
+    if first % per_map:
+        problems.append(
+            f"{path} begins with frame {first}, which is no first one of a map of {per_map} frames; "
+            "'rig export' it as npy where its first frame is the first of a map all the same"
+        )
+    what = f"{path} has {n} frames" if n == run.frames else f"{path} has {n} frames, {n - run.frames} of them lost"
+    return problems + _length_problems(what, n, plan)
+
+
+def _length_problems(what: str, n_frames: int, plan: CubePlan) -> list[str]:
+    per_map = plan.columns * plan.exposures
+    if n_frames and n_frames % per_map == 0:
+        return []
+    return [
+        f"{what}; {plan.columns} columns x {plan.exposures} exposures need {per_map} a map, or a multiple of it; "
+        "correct columns or exposures in the plan"
+    ]
+
+
+def _plane_problems(plan: CubePlan, model: RigModel) -> list[str]:
+    columns = cube_columns(model)
+    if columns is None:
+        return [
+            "the calibration maps mirror commands to planes; a bare cube needs 'planes', one per column of its plan"
+        ]
+    if columns != plan.columns:
+        return [
+            f"the calibration has {columns} planes, the plan {plan.columns} columns; "
+            "use the calibration made for this cube's plan"
+        ]
+    return []

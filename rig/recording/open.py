@@ -1,0 +1,360 @@
+"""Opening a recording for the commands that read one: what is wrong with the folder is its user's to mend.
+
+What a recording holds, as its index and manifest tell; `verify` is what reads all of it.
+
+What a part of a recording (`rig cut`) takes over from the whole, so that its maps come out the same bit for bit.
+
+Which frames of a recording belong to which map: as its manifest says and, of a run that ended early, its markers.
+
+Where the starts of a recording begin and end: with which sound blocks, and what is gone there.
+"""
+
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from calibration.files.npy_files import load_numpy
+from calibration.model.rig_model import RigModel
+from drivers.errors import DeviceNotFound, ProtocolError
+from drivers.frames import FrameBlock, Mark
+from drivers.recorded import RecordedRun, RunRecording
+from drivers.recorded.segments import PACKED_SUFFIX, segment_files
+from rig.config.models import EstimateConfig
+from rig.count.bind import MAX_RESIDUAL_COLUMNS
+from rig.count.sweeps import SweepStart
+from rig.errors import DamagedRecordingError, UsageError
+from rig.estimate.registry import LEARNING
+from rig.estimate.row.model import RowModel
+from rig.plan.scan_plan import MAX_CLOCK_ERROR
+from rig.run_folder.manifest import MANIFEST, ended_before_last_map, is_cut_short, known_missing, read_manifest
+
+SEGMENTS: Final = "frames-*.spb"
+"""Files that the frames of a recording lie in."""
+
+
+def open_recording(folder: Path) -> RunRecording:
+    """The recording of a run. UsageError where there is none, DamagedRecordingError where nothing of it is left."""
+    require_recording(folder)
+    try:
+        return RunRecording(folder)
+    except DeviceNotFound as error:
+        raise UsageError(str(error)) from None
+    except ProtocolError as error:
+        raise DamagedRecordingError(str(error)) from None
+
+
+def require_recording(path: Path) -> None:
+    """UsageError where a path is no folder with a recording, saying what it is instead."""
+    if not (path.is_dir() and segment_files(path)):
+        raise UsageError(f"{path} {_instead(path)}")
+
+
+def _instead(path: Path) -> str:
+    """What a path without a recording is, and the next step."""
+    if path.is_file():
+        recorded = path.match(f"{SEGMENTS}*")
+        then = "the folder that it lies in" if recorded else "the folder of a run taken with --record"
+        return f"is a file; name {then}"
+    if not path.exists():
+        return "does not exist; name the folder of a run taken with --record"
+    inside = sorted(part for part in path.iterdir() if part.is_dir() and segment_files(part))
+    if inside:
+        more = "" if len(inside) == 1 else f" or another of {len(inside)} in it"
+        return f"is a folder without a recording ({SEGMENTS}) of its own; name {inside[0]}{more}"
+    if (path / MANIFEST).exists() or (path / "stripe").is_dir():
+        return (
+            f"holds no recording ({SEGMENTS}): the frames of this run were not recorded; take it again with "
+            "'rig scan --record'"
+        )
+    for suffix, kind in ((".npy", "photoncube"), (".bin", "swissspad2 (or pi-imaging)")):
+        if any(path.glob(f"*{suffix}")):
+            return (
+                f"is a folder without a recording: no {SEGMENTS}, but {suffix} files; if these are frames, "
+                f"'rig import {kind} {path} --out DIR' makes a recording of them"
+            )
+    what = "a folder without a recording" if any(path.iterdir()) else "an empty folder"
+    return f"is {what}: no {SEGMENTS}; name the folder of a run taken with --record"
+
+
+def manifest_or_none(folder: Path) -> tuple[dict[str, Any] | None, str | None]:
+    """The manifest, or why there is none."""
+    try:
+        manifest = read_manifest(folder)
+    except DamagedRecordingError as error:
+        return None, str(error)
+    return manifest, None if manifest is not None else "manifest.json is missing; 'rig repair' writes one"
+
+
+@dataclass(frozen=True, slots=True)
+class MapSpan:
+    """A map's frames: of one run, from the one with its scan marker to before the one with the next."""
+
+    run: int
+    first_frame: int
+    end_frame: int
+
+
+def map_spans(recording: RunRecording, manifest: dict[str, Any] | None) -> list[MapSpan]:
+    """The whole maps of a recording, in order."""
+    manifest = manifest or {}
+    sweeps = manifest.get("sweeps")
+    if sweeps is None:
+        return list(_marked(recording))
+    spans = list(_stated(recording, sweeps))
+    while spans and is_cut_short(manifest) and spans[-1].end_frame >= recording.runs[spans[-1].run].end_frame:
+        del spans[-1]  # the run made a map of frames that are not in the recording
+    if ended_before_last_map(manifest):
+        made = (spans[-1].run, spans[-1].end_frame) if spans else (0, 0)
+        spans += [span for span in _marked(recording) if (span.run, span.first_frame) >= made]
+    return spans
+
+
+def _stated(recording: RunRecording, sweeps: list[dict[str, Any]]) -> Iterator[MapSpan]:
+    """As the manifest says: frames are counted anew with each run."""
+    run, end = 0, 0
+    for sweep in sweeps:
+        first = int(sweep["first_frame"])
+        if first < end:
+            run += 1
+        end = int(sweep["end_frame"])
+        if run < len(recording.runs):
+            yield MapSpan(run, first, end)
+
+
+def _marked(recording: RunRecording) -> Iterator[MapSpan]:
+    """As the markers say; a map whose begin or end was lost begins and ends with the frames that are left."""
+    for run in recording.runs:
+        begins = [frame for _, frame in _sweep_begins(recording, run)]
+        yield from (MapSpan(run.number, a, b) for a, b in pairwise(begins))
+
+
+def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[tuple[int, int]]:
+    """(scan markers so far, number of the first frame with them), for each scan marker but those before the run."""
+    entries = run.entries
+    changes = np.flatnonzero(np.diff(entries["sweep"].astype(np.int64), prepend=-1) != 0)
+    look_into = sorted({0, len(entries) - 1, *changes.tolist(), *(changes[1:] - 1).tolist()})
+    seen = 0
+    for i in look_into:
+        block = recording.read(run, entries[i])
+        if block is None or block.n_frames == 0:
+            continue
+        counts = _markers_seen(block)
+        before = counts[0] if i == 0 and not _marked_first(block) else seen
+        for at in np.flatnonzero(np.diff(counts, prepend=before) > 0):
+            yield int(counts[at]), block.header.first_frame + int(at)
+        seen = int(counts[-1])
+
+
+def _markers_seen(block: FrameBlock) -> np.ndarray[Any, np.dtype[np.int64]]:
+    """Scan markers of the run up to each frame: a record's low 16 bits, continued from the header's 32."""
+    sweep = block.header.sweep
+    return sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF)
+
+
+def _marked_first(block: FrameBlock) -> bool:
+    """Whether the first frame has a scan marker of its own."""
+    return bool(int(block.records["marks"][0]) & Mark.SCAN)
+
+
+@dataclass(frozen=True, slots=True)
+class RunInfo:
+    """One start of the SPAD. Frames first_frame to end_frame - 1; gaps: how many pieces are missing between them and,
+    as a repair found, at their ends; lost: frames of those.
+    """
+
+    run_id: int
+    first_frame: int
+    end_frame: int
+    frames: int
+    gaps: int
+    lost: int
+    width: int
+    height: int
+    sensor_width: int
+    sensor_height: int
+    frame_rate_hz: float | None
+    duration_s: float
+    first_map: int | None
+    end_map: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingInfo:
+    """A recording. bytes: on the disk. verdict: the run's; problems: seen without reading the frames."""
+
+    folder: Path
+    verdict: str | None
+    segments: int
+    compressed: int
+    bytes: int
+    blocks: int
+    frames: int
+    maps: int
+    runs: list[RunInfo]
+    config: str | None
+    devices: dict[str, str]
+    versions: dict[str, str]
+    problems: list[str]
+
+    def as_json(self) -> dict[str, Any]:
+        """As plain values."""
+        return {**asdict(self), "folder": str(self.folder)}
+
+
+def info(folder: Path) -> RecordingInfo:
+    """Contents of a recording (`rig info`). UsageError where there is none."""
+    recording = open_recording(folder)
+    manifest, trouble = manifest_or_none(folder)
+    spans = map_spans(recording, manifest)
+    files = list(segment_files(folder).values())
+    content = manifest or {}
+    maps_of = {run.number: [i for i, span in enumerate(spans) if span.run == run.number] for run in recording.runs}
+    known = known_missing(manifest) or []
+    runs = [_run_info(run, maps_of[run.number], [g[1:] for g in known if g[0] == run.number]) for run in recording.runs]
+    return RecordingInfo(
+        folder=folder,
+        verdict=content.get("verdict"),
+        segments=len(files),
+        compressed=sum(file.name.endswith(PACKED_SUFFIX) for file in files),
+        bytes=sum(file.stat().st_size for file in files),
+        blocks=sum(len(run.entries) for run in recording.runs),
+        frames=recording.frames,
+        maps=sum(_is_there(span, recording.runs[span.run], content) for span in spans),
+        runs=runs,
+        config=(content.get("config") or {}).get("name"),
+        devices={slot: str(of.get("name")) for slot, of in (content.get("devices") or {}).items()},
+        versions=content.get("versions") or {},
+        problems=[*recording.problems, *([] if trouble is None else [trouble])],
+    )
+
+
+def _is_there(span: MapSpan, run: RecordedRun, manifest: dict[str, Any]) -> bool:
+    """Whether a map can be made of what a repair left: of a part, which has none before it, the whole ones only."""
+    if "repaired" not in manifest:
+        return True
+    begin = span.first_frame if "cut" in manifest else span.end_frame - 1
+    return begin >= run.first_frame and span.end_frame < run.end_frame
+
+
+def _run_info(run: RecordedRun, maps: list[int], known: list[tuple[int, int]]) -> RunInfo:
+    header = run.header
+    ends = {gap for gap in known if gap[1] < run.first_frame or gap[0] >= run.end_frame}
+    gaps = [*run.gaps(), *ends]
+    period = header.frame_period_ticks
+    return RunInfo(
+        run_id=header.run_id,
+        first_frame=run.first_frame,
+        end_frame=run.end_frame,
+        frames=run.frames,
+        gaps=len(gaps),
+        lost=sum(last + 1 - first for first, last in gaps),
+        width=header.width,
+        height=header.height,
+        sensor_width=header.sensor_width,
+        sensor_height=header.sensor_height,
+        frame_rate_hz=float(header.tick_hz / period) if period else None,
+        duration_s=_duration_s(run),
+        first_map=maps[0] if maps else None,
+        end_map=maps[-1] + 1 if maps else None,
+    )
+
+
+def _duration_s(run: RecordedRun) -> float:
+    """From the first frame to the end of the last one, to the precision of its last block where that has no period."""
+    entries, header = run.entries, run.header
+    last = int(entries["n_frames"][-1]) * header.frame_period_ticks
+    return float((int(entries["t0_ticks"][-1]) - int(entries["t0_ticks"][0]) + last) / header.tick_hz)
+
+
+EndGap = tuple[int, int, int]
+"""Number of the start, first and last frame that is gone."""
+
+
+def end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> FrameBlock | None:
+    """The first or the last sound block of a start with a frame in it; None where there is none."""
+    entries = run.entries[::-1] if last else run.entries
+    return next((b for entry in entries if (b := recording.read(run, entry)) is not None and b.n_frames), None)
+
+
+def readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int]:
+    """First frame of a start and one behind its last, of its sound blocks; (first, first) where none is."""
+    first, last = (end_block(recording, run, last=end) for end in (False, True))
+    if first is None or last is None:
+        return run.first_frame, run.first_frame
+    return first.header.first_frame, last.header.first_frame + last.n_frames
+
+
+def end_gaps(recording: RunRecording) -> list[EndGap]:
+    """What a repair found missing, and the frames of blocks at the ends of starts that are damaged."""
+    known = known_missing(read_manifest(recording.path)) if recording.path.is_dir() else None
+    gaps = list(dict.fromkeys(known or ()))
+    for run in recording.runs:
+        first, end = readable_range(recording, run)
+        gaps += [(run.number, run.first_frame, first - 1)] if first > run.first_frame else []
+        gaps += [(run.number, end, run.end_frame - 1)] if end < run.end_frame else []
+    return sorted(gaps)
+
+
+def part_starts(recording: RunRecording) -> list[SweepStart]:
+    """With which sweep the maps of each run begin: the first, but in a part."""
+    cut = (read_manifest(recording.path) or {}).get("cut") if recording.path.is_dir() else None
+    if cut is None:
+        return [SweepStart() for _ in recording.runs]
+    ratios = cut.get("clock_ratios") or []
+    return [
+        SweepStart(_first_sweep(recording, run), float(ratios[run.number]) if run.number < len(ratios) else 1.0)
+        for run in recording.runs
+    ]
+
+
+def fitted_ratio(ratio: float, sweeps: Sequence[dict[str, Any]]) -> float:
+    """Ratio of the scanner's clock to nominal behind these sweeps of a manifest; `ratio` is that before the first."""
+    for i, sweep in enumerate(sweeps):
+        if i and sweep["first_frame"] < sweeps[i - 1]["end_frame"]:
+            ratio = 1.0  # another start of the SPAD
+        residual, error = sweep.get("residual_columns"), float(sweep.get("clock_error") or 0.0)
+        if residual is not None and residual <= MAX_RESIDUAL_COLUMNS and abs(error) <= MAX_CLOCK_ERROR:
+            ratio = 1 + error
+    return ratio
+
+
+def part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None) -> list[RowModel]:
+    """The states that the maps of a part were estimated with, where it is estimated as the whole was; else none.
+
+    Nothing of a whole recording, which learns the same again from its first map on.
+    """
+    manifest: dict[str, Any] = (read_manifest(folder) or {}) if folder.is_dir() else {}
+    before = (manifest.get("config") or {}).get("estimate") or {}
+    same = before.get("estimator") == estimate.estimator and estimate.estimator in LEARNING
+    if estimate.estimator == "joint":  # recordings from before there was a prior have none
+        same = same and before.get("temporal_prior", False) == estimate.temporal_prior
+    calibration = (manifest.get("calibration") or {}).get("id")
+    if "cut" not in manifest or not same or model is None or calibration != model.fingerprint():
+        return []
+    states = []
+    for i in range(manifest["cut"]["maps"][1] - manifest["cut"]["maps"][0]):
+        file = folder / "learned" / f"{i:06d}.npz"
+        if not file.exists():  # the whole kept those of some maps only
+            return []
+        try:
+            with load_numpy(file) as arrays:
+                states.append(RowModel.from_arrays(dict(arrays)))
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to learn anew") from error
+    return states
+
+
+def _first_sweep(recording: RunRecording, run: RecordedRun) -> int:
+    """Number of the first sweep that begins in a run: a part may begin in the middle of one."""
+    block = end_block(recording, run, last=False)
+    if block is None:
+        raise DamagedRecordingError(
+            f"{recording.path}: no block of start {run.number} is sound; take it from the whole"
+        )
+    begins = bool(int(block.records["marks"][0]) & Mark.SCAN)
+    return block.header.sweep - begins

@@ -1,0 +1,418 @@
+"""A recording through the live stack: its plan and its starts, with other devices recorded too, emulated or real.
+
+Frames are bound by the plan that they were taken with (`plan.yaml`), never by one compiled anew, and each start of the
+SPAD is played as one: so a map is made of the very same frames in the very same order, at any clock.
+"""
+
+import itertools
+import zipfile
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from calibration.files.npy_files import load_numpy
+from calibration.files.rig_file import CALIBRATION_FILE
+from calibration.model.rig_model import RigModel
+from drivers.interfaces import SpadArray, SpadTiming, SweepTruth
+from drivers.recorded import RecordedRun, RunRecording
+from drivers.replay.pace import Pace, PaceReport, ReplayClock
+from rig.config.files import parse_config
+from rig.config.models import EstimateConfig, RigConfig, ScanConfig
+from rig.count.sweeps import Gap, SweepAccount, SweepStart
+from rig.errors import DamagedRecordingError, UsageError
+from rig.estimate.registry import Learned
+from rig.plan.compile import spad_request
+from rig.plan.scan_plan import ScanPlan
+from rig.recording.inputs import PLAN_FILE, read_plan
+from rig.recording.open import (
+    EndGap,
+    end_block,
+    end_gaps,
+    fitted_ratio,
+    part_learned,
+    part_starts,
+    readable_range,
+    require_recording,
+)
+from rig.run_folder.manifest import (
+    MANIFEST,
+    ended_before_last_map,
+    is_cut_short,
+    read_manifest,
+    require_inputs,
+    require_plain_sweeps,
+)
+
+SILENCE_S = 5.0
+"""As of a live SPAD, in the time of the recording."""
+ENDLESS_S = 1e6
+ENDLESS = 1_000_000_000
+"""Maps of a loop that nobody counts."""
+RECORDED = ("scanner", "laser", "sync")
+"""Slots that a recording can play all by itself."""
+
+
+@runtime_checkable
+class PlaysRecording(Protocol):
+    """A SPAD that gives the frames of a recording."""
+
+    @property
+    def recording(self) -> RunRecording:
+        """What it plays."""
+        ...
+
+    @property
+    def pace(self) -> Pace:
+        """When its frames come due."""
+        ...
+
+    @property
+    def loops(self) -> bool:
+        """Whether it begins again behind the last start."""
+        ...
+
+    def leave_out(self, runs: Collection[int]) -> None:
+        """Do not play these starts, by their numbers."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayOptions:
+    """How a recording is played. block_frames: of a block at most, None for what the plan says."""
+
+    clock: str = "max"
+    loop: bool = False
+    block_frames: int | None = None
+
+    def __post_init__(self) -> None:
+        """UsageError for a clock that is none."""
+        try:
+            ReplayClock.parse(self.clock)
+        except ValueError as error:
+            raise UsageError(f"--{error}") from None
+        if self.block_frames is not None and self.block_frames < 1:
+            raise UsageError(f"block_frames is {self.block_frames}; it must be at least 1")
+
+
+def replay_config(
+    run: Path,
+    options: ReplayOptions,
+    others: RigConfig | None,
+    estimate: dict[str, Any],
+    *,
+    against_recording: bool = False,
+) -> RigConfig:
+    """The rig that plays a recording. others: whose world, scanner, laser and sync source take part; None: recorded.
+
+    against_recording: the recording's own drivers take part, against what their devices answered then.
+    estimate: settings laid over those of the recording. UsageError where there is no recording.
+    """
+    require_recording(run)
+    plan = read_plan(run)
+    manifest = read_manifest(run)
+    if manifest is None:
+        raise DamagedRecordingError(f"{run / MANIFEST} is missing; 'rig repair' writes a new one")
+    require_inputs(run, manifest)
+    require_plain_sweeps(run, manifest)
+    recorded = manifest.get("config") or {}
+    calibration = run / CALIBRATION_FILE
+    given = {key: value for key, value in estimate.items() if value is not None}
+    scan = {key: value for key, value in (recorded.get("scan") or _scan_of(plan)).items() if key != "adaptive"}
+    content: dict[str, Any] = {
+        "name": f"replay of {recorded.get('name') or run.name}",
+        "calibration": str(calibration.absolute()) if calibration.exists() else None,
+        "calibration_max_age": recorded.get("calibration_max_age"),
+        "world": None,
+        "spad": {
+            "kind": "replay",
+            "recording": str(run.absolute()),
+            "clock": options.clock,
+            "loop": options.loop,
+            "block_frames": options.block_frames,
+        },
+        **{slot: {"kind": "replay"} for slot in RECORDED},
+        "scan": scan,
+        "estimate": {**(recorded.get("estimate") or {}), **given},
+    }
+    if content["estimate"].get("estimator") != "joint":  # another estimator than that of the scan, which had a prior
+        content["estimate"].pop("temporal_prior", None)
+    if others is not None:
+        content |= {slot: part for slot, part in others.model_dump(mode="json").items() if slot in (*RECORDED, "world")}
+    elif against_recording:
+        content |= _own_drivers(run, recorded)
+    return parse_config(content, options=[f"estimate.{key}" for key in given])
+
+
+def replay_plan(
+    spad: SpadArray, recording: RunRecording, scan: ScanConfig, model: RigModel | None
+) -> tuple[ScanPlan, SpadTiming]:
+    """The plan that the frames were taken with, for the calibration that there is, and the SPAD configured for it."""
+    plan = read_plan(recording.path)
+    _require_frames_of(plan, recording)
+    if model is not None:
+        from rig.plan.calibration_reach import recalibrated
+
+        plan = recalibrated(plan, model)
+    elif not plan.windowed:
+        from rig.plan.calibration_reach import whole_rows
+
+        plan = whole_rows(plan)
+    request = replace(spad_request(scan, plan), frame_rate_hz=plan.frame_rate_hz, exposure_s=plan.exposure_s)
+    return plan, spad.configure(request)
+
+
+def _require_frames_of(plan: ScanPlan, recording: RunRecording) -> None:
+    """DamagedRecordingError where the frames are of another size than the plan's: counters are made by the plan."""
+    widths = {plan.width} if plan.windows is None else {plan.width, plan.windows.width_px}
+    for run in recording.runs:
+        header = run.header
+        if header.height != plan.rows or header.width not in widths or plan.width > header.sensor_width:
+            raise DamagedRecordingError(
+                f"{recording.path}: the frames of start {run.number} are {header.width} x {header.height} pixels of a "
+                f"sensor {header.sensor_width} wide, {PLAN_FILE} is for {plan.width} x {plan.rows}; take it from a copy"
+            )
+
+
+class Replayed:
+    """What a run needs to know of the recording that its SPAD plays. maps: to take."""
+
+    def __init__(self, spad: PlaysRecording, plan: ScanPlan, maps: int | None) -> None:
+        self._spad = spad
+        self._shapes = (plan.rows, plan.columns), (plan.rows, plan.width)
+        self._all = maps is None
+        starts = recorded_sweeps(spad.recording, plan)
+        self._played = [start for start in starts if start.sweeps]
+        self._numbers = [start.first_map + i for start in starts for i in range(start.sweeps)]
+        spad.leave_out({run.number for run in spad.recording.runs} - {start.number for start in self._played})
+        self._gone = _merged([*end_gaps(spad.recording), *(gap for start in starts for gap in start.gone)])
+        there = self._there = len(self._numbers)
+        if there == 0:
+            lost = sum(last + 1 - first for _, first, last in self._gone)
+            gone = f" ({lost} frames of it are gone)" if lost else ""
+            raise UsageError(f"{spad.recording.path} holds no whole sweep{gone}, so there is no map to be made of it")
+        if maps is not None and maps > there and not spad.loops:
+            raise UsageError(f"--maps is {maps}, {spad.recording.path} holds {there}; ask for fewer, or add --loop")
+        self.maps: int = maps or (ENDLESS if spad.loops else there)
+
+    @classmethod
+    def of(cls, spad: SpadArray, plan: ScanPlan, maps: int | None) -> "Replayed | None":
+        """None for a SPAD that plays no recording. UsageError where that has not so many maps."""
+        return cls(spad, plan, maps) if isinstance(spad, PlaysRecording) else None
+
+    @property
+    def report(self) -> PaceReport:
+        """How its clock was held."""
+        return self._spad.pace.report
+
+    @property
+    def silence_s(self) -> float:
+        """How long it may give nothing: at a slow clock longer, and while it waits for steps as long as it takes."""
+        pace = self._spad.pace
+        return ENDLESS_S if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
+
+    def groups(self) -> Iterator[int]:
+        """Sweeps of one start after the other."""
+        sweeps = [start.sweeps for start in self._played]
+        return itertools.cycle(sweeps) if self._spad.loops else iter(sweeps)
+
+    def starts_for(self, maps: int) -> int:
+        """Starts that give so many maps, at most."""
+        return -(-maps // self._there) * len(self._played)
+
+    def starts(self) -> Iterator[SweepStart]:
+        """With which sweep each of the starts begins."""
+        found = [start.begin for start in self._played]
+        return itertools.cycle(found) if self._spad.loops else iter(found)
+
+    def learned(self, estimate: EstimateConfig, model: RigModel | None) -> Sequence[Learned]:
+        """Of a part of a recording, what its maps were estimated with; empty where they are to be learned anew."""
+        learned = part_learned(self._spad.recording.path, estimate, model)
+        return [learned[number] for number in self._numbers if number < len(learned)]
+
+    def truth(self, index: int) -> SweepTruth | None:
+        """What was known of a map when it was recorded, where that was kept.
+
+        DamagedRecordingError where it is of other columns or of another sensor.
+        """
+        truth = recorded_truth(self._spad.recording.path, self._numbers[index % self._there])
+        if truth is not None and (truth.x_px.shape, truth.depth_m.shape) != self._shapes:
+            raise DamagedRecordingError(
+                f"{self._spad.recording.path}: the truth of map {index} is of {truth.x_px.shape} and "
+                f"{truth.depth_m.shape} pixels, not {self._shapes[0]} and {self._shapes[1]}; move it away"
+            )
+        return truth
+
+    def lost_outside(self, sweeps: Sequence[SweepAccount]) -> list[Gap]:
+        """(first, last) frames known to be gone from the recording that lie in none of these sweeps, its whole ones.
+
+        None where fewer maps were asked for than there are.
+        """
+        if not self._all:
+            return []
+        spans = _by_start(sweeps, [start.number for start in self._played])
+        lost = []
+        for number, first, last in self._gone:
+            for begin, end in (*spans.get(number, ()), (last + 1, last + 1)):
+                if first < min(begin, last + 1):
+                    lost.append((first, min(begin, last + 1) - 1))
+                first = max(first, end)
+        return lost
+
+
+def pace_of(spad: SpadArray) -> Pace:
+    """What steps are told to."""
+    assert isinstance(spad, PlaysRecording), "opened from a config of `replay_config`"
+    return spad.pace
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedStart:
+    """One start of the SPAD. begin: with which sweep its whole maps begin. first_map: number of the first of them in
+    the recording; sweeps: how many there are. gone: frames at its ends that the manifest tells of and no block has.
+    """
+
+    number: int
+    begin: SweepStart
+    first_map: int
+    sweeps: int
+    gone: tuple[EndGap, ...]
+
+
+def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedStart]:
+    """The whole sweeps that each start of the SPAD gave, as the run took them, as far as their frames are there.
+
+    DamagedRecordingError where a start is missing: its maps would be taken for those of others.
+    """
+    manifest = read_manifest(recording.path) or {}
+    noted = manifest.get("recording") or {}
+    begins = part_starts(recording)
+    starts = noted.get("starts")
+    if not starts:
+        planned = [_whole_sweeps(recording, run, plan) for run in recording.runs]
+    else:
+        planned = [int(start["sweeps"]) for start in starts]
+        segments = np.array([int(start["segment"]) for start in starts])
+        found = [int(np.searchsorted(segments, run.entries["segment"][0], "right")) - 1 for run in recording.runs]
+        if found != list(range(len(found))):
+            raise DamagedRecordingError(
+                f"{recording.path}: of {len(starts)} starts of the SPAD only {len(set(found))} are there, not the "
+                "first; take the missing segments from a copy"
+            )
+        planned = [min(sweeps, run.frames) for sweeps, run in zip(planned, recording.runs, strict=False)]
+    sweeps = manifest.get("sweeps")
+    taken: list[RecordedStart] = []
+    first_map = 0
+    for run, begin, of_run in zip(recording.runs, begins, planned, strict=False):
+        mine = None if sweeps is None else sweeps[first_map : first_map + of_run]
+        taken.append(_recorded_start(recording, run, begin, first_map, of_run, mine, manifest, plan))
+        first_map += of_run
+    return taken
+
+
+def _recorded_start(
+    recording: RunRecording,
+    run: RecordedRun,
+    begin: SweepStart,
+    first_map: int,
+    maps: int,
+    sweeps: Sequence[dict[str, Any]] | None,
+    manifest: dict[str, Any],
+    plan: ScanPlan,
+) -> RecordedStart:
+    """Of a start that gave `maps` maps from number `first_map` on; sweeps: theirs in the manifest, None: not noted."""
+    first, end = readable_range(recording, run)
+    whole = maps
+    cut_short = is_cut_short(manifest) or ended_before_last_map(manifest)
+    if plan.blanking is None or sweeps is None or cut_short or recording.problems:
+        whole = max(0, min(maps, _whole_sweeps(recording, run, plan) - begin.sweep))
+    gone: list[EndGap] = []
+    if sweeps and not is_cut_short(manifest) and end <= int(sweeps[-1]["end_frame"]):
+        gone.append((run.number, end, int(sweeps[-1]["end_frame"])))
+    ranges = (manifest.get("cut") or {}).get("frames") or []
+    before = 0
+    if run.number < len(ranges) and int(ranges[run.number][1]) < first:
+        _, part_first, part_end = map(int, ranges[run.number])
+        gone.append((run.number, part_first, first - 1))
+        if sweeps is not None:
+            before = sum(int(sweep["first_frame"]) < first for sweep in sweeps)
+            begin = replace(begin, clock_ratio=fitted_ratio(begin.clock_ratio, sweeps[:before]))
+        else:  # of a run that was killed nobody noted them; at a lost end a part lacks one map
+            before = maps - whole if end >= part_end else min(1, maps)
+    return RecordedStart(run.number, begin, first_map + before, min(whole, maps - before), tuple(gone))
+
+
+def _merged(gaps: Sequence[EndGap]) -> list[EndGap]:
+    """The gaps of each start in order, those that meet as one."""
+    merged: list[EndGap] = []
+    for number, first, last in sorted(gaps):
+        if merged and merged[-1][0] == number and first <= merged[-1][2] + 1:
+            merged[-1] = number, merged[-1][1], max(last, merged[-1][2])
+        else:
+            merged.append((number, first, last))
+    return merged
+
+
+def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[int, list[Gap]]:
+    """From which frame to before which the sweeps of each start go: frames are counted anew with each."""
+    spans: dict[int, list[Gap]] = {}
+    at, end = 0, 0
+    for sweep in sweeps:
+        at += sweep.first_frame < end
+        end = sweep.end_frame
+        if at < len(numbers):
+            spans.setdefault(numbers[at], []).append((sweep.first_frame, end))
+    return spans
+
+
+def recorded_truth(folder: Path, index: int) -> SweepTruth | None:
+    """What a world said of a map when it was recorded; None where there was none or it was not kept."""
+    file = folder / "truth" / f"{index:06d}.npz"
+    if not file.exists():
+        return None
+    try:
+        with load_numpy(file) as arrays:
+            return SweepTruth(x_px=arrays["x_px"], depth_m=arrays["depth_m"])
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise DamagedRecordingError(f"{file} is not readable ({error}); move it away to go on without it") from error
+
+
+def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> int:
+    """Sweeps of a start that are there to their end: by its markers, or without such by the number of frames.
+
+    Never more than its frames, whatever their headers say.
+    """
+    if plan.blanking is not None:
+        frames = float(plan.frames_per_sweep)
+        return min(run.frames, max(0, int((readable_range(recording, run)[1] - plan.frames_for(0)) / frames)))
+    last = end_block(recording, run, last=True)
+    if last is None:
+        return 0
+    before = last.header.sweep
+    return min(run.frames, max(0, before + int(((last.records["sweep"].astype(np.int64) - before) & 0xFFFF).max()) - 1))
+
+
+def _own_drivers(run: Path, recorded: dict[str, Any]) -> dict[str, Any]:
+    """The drivers of a recorded config, at ports where what was recorded answers. UsageError where there are none."""
+    parts = {slot: recorded.get(slot) or {} for slot in RECORDED}
+    parts = {slot: {**part, "port": f"emulated:{slot}"} for slot, part in parts.items() if "port" in part}
+    if not parts:
+        raise UsageError(f"{run} was taken with simulated devices only: there is no driver to play it against")
+    world = {"kind": "recorded", "recording": str(run.absolute())}
+    if "scanner" in parts:
+        world["scanner"] = parts["scanner"]["kind"]
+    return {"world": world, **parts}
+
+
+def _scan_of(plan: ScanPlan) -> dict[str, Any]:
+    """The scan section that a plan came from, as far as a run asks for it."""
+    return {
+        "columns": plan.columns,
+        "exposures": plan.exposures,
+        "frame_rate": f"{plan.frame_rate_hz} Hz",
+        "depth_range": [f"{depth_m!r} m" for depth_m in plan.depth_range_m],
+        "command_range": list(plan.command_range),
+        "bidirectional": len(plan.legs) == 2,
+    }

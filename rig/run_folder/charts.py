@@ -1,0 +1,249 @@
+"""Charts as SVG text: curves over linear or logarithmic axes, side by side, with one legend, on a white ground.
+
+Pictures in the repository are SVG (docs/decisions/0008); what these show is a handful of curves, for which no library
+is needed.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Protocol
+
+from rig.run_folder.pictures import round_values
+
+INK, FAINT, GRID = "#33404d", "#7b8896", "#e3e8ed"
+FRONT = "#f2cf5b"
+"""Colour of a Pareto front."""
+PANEL_PX = (400, 290)
+"""Width and height of a panel with its axes and labels."""
+_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 14, 30, 46
+_LEGEND_PX = 20
+_TITLE_PX = 30
+_DECADES_WITH_STEPS = 2.3
+"""Axes over fewer decades are labelled at 1, 2 and 5 times their powers of ten."""
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A curve or points. Points that are not finite, or that a logarithmic axis cannot show, are left out.
+
+    intervals: (low, high) in y of each point. names: small text beside each point. step: drawn as a histogram.
+    """
+
+    label: str
+    colour: str
+    points: Sequence[Point]
+    intervals: Sequence[Point] = ()
+    names: Sequence[str] = ()
+    dashed: bool = False
+    line: bool = True
+    marker: bool = True
+    step: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ChartMark:
+    """Something said about a place: a cross there, with words."""
+
+    at: Point
+    text: str
+
+
+class Drawable(Protocol):
+    """What stands in a place of a chart."""
+
+    @property
+    def legend(self) -> Sequence[Series]:
+        """What the legend has to explain."""
+        ...
+
+    def svg(self) -> str:
+        """Elements from (0, 0) on."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """An axis of `pixels` between two values."""
+
+    low: float
+    high: float
+    log: bool
+    start_px: float
+    end_px: float
+
+    @classmethod
+    def over(cls, values: Sequence[float], log: bool, start_px: float, end_px: float) -> "Axis":
+        """An axis that shows all values, with some room; logarithmic ones those above zero."""
+        shown = [value for value in values if math.isfinite(value) and (value > 0 or not log)] or [1.0]
+        low, high = min(shown), max(shown)
+        if log:
+            room = max(high / low, 2.0) ** 0.06
+            return cls(low / room, high * room, True, start_px, end_px)
+        room = 0.05 * ((high - low) or 1.0)
+        return cls(0.0 if 0 <= low < room * 8 else low - room, high + room, False, start_px, end_px)
+
+    def px(self, value: float) -> float:
+        """Where a value is; NaN where it cannot be shown."""
+        if not math.isfinite(value) or (self.log and value <= 0):
+            return math.nan
+        low, high, at = (math.log(v) if self.log else v for v in (self.low, self.high, value))
+        return self.start_px + (at - low) / (high - low) * (self.end_px - self.start_px)
+
+    def ticks(self) -> list[float]:
+        """Round values to label."""
+        if not self.log:
+            return round_values(self.low, self.high, 5)
+        first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
+        steps = (1, 2, 5) if math.log10(self.high / self.low) < _DECADES_WITH_STEPS else (1,)
+        values = [step * 10.0**power for power in range(first, last + 1) for step in steps]
+        return [value for value in values if self.low <= value <= self.high]
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """Curves over one pair of axes. front: points to lie on a broad band, by rising x."""
+
+    title: str
+    x_label: str
+    y_label: str
+    series: Sequence[Series]
+    x_log: bool = True
+    y_log: bool = True
+    front: Sequence[Point] = ()
+    marks: Sequence[ChartMark] = ()
+
+    @property
+    def legend(self) -> Sequence[Series]:
+        """The curves."""
+        return self.series
+
+    def svg(self) -> str:
+        """Axes, band, curves and marks."""
+        points = [point for series in self.series for point in series.points] + [mark.at for mark in self.marks]
+        ends = [(math.nan, y) for series in self.series for interval in series.intervals for y in interval if y > 0]
+        width, height = PANEL_PX
+        x = Axis.over([point[0] for point in points], self.x_log, _LEFT, width - _RIGHT)
+        y = Axis.over([point[1] for point in points + ends], self.y_log, height - _BOTTOM, _TOP)
+        parts = [_axes(x, y, self)]
+        if self.front:
+            parts.append(f'<path d="{_path(x, y, self.front)}" stroke="{FRONT}" stroke-width="9" {_ROUND}/>')
+        parts += [_curve(x, y, series) for series in self.series]
+        parts += [_mark(x, y, mark) for mark in self.marks]
+        return "".join(parts)
+
+
+_ROUND = 'fill="none" stroke-linejoin="round" stroke-linecap="round" opacity="0.75"'
+
+
+def chart_svg(
+    panels: Sequence[Drawable],
+    *,
+    title: str,
+    across: int = 2,
+    notes: Sequence[str] = (),
+    panel_px: tuple[int, int] = PANEL_PX,
+) -> str:
+    """An SVG file of panels in rows, `panel_px` for each, a legend and lines of small print below."""
+    across = min(across, len(panels))
+    down = -(-len(panels) // across)
+    width, panel_height = across * panel_px[0], panel_px[1]
+    entries = list({series.label: series for panel in panels for series in panel.legend if series.label}.values())
+    in_row = max(1, width // 190)
+    legend_top = _TITLE_PX + down * panel_height
+    notes_top = legend_top + -(-len(entries) // in_row) * _LEGEND_PX + 8
+    height = notes_top + 15 * len(notes) + 8
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
+        'font-family="Helvetica, Arial, sans-serif" font-size="12">',
+        f"<title>{escape(title)}</title>",
+        f'<rect width="{width}" height="{height}" rx="8" fill="#ffffff"/>',
+        f'<text x="14" y="21" font-size="14" font-weight="bold" fill="{INK}">{escape(title)}</text>',
+    ]
+    for i, panel in enumerate(panels):
+        at = f"{i % across * panel_px[0]} {_TITLE_PX + i // across * panel_height}"
+        parts.append(f'<g transform="translate({at})">{panel.svg()}</g>')
+    for i, series in enumerate(entries):
+        left, top = 20 + i % in_row * 190, legend_top + i // in_row * _LEGEND_PX + 8
+        line = Series(series.label, series.colour, ((0, 0), (1, 0)), dashed=series.dashed, line=series.line,
+                      marker=series.marker)  # fmt: skip
+        short = _curve(Axis(0, 1, False, left, left + 26), Axis(0, 1, False, top, top - 1), line)
+        parts.append(f'{short}<text x="{left + 34}" y="{top + 4}" fill="{INK}">{escape(series.label)}</text>')
+    for i, note in enumerate(notes):
+        parts.append(f'<text x="20" y="{notes_top + 15 * i + 8}" font-size="11" fill="{FAINT}">{escape(note)}</text>')
+    return "\n".join([*parts, "</svg>\n"])
+
+
+def _axes(x: Axis, y: Axis, panel: Panel) -> str:
+    right, bottom = x.end_px, y.start_px
+    parts = [_text(x.start_px, 18, panel.title, weight="bold")]
+    for value in x.ticks():
+        at = x.px(value)
+        parts.append(f'<path d="M{at:.1f} {y.end_px}V{bottom}" stroke="{GRID}"/>')
+        parts.append(_text(at, bottom + 15, f"{value:g}", anchor="middle"))
+    for value in y.ticks():
+        at = y.px(value)
+        parts.append(f'<path d="M{x.start_px} {at:.1f}H{right}" stroke="{GRID}"/>')
+        parts.append(_text(x.start_px - 6, at + 4, f"{value:g}", anchor="end"))
+    parts.append(f'<path d="M{x.start_px} {y.end_px}V{bottom}H{right}" fill="none" stroke="{INK}"/>')
+    parts.append(_text((x.start_px + right) / 2, bottom + 34, panel.x_label, anchor="middle"))
+    middle = (y.end_px + bottom) / 2
+    turned = f'<g transform="translate(16 {middle:.0f}) rotate(-90)">{_text(0, 0, panel.y_label, anchor="middle")}</g>'
+    return "".join([*parts, turned])
+
+
+def _curve(x: Axis, y: Axis, series: Series) -> str:
+    parts = []
+    dashes = ' stroke-dasharray="5 4"' if series.dashed else ""
+    if series.line and len(series.points) > 1:
+        path = _path(x, y, series.points, step=series.step)
+        parts.append(f'<path d="{path}" fill="none" stroke="{series.colour}" stroke-width="1.8"{dashes}/>')
+    for (at, _), (low, high) in zip(series.points, series.intervals, strict=False):
+        ends = x.px(at), y.px(max(low, y.low)), y.px(high)
+        if all(map(math.isfinite, ends)):
+            parts.append(f'<path d="M{ends[0]:.1f} {ends[1]:.1f}V{ends[2]:.1f}" stroke="{series.colour}"/>')
+    for point in series.points if series.marker else ():
+        px = x.px(point[0]), y.px(point[1])
+        if all(map(math.isfinite, px)):
+            inside = "#ffffff" if series.dashed else series.colour
+            parts.append(
+                f'<circle cx="{px[0]:.1f}" cy="{px[1]:.1f}" r="3.2" fill="{inside}" stroke="{series.colour}"/>'
+            )
+    for point, name in zip(series.points, series.names, strict=False):
+        px = x.px(point[0]), y.px(point[1])
+        if all(map(math.isfinite, px)):
+            parts.append(_text(px[0] + 5, px[1] - 5, name, size=10, colour=series.colour))
+    return "".join(parts)
+
+
+def _mark(x: Axis, y: Axis, mark: ChartMark) -> str:
+    px = x.px(mark.at[0]), y.px(mark.at[1])
+    if not all(map(math.isfinite, px)):
+        return ""
+    cross = f"M{px[0] - 4:.1f} {px[1] - 4:.1f}l8 8m0 -8l-8 8"
+    left = px[0] < (x.start_px + x.end_px) / 2
+    text = _text(px[0] + (8 if left else -8), px[1] + 4, mark.text, size=11, anchor="start" if left else "end")
+    around = 'stroke="#ffffff" stroke-width="3" stroke-linejoin="round"'  # so that it can be read on curves
+    return f'<path d="{cross}" stroke="{INK}" stroke-width="2"/><g {around}>{text}</g>{text}'
+
+
+def _path(x: Axis, y: Axis, points: Sequence[Point], *, step: bool = False) -> str:
+    placed = [(x.px(a), y.px(b)) for a, b in points]
+    placed = [point for point in placed if all(map(math.isfinite, point))]
+    if not placed:
+        return ""
+    if not step:
+        return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in placed)
+    half = (placed[-1][0] - placed[0][0]) / max(len(placed) - 1, 1) / 2
+    return f"M{placed[0][0] - half:.1f} {placed[0][1]:.1f}" + "".join(f"V{b:.1f}H{a + half:.1f}" for a, b in placed)
+
+
+def _text(
+    x: float, y: float, text: str, *, anchor: str = "start", size: int = 12, weight: str = "", colour: str = INK
+) -> str:
+    bold = f' font-weight="{weight}"' if weight else ""
+    placed = "" if anchor == "start" else f' text-anchor="{anchor}"'
+    return f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size}"{placed}{bold} fill="{colour}">{escape(text)}</text>'

@@ -1,0 +1,342 @@
+"""The folder of a run: every output in one place, whole or not there at all.
+
+    depth/000000.npy  depth/000000.png  intensity/000000.png  stripe/000000.npz  cloud/000000.ply
+    learned/000000.npz (what the map was estimated with, where the estimator learns)
+    truth/000000.npz (where a world knows it)  manifest.json  summary.json
+
+Everything is written beside the folder under a hidden name and moved in one step at the end; the folder of a recording
+is there from the start and grows in place.
+
+Making sure that files, and the names of files, survive a loss of power.
+
+Whether somebody is still recording into a folder: the recorder holds its index, until it ends or is killed.
+
+Which maps of a run are written: all, every N-th from the first on, or the last one only (`--save`).
+"""
+
+import io
+import json
+import logging
+import math
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.interfaces import SweepTruth
+from rig.depth.reconstruct import MapResult
+from rig.errors import UsageError
+from rig.run_folder.manifest import MANIFEST, sealed_text
+from rig.run_folder.pictures import cloud, depth_limits, depth_picture, intensity_picture, ply_bytes, png_bytes
+
+
+def sync_file(path: Path) -> None:
+    """What was written to a file survives a loss of power. Raises OSError."""
+    fd = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def sync_folder(path: Path) -> None:
+    """The names of the files in a folder survive a loss of power. Raises OSError."""
+    if os.name == "nt":
+        return  # Windows opens no folders; NTFS keeps its names in a journal
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+_log = logging.getLogger(__name__)
+
+Rays = tuple[NDArray[np.floating], NDArray[np.floating]]
+
+
+class RunFolder:
+    """Collects the outputs of a run; `publish` makes them appear as `path`, leaving without it removes every trace.
+
+    in_place: they are to be seen at `path` from the start.
+    Raises UsageError, one line, where the folder exists with something in it or cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, in_place: bool = False) -> None:
+        """Claim the folder; nothing is visible at `path` yet, or an empty folder where it grows in place."""
+        self.path = Path(path).absolute()
+        self._in_place = in_place
+        self._limits: tuple[float, float] | None = None
+        self._made_parents: list[Path] = []
+        self._scratch: Path | None = None
+        try:
+            self._scratch = self._claim()
+        except OSError as error:
+            self.discard()
+            raise _unwritable(self.path, error) from error
+
+    def __enter__(self) -> Self:
+        """The folder itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove what was not published."""
+        self.discard()
+
+    def write_map(self, index: int, result: MapResult, rays: Rays | None) -> None:
+        """Write all files of one map; `rays` (u, v) of the camera, None for an uncalibrated rig (no depth, no cloud).
+
+        Where one cannot be written (disk full), the map's other files go too and UsageError says why.
+        """
+        name = f"{index:06d}"
+        files = {
+            f"intensity/{name}.png": png_bytes(intensity_picture(result.intensity)),
+            f"stripe/{name}.npz": _npz_bytes(result.stripe.arrays()),
+        }
+        if result.learned is not None:
+            files[f"learned/{name}.npz"] = _npz_bytes(result.learned.arrays())
+        if rays is not None:
+            # The first map sets the colours of all, so that a film of them does not flicker.
+            self._limits = self._limits or depth_limits(result.depth_m)
+            files[f"depth/{name}.npy"] = _npy_bytes(result.depth_m)
+            files[f"depth/{name}.png"] = png_bytes(depth_picture(result.depth_m, self._limits))
+            files[f"cloud/{name}.ply"] = ply_bytes(cloud(result.depth_m, *rays, result.intensity))
+        self._write(files)
+
+    def place(self, name: str) -> Path:
+        """Where to put a file that grows while the run goes on; it must be closed before `publish`."""
+        assert self._scratch is not None, "the run folder is published or discarded already"
+        return self._scratch / name
+
+    def write_truth(self, index: int, truth: SweepTruth) -> None:
+        """Write what the world says about the sweep of a map."""
+        self._write({f"truth/{index:06d}.npz": _npz_bytes({"x_px": truth.x_px, "depth_m": truth.depth_m})})
+
+    def remove_map(self, index: int) -> None:
+        """Remove every file of a map that was not finished."""
+        assert self._scratch is not None, "the run folder is published or discarded already"
+        for file in self._scratch.glob(f"*/{index:06d}.*"):
+            file.unlink(missing_ok=True)
+
+    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write `name` (manifest.json, summary.json) as strict JSON; where there is one already, the old or the new."""
+        text = json_text(content)
+        text = sealed_text(text) if name == MANIFEST else text
+        self._write({f"{name}.part": (text + "\n").encode()})
+        file = self.place(name)
+        try:
+            if self._in_place:
+                sync_file(file.with_name(f"{name}.part"))
+            file.with_name(f"{name}.part").replace(file)
+            if self._in_place:
+                sync_folder(file.parent)
+        except OSError as error:
+            raise _unwritable(self.path, error) from error
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a file of text."""
+        self._write({name: text.encode()})
+
+    def keep(self) -> None:
+        """Leave everything as it is: what a run recorded is kept also where it does not come to its end."""
+        assert self._in_place, "a run folder that is no recording appears whole or not at all"
+        self._scratch = None
+        self._made_parents.clear()
+
+    def publish(self) -> Path:
+        """Make the folder appear under its name, or beside it (NAME-2, ...) where somebody was faster; its path."""
+        scratch = self._scratch
+        assert scratch is not None, "a run folder is published once"
+        try:
+            published = self._move(scratch)
+        except OSError as error:
+            raise _unwritable(self.path, error) from error
+        self._scratch = None
+        self._made_parents.clear()
+        if published != self.path:
+            _log.warning("%s was taken while the run went on; the run is in %s", self.path, published)
+        return published
+
+    def _move(self, scratch: Path) -> Path:
+        if self._in_place:
+            return self.path
+        if scratch.parent == self.path:  # an empty folder was given: fill it, summary.json last
+            if list(self.path.iterdir()) == [scratch]:
+                for child in sorted(scratch.iterdir(), key=lambda file: file.name == "summary.json"):
+                    child.rename(self.path / child.name)
+                scratch.rmdir()
+                return self.path
+        elif _renamed(scratch, self.path):
+            return self.path
+        beside = (self.path.with_name(f"{self.path.name}-{number}") for number in count(2))
+        return next(path for path in beside if _renamed(scratch, path))
+
+    def discard(self) -> None:
+        """Remove everything not published, and the folders made for it."""
+        if self._scratch is not None:
+            if self._in_place:
+                for child in self._scratch.iterdir():
+                    shutil.rmtree(child, ignore_errors=True) if child.is_dir() else child.unlink(missing_ok=True)
+            else:
+                shutil.rmtree(self._scratch, ignore_errors=True)
+            self._scratch = None
+        for parent in reversed(self._made_parents):
+            try:
+                parent.rmdir()
+            except OSError:
+                break  # somebody else has put something there meanwhile
+        self._made_parents.clear()
+
+    def _claim(self) -> Path:
+        if self.path.exists():
+            if not self.path.is_dir():
+                raise UsageError(f"--out {self.path} is a file; name a new folder")
+            if any(self.path.iterdir()):
+                raise UsageError(f"--out {self.path} exists and is not empty; name a new folder or empty this one")
+            parent = self.path
+        else:
+            missing = [folder for folder in self.path.parents if not folder.exists()]
+            for folder in reversed(missing):
+                folder.mkdir()
+                self._made_parents.append(folder)
+            parent = self.path.parent
+        if self._in_place:
+            if parent is not self.path:
+                self.path.mkdir()
+                self._made_parents.append(self.path)
+            return self.path
+        scratch = parent / f".{self.path.name}.{secrets.token_hex(4)}.part"
+        scratch.mkdir()
+        return scratch
+
+    def _write(self, files: Mapping[str, bytes]) -> None:
+        assert self._scratch is not None, "the run folder is published or discarded already"
+        written: list[Path] = []
+        try:
+            for name, data in files.items():
+                file = self._scratch / name
+                file.parent.mkdir(exist_ok=True)
+                written.append(file)
+                file.write_bytes(data)
+        except BaseException as error:  # an interrupt too leaves no half of a map
+            for file in written:
+                file.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise _unwritable(self.path, error) from error
+            raise
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """Strict JSON: NaN and infinities become null, arrays lists, paths text."""
+    return json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
+
+
+def _renamed(folder: Path, target: Path) -> bool:
+    """Move a folder; False where something is at `target` already."""
+    try:
+        folder.rename(target)
+    except OSError:
+        if not target.exists():
+            raise
+        return False
+    return True
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, Fraction):
+        return _plain(float(value))
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int | bool):
+        return value
+    return str(value)
+
+
+def _unwritable(path: Path, error: OSError) -> UsageError:
+    reason = error.strerror or str(error)
+    return UsageError(f"cannot write {path}: {reason}; name another folder with --out or free the space it needs")
+
+
+def _npy_bytes(array: NDArray[Any]) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=False)
+    return stream.getvalue()
+
+
+def _npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **arrays)
+    return stream.getvalue()
+
+
+try:
+    import fcntl
+except ImportError:  # Windows lets nobody else change a file that is open
+    fcntl = None  # type: ignore[assignment]
+
+
+def hold(fd: int) -> None:
+    """Hold an open file for as long as it is open. Raises OSError where somebody else does."""
+    if fcntl is not None:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_held(file: Path) -> bool:
+    """Whether somebody holds a file; False where there is none."""
+    if fcntl is None or not file.exists():
+        return False
+    with file.open("rb") as stream:
+        try:
+            fcntl.flock(stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return True
+    return False
+
+
+_EVERY = re.compile(r"every[\s:=]+(?P<step>\d+)", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class SavePolicy:
+    """step: write maps 0, step, 2 step, ...; None: the last map only."""
+
+    step: int | None = 1
+
+    @classmethod
+    def parse(cls, text: str) -> "SavePolicy":
+        """The policy that "all", "last" or "every 5" means. Raises UsageError for anything else."""
+        cleaned = text.strip().lower()
+        if cleaned == "all":
+            return cls(1)
+        if cleaned == "last":
+            return cls(None)
+        match = _EVERY.fullmatch(cleaned)
+        if match is None or int(match["step"]) == 0:
+            raise UsageError(f"--save is {text!r}; write 'all', 'last' or 'every N' with N of 1 or more")
+        return cls(int(match["step"]))
+
+    def count(self, maps: int) -> int:
+        """How many of `maps` maps are written."""
+        return min(maps, 1) if self.step is None else -(-maps // self.step)
+
+    def keeps(self, index: int) -> bool:
+        """Whether map `index` is written as soon as it is there."""
+        return self.step is not None and index % self.step == 0

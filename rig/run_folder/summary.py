@@ -1,0 +1,256 @@
+"""What a run says of itself: counts of frames, times, fog, errors against the truth, and a verdict.
+
+`as_json` is what `--json` prints and what summary.json holds.
+
+What each stage of the pipeline did: times, high-water marks and losses, live and for summary.json.
+"""
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from enum import StrEnum
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from drivers.interfaces import SweepTruth
+from drivers.replay.pace import PaceReport
+from rig.depth.fog_meter import FogEstimate
+from rig.depth.reconstruct import MapResult
+from rig.geometry.stripe_table import depth_errors, stripe_errors
+
+_LARGEST = {"ring_slots", "ring_bytes", "ring_high_water", "map_queue", "map_queue_high_water"}
+"""Figures of which a run with several starts of the SPAD has the largest; of all others it has the sum."""
+
+
+@dataclass(frozen=True, slots=True)
+class PipelineStats:
+    """One moment of a pipeline, or its end. Times are wall time in seconds; None: there is no such stage.
+
+    source_fill_s: in the SPAD's `fill`, without source_wait_s: waiting for a free slot of the ring.
+    ring_high_water: most slots in use at one time, of ring_slots. dropped_*: what found no free slot.
+    counting_s: binding and counting. estimation_s: from counts to map. map_wait_s: waiting for room among the maps that
+    the caller has not taken yet, of which there were at most map_queue_high_water and could be map_queue.
+    recorder_s: computing checksums and writing. monitor_skipped_blocks: blocks that the monitor did not look at.
+    """
+
+    source_fill_s: float = 0.0
+    source_wait_s: float = 0.0
+    ring_slots: int = 0
+    ring_bytes: int = 0
+    ring_high_water: int = 0
+    dropped_blocks: int = 0
+    dropped_frames: int = 0
+    counting_s: float = 0.0
+    estimation_s: float = 0.0
+    map_wait_s: float = 0.0
+    map_queue: int = 0
+    map_queue_high_water: int = 0
+    recorder_s: float | None = None
+    recorder_blocks: int | None = None
+    recorder_bytes: int | None = None
+    monitor_updates: int | None = None
+    monitor_skipped_blocks: int | None = None
+
+    def and_then(self, later: "PipelineStats") -> "PipelineStats":
+        """Figures of both, for runs that start the SPAD several times."""
+        joined: dict[str, Any] = {}
+        for name in (each.name for each in fields(self)):
+            values = [value for each in (self, later) if (value := getattr(each, name)) is not None]
+            joined[name] = (max if name in _LARGEST else sum)(values) if values else None
+        return PipelineStats(**joined)
+
+
+class RunVerdict(StrEnum):
+    """How a run ended; anything but `complete` is not to be trusted as it is."""
+
+    COMPLETE = "complete"
+    GAPS = "gaps"
+    UNSYNCHRONISED = "unsynchronised"
+    DOUBTFUL = "doubtful"
+    UNCALIBRATED = "uncalibrated"
+    ABORTED = "aborted"
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of the command line."""
+        return {RunVerdict.COMPLETE: 0, RunVerdict.ABORTED: 4}.get(self, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class RunFrames:
+    """Frames between the first and the last scan marker, dark and fly-back ones too; expected = received + lost.
+
+    Of a run that ended before its last map: all that came, while lit is of its whole maps.
+    crc_errors: blocks refused for their checksum, None where the source does not say. lit: frames that fell on columns.
+    """
+
+    expected: int = 0
+    received: int = 0
+    lost: int = 0
+    crc_errors: int | None = 0
+    lit: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Synchronisation:
+    """By what the frames of a run were bound to columns, and how well.
+
+    residual_columns, clock_error: the largest of its sweeps; None where one could not be checked.
+    detection_probability: the least, of a blanking pattern as bright as theirs to be found; None: bound by markers.
+    """
+
+    by: Literal["markers", "blanking pattern"]
+    residual_columns: float | None
+    clock_error: float
+    detection_probability: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What speaks against some maps of a run. maps: their numbers."""
+
+    reason: str
+    maps: tuple[int, ...]
+
+
+Errors = Mapping[str, float | None]
+
+
+@dataclass(frozen=True, slots=True)
+class TruthErrors:
+    """Errors against a known truth, averaged over maps (medians: the median of the maps')."""
+
+    stripe_error_px: Errors
+    depth_error_m: Errors
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A run in figures. Times in seconds of sensor and computer, fractions of camera pixels; None = no value."""
+
+    maps: int
+    map_rate_hz: float | None
+    columns: int
+    exposures: int
+    estimator: str
+    filter: str
+    frames: RunFrames
+    sensor_time_s: float
+    compute_time_s: float
+    realtime_factor: float | None
+    valid_fraction: float | None
+    fog: FogEstimate
+    truth: TruthErrors | None
+    verdict: RunVerdict
+    stages: PipelineStats | None = None
+    sync: Synchronisation | None = None
+    replay: PaceReport | None = None
+    verdict_reasons: tuple[Doubt, ...] = ()
+    """What maps have against themselves, whatever the verdict."""
+    accepted_calibration: tuple[str, ...] = ()
+    """What speaks against the calibration that the run was told to use all the same."""
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary as plain values; `truth` only where it is known, others only of a scan or of a replay."""
+        content = asdict(self)
+        content["verdict"] = self.verdict.value
+        if self.truth is None:
+            del content["truth"]
+        if self.stages is None:
+            del content["stages"]
+        if self.sync is None:
+            del content["sync"]
+        if self.replay is None:
+            del content["replay"]
+        if not self.verdict_reasons:
+            del content["verdict_reasons"]
+        if not self.accepted_calibration:
+            del content["accepted_calibration"]
+        return content
+
+
+class _OfMap(NamedTuple):
+    compute_s: float
+    valid: float
+    fog: FogEstimate
+    errors: tuple[Errors, Errors] | None
+    """Of stripe and depth, where the truth is known."""
+    doubts: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class MapTally:
+    """Adds up the maps of a run as they come."""
+
+    columns: int
+    exposures: int
+    estimator: str
+    filter: str
+    _maps: list[_OfMap] = field(default_factory=list)
+
+    @property
+    def maps(self) -> int:
+        """Maps so far."""
+        return len(self._maps)
+
+    @property
+    def doubts(self) -> tuple[Doubt, ...]:
+        """What speaks against maps, each reason with its maps; empty where nothing does."""
+        of_reason: dict[str, list[int]] = {}
+        for index, each in enumerate(self._maps):
+            for reason in each.doubts:
+                of_reason.setdefault(reason, []).append(index)
+        return tuple(Doubt(reason, tuple(maps)) for reason, maps in of_reason.items())
+
+    def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
+        """Count one map; `compute_s` is the wall time of its counting and estimation."""
+        valid = float(np.isfinite(result.depth_m).mean())
+        errors = None
+        if truth is not None:
+            errors = stripe_errors(result.stripe.x_px, truth.x_px), depth_errors(result.depth_m, truth.depth_m)
+        # What was learned grows from map to map; the last one knows most. One step: an interrupt counts it or does not.
+        self._maps.append(_OfMap(compute_s, valid, result.fog, errors, result.doubts))
+
+    def summary(
+        self,
+        frames: RunFrames,
+        sensor_time_s: float,
+        verdict: RunVerdict,
+        stages: PipelineStats | None = None,
+        sync: Synchronisation | None = None,
+        replay: PaceReport | None = None,
+    ) -> Summary:
+        """The run so far."""
+        errors = [each.errors for each in self._maps if each.errors is not None]
+        truth = TruthErrors(*(_over_maps(kind) for kind in zip(*errors, strict=True))) if errors else None
+        compute_s = sum(each.compute_s for each in self._maps)
+        return Summary(
+            maps=self.maps,
+            map_rate_hz=self.maps / sensor_time_s if sensor_time_s > 0 else None,
+            columns=self.columns,
+            exposures=self.exposures,
+            estimator=self.estimator,
+            filter=self.filter,
+            frames=frames,
+            sensor_time_s=sensor_time_s,
+            compute_time_s=compute_s,
+            realtime_factor=sensor_time_s / compute_s if compute_s > 0 else None,
+            valid_fraction=statistics.fmean(each.valid for each in self._maps) if self._maps else None,
+            fog=self._maps[-1].fog if self._maps else FogEstimate(),
+            truth=truth,
+            verdict=verdict,
+            stages=stages,
+            sync=sync,
+            replay=replay,
+            verdict_reasons=self.doubts,
+        )
+
+
+def _over_maps(errors: Sequence[Errors]) -> Errors:
+    combined: dict[str, float | None] = {}
+    for key in errors[0]:
+        known = [value for each in errors if (value := each[key]) is not None]
+        middle = statistics.median if key.startswith("median") else statistics.fmean
+        combined[key] = middle(known) if known else None
+    return combined

@@ -1,0 +1,5 @@
+"""A scan from open devices to its folder, and its replay from a recording.
+
+Enters: a rig and a request. Leaves: maps, one after the other, and an account of every frame. `scan` runs it;
+`acquisition` starts and stops the devices, `pipeline` moves blocks between threads, `counting` makes maps of them.
+"""

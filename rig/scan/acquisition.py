@@ -1,0 +1,349 @@
+"""Runs a scan: starts the devices in order, takes maps from their frames, and makes everything safe.
+
+The `Pipeline` does the work between the SPAD and the caller. As soon as all frames are there, or anything fails, the
+rig is made safe, on the caller's thread; what is in the ring by then is still counted and estimated.
+"""
+
+import logging
+import math
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, fields
+from fractions import Fraction
+
+from drivers.clock import Clock, VirtualClock
+from drivers.errors import DeviceFault, DeviceTimeout
+from drivers.guard import GuardLimits
+from drivers.interfaces import SpadCounters, SpadTiming
+from drivers.transports.endpoints import EMULATED_PREFIX
+from rig.count.sweeps import SweepAssembler, SweepData, SweepStart
+from rig.count.volume import SweepLayout
+from rig.depth.fog_meter import FogEstimate
+from rig.devices.open import OpenRig, lead_s, most_sweeps, require_memory, spare_lead_s
+from rig.errors import DevicesError
+from rig.plan.gate_pulses import sync_program
+from rig.plan.scan_plan import ScanPlan
+from rig.progress import tell_stage
+from rig.recording.replay import ENDLESS, PlaysRecording
+from rig.recording.writer import Recording
+from rig.run_folder.summary import PipelineStats
+from rig.scan.counting import AcquiredMap, MakesMaps
+from rig.scan.monitor import Watch
+from rig.scan.pipeline import JOIN_S, Overload, Pipeline, require_policy, ring_for
+
+_log = logging.getLogger(__name__)
+
+SILENCE_S = 5.0
+"""A SPAD that sends nothing for so long, with the ring empty, has failed."""
+WARM_UP_S = 120.0
+"""Longest wait for a laser to warm up."""
+TELL_S = 0.1
+"""Time from one report of progress to the next."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanProgress:
+    """How far a run is, told several times a second and at its end.
+
+    frames: received, of frames_planned at most, which is what the plan takes from the first scan marker to the last;
+    lost: the SPAD's own count. sweeps: counted, of `maps`. stages: what each stage has done so far. fog: as the newest
+    map says, None before. stage: rendering where the frames are simulated, else scanning or replaying; learning while
+    the first map is learned from, estimating while another one is made.
+    """
+
+    frames: int
+    frames_planned: int
+    lost: int
+    sweeps: int
+    maps: int
+    stages: PipelineStats
+    fog: FogEstimate | None = None
+    stage: str = "scanning"
+
+
+def told_of(live: Callable[[ScanProgress], None] | None) -> Callable[[ScanProgress], None]:
+    """Tells `rig.progress` and `live` how far a scan is."""
+
+    def both(now: ScanProgress) -> None:
+        notes = [f"{now.sweeps} of {now.maps} maps counted"] if 1 < now.maps < ENDLESS else []
+        notes += [f"{now.lost} lost"] if now.lost else []
+        notes += [] if now.fog is None or not now.fog.brief() else [now.fog.brief()]
+        planned = now.frames_planned if now.maps < ENDLESS else None
+        tell_stage(now.stage, now.frames, planned, "frames", ", ".join(notes))
+        if live is not None:
+            live(now)
+
+    return both
+
+
+class Acquisition:
+    """A scan of `maps` maps with an open rig, a plan and the SPAD's timing from `rig.devices.open.prepare`.
+
+    Iterate once over `run()`. maker: makes the maps, on the counting thread. first_alone: take the first map with a
+    start of its own, so that a SPAD that cannot wait stands still while it is learned from. learns: whether `maker`
+    learns from its first map. groups: sweeps of each
+    start, where that is not for the scan to choose; starts: with which sweep each begins. recording, watch: what
+    recorder and monitor work for, None for none. on_progress is called on the caller's thread, on_sweep as `Mapping`
+    says.
+    Raises UsageError where the SPAD cannot do what `policy` asks.
+    """
+
+    def __init__(
+        self,
+        rig: OpenRig,
+        plan: ScanPlan,
+        timing: SpadTiming,
+        maps: int,
+        maker: MakesMaps,
+        *,
+        policy: Overload = Overload.ABORT,
+        first_alone: bool = False,
+        learns: bool = False,
+        groups: Iterator[int] | None = None,
+        starts: Iterator[SweepStart] | None = None,
+        recording: Recording | None = None,
+        watch: Watch | None = None,
+        on_progress: Callable[[ScanProgress], None] | None = None,
+        on_sweep: Callable[[SweepData], None] | None = None,
+        silence_s: float = SILENCE_S,
+    ) -> None:
+        if maps < 1:
+            raise ValueError(f"{maps} maps; ask for at least 1")
+        require_policy(policy, rig.spad.info)
+        self._rig = rig
+        self._plan = plan
+        self._groups = groups
+        self._starts = starts
+        if groups is None:
+            require_memory(rig, plan)
+        self._timing = timing
+        self._maps = maps
+        self._maker = maker
+        self._policy = policy
+        self._first_alone = first_alone
+        self._learns = learns
+        self._recording = recording
+        self._watch = watch
+        self._on_progress = on_progress
+        self._on_sweep = on_sweep
+        self._silence_s = silence_s
+        self._pipeline: Pipeline | None = None
+        self._stats_before = PipelineStats()
+        self._counters_before = SpadCounters(0, 0, 0, 0, 0)
+        self._frames_before = 0
+        self._fog: FogEstimate | None = None
+
+    @property
+    def counters(self) -> SpadCounters:
+        """The SPAD's own counts over all its starts so far. Any thread."""
+        if self._pipeline is None:
+            return self._counters_before
+        return added_counters(self._counters_before, self._rig.spad.counters)
+
+    @property
+    def stages(self) -> PipelineStats:
+        """What each stage has done so far. Any thread."""
+        return self._stats_before if self._pipeline is None else self._stats_before.and_then(self._pipeline.stats())
+
+    def run(self) -> Generator[AcquiredMap, None, None]:
+        """Scan; yields the maps in order. However the iteration ends, gate, laser, scanner and SPAD are made safe.
+
+        Raises DeviceError where a device fails, RingOverflow where frames came too fast, RecordingError where the disk
+        is full, each after the maps that were whole by then; DevicesError where devices could not all be made safe.
+        """
+        plan = self._plan
+        counter = self._maker.counter(
+            SweepLayout(plan.columns, plan.rows, plan.width, plan.x0, plan.window, plan.exposures, plan.used_px)
+        )
+        done = 0
+        while done < self._maps:
+            group = self._group(done)
+            start = None if self._starts is None else next(self._starts)
+            assembler = SweepAssembler(plan, counter, group, done, start)
+            counter.reset()
+            yield from self._run_group(assembler, group, done)
+            done += group
+
+    def _group(self, done: int) -> int:
+        """Sweeps of the next start: as many as the SPAD's memory holds in a burst and the sync source's program."""
+        if self._groups is not None:
+            return min(self._maps - done, next(self._groups))
+        if self._first_alone and done == 0:
+            return 1
+        left, most = self._maps - done, most_sweeps(self._rig, self._plan)
+        return left if most is None else min(left, most)
+
+    def _burst_frames(self, sweeps: int) -> int | None:
+        if self._plan.burst_frames is None:
+            return None
+        lead = Fraction(lead_s(self._rig) + spare_lead_s(self._rig)) * self._plan.frame_rate_hz
+        return min(self._plan.burst_frames, math.ceil(self._plan.frames_for(sweeps) + lead))
+
+    def _run_group(self, assembler: SweepAssembler, sweeps: int, done: int) -> Generator[AcquiredMap, None, None]:
+        rig, plan = self._rig, self._plan
+        clock = rig.scanner.load(plan.waveform, plan.scanner_repeats(sweeps))
+        if clock != plan.point_rate_hz:
+            raise DeviceFault(
+                f"{rig.scanner.name} runs at {float(clock):g} points a second, planned were "
+                f"{float(plan.point_rate_hz):g}; compile the plan anew"
+            )
+        rig.sync.program(*sync_program(plan, sweeps))
+        pipeline = Pipeline(
+            rig.spad,
+            ring_for(self._policy, rig.spad.info, plan, self._timing, keeps_time=self._groups is not None),
+            assembler,
+            sweeps,
+            self._maker,
+            self._silence_s,
+            recording=self._recording,
+            watch=self._watch,
+            on_frame=None if rig.guard is None else rig.guard.beat,
+            on_sweep=self._on_sweep,
+        )
+        if rig.guard is not None:
+            rig.guard.expect(self._guard_limits(sweeps))
+            rig.spad.on_wait = rig.guard.wait
+        if self._recording is not None:
+            self._recording.begin(sweeps)
+        trouble: list[str] = []
+        try:
+            try:
+                self._arm()
+                rig.spad.start(self._burst_frames(sweeps))
+                self._pipeline = pipeline
+                rig.sync.run()
+                rig.scanner.start()
+                pipeline.start()
+                while pipeline.streaming:
+                    if (found := pipeline.take_streaming(TELL_S)) is not None:
+                        self._fog = found.result.fog
+                        yield found
+                    if rig.guard is not None and rig.guard.failure is not None:
+                        pipeline.end_source(rig.guard.failure)  # the SPAD may be what is silent: not waited for
+                        break
+                    self._check_scanner()
+                    self._tell(assembler, done)
+            finally:
+                trouble = self._make_safe(pipeline)
+            # Nothing moves or shines any more: what was received is still counted and estimated.
+            while not pipeline.drained:
+                if (found := pipeline.take_rest(TELL_S)) is not None:
+                    self._fog = found.result.fog
+                    yield found
+                self._tell(assembler, done)
+            if (failure := pipeline.error()) is not None:
+                raise failure
+            if trouble:
+                raise DevicesError("\n".join(trouble))
+        except BaseException as error:
+            if not isinstance(error, DevicesError):
+                for line in trouble:
+                    error.add_note(line)
+            raise
+        finally:
+            self._end_group(pipeline, assembler)
+
+    def _guard_limits(self, sweeps: int) -> GuardLimits:
+        """What the guard may expect of the frames: a burst is silent until it is read out."""
+        usual, plan = GuardLimits(), self._plan
+        block_s = 3 * self._timing.stride / plan.link_bytes_per_s if plan.link_bytes_per_s else 0.0
+        exposed_s = (self._burst_frames(sweeps) or 0) / float(plan.frame_rate_hz)
+        return GuardLimits(
+            frames_within_s=max(usual.frames_within_s, block_s),
+            busy_within_s=max(usual.busy_within_s, block_s),
+            waits_within_s=max(self._silence_of_spad_s(), block_s),
+            first_wait_s=max(self._silence_of_spad_s(), block_s, usual.first_wait_s) + exposed_s,
+            first_frame_s=usual.first_frame_s + exposed_s,
+        )
+
+    def _silence_of_spad_s(self) -> float:
+        """For how long the SPAD may be asked in vain while light may fall."""
+        spad, usual = self._rig.config.spad, GuardLimits()
+        if str(getattr(spad, "port", "")).startswith(EMULATED_PREFIX):  # on the processors of this very process
+            return usual.busy_within_s
+        return float(getattr(spad, "silence", usual.waits_within_s))
+
+    def _end_group(self, pipeline: Pipeline, assembler: SweepAssembler) -> None:
+        pipeline.close()
+        if pipeline.monitor_lost:
+            self._watch = None
+        if self._pipeline is not None:
+            self._counters_before, self._stats_before = self.counters, self.stages
+            self._pipeline = None
+        self._frames_before += assembler.frames_seen
+
+    def _check_scanner(self) -> None:
+        """A mirror that has stopped early: frames would go on, markers would not. DeviceFault."""
+        fault = self._rig.scanner.status.fault
+        if fault is not None:
+            raise DeviceFault(fault)
+
+    def _tell(self, assembler: SweepAssembler, done: int) -> None:
+        if self._on_progress is None:
+            return
+        planned = self._frames_before + math.ceil(self._plan.frames_for(self._maps - done))
+        frames, sweeps = min(self._frames_before + assembler.frames_seen, planned), done + assembler.sweeps_done
+        stages = self.stages
+        lost = self.counters.lost
+        lost = stages.dropped_frames if lost is None else lost
+        self._on_progress(
+            ScanProgress(frames, planned, lost, sweeps, self._maps, stages, self._fog, self._stage(sweeps))
+        )
+
+    def _stage(self, sweeps: int) -> str:
+        if self._pipeline is not None and self._pipeline.estimating:
+            return "learning" if self._learns and sweeps == 1 else "estimating"
+        if isinstance(self._rig.spad, PlaysRecording):
+            return "replaying"
+        return "rendering" if isinstance(self._rig.clock, VirtualClock) else "scanning"
+
+    def _arm(self) -> None:
+        """Arm the laser behind a gate that reads back low and wait for it; a started SPAD would overflow meanwhile."""
+        self._rig.sync.gate_low()
+        power_w = self._rig.config.scan.power
+        self._rig.laser.arm(self._rig.laser.limits.max_power_w if power_w is None else power_w)
+        _wait_until_warm(self._rig, self._rig.clock)
+
+    def _make_safe(self, pipeline: Pipeline) -> list[str]:
+        """Gate low, no more frames taken, laser paused, mirror parked, SPAD stopped: in this order, each one always."""
+        rig = self._rig
+        trouble: list[str] = []
+        interrupted: BaseException | None = None
+        steps: tuple[tuple[str, Callable[[], None]], ...] = (
+            ("gate", rig.sync.abort),
+            ("frames", pipeline.end_source),
+            ("laser", rig.laser.pause),
+            ("scanner", rig.scanner.park),
+            ("spad", rig.spad.stop),
+        )
+        for name, step in steps:
+            try:
+                step()
+            except BaseException as error:  # neither a step that fails nor a second Ctrl-C may keep the others away
+                trouble.append(f"{name}: {error or type(error).__name__}")
+                interrupted = interrupted or (None if isinstance(error, Exception) else error)
+        if not pipeline.join_source():
+            trouble.append(f"spad: {rig.spad.name} did not return within {JOIN_S:g} s of being stopped; unplug it")
+        for line in trouble:
+            _log.error("while making the rig safe: %s", line)
+        if interrupted is not None:
+            raise interrupted
+        return trouble
+
+
+def _wait_until_warm(rig: OpenRig, clock: Clock) -> None:
+    """Wait while the laser says that it warms up: 'armed' does not mean 'light'."""
+    waited_s = 0.0
+    while rig.laser.status.warming_up:
+        if waited_s >= WARM_UP_S:
+            raise DeviceTimeout(f"{rig.laser.name} is still warming up after {WARM_UP_S:g} s; wait and start again")
+        clock.sleep(0.2)
+        waited_s += 0.2
+
+
+def added_counters(before: SpadCounters, now: SpadCounters) -> SpadCounters:
+    """Counts of two runs; None where the device does not say."""
+    counts = (
+        None if (a := getattr(before, field.name)) is None or (b := getattr(now, field.name)) is None else a + b
+        for field in fields(SpadCounters)
+    )
+    return SpadCounters(*counts)  # type: ignore[arg-type]

@@ -1,0 +1,118 @@
+"""Whether the drivers said to their devices what they had said when the recording was taken, and when.
+
+Commands are compared byte by byte, and buffers of points in their time as well: how much later than in the recording
+each was sent, against the middle of its scan, since when that began is the host's to choose. Where a scan was stopped
+depends on the host's moment: a last buffer that only one of the two had sent is not compared, nor how the mirror was
+parked.
+"""
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from drivers.recorded.control_words import Spoken, Word
+from drivers.transports.tap import read_taps
+
+SWAP_TOLERANCE_S = 2e-3
+"""Most that a buffer may come earlier or later than in the recording."""
+STOP_BUFFERS = 1
+"""Buffers that one of two scans may have sent more than the other before it was stopped."""
+_SHOWN = 24
+"""Bytes of a command that are shown."""
+
+
+@dataclass(frozen=True, slots=True)
+class ControlCheck:
+    """What was compared. worst_swap_s: of `swaps` buffers the one furthest from its time. problems: a line each."""
+
+    commands: int
+    swaps: int
+    worst_swap_s: float
+    problems: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """As plain values."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        """For people."""
+        return (
+            f"{self.commands} commands as recorded, {self.swaps} buffer swaps at most {self.worst_swap_s * 1e3:.1f} ms "
+            "from their times"
+        )
+
+
+def check_control(recorded: Path, now: Path, *, devices: Sequence[str], tolerance_s: float | None) -> ControlCheck:
+    """Compare two files of control traffic. devices: that took part. tolerance_s: of swaps; None: not timed."""
+    before, after = Spoken.of(read_taps(recorded)), Spoken.of(read_taps(now) if now.exists() else ())
+    problems: list[str] = []
+    commands = swaps = 0
+    for device in devices:
+        said, says = before.commands.get(device, []), after.commands.get(device, [])
+        found = _first_difference(device, "command", said, says, tail=0)
+        commands += min(len(said), len(says))
+        problems += [found] if found else []
+    worst_s = 0.0
+    if "scanner" in devices:
+        if len(before.scans) != len(after.scans):
+            problems.append(f"scanner: {len(before.scans)} scans were recorded, {len(after.scans)} were run")
+        for number, (said, says) in enumerate(zip(before.scans, after.scans, strict=False)):
+            found = _first_difference("scanner", f"scan {number}, buffer", said, says, tail=STOP_BUFFERS)
+            problems += [found] if found else []
+            off_s = _swaps_off(said, says)
+            swaps += len(off_s)
+            worst_s = max([worst_s, *map(abs, off_s)])
+            problems += _untimely(number, off_s, tolerance_s)
+    return ControlCheck(commands, swaps, worst_s, tuple(problems))
+
+
+def _first_difference(device: str, what: str, said: list[Word], says: list[Word], *, tail: int) -> str | None:
+    """The first byte that differs, in words; None where none does."""
+    for number, (old, new) in enumerate(zip(said, says, strict=False)):
+        if old.data != new.data:
+            pairs = enumerate(zip(old.data, new.data, strict=False))
+            at = next((i for i, (a, b) in pairs if a != b), min(len(old.data), len(new.data)))
+            return (
+                f"{device}: {what} {number}: byte {at} is {_byte(new.data, at)}, recorded was {_byte(old.data, at)} "
+                f"({_shown(new.data, at)} instead of {_shown(old.data, at)})"
+            )
+    missing = len(said) - len(says)
+    if abs(missing) <= tail:
+        return None
+    if missing > 0:
+        return f"{device}: {what} {len(says)} is missing: {_shown(said[len(says)].data, 0)} was recorded"
+    return f"{device}: {what} {len(said)} was not recorded: {_shown(says[len(said)].data, 0)}"
+
+
+def _swaps_off(said: list[Word], says: list[Word]) -> list[float]:
+    """How much later than recorded each buffer came, in seconds, from when the scan as a whole did.
+
+    The second one, which a device takes as soon as the host has it, has no time of its own: 0.
+    """
+    late_s = [(new.t_ns - old.t_ns) / 1e9 for old, new in zip(said, says, strict=False)]
+    timed_s = late_s[:1] + late_s[2:]
+    middle_s = statistics.median(timed_s) if timed_s else 0.0
+    return [0.0 if i == 1 else each_s - middle_s for i, each_s in enumerate(late_s)]
+
+
+def _untimely(number: int, off_s: list[float], tolerance_s: float | None) -> list[str]:
+    late = [i for i, each_s in enumerate(off_s) if tolerance_s is not None and abs(each_s) > tolerance_s]
+    if not late:
+        return []
+    return [
+        f"scanner: scan {number}, buffer {late[0]} came {off_s[late[0]] * 1e3:+.1f} ms from its recorded time, "
+        f"more than {(tolerance_s or 0.0) * 1e3:g} ms; {len(late)} of {len(off_s)} did; unload the host"
+    ]
+
+
+def _byte(data: bytes, at: int) -> str:
+    return f"0x{data[at]:02x}" if at < len(data) else "none"
+
+
+def _shown(data: bytes, at: int) -> str:
+    begin = max(0, at - _SHOWN // 2)
+    piece = data[begin : begin + _SHOWN]
+    text = repr(piece.decode("ascii")) if piece.isascii() and piece.decode("ascii").isprintable() else piece.hex(" ")
+    return f"{'..' if begin else ''}{text}{'..' if begin + _SHOWN < len(data) else ''}"

@@ -1,0 +1,223 @@
+"""The counting thread: blocks in, maps out. It alone counts and estimates, one sweep after the other.
+
+The bounded queue of maps from the counting thread to the caller's, which also says when the stream is over.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import DeviceFault
+from drivers.ring import RingReader
+from rig.count.sweeps import SweepAccount, SweepAssembler, SweepData
+from rig.count.volume import Counter, FrameTally, SweepLayout
+from rig.depth.reconstruct import MapResult
+from rig.scan.source import Source, blocks
+from rig.threads import StageThread
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AcquiredMap:
+    """A map and the account of its sweep, without the counts, which are large.
+
+    column: float64 (columns,), where the frames of each column were bound. compute_s: wall time of binding, counting
+    and estimation.
+    """
+
+    sweep: SweepAccount
+    column: NDArray[np.float64]
+    result: MapResult
+    compute_s: float
+
+
+class MapQueue:
+    """At most `room` maps that wait for the caller. One thread puts, one takes; any may tell the stream's end."""
+
+    def __init__(self, room: int) -> None:
+        self.room = room
+        self.high_water = 0
+        """Most maps that waited at one time."""
+        self._maps: deque[AcquiredMap] = deque()
+        self._changed = threading.Condition()
+        self._streaming = True
+        self._ended = False
+        self._closed = False
+
+    @property
+    def streaming(self) -> bool:
+        """Whether the rig has still to be kept running."""
+        return self._streaming
+
+    @property
+    def drained(self) -> bool:
+        """Whether every map was taken and none will come."""
+        return self._ended and not self._maps
+
+    @property
+    def closed(self) -> bool:
+        """Whether nobody will take maps any more."""
+        return self._closed
+
+    def put(self, found: AcquiredMap) -> None:
+        """Add a map, once there is room. Into a closed queue it goes nowhere."""
+        with self._changed:
+            self._changed.wait_for(lambda: len(self._maps) < self.room or self._closed)
+            self._maps.append(found)
+            self.high_water = max(self.high_water, len(self._maps))
+            self._changed.notify_all()
+
+    def end_stream(self) -> None:
+        """The rig can be made safe: all frames are there, or something failed. Maps may still come."""
+        self._set("_streaming", False)
+
+    def end(self) -> None:
+        """No more maps."""
+        self._set("_ended", True)
+
+    def close(self) -> None:
+        """Nobody takes maps any more: let go of whoever waits to put one."""
+        self._set("_closed", True)
+
+    def take_streaming(self, timeout_s: float) -> AcquiredMap | None:
+        """The next map; None after `timeout_s`, or at once where the stream is over, which comes before the maps."""
+        return self._take(timeout_s, lambda: not self._streaming)
+
+    def take_rest(self, timeout_s: float) -> AcquiredMap | None:
+        """The next map; None after `timeout_s`, or at once where none will come."""
+        return self._take(timeout_s, lambda: self._ended and not self._maps)
+
+    def _take(self, timeout_s: float, over: Callable[[], bool]) -> AcquiredMap | None:
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._maps) or over(), timeout_s)
+            if over() or not self._maps:
+                return None
+            found = self._maps.popleft()
+            self._changed.notify_all()
+            return found
+
+    def _set(self, name: str, value: bool) -> None:
+        with self._changed:
+            setattr(self, name, value)
+            self._changed.notify_all()
+
+
+class MakesMaps(Protocol):
+    """What the counting thread needs of a `Reconstructor`. It uses it from no other thread."""
+
+    def counter(self, layout: SweepLayout) -> Counter:
+        """A counter whose sweeps `map` takes."""
+        ...
+
+    def map(self, sweep: FrameTally) -> MapResult:
+        """The map of one counted sweep."""
+        ...
+
+
+class Mapping:
+    """Counts the blocks of one start of the SPAD and estimates each sweep where it ends, before any frame behind it.
+
+    on_complete: called on this thread as soon as the marker that closes the last sweep is counted; the last map is
+    estimated after that. on_sweep: shown each counted sweep before its map is made, on this thread too. sweeps: how
+    many it is to be. Maps go to `queue`, which ends with this thread; `error` says why, where it was too early.
+    """
+
+    def __init__(
+        self,
+        reader: RingReader,
+        assembler: SweepAssembler,
+        sweeps: int,
+        maker: MakesMaps,
+        queue: MapQueue,
+        source: Source,
+        silence_s: float,
+        on_complete: Callable[[], None],
+        on_sweep: Callable[[SweepData], None] | None = None,
+    ) -> None:
+        self._reader = reader
+        self._assembler = assembler
+        self._sweeps = sweeps
+        self._maker = maker
+        self._queue = queue
+        self._source = source
+        self._silence_s = silence_s
+        self._on_complete = on_complete
+        self._on_sweep = on_sweep
+        self._thread = StageThread(self._run, "counting")
+        self.counting_s = 0.0
+        self.estimation_s = 0.0
+        self.wait_s = 0.0
+        """Time spent waiting for the caller to take maps."""
+        self.estimating = False
+        """Whether the map of a counted sweep is being made just now."""
+        self.error: BaseException | None = None
+
+    def start(self) -> None:
+        """Begin to count."""
+        self._thread.start()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the thread; False where it does not end."""
+        return self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        try:
+            with self._reader:
+                try:
+                    self._count()
+                finally:
+                    # Threads may still be at work on blocks whose slots go back now.
+                    with suppress(Exception):
+                        self._assembler.settle(0)
+        except BaseException as error:  # raised again on the caller's thread
+            self.error = error
+        self._queue.end_stream()
+        self._queue.end()
+
+    def _count(self) -> None:
+        for block in blocks(self._reader, self._source, self._silence_s):
+            sweeps = self._assembler.add(block)
+            while (sweep := self._next(sweeps)) is not None:
+                if self._assembler.complete:
+                    self._reader.close()
+                    self._on_complete()
+                self._estimate(sweep)
+            if self._assembler.complete or self._queue.closed:
+                return
+            self._settle()
+        raise DeviceFault(
+            f"{self._source.name}: the stream ended after {self._assembler.sweeps_done} of {self._sweeps} sweeps, "
+            "without the scan marker that closes the last one; check the scanner and its marker line"
+        )
+
+    def _next(self, sweeps: Iterator[SweepData]) -> SweepData | None:
+        begun = time.perf_counter()
+        try:
+            return next(sweeps, None)
+        finally:
+            self.counting_s += time.perf_counter() - begun
+
+    def _settle(self) -> None:
+        begun = time.perf_counter()
+        self._assembler.settle(self._reader.holds - 1)
+        self.counting_s += time.perf_counter() - begun
+
+    def _estimate(self, sweep: SweepData) -> None:
+        begun = time.perf_counter()
+        self.estimating = True
+        if self._on_sweep is not None:
+            self._on_sweep(sweep)
+        result = self._maker.map(sweep.volume)
+        self.estimating = False
+        column = sweep.volume.bound_column()
+        found = AcquiredMap(sweep.account(), column, result, sweep.count_s + result.compute_s)
+        estimated = time.perf_counter()
+        self.estimation_s += estimated - begun
+        self._queue.put(found)
+        self.wait_s += time.perf_counter() - estimated

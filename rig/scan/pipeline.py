@@ -1,0 +1,221 @@
+"""The threads between a SPAD and the caller: source -> ring -> {counting + estimation, recorder, monitor} -> maps.
+
+One pipeline serves one start of the SPAD. Nothing in it can wait for ever: the source waits for the ring, the ring for
+counting and recorder, counting for the caller, and `end_source` and `close` let go of each. The monitor is never waited
+for.
+
+What becomes of frames that come faster than they can be worked on: the user's policy, and the ring it asks for.
+"""
+
+from collections.abc import Callable
+from enum import StrEnum
+
+from drivers.interfaces import SpadArray, SpadInfo, SpadTiming
+from drivers.ring import BlockRing, OnFull
+from rig.count.sweeps import MOST_UNDER_WAY, SweepAssembler, SweepData
+from rig.errors import RecordingError, UsageError
+from rig.plan.scan_plan import ScanPlan
+from rig.recording.writer import WRITERS, Recorder, Recording
+from rig.run_folder.summary import PipelineStats
+from rig.scan.counting import AcquiredMap, MakesMaps, Mapping, MapQueue
+from rig.scan.monitor import Monitor, Watch
+from rig.scan.source import Source
+
+MAPS_AHEAD = 2
+"""Maps that may wait for the caller before counting waits too."""
+JOIN_S = 30.0
+"""Longest wait for the source thread after the SPAD was stopped."""
+DRAIN_S = 60.0
+"""Longest wait for the disk to take what is left in the ring."""
+LEAVE_S = 2.0
+"""Longest wait for an estimate that nobody wants any more; it ends by itself later."""
+MONITOR_S = 0.5
+"""Longest wait for the monitor's callback at the end."""
+
+
+class Pipeline:
+    """source -> ring -> {counting + estimation, recorder, monitor} -> maps, for one start of the SPAD.
+
+    assembler: takes `sweeps` sweeps; maker: makes their maps, on the counting thread. recording, watch: None for no
+    recorder and no monitor. on_sweep: as of `Mapping`.
+    """
+
+    def __init__(
+        self,
+        spad: SpadArray,
+        ring: BlockRing,
+        assembler: SweepAssembler,
+        sweeps: int,
+        maker: MakesMaps,
+        silence_s: float,
+        *,
+        recording: Recording | None = None,
+        watch: Watch | None = None,
+        on_frame: Callable[[int], None] | None = None,
+        on_sweep: Callable[[SweepData], None] | None = None,
+    ) -> None:
+        self._ring = ring
+        self._queue = MapQueue(MAPS_AHEAD)
+        self._source = Source(spad, ring, silence_s, self._queue.end_stream, on_frame)
+        self._mapping = Mapping(
+            ring.reader("counting", holds=max(1, min(MOST_UNDER_WAY, ring.slots // 4))),
+            assembler,
+            sweeps,
+            maker,
+            self._queue,
+            self._source,
+            silence_s,
+            on_complete=self._complete,
+            on_sweep=on_sweep,
+        )
+        self._recorder: Recorder | None = None
+        if recording is not None:
+            reader = ring.reader("recorder", holds=max(1, min(WRITERS, ring.slots // 4)))
+            self._recorder = Recorder(reader, recording, self._queue.end_stream)
+        self._monitor: Monitor | None = None
+        if watch is not None:
+            self._monitor = Monitor(ring.reader("monitor", required=False), watch, self.stats)
+        self.monitor_lost = False
+        """Whether the monitor's callback raised or was left behind: it must not be called again."""
+
+    @property
+    def streaming(self) -> bool:
+        """Whether the rig has still to be kept running: frames are missing and nothing failed."""
+        return self._queue.streaming
+
+    @property
+    def drained(self) -> bool:
+        """Whether every map was taken and none will come."""
+        return self._queue.drained
+
+    @property
+    def estimating(self) -> bool:
+        """Whether a map is being made just now. Any thread."""
+        return self._mapping.estimating
+
+    def stats(self) -> PipelineStats:
+        """The figures of this moment. Any thread."""
+        ring, mapping, recorder, monitor = self._ring, self._mapping, self._recorder, self._monitor
+        return PipelineStats(
+            source_fill_s=self._source.fill_s,
+            source_wait_s=ring.waited_s,
+            ring_slots=ring.slots,
+            ring_bytes=ring.slots * ring.stride,
+            ring_high_water=ring.high_water,
+            dropped_blocks=ring.dropped_blocks,
+            dropped_frames=ring.dropped_frames,
+            counting_s=mapping.counting_s,
+            estimation_s=mapping.estimation_s,
+            map_wait_s=mapping.wait_s,
+            map_queue=self._queue.room,
+            map_queue_high_water=self._queue.high_water,
+            recorder_s=None if recorder is None else recorder.busy_s,
+            recorder_blocks=None if recorder is None else recorder.blocks,
+            recorder_bytes=None if recorder is None else recorder.bytes,
+            monitor_updates=None if monitor is None else monitor.updates,
+            monitor_skipped_blocks=None if monitor is None else monitor.skipped,
+        )
+
+    def start(self) -> None:
+        """Start all threads, the source last."""
+        self._mapping.start()
+        if self._recorder is not None:
+            self._recorder.start()
+        if self._monitor is not None:
+            self._monitor.start()
+        self._source.start()
+
+    def take_streaming(self, timeout_s: float) -> AcquiredMap | None:
+        """The next map; None after `timeout_s`, or at once where the rig can be made safe, which comes first."""
+        return self._queue.take_streaming(timeout_s)
+
+    def take_rest(self, timeout_s: float) -> AcquiredMap | None:
+        """The next map of what is left in the ring; None after `timeout_s`, or at once where none will come."""
+        return self._queue.take_rest(timeout_s)
+
+    def end_source(self, why: BaseException | None = None) -> None:
+        """Fill no more. Returns at once. why: what the readers are told behind the last block."""
+        self._source.end(why)
+
+    def join_source(self) -> bool:
+        """Wait for the source thread after the SPAD was stopped; False where it hangs."""
+        return self._source.join(JOIN_S)
+
+    def error(self) -> BaseException | None:
+        """What ended the pipeline too early, once it is drained; waits until the recording is written."""
+        recorder = self._recorder
+        if recorder is not None and not recorder.join(DRAIN_S):
+            return RecordingError(
+                f"the disk did not take what was left in the ring within {DRAIN_S:g} s; name a folder on another disk "
+                "with --out"
+            )
+        if recorder is not None and recorder.error is not None:
+            return recorder.error
+        return self._mapping.error
+
+    def close(self) -> None:
+        """End all threads, whatever they are at. Maps not taken are gone; what is left in the ring is recorded."""
+        try:
+            self._source.end()
+            self._queue.close()
+            if self._monitor is not None:
+                self.monitor_lost = not self._monitor.end(MONITOR_S) or self._monitor.failed
+            self._mapping.join(LEAVE_S)
+        finally:  # a second Ctrl-C ends the wait for an estimate, not for what was received
+            if self._recorder is not None:
+                self._recorder.join(DRAIN_S)
+
+    def _complete(self) -> None:
+        """All frames are there: on a link that goes on, the ring must not fill up while the last map is estimated."""
+        self._source.end()
+        self._queue.end_stream()
+
+
+RING_BYTES = 512 * 2**20
+"""Ring of a source that cannot wait: 0.16 s of full frames at 100 kHz, more than any pause of the interpreter."""
+FEWEST_SLOTS = 8
+"""Also the slots for a source that can wait: it runs ahead by as many blocks."""
+MOST_SLOTS = 1024
+
+
+class Overload(StrEnum):
+    """What to do with blocks for which the ring has no room (`--on-overload`)."""
+
+    ABORT = "abort"
+    """Lose nothing: a source that can wait waits, one that cannot ends the run."""
+    DROP = "drop"
+    """Drop them, count them as lost and go on, also where the source could wait."""
+    BLOCK = "block"
+    """Let the source wait; refused where it cannot."""
+
+    @classmethod
+    def parse(cls, text: str) -> "Overload":
+        """The policy of that name. Raises UsageError for anything else."""
+        try:
+            return cls(text)
+        except ValueError:
+            raise UsageError(f"--on-overload is {text!r}; write 'abort', 'drop' or 'block'") from None
+
+
+def require_policy(policy: Overload, info: SpadInfo) -> None:
+    """UsageError where the policy asks a source to wait that cannot."""
+    if policy is Overload.BLOCK and not info.can_wait:
+        raise UsageError(
+            f"--on-overload is 'block', but the {info.model} SPAD cannot wait while it exposes; "
+            "choose 'abort' to lose no frame or 'drop' to go on without those lost"
+        )
+
+
+def ring_for(
+    policy: Overload, info: SpadInfo, plan: ScanPlan, timing: SpadTiming, *, keeps_time: bool = False
+) -> BlockRing:
+    """The ring between this SPAD and its readers, allocated and touched.
+
+    keeps_time: the SPAD can wait, but should have no need to.
+    """
+    few = info.can_wait and not keeps_time
+    slots = FEWEST_SLOTS if few else min(max(RING_BYTES // timing.stride, FEWEST_SLOTS), MOST_SLOTS)
+    waits = OnFull.WAIT if info.can_wait else OnFull.FAIL
+    on_full = OnFull.DROP if policy is Overload.DROP else waits
+    frames = slots * (timing.stride // plan.frame_bytes)
+    return BlockRing(slots, timing.stride, on_full=on_full, holds_s=frames / float(plan.frame_rate_hz))

@@ -1,0 +1,80 @@
+"""Depth from a bare cube, map by map."""
+
+import os
+import time
+
+from rig.config.models import EstimateConfig
+from rig.count.volume import SweepLayout
+from rig.depth.reconstruct import Reconstructor
+from rig.depth.warm_up import warm_up
+from rig.devices.calibration_use import CalibrationUse, accepted_by
+from rig.estimate.registry import LEARNING
+from rig.progress import Progress, counted, tell_stage
+from rig.recording.cube import Cube, Gap, column_commands, count_map
+from rig.run_folder.summary import MapTally, RunFrames, RunVerdict
+from rig.scan.run import OutFolder, Run, RunResult
+
+
+def reconstruct_cube(
+    cube: Cube, calibration: CalibrationUse, estimate: EstimateConfig, out: OutFolder, progress: Progress | None = None
+) -> RunResult:
+    """All maps of a checked cube; those that lack frames have them noted as gaps.
+
+    An interrupt ends the run after its last whole map, with verdict 'aborted'.
+    """
+    plan, model = cube.plan, calibration.model
+    threads = estimate.threads or os.cpu_count() or 1
+    reconstructor = Reconstructor(
+        model,
+        column_commands(plan),
+        plan.depth_range,
+        estimator=estimate.estimator,
+        filter=estimate.filter,
+        min_confidence=estimate.min_confidence,
+        threads=threads,
+    )
+    warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=False)
+    geometry = reconstructor.geometry
+    tally = MapTally(plan.columns, plan.exposures, estimate.estimator, estimate.filter)
+    counter = reconstructor.counter(
+        SweepLayout(
+            plan.columns, geometry.rows, geometry.width, geometry.x0, geometry.window, plan.exposures, dark=False
+        )
+    )
+    gaps: list[list[Gap]] = []
+    with Run(out, tally) as run:
+        run.rays = geometry.rays
+        verdict = RunVerdict.COMPLETE
+        told = counted("estimating", "maps", progress)
+        try:
+            for index in range(cube.maps):
+                if estimate.estimator in LEARNING and not index:
+                    tell_stage("learning")
+                begun = time.perf_counter()
+                sweep, missing = count_map(cube, index, counter)
+                count_s = time.perf_counter() - begun
+                result = reconstructor.map(sweep)
+                gaps.append(missing)
+                run.add(result, count_s + result.compute_s)
+                told(tally.maps, cube.maps)
+        except KeyboardInterrupt:
+            verdict = RunVerdict.ABORTED
+        if verdict is RunVerdict.COMPLETE and tally.doubts:
+            verdict = RunVerdict.DOUBTFUL
+        gaps_of_run = [gap for of_map in gaps[: tally.maps] for gap in of_map]
+        lost = sum(last - first + 1 for first, last in gaps_of_run)
+        n = tally.maps * cube.frames_per_map
+        if lost and verdict is RunVerdict.COMPLETE:
+            verdict = RunVerdict.GAPS
+        manifest = {
+            "command": "reconstruct",
+            "cube": cube.path.absolute(),
+            "plan": plan.model_dump(mode="json"),
+            "calibration": calibration.content(),
+            "estimate": estimate.model_dump(mode="json"),
+            "gaps": [list(gap) for gap in gaps_of_run],
+        }
+        frames = RunFrames(expected=n, received=n - lost, lost=lost, crc_errors=None, lit=n - lost)
+        return run.finish(
+            frames, n / float(plan.frame_rate), verdict, manifest, accepted_calibration=accepted_by(calibration)
+        )

@@ -1,0 +1,74 @@
+"""One replay from opening its devices to the word on what their drivers said."""
+
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from drivers.errors import DeviceError
+from drivers.replay.pace import Pace
+from drivers.transports.tap import CONTROL_FILE, TapFile
+from rig.config.models import RigConfig
+from rig.devices.open import open_rig
+from rig.errors import DivergedError, RigError
+from rig.recording.replay import RECORDED, pace_of
+from rig.scan.control_check import SWAP_TOLERANCE_S, ControlCheck, check_control
+from rig.scan.run import Run, RunResult
+from rig.scan.scan import ScanOptions, run_scan
+
+Steps = Callable[[Pace], None]
+
+
+def play(
+    config: RigConfig, recording: Path, run: Run, maps: int | None, options: ScanOptions, steps: Steps | None
+) -> RunResult:
+    """Play a recording with the rig of `replay_config`; `run` takes the maps.
+
+    Where drivers take part and the recording has control traffic, the two are compared once the rig is closed, also
+    where it failed. Raises DivergedError where they differ; what the run wrote is kept.
+    """
+    drivers = [slot for slot in RECORDED if getattr(config, slot).real_time]
+    compared = bool(drivers) and (recording / CONTROL_FILE).exists()
+    with ExitStack() as stack:
+        tap: TapFile | None = None
+        if options.record:
+            tap = run.start_tap()
+        elif compared:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="spadrig-control-"))
+            tap = TapFile.begin(Path(folder) / CONTROL_FILE)
+        try:
+            with open_rig(config, tap=tap) as rig:
+                pace = pace_of(rig.spad)
+                if steps is not None:
+                    steps(pace)
+                result = run_scan(rig, run, maps, 0, options)
+        except (DeviceError, RigError) as error:
+            if tap is not None and compared:
+                _require_no_difference(recording, tap, drivers, error)
+            raise
+        if tap is None or not compared:
+            return result
+        timed = pace.speed == 1.0 and maps is None
+        check = _check(recording, tap, drivers, SWAP_TOLERANCE_S if timed else None)
+    if check.problems:
+        raise _diverged(check.problems, result.folder)
+    return replace(result, control=check)
+
+
+def _check(recording: Path, tap: TapFile, drivers: Sequence[str], tolerance_s: float | None) -> ControlCheck:
+    return check_control(recording / CONTROL_FILE, Path(tap.path), devices=drivers, tolerance_s=tolerance_s)
+
+
+def _require_no_difference(recording: Path, tap: TapFile, drivers: Sequence[str], error: Exception) -> None:
+    """DivergedError where a run that failed had said something else before; what it never came to is no difference."""
+    problems = [one for one in _check(recording, tap, drivers, None).problems if "byte" in one]
+    if problems:
+        raise _diverged((*problems, str(error)), None) from error
+
+
+def _diverged(problems: Sequence[str], folder: Path | None) -> DivergedError:
+    error = DivergedError("\n".join(problems))
+    if folder is not None:
+        error.add_note(f"the maps are in {folder}")
+    return error

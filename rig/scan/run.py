@@ -1,0 +1,289 @@
+"""One run from its first map to its folder: what `rig scan` and `rig reconstruct` have in common.
+
+What the sweeps of a scan come to: frames, synchronisation, verdict, and an account of each for the manifest.
+"""
+
+import math
+import os
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from calibration.model.rig_model import RigModel
+from drivers.interfaces import SpadCounters, SweepTruth
+from drivers.replay.pace import PaceReport
+from drivers.transports.tap import CONTROL_FILE, TapFile
+from rig.count.sweeps import Gap, SweepAccount
+from rig.depth.reconstruct import MapResult
+from rig.errors import UsageError
+from rig.progress import tell_stage
+from rig.recording.segment import Space
+from rig.recording.writer import Recording
+from rig.run_folder.folder import Rays, RunFolder, SavePolicy
+from rig.run_folder.manifest import UNFINISHED, file_crc32
+from rig.run_folder.summary import MapTally, PipelineStats, RunFrames, RunVerdict, Summary, Synchronisation
+from rig.scan.control_check import ControlCheck
+
+OutFolder = str | os.PathLike[str] | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """What a run gives back.
+
+    last: the last map, None where the run ended before its first. truth: that map's, where a world knows it.
+    folder: where everything was written, None where nothing was. control: of a replay with drivers that took part, how
+    what they said compares with the recording.
+    """
+
+    summary: Summary
+    last: MapResult | None
+    truth: SweepTruth | None
+    folder: Path | None
+    control: ControlCheck | None = None
+
+    def uninterrupted(self) -> Self:
+        """Itself; raises KeyboardInterrupt where an interrupt ended the run, for those that need all of it."""
+        if self.summary.verdict is RunVerdict.ABORTED:
+            raise KeyboardInterrupt
+        return self
+
+
+class Run:
+    """Takes the maps of a run one by one, writes those to be kept, and closes with manifest and summary.
+
+    Leaving the context without `finish` removes everything that was written, but for a recording with a block in it.
+    out: folder, None to write nothing. record: the folder is that of a recording. rays: the camera's (u, v) of every
+    pixel, to be set before the first map; None for an uncalibrated rig.
+    """
+
+    def __init__(
+        self, out: OutFolder, tally: MapTally, save: SavePolicy | None = None, *, record: bool = False
+    ) -> None:
+        """Claim the folder. Raises UsageError where it cannot be written."""
+        self.tally = tally
+        self._folder = None if out is None else RunFolder(out, in_place=record)
+        self.rays: Rays | None = None
+        self._save = save or SavePolicy()
+        self._last: tuple[int, MapResult, SweepTruth | None] | None = None
+        self._recording: Recording | None = None
+        self._inputs: dict[str, int] = {}
+        self._tap: TapFile | None = None
+
+    def start_tap(self) -> TapFile:
+        """Where what passes the devices' ports is recorded from now on."""
+        assert self._folder is not None, "asked for with a recording, which needs a folder"
+        self._tap = TapFile.begin(self._folder.place(CONTROL_FILE))
+        return self._tap
+
+    @property
+    def worth_keeping(self) -> bool:
+        """Whether there is a whole map or a recorded block."""
+        return self.tally.maps > 0 or (self._recording is not None and self._recording.blocks > 0)
+
+    def space(self, recording_bytes: int, map_bytes: int, maps: int) -> Space:
+        """What a recorded run of `maps` maps takes, and what its disk has.
+
+        recording_bytes: of all frames; map_bytes: of one map. UsageError where it has no folder.
+        """
+        if self._folder is None:
+            raise UsageError("record writes the frames into the run's folder; name one with out")
+        return Space.on_disk_of(self._folder.path, recording_bytes, map_bytes * self._save.count(maps))
+
+    def start_recording(
+        self,
+        manifest: Mapping[str, Any],
+        write_inputs: Callable[[Path], None],
+        space: Space,
+    ) -> Recording:
+        """The recording of a run, in its folder; closed with the run.
+
+        manifest: what is known before the first frame; it is on the disk before this returns, and again with each start
+        of the SPAD. write_inputs: writes what has to stand beside the frames. space: what all of it will take. Raises
+        UsageError where the disk has not so much, RecordingError where it cannot be written.
+        """
+        folder = self._folder
+        assert folder is not None, "its space was looked at"
+        space.require()
+
+        def begun() -> None:
+            assert self._recording is not None, "tells of its starts only"
+            content = {"versions": versions(), **manifest, "inputs": self._inputs, "verdict": UNFINISHED}
+            content["recording"] = self._recording.content()
+            folder.write_json("manifest.json", content)
+
+        try:
+            write_inputs(folder.path)
+            self._inputs = {
+                file.name: file_crc32(file)
+                for file in sorted(folder.path.iterdir())
+                if file.is_file() and file.name != CONTROL_FILE
+            }
+        except OSError as error:
+            raise UsageError(f"cannot write {folder.path}: {error.strerror or error}; name another --out") from error
+        self._recording = Recording(folder.path, expected_bytes=space.recording_bytes, on_begin=begun)
+        if self._tap is not None:
+            self._recording.also_sync(self._tap.sync)
+        begun()
+        return self._recording
+
+    def __enter__(self) -> Self:
+        """The run itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove what was not finished, but what was recorded: 'rig repair' makes it whole."""
+        try:
+            if self._recording is not None:
+                self._recording.close()
+        finally:
+            if self._folder is not None and self._recording is not None and self._recording.blocks:
+                self._folder.keep()
+            elif self._folder is not None:
+                self._folder.discard()
+
+    def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
+        """Take the next map: whole, or, where anything ends it before it is counted, not at all."""
+        index = self.tally.maps
+        before = self._last
+        try:
+            if self._folder is not None and self._save.keeps(index):
+                tell_stage("writing")
+                self._write(index, result, truth)
+            self._last = index, result, truth
+            self.tally.add(result, compute_s, truth)
+        except BaseException:
+            if self.tally.maps == index:
+                self._last = before
+                if self._folder is not None:
+                    self._folder.remove_map(index)
+            raise
+
+    def finish(
+        self,
+        frames: RunFrames,
+        sensor_time_s: float,
+        verdict: RunVerdict,
+        manifest: Mapping[str, Any],
+        stages: PipelineStats | None = None,
+        sync: Synchronisation | None = None,
+        replay: PaceReport | None = None,
+        accepted_calibration: tuple[str, ...] = (),
+    ) -> RunResult:
+        """Write manifest and summary and make the folder appear; one without a map or a recorded block leaves none."""
+        summary = self.tally.summary(frames, sensor_time_s, verdict, stages, sync, replay)
+        summary = replace(summary, accepted_calibration=accepted_calibration)
+        index, result, truth = self._last or (None, None, None)
+        folder = None
+        if self._folder is not None and self.worth_keeping:
+            tell_stage("writing")
+            if self._save.step is None and index is not None and result is not None:
+                self._write(index, result, truth)
+            content = {"versions": versions(), **manifest, "verdict": verdict.value}
+            if self._recording is not None:
+                self._recording.close()
+                content |= {"inputs": self._inputs, "recording": self._recording.content()}
+            self._folder.write_json("manifest.json", content)
+            self._folder.write_json("summary.json", summary.as_json())
+            folder = self._folder.publish()
+        return RunResult(summary, result, truth, folder)
+
+    def _write(self, index: int, result: MapResult, truth: SweepTruth | None) -> None:
+        assert self._folder is not None, "asked for where there is one"
+        self._folder.write_map(index, result, self.rays)
+        if truth is not None:
+            self._folder.write_truth(index, truth)
+
+
+def versions() -> dict[str, str]:
+    """Versions of the program and of what its figures depend on."""
+    found = {"python": platform.python_version()}
+    for name in ("spadrig", "numpy", "numba", "opencv-contrib-python-headless"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # installed under another name, as distributions repackage it
+            continue
+    return found
+
+
+def frames_of(sweeps: list[SweepAccount], crc_errors: int | None, outside: Sequence[Gap] = ()) -> RunFrames:
+    """Sums over the sweeps; crc_errors: as the SPAD counts them, None where it does not.
+
+    outside: frames that are known to be lost beside the sweeps, (first, last).
+    """
+    beside = sum(last + 1 - first for first, last in outside)
+    return RunFrames(
+        expected=beside + sum(sweep.frames.expected for sweep in sweeps),
+        received=sum(sweep.frames.received for sweep in sweeps),
+        lost=beside + sum(sweep.frames.lost for sweep in sweeps),
+        crc_errors=crc_errors,
+        lit=sum(sweep.frames.lit for sweep in sweeps),
+    )
+
+
+def frames_that_came(of_maps: RunFrames, counters: SpadCounters, dropped: int) -> RunFrames:
+    """Frames of a run that ended before its last map: all of them, those behind its last whole map too.
+
+    counters: the SPAD's own; dropped: frames that found no free slot, for a SPAD that does not say what got lost.
+    """
+    lost = dropped if counters.lost is None else counters.lost
+    return replace(of_maps, expected=counters.delivered + lost, received=counters.delivered, lost=lost)
+
+
+def synchronisation_of(sweeps: list[SweepAccount]) -> Synchronisation | None:
+    """How well the sweeps were bound: the worst of each figure; None without any."""
+    if not sweeps:
+        return None
+    residuals = [sweep.residual_columns for sweep in sweeps]
+    found = [sweep.detection for sweep in sweeps if sweep.detection is not None]
+    return Synchronisation(
+        by="blanking pattern" if found else "markers",
+        residual_columns=None if any(map(math.isnan, residuals)) else max(residuals),
+        clock_error=max((sweep.clock_error for sweep in sweeps), key=abs),
+        detection_probability=min(found) if found else None,
+    )
+
+
+def verdict_of(
+    sweeps: list[SweepAccount],
+    model: RigModel | None,
+    *,
+    aborted: bool,
+    doubtful: bool,
+    outside: Sequence[Gap] = (),
+) -> RunVerdict:
+    """The gravest that applies. doubtful: whether a map's own light speaks against it. outside: as of `frames_of`."""
+    if aborted:
+        return RunVerdict.ABORTED
+    if not all(sweep.synchronised or _markers_lost(sweep) for sweep in sweeps):
+        return RunVerdict.UNSYNCHRONISED
+    if doubtful:
+        return RunVerdict.DOUBTFUL
+    if outside or any(sweep.frames.lost for sweep in sweeps):
+        return RunVerdict.GAPS
+    return RunVerdict.COMPLETE if model is not None else RunVerdict.UNCALIBRATED
+
+
+def _markers_lost(sweep: SweepAccount) -> bool:
+    """Whether so many frames were lost that too few markers are left to judge the sweep's clock."""
+    return sweep.frames.lost > 0 and math.isnan(sweep.residual_columns)
+
+
+def sweep_content(sweep: SweepAccount) -> dict[str, Any]:
+    """One sweep for the manifest."""
+    return {
+        "direction": sweep.direction,
+        "first_frame": sweep.first_frame,
+        "end_frame": sweep.end_frame,
+        "lost": sweep.frames.lost,
+        "dark": sweep.frames.dark,
+        "clock_error": sweep.clock_error,
+        "residual_columns": sweep.residual_columns,
+        "detection_probability": sweep.detection,
+    }

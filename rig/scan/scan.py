@@ -1,0 +1,243 @@
+"""A scan from open devices to its folder: sweeps in, maps out, and an account of what was lost.
+
+The devices of a recorded run, for its manifest: what they are and what they were set to.
+"""
+
+import logging
+import os
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from drivers.errors import DeviceError
+from drivers.interfaces import SpadTiming, SweepTruth
+from rig.count.sweeps import SweepAccount, SweepData
+from rig.depth.reconstruct import Reconstructor
+from rig.depth.warm_up import warm_binding, warm_up
+from rig.devices.calibration_use import accepted_by, calibration_use, identity_of, rig_content
+from rig.devices.open import OpenRig, lead_s, most_sweeps, prepare, spare_lead_s
+from rig.errors import RigError
+from rig.estimate.registry import LEARNING, Learned
+from rig.plan.compile import spad_request
+from rig.plan.describe import plan_content
+from rig.plan.scan_plan import ScanPlan
+from rig.progress import tell_stage
+from rig.recording.inputs import to_plain, write_inputs
+from rig.recording.replay import Replayed
+from rig.recording.segment import Space, map_bytes, recording_bytes
+from rig.recording.writer import Recording
+from rig.scan.acquisition import SILENCE_S, Acquisition, ScanProgress, told_of
+from rig.scan.monitor import Watch
+from rig.scan.pipeline import FEWEST_SLOTS, Overload, require_policy
+from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
+
+
+def devices_content(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> dict[str, Any]:
+    """Identity, limits and timing of each; `from_plain` reads `SpadInfo`, `SpadTiming` and the limits back."""
+    kinds = {slot: getattr(rig.config, slot).kind for slot in ("spad", "scanner", "laser", "sync")}
+    return {
+        "spad": {
+            "kind": kinds["spad"],
+            "name": rig.spad.name,
+            "info": to_plain(rig.spad.info),
+            "timing": to_plain(timing),
+        },
+        "scanner": {
+            "kind": kinds["scanner"],
+            "name": rig.scanner.name,
+            "limits": to_plain(rig.scanner.limits),
+            "point_rate_hz": to_plain(plan.point_rate_hz),
+        },
+        "laser": {"kind": kinds["laser"], "name": rig.laser.name, "limits": to_plain(rig.laser.limits)},
+        "sync": {"kind": kinds["sync"], "name": rig.sync.name},
+    }
+
+
+_log = logging.getLogger(__name__)
+OnSpace = Callable[[Space], None]
+"""Told, before anything moves, what a recording will take on the disk, once it is known to fit."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanOptions:
+    """How a scan is run, apart from its config. record: keep the frames; needs a run with a folder.
+
+    watch: a monitor's callback, on a thread of its own. live: told of the progress several times a second, on the
+    caller's thread. sweeps: shown each counted sweep before its map is made, on the counting thread.
+    accept_calibration: use a foreign or stale calibration too, see `rig.devices.calibration_use`.
+    """
+
+    policy: Overload = Overload.ABORT
+    record: bool = False
+    watch: Watch | None = None
+    live: Callable[[ScanProgress], None] | None = None
+    sweeps: Callable[[SweepData], None] | None = None
+    accept_calibration: bool = False
+    on_space: OnSpace | None = None
+
+
+def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanOptions | None = None) -> RunResult:
+    """Scan with an open rig; `run` takes the maps. seed: as the rig was opened with, for the manifest.
+
+    maps: None for all that a recording holds, which takes the SPAD's place.
+
+    An interrupt ends the scan after its last whole map, with verdict 'aborted'. So does an error, which is raised again
+    once the whole maps and the recording are safe; one before there is either leaves nothing.
+    """
+    options = options or ScanOptions()
+    require_policy(options.policy, rig.spad.info)
+    here = identity_of(rig)
+    calibration = calibration_use(rig, accept=options.accept_calibration, here=here)
+    plan, timing = prepare(rig)
+    replayed = Replayed.of(rig.spad, plan, maps)
+    maps = maps or 1 if replayed is None else replayed.maps
+    threads = rig.config.estimate.threads or os.cpu_count() or 1
+    recalled = () if replayed is None else replayed.learned(rig.config.estimate, rig.model)
+    reconstructor = make_reconstructor(rig, plan, threads, recalled)
+    geometry = reconstructor.geometry
+    run.rays = geometry.rays if rig.model is not None else None
+
+    estimate = rig.config.estimate
+    warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)
+    warm_binding(plan)
+    manifest: dict[str, Any] = {
+        "command": "scan" if replayed is None else "replay",
+        "config": rig.config.model_dump(mode="json"),
+        "plan": plan_content(plan),
+        "calibration": None if calibration is None else calibration.content(),
+        "rig": rig_content(here),
+        "devices": devices_content(rig, plan, timing),
+        "seed": seed,
+        "maps": maps,
+        "on_overload": options.policy.value,
+    }
+    recording = None
+    if options.record:
+        starts = None if replayed is None else replayed.starts_for(maps)
+        space = run.space(*recorded_bytes(rig, plan, timing, maps, starts), maps)
+        recording = _recording(rig, run, plan, manifest, space, options.on_space)
+    acquisition = Acquisition(
+        rig,
+        plan,
+        timing,
+        maps,
+        reconstructor,
+        first_alone=_first_alone(rig),
+        groups=None if replayed is None else replayed.groups(),
+        on_sweep=options.sweeps,
+        policy=options.policy,
+        starts=None if replayed is None else replayed.starts(),
+        recording=recording,
+        watch=options.watch,
+        learns=estimate.estimator in LEARNING and not recalled,
+        on_progress=told_of(options.live),
+        silence_s=SILENCE_S if replayed is None else replayed.silence_s,
+    )
+    sweeps: list[SweepAccount] = []
+    ended_by: BaseException | None = None
+    try:
+        _collect(acquisition, rig, plan, run, sweeps, replayed)
+    except (KeyboardInterrupt, DeviceError, RigError) as error:
+        if not run.worth_keeping and not isinstance(error, KeyboardInterrupt):
+            raise
+        ended_by = error
+    del sweeps[run.tally.maps :]
+    counters, stages = acquisition.counters, acquisition.stages
+    outside = [] if replayed is None or ended_by is not None else replayed.lost_outside(sweeps)
+    if outside:
+        _log.warning("%d frames are gone from the recording, beside its whole maps", sum(b + 1 - a for a, b in outside))
+    frames = frames_of(sweeps, counters.crc_errors, outside)
+    result = run.finish(
+        frames if ended_by is None else frames_that_came(frames, counters, stages.dropped_frames),
+        frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
+        verdict_of(sweeps, rig.model, aborted=ended_by is not None, doubtful=bool(run.tally.doubts), outside=outside),
+        {
+            **manifest,
+            "sweeps": [sweep_content(sweep) for sweep in sweeps],
+            "gaps": [list(gap) for gap in (*(gap for sweep in sweeps for gap in sweep.gaps), *outside)],
+            "counters": asdict(counters),
+        },
+        stages,
+        synchronisation_of(sweeps),
+        None if replayed is None else replayed.report,
+        accepted_by(calibration),
+    )
+    if ended_by is not None and not isinstance(ended_by, KeyboardInterrupt):
+        if result.folder is not None:
+            whole = f"{len(sweeps)} of {maps} maps were whole and are" if sweeps else "no map was whole; frames are"
+            ended_by.add_note(f"{whole} in {result.folder}")
+        raise ended_by
+    return result
+
+
+def recorded_bytes(
+    rig: OpenRig, plan: ScanPlan, timing: SpadTiming, maps: int, starts: int | None = None
+) -> tuple[int, int]:
+    """Bytes that the frames of a scan take at most, and those of one map.
+
+    starts: of the SPAD, where that is not for the scan to choose.
+    """
+    request = spad_request(rig.config.scan, plan)
+    spare_s = lead_s(rig) + spare_lead_s(rig)
+    if rig.spad.info.can_wait:  # on virtual time the SPAD may be a whole ring ahead of what is counted
+        spare_s += FEWEST_SLOTS * request.block_frames / float(plan.frame_rate_hz)
+    if starts is None:
+        most = most_sweeps(rig, plan) or maps
+        starts = -(-maps // most) + (_first_alone(rig) and maps > 1)
+    return recording_bytes(plan, request, timing, maps, starts=starts, spare_s=spare_s), map_bytes(plan)
+
+
+def _first_alone(rig: OpenRig) -> bool:
+    """Whether the first map has a start of its own: a live stream cannot stand still while it is learned from."""
+    return rig.config.estimate.estimator in LEARNING and not rig.spad.info.can_wait
+
+
+def _recording(
+    rig: OpenRig, run: Run, plan: ScanPlan, manifest: dict[str, Any], space: Space, on_space: OnSpace | None
+) -> Recording:
+    """The recording of a scan, begun in the run's folder with all that is known before the first frame."""
+    recording = run.start_recording(manifest, lambda folder: write_inputs(folder, plan, rig.model), space)
+    if on_space is not None:
+        on_space(space)
+    return recording
+
+
+def make_reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned] = ()) -> Reconstructor:
+    """What makes the maps of a plan, as the config says."""
+    estimate = rig.config.estimate
+    return Reconstructor(
+        rig.model,
+        plan.commands,
+        plan.depth_range_m,
+        sensor=(plan.rows, plan.width),
+        estimator=estimate.estimator,
+        filter=estimate.filter,
+        min_confidence=estimate.min_confidence,
+        threads=threads,
+        learned=learned,
+        lines=plan.lines,
+        temporal_prior=estimate.temporal_prior,
+    )
+
+
+def _collect(
+    acquisition: Acquisition,
+    rig: OpenRig,
+    plan: ScanPlan,
+    run: Run,
+    sweeps: list[SweepAccount],
+    replayed: Replayed | None,
+) -> None:
+    running = acquisition.run()
+    with closing(running):
+        for found in running:
+            truth: SweepTruth | None = None
+            if replayed is not None:
+                truth = replayed.truth(found.sweep.index)
+            elif rig.world is not None:  # asked only now: no estimate ever sees it
+                tell_stage("comparing with the truth")
+                velocity_per_s = plan.velocity_per_s(found.sweep.direction)
+                truth = rig.world.truth(plan.line_commands(found.column), velocity_per_s)
+            sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
+            run.add(found.result, found.compute_s, truth)

@@ -1,0 +1,115 @@
+"""The source thread, which lets the SPAD fill the ring, and the blocks as a reader gets them."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+from drivers.errors import DeviceTimeout
+from drivers.frames import FrameBlock
+from drivers.interfaces import SpadArray
+from drivers.ring import BlockRing, RingReader
+from rig.threads import StageThread
+
+HANG_S = 180.0
+"""Longest wait for a SPAD whose `fill` neither returns nor says that it has nothing."""
+
+
+class Source:
+    """The thread that fills the ring. on_end: called on that thread when it ends, for whatever reason.
+
+    on_frame: told the number of the last frame on that thread whenever there are new ones; what it raises ends the
+    source. What the SPAD raises is handed to the readers, behind the blocks that came before it.
+    """
+
+    def __init__(
+        self,
+        spad: SpadArray,
+        ring: BlockRing,
+        silence_s: float,
+        on_end: Callable[[], None],
+        on_frame: Callable[[int], None] | None = None,
+    ) -> None:
+        self._spad = spad
+        self._ring = ring
+        self._silence_s = silence_s
+        self._on_end = on_end
+        self._on_frame = on_frame
+        self._over = threading.Event()
+        self._why: BaseException | None = None
+        self._thread = StageThread(self._run, "spad source")
+        self._busy_s = 0.0
+        self.silences: list[DeviceTimeout] = []
+        """What the SPAD said each time it had nothing for half of `silence_s`."""
+
+    @property
+    def name(self) -> str:
+        """The SPAD's name."""
+        return self._spad.name
+
+    @property
+    def fill_s(self) -> float:
+        """Time in the SPAD's `fill`, without that spent waiting for a free slot."""
+        return max(0.0, self._busy_s - self._ring.waited_s)
+
+    def start(self) -> None:
+        """Begin to fill."""
+        self._thread.start()
+
+    def end(self, why: BaseException | None = None) -> None:
+        """Fill no more after the present block. Any thread; returns at once. why: handed to the readers behind it."""
+        self._why = self._why or why
+        self._over.set()
+        self._ring.end_waits()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the thread; False where it does not end. Readers get no more blocks in any case."""
+        ended = self._thread.join(timeout_s)
+        self._ring.finish()
+        return ended
+
+    def _run(self) -> None:
+        error: BaseException | None = None
+        try:
+            while not self._over.is_set() and self._fill():
+                pass
+        except BaseException as caught:  # handed to the readers, who raise it on their threads
+            error = caught
+        self._ring.finish(error or self._why)
+        self._on_end()
+
+    def _fill(self) -> bool:
+        """Whether more may come."""
+        begun = time.perf_counter()
+        try:
+            more = self._spad.fill(self._ring, self._silence_s / 2)
+            if self._on_frame is not None:
+                self._on_frame(self._ring.last_frame)
+            return more
+        except DeviceTimeout as error:
+            if not self._ring.full:  # else it is no silence: it waits for a reader that is slow
+                self.silences.append(error)
+            return True
+        finally:
+            self._busy_s += time.perf_counter() - begun
+
+
+def blocks(reader: RingReader, source: Source, silence_s: float) -> Iterator[FrameBlock]:
+    """The blocks of the run. DeviceTimeout, in the SPAD's own words, where it is silent while the ring is empty."""
+    while True:
+        heard = len(source.silences)
+        waited_s = 0.0
+        while True:
+            try:
+                block = reader.next(silence_s)
+                break
+            except DeviceTimeout:
+                waited_s += silence_s
+                # The first time-out may be of a wait for room that ended just before it was looked at. One that does
+                # not come means that the SPAD is at work: a simulated one compiles its kernels before the first block.
+                if len(source.silences) >= heard + 2:
+                    raise source.silences[-1] from None
+                if waited_s >= HANG_S:
+                    raise
+        if block is None:
+            return
+        yield block

@@ -1,0 +1,143 @@
+"""Logarithms, powers of e and the error function of sixteen float32 at once: a call of the C library takes one.
+
+Likelihoods from scores: 2^x read off the bits of a bfloat16, which is linear between powers of two.
+
+A score is a whole number of units, 128 >> shift to the octave. A term is exact at whole octaves above
+`nothing_below`, elsewhere up to 6 % too large, 4 % on average.
+"""
+
+import math
+from typing import Any, Final
+
+import numba
+import numpy as np
+from llvmlite import ir
+
+from rig.simd.vectors import (
+    FLOAT32,
+    LANES,
+    VectorCode,
+    add_saturated,
+    from_bfloat16,
+    from_bfloat16_unpacked,
+    intrinsic_of,
+    larger,
+    larger_float,
+    smaller_float,
+    sub_saturated,
+    zero_float32,
+    zero_int16,
+)
+
+_WIDE = ir.VectorType(ir.IntType(32), LANES)
+_MANTISSA_BITS: Final = 23
+_BIAS: Final = 127
+_ROOT_HALF: Final = 0x3F3504F3
+"""Bits of sqrt(1/2): mantissas from there to sqrt(2) have the smallest logarithms."""
+_LOG2_E, _LN_2 = 1.0 / math.log(2.0), math.log(2.0)
+_LEAST, _MOST = -87.0, 88.0
+"""Powers of e that a float32 holds."""
+_TO_WHOLE: Final = 1.5 * 2.0**_MANTISSA_BITS
+"""Added and taken off again it leaves the nearest whole number."""
+_ERF: Final = 0.0000430638, 0.0002765672, 0.0001520143, 0.0092705272, 0.0422820123, 0.0705230784
+"""Abramowitz and Stegun, Handbook of Mathematical Functions, 7.1.28, the highest power first."""
+
+
+def _whole(number: int) -> Any:
+    return ir.Constant(_WIDE, [number] * LANES)
+
+
+def _exponents(builder: Any, a: Any) -> Any:
+    above = builder.sub(builder.bitcast(a, _WIDE), _whole(_ROOT_HALF))
+    return builder.ashr(above, _whole(_MANTISSA_BITS))
+
+
+def _mantissas(builder: Any, a: Any) -> Any:
+    exponents = builder.shl(_exponents(builder, a), _whole(_MANTISSA_BITS))
+    return builder.bitcast(builder.sub(builder.bitcast(a, _WIDE), exponents), FLOAT32.llvm)
+
+
+def _power(builder: Any, a: Any) -> Any:
+    biased = builder.add(builder.fptosi(a, _WIDE), _whole(_BIAS))
+    return builder.bitcast(builder.shl(biased, _whole(_MANTISSA_BITS)), FLOAT32.llvm)
+
+
+def _of_lanes(emit: Any) -> Any:
+    @intrinsic_of
+    def operation(typing: Any, a: Any) -> VectorCode:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return emit(builder, args[0])
+
+        return a(a), code
+
+    return operation
+
+
+exponents = _of_lanes(lambda builder, a: builder.sitofp(_exponents(builder, a), FLOAT32.llvm))
+"""exponents(a): powers of two nearest to the lanes, which must be positive and no smaller than 1.2e-38."""
+mantissas = _of_lanes(_mantissas)
+"""mantissas(a): the lanes divided by those powers, sqrt(1/2) to sqrt(2)."""
+power_of_two = _of_lanes(_power)
+"""power_of_two(a): of whole numbers from -126 to 127."""
+
+
+@numba.njit(forceinline=True)
+def logarithm(a):  # type: ignore[no-untyped-def]
+    """Natural logarithm of positive lanes, to 2e-7 of it or of 1."""
+    part = mantissas(a)
+    ratio = (part - 1.0) / (part + 1.0)
+    square = ratio * ratio
+    series = square * (square * (square * (2.0 / 7.0) + 2.0 / 5.0) + 2.0 / 3.0) + 2.0
+    return exponents(a) * _LN_2 + series * ratio
+
+
+@numba.njit(forceinline=True)
+def exponential(a):  # type: ignore[no-untyped-def]
+    """e to the lanes, cut at -87 and 88, to 1e-5 of it at the ends and 3e-7 around 1."""
+    steps = smaller_float(larger_float(a, _LEAST), _MOST) * _LOG2_E
+    whole = steps + _TO_WHOLE - _TO_WHOLE
+    rest = (steps - whole) * _LN_2
+    grown = rest * (1.0 / 720.0) + 1.0 / 120.0
+    for below in (24.0, 6.0, 2.0, 1.0, 1.0):
+        grown = grown * rest + 1.0 / below
+    return grown * power_of_two(whole)
+
+
+@numba.njit(forceinline=True)
+def error_function(a):  # type: ignore[no-untyped-def]
+    """erf of lanes from 0 on, to 1e-6."""
+    grown = smaller_float(a, 4.0) * _ERF[0] + _ERF[1]
+    for more in _ERF[2:]:
+        grown = grown * smaller_float(a, 4.0) + more
+    grown = grown * smaller_float(a, 4.0) + 1.0
+    for _ in range(4):
+        grown = grown * grown
+    one = zero_float32() + 1.0
+    return one - one / grown
+
+
+BIAS: Final = np.int16(127 << 7)
+"""Exponent of 1.0 as a bfloat16."""
+MEAN_EXCESS: Final = np.float32(1.040684)
+"""Mean of (1 + f) / 2^f over f in 0..1: by so much a term is too large on average."""
+
+
+@numba.njit(inline="always")
+def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
+    """What to add to scores so that nothing is at 0, 127 octaves below each lane's best score or at the lowest."""
+    return add_saturated(sub_saturated(zero_int16(), best), np.int16(np.int64(BIAS) >> shift))
+
+
+@numba.njit(inline="always")
+def powers(scores, lift, shift):  # type: ignore[no-untyped-def]
+    """2^(score / units) of 16-bit lanes as float32 in the order UNPACKED, up to a factor common to all.
+
+    lift: see `lift_to_powers`; what is below nothing is 0.
+    """
+    return from_bfloat16_unpacked(larger(add_saturated(scores, lift), np.int16(0)) << shift)
+
+
+@numba.njit(inline="always")
+def powers_in_order(scores, lift, shift):  # type: ignore[no-untyped-def]
+    """The same in order."""
+    return from_bfloat16(larger(add_saturated(scores, lift), np.int16(0)) << shift)

@@ -1,0 +1,185 @@
+"""Lanes and numbers from memory and to it, named by its address.
+
+Not as an array: numba counts references to every array that a compiled function is handed, and on the way through the
+functions of one image row that took 0.95 us, twenty times the work itself. Whoever takes an address (`address_of`)
+keeps the array alive and the index inside it; nothing here checks.
+
+Arrays that begin at a cache line: a vector of 32 bytes then never lies across two, which would be read twice.
+"""
+
+from typing import Any, Final
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numpy.typing import DTypeLike, NDArray
+
+from rig.simd.vectors import BLOCK, BYTES, FLOAT32, FOUR, INT16, LANES, VectorCode, called, intrinsic_of, place_list
+
+_I8, _I16, _I32, _I64, _F32 = ir.IntType(8), ir.IntType(16), ir.IntType(32), ir.IntType(64), ir.FloatType()
+
+
+@numba.njit(inline="always")
+def address_of(array):  # type: ignore[no-untyped-def]
+    """Address of an array's first element."""
+    return array.ctypes.data
+
+
+def _pointer(builder: Any, address: Any, index: Any, element: Any, whole: Any) -> Any:
+    """Pointer to `whole`, which begins at element `index` of what lies at `address`."""
+    return builder.bitcast(builder.gep(builder.inttoptr(address, element.as_pointer()), [index]), whole.as_pointer())
+
+
+def _reader(numba_type: Any, element: Any, whole: Any, align: int) -> Any:
+    @intrinsic_of
+    def read(typing: Any, address: Any, index: Any) -> VectorCode:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            loaded = builder.load(_pointer(builder, args[0], args[1], element, whole))
+            loaded.align = align
+            return loaded
+
+        return numba_type(types.intp, types.intp), code
+
+    return read
+
+
+def _writer(numba_type: Any, element: Any, whole: Any, align: int) -> Any:
+    @intrinsic_of
+    def write(typing: Any, address: Any, index: Any, value: Any) -> VectorCode:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            stored = builder.store(args[2], _pointer(builder, args[0], args[1], element, whole))
+            stored.align = align
+            return context.get_dummy_value()
+
+        return types.void(types.intp, types.intp, numba_type), code
+
+    return write
+
+
+load_bytes = _reader(BYTES, _I8, BYTES.llvm, 1)
+"""load_bytes(address, index): 32 bytes from `index` on."""
+load_block = _reader(BLOCK, _I8, BLOCK.llvm, 1)
+"""load_block(address, index): 128 bytes from `index` on."""
+load_int16 = _reader(INT16, _I16, INT16.llvm, 2)
+"""load_int16(address, index): 16 of the int16 at `address`, from number `index` on."""
+load_float32 = _reader(FLOAT32, _F32, FLOAT32.llvm, 4)
+"""load_float32(address, index): the same of float32."""
+load_four = _reader(FOUR, _F32, FOUR.llvm, 4)
+"""load_four(address, index): four of the float32."""
+store_bytes = _writer(BYTES, _I8, BYTES.llvm, 1)
+"""store_bytes(address, index, bytes): write 32 bytes."""
+store_int16 = _writer(INT16, _I16, INT16.llvm, 2)
+"""store_int16(address, index, lanes): write 16 int16."""
+store_float32 = _writer(FLOAT32, _F32, FLOAT32.llvm, 4)
+"""store_float32(address, index, lanes): write 16 float32."""
+store_four = _writer(FOUR, _F32, FOUR.llvm, 4)
+"""store_four(address, index, lanes): write four float32."""
+read_byte = _reader(types.uint8, _I8, _I8, 1)
+read_int16 = _reader(types.int16, _I16, _I16, 2)
+read_int32 = _reader(types.int32, _I32, _I32, 4)
+read_int64 = _reader(types.int64, _I64, _I64, 1)
+read_float32 = _reader(types.float32, _F32, _F32, 4)
+"""read_...(address, index): one number."""
+write_byte = _writer(types.uint8, _I8, _I8, 1)
+write_int16 = _writer(types.int16, _I16, _I16, 2)
+write_int32 = _writer(types.int32, _I32, _I32, 4)
+write_int64 = _writer(types.int64, _I64, _I64, 1)
+write_float32 = _writer(types.float32, _F32, _F32, 4)
+"""write_...(address, index, number): one number."""
+
+
+@numba.njit(cache=True, nogil=True)
+def copy_floats(source: int, to: int, number: int) -> None:
+    """Copy so many float32 from one address to another: numba copies slices number by number."""
+    whole = number - number % LANES
+    for i in range(0, whole, LANES):
+        store_float32(to, i, load_float32(source, i))
+    for i in range(whole, number):
+        write_float32(to, i, read_float32(source, i))
+
+
+@intrinsic_of
+def add_bytes(typing: Any, address: Any, index: Any, counts: Any) -> VectorCode:
+    """add_bytes(address, index, counts): add 32 unsigned bytes to as many int32 at `address`, from `index` on."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        wide = ir.VectorType(_I32, 2 * LANES)
+        pointer = _pointer(builder, args[0], args[1], _I32, wide)
+        before = builder.load(pointer)
+        stored = builder.store(builder.add(before, builder.zext(args[2], wide)), pointer)
+        before.align = stored.align = 4
+        return context.get_dummy_value()
+
+    return types.void(types.intp, types.intp, BYTES), code
+
+
+@intrinsic_of
+def load_two_rows(typing: Any, address: Any, first: Any, second: Any) -> VectorCode:
+    """load_two_rows(address, first, second): 16 bytes from `first` on, and behind them 16 bytes from `second` on."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        half = ir.VectorType(_I8, LANES)
+        rows = [builder.load(_pointer(builder, args[0], at, _I8, half)) for at in args[1:]]
+        for row in rows:
+            row.align = 1
+        return builder.shuffle_vector(*rows, place_list(range(2 * LANES)))
+
+    return BYTES(types.intp, types.intp, types.intp), code
+
+
+def _prefetch(to_write: int, locality: int) -> Any:
+    @intrinsic_of
+    def fetch(typing: Any, address: Any) -> VectorCode:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            pointer = builder.inttoptr(args[0], _I8.as_pointer())
+            how = [ir.Constant(_I32, number) for number in (to_write, locality, 1)]
+            called(builder, "llvm.prefetch.p0", ir.VoidType(), pointer, *how)
+            return context.get_dummy_value()
+
+        return types.void(types.intp), code
+
+    return fetch
+
+
+prefetch = _prefetch(0, 2)
+"""prefetch(address): fetch the cache line there into the second cache; any address will do."""
+prefetch_to_write = _prefetch(1, 3)
+"""prefetch_to_write(address): fetch the cache line there into the first cache, for this core alone."""
+
+
+@intrinsic_of
+def load_widened(typing: Any, address: Any, index: Any) -> VectorCode:
+    """load_widened(address, index): 16 unsigned bytes from `index` on as lanes of 16 bits."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        loaded = builder.load(_pointer(builder, args[0], args[1], _I8, ir.VectorType(_I8, LANES)))
+        loaded.align = 1
+        return builder.zext(loaded, INT16.llvm)
+
+    return INT16(types.intp, types.intp), code
+
+
+@intrinsic_of
+def load_counts(typing: Any, address: Any, index: Any) -> VectorCode:
+    """load_counts(address, index): 16 unsigned bytes from `index` on as float32."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        loaded = builder.load(_pointer(builder, args[0], args[1], _I8, ir.VectorType(_I8, LANES)))
+        loaded.align = 1
+        # By way of signed numbers, which every processor turns into float32 at once.
+        return builder.sitofp(builder.zext(loaded, ir.VectorType(_I32, LANES)), FLOAT32.llvm)
+
+    return FLOAT32(types.intp, types.intp), code
+
+
+CACHE_LINE: Final = 64
+"""Bytes."""
+
+
+def aligned_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """Zeros of that shape, contiguous, beginning at a cache line."""
+    size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+    memory = np.zeros(size + CACHE_LINE, np.uint8)
+    begin = -memory.ctypes.data % CACHE_LINE
+    return memory[begin : begin + size].view(dtype).reshape(shape)

@@ -1,0 +1,339 @@
+"""Sixteen lanes as one numba value: the vector arithmetic of the hot path, spelled out instead of hoped for.
+
+LLVM's own vectoriser gives up on the search along a row (several short loops over one small buffer), so its kernels say
+what they mean: `Lanes` is an LLVM vector of 16 numbers, legalised to whatever the processor has (AVX2, AVX-512, NEON).
+Everything here is for code compiled with `numba.njit`; lanes live in registers and cannot leave a kernel. They come
+from memory and go there with `rig.simd.memory`; `rig.simd.shuffles` has what goes from lane to lane.
+
+Lanes of bfloat16, the upper halves of float32 numbers: two bytes with 8 bits of precision and all of the range.
+"""
+
+import operator
+from collections.abc import Callable, Iterable
+from typing import Any, Final
+
+from llvmlite import binding, ir
+from numba import config, types
+from numba.core import cgutils
+from numba.core.datamodel import models
+from numba.extending import intrinsic, overload, register_model
+
+LANES: Final = 16
+
+_INT32 = ir.IntType(32)
+intrinsic_of: Any = intrinsic
+_Signature = Any
+_Codegen = Callable[[Any, Any, Any, Any], Any]
+VectorCode = tuple[_Signature, _Codegen]
+"""What an intrinsic gives: its signature and what writes its LLVM code."""
+
+
+class Lanes(types.Type):
+    """Numba type of `count` integers of `bits` bits, or of as many float32."""
+
+    def __init__(self, bits: int, *, real: bool = False, count: int = LANES) -> None:
+        self.bits = bits
+        self.real = real
+        self.count = count
+        super().__init__(name=f"Lanes({'float' if real else 'int'}{bits} x {count})")
+
+    @property
+    def llvm(self) -> ir.VectorType:
+        """The LLVM type."""
+        return ir.VectorType(ir.FloatType() if self.real else ir.IntType(self.bits), self.count)
+
+
+@register_model(Lanes)
+class _LanesModel(models.PrimitiveModel):
+    """Lanes are passed about as the LLVM vector itself."""
+
+    def __init__(self, manager: Any, lanes: Lanes) -> None:
+        super().__init__(manager, lanes, lanes.llvm)  # type: ignore[no-untyped-call]
+
+
+BYTES = Lanes(8, count=2 * LANES)
+"""Two bytes a lane."""
+BLOCK = Lanes(8, count=8 * LANES)
+"""128 bytes, as many registers as they take."""
+INT16 = Lanes(16)
+FLOAT32 = Lanes(32, real=True)
+FOUR = Lanes(32, real=True, count=4)
+"""Four float32."""
+
+
+def splat(context: Any, builder: Any, lanes: Lanes, number_type: Any, number: Any) -> Any:
+    """A number as all of the lanes."""
+    element = types.float32 if lanes.real else types.Integer.from_bitwidth(lanes.bits, signed=True)
+    cast = context.cast(builder, number, number_type, element)
+    nothing = ir.Constant(lanes.llvm, ir.Undefined)
+    first = builder.insert_element(nothing, cast, ir.Constant(_INT32, 0))
+    return builder.shuffle_vector(first, nothing, place_list([0] * lanes.count))
+
+
+def place_list(indices: Iterable[int]) -> Any:
+    """Which elements a shuffle takes."""
+    places = list(indices)
+    return ir.Constant(ir.VectorType(_INT32, len(places)), places)
+
+
+def vector_name(vector: ir.VectorType) -> str:
+    """What LLVM calls a vector in the names of its intrinsics."""
+    return f"v{vector.count}" + ("f32" if isinstance(vector.element, ir.FloatType) else f"i{vector.element.width}")
+
+
+def called(builder: Any, name: str, result: Any, *args: Any) -> Any:
+    """The result of a call of an LLVM intrinsic."""
+    function_type = ir.FunctionType(result, [arg.type for arg in args])
+    function = cgutils.get_or_insert_function(builder.module, function_type, name)  # type: ignore[no-untyped-call]
+    return builder.call(function, args)
+
+
+def _binary(emit: Callable[[Any, Any, Any], Any]) -> Any:
+    """An operation of lanes with lanes or with a number."""
+
+    @intrinsic_of
+    def operation(typing: Any, a: Any, b: Any) -> VectorCode:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            left, right = args
+            if not isinstance(signature.args[1], Lanes):
+                right = splat(context, builder, signature.args[0], signature.args[1], right)
+            return emit(builder, left, right)
+
+        return a(a, b), code
+
+    return operation
+
+
+def _named(name: str) -> Any:
+    return _binary(lambda builder, a, b: called(builder, f"llvm.{name}.{vector_name(a.type)}", a.type, a, b))
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value.type.element, ir.FloatType)
+
+
+# Sums of a fixed number of products may be fused: every machine with the same instructions gives the same bits.
+_add = _binary(lambda b, x, y: b.fadd(x, y, flags=("contract",)) if _is_real(x) else b.add(x, y))
+_sub = _binary(lambda b, x, y: b.fsub(x, y, flags=("contract",)) if _is_real(x) else b.sub(x, y))
+_mul = _binary(lambda b, x, y: b.fmul(x, y, flags=("contract",)) if _is_real(x) else b.mul(x, y))
+
+add_saturated = _named("sadd.sat")
+"""add_saturated(a, b): signed sum that stops at the limits of the type instead of wrapping round."""
+sub_saturated = _named("ssub.sat")
+"""sub_saturated(a, b): signed difference that stops at the limits of the type."""
+larger = _named("smax")
+"""larger(a, b): the larger one of two integers in each lane."""
+larger_float = _named("maxnum")
+"""larger_float(a, b): the larger one of two float32 in each lane."""
+smaller = _named("smin")
+"""smaller(a, b): the smaller one of two integers in each lane."""
+smaller_float = _named("minnum")
+"""smaller_float(a, b): the smaller one of two float32 in each lane."""
+
+add_saturated_unsigned = _named("uadd.sat")
+"""add_saturated_unsigned(a, b): sum of unsigned integers that stops at the largest of the type."""
+sub_saturated_unsigned = _named("usub.sat")
+"""sub_saturated_unsigned(a, b): difference of unsigned integers that stops at 0."""
+smaller_unsigned = _named("umin")
+"""smaller_unsigned(a, b): the smaller one of two unsigned integers in each lane."""
+
+for _operator, _operation in (
+    (operator.add, _add),
+    (operator.sub, _sub),
+    (operator.mul, _mul),
+    (operator.truediv, _binary(lambda b, x, y: b.fdiv(x, y))),
+    (operator.and_, _binary(lambda b, x, y: b.and_(x, y))),
+    (operator.or_, _binary(lambda b, x, y: b.or_(x, y))),
+    (operator.rshift, _binary(lambda b, x, y: b.lshr(x, y))),
+    (operator.lshift, _binary(lambda b, x, y: b.shl(x, y))),
+):
+
+    def _overload(operation: Any) -> Any:
+        def of_lanes(a, b):  # type: ignore[no-untyped-def]
+            return (lambda a, b: operation(a, b)) if isinstance(a, Lanes) else None
+
+        return of_lanes
+
+    overload(_operator)(_overload(_operation))
+
+
+def conversion(to: Lanes, emit: Callable[[Any, Any], Any]) -> Any:
+    """An operation of lanes that gives lanes of another kind."""
+
+    @intrinsic_of
+    def convert(typing: Any, a: Any) -> VectorCode:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return emit(builder, args[0])
+
+        return to(a), code
+
+    return convert
+
+
+_WIDE = ir.VectorType(_INT32, LANES)
+
+
+as_bytes = conversion(BYTES, lambda builder, a: builder.bitcast(a, BYTES.llvm))
+"""as_bytes(a): the two bytes of each 16-bit lane."""
+to_int16 = conversion(INT16, lambda b, a: b.trunc(b.fptosi(a, _WIDE), INT16.llvm))
+"""to_int16(a): float32 lanes, which must fit, without their fraction."""
+to_float32 = conversion(FLOAT32, lambda b, a: b.sitofp(b.sext(a, _WIDE), FLOAT32.llvm))
+"""to_float32(a): 16-bit lanes as numbers."""
+square_root = conversion(FLOAT32, lambda b, a: called(b, f"llvm.sqrt.{vector_name(a.type)}", a.type, a))
+"""square_root(a): of float32 lanes."""
+
+
+def _has_avx2() -> bool:
+    """Whether numba compiles for a processor with AVX2: this one, unless its settings name another."""
+    settings: Any = config
+    if settings.CPU_NAME is None and settings.CPU_FEATURES is None:
+        return bool(binding.get_host_cpu_features().get("avx2", False))
+    return "+avx2" in (settings.CPU_FEATURES or "")
+
+
+@intrinsic_of
+def dot_pairs(typing: Any, counts: Any, weights: Any) -> VectorCode:
+    """dot_pairs(counts, weights): in each lane the sum of its two products, 16 bits, stopping at their limits.
+
+    counts: unsigned bytes; weights: signed.
+    """
+    # LLVM has no name of its own for what is one instruction on x86, and does not always recognise it.
+    one_instruction = _has_avx2()
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if one_instruction:
+            return called(builder, "llvm.x86.avx2.pmadd.ub.sw", INT16.llvm, *args)
+        nothing = ir.Constant(BYTES.llvm, ir.Undefined)
+
+        def product(place: int) -> Any:
+            places = place_list(range(place, 2 * LANES, 2))
+            n = builder.zext(builder.shuffle_vector(args[0], nothing, places), _WIDE)
+            return builder.mul(n, builder.sext(builder.shuffle_vector(args[1], nothing, places), _WIDE))
+
+        low, high = ir.Constant(_WIDE, [-32768] * LANES), ir.Constant(_WIDE, [32767] * LANES)
+        both = builder.add(product(0), product(1))
+        both = builder.select(builder.icmp_signed(">", both, low), both, low)
+        both = builder.select(builder.icmp_signed("<", both, high), both, high)
+        return builder.trunc(both, INT16.llvm)
+
+    return INT16(BYTES, BYTES), code
+
+
+def _constant(lanes: Lanes, number: float) -> Any:
+    @intrinsic_of
+    def constant(typing: Any) -> VectorCode:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return ir.Constant(lanes.llvm, [number] * lanes.count)
+
+        return lanes(), code
+
+    return constant
+
+
+zero_bytes = _constant(BYTES, 0)
+zero_int16 = _constant(INT16, 0)
+zero_float32 = _constant(FLOAT32, 0.0)
+zero_four = _constant(FOUR, 0.0)
+
+
+@intrinsic_of
+def smallest_byte(typing: Any, a: Any) -> VectorCode:
+    """smallest_byte(a): the smallest one of unsigned bytes."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return called(builder, f"llvm.vector.reduce.umin.{vector_name(args[0].type)}", ir.IntType(8), args[0])
+
+    return types.uint8(a), code
+
+
+def _extreme(name: str) -> Any:
+    @intrinsic_of
+    def extreme(typing: Any, a: Any) -> VectorCode:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            part = args[0]
+            while part.type.count > 1:
+                half = part.type.count // 2
+                parts = [builder.shuffle_vector(part, part, place_list(range(i, i + half))) for i in (0, half)]
+                part = called(builder, f"llvm.{name}.{vector_name(parts[0].type)}", parts[0].type, *parts)
+            return builder.extract_element(part, ir.Constant(_INT32, 0))
+
+        return types.float32(a), code
+
+    return extreme
+
+
+largest_float, smallest_float = _extreme("maxnum"), _extreme("minnum")
+"""largest_float(a), smallest_float(a): the largest, and the smallest, one of float32 lanes that is a number."""
+
+
+@intrinsic_of
+def where_small(typing: Any, values: Any, sizes: Any, limit: Any) -> VectorCode:
+    """where_small(values, sizes, limit): float32 lanes, 0 where the size is more than `limit` either way, or NaN."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        size = called(builder, f"llvm.fabs.{vector_name(FLOAT32.llvm)}", FLOAT32.llvm, args[1])
+        small = builder.fcmp_ordered("<=", size, splat(context, builder, FLOAT32, signature.args[2], args[2]))
+        return builder.select(small, args[0], ir.Constant(FLOAT32.llvm, [0.0] * LANES))
+
+    return FLOAT32(FLOAT32, FLOAT32, limit), code
+
+
+@intrinsic_of
+def where_below(typing: Any, values: Any, others: Any, sizes: Any, limits: Any) -> VectorCode:
+    """where_below(values, others, sizes, limits): float32 lanes, of `values` where the size is below the limit."""
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        limit = args[3]
+        if not isinstance(signature.args[3], Lanes):
+            limit = splat(context, builder, FLOAT32, signature.args[3], limit)
+        return builder.select(builder.fcmp_ordered("<", args[2], limit), args[0], args[1])
+
+    return FLOAT32(FLOAT32, FLOAT32, FLOAT32, limits), code
+
+
+@intrinsic_of
+def scaled(typing: Any, a: Any, weights: Any) -> VectorCode:
+    """scaled(a, weights): a * weights / 2^15 rounded to the nearest, of signed 16-bit lanes; not both -32768."""
+    one_instruction = _has_avx2()
+
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if one_instruction:
+            return called(builder, "llvm.x86.avx2.pmul.hr.sw", INT16.llvm, *args)
+        product = builder.mul(builder.sext(args[0], _WIDE), builder.sext(args[1], _WIDE))
+        half, places = ir.Constant(_WIDE, [1 << 14] * LANES), ir.Constant(_WIDE, [15] * LANES)
+        return builder.trunc(builder.ashr(builder.add(product, half), places), INT16.llvm)
+
+    return INT16(INT16, INT16), code
+
+
+_INT32_LANES = ir.VectorType(ir.IntType(32), LANES)
+
+UNPACKED: Final = (0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15)
+"""Which lane stands where after `from_bfloat16_unpacked`: the order that costs an x86 processor one instruction."""
+
+
+def _unpacked(builder: Any, bits: Any) -> Any:
+    # A zero in front of each number (at the lower address) is the lower half of a float32.
+    zeros = ir.Constant(bits.type, [0] * LANES)
+    pairs = [index for lane in UNPACKED for index in (LANES, lane)]
+    wide = builder.shuffle_vector(bits, zeros, place_list(pairs))
+    return builder.bitcast(wide, FLOAT32.llvm)
+
+
+def _as_float(builder: Any, bits: Any) -> Any:
+    wide = builder.shl(builder.zext(bits, _INT32_LANES), ir.Constant(_INT32_LANES, [16] * LANES))
+    return builder.bitcast(wide, FLOAT32.llvm)
+
+
+def _upper_half(builder: Any, a: Any) -> Any:
+    return builder.trunc(
+        builder.lshr(builder.bitcast(a, _INT32_LANES), ir.Constant(_INT32_LANES, [16] * LANES)), INT16.llvm
+    )
+
+
+from_bfloat16 = conversion(FLOAT32, _as_float)
+"""from_bfloat16(a): 16-bit patterns, the upper halves of float32 numbers, as those numbers."""
+from_bfloat16_unpacked = conversion(FLOAT32, _unpacked)
+"""from_bfloat16_unpacked(a): the same in the order UNPACKED."""
+to_bfloat16 = conversion(INT16, _upper_half)
+"""to_bfloat16(a): upper halves of float32 lanes as 16-bit patterns."""

@@ -1,0 +1,150 @@
+"""Compiled work on image rows, shared out between threads; kernels release the interpreter's lock while they run.
+
+The thread of one stage of the pipeline.
+"""
+
+import os
+import sys
+import threading
+import weakref
+from collections.abc import Callable
+from itertools import pairwise
+from queue import SimpleQueue
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+Work = Callable[[int, int], None]
+"""Called with the first row and the one behind the last."""
+_Job = tuple[Work, int, int]
+_LEAST_URGENT = 19
+
+
+class RowWorkers:
+    """Threads that share the rows of a picture, each one always the same: what it touched is still in its cache.
+
+    Work can be left with them (`post`): each goes through it in order, none waits for the others, and handing over
+    costs the caller little. Work that fails is raised again at the next call, and what was left behind it is not begun.
+    With one thread all is done at once. The threads end with `close`, or when nobody has the workers any more.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self.threads = max(1, threads)
+        self._state = _State(self.threads if self.threads > 1 else 0)
+        self._ended = weakref.finalize(self, _end, self._state)
+        for i, queue in enumerate(self._state.queues):
+            threading.Thread(target=_run, args=(self._state, queue, i), name=f"rows {i}", daemon=True).start()
+
+    def over(self, rows: int, work: Work) -> None:
+        """Call work(first, last) for ranges that cover rows 0..rows-1 once, behind all that was posted before."""
+        self.post(rows, work)
+        self.settle()
+
+    def post(self, rows: int, work: Work) -> None:
+        """The same without waiting for it."""
+        state = self._state
+        if not state.queues:
+            if rows:
+                work(0, rows)
+            return
+        if state.error is not None:
+            self.settle()
+        edges = np.linspace(0, rows, self.threads + 1).astype(int).tolist()
+        state.posted += 1
+        for queue, (first, last) in zip(state.queues, pairwise(edges), strict=True):
+            queue.put((work, first, last))
+
+    def settle(self, under_way: int = 0) -> None:
+        """Wait until no more than the last `under_way` posts are not done; all of them where one failed."""
+        state = self._state
+        if not state.queues:
+            return
+        wanted = state.posted - under_way
+        if min(state.done) < wanted or state.error is not None:
+            with state.changed:
+                state.wanted = wanted
+                state.changed.wait_for(lambda: min(state.done) >= (wanted if state.error is None else state.posted))
+        if state.error is not None:
+            error, state.error = state.error, None
+            raise error
+
+    def close(self) -> None:
+        """End the threads once all is done."""
+        self._ended()
+
+    def __enter__(self) -> Self:
+        """The workers themselves."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()
+
+
+class _State:
+    """What the threads know; they must not keep the workers themselves alive."""
+
+    def __init__(self, threads: int) -> None:
+        self.queues: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(threads)]
+        self.done = [0] * threads
+        self.posted = 0
+        self.wanted = 0
+        """Posts that the caller waits for."""
+        self.changed = threading.Condition()
+        self.error: BaseException | None = None
+        """The first failure, until the caller has been told and nothing is left over."""
+
+
+def yield_to_others() -> None:
+    """Let the calling thread work only while others leave a core idle, where the system knows priorities of threads.
+
+    Row threads work in step: one that shares its core with work of no hurry slows all of them.
+    """
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LEAST_URGENT)
+
+
+def _run(state: _State, queue: "SimpleQueue[_Job | None]", i: int) -> None:
+    while (job := queue.get()) is not None:
+        work, first, last = job
+        try:
+            if first < last and state.error is None:
+                work(first, last)
+        except BaseException as error:  # raised again on the caller's thread
+            with state.changed:
+                state.error = state.error or error
+        # Frames that the work holds must not outlive it.
+        del work, job
+        with state.changed:
+            state.done[i] += 1
+            # Whoever waits is not woken to find that others are not done.
+            if min(state.done) >= state.wanted or state.error is not None:
+                state.changed.notify_all()
+
+
+def _end(state: _State) -> None:
+    for queue in state.queues:
+        queue.put(None)
+
+
+class StageThread:
+    """Runs `run`, which handles all that it raises, once and beside the caller; a program that ends leaves it behind.
+
+    A run may fail before its threads are started: `join` may come without `start`.
+    """
+
+    def __init__(self, run: Callable[[], None], name: str) -> None:
+        self._thread = threading.Thread(target=run, name=name, daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for its end; False where it does not come."""
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
+        return not self._thread.is_alive()

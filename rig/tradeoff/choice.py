@@ -1,0 +1,154 @@
+"""Which setting to use: the least error within a time, or the least time within an error.
+
+A setting is judged by its worst among the scenes and fogs that were tried, since what is asked for has to hold in all
+of them.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from calibration.errors import digits
+from drivers.units import parse_quantity
+from rig.errors import UsageError
+from rig.tradeoff.rows import Clock, TradeoffRow, TrialSetting
+
+_PIXELS = re.compile(r"\s*(\d+\.?\d*(?:[eE][+-]?\d{1,3})?|\.\d+)\s*px\s*", re.ASCII)
+
+
+WORTH = 1.5
+"""Times the least error of all: what a longer scan would still take off is not worth its time to most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What is asked for: exactly one of a time and an error; of: whose time counts."""
+
+    time_ms: float | None = None
+    error_px: float | None = None
+    of: Clock = "sensor"
+
+    def __str__(self) -> str:
+        """In words."""
+        if self.time_ms is not None:
+            return f"at most {self.time_ms:g} ms of {self.of} time a map"
+        return f"at most {self.error_px:g} px of error"
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The setting to use, or where none does what was asked for, the nearest; figures of its worst scene and fog."""
+
+    wish: Wish
+    fits: bool
+    setting: TrialSetting
+    mean_abs_px: float
+    sensor_ms: float
+    compute_ms: float
+
+    def __str__(self) -> str:
+        """In words."""
+        if self.fits:
+            return f"for {self.wish}: {self.setting}: {self.figures}"
+        nearest = f"{self.setting}: {self.figures}"
+        return f"nothing tried gives {self.wish}; nearest is {nearest}; try other --exposures or --estimators"
+
+    @property
+    def figures(self) -> str:
+        """Error and times, in words."""
+        return (
+            f"{digits(self.mean_abs_px)} px in {digits(self.sensor_ms)} ms of sensor and "
+            f"{digits(self.compute_ms)} ms of computing a map"
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        wish = {"time_budget_ms": self.wish.time_ms, "error_px": self.wish.error_px, "of": self.wish.of}
+        return {"asked": wish, "fits": self.fits, **asdict(self.setting), **self._times()}
+
+    def _times(self) -> dict[str, float]:
+        return {"mean_abs_px": self.mean_abs_px, "sensor_ms": self.sensor_ms, "compute_ms": self.compute_ms}
+
+
+def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
+    """What two options ask for, None where neither is given. UsageError, a line per problem."""
+    problems = []
+    time_ms = error_px = None
+    if of not in ("sensor", "compute"):
+        problems.append(f"--of is {of!r}; the time is that of sensor or compute")
+    if time_budget is not None and error is not None:
+        problems.append("--time-budget and --error ask for two things; give one of them")
+    if time_budget is not None:
+        try:
+            time_ms = 1e3 * parse_quantity(time_budget, "time")
+        except ValueError as wrong:
+            problems.append(f"--time-budget {wrong}")
+    if error is not None:
+        match = _PIXELS.fullmatch(error)
+        if match is None:
+            problems.append(f"--error {error!r} is no number of pixels; write e.g. '0.1 px'")
+        else:
+            error_px = float(match[1])
+    for name, text, value in (("--time-budget", time_budget, time_ms), ("--error", error, error_px)):
+        if value is not None and value <= 0:
+            problems.append(f"{name} is {text}; it must be more than 0")
+    if problems:
+        raise UsageError.of(problems)
+    if time_ms is None and error_px is None:
+        return None
+    return Wish(time_ms, error_px, "compute" if of == "compute" else "sensor")
+
+
+def choose(rows: Sequence[TradeoffRow], wish: Wish) -> Choice | None:
+    """The setting to use; None where too many answers are missing in every one."""
+    by_setting: dict[TrialSetting, list[TradeoffRow]] = {}
+    for row in rows:
+        by_setting.setdefault(row.setting, []).append(row)
+    places = max((len(found) for found in by_setting.values()), default=0)
+    answers = [
+        _answer(wish, setting, found)
+        for setting, found in by_setting.items()
+        if len(found) == places and all(row.counts for row in found)
+    ]
+    if not answers:
+        return None
+
+    def time_ms(answer: Choice) -> float:
+        return answer.sensor_ms if wish.of == "sensor" else answer.compute_ms
+
+    fitting = [answer for answer in answers if answer.fits]
+    by_error = (wish.time_ms is not None) == bool(fitting)
+    if by_error:
+        return min(fitting or answers, key=lambda answer: (answer.mean_abs_px, time_ms(answer)))
+    return min(fitting or answers, key=lambda answer: (time_ms(answer), answer.mean_abs_px))
+
+
+def advice(rows: Sequence[TradeoffRow], wish: Wish | None, answer: Choice | None) -> str:
+    """Which setting to take, in a sentence: what was asked for, or where nothing was, the shortest scan whose error is
+    at most `WORTH` times the least of all. answer: to the wish.
+    """
+    if wish is not None and answer is not None:
+        return f"take {_named(answer)}, the best for {wish}" if answer.fits else str(answer)
+    least = choose(rows, Wish(error_px=0.0))
+    if least is None:
+        return "no setting can be named: every one leaves more than 5 % of the answers out; raise --exposures"
+    found = choose(rows, Wish(error_px=WORTH * least.mean_abs_px))
+    assert found is not None, "the one with the least error fits"
+    why = f"the shortest scan within {WORTH:g} times the least error, {digits(least.mean_abs_px)} px"
+    return f"take {_named(found)}; {why}"
+
+
+def _named(answer: Choice) -> str:
+    setting = answer.setting
+    filtered = "" if setting.filter == "none" else f" + {setting.filter}"
+    lines = "" if setting.lines == 1 else f" and {setting.lines} lines"
+    return f"K = {setting.exposures} with {setting.estimator}{filtered}{lines}: {answer.figures}"
+
+
+def _answer(wish: Wish, setting: TrialSetting, rows: Sequence[TradeoffRow]) -> Choice:
+    error_px = max(row.mean_abs_px for row in rows)
+    sensor_ms, compute_ms = max(row.sensor_ms for row in rows), max(row.compute_ms for row in rows)
+    time_ms = sensor_ms if wish.of == "sensor" else compute_ms
+    fits = (wish.time_ms is None or time_ms <= wish.time_ms) and (wish.error_px is None or error_px <= wish.error_px)
+    return Choice(wish, fits, setting, error_px, sensor_ms, compute_ms)

@@ -1,0 +1,237 @@
+"""Which physical effects a simulated scene calls for and what each is worth: the world's word, and trials of ours."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.clock import VirtualClock
+from drivers.errors import DeviceError
+from drivers.interfaces import World
+from drivers.registry import Surroundings, lookup
+from rig.config.models import RigConfig
+from rig.devices.open import ProjectsLines
+from rig.errors import PlanError, UsageError
+from rig.geometry.line_grid import line_grid
+from rig.geometry.stripe_table import MISSING_PX, charged_errors
+from rig.plan.scan_plan import column_command
+from rig.progress import Progress, part
+
+Array = NDArray[np.float64]
+Flux = dict[str, NDArray[Any]]
+"""x_px, total and the parts of the total by effect, (width,) each, photons per exposure."""
+
+TRIAL_COLUMNS = 40
+"""Columns of a trial scan, over the config's range: some 10^4 rows with a stripe."""
+
+
+@runtime_checkable
+class ReportsEffects(World, Protocol):
+    """A world that can say what its effects are worth."""
+
+    def effects_report(self, power_w: float, exposure_s: float, exposures: int) -> Mapping[str, Any]:
+        """planned_for, changed_decisions_bound, and effects: a mapping each, keys as the first fields of `Effect`, and
+        `removable`: whether `effects` of the world's config may leave it out.
+        """
+        ...
+
+    def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
+        """Choose what is simulated, as for a scan of frames of that exposure, so many to a column, at that power."""
+        ...
+
+    def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
+        """Photons per exposure of an image row with the mirror at a command, (width,) for each effect."""
+        ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and width."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One effect in one scene.
+
+    on, why: whether it is simulated, and the reason. share: of all detected photons. changed_decisions_bound: the share
+    of decisions that can change at most without it, None where there is no bound. cost_us_per_frame: of one thread;
+    None: it is worked in elsewhere. stripe_error_change_px: how much larger the mean stripe error is with it than
+    without it, and its standard error; `basis` says whether that was measured in a pair of trial scans or is the bound
+    of an effect that is left out; None: neither.
+    """
+
+    effect: str
+    on: bool
+    why: str
+    share: float
+    changed_decisions_bound: float | None
+    cost_us_per_frame: float | None
+    stripe_error_change_px: float | None = None
+    stripe_error_change_sd_px: float | None = None
+    basis: Literal["trial", "bound"] | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneEffects:
+    """The effects of a scene. planned_for: the most power_w, exposure_s and exposures of a column that the choice of
+    effects holds for; changed_decisions_bound: of all that it leaves out together.
+    """
+
+    planned_for: Mapping[str, float]
+    changed_decisions_bound: float
+    effects: tuple[Effect, ...]
+
+    def __iter__(self) -> Iterator[Effect]:
+        """The effects."""
+        return iter(self.effects)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def scene_effects(config: RigConfig, *, trials: bool = True, progress: Progress | None = None) -> SceneEffects:
+    """The effects of a config's scene at its scan's power, exposure and exposures. UsageError without a world.
+
+    trials: measure by how much each effect changes the stripe error; progress: called with trial scans done and all.
+    """
+    scan = config.scan
+    with open_world(config) as (world, power_w):
+        report = world.effects_report(power_w, scan.exposure_s, scan.exposures)
+    lines = list(report["effects"])
+    removable = [line.pop("removable") for line in lines]
+    effects = [Effect(**line) for line in lines]
+    if trials:
+        on = [effect.effect for effect in effects if effect.on]
+        tried = [e.effect for e, can in zip(effects, removable, strict=True) if e.on and can]
+        changes = _trials(config, on, tried, progress)
+        effects = [_with_change(effect, changes) for effect in effects]
+    return SceneEffects(report["planned_for"], report["changed_decisions_bound"], tuple(effects))
+
+
+def flux_row(config: RigConfig, row: int, column: int) -> Flux:
+    """Noise-free photons per exposure of one image row while the line is at a column's centre.
+
+    x_px: pixels (width,); total; and by name what each effect of light and dark counts brings, zeros for those that are
+    off; they add up to the total. UsageError for a row or column that is not there.
+    """
+    scan = config.scan
+    with open_world(config) as (world, power_w):
+        rows, width = world.size
+        problems = [
+            f"{name} is {value}; the {whole} has {name}s 0 to {count - 1}"
+            for name, value, whole, count in (("row", row, "camera", rows), ("column", column, "scan", scan.columns))
+            if not 0 <= value < count
+        ]
+        if problems:
+            raise UsageError.of(problems)
+        command = _mirror_command(config, column)
+        parts = world.flux_row(row, command, power_w, scan.exposure_s)
+    return {"x_px": np.arange(width), "total": sum(parts.values(), np.zeros(width)), **parts}
+
+
+def _mirror_command(config: RigConfig, column: int) -> float:
+    """Where the mirror stands while a column is lit."""
+    scan, offsets = config.scan, config.line_offsets
+    if len(offsets) > 1:
+        grid, _ = line_grid(offsets, scan.columns, scan.command_range)
+        column = int(grid.place[column])
+    return float(column_command(column, scan.command_range, scan.columns // len(offsets)))
+
+
+@contextmanager
+def open_world(config: RigConfig) -> Iterator[tuple[ReportsEffects, float]]:
+    """The config's world, planned for its scan, with its simulated devices, and the scan's power in W."""
+    if config.world is None:
+        raise UsageError(f"{config.name} has no simulated world; name a config that has one, such as 'simulated'")
+    alone = Surroundings(VirtualClock(), None, 0)
+    with ExitStack() as stack:
+        try:
+            world: Any = lookup("world", config.world.kind).create(config.world, alone)
+        except DeviceError as error:  # a scene that is not there is the config's fault
+            raise UsageError(f"world: {error}") from error
+        if isinstance(world, ProjectsLines):
+            world.project_lines(config.line_offsets, shared=config.line_power == "shared")
+        if hasattr(world, "close"):
+            stack.enter_context(closing(world))
+        if not isinstance(world, ReportsEffects):
+            raise UsageError(f"world {config.world.kind} says nothing of its effects")
+        for slot in ("spad", "scanner", "laser", "sync"):
+            device = getattr(config, slot)
+            if not device.real_time:  # a simulated one tells the world what it does
+                stack.enter_context(lookup(slot, device.kind).create(device, replace(alone, world=world)))
+        # As a scan does: the laser's limit. One that is not there states it in its config.
+        power_w = getattr(config.laser, "max_power", None) if config.scan.power is None else config.scan.power
+        if power_w is None:
+            raise UsageError(f"{config.name} states no laser power; add for example 'power: 20 mW' under scan")
+        world.plan_for(power_w, config.scan.exposure_s, config.scan.exposures)
+        yield world, power_w
+
+
+def _trials(
+    config: RigConfig, on: list[str], tried: list[str], progress: Progress | None
+) -> dict[str, tuple[float, float]]:
+    """By how many px the mean stripe error grows with each effect, and the standard error: pairs of short scans, same
+    random numbers, all other effects on. Empty for a world that lives in the host's time.
+    """
+    if config.world is None or config.world.real_time:
+        return {}
+    columns = min(TRIAL_COLUMNS - TRIAL_COLUMNS % -len(config.line_offsets), config.scan.columns)
+    trials = 1 + len(tried)
+    while True:
+        try:
+            with part(f"trial scan 1 of {trials}"):
+                whole = _trial(config, columns, on)
+            break
+        except PlanError:  # the mirror cannot sweep as fast
+            if columns == config.scan.columns:
+                raise
+            columns = min(2 * columns, config.scan.columns)
+    changes = {}
+    for done, name in enumerate(tried, 1):
+        if progress is not None:
+            progress(done, trials)
+        with part(f"trial scan {done + 1} of {trials}"):
+            change = whole - _trial(config, columns, [other for other in on if other != name])
+        per_column = [float(np.nanmean(each)) for each in change.T if np.isfinite(each).any()]
+        if per_column:
+            spread = float(np.std(per_column, ddof=1)) if len(per_column) > 1 else float("nan")
+            changes[name] = float(np.nanmean(change)), spread / len(per_column) ** 0.5
+    return changes
+
+
+def _trial(config: RigConfig, columns: int, names: list[str]) -> Array:
+    """Charged stripe errors of a scan with so many columns and these effects. An interrupt is raised again."""
+    from rig.devices.open import open_rig
+    from rig.run_folder.summary import MapTally
+    from rig.scan.run import Run
+    from rig.scan.scan import run_scan
+
+    assert config.world is not None, "there was a report"
+    world = config.world.model_copy(update={"effects": tuple(names)})
+    short = config.scan.model_copy(update={"columns": columns})
+    settings = config.model_copy(update={"world": world, "scan": short})
+    tally = MapTally(columns, short.exposures, settings.estimate.estimator, settings.estimate.filter)
+    with Run(None, tally) as run, open_rig(settings) as rig:
+        result = run_scan(rig, run, 1, 0).uninterrupted()
+    last, truth = result.last, result.truth
+    assert last is not None, "one map was asked for"
+    assert truth is not None, "worlds know it"
+    return charged_errors(last.stripe.x_px, truth.x_px)
+
+
+def _with_change(effect: Effect, changes: Mapping[str, tuple[float, float]]) -> Effect:
+    if effect.effect in changes:
+        change, sd = changes[effect.effect]
+        return replace(effect, stripe_error_change_px=change, stripe_error_change_sd_px=sd, basis="trial")
+    if not effect.on and effect.changed_decisions_bound is not None:
+        most_px = MISSING_PX * effect.changed_decisions_bound
+        return replace(effect, stripe_error_change_px=most_px, basis="bound")
+    return effect

@@ -1,0 +1,117 @@
+"""The files of a trade-off: tradeoff.json, .csv and .svg, and setting.yaml, the setting to use as a config.
+
+A trade-off as a picture: error over sensor time and over compute time, a pair of panels for each scene and fog.
+"""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+
+import yaml
+
+from rig.config.files import portable_content
+from rig.config.models import RigConfig
+from rig.run_folder.charts import Panel, Series, chart_svg
+from rig.run_folder.folder import RunFolder
+from rig.scan.run import versions
+from rig.tradeoff.rows import Clock, TradeoffRow
+from rig.tradeoff.trials import Tradeoff
+
+COLOURS = {"argmax": "#7b8896", "edge": "#d55e00", "likelihood": "#0072b2", "joint": "#009e73"}
+"""Of estimators; told apart by the colour-blind too (Okabe and Ito, 'Color universal design', 2008)."""
+OTHER_COLOUR = "#cc79a7"
+
+
+def tradeoff_svg(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
+    """The SVG file. Rows with too many answers missing are left out."""
+    places = list(dict.fromkeys((row.scene, row.fog) for row in rows))
+    shown = [row for row in rows if row.counts]
+    panels = [
+        _panel([row for row in shown if (row.scene, row.fog) == place], _named(*place), of)
+        for place in places
+        for of in ("sensor", "compute")
+    ]
+    notes = [
+        "Numbers at points: exposures of a column. Bars: 95 % interval of the mean, over " + ci95_by + ".",
+        "Yellow: nothing else has less error in as little time. Missing answers count as 10 px.",
+    ]
+    if len(shown) < len(rows):
+        notes.append(f"Not shown, for more than 5 % of missing answers: {len(rows) - len(shown)} of {len(rows)} rows.")
+    return chart_svg(panels, title="What accuracy costs in time", notes=notes)
+
+
+def colour_of(estimator: str) -> str:
+    """An estimator's colour, in every picture the same."""
+    return COLOURS.get(estimator, OTHER_COLOUR)
+
+
+def _named(scene: str, fog: str | None) -> str:
+    short = scene.rstrip("/").rsplit("/", 1)[-1]
+    return short if fog is None else f"{short}, {'clear air' if fog == 'clear' else f'visibility {fog}'}"
+
+
+def _panel(rows: Sequence[TradeoffRow], place: str, of: Clock) -> Panel:
+    curves: dict[tuple[str, str, int], list[TradeoffRow]] = {}
+    for row in sorted(rows, key=lambda row: row.exposures):
+        curves.setdefault((row.estimator, row.filter, row.lines), []).append(row)
+    front = sorted(
+        (row.time_ms(of), row.mean_abs_px) for row in rows if (row.pareto if of == "sensor" else row.pareto_compute)
+    )
+    return Panel(
+        title=place,
+        x_label=f"{of} time of a map, ms",
+        y_label="mean error, px",
+        series=[_series(key, found, of) for key, found in curves.items()],
+        front=front,
+    )
+
+
+def _series(key: tuple[str, str, int], rows: Sequence[TradeoffRow], of: Clock) -> Series:
+    estimator, filter, lines = key
+    label = estimator + ("" if filter == "none" else f" + {filter}") + ("" if lines == 1 else f", {lines} lines")
+    return Series(
+        label=label,
+        colour=colour_of(estimator),
+        points=[(row.time_ms(of), row.mean_abs_px) for row in rows],
+        intervals=[row.ci95 for row in rows],
+        names=[str(row.exposures) for row in rows],
+        dashed=filter != "none",
+    )
+
+
+SETTING_FILE = "setting.yaml"
+
+
+def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) -> Tradeoff:
+    """Write everything and make the folder appear; the trade-off with its folder. setting: of the answer."""
+    folder.write_json("tradeoff.json", {**done.as_json(), "versions": versions()})
+    folder.write_text("tradeoff.csv", csv_text(done.rows))
+    folder.write_text("tradeoff.svg", tradeoff_svg(done.rows, done.ci95_by))
+    if setting is not None:
+        comments = [f"rig tradeoff: {done.answer}"]
+        if done.accepted_calibration:
+            comments.append("its calibration was accepted all the same: scan with --accept-calibration")
+        folder.write_text(SETTING_FILE, config_text(setting, comments))
+    return replace(done, folder=folder.publish())
+
+
+def csv_text(rows: Sequence[TradeoffRow]) -> str:
+    """A line for each row, columns as in the JSON; the interval in two columns."""
+    stream = io.StringIO()
+    writer: csv.DictWriter[str] | None = None
+    for row in rows:
+        content = row.as_json()
+        low, high = content.pop("ci95")
+        line = {**content, "ci95_low": low, "ci95_high": high}
+        if writer is None:
+            writer = csv.DictWriter(stream, line.keys(), lineterminator="\n")
+            writer.writeheader()
+        writer.writerow(line)
+    return stream.getvalue()
+
+
+def config_text(config: RigConfig, comments: Sequence[str]) -> str:
+    """A config as a YAML file that every command takes, wherever it lies."""
+    head = "".join(f"# {comment}\n" for comment in comments)
+    return head + yaml.safe_dump(portable_content(config), sort_keys=False, allow_unicode=True)

@@ -1,0 +1,203 @@
+"""One simulated scan that serves several estimators: its frames are kept, and every estimator makes its maps of them.
+
+The first map is learned from. The frames of the last one are counted and estimated when the SPAD stands still, so that
+times are those of the work alone, as on a rig whose frames are not computed by the same machine. Only the pixels that
+the plan uses are kept, as a SPAD would send them that sends windows.
+"""
+
+import os
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.config.models import RigConfig
+from rig.count.volume import Counter, FrameTally, SweepLayout, SweepTally
+from rig.depth.reconstruct import MapResult, Reconstructor
+from rig.depth.warm_up import warm_binding, warm_up
+from rig.devices.open import OpenRig, open_rig, prepare
+from rig.errors import UsageError
+from rig.estimate.registry import LEARNING
+from rig.geometry.stripe_table import StripeTable
+from rig.geometry.windows import WORD_PX
+from rig.plan.scan_plan import ScanPlan
+from rig.scan.acquisition import Acquisition, told_of
+from rig.scan.scan import make_reconstructor
+from rig.tradeoff.rows import MapScore, score_map
+
+MAPS = 2
+"""The first one is learned from, the last one is scored."""
+TIMED_PASSES = 3
+"""How often the last map is made, for the median of its time."""
+LONG_S = 1.0
+"""Passes that take longer than that together are enough."""
+MOST_KEPT_BYTES = 2_000_000_000
+"""Of frames of one sweep in memory."""
+
+Block = tuple[NDArray[np.uint8], NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]
+"""What a `Counter` takes: bits, bins, columns, x0."""
+Method = tuple[str, str]
+"""Estimator and filter."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeptSweep(FrameTally):
+    """The frames of a sweep themselves."""
+
+    blocks: list[Block]
+
+
+class FrameKeeper:
+    """The `Counter` that keeps the frames of a sweep, as far as the plan uses them."""
+
+    def __init__(self, layout: SweepLayout) -> None:
+        self._layout = layout
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin the next sweep."""
+        self._tally = SweepTally(self._layout)
+        self._blocks: list[Block] = []
+
+    def add(
+        self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
+    ) -> None:
+        """Keep frames, see `Counter`."""
+        self._tally.note(bins, column, x0 // np.int32(WORD_PX))
+        self._blocks.append((self._used(bits, x0), bins.copy(), column.copy(), x0.copy()))
+
+    def settle(self, under_way: int = 0) -> None:
+        """Nothing is read on after `add`."""
+
+    def finish(self) -> KeptSweep:
+        """The sweep's frames."""
+        tally = self._tally.finish()
+        return KeptSweep(
+            n_frames=tally.n_frames, column=tally.column, dark_counts=tally.dark_counts, n_dark=tally.n_dark,
+            width=tally.width, dark_frames=tally.dark_frames, blocks=self._blocks,
+        )  # fmt: skip
+
+    def _used(self, bits: NDArray[np.uint8], x0: NDArray[np.int32]) -> NDArray[np.uint8]:
+        frames, rows, row_bytes = bits.shape
+        used_bytes = self._layout.used_words * WORD_PX // 8
+        if row_bytes == used_bytes:
+            return bits.copy()
+        used = np.empty((frames, rows, used_bytes), np.uint8)
+        ends = np.flatnonzero(np.diff(x0, append=-1)) + 1
+        for first, end in zip((0, *ends[:-1]), ends, strict=True):
+            begin = int(x0[first]) // 8
+            used[first:end] = bits[first:end, :, begin : begin + used_bytes]
+        return used
+
+
+class ManyMakers:
+    """Makes the maps of several estimators and filters of the same frames; takes the place of a `Reconstructor`."""
+
+    def __init__(self, makers: Mapping[str, Reconstructor], filters: Sequence[str]) -> None:
+        self._makers = makers
+        self._filters = filters
+        self._counters: dict[str, Counter] = {}
+        self._maps = 0
+        self.results: dict[Method, tuple[MapResult, float]] = {}
+        """Of the last map: result, and seconds that counting and estimating took."""
+
+    def counter(self, layout: SweepLayout) -> FrameKeeper:
+        """What keeps the frames."""
+        self._counters = {name: maker.counter(layout) for name, maker in self._makers.items()}
+        return FrameKeeper(layout)
+
+    def map(self, sweep: FrameTally) -> MapResult:
+        """The first map is learned from, the last one made by all; gives back one of them."""
+        assert isinstance(sweep, KeptSweep), "made by the counter above"
+        self._maps += 1
+        last = self._maps == MAPS
+        names = list(self._makers)
+        if not last:  # there is nothing to learn for the others
+            names = [name for name in names if name in LEARNING] or names[:1]
+        for name in names:
+            made = self._timed(name, sweep, TIMED_PASSES if last else 1)
+            self.results |= {(name, filter): each for filter, each in made.items()} if last else {}
+        sweep.blocks.clear()  # the next sweep's frames need the room
+        return next(iter(made.values()))[0]
+
+    def _timed(self, name: str, sweep: KeptSweep, passes: int) -> dict[str, tuple[MapResult, float]]:
+        """What the first of some passes gave, and the median of their seconds."""
+        begun = time.perf_counter()
+        made = [self._all_filters(name, sweep)]
+        while len(made) < passes and time.perf_counter() - begun < LONG_S:
+            made.append(self._all_filters(name, sweep))
+        return {
+            filter: (made[0][filter], statistics.median(each[filter].compute_s for each in made)) for filter in made[0]
+        }
+
+    def _all_filters(self, name: str, sweep: KeptSweep) -> dict[str, MapResult]:
+        stripe, counted, estimate_s = self._estimate(name, sweep)
+        return {filter: self._makers[name].complete(stripe, counted, filter, estimate_s) for filter in self._filters}
+
+    def _estimate(self, name: str, sweep: KeptSweep) -> tuple[StripeTable, FrameTally, float]:
+        """Stripe table, what was counted, and the seconds that counting and estimating took."""
+        maker, counter = self._makers[name], self._counters[name]
+        begun = time.perf_counter()
+        counter.reset()
+        for block in sweep.blocks:
+            counter.add(*block)
+        counted = replace(counter.finish(), velocity_per_s=sweep.velocity_per_s)
+        stripe = maker.estimator.estimate(counted, maker.geometry)
+        return stripe, counted, time.perf_counter() - begun
+
+
+def score_methods(
+    config: RigConfig,
+    estimators: Sequence[str],
+    filters: Sequence[str],
+    seed: int,
+    on_frames: Callable[[int, int], None] | None = None,
+) -> dict[Method, MapScore]:
+    """Scan once with a simulated rig and score what each estimator, with each filter, makes of the same frames.
+
+    on_frames: told how many frames have been taken and how many there will be.
+    """
+    with open_rig(config, seed=seed) as rig:
+        assert rig.world is not None, "only simulated rigs are tried"
+        plan, timing = prepare(rig)
+        for estimator in estimators:
+            for filter in filters:
+                warm_up(estimator, filter, plan.exposures, dark=True)
+        warm_binding(plan)
+        maker = ManyMakers({name: _maker(rig, plan, name) for name in estimators}, filters)
+        told = told_of(None if on_frames is None else lambda done: on_frames(done.frames, done.frames_planned))
+        learns = not LEARNING.isdisjoint(estimators)
+        running = Acquisition(rig, plan, timing, MAPS, maker, learns=learns, on_progress=told).run()
+        with closing(running):
+            last = [found for found in running][-1]
+        truth = rig.world.truth(plan.line_commands(last.column), plan.velocity_per_s(last.sweep.direction))
+    expected = last.sweep.frames.expected
+    sensor_ms = 1e3 * (expected / float(plan.frame_rate_hz) + plan.readout_s(expected))
+    return {
+        method: score_map(result, truth, sensor_ms, 1e3 * compute_s)
+        for method, (result, compute_s) in maker.results.items()
+    }
+
+
+def require_plan(config: RigConfig) -> None:
+    """UsageError where there is no such scan, or its frames are too many to be kept."""
+    with open_rig(config) as rig:
+        plan, _ = prepare(rig)
+    frame = plan.rows * (plan.used_px or plan.width) // 8
+    kept = float(plan.frames_per_sweep) * frame
+    if kept > MOST_KEPT_BYTES:
+        most = int(plan.exposures * MOST_KEPT_BYTES / kept)
+        raise UsageError(
+            f"{plan.exposures} exposures make {kept / 1e9:.3g} GB of frames a sweep, at most "
+            f"{MOST_KEPT_BYTES / 1e9:g} GB are kept for all estimators; leave out --exposures above {most}"
+        )
+
+
+def _maker(rig: OpenRig, plan: ScanPlan, estimator: str) -> Reconstructor:
+    estimate = rig.config.estimate.model_copy(update={"estimator": estimator})
+    config = rig.config.model_copy(update={"estimate": estimate})
+    return make_reconstructor(replace(rig, config=config), plan, estimate.threads or os.cpu_count() or 1)

@@ -1,0 +1,205 @@
+"""What accuracy costs in time: scans of a simulated rig over settings, scored by the world's truth."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count, product, starmap
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeVar
+
+from rig.config.models import RigConfig
+from rig.errors import UsageError
+from rig.estimate.registry import ESTIMATORS, FILTERS
+from rig.progress import Progress, part, tell_stage
+from rig.tradeoff.choice import Choice, Wish, advice, choose
+from rig.tradeoff.limits import SceneLimits
+from rig.tradeoff.rows import MapScore, TradeoffRow, TrialSetting, row_of, with_fronts
+from rig.tradeoff.scan import MAPS, Method, require_plan, score_methods
+
+Made = TypeVar("Made")
+
+
+class Trial(NamedTuple):
+    """What one scan is of. scene, lines: None: as the config says; fog: None: as the scene says."""
+
+    scene: str | None
+    fog: str | None
+    exposures: int
+    lines: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Trials:
+    """What is to be tried: every scene in every fog, with every number of exposures and lines, estimator and filter.
+
+    config_of: makes the config of one of them. repeat: scans of each, seeds `seed`, `seed` + 1 and so on.
+    """
+
+    config_of: Callable[[Trial], RigConfig]
+    scenes: Sequence[str | None]
+    fogs: Sequence[str | None]
+    exposures: Sequence[int]
+    lines: Sequence[int | None]
+    estimators: Sequence[str]
+    filters: Sequence[str]
+    repeat: int
+    seed: int
+    limits: bool
+
+    def __iter__(self) -> Iterator[Trial]:
+        """Every one once; repeats are scans of their own."""
+        return starmap(Trial, product(self.scenes, self.fogs, self.exposures, self.lines))
+
+    def first(self) -> Trial:
+        """One of them, of the lines that the config has."""
+        return next(iter(self))._replace(lines=None)
+
+    def configs(self) -> dict[Trial, RigConfig]:
+        """The config of each. UsageError with all that is wrong with any."""
+        return _all_or_problems(self, self.config_of)
+
+    def require_plans(self) -> None:
+        """UsageError with all that stands against scanning so: of the fewest and the most exposures everywhere."""
+        ends = {min(self.exposures), max(self.exposures)}
+        configs = self.configs()
+        _all_or_problems(
+            [trial for trial in self if trial.exposures in ends], lambda trial: require_plan(configs[trial])
+        )
+
+
+def _all_or_problems(trials: Iterable[Trial], make: Callable[[Trial], Made]) -> dict[Trial, Made]:
+    found: dict[Trial, Made] = {}
+    problems: list[str] = []
+    for trial in trials:
+        try:
+            found[trial] = make(trial)
+        except UsageError as error:
+            problems += error.problems
+    if problems:
+        raise UsageError.of(problems)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Tradeoff:
+    """Rows of all settings; answer: the setting to use, where one was asked for and any counts.
+
+    ci95_by: what the intervals are over. verdict: aborted where an interrupt ended it; the rows are those that were
+    whole by then. folder: where everything was written, None where nothing was. accepted_calibration: what the
+    calibration was used in spite of.
+    """
+
+    rows: tuple[TradeoffRow, ...]
+    ci95_by: Literal["repeats", "blocks of a map"]
+    wish: Wish | None
+    answer: Choice | None
+    verdict: Literal["complete", "aborted"]
+    folder: Path | None = None
+    accepted_calibration: tuple[str, ...] = ()
+
+    @property
+    def advice(self) -> str:
+        """Which setting to take, in a sentence."""
+        of = "of what was whole by then, " if self.verdict == "aborted" else ""
+        return of + advice(self.rows, self.wish, self.answer)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; `answer` only where a setting was asked for."""
+        content: dict[str, Any] = {
+            "advice": self.advice,
+            "rows": [row.as_json() for row in self.rows],
+            "ci95_by": self.ci95_by,
+        }
+        if self.wish is not None:
+            content["answer"] = None if self.answer is None else self.answer.as_json()
+        if self.accepted_calibration:
+            content["accepted_calibration"] = list(self.accepted_calibration)
+        return {**content, "verdict": self.verdict}
+
+
+def run_tradeoff(trials: Trials, wish: Wish | None, progress: Progress | None = None) -> Tradeoff:
+    """Scan and score all of it. progress: called with frames taken and all, those on columns.
+
+    An interrupt ends it after the last whole row; before there is one it is raised.
+    """
+    rows: list[TradeoffRow] = []
+    verdict: Literal["complete", "aborted"] = "complete"
+    try:
+        for found in _rows(trials, progress):
+            rows += found
+    except KeyboardInterrupt:
+        if not rows:
+            raise
+        verdict = "aborted"
+    done = with_fronts(rows)
+    return Tradeoff(
+        rows=done,
+        ci95_by="repeats" if trials.repeat > 1 else "blocks of a map",
+        wish=wish,
+        answer=None if wish is None else choose(done, wish),
+        verdict=verdict,
+    )
+
+
+def require_methods(estimators: Sequence[str], filters: Sequence[str]) -> list[str]:
+    """What is wrong with names of estimators and filters."""
+    return [
+        f"{what} {name!r} is unknown; choose of {', '.join(known)}"
+        for what, names, known in (("estimator", estimators, ESTIMATORS), ("filter", filters, FILTERS))
+        for name in names
+        if name not in known
+    ]
+
+
+def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRow]]:
+    """The rows of one trial after the other."""
+    configs = trials.configs()
+    bar = _Bar(progress, trials.repeat * sum(map(_frames_of, configs.values())))
+    limits = SceneLimits(trials.exposures)
+    scans = len(configs) * trials.repeat
+    numbers = count(1)
+    for trial, config in configs.items():
+        scores: dict[Method, list[MapScore]] = {}
+        for seed in range(trials.seed, trials.seed + trials.repeat):
+            with part(f"scan {next(numbers)} of {scans}"):
+                found = score_methods(config, trials.estimators, trials.filters, seed, bar.within(_frames_of(config)))
+            for method, score in found.items():
+                scores.setdefault(method, []).append(score)
+            bar.add(_frames_of(config))
+        scene = str(getattr(config.world, "scene", "")) if trial.scene is None else trial.scene
+        lines = len(config.line_offsets)
+        rows = [
+            row_of(scene, trial.fog, TrialSetting(*method, trial.exposures, lines), each)
+            for method, each in scores.items()
+        ]
+        if trials.limits:
+            tell_stage("finding what the light allows")
+        yield limits.beside(rows, config) if trials.limits else rows
+
+
+def _frames_of(config: RigConfig) -> int:
+    """Frames on columns of one scan."""
+    return MAPS * config.scan.columns * config.scan.exposures // len(config.line_offsets)
+
+
+class _Bar:
+    """Progress in frames on columns."""
+
+    def __init__(self, progress: Progress | None, total: int) -> None:
+        self._progress = progress
+        self._total = total
+        self._done = 0
+
+    def within(self, frames: int) -> Callable[[int, int], None] | None:
+        """What a scan of so many is to tell how far it is."""
+        if self._progress is None:
+            return None
+        return lambda done, planned: self._tell(self._done + frames * min(1.0, done / max(planned, 1)))
+
+    def add(self, frames: int) -> None:
+        """A scan of so many is done."""
+        self._done += frames
+        self._tell(self._done)
+
+    def _tell(self, done: float) -> None:
+        if self._progress is not None:
+            self._progress(round(done), self._total)

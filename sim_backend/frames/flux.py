@@ -1,0 +1,146 @@
+"""The flux of every pixel: detected photons per exposure for one mirror command, from the effects that are run.
+
+    lambda = exposure (steady + share power sheet),     p = 1 - exp(-lambda)
+
+share is the part of the exposure during which the gate let light out. `steady` is made once, `sheet` once per command
+(what that costs: `sim_backend.frames.photons`).
+
+Mirror positions at which the flux is computed: frames of one column share one.
+
+Tracing the light costs more than drawing a frame, so the frames that the mirror spends in one cell of a grid all get
+their mean position. A mean over a column's frames, which is what is counted and bound, is then that of a mirror that
+moves on, wherever in their column the frames happen to lie. Told the columns' commands the cells are the columns; not
+told, the command range is divided finely, four cells per pixel of width.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backend.effects.catalogue import CATALOGUE, Entry
+from sim_backend.effects.setting import BitEffect, LaserEffect, Setting
+from sim_backend.light.sheet import LightSheet
+
+Array = NDArray[np.float64]
+
+
+class FluxModel:
+    """Sums the effects of one rig in one scene. Reads only; any thread may use it."""
+
+    def __init__(self, setting: Setting, entries: Sequence[Entry] | None = None) -> None:
+        """entries: the effects to use, in the catalogue's order; by default all that the scene calls for."""
+        if entries is None:
+            entries = [entry for entry in CATALOGUE if entry.called(setting)[0]]
+        self.setting = setting
+        loaded = {entry: entry.load()(setting) for entry in entries if entry.kind != "within"}
+        self.laser: Mapping[str, LaserEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "laser"}
+        """By name, in the order in which they add: a later one may act on what the earlier ones brought."""
+        self.steady: Mapping[str, Array] = {e.name: effect.rate() for e, effect in loaded.items() if e.kind == "steady"}
+        """Detections per second (rows, width) by name."""
+        self.bits: Mapping[str, BitEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "bits"}
+        """What the sensor does to the bits, by name, in the order in which it does."""
+        self.steady_per_s: Array = sum(self.steady.values(), np.zeros(setting.view.u.shape))
+        """Detections per second without the laser, float64 (rows, width)."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The effects whose code runs."""
+        return (*self.laser, *self.steady, *self.bits)
+
+    @property
+    def bit_effects(self) -> tuple[BitEffect, ...]:
+        """What the sensor does to the bits, in the order in which it does."""
+        return tuple(self.bits.values())
+
+    @property
+    def hold_s(self) -> float:
+        """For how long the sheet's light may be taken as constant; 0: nothing moves, it is constant for ever."""
+        return min((held for effect in self.laser.values() if (held := hold_s(effect)) > 0), default=0.0)
+
+    def without(self, names: Collection[str]) -> "FluxModel":
+        """The same with fewer effects, which are not made anew."""
+        fewer = copy(self)
+        fewer.laser = {name: effect for name, effect in self.laser.items() if name not in names}
+        fewer.steady = {name: rate for name, rate in self.steady.items() if name not in names}
+        fewer.bits = {name: effect for name, effect in self.bits.items() if name not in names}
+        fewer.steady_per_s = sum(fewer.steady.values(), np.zeros_like(self.steady_per_s))
+        return fewer
+
+    def add_sheet(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
+        """Add detections per second and watt from the sheet to `rate`, rows first_row..last_row-1. Releases the GIL."""
+        for effect in self.laser.values():
+            effect.add(sheet, first_row, last_row, rate)
+
+    def flux(self, plane: Array, exposure_s: float, power_w: float, share: float = 1.0) -> Array:
+        """Photons per exposure, float64 (rows, width), with the mirror at the plane (4,) = nx, ny, nz, d."""
+        view = self.setting.view
+        sheet = view.sheet(plane)
+        rate = np.zeros_like(self.steady_per_s)
+        self.add_sheet(sheet, 0, view.rows, rate)
+        return exposure_s * (self.steady_per_s + share * power_w * rate)
+
+
+def hold_s(effect: LaserEffect) -> float:
+    """For how long an effect's light stands still; 0: it does not move."""
+    return float(getattr(effect, "hold_s", 0.0))
+
+
+FINE_POSITIONS_PER_PX = 4
+ROUNDING = 1e-9
+"""Positions are rounded to this, far below what a frame can tell: frames then have the very same mean."""
+_SLACK = 1e-6
+"""Of a step: where frames lie on the very border of cells."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommandGrid:
+    """Ascending positions (n,) float64; a cell is what is nearest to one, edges (n - 1,) are between them. `low`,
+    `high`: what still belongs to the ends.
+    """
+
+    positions: Array
+    edges: Array
+    low: float
+    high: float
+
+    def hold(self, commands: Array, steps: Array) -> Array:
+        """Mean positions of the frames that share a cell with these, at commands (n,), NaN past the ends of the grid.
+
+        steps: (n,) how far the mirror moves from one frame to the next, 0: the frame is alone, as where one step leads
+        out of the cell; NaN: not known, it is held at the cell's own position.
+        """
+        if len(self.positions) == 0:
+            return np.full(commands.shape, np.nan)
+        cell = np.searchsorted(self.edges, commands, side="right")
+        borders = np.concatenate([[self.low], self.edges, [self.high]])
+        step = np.where(steps == 0, 2 * (self.high - self.low), np.abs(steps))
+        below = np.maximum(np.floor((commands - borders[cell]) / step + _SLACK), 0)
+        above = np.maximum(np.ceil((borders[cell + 1] - commands) / step - _SLACK) - 1, 0)
+        mean = np.rint((commands + 0.5 * step * (above - below)) / ROUNDING) * ROUNDING
+        held = np.where(np.isnan(step), self.positions[cell], mean)
+        return np.where((commands >= self.low) & (commands <= self.high), held, np.nan)
+
+
+def column_grid(commands: Array, limits: tuple[float, float]) -> CommandGrid:
+    """Grid of the columns' commands (columns,), continued at the outer spacing up to the limits of the rig model."""
+    at = np.unique(np.asarray(commands, dtype=np.float64))
+    if len(at) > 1:
+        below, above = at[1] - at[0], at[-1] - at[-2]
+        before = np.arange(at[0] - below, limits[0] - 0.5 * below, -below)[::-1]
+        after = np.arange(at[-1] + above, limits[1] + 0.5 * above, above)
+        at = np.concatenate([np.maximum(before, limits[0]), at, np.minimum(after, limits[1])])
+    return _grid(np.unique(at), limits)
+
+
+def fine_grid(width: int, limits: tuple[float, float]) -> CommandGrid:
+    """Grid for a bench that knows no columns."""
+    return _grid(np.linspace(*limits, FINE_POSITIONS_PER_PX * width + 1), limits)
+
+
+def _grid(at: Array, limits: tuple[float, float]) -> CommandGrid:
+    edges = 0.5 * (at[1:] + at[:-1])
+    slack = 0.5 * float(np.min(np.diff(at))) if len(at) > 1 else 0.0
+    return CommandGrid(at, edges, limits[0] - slack, limits[1] + slack)

@@ -1,0 +1,193 @@
+"""The light sheet of one mirror command in a scene: where on each row it is seen, and where it ends.
+
+A world is 2.5-D: one depth per pixel, shadows along rows. Light that has gone behind a surface stays behind it. A row
+sees its sheet as a plane: all rows the same one, or, where the sheet bows or rows are exposed one after the other, each
+its own: that of the mirror at its time, and the tangent of the bowed sheet where the row sees it.
+
+Compiled walk of the light along each image row: where the sheet ends, and whether it ends as a stripe.
+
+On a row the sheet's inverse depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The
+walk starts at the near edge of the picture and ends where w passes the surface's inverse depth. Spans of 32 pixels
+in which even the least w lies before the nearest surface are passed at once. Measured: about 0.05 ms for 512 x 512
+pixels on one core, half of them lit; pixel by pixel it took 0.2 ms.
+"""
+
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model.light_sheet import LightSheets
+
+Array = NDArray[np.float64]
+
+_TANGENT_STEP_M = 1e-4
+"""To either side of a point: sheets bend over metres."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightSheet:
+    """The planes n.X = d of a sheet, k = 1 for all rows or one for each, and what their light does on every row.
+
+    normal: (k, 3) float64 unit vectors; offset_m: (k,) d; inverse: (k, 3) n/d, so that 1/z = inverse.(u, v, 1).
+    x_stripe_px: (rows,) float64, sub-pixel stripe position, NaN = no stripe.
+    x_end_px: (rows,) float64, end of the lit part, NaN = nothing lit.
+    start_px, step: (rows,) int64, first pixel on the light's way and its direction along the row (+1, -1, 0 = not
+    seen). time_s: of the bench, for what moves. bowed: what the planes are made to touch; None: they are the sheet."""
+
+    normal: Array
+    offset_m: Array
+    inverse: Array
+    x_stripe_px: Array
+    x_end_px: Array
+    start_px: NDArray[np.int64]
+    step: NDArray[np.int64]
+    time_s: float = 0.0
+    bowed: LightSheets | None = None
+
+    def touch(self, u: Array, v: Array, first_row: int, last_row: int) -> None:
+        """Make the planes of rows first_row..last_row-1 touch the bowed sheet where the rays u, v (rows,) meet it.
+
+        A row whose ray does not meet it keeps its plane.
+        """
+        assert self.bowed is not None, "a flat sheet is its own plane"
+        rows = slice(first_row, last_row)
+        bowed = replace(
+            self.bowed, planes=self.bowed.planes[rows], middle=self.bowed.middle[rows], across=self.bowed.across[rows]
+        )
+        ray = np.stack([u, v, np.ones_like(u)], axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # Where the ray meets the plane: so near the sheet that the tangent there and here are one.
+            points = ray / np.sum(self.inverse[rows] * ray, axis=-1, keepdims=True)
+            aside = _TANGENT_STEP_M * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
+            off_m, *around = bowed.distance_m(points + aside)
+            normal = (np.array(around[:3]) - around[3:]).T / (2 * _TANGENT_STEP_M)
+            offset_m = np.sum(normal * points, axis=-1) - off_m
+            length = np.linalg.norm(normal, axis=-1, keepdims=True)
+            normal, offset_m = normal / length, offset_m / length[:, 0]
+            inverse = normal / np.where(offset_m != 0, offset_m, np.nan)[:, None]
+        met = np.isfinite(offset_m)
+        self.normal[rows][met], self.offset_m[rows][met], self.inverse[rows][met] = (
+            normal[met], offset_m[met], inverse[met],
+        )  # fmt: skip
+
+
+def empty_sheet(planes: Array, rows: int, time_s: float = 0.0, bowed: LightSheets | None = None) -> LightSheet:
+    """A sheet that has not been traced on any row yet. planes: (4,) nx, ny, nz, d of all rows, or (rows, 4).
+
+    bowed: (rows,) sheets whose planes these are, None where they are flat.
+    """
+    planes = np.array(planes if planes.ndim == 2 else planes[None])
+    offset = planes[:, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):  # through the camera: seen edge-on, no depth
+        inverse = np.where(offset[:, None] != 0, planes[:, :3] / offset[:, None], np.nan)
+    return LightSheet(
+        normal=np.ascontiguousarray(planes[:, :3]),
+        offset_m=offset.copy(),
+        inverse=inverse,
+        x_stripe_px=np.full(rows, np.nan),
+        x_end_px=np.full(rows, np.nan),
+        start_px=np.zeros(rows, np.int64),
+        step=np.zeros(rows, np.int64),
+        time_s=time_s,
+        bowed=bowed,
+    )
+
+
+DEPTH_JUMP = 0.02
+"""Relative step of depth from one pixel to the next above which two pixels lie on different surfaces. A surface this
+steep makes 85 degrees with the image plane at f = 600 px and returns next to no light.
+"""
+
+SPAN_PX = 32
+"""Pixels that are passed at a time."""
+
+
+@numba.njit(cache=True, nogil=True)
+def trace_rows(
+    u: NDArray[np.float64],
+    v: NDArray[np.float64],
+    surface: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    plane: NDArray[np.float64],
+    first_row: int,
+    last_row: int,
+    x_stripe: NDArray[np.float64],
+    x_end: NDArray[np.float64],
+    start: NDArray[np.int64],
+    step: NDArray[np.int64],
+) -> None:
+    """Trace rows first_row..last_row-1 of planes p = n/d, (1, 3) or one a row (rows, 3), inverse depth p.(u, v, 1).
+
+    surface: inverse depth of the scene (rows, width), 0 = open sky. bounds: see `span_bounds`. Writes per row:
+    x_stripe, NaN where there is none; x_end, where the lit part of the sheet ends (NaN: nothing of it is lit); start,
+    first pixel on the light's way; step, +1 where the light travels towards larger x (scanner on the left), -1 the
+    other way, 0 where the row sees no sheet."""
+    width = u.shape[1]
+    for y in range(first_row, last_row):
+        k = min(y, len(plane) - 1)
+        px, py, pz = plane[k, 0], plane[k, 1], plane[k, 2]
+        low_u, low_v = 0 if px >= 0 else 1, 2 if py >= 0 else 3
+        x_stripe[y] = np.nan
+        x_end[y] = np.nan
+        step[y] = 0
+        left = 0
+        while left < width and np.isnan(u[y, left]):
+            left += 1
+        right = width - 1
+        while right > left and np.isnan(u[y, right]):
+            right -= 1
+        if left >= right:
+            continue
+        w_left = px * u[y, left] + py * v[y, left] + pz
+        w_right = px * u[y, right] + py * v[y, right] + pz
+        if not (w_left > 0.0 or w_right > 0.0):
+            continue
+        move = 1 if w_left > w_right else -1
+        x = left if move == 1 else right
+        last = right if move == 1 else left
+        start[y] = x
+        step[y] = move
+        if not px * u[y, x] + py * v[y, x] + pz - surface[y, x] > 0.0:
+            continue  # enters the picture behind what is seen there: in its shadow
+        x_end[y] = last + 0.5 * move
+        while x != last:
+            span = (x + move) // SPAN_PX
+            in_span = min(SPAN_PX - (x + move) % SPAN_PX if move == 1 else (x + move) % SPAN_PX + 1, (last - x) * move)
+            least = px * bounds[y, span, low_u] + py * bounds[y, span, low_v] + pz
+            if least > bounds[y, span, 4]:
+                x += move * in_span
+                continue
+            here = 1.0
+            while here > 0.0 and in_span > 0:
+                x += move
+                in_span -= 1
+                here = px * u[y, x] + py * v[y, x] + pz - surface[y, x]
+            if here > 0.0:
+                continue
+            s0 = surface[y, x - move]
+            s1 = surface[y, x]
+            if abs(s1 - s0) > DEPTH_JUMP * max(s0, s1) or max(s0, s1) == 0.0:
+                x_end[y] = x - 0.5 * move  # a side that the camera does not see, or open sky
+            else:
+                before = px * u[y, x - move] + py * v[y, x - move] + pz - s0
+                x_end[y] = x - move + move * before / (before - here)
+                x_stripe[y] = x_end[y]
+            break
+
+
+@numba.njit(cache=True)
+def span_bounds(u: NDArray[np.float64], v: NDArray[np.float64], surface: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Least and largest u, least and largest v, and largest inverse depth of every span, (rows, spans, 5); infinite
+    inverse depth where a ray is NaN."""
+    rows, width = u.shape
+    bounds = np.zeros((rows, -(-width // SPAN_PX), 5))
+    bounds[:, :, 0], bounds[:, :, 1], bounds[:, :, 2], bounds[:, :, 3] = np.inf, -np.inf, np.inf, -np.inf
+    for y in range(rows):
+        for x in range(width):
+            of = bounds[y, x // SPAN_PX]
+            of[0], of[1] = min(of[0], u[y, x]), max(of[1], u[y, x])
+            of[2], of[3] = min(of[2], v[y, x]), max(of[3], v[y, x])
+            of[4] = np.inf if np.isnan(u[y, x] + v[y, x]) else max(of[4], surface[y, x])
+    return bounds

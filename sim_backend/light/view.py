@@ -1,0 +1,192 @@
+"""What the camera sees of a scene, per pixel, as the light transport needs it: rays, inverse depth, facets, albedo."""
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model.rig_model import RigModel
+from sim_backend.light.sheet import DEPTH_JUMP, LightSheet, empty_sheet, span_bounds, trace_rows
+from sim_backend.scenes.surfaces import Surfaces
+
+Array = NDArray[np.float64]
+
+
+class Moves(Protocol):
+    """What makes the surfaces move."""
+
+    def view(self, still: "CameraView", time_s: float) -> "CameraView":
+        """The view at a time of the bench; `still` is that at time 0. Any thread may ask."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraView:
+    """Rays and surfaces on the camera's pixel grid. All maps float64 (rows, width).
+
+    u, v: ray tangents, NaN where the lens has no inverse. u_x, v_x: their slopes per pixel along the row.
+    surface: inverse depth in 1/m (0: nothing there). facet: (rows, width, 3), the plane m.X = 1 through each surface
+    point. albedo: 0..1. source_m: (3,) where the light leaves the mirror. motion: None where nothing moves."""
+
+    u: Array
+    v: Array
+    u_x: Array
+    v_x: Array
+    surface: Array
+    facet: Array
+    albedo: Array
+    source_m: Array
+    motion: Moves | None = None
+    bounds: Array = field(init=False)
+    """Of u, v and surface (`span_bounds`)."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "bounds", span_bounds(self.u, self.v, self.surface))
+
+    def at(self, time_s: float) -> "CameraView":
+        """The view at a time of the bench."""
+        return self if self.motion is None else self.motion.view(self, time_s)
+
+    @property
+    def rows(self) -> int:
+        """Image rows."""
+        return int(self.u.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Pixels per row."""
+        return int(self.u.shape[1])
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels along the row per unit of tangent, in the middle of the picture."""
+        return 1.0 / abs(float(self.u_x[self.rows // 2, self.width // 2]))
+
+    @property
+    def median_depth_m(self) -> float:
+        """Of the surfaces in the picture; 0 where there is none."""
+        lit = self.surface[self.surface > 0]
+        return 1.0 / float(np.median(lit)) if len(lit) else 0.0
+
+    def sheet(self, plane: Array, time_s: float = 0.0) -> LightSheet:
+        """The flat sheet of the plane (4,) = nx, ny, nz, d at a time of the bench, traced on every row."""
+        sheet = empty_sheet(plane, self.rows, time_s)
+        self.trace(sheet, 0, self.rows)
+        return sheet
+
+    def trace(self, sheet: LightSheet, first_row: int, last_row: int) -> None:
+        """Trace rows first_row..last_row-1 of a sheet in place. Releases the GIL, but for sheets that bow."""
+        now = self.at(sheet.time_s)
+        now._trace_planes(sheet, first_row, last_row)
+        if sheet.bowed is not None:
+            # The plane of the fan's middle ends a pixel or two beside the sheet: near enough for a tangent.
+            rows = np.arange(first_row, last_row)
+            ends = sheet.x_end_px[rows]
+            x = np.where(np.isnan(ends), sheet.start_px[rows], np.rint(np.clip(ends, 0, now.width - 1)))
+            at = rows, x.astype(np.int64)
+            sheet.touch(now.u[at], now.v[at], first_row, last_row)
+            now._trace_planes(sheet, first_row, last_row)
+
+    def _trace_planes(self, sheet: LightSheet, first_row: int, last_row: int) -> None:
+        trace_rows(
+            self.u,
+            self.v,
+            self.surface,
+            self.bounds,
+            sheet.inverse,
+            first_row,
+            last_row,
+            sheet.x_stripe_px,
+            sheet.x_end_px,
+            sheet.start_px,
+            sheet.step,
+        )
+
+
+def make_view(
+    model: RigModel, surfaces: Surfaces, motion: Moves | None = None, rays: tuple[Array, Array] | None = None
+) -> CameraView:
+    """View of the surfaces through the model's camera. The model must know where its light comes from (`source_m`).
+
+    rays: the camera's tangents (u, v), where they are known already."""
+    assert model.source_m is not None, "checked by the world"
+    u, v = model.camera.tangents() if rays is None else rays
+    u_x, v_x = _slope(u, 1), _slope(v, 1)
+    u_y, v_y = _slope(u, 0), _slope(v, 0)
+    surface = 1.0 / surfaces.depth_m.astype(np.float64)
+    surface[~np.isfinite(surface)] = 0.0
+    return CameraView(
+        u=np.ascontiguousarray(u),
+        v=np.ascontiguousarray(v),
+        u_x=u_x,
+        v_x=v_x,
+        surface=surface,
+        facet=_facets(surface, (u, v), (u_x, v_x, u_y, v_y)),
+        albedo=surfaces.albedo.astype(np.float64),
+        source_m=np.array(model.source_m, dtype=np.float64),
+        motion=motion,
+    )
+
+
+def _slope(tangent: Array, axis: int) -> Array:
+    if tangent.shape[axis] < 2:
+        return np.zeros_like(tangent)
+    slope: Array = np.gradient(tangent, axis=axis)
+    # Beside a pixel without a ray the step to the other neighbour counts; a pixel alone has no slope.
+    step, none = np.diff(tangent, axis=axis), np.full_like(np.take(tangent, [0], axis), np.nan)
+    for one_sided in (np.concatenate([step, none], axis), np.concatenate([none, step], axis)):
+        slope = np.where(np.isnan(slope), one_sided, slope)
+    return np.where(np.isnan(slope) & ~np.isnan(tangent), 0.0, slope)
+
+
+def _facets(surface: Array, rays: tuple[Array, Array], slopes: tuple[Array, Array, Array, Array]) -> Array:
+    """Planes m.X = 1 tangent to the surface, float64 (rows, width, 3).
+
+    On a plane the inverse depth is w = m.(u, v, 1), so m = (w_u, w_v, w - u w_u - v w_v). Gradients are averaged over
+    two pixels to each side that lie on the same surface."""
+    u, v = rays
+    u_x, v_x, u_y, v_y = slopes
+    w_x, w_y = _surface_slope(surface, 1), _surface_slope(surface, 0)
+    determinant = u_x * v_y - u_y * v_x
+    with np.errstate(all="ignore"):
+        w_u = (w_x * v_y - w_y * v_x) / determinant
+        w_v = (w_y * u_x - w_x * u_y) / determinant
+    facet = np.stack([w_u, w_v, surface - u * w_u - v * w_v], axis=-1)
+    lost = ~np.isfinite(facet).all(axis=-1)
+    facet[lost] = 0.0
+    facet[lost, 2] = surface[lost]
+    return np.ascontiguousarray(facet)
+
+
+def _surface_slope(surface: Array, axis: int) -> Array:
+    """Slope of inverse depth per pixel from neighbours within two pixels, none of them across a depth jump."""
+    w = np.moveaxis(surface, axis, 0)
+    step = np.diff(w, axis=0)
+    joined = np.abs(step) <= DEPTH_JUMP * np.maximum(w[1:], w[:-1])
+    step = np.where(joined, step, 0.0)
+    total = np.zeros_like(w)
+    weight = np.zeros_like(w)
+    # The step between pixels i and i+1 (a neighbour's outer step counts half, and only if the inner one is joined).
+    for offset, share in ((0, 1.0), (-1, 1.0), (1, 0.5), (-2, 0.5)):
+        reach = joined.copy() if offset in (0, -1) else _inner_joined(joined, offset)
+        lo, hi = max(0, -offset), min(len(w), len(step) - offset)
+        if lo >= hi:
+            continue
+        take = slice(lo + offset, hi + offset)
+        usable = reach[take] & joined[take]
+        total[lo:hi] += share * step[take] * usable
+        weight[lo:hi] += share * usable
+    with np.errstate(all="ignore"):
+        slope = np.where(weight > 0, total / weight, 0.0)
+    return np.ascontiguousarray(np.moveaxis(slope, 0, axis))
+
+
+def _inner_joined(joined: NDArray[np.bool_], offset: int) -> NDArray[np.bool_]:
+    """For the outer step at `offset` (1 or -2), whether the inner step between it and the pixel is joined."""
+    inner = np.zeros_like(joined)
+    if offset == 1:
+        inner[1:] = joined[:-1]
+    else:
+        inner[:-1] = joined[1:]
+    return inner

@@ -1,0 +1,180 @@
+"""What a scene file says: surfaces, medium, weather, ambient light, motion. Unknown keys are refused, quantities carry
+units.
+
+surfaces: street              # the built-in street, board, or a folder with world.npz or disparity.npy and left.png
+board: {rotation: [20 deg, 0 deg, 0 deg], position: [-30 cm, -20 cm, 1.5 m]}    # of `surfaces: board`; or a list
+wall: 4 m                                                     # behind the board
+medium: {fog: {visibility: 30 m}, backscatter: 0.05 /sr}      # or smoke, `sim_backend.scenes.medium`; none: clear air
+rain: {rate: 20 mm/h}                                         # or snow: {rate: 2 mm/h}, `sim_backend.scenes.medium`
+ambient: {illuminance: 100 lux}                               # none: darkness
+motion: {velocity: [0 m/s, 0 m/s, -2 m/s]}                    # of all surfaces: x right, y down, z away from the camera
+seed: 1                                                       # where the drops are
+"""
+
+import difflib
+import os
+from pathlib import Path
+from typing import Annotated, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from calibration.errors import FileError
+from calibration.files.problems import ValueSources, validated
+from calibration.files.sections import load_yaml
+from drivers.errors import DeviceError
+from drivers.units import Lux, Metres, MetresPerSecond, Radians
+from sim_backend.scenes.medium import Fog, Medium, Rain, SceneSection, Snow
+from sim_backend.scenes.prepared import load_folder
+from sim_backend.scenes.surfaces import Surfaces
+
+Array = NDArray[np.float64]
+SCENE_FOLDER = Path(__file__).parents[2] / "config" / "scenes"
+"""Where the bundled scenes are found by name."""
+CLEAR = "clear"
+"""In place of a visibility: no fog."""
+
+
+class AmbientLight(SceneSection):
+    """Daylight or lamps on the scene, diffuse."""
+
+    illuminance: Annotated[Lux, Field(ge=0, examples=["100 lux"])]
+
+
+class SceneMotion(SceneSection):
+    """How the surfaces move, all of them together and straight on, from the bench's time 0 on."""
+
+    velocity: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] = Field(examples=["[0 m/s, 0 m/s, -2 m/s]"])
+    """Along x (right), y (down), z (away from the camera)."""
+
+
+class BoardPlace(SceneSection):
+    """Where a calibration board is held, as `calibration.views.BoardPose` has it."""
+
+    rotation: tuple[Radians, Radians, Radians] = Field(examples=["[20 deg, 0 deg, 0 deg]"])
+    """Rotation vector; all 0: square to the camera's axis."""
+    position: tuple[Metres, Metres, Metres] = Field(examples=["[-30 cm, -20 cm, 1.5 m]"])
+    """Of the top left corner of the board's squares: x right, y down, z away from the camera."""
+
+
+class BoardShown(BoardPlace):
+    """A calibration board in the scene."""
+
+    file: str | None = None
+    """What is printed on it, a board file; the bundled one by default."""
+    mirrored: bool = False
+    """Printed the wrong way round."""
+
+
+class SceneFile(SceneSection):
+    """A whole scene file."""
+
+    surfaces: str = Field(default="street", examples=["street"])
+    board: BoardShown | tuple[BoardShown, ...] = Field(
+        default=(), examples=["{rotation: [20 deg, 0 deg, 0 deg], position: [-30 cm, -20 cm, 1.5 m]}"]
+    )
+    """What stands in front of the wall where `surfaces` is `board`."""
+    wall: Annotated[Metres, Field(gt=0, examples=["4 m"])] = 4.0
+    """How far behind the camera's plane the wall is that boards stand in front of."""
+    medium: Medium | None = Field(default=None, examples=["{fog: {visibility: 30 m}}"])
+    rain: Rain | None = Field(default=None, examples=["{rate: 20 mm/h}"])
+    snow: Snow | None = Field(default=None, examples=["{rate: 2 mm/h}"])
+    ambient: AmbientLight | None = Field(default=None, examples=["{illuminance: 100 lux}"])
+    motion: SceneMotion | None = Field(default=None, examples=["{velocity: [0 m/s, 0 m/s, -2 m/s]}"])
+    seed: int = Field(default=1, ge=0, lt=2**63, examples=["1"])
+    """Which drops and flakes there are, where, and which speckle."""
+
+    @model_validator(mode="after")
+    def _boards_on_board_scenes(self) -> Self:
+        if (self.surfaces == "board") != bool(self.boards):
+            raise ValueError("write both or neither of 'surfaces: board' and 'board: {rotation: ..., position: ...}'")
+        return self
+
+    @property
+    def boards(self) -> tuple[BoardShown, ...]:
+        """All boards of the scene."""
+        return (self.board,) if isinstance(self.board, BoardShown) else self.board
+
+    @property
+    def illuminance_lux(self) -> float:
+        """Ambient illuminance, 0 in darkness."""
+        return 0.0 if self.ambient is None else self.ambient.illuminance
+
+    @property
+    def extinction_per_m(self) -> float:
+        """Extinction coefficient in 1/m of all that is in the air, 0 in clear air."""
+        return sum((part.extinction_per_m for part in (self.medium, self.rain, self.snow) if part is not None), 0.0)
+
+    @property
+    def diffuse_extinction_per_m(self) -> float:
+        """The same for light that may be turned a little on its way: what haze, airlight and ambient light feel."""
+        return self.extinction_per_m - (0.0 if self.medium is None else self.medium.forward_per_m)
+
+
+def bundled_scenes() -> tuple[str, ...]:
+    """Names of the scenes that come with the project."""
+    return tuple(sorted(path.stem for path in SCENE_FOLDER.glob("*.yaml")))
+
+
+def load_scene(name: str) -> tuple[SceneFile, Path]:
+    """The scene of a bundled name, a scene file or a folder of surfaces, and the folder its paths are relative to.
+
+    A bare folder is its surfaces in clear, dark air. DeviceError where there is no such scene or it is wrong, a line
+    for each problem of its file."""
+    bundled = SCENE_FOLDER / f"{name}.yaml"
+    path = Path(name).expanduser()
+    file = bundled if name in bundled_scenes() else path
+    if os.path.isdir(file):  # unlike Path.is_dir, it takes any text for a name
+        return SceneFile(surfaces=str(file.resolve())), file
+    if not os.path.isfile(file):
+        close = difflib.get_close_matches(path.stem, bundled_scenes(), n=1)
+        meant = f"did you mean '{close[0]}'? " if close else ""
+        raise DeviceError(
+            f"scene {name!r} is no file, no folder and none of the bundled; {meant}bundled scenes are "
+            f"{', '.join(bundled_scenes())}"
+        )
+    try:
+        read = load_yaml(file, "a scene", "surfaces: street")
+        return validated(SceneFile, read.content, ValueSources(str(file), read.lines)), file.parent
+    except FileError as error:
+        raise DeviceError("\n".join(error.problems)) from error
+
+
+def with_fog(scene: SceneFile, visibility: str) -> SceneFile:
+    """The scene in another fog: of that visibility (text with a unit), or CLEAR; how it scatters is as in the scene."""
+    if visibility == CLEAR:
+        return scene.model_copy(update={"medium": None})
+    fog = Fog(visibility=visibility)  # type: ignore[arg-type]
+    if scene.medium is None:
+        return scene.model_copy(update={"medium": Medium(fog=fog)})
+    medium = scene.medium.model_copy(update={"fog": fog, "smoke": None, "extinction": None})
+    return scene.model_copy(update={"medium": medium})
+
+
+def with_board_at(scene: SceneFile, place: BoardPlace) -> SceneFile:
+    """The scene with its board, the first where there are several, held elsewhere. DeviceError where there is none."""
+    if not scene.boards:
+        raise DeviceError(
+            "board_pose moves the board of a scene, this one has none; choose a scene with 'surfaces: board'"
+        )
+    moved = scene.boards[0].model_copy(update={"rotation": place.rotation, "position": place.position})
+    return scene.model_copy(update={"board": (moved, *scene.boards[1:])})
+
+
+def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surfaces:
+    """The scene's surfaces for the rays (u, v), each (rows, width); relative folders start at `folder`."""
+    if scene.surfaces == "street":
+        from sim_backend.scenes.street import street
+
+        return street(u, v)
+    if scene.surfaces == "board":
+        from sim_backend.scenes.board import board_scene, load_boards
+
+        return board_scene(u, v, load_boards(scene.boards, folder), scene.wall)
+    path = folder / Path(scene.surfaces).expanduser()
+    if not path.is_dir():
+        raise DeviceError(
+            f"surfaces {scene.surfaces!r}: {path} is no folder; name 'street', 'board' or a folder with a scene in it"
+        )
+    return load_folder(path, (u.shape[0], u.shape[1]))

@@ -1,0 +1,1 @@
+"""Models of the devices' firmware: bytes in, bytes out, made from manuals and public sources."""

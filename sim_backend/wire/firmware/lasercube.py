@@ -1,0 +1,134 @@
+"""A LaserCube / LaserDock board as its firmware behaves (hardware.md 3.2; vendor's library 51d13bc).
+
+One ring of samples, played at the set rate as soon as there are any; commands with replies of 64 bytes. What happens
+when the ring runs empty is not documented: this model holds the last sample or repeats the last ones, as it is told.
+"""
+
+from collections import deque
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backend.wire.firmware.dac_model import DAC_STEPS, DacModel, Played
+from sim_backend.wire.serve.usb_model import AlternateSpec, DeviceSpec, EndpointSpec
+
+COMMANDS, REPLIES, SAMPLES = 0x01, 0x81, 0x03
+RED, GREEN, BLUE, PLAYING = 0, 1, 2, 3
+"""Lines of the history; the last one is high while samples of the ring are played."""
+_REPEATED_SAMPLES = 64
+
+
+class LaserCubeModel(DacModel):
+    """The firmware."""
+
+    def __init__(
+        self,
+        *,
+        serial: str | None = "LC1",
+        product_name: str = "LaserCube",
+        when_empty: Literal["hold", "repeat"] = "hold",
+        ring: int = 4096,
+        highest_rate_hz: int = 40_000,
+        clock_error: float = 0.0,
+        axis: str = "x",
+    ) -> None:
+        """clock_error: of its crystal. axis: the one whose mirror the history follows."""
+        spec = DeviceSpec(
+            vendor=0x1FC9,
+            product=0x04D8,
+            manufacturer="Wicked Lasers",
+            product_name=product_name,
+            serial=serial,
+            speed="high",
+            alternates=(
+                AlternateSpec(0, 0, (EndpointSpec(COMMANDS, "bulk", 512), EndpointSpec(REPLIES, "bulk", 512))),
+                AlternateSpec(1, 0),
+                AlternateSpec(1, 1, (EndpointSpec(SAMPLES, "bulk", 512),)),
+            ),
+        )
+        super().__init__(spec, commands=COMMANDS, replies=REPLIES, points=SAMPLES)
+        self.enabled = False
+        self.rate_hz = 30_000
+        self.rate_offset_hz = 0
+        """Test knob: the rate that is set is another one by this much."""
+        self._ring_points, self._highest_rate_hz = ring, highest_rate_hz
+        self._when_empty, self._axis, self._clock_error = when_empty, axis, clock_error
+        self._ring: deque[NDArray[np.uint16]] = deque()
+        self._queued = 0
+        self._played_to_s = 0.0
+        self._last: NDArray[np.uint16] | None = None
+
+    def moving(self, now_s: float) -> bool:
+        """Whether samples are being played."""
+        self.advance(now_s)
+        return self._queued > 0
+
+    def advance(self, now_s: float) -> None:
+        """Play on until now."""
+        rate_hz = self.rate_hz * (1 + self._clock_error)
+        while self._queued:
+            due = int((now_s - self._played_to_s) * rate_hz + 1e-6)
+            if due <= 0:
+                return
+            block = self._ring.popleft()
+            if len(block) > due:
+                self._ring.appendleft(block[due:])
+                block = block[:due]
+            self._queued -= len(block)
+            self._play(block, rate_hz)
+            if not self._queued and self._when_empty == "repeat":
+                self._ring.append(block[-_REPEATED_SAMPLES:])
+                self._queued = len(self._ring[0])
+
+    def _play(self, block: NDArray[np.uint16], rate_hz: float) -> None:
+        start_s, self._played_to_s = self._played_to_s, self._played_to_s + len(block) / rate_hz
+        levels = np.stack([block[:, 0] & 0xFF, block[:, 0] >> 8, block[:, 1], np.full(len(block), 255)], axis=1)
+        if not self.enabled:
+            levels[:, :3] = 0
+        command = block[:, 2 if self._axis == "x" else 3] / DAC_STEPS * 2 - 1
+        self.history.play(Played(start_s, self._played_to_s, 1 / rate_hz, command, levels.astype(np.uint8)))
+
+    def _take_points(self, data: bytes, now_s: float) -> int | None:
+        samples = np.frombuffer(data, "<u2").reshape(-1, 4).astype(np.uint16)
+        if self._queued + len(samples) > self._ring_points:
+            return None
+        if not self._queued:
+            self._played_to_s = now_s
+        self._ring.append(samples)
+        self._queued += len(samples)
+        return len(data)
+
+    def _halt(self, now_s: float) -> None:
+        self._ring.clear()
+        self._queued = 0
+
+    def _command(self, data: bytes, now_s: float) -> None:
+        code, value = self._answer(data, now_s)
+        self._replies.append((bytes((data[0], code)) + value).ljust(64, b"\0"))
+
+    def _answer(self, data: bytes, now_s: float) -> tuple[int, bytes]:
+        """Reply code and data."""
+        answers = {
+            0x81: bytes((self.enabled,)),
+            0x83: self.rate_hz.to_bytes(4, "little"),
+            0x84: self._highest_rate_hz.to_bytes(4, "little"),
+            0x87: (0).to_bytes(4, "little"),
+            0x88: (4095).to_bytes(4, "little"),
+            0x89: self._ring_points.to_bytes(4, "little"),
+            0x8A: (self._ring_points - self._queued).to_bytes(4, "little"),
+            0x8B: b"\x00",
+            0x8C: b"\x0c",
+        }
+        match data[0]:
+            case 0x80:
+                self.enabled = bool(data[1])
+            case 0x82:
+                self.rate_hz = int.from_bytes(data[1:5], "little") + self.rate_offset_hz
+            case 0x8D:
+                self._halt(now_s)
+            case opcode if opcode in answers:
+                return 0, answers[opcode]
+            case _:
+                return 1, b""
+        return 0, b""

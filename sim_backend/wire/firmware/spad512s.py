@@ -1,0 +1,187 @@
+"""The vendor's program of a SPAD512S as seen from its TCP port (hardware.md section 2.1), traps included.
+
+A pure state machine: commands in, text and pixels out, time passed in. It takes frames of 1 bit only; what lies in them
+comes from `frames`, upright, and is turned onto the sensor's side as the real one delivers it.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.spads.orientation import QuarterTurn, turn_packed
+
+FrameSource = Callable[[int, float, float, int], NDArray[np.uint8]]
+"""(first frame, start of its exposure in s of the clock, period in s, n) -> upright frames, uint8 (n, height, bytes).
+"""
+
+BANNER: Final = "SPAD512S TCP server\n"
+CALIBRATION_SOON: Final = "The breakdown calibration process will start soon.\n"
+CALIBRATION_BEGUN: Final = "The breakdown calibration process has started.\n"
+CALIBRATION_DONE: Final = "The breakdown is around 24.1 V\n"
+READ_OUT_S: Final = 10.24e-6
+_INFO: Final = "MASTER-0042\nSLAVE-0043\n2.3.1\n1.4\n1.1\n{flavour}\n{intensity}\n1\n0\n"
+_FRAMES_AT_ONCE = 8
+"""Frames made at a time."""
+
+
+class Spad512sModel:
+    """The program and its device. calibration_s: how long it calibrates after a first connection; 0: not at all.
+
+    glued_done: text answers end with DONE, as one emulation has it and the real program may or may not. extra_fields:
+    `R` answers eight fields instead of six. paced: pixels come no earlier than the sensor exposes them.
+    """
+
+    def __init__(
+        self,
+        frames: FrameSource,
+        *,
+        calibration_s: float = 0.0,
+        glued_done: bool = False,
+        extra_fields: bool = False,
+        flavour: str = "512",
+        intensity: bool = True,
+        heeds_stop: bool = True,
+        rotation: QuarterTurn = 90,
+        paced: bool = False,
+    ) -> None:
+        self.commands: list[str] = []
+        """Commands as they came, for tests to look at."""
+        self.fail_at_byte: int | None = None
+        """The next run ends with `fail_text` behind so many bytes of pixels."""
+        self.fail_text = b"\nAuto-protect: too much light. Acquisition ERROR"
+        self._frames = frames
+        self._calibration_s = calibration_s
+        self._done = "\nDONE" if glued_done else ""
+        self._extra = ",1,0" if extra_fields else ""
+        self._heeds_stop = heeds_stop
+        self._info = _INFO.format(flavour=flavour, intensity=int(intensity))
+        self._rows = 1024 if "1M" in flavour else 512
+        self._rotation: QuarterTurn = rotation
+        self._paced = paced
+        self.restarted()
+        self._calibrating_until: float | None = None
+        self._pile_up_sent = False
+        self._out = bytearray()
+        self._run: _Run | None = None
+
+    @property
+    def running(self) -> bool:
+        """Whether a run is under way."""
+        return self._run is not None
+
+    def connected(self, now_s: float) -> None:
+        """Greet."""
+        self._out = bytearray(BANNER.encode())
+        self._run = None
+
+    def disconnected(self, now_s: float) -> None:
+        """The run, if any, goes to nobody."""
+        self._run = None
+        self._out.clear()
+
+    def restarted(self) -> None:
+        """The program ended and was started anew."""
+        self._calibrated = self._calibration_s == 0
+
+    def receive(self, data: bytes, now_s: float) -> None:
+        """One command: there is no framing, so two that come together are none, as with the real program."""
+        command = data.decode("ascii", "replace").strip()
+        self.commands.append(command)
+        if self._calibrating_until is not None:
+            self._say("ERROR")  # whatever is sent during the calibration breaks the protocol
+        elif self._run is not None:
+            if command == "STOP" and self._heeds_stop:
+                self._run.aborted = True
+        else:
+            self._obey(command, now_s)
+
+    def send(self, limit: int, now_s: float) -> bytes:
+        """Text first, then the pixels of the run."""
+        if self._calibrating_until is not None and now_s >= self._calibrating_until:
+            self._calibrating_until = None
+            self._calibrated = True
+            self._out += CALIBRATION_DONE.encode()
+        if not self._out and self._run is not None:
+            self._expose(self._run, now_s)
+        piece = bytes(self._out[:limit])
+        del self._out[:limit]
+        return piece
+
+    def _obey(self, command: str, now_s: float) -> None:
+        name, *arguments = command.split(",")
+        if name == "D" and not arguments:
+            self._describe(now_s)
+        elif name == "V" and not arguments:
+            self._say("23.5,4.0")
+        elif name == "R" and not arguments:
+            self._say(f"41.5,42.0,38.5,-9.5,40000000.0,97656.25{self._extra}")
+        elif name == "PU" and arguments in (["0"], ["1"]):
+            self._pile_up_sent = arguments == ["0"]
+            self._say("Pile-up correction set")
+        elif name == "I":
+            self._acquire(arguments, now_s)
+        elif name != "STOP":
+            self._say(f"Unknown command {name} ERROR")
+
+    def _describe(self, now_s: float) -> None:
+        if self._calibrated:
+            self._say(self._info)
+            return
+        self._calibrating_until = now_s + self._calibration_s
+        self._out += (CALIBRATION_SOON + CALIBRATION_BEGUN).encode()
+
+    def _acquire(self, arguments: list[str], now_s: float) -> None:
+        """I,bits,tInt,n,trigger,overlap,sparse,stream"""
+        try:
+            bits, t_int, n, _, _, sparse, stream = (int(word) for word in arguments[:7])
+        except ValueError:
+            self._say("Wrong number of arguments ERROR")
+            return
+        if (bits, sparse, stream) != (1, 0, 1) or n < 1 or t_int < 1:
+            self._say("Mode not emulated ERROR")
+            return
+        if not self._pile_up_sent:
+            self._say("Pile-up correction not set ERROR")
+            return
+        self._pile_up_sent = False  # it holds for one acquisition
+        self._run = _Run(n, max(t_int * 1e-6, READ_OUT_S), now_s)  # microseconds: bits is 1
+
+    def _expose(self, run: "_Run", now_s: float) -> None:
+        """The next frames onto the wire, and what ends the run."""
+        if run.aborted or run.next_frame == run.n_frames:
+            self._out += b"ERROR" if run.aborted else b"DONE"
+            self._run = None
+            return
+        n = min(_FRAMES_AT_ONCE, run.n_frames - run.next_frame)
+        if self._paced and now_s < run.start_s + (run.next_frame + n) * run.period_s:
+            return
+        upright = self._frames(run.next_frame, run.start_s + run.next_frame * run.period_s, run.period_s, n)
+        pixels = np.empty((n, self._rows, 64), np.uint8)
+        turn_packed(upright, _BACK[self._rotation], pixels)
+        sent = run.next_frame * self._rows * 64
+        run.next_frame += n
+        data = pixels.tobytes()
+        if self.fail_at_byte is not None and sent + len(data) > self.fail_at_byte:
+            self._out += data[: self.fail_at_byte - sent] + self.fail_text
+            self.fail_at_byte = None
+            self._run = None
+            return
+        self._out += data
+
+    def _say(self, text: str) -> None:
+        self._out += (text + self._done).encode()
+
+
+_BACK: Final[dict[QuarterTurn, QuarterTurn]] = {0: 0, 90: 270, 180: 180, 270: 90}
+"""The turn that undoes another."""
+
+
+class _Run:
+    def __init__(self, n_frames: int, period_s: float, start_s: float) -> None:
+        self.n_frames = n_frames
+        self.period_s = period_s
+        self.start_s = start_s
+        self.next_frame = 0
+        self.aborted = False

@@ -1,0 +1,295 @@
+"""An SPB1 device on USB (hardware.md section 8, docs/spb1-usb.md): control plane, states, heartbeat, watchdog.
+
+Comes as a Cypress FX3 board (section 2.4: commands on 0x01, stream on 0x81, acknowledgements on 0x82) or behind an FTDI
+FT601 (section 2.5: session commands on 0x01, commands on 0x02, stream on 0x82; acknowledgements on 0x83 where it has a
+second channel, else in the stream). A pure state machine: what the sensor sees comes from `source`.
+"""
+
+import struct
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Final, Literal
+
+from drivers.frames import BlockFlag, BlockStatus
+from drivers.spb1.control import (
+    ACK_BLOCK_BYTES,
+    COMMAND,
+    COMMAND_MAGIC,
+    Ack,
+    AckStatus,
+    Feature,
+    Op,
+    Register,
+    SensorState,
+)
+from drivers.spb1.layout import ALIGN, REGISTER_ACK
+from sim_backend.wire.firmware.spb_usb_run import (
+    WRITABLE,
+    BlockMemory,
+    Chip,
+    EmulatedRun,
+    FrameSource,
+    RunSettings,
+    device_spec,
+    registers_at_power_up,
+)
+from sim_backend.wire.serve.usb_model import STALL, Answer, Setup, Stall, UsbModel
+
+FT601_COMMAND: Final = struct.Struct("<IBBHIII")
+FT601_CONFIG_BYTES: Final = 152
+
+
+class SpbUsbModel(UsbModel):
+    """The device. paced: frames come when they are exposed; else as fast as the host takes them.
+
+    fifo_frames: frames that wait for the host before new ones are lost. mangle: what becomes of each block of the
+    stream on its way (damage for tests). acks: on an endpoint of their own, or in the stream.
+    """
+
+    def __init__(
+        self,
+        source: FrameSource,
+        width: int,
+        height: int,
+        *,
+        chip: Chip = "fx3",
+        acks: Literal["endpoint", "stream"] = "endpoint",
+        serial: str | None = "SPB-0001",
+        product_name: str = "SPB1 SPAD",
+        paced: bool = False,
+        fifo_frames: int = 10_000,
+        payload_crc: bool = True,
+        tick_hz: int = 100_000_000,
+        min_period_ticks: int = 1000,
+        ddr_bytes: int = 1 << 30,
+        max_stride: int = 1 << 20,
+        link_bytes_per_s: int = 400_000_000,
+        protocol: int = 0x0100,
+        features: Feature = ~Feature.EXTERNAL_TRIGGER,
+    ) -> None:
+        self.chip: Chip = chip
+        self.mangle: Callable[[memoryview], Iterable[bytes | memoryview]] | None = None
+        self.gate_allowed = True
+        """The FPGA's own gate line: low from the moment the watchdog strikes or a run is aborted until the next START.
+        """
+        self.deaf = False
+        """The firmware hangs: it takes commands and says nothing."""
+        self.pings: list[int] = []
+        self.commands: list[tuple[int, int, int]] = []
+        """(op, address, value) of every command but PING."""
+        self.spec = device_spec(chip, acks, serial, product_name)
+        self._source = source
+        self._board = RunSettings(width, height, tick_hz, paced, fifo_frames, payload_crc)
+        self._acks_in_stream = acks == "stream"
+        self._registers = registers_at_power_up(
+            width,
+            height,
+            serial or "",
+            tick_hz,
+            min_period_ticks,
+            ddr_bytes,
+            max_stride,
+            link_bytes_per_s,
+            protocol,
+            features,
+        )
+        self._max_stride = max_stride
+        self._min_period = min_period_ticks
+        self._window_entries = self._registers[Register.WINDOW_ENTRIES]
+        self._state = SensorState.IDLE
+        self._run: EmulatedRun | None = None
+        self._run_id = 0
+        self._exposed = 0
+        self._acks: deque[bytes] = deque()
+        self._queue: deque[memoryview] = deque()
+        self._memory = BlockMemory()
+        self._session_open = chip == "fx3"
+
+    @property
+    def state(self) -> SensorState:
+        """Where the device stands."""
+        return self._state
+
+    @property
+    def heartbeat_ms(self) -> int:
+        """What the host set for the watchdog."""
+        return self._registers[Register.HEARTBEAT_MS]
+
+    # The bus
+
+    def unplugged(self, now_s: float) -> None:
+        """Bus power is gone."""
+        self._reset()
+
+    def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
+        """Nothing happens: hosts choose the setting that is there."""
+
+    def control(self, setup: Setup, data: bytes, now_s: float) -> Answer:
+        """FT601: its configuration (0xCF) and its own firmware version (0xF1)."""
+        if self.chip != "ft601" or not setup.request_type & 0x80:
+            return STALL
+        if setup.request == 0xCF and setup.value == 1:
+            return bytes(FT601_CONFIG_BYTES)
+        return b"\x09\x01\x00\x00" if setup.request == 0xF1 else STALL
+
+    def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
+        """Commands, of the FT601's session or ours."""
+        self._watch(now_s)
+        if self.deaf:
+            return len(data)
+        if self.chip == "ft601" and endpoint == 0x01:
+            return self._session(data)
+        for at in range(0, len(data) - len(data) % COMMAND.size, COMMAND.size):
+            magic, op, request_id, address, value = COMMAND.unpack_from(data, at)
+            if magic == COMMAND_MAGIC:
+                self._acknowledge(self._obey(op, request_id, address, value, now_s))
+        return len(data)
+
+    def inp(self, endpoint: int, length: int, now_s: float) -> Answer:
+        """Acknowledgements or the stream."""
+        self._watch(now_s)
+        if self.deaf:
+            return None
+        if endpoint == (0x82 if self.chip == "fx3" else 0x83):
+            return self._acks.popleft() if self._acks else None
+        if not self._session_open or endpoint == (0x82 if self.chip == "fx3" else 0x81):
+            return None
+        if not self._queue and self._run is not None:
+            self._send(self._run, self._run.next_block(now_s))
+        if not self._queue:
+            return None
+        piece = self._queue.popleft()
+        if len(piece) > length:
+            self._queue.appendleft(piece[length:])
+        return piece[:length]
+
+    def _session(self, data: bytes) -> int:
+        if len(data) == FT601_COMMAND.size:
+            _, pipe, command, _, _, _, _ = FT601_COMMAND.unpack(data)
+            if pipe == 0x82 and command == 2:
+                self._session_open = True
+            elif pipe == 0x82 and command in (0, 3):
+                self._session_open = False
+                self._queue.clear()
+        return len(data)
+
+    # Commands
+
+    def _obey(self, op: int, request_id: int, address: int, value: int, now_s: float) -> Ack:
+        status, answer = AckStatus.OK, value
+        if op == Op.PING:
+            self.pings.append(value)
+            if self._run is not None:
+                self._run.pinged_s = now_s
+            return Ack(op, request_id, status, value)
+        self.commands.append((op, address, value))
+        if op == Op.READ:
+            status, answer = self._read(address)
+        elif op == Op.WRITE:
+            status = self._write(address, value)
+        elif op == Op.START:
+            status, answer = self._start(now_s)
+        elif op in (Op.STOP, Op.ABORT):
+            self._stop(abort=op == Op.ABORT)
+        else:
+            status = AckStatus.UNKNOWN_OP
+        return Ack(op, request_id, status, answer)
+
+    def _acknowledge(self, ack: Ack) -> None:
+        if not self._acks_in_stream:
+            self._acks.append(ack.packed())
+            return
+        # That of START still has the stride of before the run: so the host knows where blocks of frames begin.
+        in_run = self._run is not None and ack.op != Op.START
+        stride = self._registers[Register.STRIDE] if in_run else ACK_BLOCK_BYTES
+        self._send(None, self._memory.control_block(stride, REGISTER_ACK, self._run_id, ack.packed()))
+
+    def _read(self, address: int) -> tuple[AckStatus, int]:
+        run = self._run
+        if address == Register.STATE:
+            return AckStatus.OK, self._state
+        if address in (Register.EXPOSED, Register.EXPOSED + 4):
+            exposed = self._exposed if run is None else run.next_frame
+            return AckStatus.OK, exposed >> 8 * (address - Register.EXPOSED) & 0xFFFFFFFF
+        if address == Register.FIFO_HIGH_WATER and run is not None:
+            return AckStatus.OK, run.high_water_bytes
+        if address not in self._registers:
+            return AckStatus.BAD_ADDRESS, 0
+        return AckStatus.OK, self._registers[address]
+
+    def _write(self, address: int, value: int) -> AckStatus:
+        if Register.WINDOW_X0 <= address < Register.WINDOW_X0 + 4 * self._window_entries and address % 4 == 0:
+            pass
+        elif address not in WRITABLE:
+            return AckStatus.BAD_ADDRESS
+        if self._state not in (SensorState.IDLE, SensorState.ARMED):
+            return AckStatus.WRONG_STATE
+        if (address == Register.STRIDE and (value % ALIGN or not ALIGN <= value <= self._max_stride)) or (
+            address == Register.PERIOD_TICKS and value < self._min_period
+        ):
+            return AckStatus.BAD_VALUE
+        self._registers[address] = value
+        self._state = SensorState.ARMED
+        return AckStatus.OK
+
+    def _start(self, now_s: float) -> tuple[AckStatus, int]:
+        if self._state is not SensorState.ARMED:
+            return AckStatus.WRONG_STATE, 0
+        run_id = (self._run_id + 1) & 0xFFFF
+        try:
+            run = EmulatedRun(self._board, self._source, self._registers, run_id, self._memory, now_s)
+        except ValueError:
+            return AckStatus.BAD_VALUE, 0
+        self._run, self._run_id = run, run_id
+        self._queue.clear()
+        self._state = SensorState.RUNNING
+        self.gate_allowed = True
+        self._source.started()
+        return AckStatus.OK, self._run_id
+
+    def _stop(self, *, abort: bool) -> None:
+        if self._run is None:
+            return
+        if abort:
+            self._end(self._run, BlockStatus.ABORTED, BlockFlag(0))
+        else:
+            self._run.stop()
+            if self._state is SensorState.RUNNING:
+                self._state = SensorState.DRAINING
+
+    def _end(self, run: EmulatedRun, status: BlockStatus, flag: BlockFlag) -> None:
+        """Gate low, FIFO flushed, a last block without frames, idle."""
+        self._queue.clear()
+        self.gate_allowed = False
+        self._send(run, run.end(status, flag))
+
+    def _reset(self) -> None:
+        self._run = None
+        self._state = SensorState.IDLE
+        self._queue.clear()
+        self._acks.clear()
+        self._session_open = self.chip == "fx3"
+        self.gate_allowed = False
+
+    def _watch(self, now_s: float) -> None:
+        """The watchdog: a run whose host sends no PING ends dark."""
+        limit_ms = self._registers[Register.HEARTBEAT_MS]
+        run = self._run
+        if run is not None and limit_ms and now_s - run.pinged_s > limit_ms / 1000:
+            self._end(run, BlockStatus.ABORTED, BlockFlag.GATE_FORCED_LOW)
+
+    def _send(self, run: EmulatedRun | None, block: memoryview | None) -> None:
+        """Queue a block; a run ends with its last one."""
+        if block is not None:
+            pieces = (block,) if self.mangle is None else self.mangle(block)
+            self._queue.extend(memoryview(piece) for piece in pieces if len(piece))
+        if run is not None and run.over:
+            self._exposed = run.next_frame
+            self._registers[Register.FIFO_HIGH_WATER] = min(run.high_water_bytes, 0xFFFFFFFF)
+            self._run = None
+            self._state = SensorState.ARMED
+
+    def lose_next(self, n: int) -> None:
+        """Lose the next frames of the run inside the device."""
+        if self._run is not None:
+            self._run.lose(n)

@@ -1,0 +1,314 @@
+"""One run of an emulated SPB1 device: frames exposed, frames its memory loses, the blocks in which the others come.
+
+What an emulated SPB1 device is: its USB descriptors and its registers (docs/spb1-usb.md).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Final, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.frames import FRAME_RECORD, BlockFlag, BlockHeader, BlockStatus, frame_bytes
+from drivers.interfaces import WindowTable
+from drivers.spb1 import BlockLayout, block_views, frames_per_block, seal_block
+from drivers.spb1.control import IDENTITY_MAGIC, TEXT_BYTES, Feature, Register, pattern_row
+from drivers.spb1.layout import IDLE
+from drivers.spb1.writer import seal_control
+from sim_backend.wire.serve.usb_model import AlternateSpec, DeviceSpec, EndpointSpec
+
+IDLE_S: Final = 0.1
+"""A run without frames for so long sends a heartbeat block."""
+BUFFERS: Final = 80
+"""Blocks that transports may hold at a time; memory is taken as it is needed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Consecutive frames: start of the first in s of the transport's clock, period, exposure, and their windows."""
+
+    first_frame: int
+    n: int
+    start_s: float
+    period_s: float
+    exposure_s: float
+    window: WindowTable | None
+
+
+class FrameSource(Protocol):
+    """What the sensor sees and which markers reach it. Asked for every frame of a run, once and in order."""
+
+    def started(self) -> None:
+        """A run begins: counters of markers are 0."""
+        ...
+
+    def expose(self, span: Span, records: NDArray[np.void], bits: NDArray[np.uint8] | None) -> int:
+        """Fill `marks`, `x0`, `line`, `sweep` of the records (n,) and the bits; None: the frames get lost.
+
+        bits: (n, height, row bytes), with old bytes in it. Returns scan markers since START at the first frame.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class RunSettings:
+    """What holds for all runs. Options as of `SpbUsbModel`."""
+
+    width: int
+    height: int
+    tick_hz: int
+    paced: bool
+    fifo_frames: int
+    payload_crc: bool
+
+
+class BlockMemory:
+    """Buffers that no transport holds any more."""
+
+    def __init__(self) -> None:
+        self._buffers: list[NDArray[np.uint8]] = []
+        self._next = 0
+
+    def take(self, size: int) -> NDArray[np.uint8]:
+        """The one that was given out longest ago."""
+        if self._next == len(self._buffers):
+            self._buffers.append(np.zeros(0, np.uint8))
+        if len(self._buffers[self._next]) != size:
+            self._buffers[self._next] = np.zeros(size, np.uint8)
+        memory = self._buffers[self._next]
+        self._next = (self._next + 1) % BUFFERS
+        return memory
+
+    def control_block(self, stride: int, payload_type: int, run_id: int, payload: bytes) -> memoryview:
+        """A block without frames."""
+        memory = self.take(stride)
+        seal_control(memory, payload_type, run_id, payload)
+        return memory.data
+
+
+class EmulatedRun:
+    """From START to its last block."""
+
+    def __init__(
+        self,
+        board: RunSettings,
+        source: FrameSource,
+        registers: Mapping[int, int],
+        run_id: int,
+        memory: BlockMemory,
+        now_s: float,
+    ) -> None:
+        """ValueError where the stride holds no frame."""
+        self.next_frame = 0
+        self.pinged_s = now_s
+        self.over = False
+        """Its last block was made."""
+        self.high_water_bytes = 0
+        """Most that waited for the host."""
+        self._board, self._source, self._memory, self._run_id = board, source, memory, run_id
+        self._period, self._exposure = registers[Register.PERIOD_TICKS], registers[Register.EXPOSURE_TICKS]
+        self._burst = registers[Register.MODE] == 1
+        self._pattern = bool(registers[Register.TEST_PATTERN])
+        self._stride = registers[Register.STRIDE]
+        self._window = _window(registers)
+        self._width = board.width if self._window is None else self._window.width_px
+        most = frames_per_block(self._stride, self._width, board.height)
+        self._block_frames = min(most, registers[Register.BLOCK_FRAMES])
+        self._n_frames = (registers[Register.N_FRAMES] | registers[Register.N_FRAMES + 4] << 32) or None
+        self._start_s = self._sent_s = now_s
+        self._seq = 0
+        self._lost = 0
+        self._just_lost = False
+
+    def stop(self) -> None:
+        """No frame more."""
+        self._n_frames = self.next_frame
+
+    def end(self, status: BlockStatus, flag: BlockFlag) -> memoryview:
+        """The last block, without frames."""
+        self.over = True
+        return self._block(0, BlockFlag.LAST | flag, status)
+
+    def next_block(self, now_s: float) -> memoryview | None:
+        """The next block, if there is one by now."""
+        if self._n_frames is not None and self.next_frame >= self._n_frames:
+            return self.end(BlockStatus.OK, BlockFlag(0))  # stopped just behind a whole block
+        n = self._block_frames if self._n_frames is None else min(self._block_frames, self._n_frames - self.next_frame)
+        if self._board.paced:
+            n = self._lose_overrun(n, now_s)
+            if n == 0:
+                return self._idle(now_s)
+        self._sent_s = now_s
+        self.over = self._n_frames is not None and self.next_frame + n == self._n_frames
+        return self._block(n, BlockFlag.LAST if self.over else BlockFlag(0), BlockStatus.OK)
+
+    def lose(self, n: int) -> None:
+        """The next frames are exposed and never sent."""
+        if self._n_frames is not None:
+            n = min(n, self._n_frames - self.next_frame)
+        self._source.expose(self._span(n), np.zeros(n, FRAME_RECORD), None)
+        self.next_frame += n
+        self._lost += n
+        self._just_lost = True
+
+    def _idle(self, now_s: float) -> memoryview | None:
+        if now_s - self._sent_s < IDLE_S:
+            return None
+        self._sent_s = now_s
+        return self._memory.control_block(self._stride, IDLE, self._run_id, b"")
+
+    def _lose_overrun(self, n: int, now_s: float) -> int:
+        """Frames of the next block that are exposed by now; what the FIFO cannot hold is lost first."""
+        exposed = int((now_s - self._start_s) * self._board.tick_hz / self._period)
+        if self._n_frames is not None:
+            exposed = min(exposed, self._n_frames)
+        waiting, fifo = exposed - self.next_frame, self._board.fifo_frames
+        held = waiting if self._burst else min(waiting, fifo)
+        self.high_water_bytes = max(self.high_water_bytes, held * frame_bytes(self._width, self._board.height))
+        if not self._burst and waiting > fifo:
+            self.lose(waiting - fifo)
+            n = min(n, waiting, fifo)
+        return n if exposed - self.next_frame >= n else 0
+
+    def _span(self, n: int) -> Span:
+        period_s, exposure_s = self._period / self._board.tick_hz, self._exposure / self._board.tick_hz
+        start_s = self._start_s + self.next_frame * period_s
+        return Span(self.next_frame, n, start_s, period_s, exposure_s, self._window)
+
+    def _block(self, n: int, flags: BlockFlag, status: BlockStatus) -> memoryview:
+        board, layout = self._board, BlockLayout(n, self._width, self._board.height)
+        memory = self._memory.take(self._stride)
+        records, bits = block_views(memory, layout)
+        sweep = 0
+        if n:
+            records["y0"] = 0
+            records["ticks"] = np.arange(n, dtype=np.uint32) * np.uint32(self._period)
+            sweep = self._source.expose(self._span(n), records, bits)
+            if self._pattern:
+                flags |= BlockFlag.TEST_PATTERN
+                _draw_pattern(bits, self.next_frame, self._width)
+        if self._seq == 0:
+            flags |= BlockFlag.FIRST
+        if self._just_lost:
+            flags |= BlockFlag.LOST_BEFORE | BlockFlag.MEMORY_OVERFLOW
+        if self._burst:
+            flags |= BlockFlag.BURST
+        header = BlockHeader(
+            flags=flags,
+            run_id=self._run_id,
+            block_seq=self._seq,
+            first_frame=self.next_frame,
+            t0_ticks=round(self._start_s * board.tick_hz) + self.next_frame * self._period,
+            lost_before=self._lost,
+            tick_hz=Fraction(board.tick_hz),
+            frame_period_ticks=self._period,
+            exposure_ticks=self._exposure,
+            sweep=sweep,
+            frame_step=1,
+            width=self._width,
+            height=board.height,
+            sensor_width=board.width,
+            sensor_height=board.height,
+        )
+        seal_block(memory, header, layout, status=status, frames_lost=self._lost, payload_crc=board.payload_crc)
+        self.next_frame += n
+        self._seq += 1
+        self._just_lost = False
+        return memory.data
+
+
+def _window(registers: Mapping[int, int]) -> WindowTable | None:
+    """The table that the host wrote; None for full frames."""
+    width = registers[Register.WINDOW_WIDTH_PX]
+    if width == 0:
+        return None
+    counts = [registers[Register.WINDOW_COUNTS + 4 * i] for i in range(registers[Register.WINDOW_SWEEPS])]
+    begins = np.cumsum([0, *counts])
+    tables = [
+        np.array([registers[Register.WINDOW_X0 + 4 * i] for i in range(begin, begin + count)], np.int32)
+        for begin, count in zip(begins, counts, strict=False)
+    ]
+    return WindowTable(width, tuple(tables))
+
+
+def _draw_pattern(bits: NDArray[np.uint8], first_frame: int, width: int) -> None:
+    for frame, image in enumerate(bits, first_frame):
+        for row in range(len(image)):
+            image[row] = np.frombuffer(pattern_row(row, frame, width), np.uint8)
+
+
+Chip = Literal["fx3", "ft601"]
+
+_PACKET = 1024
+WRITABLE: Final = frozenset(
+    (
+        Register.HEARTBEAT_MS,
+        Register.PERIOD_TICKS,
+        Register.EXPOSURE_TICKS,
+        Register.MODE,
+        Register.STRIDE,
+        Register.BLOCK_FRAMES,
+        Register.N_FRAMES,
+        Register.N_FRAMES + 4,
+        Register.WINDOW_WIDTH_PX,
+        Register.WINDOW_SWEEPS,
+        Register.TEST_PATTERN,
+        Register.WINDOW_COUNTS,
+        Register.WINDOW_COUNTS + 4,
+    )
+)
+
+
+def device_spec(chip: Chip, acks: str, serial: str | None, product_name: str) -> DeviceSpec:
+    """FX3: 04B4:00F1, one interface. FT601: 0403:601F, interface 0 for its session, interface 1 for data."""
+    bulk = [EndpointSpec(address, "bulk", _PACKET) for address in (0x01, 0x81)]
+    if chip == "fx3":
+        if acks == "endpoint":
+            bulk.append(EndpointSpec(0x82, "bulk", _PACKET))
+        return DeviceSpec(0x04B4, 0x00F1, "spadrig", product_name, serial, "super", (AlternateSpec(0, 0, tuple(bulk)),))
+    session = (EndpointSpec(0x01, "bulk", _PACKET), EndpointSpec(0x81, "interrupt", 64, 1))
+    data = [EndpointSpec(address, "bulk", _PACKET) for address in (0x02, 0x82)]
+    if acks == "endpoint":
+        data.append(EndpointSpec(0x83, "bulk", _PACKET))
+    alternates = (AlternateSpec(0, 0, session), AlternateSpec(1, 0, tuple(data)))
+    return DeviceSpec(0x0403, 0x601F, "FTDI", product_name, serial, "super", alternates)
+
+
+def registers_at_power_up(
+    width: int,
+    height: int,
+    serial: str,
+    tick_hz: int,
+    min_period_ticks: int,
+    ddr_bytes: int,
+    max_stride: int,
+    link_bytes_per_s: int,
+    protocol: int,
+    features: Feature,
+) -> dict[int, int]:
+    """All of them by address, those that nobody wrote yet 0."""
+    registers = dict.fromkeys(WRITABLE, 0)
+    registers |= {
+        Register.MAGIC: IDENTITY_MAGIC,
+        Register.PROTOCOL: protocol,
+        Register.SENSOR_SIZE: width | height << 16,
+        Register.TICK_HZ: tick_hz,
+        Register.TICK_HZ_DEN: 1,
+        Register.DDR_BYTES: ddr_bytes & 0xFFFFFFFF,
+        Register.DDR_BYTES + 4: ddr_bytes >> 32,
+        Register.MAX_STRIDE: max_stride,
+        Register.FEATURES: int(features) & 0x3F,
+        Register.ROI_STEP_PX: 64,
+        Register.MIN_PERIOD_TICKS: min_period_ticks,
+        Register.LINK_BYTES_PER_S: link_bytes_per_s,
+        Register.WINDOW_ENTRIES: 4096,
+        Register.FIFO_HIGH_WATER: 0,
+        Register.STRIDE: max_stride,
+    }
+    for register, text in ((Register.MODEL, "emulated SPB1"), (Register.SERIAL, serial)):
+        raw = text.encode().ljust(TEXT_BYTES, b"\0")
+        for at in range(0, TEXT_BYTES, 4):
+            registers[register + at] = int.from_bytes(raw[at : at + 4], "little")
+    return registers

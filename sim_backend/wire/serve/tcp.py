@@ -1,0 +1,167 @@
+"""Serves a model of a program that speaks TCP: the real driver connects to it with a real socket, on this computer.
+
+One client at a time, as vendors' programs have it: while one is served nobody listens, and others are refused.
+"""
+
+import select
+import socket
+import struct
+import time
+from contextlib import suppress
+from typing import Protocol
+
+from drivers.clock import Clock
+from drivers.transports.endpoints import Endpoint
+from sim_backend.wire.serve.wire_server import FaultSchedule, WireServer
+
+HOST = "127.0.0.1"
+CHUNK_BYTES = 65_536
+"""Most that is asked of the model at a time: one piece of a stream, which a fault may strike."""
+_TURN_S = 0.002
+"""One turn of the serving thread while nothing moves."""
+
+
+class TcpModel(Protocol):
+    """A program behind a port: a pure state machine fed with bytes and a time. No threads, no waiting."""
+
+    def connected(self, now_s: float) -> None:
+        """A client connected."""
+        ...
+
+    def receive(self, data: bytes, now_s: float) -> None:
+        """Take bytes from the client, in pieces of any size."""
+        ...
+
+    def send(self, limit: int, now_s: float) -> bytes:
+        """The next bytes for the client, at most `limit`; b"" where there are none yet."""
+        ...
+
+    def disconnected(self, now_s: float) -> None:
+        """The client is gone."""
+        ...
+
+
+class TcpServer(WireServer[TcpModel]):
+    """A program that serves one client."""
+
+    def __init__(self, model: TcpModel, *, clock: Clock | None = None, faults: FaultSchedule | None = None) -> None:
+        super().__init__(model, clock, faults)
+        self._port = 0
+        self._listener: socket.socket | None = None
+        self._client: socket.socket | None = None
+
+    @property
+    def address(self) -> str:
+        """Where a client finds it."""
+        return f"{HOST}:{self._port}"
+
+    @property
+    def endpoint(self) -> Endpoint:
+        """The same for `Surroundings.ports`."""
+        return Endpoint(self.address, emulated=True)
+
+    def plug(self) -> None:
+        """The program runs: it listens, on the same port as before."""
+        with self.lock:
+            if self._listener is None and self._client is None:
+                self._listen()
+
+    def unplug(self) -> None:
+        """The program ends: the client's connection is reset, new ones are refused."""
+        with self.lock:
+            if self._listener is not None:
+                self._listener.close()
+                self._listener = None
+            self._drop_client()
+
+    def _listen(self) -> None:
+        self._listener = socket.create_server((HOST, self._port), backlog=1)
+        self._listener.setblocking(False)
+        self._port = self._listener.getsockname()[1]
+
+    def _serve(self) -> None:
+        while not self._ending.is_set():
+            with self.lock:
+                moved = False if self._hung else self._turn()
+                readers = [one for one in (self._client, self._listener) if one is not None]
+            if self._hung or not readers:
+                self._ending.wait(_TURN_S)
+            elif not moved:
+                with suppress(OSError, ValueError):  # closed while waiting
+                    select.select(readers, [], [], _TURN_S)
+
+    def _turn(self) -> bool:
+        """Accept, take, answer; whether anything moved."""
+        now_s = self._now_s()
+        if self._client is None:
+            return self._accept(now_s)
+        took = self._take(now_s)
+        return self._give(now_s) or took
+
+    def _accept(self, now_s: float) -> bool:
+        if self._listener is None:
+            return False
+        try:
+            self._client, _ = self._listener.accept()
+        except OSError:
+            return False
+        self._listener.close()  # refuses everybody else from now on
+        self._listener = None
+        self._client.setblocking(False)
+        self._outbox.clear()
+        self._free_at = 0.0
+        self.model.connected(now_s)
+        return True
+
+    def _take(self, now_s: float) -> bool:
+        assert self._client is not None, "asked for by the turn"
+        try:
+            data = self._client.recv(CHUNK_BYTES)
+        except BlockingIOError:
+            return False
+        except OSError:
+            data = b""
+        if data:
+            self.model.receive(data, now_s)
+        else:
+            self._drop_client()
+            self._listen()
+        return True
+
+    def _give(self, now_s: float) -> bool:
+        """Send what is due; ask the model for more only when all is sent, as a program blocks in its own send."""
+        if self._client is None:
+            return False
+        if not self._outbox and time.monotonic() >= self._free_at:
+            self._reply(self.model.send(CHUNK_BYTES, now_s))
+        now, moved = time.monotonic(), False
+        while self._client is not None and self._outbox and self._outbox[0][0] <= now:
+            due_at, data = self._outbox.popleft()
+            sent = self._send(data)
+            moved = moved or sent > 0
+            if sent < len(data):
+                self._outbox.appendleft((due_at, data[sent:]))
+                break
+        return moved
+
+    def _send(self, data: bytes) -> int:
+        assert self._client is not None, "asked for by the caller"
+        try:
+            return self._client.send(data)
+        except BlockingIOError:
+            return 0
+        except OSError:
+            self._drop_client()
+            self._listen()
+            return len(data)
+
+    def _drop_client(self) -> None:
+        """Reset the connection, as the end of a program with unread input does."""
+        if self._client is None:
+            return
+        with suppress(OSError):
+            self._client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self._client.close()
+        self._client = None
+        self._outbox.clear()
+        self.model.disconnected(self._now_s())

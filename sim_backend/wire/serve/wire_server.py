@@ -1,0 +1,246 @@
+"""What serves a model has a thread, a cable that can be pulled, firmware that can hang, and faults that strike.
+
+What can go wrong on a wire: late, split, merged, cut, corrupt, repeated or lost replies, stalls, unplugging, hangs.
+
+One seeded schedule decides, reply by reply, which fault strikes; the transports (serial, TCP, USB) act it out.
+"""
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from types import TracebackType
+from typing import Generic, Self, TypeVar
+
+import numpy as np
+
+from drivers.clock import NS_PER_S, Clock, SystemClock
+from drivers.transports.endpoints import Endpoint
+
+
+class Fault(Enum):
+    """One thing that goes wrong with one reply, acted out by `FaultSchedule.shape`; the last three strike the whole
+    device and are the transport's to act out."""
+
+    LATE = "late"
+    """Comes whole, after `late_s`."""
+    SPLIT = "split"
+    """Comes in two parts with a pause between them."""
+    MERGED = "merged"
+    """Comes together with the next reply."""
+    TRUNCATED = "truncated"
+    """Its end never comes."""
+    CORRUPTED = "corrupted"
+    """One of its bits is flipped."""
+    REPEATED = "repeated"
+    """Comes twice."""
+    LOST = "lost"
+    """Never comes."""
+    STALL = "stall"
+    """It and all that follows come after `stall_s`."""
+    UNPLUG = "unplug"
+    """The cable is pulled before it comes."""
+    HANG = "hang"
+    """The firmware hangs: it takes and says nothing from now on; its outputs stay as they are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """Bytes that reach the host a while after the device sent them."""
+
+    delay_s: float
+    data: bytes
+
+
+class FaultSchedule:
+    """Decides on each reply. Seeded, so that a sequence that failed can be run again.
+
+    probability: that a reply meets a fault at all. kinds: which ones, equally often. skip: so many replies come
+    unharmed first (the opening of a device, say). most: faults in all; None: no end.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        probability: float = 0.2,
+        kinds: Sequence[Fault] = tuple(Fault),
+        *,
+        skip: int = 0,
+        most: int | None = None,
+        late_s: float = 0.3,
+        stall_s: float = 1.5,
+    ) -> None:
+        self._random = np.random.default_rng(seed)
+        self._probability = probability
+        self._kinds = tuple(kinds)
+        self._skip = skip
+        self._left = most
+        self._late_s = late_s
+        self.stall_s = stall_s
+        self._held = b""
+        self.struck: list[Fault] = []
+        """What struck so far, in order."""
+
+    def next(self) -> Fault | None:
+        """The fault that strikes the next reply."""
+        if self._skip > 0:
+            self._skip -= 1
+            return None
+        if self._left == 0 or not self._kinds or self._random.random() >= self._probability:
+            return None
+        if self._left is not None:
+            self._left -= 1
+        fault = self._kinds[int(self._random.integers(len(self._kinds)))]
+        self.struck.append(fault)
+        return fault
+
+    def shape(self, fault: Fault | None, reply: bytes) -> tuple[Delivery, ...]:
+        """What arrives instead of `reply`; a reply held back to be merged comes with the next one."""
+        if fault is Fault.MERGED:
+            self._held += reply
+            return ()
+        held, self._held = self._held, b""
+        whole = held + reply
+        if not whole:
+            return ()
+        match fault:
+            case Fault.LATE:
+                return (Delivery(self._random.uniform(0.1, 1.0) * self._late_s, whole),)
+            case Fault.SPLIT:
+                cut = int(self._random.integers(len(whole) + 1))
+                return Delivery(0.0, whole[:cut]), Delivery(self._random.uniform(0.0, 0.2) * self._late_s, whole[cut:])
+            case Fault.TRUNCATED:
+                return (Delivery(0.0, whole[: int(self._random.integers(len(whole)))]),)
+            case Fault.CORRUPTED:
+                return (Delivery(0.0, self._corrupted(whole)),)
+            case Fault.REPEATED:
+                return (Delivery(0.0, whole + whole),)
+            case Fault.LOST:
+                return ()
+            case _:
+                return (Delivery(0.0, whole),)
+
+    def _corrupted(self, data: bytes) -> bytes:
+        damaged = bytearray(data)
+        damaged[int(self._random.integers(len(data)))] ^= 1 << int(self._random.integers(8))
+        return bytes(damaged)
+
+
+class FaultScript(FaultSchedule):
+    """Faults in a given order, one a reply (None: the reply comes unharmed); none after the last."""
+
+    def __init__(self, *script: Fault | None, late_s: float = 0.3, stall_s: float = 1.5) -> None:
+        super().__init__(0, late_s=late_s, stall_s=stall_s)
+        self._script = list(script)
+
+    def next(self) -> Fault | None:
+        """The next of the script."""
+        fault = self._script.pop(0) if self._script else None
+        if fault is not None:
+            self.struck.append(fault)
+        return fault
+
+
+Model = TypeVar("Model")
+
+
+class WireServer(ABC, Generic[Model]):
+    """A device on a wire of its own, from entering the `with` block (or `start`) to leaving it (`close`).
+
+    The model's time comes from a clock, so that a warm-up of minutes costs a test nothing; what is on the wire is late
+    in the host's time.
+    """
+
+    def __init__(self, model: Model, clock: Clock | None, faults: FaultSchedule | None) -> None:
+        self.model = model
+        self.lock = threading.RLock()
+        """Held around every call of the model; hold it to look at more than one of its attributes."""
+        self.faults = faults
+        self._clock = clock or SystemClock()
+        self._outbox: deque[tuple[float, bytes]] = deque()
+        self._free_at = 0.0
+        """When the next reply may leave: they leave in order."""
+        self._hung = False
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name=type(self).__name__, daemon=True)
+
+    @property
+    @abstractmethod
+    def endpoint(self) -> Endpoint:
+        """Where a host finds the device while it is plugged in, for `Surroundings.ports`."""
+
+    def start(self) -> Self:
+        """Plug it in and serve it on a thread of its own."""
+        self.plug()
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Unplug it for good; again: nothing happens."""
+        self._ending.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self.unplug()
+
+    def __enter__(self) -> Self:
+        """The server, serving."""
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()
+
+    @abstractmethod
+    def plug(self) -> None:
+        """Put the cable in. The device kept its power: its state is what it was."""
+
+    @abstractmethod
+    def unplug(self) -> None:
+        """Pull the cable: the open port is lost, bytes on their way with it."""
+
+    def hang(self) -> None:
+        """The firmware hangs: nothing is taken and nothing said, outputs stay as they are."""
+        with self.lock:
+            self._hung = True
+            self._outbox.clear()
+
+    def resume(self) -> None:
+        """End a hang."""
+        with self.lock:
+            self._hung = False
+
+    @abstractmethod
+    def _serve(self) -> None:
+        """The thread, until `_ending` is set."""
+
+    def _now_s(self) -> float:
+        """The model's time."""
+        return self._clock.now_ns() / NS_PER_S
+
+    def _reply(self, reply: bytes) -> None:
+        """Queue what the model says, as the faults would have it."""
+        if not reply:
+            return
+        now = time.monotonic()
+        if self.faults is None:
+            self._queue(now, reply)
+            return
+        fault = self.faults.next()
+        if fault is Fault.UNPLUG:
+            self.unplug()
+        elif fault is Fault.HANG:
+            self.hang()
+        else:
+            if fault is Fault.STALL:
+                self._free_at = max(self._free_at, now) + self.faults.stall_s
+            for delivery in self.faults.shape(fault, reply):
+                self._queue(now + delivery.delay_s, delivery.data)
+
+    def _queue(self, at: float, data: bytes) -> None:
+        self._free_at = max(self._free_at, at)
+        self._outbox.append((self._free_at, data))

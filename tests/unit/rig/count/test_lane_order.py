@@ -1,0 +1,161 @@
+"""Counts in lane order against unpacked bits: from planes, from counts in pixel order, and back."""
+
+import numba
+import numpy as np
+import pytest
+
+from rig.count.lane_order import (
+    PAD,
+    PAIRS,
+    STEPS,
+    halve_counts,
+    new_counts,
+    padded_lanes,
+    pixel_order,
+    place_of,
+    read_counts,
+    read_planes,
+    sum_counts,
+    write_counts,
+)
+
+PLANE_BYTES = 256
+
+
+@numba.njit
+def read(planes, first, second, plane_bytes, n_planes, window, n, lanes):
+    read_planes(planes, first, second, plane_bytes, n_planes, window, n, lanes)
+
+
+@numba.njit
+def add(n, lanes, sums):
+    sum_counts(n, lanes, sums)
+
+
+def address(array):
+    return array.ctypes.data
+
+
+def pixels_of(n, lanes):
+    """A row of counts in pixel order (8 lanes,)."""
+    pairs = n.reshape(PAIRS, lanes + 2 * PAD, 2)
+    return pairs[:, PAD : PAD + lanes].transpose(1, 0, 2).ravel()
+
+
+def padding_of(n, lanes):
+    pairs = n.reshape(PAIRS, lanes + 2 * PAD, 2)
+    return np.concatenate([pairs[:, :PAD].ravel(), pairs[:, PAD + lanes :].ravel()])
+
+
+@pytest.mark.parametrize(
+    ("pixels", "lanes"), [(1, 16), (64, 16), (128, 16), (192, 32), (256, 32), (320, 48), (512, 64)]
+)
+def test_rows_are_whole_vectors(pixels, lanes):
+    assert padded_lanes(pixels) == lanes
+    assert new_counts(3, lanes).shape == (3, PAIRS * (lanes + 2 * PAD) * 2)
+
+
+@pytest.mark.parametrize("window", range(64, 513, 64))
+@pytest.mark.parametrize("n_planes", [1, 2, 4, 8])
+@pytest.mark.parametrize("at", [(0, 64), (8, 16), (40, 40)])
+def test_planes_are_read_as_the_bits_that_they_hold(n_planes, window, at):
+    rng = np.random.default_rng(window + n_planes)
+    planes = rng.integers(0, 256, (8, PLANE_BYTES), np.uint8)
+    lanes = padded_lanes(window)
+    n = new_counts(2, lanes)
+    read(address(planes), *at, PLANE_BYTES, n_planes, window, address(n), lanes)
+    for row, begin in zip(n, at, strict=True):
+        bits = np.unpackbits(planes[:, begin : begin + window // 8], axis=1).astype(int)
+        wanted = (bits[:n_planes] << np.arange(n_planes)[:, None]).sum(axis=0)
+        np.testing.assert_array_equal(pixels_of(row, lanes)[:window], wanted)
+        # Beyond the window lie other pixels' bits.
+        assert not pixels_of(row, lanes)[window:].any()
+        assert not padding_of(row, lanes).any()
+
+
+def test_every_count_of_eight_planes_is_read():
+    planes = np.zeros((8, PLANE_BYTES), np.uint8)
+    counts = np.arange(256)
+    for q in range(8):
+        planes[q, :32] = np.packbits((counts >> q) & 1)
+    n = new_counts(2, 32)
+    read(address(planes), 0, 0, PLANE_BYTES, 8, 256, address(n), 32)
+    for row in n:
+        np.testing.assert_array_equal(pixels_of(row, 32), counts)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
+@pytest.mark.parametrize("window", [64, 128, 192, 448])
+def test_counts_come_back_as_they_went_in(window, dtype):
+    rng = np.random.default_rng(window)
+    counts = rng.integers(0, 200, window).astype(dtype)
+    lanes = padded_lanes(window)
+    n = new_counts(1, lanes)[0]
+    read_counts(counts, 0, address(n), lanes)
+    np.testing.assert_array_equal(pixels_of(n, lanes)[:window], counts)
+    assert not padding_of(n, lanes).any()
+    for x in (0, 1, 7, 8, window - 1):
+        assert n[place_of(x, lanes)] == counts[x]
+    for x in (-1, -8, lanes * STEPS, lanes * STEPS + 7):
+        assert n[place_of(x, lanes)] == 0
+    out = np.full(window, 3, dtype)
+    write_counts(n, out)
+    np.testing.assert_array_equal(out, counts + 3)
+
+
+@pytest.mark.parametrize("times", [1, 2, 3])
+def test_halving_rounds_the_same_from_planes_and_from_counts(times):
+    most = min(60 << times, 256)
+    counts = np.random.default_rng(times).integers(0, most, 128).astype(np.uint32)
+    counts[:2] = 0, most - 1
+    one, other = new_counts(2, 16)
+    read_counts(counts, times, address(one), 16)
+    # Rounded up or down by turns, so that few counts keep their mean.
+    shares = ((np.arange(128) & 7) << times) >> 3
+    np.testing.assert_array_equal(pixels_of(one, 16), (counts + shares) >> times)
+    read_counts(counts, 0, address(other), 16)
+    halve_counts(address(other), 16, times)
+    np.testing.assert_array_equal(other, one)
+
+
+@pytest.mark.parametrize("times", [4, 5, 10, 14])
+def test_few_of_very_many_exposures_keep_their_mean_in_every_pixel(times):
+    """Eight shares alone would turn 0.16 ones of a pixel, 327 of 2^11, into 0.125 or none."""
+    counts, n, total = np.full(128, 0.16 * 2**times).round().astype(np.uint32), new_counts(1, 16)[0], np.zeros(128)
+    for turn in range(2048):
+        read_counts(counts, times, address(n), 16, turn)
+        total += pixels_of(n, 16)
+    np.testing.assert_allclose(total / 2048, counts / 2**times, atol=2.0 ** -min(times, 11))
+
+
+@pytest.mark.parametrize("times", [1, 2, 3])
+@pytest.mark.parametrize("rate", [0.1, 0.5, 2.0])
+def test_halved_counts_keep_their_mean(rate, times):
+    counts = np.random.default_rng(times).poisson(rate, (200, 512)).astype(np.uint16)
+    n = new_counts(1, 64)[0]
+    total = 0
+    for row in counts:
+        read_counts(row, times, address(n), 64)
+        total += int(pixels_of(n, 64).sum())
+    assert total / counts.sum() == pytest.approx(2.0**-times, rel=0.03)
+
+
+def test_the_largest_counts_are_halved_without_running_over():
+    counts = np.full(64, 2**31, np.uint32)
+    n = new_counts(1, 16)[0]
+    read_counts(counts, 26, address(n), 16)
+    assert set(pixels_of(n, 16)[:64].tolist()) == {32}
+
+
+def test_sums_of_counts_are_in_pixel_order_when_asked():
+    rng = np.random.default_rng(1)
+    sums = np.zeros((3, PAIRS, 16, 2), np.uint8)
+    wanted = np.zeros((3, 128), np.int64)
+    for _ in range(5):
+        for y in range(3):
+            counts, n = rng.integers(0, 52, 128).astype(np.uint8), new_counts(1, 16)[0]
+            read_counts(counts, 0, address(n), 16)
+            add(address(n), 16, address(sums[y]))
+            wanted[y] += counts
+    for width in (128, 100, 1):
+        np.testing.assert_array_equal(pixel_order(sums, width), wanted[:, :width])

@@ -1,0 +1,114 @@
+"""Maps whose own light speaks against them, and maps that are right though faint, hazy, tilted or small."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rig.count.map_checks import POINTS, MapChecks, check_points
+from rig.geometry.stripe_table import StripeTable
+from tests.unit.small_maps import simulated, volume_of
+
+ROWS, COLUMNS = 64, 160
+
+
+def doubts(light: str, exposures: int, change=None, rig: str = "left") -> tuple[str, ...]:
+    """Of a simulated sweep whose counts (columns, rows, width) were changed; no answer is sure."""
+    sweep = simulated(light, exposures, rig, rows=ROWS, columns=COLUMNS)
+    counts = sweep.counts if change is None else change(sweep.counts)
+    volume = volume_of(counts, sweep.geometry, exposures)
+    checks = MapChecks(sweep.geometry, calibrated=True, knows=False)
+    return checks.doubts(volume, volume.intensity(), StripeTable.empty(ROWS, COLUMNS))
+
+
+def least_significant_first(counts):
+    x = np.arange(counts.shape[2])
+    return counts[:, :, 8 * (x // 8) + 7 - x % 8]
+
+
+def exposures_first(counts):
+    """Frame k of all columns, then the next: K frames of following columns are taken for one column's."""
+    rng = np.random.default_rng(0)
+    columns, exposures = len(counts), int(counts.max())
+    of = (np.arange(columns)[:, None] * exposures + np.arange(exposures)) % columns
+    share = counts[of] / exposures
+    return (rng.random(share.shape) < share).sum(axis=1).astype(counts.dtype)
+
+
+def shuffled(counts):
+    return counts[np.random.default_rng(0).permutation(len(counts))]
+
+
+def twice_as_fast(counts):
+    """The planes of half the angle."""
+    return counts[np.minimum(2 * np.arange(len(counts)), len(counts) - 1)]
+
+
+def noise(counts):
+    return np.random.default_rng(0).binomial(10, 0.05, counts.shape).astype(counts.dtype)
+
+
+def pattern(counts):
+    """The same pixels in all frames."""
+    lit = np.random.default_rng(0).random(counts.shape[1:]) < 0.3
+    return np.broadcast_to(np.where(lit, 10, 0), counts.shape).astype(counts.dtype)
+
+
+@pytest.mark.parametrize("rig", ["left", "right", "turned"])
+@pytest.mark.parametrize(("light", "exposures"), [("clear", 3), ("report", 3), ("report", 10), ("dense", 20)])
+def test_a_right_map_is_not_doubted(light: str, exposures: int, rig: str) -> None:
+    assert doubts(light, exposures, rig=rig) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "seen", "lights"),
+    [
+        (least_significant_first, "the bits of each byte seem reversed", ("clear", "report", "dense")),
+        (exposures_first, "columns do not follow one another", ("clear",)),
+        (lambda counts: counts[::-1], "columns do not follow one another", ("clear", "report")),
+        (shuffled, "columns do not follow one another", ("clear", "report", "dense")),
+        (twice_as_fast, "columns do not follow one another", ("clear", "report", "dense")),
+        (noise, "no line", ("clear",)),
+        (pattern, "no line", ("clear",)),
+        (np.zeros_like, "no light", ("clear",)),
+        (lambda counts: np.full_like(counts, 10), "saturated", ("clear",)),
+    ],
+)
+def test_a_wrong_map_says_what_is_wrong(change, seen: str, lights: tuple[str, ...]) -> None:
+    for light in lights:
+        (reason,) = doubts(light, 10, change)
+        assert reason.startswith(seen)
+
+
+def test_sure_answers_need_light() -> None:
+    sweep = simulated("report", 10, rows=ROWS, columns=COLUMNS)
+    volume, truth = sweep.volume, sweep.point.truth()
+    checks = MapChecks(sweep.geometry, calibrated=True, knows=True)
+    nothing = np.zeros_like(truth)
+    right = StripeTable(
+        truth, np.where(np.isfinite(truth), np.float32(0.95), np.float32(0.0)), nothing, nothing, nothing
+    )
+    assert checks.doubts(volume, volume.intensity(), right) == ()
+    # A surface that is not there, in the haze before some of the stripes.
+    beside = replace(right, x_px=np.where(np.arange(COLUMNS) % 4 == 0, truth - 25, truth).astype(np.float32))
+    (reason,) = checks.doubts(volume, volume.intensity(), beside)
+    assert reason.startswith("answers without light")
+    # An estimator that says it is not sure has claimed nothing.
+    unsure = replace(beside, confidence=np.full_like(truth, 0.5))
+    assert checks.doubts(volume, volume.intensity(), unsure) == ()
+
+
+def test_a_map_of_few_points_is_not_judged() -> None:
+    sweep = simulated("report", 10, rows=4, columns=30)
+    volume = volume_of(noise(sweep.counts), sweep.geometry, 10)
+    checks = MapChecks(sweep.geometry, calibrated=True, knows=True)
+    assert checks.doubts(volume, volume.intensity(), StripeTable.empty(4, 30)) == ()
+
+
+def test_points_lie_in_the_searched_windows_with_their_partners() -> None:
+    geometry = simulated("report", 10, "turned", rows=ROWS, columns=COLUMNS).geometry
+    points = check_points(geometry)
+    assert 0 < points.row.shape[1] <= POINTS
+    assert (geometry.x_lo <= geometry.x_hi)[points.row, points.column].all()
+    assert np.array_equal(points.row[1], points.row[0] + 1)
+    assert (points.column[2] > points.column[0]).all()

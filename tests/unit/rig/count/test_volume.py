@@ -1,0 +1,226 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.count.volume import BIN_DARK, BIN_UNUSABLE, CountVolume, SweepCounter, SweepLayout
+from rig.threads import RowWorkers
+
+WORD = 64
+VOLUME = [field.name for field in dataclasses.fields(CountVolume)]
+
+
+def packed(frames):
+    """Frames (n, rows, width) bool as bytes, rows padded to whole words."""
+    bits = np.packbits(frames, axis=2)
+    return np.pad(bits, ((0, 0), (0, 0), (0, -bits.shape[2] % 8)))
+
+
+def expected_counts(frames, bins, x0, window):
+    """Counts by unpacked sums, whole pixels beyond the picture zero."""
+    n_columns, (_, rows, width) = len(x0), frames.shape
+    wide = np.zeros((n_columns, rows, width + window + WORD), np.int64)
+    for c in range(n_columns):
+        wide[c, :, :width] = frames[bins == c].sum(axis=0)
+    return np.stack([wide[c, :, x : x + window] for c, x in enumerate(x0)])
+
+
+def layout_of(frames, x0, window, used_px=None):
+    _, rows, width = frames.shape
+    return SweepLayout(len(x0), rows, width, np.asarray(x0, np.int32), window, 1, used_px)
+
+
+def count(frames, bins, column, x0, window, *, threads=2, blocks=(10**9,)):
+    """The project's volume of whole frames, see `counted`."""
+    nowhere = np.zeros(len(frames), np.int32)
+    return counted(packed(frames), bins, column, nowhere, layout_of(frames, x0, window), threads, blocks)
+
+
+def counted(bits, bins, column, frame_x0, layout, threads, blocks):
+    """The project's volume, the stream cut into blocks of the given sizes (the last one repeated)."""
+    first, sizes = 0, list(blocks)
+    with RowWorkers(threads) as workers:
+        counter = SweepCounter(layout, workers)
+        while first < len(bits):
+            part = slice(first, first + (sizes.pop(0) if len(sizes) > 1 else sizes[0]))
+            counter.add(np.ascontiguousarray(bits[part]), bins[part], column[part], frame_x0[part])
+            first = part.stop
+        return counter.finish()
+
+
+def stream(seed, n, rows, width, n_columns, rate=0.3):
+    rng = np.random.default_rng(seed)
+    frames = rng.random((n, rows, width)) < rate
+    bins = rng.integers(BIN_UNUSABLE, n_columns, n).astype(np.int32)
+    return frames, bins, rng.uniform(-0.5, n_columns - 0.5, n)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32), st.integers(1, 150), st.integers(1, 7), st.integers(1, 200), st.integers(1, 9), st.data()
+)  # fmt: skip
+def test_counts_are_the_unpacked_sums_whatever_the_order_of_columns(seed, n, rows, width, n_columns, data):
+    frames, bins, column = stream(seed, n, rows, width, n_columns)
+    words = -(-width // WORD)
+    window = WORD * data.draw(st.integers(1, words))
+    starts = st.integers(0, words - window // WORD).map(lambda w: w * WORD)
+    x0 = np.array(data.draw(st.lists(starts, min_size=n_columns, max_size=n_columns)), np.int32)
+    volume = count(frames, bins, column, x0, window)
+    np.testing.assert_array_equal(volume.counts, expected_counts(frames, bins, x0, window))
+    np.testing.assert_array_equal(volume.n_frames, [(bins == c).sum() for c in range(n_columns)])
+    means = [column[bins == c].mean() if (bins == c).any() else np.nan for c in range(n_columns)]
+    np.testing.assert_allclose(volume.column, means, rtol=1e-12)
+    assert volume.n_dark == (bins == BIN_DARK).sum()
+    if volume.n_dark:
+        np.testing.assert_array_equal(volume.dark_counts, frames[bins == BIN_DARK].sum(axis=0))
+    else:
+        assert volume.dark_counts is None
+
+
+@pytest.mark.parametrize(("rows", "width"), [(50, 70), (30, 500), (1, 1), (3, 64), (64, 130)])
+def test_sensors_that_are_no_multiple_of_a_word_are_counted_whole(rows, width):
+    frames, bins, column = stream(3, 90, rows, width, 7)
+    x0, window = np.zeros(7, np.int32), -(-width // WORD) * WORD
+    volume = count(frames, bins, column, x0, window)
+    np.testing.assert_array_equal(volume.counts, expected_counts(frames, bins, x0, window))
+    assert volume.dark_counts.shape == volume.intensity().shape == (rows, width)
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 31, 62, 63, 64, 65, 126, 127, 128, 189, 254, 255])
+def test_every_number_of_exposures_up_to_255_fits_a_byte(k):
+    rng = np.random.default_rng(k)
+    frames = rng.random((k, 3, 70)) < 0.9
+    frames[:, 1] = True
+    volume = count(frames, np.ones(k, np.int32), np.ones(k), [0, 0, 0], 128)
+    assert volume.counts.dtype == np.uint8
+    np.testing.assert_array_equal(volume.counts[1, :, :70], frames.sum(axis=0))
+    assert volume.counts[1, 1, :70].tolist() == [k] * 70
+    assert not volume.counts[[0, 2]].any()
+
+
+@pytest.mark.parametrize(
+    ("k", "dtype"),
+    [(255, np.uint8), (256, np.uint16), (300, np.uint16), (65_535, np.uint16), (65_536, np.uint32),
+     (70_000, np.uint32)],
+)  # fmt: skip
+def test_counts_widen_before_they_overflow(k, dtype):
+    frames, _, _ = stream(1, 100, 2, 70, 1)
+    frames[:, 0] = True
+    bits, nowhere = packed(frames), np.zeros(100, np.int32)
+    counter = SweepCounter(layout_of(frames, [0, 0], 128), RowWorkers(1))
+    # The neighbour was counted while the counts were still narrow.
+    counter.add(bits, np.ones(100, np.int32), np.ones(100), nowhere)
+    expected = np.zeros((2, 70), np.int64)
+    for first in range(0, k, 100):
+        n = min(100, k - first)
+        counter.add(bits[:n], np.zeros(n, np.int32), np.zeros(n), nowhere[:n])
+        expected += frames[:n].sum(axis=0)
+    volume = counter.finish()
+    assert volume.counts.dtype == dtype
+    np.testing.assert_array_equal(volume.counts[0, :, :70], expected)
+    np.testing.assert_array_equal(volume.counts[1, :, :70], frames.sum(axis=0))
+    assert volume.counts[0, 0, 0] == k
+    assert volume.intensity()[0, 0] == k + 100
+
+
+def test_more_than_255_dark_frames_do_not_overflow():
+    frames = np.ones((300, 2, 70), bool)
+    volume = count(frames, np.full(300, BIN_DARK, np.int32), np.zeros(300), [0], 128)
+    assert volume.dark_counts.dtype == np.uint32
+    assert np.all(volume.dark_counts == 300)
+    assert not volume.counts.any()
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 16])
+@pytest.mark.parametrize("blocks", [(1,), (7,), (64, 1, 63), (3, 500)])
+def test_neither_threads_nor_blocks_change_a_bit(threads, blocks):
+    frames, bins, column = stream(5, 400, 13, 130, 5)
+    bins = np.sort(bins)  # long runs of one column, so that blocks cut them
+    x0 = [0, 64, 64, 0, 64]
+    one = count(frames, bins, column, x0, 128, threads=1)
+    other = count(frames, bins, column, x0, 128, threads=threads, blocks=blocks)
+    for name in VOLUME:
+        np.testing.assert_array_equal(getattr(other, name), getattr(one, name))
+
+
+def test_a_column_without_frames_has_no_position_and_no_counts():
+    frames, _, _ = stream(1, 20, 2, 64, 1)
+    volume = count(frames, np.full(20, 2, np.int32), np.linspace(1.6, 2.4, 20), [0, 0, 0], 64)
+    assert volume.n_frames.tolist() == [0, 0, 20]
+    assert np.isnan(volume.column[:2]).all()
+    assert volume.column[2] == pytest.approx(2.0)
+    assert not volume.counts[:2].any()
+
+
+def test_a_volume_outlives_the_next_sweep():
+    frames, bins, column = stream(1, 60, 3, 64, 3)
+    nowhere = np.zeros(60, np.int32)
+    counter = SweepCounter(layout_of(frames, [0, 0, 0], 64), RowWorkers(1))
+    counter.add(packed(frames), bins, column, nowhere)
+    first = counter.finish()
+    kept = first.counts.copy(), first.n_frames.copy(), first.dark_counts.copy()
+    counter.reset()
+    empty = counter.finish()
+    assert not empty.counts.any()
+    assert not empty.n_frames.any()
+    assert empty.n_dark == 0
+    counter.add(packed(frames), bins, column, nowhere)
+    second = counter.finish()
+    for volume in (first, second):
+        for got, wanted in zip((volume.counts, volume.n_frames, volume.dark_counts), kept, strict=True):
+            np.testing.assert_array_equal(got, wanted)
+
+
+@pytest.mark.parametrize("blocks", [(10**9,), (1,), (7, 30)])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_frames_cut_to_their_used_pixels_are_counted_as_whole_ones(blocks, threads):
+    frames, bins, column = stream(11, 300, 5, 300, 6)
+    rng, used, window = np.random.default_rng(2), 192, 128
+    bins = np.repeat(bins[::5], 5)  # runs of one column, so that its frames share a run
+    x0 = np.array([0, 64, 64, 128, 128, 192], np.int32)
+    used_x0 = rng.integers(0, 3, 300).astype(np.int32) * 64  # rows of 300 pixels have 5 words, windows 3
+    outside = (bins >= 0) & ~((used_x0 <= x0[bins]) & (x0[bins] + window <= used_x0 + used))
+    bins[outside] = BIN_UNUSABLE
+    assert len(np.unique(bins)) == 8
+    whole = packed(frames)
+    cut = np.stack([frame[:, at // 8 : (at + used) // 8] for frame, at in zip(whole, used_x0, strict=True)])
+    layout = layout_of(frames, x0, window, used)
+    volumes = [counted(bits, bins, column, used_x0, layout, threads, blocks) for bits in (whole, cut)]
+    for name in VOLUME:
+        np.testing.assert_array_equal(getattr(volumes[0], name), getattr(volumes[1], name))
+    np.testing.assert_array_equal(volumes[0].counts, expected_counts(frames, bins, x0, window))
+    seen = (used_x0[:, None] <= np.arange(300)) & (np.arange(300) < used_x0[:, None] + used)
+    dark = bins == BIN_DARK
+    np.testing.assert_array_equal(volumes[0].dark_frames, seen[dark].sum(axis=0))
+    np.testing.assert_array_equal(volumes[0].dark_counts, (frames & seen[:, None, :])[dark].sum(axis=0))
+    assert volumes[0].n_dark == dark.sum()
+
+
+@pytest.mark.parametrize(("window", "x0"), [(100, 0), (64, 32), (64, 1)])
+def test_windows_off_the_word_grid_are_refused(window, x0):
+    with pytest.raises(ValueError, match="multiples of 64"):
+        SweepLayout(1, 2, 200, np.array([x0], np.int32), window, 10)
+
+
+def test_intensity_is_the_sum_over_columns_at_their_place():
+    frames, bins, column = stream(9, 200, 4, 200, 5)
+    x0, window = np.array([0, 64, 128, 64, 0]), 128
+    volume = count(frames, bins, column, x0, window)
+    wanted = np.zeros((4, 200), np.int64)
+    for c in range(5):
+        end = min(x0[c] + window, 200)
+        wanted[:, x0[c] : end] += frames[bins == c].sum(axis=0)[:, x0[c] : end]
+    np.testing.assert_array_equal(volume.intensity(), wanted)
+
+
+def test_intensity_of_wide_counts_does_not_wrap():
+    counts = np.full((3, 2, 64), 65_535, np.uint16)
+    full = np.full(3, 65_535, np.int32)
+    volume = CountVolume(
+        counts=counts, x0=np.zeros(3, np.int32), n_frames=full, column=np.arange(3.0), dark_counts=None, n_dark=0,
+        width=50,
+    )  # fmt: skip
+    assert np.all(volume.intensity() == 3 * 65_535)
+    assert volume.intensity().shape == (2, 50)

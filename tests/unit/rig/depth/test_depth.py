@@ -1,0 +1,162 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rig.depth.depth import depth_map
+from rig.geometry.stripe_table import StripeTable
+from tests.reference.geometry import FOCAL_PX, Geometry
+from tests.reference.scene import Scene
+from tests.reference.working_point import CLEAR, WorkingPoint
+from tests.unit.small_maps import RIGS, geometry_of
+
+ROWS, WIDTH, COLUMNS = 8, 512, 500
+RIG = Geometry.build(width=WIDTH, height=ROWS, columns=COLUMNS)
+GEOMETRY = geometry_of(RIG)
+
+
+def table(x_px, confidence=1.0, x_sd_px=0.0):
+    x = np.asarray(x_px, np.float32)
+    empty = np.isnan(x)
+    sure = np.where(empty, 0.0, np.broadcast_to(confidence, x.shape)).astype(np.float32)
+    sd = np.where(empty, np.nan, np.broadcast_to(x_sd_px, x.shape)).astype(np.float32)
+    return StripeTable(x, sure, sd, np.ones_like(x), np.zeros_like(x))
+
+
+def wall_stripes(depth_m, rows=ROWS):
+    """Exact stripes (rows, columns) of a wall facing the camera, NaN outside the picture."""
+    n, d = RIG.planes[:, :3], RIG.planes[:, 3]
+    u = (d / depth_m - n[:, 2]) / n[:, 0]
+    x = (WIDTH - 1) / 2 + FOCAL_PX * u
+    return np.tile(np.where((x >= 0) & (x <= WIDTH - 1), x, np.nan), (rows, 1))
+
+
+def facing(depth_m):
+    return lambda u, v: np.full_like(u, 1 / depth_m)
+
+
+def tilted(u, v):
+    """Inverse depth of a slanted wall 0.6 X + 0.3 Y + Z = 3 m, 2.4 to 4 m away."""
+    return (0.6 * u + 0.3 * v + 1.0) / 3.0
+
+
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("wall", [facing(1.3), facing(3.0), facing(7.5), tilted])
+def test_exact_stripes_of_a_wall_give_its_depth(rig, wall):
+    g = Geometry.build(width=WIDTH, height=ROWS, columns=COLUMNS, **RIGS[rig])
+    depth = 1.0 / wall(g.u, g.v)
+    scene = Scene("wall", depth.astype(np.float32), np.ones(depth.shape, np.float32), np.ones(depth.shape, bool))
+    stripes = WorkingPoint(scene, CLEAR, g).truth()
+    result = depth_map(table(stripes), geometry_of(g), 0.5)
+    assert result.dtype == np.float32
+    known = np.isfinite(result)
+    np.testing.assert_allclose(result[known], depth[known], rtol=1e-4)
+    first, last = np.nanmin(stripes, axis=1), np.nanmax(stripes, axis=1)
+    x = np.arange(WIDTH)
+    between = (x >= first[:, None]) & (x <= last[:, None])
+    assert between.mean() > 0.5
+    np.testing.assert_array_equal(known, between)
+
+
+def test_a_jump_between_two_walls_is_not_bridged():
+    x = np.where(np.arange(COLUMNS) < 240, wall_stripes(2.0), wall_stripes(4.0))
+    result = depth_map(table(x), GEOMETRY, 0.5)
+    edges = np.ceil(x[0, 239]), np.floor(x[0, 240])
+    assert edges[1] - edges[0] > 40
+    gap = np.arange(WIDTH)[None, :]
+    gap = np.broadcast_to((gap > edges[0]) & (gap < edges[1]), result.shape)
+    assert np.isnan(result[gap]).all()
+    known = result[np.isfinite(result)]
+    assert np.all(np.minimum(np.abs(known / 2 - 1), np.abs(known / 4 - 1)) < 1e-4)
+    assert np.any(known < 3)
+    assert np.any(known > 3)
+
+
+@pytest.mark.parametrize(("front", "back", "wins_m"), [(0.6, 0.9, 4.0), (0.9, 0.6, 2.0)])
+def test_the_more_confident_surface_wins_a_pixel_that_two_claim(front, back, wins_m):
+    # The line passes the far wall first, then the near one at smaller x: both cover the pixels between.
+    early = np.arange(COLUMNS) < 240
+    x = np.where(early, wall_stripes(4.0), wall_stripes(2.0))
+    result = depth_map(table(x, np.where(early, back, front)), GEOMETRY, 0.5)
+    both = slice(int(np.ceil(x[0, 240])) + 1, int(x[0, 239]) - 1)
+    assert both.stop - both.start > 30
+    np.testing.assert_allclose(result[:, both], wins_m, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("lost", "bridged"), [(1, True), (2, False)])
+def test_stripes_are_joined_over_at_most_two_columns(lost, bridged):
+    x = wall_stripes(3.0)
+    whole = depth_map(table(x), GEOMETRY, 0.5)
+    x[:, 200 : 200 + lost] = np.nan
+    result = depth_map(table(x), GEOMETRY, 0.5)
+    gap = slice(int(np.ceil(x[0, 199])), int(np.floor(x[0, 200 + lost])) + 1)
+    inner = slice(gap.start + (x[0, 199] == gap.start), gap.stop)
+    assert inner.stop > inner.start
+    if bridged:
+        np.testing.assert_allclose(result, whole, rtol=1e-4)
+    else:
+        assert np.isnan(result[:, inner]).all()
+        assert np.isfinite(result[:, inner.start - 3 : inner.start - 1]).all()
+
+
+def test_only_confident_stripes_enter_and_the_limit_itself_is_enough():
+    x = wall_stripes(3.0)
+    confidence = np.full(x.shape, 0.7)
+    confidence[2] = 0.69
+    result = depth_map(table(x, confidence), GEOMETRY, float(np.float32(0.7)))
+    assert np.isnan(result[2]).all()
+    assert np.isfinite(result[3]).mean() > 0.5
+    np.testing.assert_array_equal(result[1], result[3])
+
+
+@pytest.mark.parametrize(
+    ("error_px", "sd_px", "joined"),
+    [(0.8, 0.0, True), (1.3, 0.0, False), (1.3, 0.3, True), (-0.8, 0.0, True), (-1.3, 0.0, False), (3.0, 0.3, False)],
+)
+def test_stripes_are_joined_within_a_pixel_and_three_sd(error_px, sd_px, joined):
+    x = np.full((ROWS, COLUMNS), np.nan)
+    x[:, 200:204] = wall_stripes(3.0)[:, 200:204] + [0.0, 0.0, 6.0 + error_px, 6.0 + error_px]
+    geometry = GEOMETRY
+    # Columns 202 and 203 are made six pixels later ones, so that the pixels in between are many.
+    plane = geometry.plane.copy()
+    n, d = RIG.planes[:, :3], RIG.planes[:, 3]
+    moved = n[202:204].copy()
+    moved[:, 2] -= moved[:, 0] * 6.0 / FOCAL_PX
+    plane[202:204] = moved / (d[202:204] + 0.0)[:, None]
+    result = depth_map(table(x, 1.0, sd_px), replace(geometry, plane=plane), 0.5)
+    gap = slice(int(np.ceil(x[0, 201] + 1)), int(x[0, 201] + 4))
+    assert np.isfinite(result[:, gap]).all() == joined
+    assert np.isnan(result[:, gap]).all() == (not joined)
+
+
+def test_depths_more_than_a_tenth_outside_the_range_are_no_estimate():
+    for depth_m, inside in [(0.95, True), (0.85, False), (8.5, True), (9.5, False)]:
+        result = depth_map(table(wall_stripes(depth_m)), GEOMETRY, 0.5)
+        if inside:
+            np.testing.assert_allclose(result[np.isfinite(result)], depth_m, rtol=1e-4)
+        assert np.isfinite(result).any() == inside
+
+
+def test_without_stripes_there_is_no_depth():
+    assert np.isnan(depth_map(StripeTable.empty(ROWS, COLUMNS), GEOMETRY, 0.0)).all()
+
+
+def test_a_single_stripe_makes_no_surface():
+    x = np.full((ROWS, COLUMNS), np.nan)
+    x[:, 250] = wall_stripes(3.0)[:, 250]
+    assert np.isnan(depth_map(table(x), GEOMETRY, 0.5)).all()
+
+
+def test_each_row_is_filled_from_its_own_stripes_only():
+    x = wall_stripes(3.0)
+    x[4] = np.nan
+    result = depth_map(table(x), GEOMETRY, 0.5)
+    assert np.isnan(result[4]).all()
+    assert np.isfinite(result[[3, 5]]).mean() > 0.5
+
+
+def test_stripes_beyond_the_picture_do_not_spill():
+    x = wall_stripes(3.0)
+    x[0, 100:102] = [-0.4, 0.6]
+    x[1, 400:402] = [WIDTH - 1.6, WIDTH - 0.6]
+    assert np.isfinite(depth_map(table(x, 1.0, 500.0), GEOMETRY, 0.5)).any()

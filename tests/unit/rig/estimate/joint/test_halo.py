@@ -1,0 +1,201 @@
+"""The halo of forward-peaked fog: what it adds to label costs, and that it is found where it is and only there."""
+
+import io
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rig.estimate.joint.halo import bright_lines, learn_next_halo, solve
+from rig.estimate.joint.joint import Joint
+from rig.estimate.joint.labels.cost_rows import EXCLUDED
+from rig.estimate.joint.labels.costs import _lights, costs_of
+from rig.estimate.joint.labels.grid import PER_PX, label_grid
+from rig.estimate.joint.labels.halo_rows import BLOCK_PX
+from rig.estimate.joint.lesson import add_quiet
+from rig.estimate.joint.place.places import most_shown
+from rig.estimate.joint.tables import tables_of
+from rig.estimate.row.inputs import halo_shares, over_bins, row_buffers, row_fluxes, state_of, sweep_of
+from rig.estimate.row.likelihood import FLOOR
+from rig.estimate.row.model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, pixel_shares
+from rig.estimate.search.online_learning import LearningSetting
+from rig.simd.vectors import LANES
+from rig.threads import RowWorkers
+from tests.unit.rig.estimate.joint.test_label_volume import known_model
+from tests.unit.small_maps import simulated
+
+WORKERS = RowWorkers(1)
+HALO = np.tile(np.array([0.0, 1.0, 0.0, 1.5, 0.0], np.float32), (HALO_NODES, 1))
+
+
+def flux_of(label, model, geometry, row, y, c, light):
+    """Flux of each pixel of a row's buffers for a stripe at a label, written out."""
+    length, _, _, start = row
+    side, state = 1 if geometry.near_is_left else -1, state_of(model)
+    buffers = row_buffers(geometry.window, 1)
+    row_fluxes(sweep_of(geometry), state, buffers, y, c)
+    t = side * (label_grid(geometry).x_far[y, c] - start) - label / PER_PX
+    pixels = np.arange(length)
+    at = int(np.floor(t + 0.5))
+    lit = np.clip(t + 0.5 - pixels, 0.0, 1.0)
+    s = light * buffers.scale[at]
+    base = buffers.behind[:length] + lit * (buffers.before[:length] - buffers.behind[:length])
+    halo = halo_shares(model, geometry.width)[buffers.cell[at]]
+    around = np.interp(np.abs(pixels - t), np.arange(geometry.width), halo)
+    return base + s * (pixel_shares(model.line_sigma_px, pixels - t) + around)
+
+
+@pytest.mark.parametrize("apart", [1, 4])
+def test_costs_are_those_of_a_stripe_with_its_halo(apart):
+    swept, y = simulated("halo", 10, rows=20, columns=48), 7
+    model, geometry, volume = replace(known_model(swept.geometry), halo=HALO), swept.geometry, swept.volume
+    # However far apart the brightnesses are that stripes can have.
+    model = replace(model, amplitude=model.amplitude * np.array([1 / apart, 1 / apart, apart, apart], np.float32))
+    costs = costs_of(model, geometry, label_grid(geometry), 10, WORKERS)
+    out = np.zeros((geometry.rows, geometry.columns, costs.grid.labels), np.uint8)
+    costs.fill(volume, 0, geometry.rows, out)
+    off = []
+    for c in range(4, 44, 5):
+        row = row_fluxes(sweep_of(geometry), state_of(model), row_buffers(geometry.window, 1), y, c)
+        side = 1 if geometry.near_is_left else -1
+        n = volume.counts[c, y, row[3] + side * np.arange(row[0]) - geometry.x0[c]].astype(float)
+        given = out[y, c, : costs.grid.stripes].astype(float)
+        labels = np.flatnonzero(given != EXCLUDED)
+        labels = labels[(labels > 4) & (labels < labels[-1] - 4)]
+        scores = np.full((len(labels), 2), -np.inf)
+        for i, label in enumerate(labels):
+            for m, light in enumerate(_lights(model).astype(float)):
+                p = (1 - FLOOR) * -np.expm1(-flux_of(label, model, geometry, row, y, c, light)) + FLOOR / 2
+                scores[i, m] = (n * np.log(p) + (10 - n) * np.log1p(-p)).sum()
+        nats = given[labels] / costs.units_per_nat
+        wanted = scores.max(axis=1).max() - scores.max(axis=1)
+        # Both against the same label: in the volume the best one may be 'none'.
+        best = int(np.argmin(nats))
+        near = np.abs(labels - labels[best]) < 8 * PER_PX
+        off.append((nats - nats[best] - wanted + wanted[best])[near & (np.minimum(wanted, nats) < 10)])
+    # Counts enter by blocks of 8 px, and places by straight lines between blocks: within a nat or two.
+    assert np.sqrt(np.mean(np.concatenate(off) ** 2)) < 2.0
+    assert abs(np.mean(np.concatenate(off))) < 1.0
+    places = LANES // BLOCK_PX * costs.tables.tap.shape[1] + 1
+    assert costs.halo.weight[..., :places].any()
+    assert not costs.halo.weight[..., places:].any(), "no label lies there, and shares of the halo end before"
+    plain = costs_of(replace(model, halo=0 * HALO), geometry, costs.grid, 10, WORKERS)
+    assert plain.halo.weight.size == 0, "without a halo there are no tables of one"
+
+
+@cache
+def first_map(light):
+    """A sweep, the estimator that has made its map, and that map."""
+    swept, joint = simulated(light, 5, rows=48, columns=240), Joint(2, learns=False)
+    return swept, joint, joint.estimate(swept.volume, swept.geometry)
+
+
+@pytest.mark.parametrize("light", ["halo", "halo-less"])
+def test_a_halo_is_found_where_there_is_one(light):
+    swept, joint, stripes = first_map(light)
+    model = joint.used
+    assert bool(model.halo.any()) is (light == "halo")
+    assert model.extinction_per_m == pytest.approx(swept.point.light.extinction_per_m, rel=0.3)
+    errors = swept.errors(stripes.x_px)
+    assert np.nanmean(errors) < 1.0
+    assert np.isfinite(errors).mean() > 0.95
+
+
+@pytest.mark.parametrize(("light", "other"), [("halo", "halo-less"), ("halo-less", "halo")])
+def test_later_maps_tell_whether_there_is_a_halo(light, other):
+    swept, joint, stripes = first_map(light)
+    setting = LearningSetting(joint.used, swept.geometry, 5, False)
+    tables = tables_of(setting, WORKERS)
+    seen = bright_lines(swept.volume, swept.geometry, tables, stripes, joint._memory.places, WORKERS)
+    assert learn_next_halo(setting, seen, WORKERS) is joint.used
+    wrong = first_map(other)[1].used
+    assert learn_next_halo(replace(setting, model=wrong), seen, WORKERS).halo.any() == (light == "halo")
+    several = replace(setting.geometry, others=setting.geometry.plane[:, None])
+    assert learn_next_halo(replace(setting, model=wrong, geometry=several), seen, WORKERS) is wrong
+    clear = replace(first_map("halo-less")[1].used, extinction_per_m=np.nan)
+    assert learn_next_halo(replace(setting, model=clear), seen, WORKERS) is clear, "without haze there is no halo"
+
+
+def test_pixels_without_a_ray_are_not_quiet():
+    swept = simulated("halo", 10, rows=20, columns=48)
+    g, volume = swept.geometry, swept.volume
+    cut = int(np.median(swept.point.x_true[np.isfinite(swept.point.x_true)])) + 40
+    u = g.u.copy()
+    u[:, cut:] = np.nan
+    g = replace(g, u=u, v=np.where(np.isnan(u), u, g.v), x_hi=np.minimum(g.x_hi, cut - 1))
+    model = replace(known_model(g), halo=HALO)
+    x_px = swept.point.x_true.astype(np.float32)
+    there = np.isfinite(x_px) & (x_px < cut)
+    signal, confidence = np.where(there, 0.3, 0).astype(np.float32), there.astype(np.float32)
+    shares = halo_shares(model, g.width)
+    found = {}
+    for name, halo in (("halo", shares), ("none", shares[:, :0])):
+        quiet = found[name] = np.zeros((2, g.rows, g.width))
+        add_quiet(
+            volume.counts, volume.n_frames, sweep_of(g), state_of(model), halo, x_px, signal, confidence, 1, np.inf, 0,
+            g.rows, quiet,
+        )  # fmt: skip
+        assert not quiet[:, :, cut:].any()
+        assert quiet[1, :, :cut].any()
+    assert np.isfinite(found["halo"]).all()
+    np.testing.assert_array_equal(found["halo"][1], found["none"][1])
+
+
+def test_pixels_are_not_quiet_in_the_halo_of_a_stripe_whose_light_is_not_known():
+    swept = simulated("halo", 10, rows=20, columns=48)
+    g, volume = swept.geometry, swept.volume
+    state = state_of(replace(known_model(g), halo=HALO))
+    x_px = swept.point.x_true.astype(np.float32)
+    there = np.isfinite(x_px)
+    shown, confidence = most_shown(10) / state.psi[0], there.astype(np.float32)
+
+    def exposures(signal, most_light, halo):
+        quiet, light = np.zeros((2, g.rows, g.width)), np.where(there, signal, 0).astype(np.float32)
+        add_quiet(
+            volume.counts, volume.n_frames, sweep_of(g), state, halo, x_px, light, confidence, 1, most_light, 0, g.rows,
+            quiet,
+        )  # fmt: skip
+        return quiet[1].sum()
+
+    halo = halo_shares(replace(known_model(g), halo=HALO), g.width)
+    everything = exposures(0.3, np.inf, halo)
+    assert exposures(0.99 * shown, np.inf, halo) == everything > 0
+    assert exposures(1.01 * shown, np.inf, halo) == 0, "full pixels do not tell how bright the halo is"
+    assert exposures(1.01 * shown, np.inf, halo[:, :0]) == everything, "where there is none that does not matter"
+    assert 0 < exposures(0.3, 0.004, halo) < 0.8 * everything, "near a stripe its halo is too bright"
+    assert exposures(0.3, 0.0, halo) == 0
+
+
+def test_shares_add_up_to_the_halos_light():
+    model = replace(known_model(simulated(rows=20, columns=48).geometry), halo=HALO)
+    shares = halo_shares(model, 2000)
+    assert 2 * shares.sum(axis=1) - shares[:, 0] == pytest.approx(np.full(BINS, 2.5), rel=1e-2)
+    assert over_bins(np.arange(HALO_NODES)[:, None] * 1.0, BINS)[[0, -1], 0] == pytest.approx([0, HALO_NODES - 1])
+    assert len(HALO_REACHES_PX) == HALO.shape[1]
+
+
+def test_the_fit_keeps_numbers_from_falling_below_zero():
+    rng = np.random.default_rng(1)
+    shapes = rng.random((40, 4))
+    right = shapes @ np.array([1.0, 0.0, 2.0, -0.5])
+    matrix, product = shapes.T @ shapes, shapes.T @ right
+    assert solve(matrix, product, 3) == pytest.approx([1.0, 0.0, 2.0, -0.5], abs=1e-2)
+    bounded = solve(matrix, product, -1)
+    assert bounded.min() == 0.0
+    slope = matrix @ bounded - product
+    assert np.abs(slope[bounded > 0]).max() < 0.02
+    assert slope[bounded == 0].min() > -0.02
+
+
+def test_states_kept_before_there_was_a_halo_still_load():
+    model = known_model(simulated(rows=20, columns=48).geometry)
+    room = io.BytesIO()
+    np.savez(room, **{name: array for name, array in model.arrays().items() if name != "halo"})
+    room.seek(0)
+    with np.load(room) as kept:
+        assert not RowModel.from_arrays(dict(kept)).halo.any()
+    with_halo = RowModel.from_arrays(replace(model, halo=HALO).arrays())
+    assert with_halo.halo.tobytes() == HALO.tobytes()
+    with pytest.raises(KeyError):
+        RowModel.from_arrays({name: array for name, array in model.arrays().items() if name != "ambient"})

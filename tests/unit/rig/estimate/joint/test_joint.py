@@ -1,0 +1,148 @@
+"""The joint estimator on small maps: the same bits always, missing data stay missing, and answers that are good."""
+
+from dataclasses import fields, replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rig.estimate.joint.joint import Joint
+from rig.estimate.joint.labels.grid import PER_PX, label_grid
+from rig.estimate.registry import create_estimator, recalling
+from rig.estimate.row.model import RowModel
+from rig.geometry.stripe_table import StripeTable
+from tests.reference.geometry import Geometry
+from tests.reference.scene import Scene
+from tests.reference.working_point import POINTS, WorkingPoint
+from tests.unit.small_maps import geometry_of, simulated, street, volume_of
+
+
+@cache
+def estimated(light="report", exposures=3, rig="left") -> tuple[StripeTable, RowModel]:
+    """The first map of a sweep and the state it was estimated with."""
+    sweep, estimator = simulated(light, exposures, rig), Joint(2)
+    return estimator.estimate(sweep.volume, sweep.geometry), estimator.used
+
+
+def assert_same(found: StripeTable, wanted: StripeTable) -> None:
+    for field in fields(StripeTable):
+        np.testing.assert_array_equal(getattr(found, field.name), getattr(wanted, field.name), err_msg=field.name)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_threads_change_no_bit(threads):
+    sweep, (wanted, used) = simulated(exposures=3), estimated()
+    estimator = Joint(threads)
+    assert_same(estimator.estimate(sweep.volume, sweep.geometry), wanted)
+    for name, value in estimator.used.arrays().items():
+        np.testing.assert_array_equal(value, used.arrays()[name], err_msg=name)
+
+
+def test_a_state_that_was_kept_gives_the_same_bits_whatever_came_between():
+    sweep, other, (wanted, used) = simulated(exposures=3), simulated(exposures=3, seed=2), estimated()
+    kept = RowModel.from_arrays(used.arrays())
+    again = recalling("joint", [kept])
+    assert_same(again.estimate(sweep.volume, sweep.geometry), wanted)
+    between = again.estimate(other.volume, other.geometry)
+    assert np.nanmax(np.abs(between.x_px - wanted.x_px)) > 0.01
+    assert_same(again.estimate(sweep.volume, sweep.geometry), wanted)
+    assert again.used is kept
+
+
+def test_columns_without_frames_have_no_answer_and_those_beside_them_do():
+    sweep, (_, used) = simulated(exposures=3), estimated()
+    frames = np.full(96, 3)
+    frames[[0, 40, 41, 42, 95]] = 0
+    counts = np.where(frames[:, None, None] > 0, sweep.counts, 0).astype(np.uint8)
+    found = recalling("joint", [used]).estimate(volume_of(counts, sweep.geometry, frames), sweep.geometry)
+    for field in fields(StripeTable):
+        values = getattr(found, field.name)
+        if values is not None:
+            missing = values[:, frames == 0]
+            assert not missing.any() if field.name.startswith("confidence") else np.isnan(missing).all()
+    beside = np.zeros(96, bool)
+    beside[[1, 39, 43, 94]] = True
+    scored = sweep.point.trusted & beside
+    # The outermost ones have a neighbour on one side only, and that one is at the picture's border.
+    assert np.mean(np.abs(found.x_px - sweep.point.x_true)[scored] <= 1) > 0.85
+
+
+LIMITS = {
+    ("report", 3, "left"): 0.3, ("report", 3, "right"): 0.3, ("report", 3, "turned"): 0.3, ("report", 1, "left"): 0.5,
+    ("dense", 10, "left"): 0.4, ("clear", 3, "left"): 0.3,
+}  # fmt: skip
+"""Mean error in px, cut off at 10, that so few rows and columns allow."""
+
+
+@pytest.mark.parametrize(("light", "exposures", "rig"), LIMITS)
+def test_errors_are_small_on_every_rig(light, exposures, rig):
+    sweep, (found, _) = simulated(light, exposures, rig), estimated(light, exposures, rig)
+    assert np.minimum(sweep.errors(found.x_px), 10).mean() < LIMITS[light, exposures, rig]
+
+
+def test_more_exposures_than_a_byte_holds():
+    sweep = simulated(exposures=2)
+    rng = np.random.default_rng(1)
+    flux = np.stack([sweep.point.flux_of_column(c) for c in range(96)])
+    counts = rng.binomial(300, -np.expm1(-flux)).astype(np.uint16)
+    found = Joint(2).estimate(volume_of(counts, sweep.geometry, 300), sweep.geometry)
+    errors = sweep.errors(found.x_px)
+    assert np.minimum(errors, 10).mean() < 0.2
+    assert np.mean(errors <= 1) > 0.99
+
+
+@pytest.mark.parametrize("level", [0, 3])
+def test_counts_of_nothing_or_all_ones_are_answered_without_confidence(level):
+    sweep = simulated(exposures=3)
+    blank = volume_of(np.full_like(sweep.counts, level), sweep.geometry, 3)
+    asked = sweep.geometry.x_lo <= sweep.geometry.x_hi
+    found = create_estimator("joint").estimate(blank, sweep.geometry)
+    np.testing.assert_array_equal(np.isfinite(found.x_px), asked)
+    assert np.median(found.confidence[asked]) < 0.5
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_lines_that_leave_the_picture_are_not_believed_at_its_edge(side, monkeypatch):
+    # Planes to both sides of what the camera sees: most of their search lies beside the sensor, the rest is dark.
+    monkeypatch.setattr("tests.reference.geometry.TANGENTS", (-0.6, 0.9))
+    g = Geometry.build(height=32, columns=96, side=side)
+    point = WorkingPoint(street(32), POINTS["clear"], g)
+    sweep = volume_of(point.counts(5, 1), geometry_of(g), 5)
+    found = Joint(2).estimate(sweep, geometry_of(g))
+    at_edge = ~np.isfinite(point.truth()) & ((found.x_px < 1.0) | (found.x_px > 510.0))
+    assert at_edge.mean() > 0.05
+    assert np.mean(found.confidence[at_edge] > 0.5) < 0.02
+
+
+def test_room_of_a_map_is_not_carried_to_one_of_another_size():
+    small, large = simulated(exposures=3, rows=20), simulated(exposures=3)
+    estimator = Joint(2, estimated()[1], learns=False)
+    wanted = estimator.estimate(large.volume, large.geometry)
+    model = estimator.used
+    estimator.model = replace(model, row_gain=model.row_gain[:20], ambient=model.ambient[:20])
+    assert estimator.estimate(small.volume, small.geometry).x_px.shape == (20, 96)
+    estimator.model = model
+    assert_same(estimator.estimate(large.volume, large.geometry), wanted)
+
+
+ROLLED = {"side": "right", "roll_deg": 5.0}
+
+
+@pytest.mark.parametrize("rig", [{}, {"side": "right"}, ROLLED], ids=["left", "right", "rolled"])
+@pytest.mark.parametrize("depth_m", [1.6, 4.0])
+def test_a_wall_has_one_label_over_all_columns_and_rows(rig, depth_m):
+    wall = np.full((24, 512), depth_m, np.float32)
+    g = Geometry.build(height=24, columns=60, **rig)
+    seen = WorkingPoint(Scene("wall", wall, np.ones_like(wall), np.ones(wall.shape, bool)), geometry=g)
+    geometry = geometry_of(g)
+    grid = label_grid(geometry)
+    label = PER_PX * grid.side * (grid.x_far - seen.x_true)
+    there = np.isfinite(label)
+    assert there.mean() > 0.2
+    assert np.ptp(label[there]) < 0.1
+    assert np.all((label[there] >= 0) & (label[there] < grid.stripes))
+    # Disparity from the far end.
+    near_m, far_m = geometry.depth_range_m
+    assert near_m < depth_m < far_m
+    lateral = np.cos(np.deg2rad(rig.get("roll_deg", 0.0)))
+    assert label[there].mean() / PER_PX == pytest.approx(600 * 0.3 * (1 / depth_m - 1 / far_m) / lateral, rel=0.01)

@@ -1,0 +1,254 @@
+"""The 16-bit label costs against log-likelihoods written out in numpy, row by row."""
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from rig.count.volume import CountVolume
+from rig.estimate.joint.labels.cost_rows import COST_LIMIT, EXCLUDED
+from rig.estimate.joint.labels.costs import QUARTILES, SHARP, _lights, costs_of
+from rig.estimate.joint.labels.grid import PER_PX, label_grid
+from rig.estimate.joint.winner import UNITS
+from rig.estimate.row.inputs import row_buffers, row_fluxes, state_of, sweep_of
+from rig.estimate.row.likelihood import FLOOR
+from rig.estimate.row.model import BINS, RowModel, pixel_shares, stripe_scale
+from rig.threads import RowWorkers
+from tests.unit.small_maps import simulated, volume_of
+
+WORKERS = RowWorkers(1)
+ROWS, COLUMNS = 20, 48
+FINE = 8
+"""Steps of a pixel that positions are rounded to."""
+SEEN = 80
+"""Costs up to which they must be right: what costs more is not chosen."""
+
+
+@cache
+def sweep(rig="left", exposures=10, light="report", rows=ROWS):
+    return simulated(light, exposures, rig, rows=rows, columns=COLUMNS)
+
+
+def known_model(geometry, *, haze=0.14, ambient=0.005, sigma_px=0.6) -> RowModel:
+    """About the light of the yardstick's report."""
+    near_m, far_m = geometry.depth_range_m
+    w_lo, w_hi = 0.6 / far_m, 1.15 / near_m
+    per_w = (BINS - 1) / (w_hi - w_lo)
+    path_m = 1.0 / (w_lo + np.arange(BINS) / per_w)
+    columns = [haze * np.exp(-0.1 * (path_m - 1.5)), np.full(BINS, 0.02 * haze), stripe_scale(path_m, 0.05),
+               np.zeros(BINS)]  # fmt: skip
+    return RowModel(
+        np.stack(columns, 1).astype(np.float32), w_lo, per_w, np.ones(geometry.rows, np.float32),
+        np.ones(geometry.columns, np.float32), np.full((geometry.rows, geometry.width), ambient, np.float32),
+        np.array([0.2, 0.6, 1.8, 5.0], np.float32), np.array([0.2, 0.3, 0.3, 0.2]), 0.02, sigma_px, 0.05, 0.01,
+    )  # fmt: skip
+
+
+def filled(model, geometry, volume, exposures, pieces=1):
+    grid = label_grid(geometry)
+    costs = costs_of(model, geometry, grid, exposures, WORKERS)
+    out = np.full((geometry.rows, geometry.columns, grid.labels), 7, np.uint8)
+    edges = np.linspace(0, geometry.rows, pieces + 1).astype(int)
+    for first, last in pairwise(edges):
+        costs.fill(volume, first, last, out)
+    return out, costs
+
+
+def log_likelihood(n, k, flux):
+    p = (1 - FLOOR) * -np.expm1(-flux) + FLOOR / 2
+    return n * np.log(p) + (k - n) * np.log1p(-p)
+
+
+def exact(model, geometry, volume, y, c):
+    """Log-likelihoods of the labels of a row, NaN of those that cannot be."""
+    grid, swept, state = label_grid(geometry), sweep_of(geometry), state_of(model)
+    row = row_buffers(geometry.window, 1)
+    length, first, last, start = row_fluxes(swept, state, row, y, c)
+    side, k = grid.side, int(volume.n_frames[c])
+    n = volume.counts[c, y, start + side * np.arange(length) - geometry.x0[c]].astype(float)
+    before, behind, scale = (a[:length].astype(float) for a in (row.before, row.behind, row.scale))
+    dark = log_likelihood(n, k, behind)
+    edge = np.concatenate([[0.0], np.cumsum(log_likelihood(n, k, before) - dark)])
+    reach = len(state.psi) - 1
+    scores = np.full(grid.stripes, np.nan)
+    for label in range(grid.stripes):
+        # From near to far, as the row's buffers are.
+        t = np.floor(FINE * side * grid.x_far[y, c] + 0.5) / FINE - side * start - label / PER_PX
+        i = int(np.floor(t + 0.5))
+        if not (0 <= i < length and first - 1 <= t <= last + 1):
+            continue
+        around = np.arange(max(i - reach, 0), min(i + reach + 1, length))
+        base = np.where(around < i, before[around], behind[around])
+        base[around == i] = behind[i] + (0.5 + t - i) * (before[i] - behind[i])
+        share = pixel_shares(model.line_sigma_px, around - t)
+        scores[label] = edge[around[0]] + max(
+            (log_likelihood(n[around], k, base + light * scale[i] * share) - dark[around]).sum()
+            for light in _lights(model).astype(float)
+        )
+    return scores
+
+
+def differences(model, geometry, volume, exposures, columns=(0, 3, 17, 30, 47), rows=(0, 7, 19)):
+    """How much costs up to SEEN differ from the exact ones by more than a tenth; labels that only one of them has."""
+    out, costs = filled(model, geometry, volume, exposures)
+    grid, found, alone = costs.grid, [], 0
+    for y in rows:
+        for c in columns:
+            if geometry.x_lo[y, c] > geometry.x_hi[y, c]:
+                continue
+            scores = exact(model, geometry, volume, y, c)
+            # Columns of other lengths have units of their own.
+            worth = (SHARP + exposures) / (SHARP + volume.n_frames[c])
+            wanted = worth * costs.units_per_nat * (np.nanmax(scores, initial=-np.inf) - scores)
+            given = out[y, c, : grid.stripes].astype(float)
+            alone += int((np.isnan(wanted) != (given == EXCLUDED)).sum())
+            both = np.isfinite(wanted) & (given != EXCLUDED)
+            # The best one may be a label that only other rows of the band have.
+            given[both] -= given[both].min(initial=COST_LIMIT)
+            compared = both & (np.minimum(wanted, given) < SEEN)
+            limited = np.minimum(wanted, COST_LIMIT)[compared]
+            found.append(np.maximum(np.abs(given[compared] - limited) - 0.1 * limited, 0.0))
+            assert given[both].max(initial=0) <= COST_LIMIT
+            assert (out[y, c, grid.stripes :] == EXCLUDED).all()
+    return np.concatenate(found), alone
+
+
+@pytest.mark.parametrize("rig", ["left", "right"])
+@pytest.mark.parametrize("exposures", [1, 10, 255, 1000])
+def test_costs_are_log_likelihoods(rig, exposures):
+    s = sweep(rig, exposures)
+    found, alone = differences(known_model(s.geometry), s.geometry, s.volume, exposures)
+    assert len(found) > 100
+    assert np.mean(found > 1.0) < 0.05
+    assert found.max() <= 3.0
+    assert alone <= 6
+
+
+@pytest.mark.parametrize(("light", "sigma_px"), [("dense", 0.5), ("clear", 0.9), ("report", 1.7)])
+def test_in_any_light_and_with_any_line(light, sigma_px):
+    s = sweep("left", 10, light)
+    haze, ambient = {"dense": (0.31, 0.05), "clear": (1e-6, 0.002), "report": (0.14, 0.005)}[light]
+    model = known_model(s.geometry, haze=haze, ambient=ambient, sigma_px=sigma_px)
+    found, _ = differences(model, s.geometry, s.volume, 10)
+    assert found.max() <= 3.0
+
+
+def test_turned_and_distorted_rigs():
+    s = sweep("turned", 10)
+    found, alone = differences(known_model(s.geometry), s.geometry, s.volume, 10, columns=(0, 9, 20, 31, 47))
+    # Light and geometry are those of the band's middle row there.
+    assert np.percentile(found, 90) <= 2.0
+    assert found.max() <= 8.0
+    assert alone <= 10
+
+
+@pytest.mark.parametrize("ones", [0, 1], ids=["dark", "saturated"])
+def test_rows_of_zeros_or_ones_stay_in_range(ones):
+    s = sweep()
+    for exposures, dtype in ((1, np.uint8), (10, np.uint8), (60000, np.uint16)):
+        counts = np.full_like(s.counts, exposures * ones, dtype)
+        volume = volume_of(counts, s.geometry, exposures)
+        found, _ = differences(known_model(s.geometry), s.geometry, volume, exposures, columns=(3, 20), rows=(5,))
+        # So unlikely a row lies outside of what 16 bits hold, but its best answer is the right one.
+        assert found.max(initial=0) <= (2.0 if exposures < 100 else COST_LIMIT)
+
+
+def test_columns_of_other_lengths_and_without_frames():
+    s = sweep()
+    exposures = np.full(COLUMNS, 10, np.int32)
+    exposures[[3, 17, 30]] = 7, 14, 0
+    counts = np.minimum(s.counts, exposures[:, None, None]).astype(np.uint8)
+    volume = volume_of(counts, s.geometry, exposures)
+    found, _ = differences(known_model(s.geometry), s.geometry, volume, 10, columns=(3, 17))
+    assert found.max() <= 2.0
+    out, costs = filled(known_model(s.geometry), s.geometry, volume, 10)
+    grid = costs.grid
+    assert not out[:, 30, : grid.stripes].any()
+    assert (out[:, 30, grid.stripes :] == EXCLUDED).all()
+
+
+def test_a_column_with_many_more_frames_than_usual():
+    s = sweep("left", 100)
+    volume = s.volume
+    few, _ = filled(known_model(s.geometry), s.geometry, volume, 3)
+    usual, costs = filled(known_model(s.geometry), s.geometry, volume, 100)
+    best = [a[:, :, : costs.grid.stripes].argmin(axis=2) for a in (few, usual)]
+    assert np.mean(np.abs(best[0] - best[1]) <= 1) > 0.9
+
+
+@pytest.mark.parametrize("frames", [2, 40])
+def test_a_column_of_another_length_costs_what_it_would_among_its_like(frames):
+    s = sweep("left", frames)
+    model, exposures = known_model(s.geometry), np.full(COLUMNS, 10, np.int32)
+    alike, costs = filled(model, s.geometry, s.volume, frames)
+    exposures[20] = frames
+    among, _ = filled(model, s.geometry, volume_of(s.counts, s.geometry, exposures), 10)
+    stripes = costs.grid.stripes
+    own, other = (a[:, 20, :stripes].astype(float) for a in (alike, among))
+    compared = (np.minimum(own, other) < SEEN) & (own != EXCLUDED)
+    assert np.count_nonzero(compared) > 100
+    assert np.abs(other[compared] - own[compared]).max() <= 3.0
+
+
+def test_counts_of_any_width_give_the_same():
+    s = sweep()
+    volume = s.volume
+    wide = replace(volume, counts=volume.counts.astype(np.uint32))
+    model = known_model(s.geometry)
+    np.testing.assert_array_equal(filled(model, s.geometry, volume, 10)[0], filled(model, s.geometry, wide, 10)[0])
+
+
+@pytest.mark.parametrize("rig", ["left", "turned"])
+def test_rows_may_be_filled_in_any_pieces(rig):
+    s = sweep(rig, 3, rows=70)
+    model = known_model(s.geometry)
+    whole, _ = filled(model, s.geometry, s.volume, 3)
+    for pieces in (3, 70):
+        np.testing.assert_array_equal(filled(model, s.geometry, s.volume, 3, pieces)[0], whole)
+    assert not (whole == 7).all(axis=2).any()
+
+
+def test_hot_pixels_say_nothing():
+    s = sweep()
+    clean, costs = filled(known_model(s.geometry), s.geometry, s.volume, 10)
+    hot = np.random.default_rng(1).random((ROWS, s.geometry.width)) < 0.02
+    counts = np.where(hot, np.uint8(10), s.counts)
+    model = known_model(s.geometry)
+    model = replace(model, ambient=np.where(hot, np.float32(4.0), model.ambient))
+    spoilt, _ = filled(model, s.geometry, volume_of(counts, s.geometry, 10), 10)
+    blind, _ = filled(known_model(s.geometry), s.geometry, volume_of(counts, s.geometry, 10), 10)
+    stripes = costs.grid.stripes
+    best, aware, unaware = (a[:, :, :stripes].argmin(axis=2) for a in (clean, spoilt, blind))
+    assert np.mean(np.abs(best - aware) <= 2) > 0.93
+    assert np.mean(np.abs(best - unaware) <= 2) < 0.85
+
+
+def test_units_follow_the_exposures():
+    s = sweep()
+    model, grid = known_model(s.geometry), label_grid(s.geometry)
+    units = [costs_of(model, s.geometry, grid, k, WORKERS).units_per_nat for k in (1, 8, 24)]
+    np.testing.assert_allclose(units, [UNITS / (1 + 1 / SHARP), UNITS / 2, UNITS / 4])
+
+
+def test_lights_are_quartiles():
+    model = known_model(sweep().geometry)
+    assert model.amplitude[0] < _lights(model)[0] < model.amplitude[2] < model.amplitude[3]
+    assert len(_lights(model)) == len(QUARTILES)
+
+
+def test_true_positions_cost_least():
+    s = sweep()
+    out, costs = filled(known_model(s.geometry), s.geometry, s.volume, 10)
+    grid = costs.grid
+    x_px = grid.x_far - grid.side * out[:, :, : grid.stripes].argmin(axis=2) / PER_PX
+    assert np.median(s.errors(x_px)) < 0.35
+
+
+def test_a_volume_is_not_written_to():
+    s = sweep()
+    volume: CountVolume = s.volume
+    before = volume.counts.copy()
+    filled(known_model(s.geometry), s.geometry, volume, 10)
+    np.testing.assert_array_equal(volume.counts, before)

@@ -1,0 +1,219 @@
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rig.estimate.row.ambient import ambient_map
+from rig.estimate.row.em import FADE, flux, lattice, learn_first, learn_next, lines_of, next_lattice
+from rig.estimate.row.model import BINS, RowModel, fit_haze, stripe_scale
+from rig.threads import RowWorkers
+from tests.reference.geometry import Geometry
+from tests.unit.small_maps import RIGS, geometry_of, simulated, volume_of
+
+WORKERS = RowWorkers(1)
+PATH_M = 1.0 / np.linspace(0.08, 1.1, BINS)
+
+
+@cache
+def learned(light="report", exposures=10, rig="left") -> RowModel:
+    sweep = simulated(light, exposures, rig)
+    return first_model(sweep.volume, sweep.geometry)
+
+
+def first_model(volume, geometry, workers=WORKERS) -> RowModel:
+    return learn_first(volume, geometry, ambient_map(volume, volume.intensity(), geometry, None), workers)
+
+
+def next_model(sweep, model, before=None, workers=WORKERS):
+    lines = lines_of(sweep.volume, next_lattice(sweep.geometry))
+    return learn_next(lines, sweep.geometry, model, before, workers)
+
+
+def noisy_haze(rng, extinction, amplitude=0.3, photons=2000.0):
+    """Haze of an exponential with the scatter of counting, and its variance."""
+    haze = amplitude * np.exp(-2 * extinction * PATH_M)
+    variance = (haze + 0.005) / photons  # ambient light counts as well
+    return haze + rng.normal(0, np.sqrt(variance)), variance
+
+
+@pytest.mark.parametrize("extinction", [0.02, 0.05, 0.3, 1.0])
+def test_an_exponential_is_fitted_within_its_own_uncertainty(extinction):
+    rng = np.random.default_rng(1)
+    pulls = []
+    for _ in range(200):
+        fit = fit_haze(PATH_M, *noisy_haze(rng, extinction))
+        assert fit.extinction_sd_per_m < 0.5 * extinction
+        pulls.append((fit.extinction_per_m - extinction) / fit.extinction_sd_per_m)
+    assert abs(np.mean(pulls)) < 0.4
+    assert 0.7 < np.std(pulls) < 1.2
+
+
+def test_an_exact_exponential_is_found_again():
+    haze = 0.4 * np.exp(-2 * 0.123 * PATH_M)
+    fit = fit_haze(PATH_M, haze, np.full(BINS, 1e-6))
+    assert fit.extinction_per_m == pytest.approx(0.123, rel=1e-4)
+    assert fit.amplitude == pytest.approx(0.4, rel=1e-4)
+
+
+def test_even_light_has_no_extinction():
+    fit = fit_haze(PATH_M, np.full(BINS, 0.2), np.full(BINS, 1e-6))
+    assert fit.extinction_per_m == pytest.approx(0.0, abs=1e-6)
+    growing = fit_haze(PATH_M, 0.1 + 0.02 * PATH_M, np.full(BINS, 1e-6))
+    assert growing.extinction_per_m == 0.0
+
+
+def test_where_there_is_no_haze_there_is_no_fit():
+    nothing, variance = np.zeros(BINS), np.full(BINS, 1e-6)
+    assert fit_haze(PATH_M, nothing, variance) is None
+    assert fit_haze(PATH_M, nothing - 1e-3, variance) is None
+    assert fit_haze(PATH_M, np.full(BINS, np.nan), variance) is None
+    few = np.full(BINS, np.nan)
+    few[:3] = 0.1
+    assert fit_haze(PATH_M, few, variance) is None
+    # Haze that is lost in its own noise.
+    assert fit_haze(PATH_M, np.full(BINS, 1e-4), np.ones(BINS)) is None
+
+
+def test_bins_without_data_take_no_part_in_the_fit():
+    rng = np.random.default_rng(2)
+    haze, variance = noisy_haze(rng, 0.2)
+    haze[::3], variance[::3] = np.nan, np.nan
+    assert fit_haze(PATH_M, haze, variance).extinction_per_m == pytest.approx(0.2, abs=0.03)
+
+
+@pytest.mark.parametrize("extinction", [0.0, 0.05, 5.0])
+def test_stripe_scale_falls_as_distance_squared_and_both_paths(extinction):
+    scale = stripe_scale(PATH_M, extinction)
+    assert np.all(np.isfinite(scale) & (scale > 0))
+    assert scale[BINS // 2] == pytest.approx(1.0)
+    a, b = BINS // 2, BINS // 2 + 10
+    wanted = (PATH_M[a] / PATH_M[b]) ** 2 * math.exp(-2 * extinction * (PATH_M[b] - PATH_M[a]))
+    assert scale[b] / scale[a] == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("lines", [1, 50, 3000, 10**6])
+def test_the_lattice_picks_distinct_rows_and_columns_that_have_a_window(rig, lines):
+    geometry = geometry_of(Geometry.build(width=300, height=40, columns=100, **RIGS[rig]))
+    y, c = lattice(geometry, lines)
+    seen = geometry.x_lo <= geometry.x_hi
+    assert seen[y, c].all()
+    assert len(set(zip(y.tolist(), c.tolist(), strict=True))) == len(y)
+    if lines >= seen.sum():
+        assert len(y) == seen.sum()
+    else:
+        assert 0.6 * lines <= len(y) <= lines
+    if lines == 3000:
+        # Every row with windows takes part about evenly.
+        share = np.bincount(y, minlength=40) / np.maximum(seen.sum(axis=1), 1)
+        assert share[seen.any(axis=1)].max() < 3 * share[seen.any(axis=1)].mean()
+        assert (share[seen.any(axis=1)] > 0).all()
+
+
+def test_flux_is_finite_from_no_ones_to_all_ones():
+    assert flux(0.0, 0.0) == 0.0
+    assert flux(0.0, 1000.0) == 0.0
+    assert np.isfinite(flux(1000.0, 1000.0))
+    assert flux(1000.0, 1000.0) > 7
+    assert flux(632.12, 1000.0) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("light", ["report", "dense", "clear"])
+def test_the_learned_haze_is_that_of_the_light(light):
+    sweep, model = simulated(light), learned(light)
+    # Light before the stripe at the near end of the rows, by the truth.
+    wanted = np.median(
+        [sweep.point.flux_of_column(c)[16, max(int(sweep.geometry.x_lo[16, c]), 0) + 5] for c in range(30, 96, 6)]
+    )
+    path_m = model.path_m()
+    near = np.median(model.profile[(path_m > 1.1) & (path_m < 2.0), 0])
+    found = near + np.median(model.ambient)
+    assert found == pytest.approx(wanted, rel=0.35, abs=0.01)
+
+
+@pytest.mark.parametrize("light", ["report", "dense"])
+@pytest.mark.parametrize("exposures", [3, 10])
+def test_the_width_of_the_line_is_learned(light, exposures):
+    assert learned(light, exposures).line_sigma_px == pytest.approx(0.6, rel=0.35)
+
+
+def test_the_level_behind_the_stripe_is_ambient_light():
+    for light in ("report", "dense"):
+        model, truth = learned(light), simulated(light).point.light.ambient
+        behind = np.median(model.ambient) + np.median(model.profile[:, 1])
+        assert behind == pytest.approx(truth, rel=0.5, abs=0.005)
+
+
+def test_learned_numbers_are_in_range():
+    for light in ("report", "dense", "clear"):
+        model = learned(light)
+        assert np.isfinite(model.profile).all()
+        assert (model.profile[:, :3] >= 0).all()
+        assert np.all(np.diff(model.amplitude) > 0)
+        assert model.weight.sum() == pytest.approx(1.0)
+        assert 0 < model.none_weight <= 0.5
+        assert (model.ambient > 0).all()
+        assert (model.row_gain > 0).all()
+
+
+def test_one_more_sweep_of_the_same_light_moves_the_model_little():
+    sweep, model = simulated(seed=2), learned()
+    after, _ = next_model(sweep, model)
+    assert after.extinction_per_m == pytest.approx(model.extinction_per_m, rel=0.25)
+    assert abs(np.log(after.line_sigma_px / model.line_sigma_px)) < 0.15
+    far = (model.path_m() > 1.0) & (model.path_m() < 4.0)
+    np.testing.assert_allclose(after.profile[far, 0], model.profile[far, 0], rtol=0.25, atol=0.01)
+
+
+def test_rows_with_a_weaker_line_get_a_smaller_gain():
+    sweep = simulated("dense", rows=160, columns=40)
+    # The lower rows see half of all light: haze, stripe and ambient.
+    counts = sweep.counts.copy()
+    counts[:, 80:] = np.random.default_rng(5).binomial(counts[:, 80:], 0.5)
+    falls = []
+    for picture in (sweep.counts, counts):
+        volume = volume_of(picture, sweep.geometry, 10)
+        model = first_model(volume, sweep.geometry)
+        falls.append(model.row_gain[-30:].mean() / model.row_gain[:30].mean())
+    assert falls[1] < 0.75 * falls[0]
+
+
+def test_learning_does_not_change_the_model_it_started_from():
+    sweep, model = simulated(seed=2), learned()
+    kept = replace(model, profile=model.profile.copy(), ambient=model.ambient.copy(), row_gain=model.row_gain.copy())
+    next_model(sweep, model)
+    for name in ("profile", "ambient", "row_gain"):
+        np.testing.assert_array_equal(getattr(model, name), getattr(kept, name))
+
+
+def test_threads_change_nothing_of_what_is_learned():
+    sweep = simulated(seed=2)
+    with RowWorkers(3) as three:
+        one, other = learned(), first_model(simulated().volume, simulated().geometry, three)
+        (next_one, seen), (next_other, also) = next_model(sweep, one), next_model(sweep, other, workers=three)
+    for a, b in ((one, other), (next_one, next_other)):
+        for name, value in a.arrays().items():
+            np.testing.assert_array_equal(b.arrays()[name], value, err_msg=name)
+    np.testing.assert_array_equal(seen.levels, also.levels)
+
+
+def test_what_the_sweeps_before_taught_fades_with_each():
+    sweep, model = simulated(seed=2), learned()
+    _, alone = next_model(sweep, model)
+    _, both = next_model(sweep, model, before=alone)
+    np.testing.assert_allclose(both.levels, (1 + FADE) * alone.levels, rtol=1e-12)
+    np.testing.assert_allclose(both.amplitude_mass, (1 + FADE) * alone.amplitude_mass, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_lines_are_the_counts_of_their_row_and_column_sorted_by_column(rig):
+    sweep = simulated(rig=rig)
+    rows, columns = next_lattice(sweep.geometry)
+    lines = lines_of(sweep.volume, (rows, columns))
+    assert np.all(np.diff(columns) >= 0)
+    assert np.all(np.diff(rows)[np.diff(columns) == 0] > 0)
+    for i in (0, len(rows) // 2, len(rows) - 1):
+        np.testing.assert_array_equal(lines.counts[i], sweep.volume.counts[columns[i], rows[i]])
+    np.testing.assert_array_equal(lines.exposures, np.full(len(rows), 10))

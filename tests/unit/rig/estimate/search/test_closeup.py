@@ -1,0 +1,212 @@
+"""Where within its pixel the line lies: the compiled close-up against a posterior summed label by label."""
+
+from functools import cache
+
+import numba
+import numpy as np
+import pytest
+
+from rig.estimate.row.likelihood import FLOOR, LABEL_PX, LABELS, logit_table
+from rig.estimate.row.model import fine_profiles
+from rig.estimate.search.closeup import (
+    LEVELS,
+    LOWEST_OCTAVE,
+    closeup_tables,
+    label_scores,
+    label_weights,
+    level_flux,
+    levels_of,
+    offsets,
+)
+from rig.estimate.search.tables import count_place, search_in, search_memory
+from rig.simd.functions import lift_to_powers, powers
+from rig.simd.memory import address_of, load_float32, load_int16, read_int16, store_float32, store_int16, write_byte
+from rig.simd.shuffles import largest_of_rows, store_folded, totals_of_rows
+from rig.simd.vectors import LANES
+
+TABLE = logit_table()
+AMBIENT, SHARE = 0.004, 0.1
+OFFSETS = (np.arange(LABELS) - LABELS // 2) * LABEL_PX
+LANE_COUNT = 16
+SHIFT = 3
+"""Units of a sixteenth of an octave, as at about ten exposures."""
+
+
+@numba.njit
+def look(memory, counts, x, exposures, weight, constant, pairs, index, square, shift, out):
+    """The close-up of counts around pixel x; lanes cannot leave a kernel."""
+    search = search_in(address_of(memory), LANE_COUNT)
+    reach = counts.shape[0] // 2
+    for t in range(counts.shape[0]):
+        write_byte(search.n, count_place(search, x - reach + t), np.uint8(counts[t]))
+    store_int16(search.label, 0, label_scores(search, 0, x, exposures, weight, constant, pairs))
+    store_int16(search.lift, 0, lift_to_powers(largest_of_rows(search.label), shift))
+    likelihood = powers(load_int16(search.label, 0), read_int16(search.lift, 0), shift)
+    store_folded(search.mass, 0, likelihood)
+    store_folded(search.moment, 0, likelihood * load_float32(index, 0))
+    store_folded(search.square, 0, likelihood * load_float32(square, 0))
+    mass, moment, spread = totals_of_rows(search.mass), totals_of_rows(search.moment), totals_of_rows(search.square)
+    offset, sd = offsets(mass, moment, spread, LABEL_PX)
+    store_float32(address_of(out), 0, offset)
+    store_float32(address_of(out), LANES, sd)
+
+
+@cache
+def level_of(flux):
+    """Level that a flux in photons per exposure lies in: half octaves from 2^LOWEST_OCTAVE on, of equal width each."""
+    octave = np.floor(np.log2(flux)) if flux > 0 else -np.inf
+    level = 2 * (octave - LOWEST_OCTAVE) + (flux >= 1.5 * 2.0**octave)
+    return int(np.clip(level, 0, LEVELS - 1))
+
+
+def tables(near_is_left, sigma_px, shift=SHIFT):
+    weight, constant = label_weights(AMBIENT, SHARE, near_is_left, fine_profiles(sigma_px), TABLE)
+    return closeup_tables(weight, constant, 128 >> shift)
+
+
+def fluxes(haze, line, near_is_left, sigma_px):
+    """Flux (LABELS, pixels) of every label by the definition, float64, levels as given."""
+    fine = fine_profiles(sigma_px).astype(float)
+    reach = fine.shape[1] // 2
+    t = np.arange(-reach, reach + 1)
+    behind = min(AMBIENT + SHARE * max(haze - AMBIENT, 0.0), haze)
+    left, right = (haze, behind) if near_is_left else (behind, haze)
+    of_left = np.clip(OFFSETS[:, None] - t + 0.5, 0, 1)
+    return of_left * left + (1 - of_left) * right + line * fine
+
+
+def posterior(counts, k, haze, line, near_is_left, sigma_px):
+    """Mean and sd of the position over the labels, brute force."""
+    flux = fluxes(haze, line, near_is_left, sigma_px)
+    q = (1 - FLOOR) * np.exp(-flux) + FLOOR / 2
+    score = (counts * np.log(1 - q) + (k - counts) * np.log(q)).sum(axis=1)
+    weight = np.exp(score - score.max())
+    mean = np.average(OFFSETS, weights=weight)
+    return mean, np.sqrt(np.average((OFFSETS - mean) ** 2, weights=weight) + LABEL_PX**2 / 12)
+
+
+def placed(counts, k, haze_level, line_level, near_is_left, sigma_px, shift=SHIFT, x=37):
+    """The compiled answer for counts (pixels,) around pixel x."""
+    made = tables(near_is_left, sigma_px, shift)
+    weight, constant = made.weight[haze_level, line_level].copy(), made.constant[haze_level, line_level].copy()
+    out = np.zeros(2 * LANES, np.float32)
+    look(
+        search_memory(LANE_COUNT), np.asarray(counts), x, float(k), weight.ctypes.data, constant.ctypes.data,
+        made.weight.shape[3], made.label.ctypes.data, made.square.ctypes.data, shift, out,
+    )  # fmt: skip
+    return out[0], out[LANES]
+
+
+def test_levels_are_two_to_the_octave_and_their_middle_lies_in_them():
+    for level in range(LEVELS):
+        assert level_of(np.float32(level_flux(level))) == level
+    assert level_of(np.float32(2.0**LOWEST_OCTAVE)) == 0
+    assert level_of(np.float32(1.5 * 2.0**LOWEST_OCTAVE)) == 1
+    for flux in (0.0, 1e-30, 1e-6):
+        assert level_of(np.float32(flux)) == 0
+    for flux in (16.0, 1e3, 1e30):
+        assert level_of(np.float32(flux)) == LEVELS - 1
+    ratio = [level_flux(i + 1) / level_flux(i) for i in range(LEVELS - 1)]
+    assert 1.4 <= min(ratio) <= max(ratio) <= 1.45
+
+
+def test_levels_of_many_fluxes_are_those_of_each():
+    @numba.njit
+    def many(before, signal, out):
+        levels = levels_of(load_float32(address_of(before), 0), load_float32(address_of(signal), 0))
+        store_int16(address_of(out), 0, levels)
+
+    rng, out = np.random.default_rng(1), np.zeros(LANES, np.int16)
+    for _ in range(20):
+        before, signal = np.exp2(rng.uniform(-20, 8, (2, LANES))).astype(np.float32)
+        before[0], signal[0] = 0.0, 2.0**LOWEST_OCTAVE
+        many(before, signal, out)
+        np.testing.assert_array_equal(
+            out, [level_of(a) * LEVELS + level_of(b) for a, b in zip(before, signal, strict=True)]
+        )
+
+
+def compared(k, shift, sigma_px, near_is_left):
+    """Answers (mean, sd), those of the posterior, and the truth (n,), of lines of any brightness in any haze."""
+    rng = np.random.default_rng(k)
+    found, wanted, where = [], [], []
+    for _ in range(300):
+        haze_level, line_level = level_of(np.float32(rng.uniform(0.01, 0.4))), level_of(np.float32(rng.uniform(0.2, 3)))
+        haze, line = level_flux(haze_level), level_flux(line_level)
+        label = rng.integers(4, LABELS - 4)
+        flux = fluxes(haze, line, near_is_left, sigma_px)[label]
+        counts = rng.binomial(k, -np.expm1(-flux))
+        found.append(placed(counts, k, haze_level, line_level, near_is_left, sigma_px, shift))
+        wanted.append(posterior(counts, k, haze, line, near_is_left, sigma_px))
+        where.append(OFFSETS[label])
+    return np.array(found), np.array(wanted), np.array(where)
+
+
+@pytest.mark.parametrize("near_is_left", [True, False])
+@pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
+@pytest.mark.parametrize(("k", "shift"), [(1, 3), (3, 3), (10, 3)])
+def test_the_answer_is_the_posterior_mean_and_sd_over_quarter_pixels(k, shift, sigma_px, near_is_left):
+    found, wanted, _ = compared(k, shift, sigma_px, near_is_left)
+    # Sixteenths of an octave a count, and likelihoods up to 6 % too large.
+    assert np.abs(found - wanted).max() < 0.07
+    assert np.abs((found - wanted).mean(axis=0)).max() < 0.015
+
+
+@pytest.mark.parametrize("sigma_px", [0.4, 0.6, 1.0])
+@pytest.mark.parametrize(
+    ("k", "shift"),
+    [(1, 3), (3, 3), (10, 3), (20, 3), (63, 3)],
+)
+def test_whole_units_cost_hardly_any_accuracy(k, shift, sigma_px):
+    # Units as `judge_of` takes them at so many exposures.
+    found, wanted, where = compared(k, shift, sigma_px, True)
+    errors = [np.sqrt(np.mean((answers[:, 0] - where) ** 2)) for answers in (found, wanted)]
+    assert errors[0] < 1.1 * errors[1]
+
+
+@pytest.mark.parametrize("near_is_left", [True, False])
+@pytest.mark.parametrize("offset", [-0.5, -0.25, 0.0, 0.25, 0.5])
+@pytest.mark.parametrize("k", [20, 60])
+def test_the_expected_answer_is_where_the_line_is(k, offset, near_is_left):
+    rng = np.random.default_rng(1)
+    haze_level, line_level = level_of(np.float32(0.1)), level_of(np.float32(1.5))
+    label = int(np.argmin(np.abs(OFFSETS - offset)))
+    truth = fluxes(level_flux(haze_level), level_flux(line_level), near_is_left, 0.6)[label]
+    answers = np.array(
+        [
+            placed(c, k, haze_level, line_level, near_is_left, 0.6)
+            for c in rng.binomial(k, -np.expm1(-truth), (400, len(truth)))
+        ]
+    )
+    assert abs(answers[:, 0].mean() - offset) < 0.03
+    # What is stated is what happens, with the width of a label, in whose middle these lines lie.
+    happened = np.hypot(answers[:, 0].std(), LABEL_PX / np.sqrt(12))
+    assert 0.8 < happened / np.sqrt(np.mean(answers[:, 1] ** 2)) < 1.25
+
+
+@pytest.mark.parametrize("near_is_left", [True, False])
+@pytest.mark.parametrize("shift", range(3, 7))
+def test_answers_to_any_counts_lie_among_the_labels(near_is_left, shift):
+    rng = np.random.default_rng(shift)
+    pixels = fine_profiles(0.6).shape[1]
+    for k in (1, 10, 64):
+        for counts in (np.zeros(pixels, int), np.full(pixels, k), *rng.integers(0, k + 1, (10, pixels))):
+            for haze_level in (0, 20, LEVELS - 1):
+                for line_level in (0, 20, LEVELS - 1):
+                    offset, sd = placed(counts, k, haze_level, line_level, near_is_left, 0.6, shift)
+                    assert abs(offset) <= 1.5 + 1e-6
+                    assert 0.07 < sd < 1.52
+
+
+@pytest.mark.parametrize("x", [0, 1, 63, 126, 127])
+def test_lines_at_the_ends_of_a_row_are_placed_as_elsewhere(x):
+    counts = np.array([0, 0, 1, 3, 9, 6, 1, 0, 0])[: fine_profiles(0.6).shape[1]]
+    level = level_of(np.float32(0.1)), level_of(np.float32(1.0))
+    assert placed(counts, 10, *level, True, 0.6, x=x) == placed(counts, 10, *level, True, 0.6, x=40)
+
+
+def test_spare_lanes_are_no_labels():
+    made = tables(True, 0.6)
+    assert LABELS < LANES
+    assert np.all(made.constant[:, :, LABELS:] < -1e20)
+    assert np.count_nonzero(made.label) == LABELS - 1

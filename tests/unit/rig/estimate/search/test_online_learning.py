@@ -1,0 +1,129 @@
+"""When a map teaches, and from which map on that is heeded."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from rig.errors import UsageError
+from rig.estimate.joint import tables as joint_tables
+from rig.estimate.joint.joint import Joint
+from rig.estimate.likelihood import Likelihood
+from rig.estimate.search import online_learning as lessons
+from rig.estimate.search.online_learning import LAG_FRAMES, LEAST_SURE, TEACH_FRAMES, LearningSetting, OnlineLearner
+from rig.geometry.stripe_table import StripeTable
+from rig.threads import RowWorkers
+from tests.unit.rig.estimate.joint.test_label_volume import known_model
+from tests.unit.small_maps import simulated
+
+WORKERS = RowWorkers(1)
+GEOMETRY = simulated().geometry
+MODEL = known_model(GEOMETRY)
+
+
+def stripes(sure=1.0) -> StripeTable:
+    """A map of which such a share is confident."""
+    table = StripeTable.empty(10, 100)
+    table.confidence.flat[: round(sure * table.confidence.size)] = 0.9
+    return table
+
+
+@pytest.fixture
+def taught(monkeypatch):
+    """The map of each lesson, and what it was told of the lesson before."""
+    found = []
+
+    def learn_next(lines, geometry, model, before, workers):
+        found.append((lines, before))
+        return replace(model, none_weight=model.none_weight + 0.01), f"seen {lines}"
+
+    monkeypatch.setattr(lessons, "learn_next", learn_next)
+    monkeypatch.setattr(lessons, "ambient_map", lambda tally, *rest: MODEL.ambient)
+    return found
+
+
+def run(frames, maps, learns=True, model=MODEL):
+    """The `none_weight` that each of so many maps of so many frames is estimated with, in hundredths above MODEL's."""
+    school = OnlineLearner(lambda setting, workers: setting.model.none_weight, model, learns=learns)
+    used = []
+    for index in range(maps):
+        now = school.model_for(lambda: MODEL)
+        # Tables that were made beside the stream are those of the model they came with.
+        assert school.tables(LearningSetting(now, GEOMETRY, 10, False), WORKERS) == now.none_weight
+        used.append(round(100 * (now.none_weight - MODEL.none_weight)))
+        seen = SimpleNamespace(tally=None, intensity=None, quiet=None, lines=index)
+        school.attend(stripes(), now, frames, lambda seen=seen: seen)
+    return used
+
+
+def test_a_map_teaches_every_so_many_frames_and_is_heeded_a_fixed_number_later(taught):
+    each = LAG_FRAMES // 5
+    first, heeded = TEACH_FRAMES // each, LAG_FRAMES // each
+    used = run(each, first + heeded + 1)
+    assert used == [0] * (first + heeded) + [1]
+    assert taught == [(first - 1, None)]
+
+
+def test_lessons_carry_on_what_was_seen_before(taught):
+    assert run(TEACH_FRAMES, 4) == [0, 0, 1, 1]
+    assert taught == [(0, None), (2, "seen 0")]
+
+
+def test_an_estimator_that_learns_nothing_keeps_its_model(taught):
+    assert run(TEACH_FRAMES, 5, learns=False) == [0] * 5
+    assert not taught
+
+
+@pytest.mark.parametrize(("sure", "kept"), [(0.0, False), (0.5 * LEAST_SURE, False), (2 * LEAST_SURE, True)])
+def test_maps_without_confident_answers_teach_nothing_and_leave_no_model(taught, sure, kept):
+    school = OnlineLearner(lambda setting, workers: None, None, learns=True)
+    for _ in range(3):
+        school.attend(stripes(sure), MODEL, 0, pytest.fail)
+        assert school.model is (MODEL if kept else None)
+    if not kept:
+        school.attend(stripes(sure), MODEL, TEACH_FRAMES, pytest.fail)
+
+
+def test_the_first_model_is_asked_for_until_a_map_has_taught():
+    school = OnlineLearner(lambda setting, workers: None, None, learns=True)
+    assert school.model_for(lambda: MODEL) is MODEL
+    assert school.model is None
+    school.model = MODEL
+    assert school.model_for(pytest.fail) is MODEL
+
+
+def test_tables_are_made_anew_for_another_setting_alone():
+    made = []
+    school = OnlineLearner(lambda setting, workers: made.append(setting), MODEL, learns=True)
+    setting = LearningSetting(MODEL, GEOMETRY, 10, False)
+    others = [replace(setting, exposures=11), replace(setting, dark=True), replace(setting, model=replace(MODEL))]
+    for each in (setting, replace(setting), *others):
+        school.tables(each, WORKERS)
+    assert made == [setting, *others]
+
+
+def test_two_settings_under_one_model_may_take_turns():
+    made = []
+    school = OnlineLearner(lambda setting, workers: made.append(setting) or len(made), MODEL, learns=True)
+    whole, half = LearningSetting(MODEL, GEOMETRY, 10, False), LearningSetting(MODEL, GEOMETRY, 5, False)
+    assert [school.tables(each, WORKERS) for each in (whole, half, whole, half)] == [1, 2, 1, 2]
+    # A third takes the place of what was used before the last one, another model that of all.
+    assert [school.tables(replace(whole, exposures=k), WORKERS) for k in (7, 5, 10)] == [3, 2, 4]
+    other = replace(whole, model=replace(MODEL))
+    assert [school.tables(each, WORKERS) for each in (other, whole)] == [5, 6]
+
+
+@pytest.mark.parametrize("lacking", ["column_gain", "row_gain", "ambient"])
+def test_a_state_of_another_sweeps_size_is_refused(lacking):
+    less = replace(MODEL, **{lacking: getattr(MODEL, lacking)[:-1]})
+    for estimator in (Joint(1, less), Likelihood(1, less)):
+        with pytest.raises(UsageError, match=f"sweep of {GEOMETRY.rows} rows of {GEOMETRY.width} pixels and"):
+            estimator.estimate(simulated().volume, GEOMETRY)
+
+
+def test_a_map_that_would_not_fit_the_memory_is_refused_before_the_scan(monkeypatch):
+    monkeypatch.setattr(joint_tables, "MOST_BYTES", 2 * GEOMETRY.rows * GEOMETRY.columns)
+    with pytest.raises(UsageError, match=r"places on each of 32 rows of 96 columns.*narrow depth_range"):
+        Joint(1).counter(None, GEOMETRY)
+    with pytest.raises(UsageError, match="narrow depth_range"):
+        Joint(1, MODEL).estimate(simulated().volume, GEOMETRY)

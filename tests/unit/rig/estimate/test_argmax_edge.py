@@ -1,0 +1,191 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.estimate.registry import create_estimator
+from tests.unit.small_maps import rows_of, simulated
+
+SIDES = pytest.mark.parametrize("near_is_left", [True, False])
+NAMES = pytest.mark.parametrize("name", ["argmax", "edge"])
+
+
+def estimate(name, counts, exposures, threads=2, **rows):
+    return create_estimator(name, threads).estimate(*rows_of(np.asarray(counts), exposures, **rows))
+
+
+def row(width=100, **peaks):
+    """One row of zeros with peaks x12=5."""
+    counts = np.zeros((1, 1, width), np.uint8)
+    for name, n in peaks.items():
+        counts[0, 0, int(name[1:])] = n
+    return counts
+
+
+@SIDES
+def test_argmax_gives_ties_to_the_smallest_x(near_is_left):
+    counts = row(x20=5, x50=5, x80=5, x90=4)
+    assert estimate("argmax", counts, 10, near_is_left=near_is_left).x_px.item() == 20.0
+
+
+@SIDES
+def test_argmax_of_a_row_without_counts_is_the_smallest_x_at_low_confidence(near_is_left):
+    stripes = estimate("argmax", row(), 10, near_is_left=near_is_left, x_lo=7)
+    assert stripes.x_px.item() == 7.0
+    assert stripes.confidence.item() < 0.1
+
+
+@SIDES
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32), st.integers(1, 5), st.integers(3, 130), st.data())
+def test_argmax_is_the_first_largest_count_of_the_window(near_is_left, seed, k, width, data):
+    x_lo = data.draw(st.integers(0, width - 1))
+    x_hi = data.draw(st.integers(x_lo, width - 1))
+    counts = np.random.default_rng(seed).integers(0, k + 1, (3, 4, width)).astype(np.uint8)
+    x = estimate("argmax", counts, k, near_is_left=near_is_left, x_lo=x_lo, x_hi=x_hi).x_px
+    first = x_lo + counts[:, :, x_lo : x_hi + 1].argmax(axis=2).T
+    assert np.all(np.abs(x - first) <= 0.5)
+
+
+@NAMES
+@SIDES
+def test_brighter_pixels_outside_the_search_interval_are_not_seen(name, near_is_left):
+    counts = row(x10=9, x40=5, x95=9)
+    stripes = estimate(name, counts, 10, near_is_left=near_is_left, x_lo=11, x_hi=94)
+    assert stripes.x_px.item() == 40.0
+
+
+@NAMES
+def test_windows_that_start_off_zero_are_read_at_their_place(name):
+    assert estimate(name, row(200, x150=8, x30=9), 10, x0=64, x_lo=70).x_px.item() == 150.0
+
+
+@SIDES
+def test_edge_finds_the_step_that_argmax_misses(near_is_left):
+    x = np.arange(120)
+    counts = np.round(60 * np.exp(-x / 40) * (x <= 70) + 25 * (x == 70)).astype(np.uint8)
+    if not near_is_left:
+        counts = counts[::-1]
+    step = 70 if near_is_left else 49
+    stripes = estimate("edge", counts[None, None], 100, near_is_left=near_is_left)
+    assert abs(stripes.x_px.item() - step) <= 0.5
+    assert abs(estimate("argmax", counts[None, None], 100, near_is_left=near_is_left).x_px.item() - step) > 60
+    assert stripes.haze.item() == pytest.approx(60 * np.exp(-70 / 40) / 100, rel=0.3)
+
+
+@NAMES
+def test_a_mirrored_rig_gives_the_mirrored_answer(name):
+    # With 300 exposures hardly a row has two equal largest counts, which go to the smallest x on both sides.
+    counts = np.ascontiguousarray(simulated(exposures=300).counts[:, :, 100:400])
+    left = estimate(name, counts, 300)
+    right = estimate(name, np.ascontiguousarray(counts[:, :, ::-1]), 300, near_is_left=False)
+    unique = (counts == counts.max(axis=2, keepdims=True)).sum(axis=2).T == 1
+    assert unique.mean() > 0.7
+    same = np.isclose(right.x_px[unique], 299 - left.x_px[unique], atol=1e-3)
+    # Scores of `edge` are products of small numbers and tie a little more often.
+    assert same.mean() > (0.99 if name == "edge" else 0.999)
+    np.testing.assert_allclose(right.confidence[unique][same], left.confidence[unique][same], atol=1e-5)
+
+
+@NAMES
+@SIDES
+@pytest.mark.parametrize("offset", [-0.4, -0.2, 0.0, 0.2, 0.4])
+def test_positions_are_sub_pixel(name, near_is_left, offset):
+    # Pixel shares of a Gaussian of 0.6 px, by fine sums.
+    fine = np.arange(-6, 6, 0.01) + 0.005
+    light = np.exp(-0.5 * ((fine - offset) / 0.6) ** 2)
+    shares = np.histogram(fine, np.arange(-5.5, 6), weights=light / light.sum())[0]
+    counts = np.zeros((1, 1, 100), np.uint16)
+    counts[0, 0, 45:56] = np.round(6000 * shares)
+    stripes = estimate(name, counts, 10_000, near_is_left=near_is_left)
+    assert stripes.x_px.item() == pytest.approx(50 + offset, abs=0.12)
+    assert stripes.confidence.item() > 0.99
+
+
+@NAMES
+def test_signal_is_summed_across_the_stripe(name):
+    flux = 0.01 + 0.5 * np.array([0.0] * 48 + [0.10, 0.20, 0.40, 0.20, 0.10] + [0.0] * 47)
+    counts = np.round(10_000 * -np.expm1(-flux)).astype(np.uint16)[None, None]
+    stripes = estimate(name, counts, 10_000)
+    assert stripes.signal.item() == pytest.approx(0.5, rel=0.2)
+    assert stripes.haze.item() == pytest.approx(0.01, rel=0.2)
+
+
+@NAMES
+def test_columns_without_frames_have_no_answer(name):
+    counts = np.concatenate([row(x30=4)] * 3)
+    stripes = estimate(name, counts, np.array([10, 0, 10]))
+    np.testing.assert_array_equal(np.isnan(stripes.x_px[0]), [False, True, False])
+    assert stripes.confidence[0, 1] == 0.0
+    assert np.isnan([stripes.x_sd_px[0, 1], stripes.signal[0, 1], stripes.haze[0, 1]]).all()
+
+
+@NAMES
+def test_rows_with_an_empty_search_interval_have_no_answer(name):
+    stripes = estimate(name, row(x30=4), 10, x_lo=40, x_hi=39)
+    assert np.isnan(stripes.x_px.item())
+    assert stripes.confidence.item() == 0.0
+
+
+@NAMES
+def test_threads_change_nothing(name):
+    sweep = simulated()
+    tables = [create_estimator(name, threads).estimate(sweep.volume, sweep.geometry) for threads in (1, 3)]
+    for field in ("x_px", "confidence", "x_sd_px", "signal", "haze"):
+        np.testing.assert_array_equal(getattr(tables[0], field), getattr(tables[1], field))
+
+
+@NAMES
+def test_estimates_do_not_depend_on_the_type_of_the_counts(name):
+    sweep = simulated()
+    counts = sweep.counts[:, :16, :256]
+    narrow, wide = (estimate(name, counts.astype(t), 10) for t in (np.uint8, np.uint32))
+    np.testing.assert_array_equal(narrow.x_px, wide.x_px)
+    np.testing.assert_array_equal(narrow.confidence, wide.confidence)
+
+
+def test_confidence_of_argmax_says_how_far_the_peak_stands_out():
+    clear = estimate("argmax", row(x30=9), 10)
+    doubtful = estimate("argmax", row(x30=2, x60=2), 10)
+    assert clear.confidence.item() > 0.99
+    assert 0.2 < doubtful.confidence.item() < 0.6
+    assert 0 < clear.x_sd_px.item() < 1
+
+
+@NAMES
+@pytest.mark.parametrize("rig", ["left", "right", "turned"])
+def test_bright_stripes_in_clear_air_are_found(name, rig):
+    sweep = simulated("clear", 30, rig)
+    errors = sweep.errors(create_estimator(name).estimate(sweep.volume, sweep.geometry).x_px)
+    assert np.median(errors) < 0.25
+    assert np.mean(errors < 1) > 0.8
+
+
+def test_in_fog_edge_is_better_than_argmax():
+    sweep = simulated(exposures=20)
+    argmax, edge = (
+        sweep.errors(create_estimator(name).estimate(sweep.volume, sweep.geometry).x_px) for name in ("argmax", "edge")
+    )
+    assert np.mean(edge < 1) > 1.2 * np.mean(argmax < 1)
+
+
+@NAMES
+def test_confidence_stays_a_probability_however_bright_the_haze(name):
+    # The near haze is far brighter than the stripe: thousands of counts lie between them.
+    x = np.arange(200)
+    counts = np.round(40_000 * np.exp(-x / 30) * (x < 150) + 1_500 * (x == 150)).astype(np.uint16)
+    stripes = estimate(name, counts[None, None], 50_000)
+    assert 0.0 <= stripes.confidence.item() <= 1.0
+    assert (abs(stripes.x_px.item() - 150) <= 1) == (name == "edge")
+
+
+@NAMES
+@pytest.mark.parametrize("light", ["report", "clear"])
+def test_answers_with_high_confidence_are_mostly_right(name, light):
+    sweep = simulated(light)
+    stripes = create_estimator(name).estimate(sweep.volume, sweep.geometry)
+    sure = stripes.confidence[sweep.point.trusted] > 0.9
+    right = sweep.errors(stripes.x_px) <= 1
+    assert sure.mean() > 0.3
+    assert right[sure].mean() > 0.75
+    assert right[sure].mean() > right[~sure].mean() + 0.3

@@ -1,0 +1,95 @@
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.estimate.median import median_filter
+from rig.geometry.stripe_table import StripeTable
+
+
+def table(x_px):
+    x = np.asarray(x_px, np.float32)
+    return StripeTable(x, np.full_like(x, 0.7), np.full_like(x, 0.3), np.full_like(x, 0.5), np.full_like(x, 0.1))
+
+
+def reference_median(x, reference):
+    """5x5 nanmedian of x - reference, put back; NaN stays NaN."""
+    disparity = np.pad(x - reference, 2, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(disparity, (5, 5))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        result = np.nanmedian(windows, axis=(2, 3)) + reference
+    return np.where(np.isnan(x), np.nan, result)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32), st.integers(1, 12), st.integers(1, 12), st.floats(0, 1))
+def test_the_filter_is_the_nan_aware_median_of_disparity(seed, rows, columns, missing):
+    rng = np.random.default_rng(seed)
+    x = np.where(rng.random((rows, columns)) < missing, np.nan, rng.uniform(0, 500, (rows, columns)))
+    reference = rng.uniform(-100, 600, (rows, columns))
+    x = x.astype(np.float32)
+    result = median_filter(table(x), reference).x_px
+    assert result.dtype == np.float32
+    np.testing.assert_allclose(result, reference_median(x, reference), atol=1e-3)
+
+
+def test_a_slanted_surface_is_unharmed():
+    y, c = np.mgrid[0:20, 0:30].astype(float)
+    reference = 40 + 3.0 * c + 0.3 * y  # columns 3 px apart, tilted
+    x = reference + 12 + 0.25 * c - 0.1 * y
+    result = median_filter(table(x), reference).x_px
+    np.testing.assert_allclose(result[2:-2, 2:-2], x[2:-2, 2:-2], atol=1e-4)
+    # At the border the neighbourhood is one-sided: half its reach of the slope at most.
+    np.testing.assert_allclose(result, x, atol=0.36)
+
+
+def test_lone_outliers_go_and_missing_answers_stay_missing():
+    reference = np.tile(np.arange(12.0) * 2, (10, 1))
+    x = reference + 5
+    x[4, 6] = 300.0
+    x[7, 3] = np.nan
+    result = median_filter(table(x), reference).x_px
+    assert result[4, 6] == pytest.approx(17.0)
+    assert np.isnan(result[7, 3])
+    assert np.isnan(result).sum() == 1
+
+
+def test_a_step_between_surfaces_keeps_its_place():
+    reference = np.tile(np.arange(20.0), (20, 1))
+    x = reference + np.where(np.arange(20) < 10, 0.0, 40.0)
+    np.testing.assert_allclose(median_filter(table(x), reference).x_px, x, atol=1e-4)
+
+
+def test_light_stays_and_confidence_is_the_agreement_of_the_neighbours():
+    rng = np.random.default_rng(1)
+    before = table(rng.uniform(0, 100, (9, 9)))
+    x = before.x_px.copy()
+    after = median_filter(before, np.zeros((9, 9)))
+    for name in ("signal", "haze"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    window = before.x_px[2:7, 2:7]
+    agree = np.abs(window - np.median(window)) <= 1.0
+    assert after.confidence[4, 4] == pytest.approx(np.mean(agree) * (1 - 0.3 ** agree.sum()), rel=1e-5)
+    even = median_filter(table(np.full((9, 9), 7.0)), np.zeros((9, 9)))
+    np.testing.assert_allclose(even.confidence, 1.0, atol=1e-4)
+    assert np.all(even.x_sd_px < before.x_sd_px)
+    np.testing.assert_array_equal(before.x_px, x)
+    assert not np.array_equal(after.x_px, x)
+
+
+def test_answers_that_go_by_each_other_are_no_surer_because_they_agree():
+    before = table(np.full((9, 9), 7.0))
+    before.confidence[:] = 0.1
+    np.testing.assert_allclose(median_filter(before, np.zeros((9, 9)), coupled=True).confidence, 0.1, rtol=1e-5)
+    before.confidence[4, 4] = 1.0
+    alone = median_filter(before, np.zeros((9, 9)))
+    assert alone.confidence[4, 4] == pytest.approx(1.0, abs=1e-4)
+    assert alone.confidence[0, 0] == pytest.approx(1 - 0.9**9, rel=1e-5)
+    assert median_filter(before, np.zeros((9, 9)), coupled=True).confidence[4, 4] == pytest.approx(3.4 / 25, rel=1e-5)
+
+
+def test_an_empty_table_stays_empty():
+    assert np.isnan(median_filter(StripeTable.empty(4, 5), np.zeros((4, 5))).x_px).all()

@@ -1,0 +1,293 @@
+"""Imports: every pixel of a foreign file is where it belongs, and what is no such file is refused."""
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.clock import SystemClock
+from drivers.frames import BlockFlag, FrameBlock
+from drivers.interfaces import SpadRequest
+from drivers.recorded import RunRecording
+from drivers.registry import Surroundings, lookup
+from drivers.ring import BlockRing
+from rig.api import import_frames
+from rig.errors import UsageError
+from rig.exchange import swissspad2
+from tests.unit.rig.exchange.foreign_files import (
+    Frames,
+    pi_packed,
+    pi_sparse,
+    some_frames,
+    swissspad2_full,
+    swissspad2_half,
+)
+
+NUMBERS = st.integers(-5, 2**70) | st.floats()
+JSON = st.recursive(st.none() | NUMBERS | st.text(max_size=3), lambda inner: st.lists(inner, max_size=3), max_leaves=6)
+CLOCKS = st.fixed_dictionaries({"tick_hz": st.lists(NUMBERS, min_size=2, max_size=2), "frame_period_ticks": NUMBERS})
+RANGES = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 2**70), st.integers(-1, 4)), max_size=3)
+
+DEFECTS = Path(__file__).parents[5] / "shared" / "sensor-data" / "defect_mask_254x496.npy"
+
+
+def blocks_of(folder: Path) -> list[FrameBlock]:
+    recording = RunRecording(folder)
+    assert recording.problems == []
+    return [block for run in recording.runs for block in recording.blocks(run)]
+
+
+def frames_of(folder: Path) -> Frames:
+    return np.concatenate([np.unpackbits(b.bits, axis=2, count=b.header.width) for b in blocks_of(folder)]).astype(bool)
+
+
+def test_pi_imaging_frames_are_turned_upright(tmp_path: Path) -> None:
+    frames = some_frames(3, 512, 512)
+    (tmp_path / "RAW00000.bin").write_bytes(pi_packed(frames))
+    result = import_frames("pi-imaging", [tmp_path / "RAW00000.bin"], tmp_path / "run")
+    assert (result.frames, result.width, result.height) == (3, 512, 512)
+    assert np.array_equal(frames_of(tmp_path / "run"), np.rot90(frames, axes=(1, 2)))
+
+
+def test_done_behind_the_pixels_is_no_pixel_and_done_in_them_is(tmp_path: Path) -> None:
+    raw = pi_packed(some_frames(2, 512, 512))[:-4] + b"DONE"
+    (tmp_path / "a.bin").write_bytes(raw)
+    (tmp_path / "b.bin").write_bytes(raw + b"DONE")
+    import_frames("pi-imaging", [tmp_path / "a.bin", tmp_path / "b.bin"], tmp_path / "run", turn_deg=0)
+    assert np.packbits(frames_of(tmp_path / "run"), axis=2).tobytes() == raw + raw
+
+
+@pytest.mark.parametrize("ending", [b"", b"DONE"])
+@pytest.mark.parametrize("rows", [512, 1024])
+def test_sparse_lists_are_seen_from_the_file(tmp_path: Path, ending: bytes, rows: int) -> None:
+    frames = some_frames(70, rows, 512, seed=3) & some_frames(70, rows, 512, seed=4)
+    frames[[0, 65]] = False
+    (tmp_path / "sparse.bin").write_bytes(pi_sparse(frames) + ending)
+    import_frames("pi-imaging", [tmp_path / "sparse.bin"], tmp_path / "run", turn_deg=0, rows=rows)
+    assert np.array_equal(frames_of(tmp_path / "run"), frames)
+
+
+def test_a_file_that_could_be_either_is_asked_about(tmp_path: Path) -> None:
+    dark = np.zeros((1, 512, 512), bool)
+    dark[0, 511, 512 - 32 + 21] = True  # the last four bytes read 262144, little-endian
+    (tmp_path / "dark.bin").write_bytes(pi_packed(dark))
+    with pytest.raises(UsageError, match="--form"):
+        import_frames("pi-imaging", [tmp_path / "dark.bin"], tmp_path / "run")
+    import_frames("pi-imaging", [tmp_path / "dark.bin"], tmp_path / "run", form="packed", turn_deg=0)
+    assert np.array_equal(frames_of(tmp_path / "run"), dark)
+
+
+def test_swissspad2_half_array(tmp_path: Path) -> None:
+    frames = some_frames(5, 256, 512)
+    (tmp_path / "RAW00000.bin").write_bytes(swissspad2_half(frames))
+    import_frames("swissspad2", [tmp_path], tmp_path / "run")
+    assert np.array_equal(frames_of(tmp_path / "run"), frames)
+
+
+def test_swissspad2_full_array(tmp_path: Path) -> None:
+    frames = some_frames(4, 512, 512)
+    (tmp_path / "RAW00000.bin").write_bytes(swissspad2_full(frames))
+    import_frames("swissspad2", [tmp_path], tmp_path / "run", form="full")
+    assert np.array_equal(frames_of(tmp_path / "run"), frames)
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_swissspad2_as_photoncube_converts_it(tmp_path: Path, full: bool) -> None:
+    tool = pytest.importorskip(
+        "photoncube", reason="the public tool photoncube is not installed (pip install photoncube)"
+    )
+    per_file = 256 if full else 512
+    raw = np.random.default_rng(7).integers(0, 256, (2, per_file * (32768 if full else 16384)), np.uint8)
+    camera = tmp_path / "camera"
+    camera.mkdir()
+    for number, content in zip((9, 10), raw, strict=True):  # by number, not by letter
+        (camera / f"RAW{number}.bin").write_bytes(content.tobytes())
+    tool.PhotonCube.convert_to_npy(str(camera), str(tmp_path / "cube.npy"), is_full_array=full)
+    import_frames("swissspad2", [camera], tmp_path / "run", form="full" if full else "half")
+    got = np.concatenate([block.bits for block in blocks_of(tmp_path / "run")])
+    assert np.array_equal(got, np.load(tmp_path / "cube.npy"))
+
+
+def test_full_frames_read_as_halves_are_noticed() -> None:
+    scene = np.random.default_rng(1).random((512, 512)) * 0.3
+    if DEFECTS.exists():  # a real sensor's pattern of hot pixels
+        scene[:254, :496][np.load(DEFECTS)] = 0.9
+    frames = np.random.default_rng(2).random((24, 512, 512)) < scene
+    raw = np.frombuffer(swissspad2_full(frames), np.uint8)
+    assert swissspad2._alternates(raw)
+    halves = np.frombuffer(swissspad2_half(frames[:, :256]), np.uint8)
+    assert not swissspad2._alternates(halves)
+
+
+def test_a_photon_cube_of_any_width_keeps_its_clock_and_numbers(tmp_path: Path) -> None:
+    frames = some_frames(9, 3, 21)
+    np.save(tmp_path / "frames.npy", np.packbits(frames, axis=2) | np.array([0, 0, 7], np.uint8))  # no pixels: cleared
+    sidecar = {
+        "format": "spadrig-frames",
+        "width": 21,
+        "clock": {"tick_hz": [97_700_000, 1], "frame_period_ticks": 1000},
+        "ranges": [[1, 0, 4], [1, 6, 5]],
+    }
+    (tmp_path / "frames.json").write_text(json.dumps(sidecar))
+    result = import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+    assert result.gaps == ((4, 5),)
+    first, second = blocks_of(tmp_path / "run")
+    assert (first.header.first_frame, second.header.first_frame, second.header.lost_before) == (0, 6, 2)
+    assert second.header.flags == BlockFlag.LAST | BlockFlag.LOST_BEFORE
+    assert first.header.tick_hz / first.header.frame_period_ticks == 97_700
+    assert np.array_equal(frames_of(tmp_path / "run"), frames)
+    assert second.start_ticks[0] == 6 * first.header.frame_period_ticks
+
+
+@settings(max_examples=50, deadline=None)
+@given(content=st.dictionaries(st.sampled_from(["width", "clock", "ranges"]), JSON | CLOCKS | RANGES))
+def test_whatever_stands_beside_a_cube_its_pixels_are_taken_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, content: dict[str, object]
+) -> None:
+    folder = tmp_path_factory.mktemp("beside")
+    frames = some_frames(3, 2, 16)
+    np.save(folder / "frames.npy", np.packbits(frames, axis=2))
+    (folder / "frames.json").write_text(json.dumps({"format": "spadrig-frames", "width": 16, **content}))
+    try:
+        import_frames("photoncube", [folder / "frames.npy"], folder / "run")
+    except UsageError:
+        return
+    width = content.get("width", 16)
+    assert np.array_equal(frames_of(folder / "run"), frames[:, :, :width])
+
+
+@pytest.mark.parametrize("rate", [Fraction(0), Fraction(1, 10**12), Fraction(2**32)])
+def test_a_frame_rate_that_no_block_can_say_is_refused(tmp_path: Path, rate: Fraction) -> None:
+    np.save(tmp_path / "frames.npy", np.zeros((2, 4, 2), np.uint8))
+    with pytest.raises(UsageError, match="frame rate"):
+        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run", frame_rate=rate)
+
+
+def test_a_photon_cube_with_one_channel_is_that_channel(tmp_path: Path) -> None:
+    frames = some_frames(2, 4, 16)
+    np.save(tmp_path / "frames.npy", np.packbits(frames, axis=2)[..., None])
+    import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run", frame_rate=Fraction(100_000, 3))
+    assert np.array_equal(frames_of(tmp_path / "run"), frames)
+    header = blocks_of(tmp_path / "run")[0].header
+    assert header.tick_hz / header.frame_period_ticks == Fraction(100_000, 3)
+
+
+def test_an_imported_recording_plays_as_a_spad(tmp_path: Path) -> None:
+    frames = some_frames(40, 6, 64)
+    np.save(tmp_path / "frames.npy", np.packbits(frames, axis=2))
+    rate = Fraction(97_700)
+    import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run", frame_rate=rate)
+    kind = lookup("spad", "replay")
+    config = kind.config.model_validate({"kind": "replay", "recording": tmp_path / "run", "clock": "max"})
+    with kind.create(config, Surroundings(SystemClock(), None, 0)) as spad:
+        timing = spad.configure(SpadRequest(rate, float(1 / rate), "stream", 16))
+        ring = BlockRing(8, timing.stride)
+        reader = ring.reader("test")
+        spad.start(None)
+        while spad.fill(ring, 5.0):
+            pass
+        ring.finish()
+        assert np.array_equal(np.concatenate([np.unpackbits(block.bits, axis=2) for block in reader]), frames)
+
+
+def test_without_a_frame_rate_there_is_no_clock(tmp_path: Path) -> None:
+    np.save(tmp_path / "frames.npy", np.zeros((2, 4, 2), np.uint8))
+    result = import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+    assert result.frame_rate_hz is None
+    assert blocks_of(tmp_path / "run")[0].header.frame_period_ticks == 0
+
+
+@pytest.mark.parametrize(
+    ("array", "why"),
+    [
+        (np.zeros((2, 4, 2), np.float32), "float32"),
+        (np.zeros((4, 2), np.uint8), "shape"),
+        (np.zeros((0, 4, 2), np.uint8), "shape"),
+        (np.zeros((2, 4, 2, 3), np.uint8), "3 channels"),
+    ],
+)
+def test_what_is_no_photon_cube_is_refused(tmp_path: Path, array: np.ndarray, why: str) -> None:
+    np.save(tmp_path / "frames.npy", array)
+    with pytest.raises(UsageError, match=why):
+        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("transforms", "why"),
+    [
+        ({"bitpack": True, "bitpack_dim": 1, "w": 16}, "axis 1"),
+        ({"bitpack": False, "w": 2}, "not packed"),
+        ({"bitpack": True, "bitpack_dim": 2, "w": 40}, "width of 40"),
+    ],
+)
+def test_visionsim_says_how_a_cube_is_packed(tmp_path: Path, transforms: dict[str, object], why: str) -> None:
+    np.save(tmp_path / "frames.npy", np.zeros((2, 4, 2), np.uint8))
+    (tmp_path / "transforms.json").write_text(json.dumps({**transforms, "file_path": "frames.npy"}))
+    with pytest.raises(UsageError, match=why):
+        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+
+
+@pytest.mark.parametrize("kind", ["pi-imaging", "swissspad2"])
+def test_every_file_that_was_cut_off_is_named(tmp_path: Path, kind: str) -> None:
+    for name in ("a.bin", "b.bin"):
+        (tmp_path / name).write_bytes(bytes(40000))
+    (tmp_path / "c.bin").write_bytes(b"")
+    with pytest.raises(UsageError) as refused:
+        import_frames(kind, [tmp_path], tmp_path / "run")
+    assert len(refused.value.problems) == 3
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "why"),
+    [
+        ("tiff", {}, "choose one of pi-imaging"),
+        ("photoncube", {"form": "half"}, "leave --form out"),
+        ("swissspad2", {"form": "sparse"}, "half or full"),
+        ("swissspad2", {"turn_deg": 45}, "45 degrees"),
+        ("swissspad2", {"rows": 512}, "leave --rows out"),
+        ("pi-imaging", {"rows": 600}, "1024"),
+        ("pi-imaging", {"frame_rate": "100"}, "no unit"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(tmp_path: Path, kind: str, options: dict[str, object], why: str) -> None:
+    with pytest.raises(UsageError, match=why):
+        import_frames(kind, [tmp_path], tmp_path / "run", **options)  # type: ignore[arg-type]
+
+
+def test_a_cube_that_looks_unpacked_is_refused_until_it_is_said_to_be_packed(tmp_path: Path) -> None:
+    frames = some_frames(40, 6, 16)
+    np.save(tmp_path / "frames.npy", frames.astype(np.uint8))
+    with pytest.raises(UsageError, match=r"0 and 1 only.*numpy\.packbits\(frames, axis=2\).*--form packed"):
+        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    result = import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run", form="packed")
+    assert result.width == 128
+    assert np.array_equal(frames_of(tmp_path / "run"), np.unpackbits(frames.astype(np.uint8), axis=2).astype(bool))
+
+
+def test_frames_of_few_photons_that_a_file_beside_them_tells_of_are_packed(tmp_path: Path) -> None:
+    np.save(tmp_path / "frames.npy", np.ones((3, 4, 2), np.uint8))
+    (tmp_path / "frames.json").write_text(json.dumps({"format": "spadrig-frames", "width": 16}))
+    assert import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run").width == 16
+
+
+def test_dark_frames_are_packed(tmp_path: Path) -> None:
+    np.save(tmp_path / "frames.npy", np.zeros((3, 4, 2), np.uint8))
+    assert import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run").width == 16
+
+
+@pytest.mark.parametrize(
+    ("dtype", "line"),
+    [(bool, "packbits(frames, axis=2)"), (np.int64, "packbits(frames, axis=2)"), (float, "packbits(frames != 0, axis")],
+)
+def test_frames_of_another_type_are_told_how_to_pack(tmp_path: Path, dtype: type, line: str) -> None:
+    np.save(tmp_path / "frames.npy", some_frames(3, 4, 16).astype(dtype))
+    with pytest.raises(UsageError) as refused:
+        import_frames("photoncube", [tmp_path / "frames.npy"], tmp_path / "run")
+    assert f"make it with numpy.{line}" in str(refused.value)

@@ -1,0 +1,186 @@
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from calibration.model.camera import Camera
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PlaneTable
+from rig.errors import UsageError
+from rig.geometry.kernels import row_windows
+from rig.geometry.windows import MARGIN_PX, sweep_geometry, uncalibrated_geometry
+from tests.reference.geometry import Geometry
+from tests.unit.small_maps import RIGS, geometry_of, rig_model
+
+sides = st.sampled_from([-1.0, 1.0])
+
+
+@st.composite
+def views(draw):
+    """Rays with NaN borders, a tilted plane on either side, and a range of inverse depths."""
+    rows, width = draw(st.integers(1, 4)), draw(st.integers(2, 90))
+    focal = draw(st.floats(20, 800))
+    x, y = np.meshgrid(np.arange(width), np.arange(rows))
+    u = ((x - width * draw(st.floats(0, 1))) / focal).astype(np.float32)
+    v = ((y - rows * draw(st.floats(0, 1))) / focal).astype(np.float32)
+    for row in range(rows):
+        left, right = draw(st.integers(0, width)), draw(st.integers(0, width))
+        if draw(st.booleans()):
+            u[row, :left] = v[row, :left] = np.nan
+        if draw(st.booleans()):
+            u[row, right:] = v[row, right:] = np.nan
+    tilt = draw(st.floats(-0.95, 0.95))
+    baseline = draw(sides) * draw(st.floats(0.01, 1.0))
+    planes = [np.array([1.0, tilt, -draw(st.floats(-1, 1))]) / baseline for _ in range(draw(st.integers(1, 3)))]
+    far = draw(st.floats(-0.5, 3.0))
+    return u, v, np.array(planes), far, far + draw(st.floats(1e-3, 5.0))
+
+
+@settings(max_examples=300, deadline=None)
+@given(views())
+def test_windows_are_the_pixels_whose_depth_lies_in_the_range(view):
+    u, v, planes, w_far, w_near = view
+    x_lo, x_hi = row_windows(u, v, planes, w_far, w_near)
+    assert x_lo.shape == x_hi.shape == (u.shape[0], len(planes))
+    for y in range(u.shape[0]):
+        for c, p in enumerate(planes):
+            w = p[0] * u[y].astype(np.float64) + p[1] * v[y].astype(np.float64) + p[2]
+            valid = np.isfinite(w)
+            # Within rounding of a limit either answer is right.
+            assume(not np.any(np.abs(w[valid][:, None] - [w_far, w_near]) < 1e-9))
+            inside = np.flatnonzero(valid & (w >= w_far) & (w <= w_near))
+            if valid.sum() < 2:
+                assert x_lo[y, c] > x_hi[y, c]  # a single ray says nothing of position
+            elif inside.size:
+                assert (x_lo[y, c], x_hi[y, c]) == (inside[0], inside[-1])
+            else:
+                assert x_lo[y, c] > x_hi[y, c]
+
+
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("depth_m", [1.02, 1.6, 3.0, 7.8])
+def test_stripes_of_a_wall_within_the_range_lie_in_their_windows(rig, depth_m):
+    g = Geometry.build(width=300, height=40, columns=60, **RIGS[rig])
+    geometry = geometry_of(g)
+    assert geometry.near_is_left == (rig == "left")
+    seen = 0
+    for c in range(g.columns):
+        beyond = g.inverse_depth(c) - 1 / depth_m
+        if rig != "left":
+            beyond = -beyond
+        # Near points are where inverse depth is largest: the stripe is where the difference changes sign.
+        for y in range(0, g.height, 7):
+            crossing = np.flatnonzero((beyond[y, :-1] >= 0) & (beyond[y, 1:] < 0))
+            for x in crossing:
+                seen += 1
+                assert geometry.x_lo[y, c] - 1 <= x <= geometry.x_hi[y, c]
+    assert seen > 40
+
+
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize(("width", "height"), [(512, 12), (70, 50), (500, 30), (65, 5), (300, 1)])
+def test_stored_windows_hold_every_search_interval_with_its_margin(rig, width, height):
+    geometry = geometry_of(Geometry.build(width=width, height=height, columns=61, **RIGS[rig]))
+    padded = -(-width // 64) * 64
+    assert geometry.window % 64 == 0
+    assert 0 < geometry.window <= padded
+    assert np.all(geometry.x0 % 64 == 0)
+    assert np.all((geometry.x0 >= 0) & (geometry.x0 + geometry.window <= padded))
+    seen = geometry.x_lo <= geometry.x_hi
+    assert seen.any()
+    x0 = np.broadcast_to(geometry.x0, seen.shape)[seen]
+    assert np.all(geometry.x_lo[seen] >= 0)
+    assert np.all(geometry.x_hi[seen] < width)
+    assert np.all(x0 <= np.maximum(geometry.x_lo[seen] - MARGIN_PX, 0))
+    assert np.all(x0 + geometry.window > np.minimum(geometry.x_hi[seen] + MARGIN_PX, width - 1))
+
+
+@pytest.mark.parametrize("rig", ["left", "right"])
+def test_the_margin_is_kept_on_both_sides_of_every_single_column(rig):
+    g = Geometry.build(width=512, height=3, columns=120, **RIGS[rig])
+    for c in range(20, 100):
+        geometry = sweep_geometry(rig_model(g), np.array([float(c)]), (1.0, 8.0))
+        first, last = geometry.x_lo.min(), geometry.x_hi.max()
+        assert geometry.x0[0] <= max(first - MARGIN_PX, 0) < geometry.x0[0] + 64
+        assert geometry.x0[0] + geometry.window > min(last + MARGIN_PX, 511)
+
+
+def test_windows_are_no_wider_than_the_disparity_span_asks():
+    # f = 600 px, baseline 0.3 m: 1 to 8 m are 157.5 px, with margins and the word grid at most 4 words.
+    assert geometry_of(Geometry.build(height=4, columns=100)).window <= 256
+    assert geometry_of(Geometry.build(height=4, columns=100), (3.0, 8.0)).window <= 128
+
+
+def test_a_lens_that_does_not_reach_the_corners_leaves_them_out():
+    matrix = np.array([[60.0, 0, 79.5], [0, 60.0, 29.5], [0, 0, 1]])
+    camera = Camera(160, 60, matrix, np.array([-0.3, 0.0, 0.0, 0.0]))
+    planes = Geometry.build(columns=40).planes
+    geometry = sweep_geometry(RigModel(camera, PlaneTable(np.arange(40.0), planes)), np.arange(40.0), (0.3, 50.0))
+    blind = np.isnan(geometry.u)
+    assert 0.05 < blind.mean() < 0.95
+    y, c = np.nonzero(geometry.x_lo <= geometry.x_hi)
+    assert not blind[y, geometry.x_lo[y, c]].any()
+    assert not blind[y, geometry.x_hi[y, c]].any()
+
+
+def test_a_plane_through_the_camera_is_refused_with_its_column():
+    g = Geometry.build(width=100, height=4, columns=9)
+    planes = g.planes.copy()
+    planes[5, 3] = 3e-8
+    model = RigModel(rig_model(g).camera, PlaneTable(np.arange(9.0), planes))
+    with pytest.raises(UsageError, match=r"column 5 passes 3\.0e-08 m") as error:
+        sweep_geometry(model, np.arange(9.0), (1.0, 8.0))
+    assert "\n" not in str(error.value)
+
+
+def test_a_depth_range_that_no_column_sees_is_refused_with_its_limits():
+    g = Geometry.build(width=100, height=4, columns=9)
+    with pytest.raises(UsageError, match=re.escape("between 0.01 m and 0.02 m")):
+        geometry_of(g, (0.01, 0.02))
+
+
+def test_columns_outside_the_picture_get_a_window_of_their_own_without_pixels():
+    g = Geometry.build(width=128, height=3, columns=50)
+    geometry = geometry_of(g)
+    empty = (geometry.x_lo > geometry.x_hi).all(axis=0)
+    assert 0 < empty.sum() < 50
+    assert np.all(geometry.x0[empty] == 0)
+
+
+@pytest.mark.parametrize("rig", ["left", "right"])
+def test_the_reference_line_is_that_of_a_wall_at_the_middle_inverse_depth(rig):
+    g = Geometry.build(width=200, height=9, columns=30, axis_tilt_z_deg=4.0, **RIGS[rig])
+    reference = geometry_of(g).reference_px()
+    w = 0.5 * (1.0 + 1.0 / 8.0)
+    v = (np.arange(9) - 4.0) / g.focal_px
+    n, d = g.planes[:, :3], g.planes[:, 3]
+    u = (w * d - n[:, 2] - n[:, 1] * v[:, None]) / n[:, 0]
+    np.testing.assert_allclose(reference, 99.5 + g.focal_px * u, atol=1e-3)
+
+
+def test_rows_without_rays_still_have_a_reference():
+    geometry = geometry_of(Geometry.build(width=200, height=9, columns=30))
+    u, v = geometry.u.copy(), geometry.v.copy()
+    u[0], v[0] = np.nan, np.nan
+    u[1, :50] = v[1, :50] = np.nan
+    assert np.isfinite(replace(geometry, u=u, v=v).reference_px()).all()
+
+
+@pytest.mark.parametrize("width", [1, 63, 64, 65, 501])
+def test_without_a_model_the_whole_row_is_searched(width):
+    geometry = uncalibrated_geometry(3, width, 5)
+    assert (geometry.rows, geometry.width, geometry.columns) == (3, width, 5)
+    assert np.all(geometry.x_lo == 0)
+    assert np.all(geometry.x_hi == width - 1)
+    assert geometry.window % 64 == 0
+    assert geometry.window >= width
+    assert np.isfinite(geometry.u).all()
+
+
+def test_one_row_is_a_sensor_and_one_column_is_none():
+    assert geometry_of(Geometry.build(width=300, height=1, columns=20)).rows == 1
+    with pytest.raises(UsageError, match="no column meets the picture"):
+        geometry_of(Geometry.build(width=1, height=30, columns=20))

@@ -1,0 +1,227 @@
+"""Files whose numbers tell of more than they hold: none of them decides how much memory or time is taken."""
+
+import io
+import tracemalloc
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from calibration.files.npy_files import load_numpy
+from drivers.errors import DeviceError
+from drivers.frames import FrameBlock
+from drivers.recorded import INDEX_FILE, RunRecording
+from drivers.recorded.contents import HEADER_BYTES, INDEX_RECORD
+from drivers.recorded.segments import FrameTable, table_bytes
+from rig.api import export_run, reconstruct
+from rig.count.bind import FrameBinder
+from rig.errors import RigError, UsageError
+from rig.recording.inputs import PLAN_FILE, read_plan, write_inputs
+from rig.recording.open import info
+from rig.recording.repair import repair
+from rig.recording.replay import recorded_sweeps
+from rig.recording.verify import verify
+from tests.unit.rig.count.streams import plan_of, rig_model, scan
+from tests.unit.rig.recording.recorded import record, run_blocks
+
+MOST_BYTES = 100_000_000
+"""Of what is done with a recording of a megabyte; what forged numbers ask for is gigabytes."""
+
+
+@contextmanager
+def little_memory() -> Iterator[None]:
+    """The block takes no more than `MOST_BYTES`; it may end in an error of ours."""
+    tracemalloc.start()
+    try:
+        with suppress(RigError, DeviceError):
+            yield
+        assert tracemalloc.get_traced_memory()[1] < MOST_BYTES
+    finally:
+        tracemalloc.stop()
+
+
+def forged(folder: Path, change: Callable[[int, FrameBlock], dict[str, Any]], **manifest: Any) -> Path:
+    """A sound recording but for what `change` says of its blocks' headers; all checksums are right."""
+    blocks = [replace(block, header=replace(block.header, **change(i, block))) for i, block in enumerate(run_blocks())]
+    write_inputs(record(folder, [blocks], **manifest), plan_of(scan()), rig_model())
+    return folder
+
+
+@pytest.mark.parametrize("command", [info, verify, repair])
+def test_a_run_number_of_the_index_takes_no_memory(tmp_path: Path, command: Callable[[Path], object]) -> None:
+    index = record(tmp_path, [run_blocks()]) / INDEX_FILE
+    raw = bytearray(index.read_bytes())
+    entries = np.frombuffer(raw, INDEX_RECORD, offset=HEADER_BYTES)
+    entries["run_id"][1] = 2**31 - 1
+    entries["crc"][1] = zlib.crc32(entries[1].tobytes()[:-4])
+    index.write_bytes(raw)
+    with little_memory():
+        command(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("sweep", 2**32 - 1), ("first_frame", 2**62), ("t0_ticks", 2**62), ("sensor_width", 0xFFFF)],
+)
+def test_a_header_takes_no_memory_and_no_time(tmp_path: Path, field: str, value: int) -> None:
+    change: dict[str, Any] = {field: value}
+    if field.startswith("sensor"):
+        change["sensor_height"] = value
+    last = len(run_blocks()) - 1
+    folder = forged(tmp_path / "run", lambda i, _: change if i == last else {}, verdict="aborted", recording={})
+    for command in (info, verify, reconstruct):
+        with little_memory():
+            command(folder)
+    with little_memory():
+        export_run(folder, "png", view="frames")
+
+
+def test_pictures_are_not_made_as_large_as_a_header_says(tmp_path: Path) -> None:
+    folder = forged(tmp_path / "run", lambda i, _: {"sensor_width": 0xFFFF, "sensor_height": 0xFFFF})
+    with pytest.raises(UsageError, match="65535 x 65535 pixels"):
+        export_run(folder, "png", view="frames", frames_per_picture=1)
+
+
+def test_no_more_sweeps_are_made_than_there_are_frames(tmp_path: Path) -> None:
+    folder = forged(tmp_path / "run", lambda i, _: {"sweep": 2**32 - 1}, recording={})
+    recording = RunRecording(folder)
+    assert [start.sweeps for start in recorded_sweeps(recording, plan_of(scan()))] == [recording.frames]
+    folder = forged(tmp_path / "other", lambda i, _: {}, recording={"starts": [{"sweeps": 10**12, "segment": 0}]})
+    assert sum(start.sweeps for start in recorded_sweeps(RunRecording(folder), plan_of(scan()))) <= recording.frames
+
+
+def test_sweeps_that_nobody_wants_are_not_bound() -> None:
+    blocks: Sequence[FrameBlock] = run_blocks()
+    binder = FrameBinder(plan_of(scan()), end_sweep=5)
+    closed = []
+    for block in blocks[:4]:
+        closed += binder.bind(block)[1]
+    late = replace(blocks[4], header=replace(blocks[4].header, sweep=2**32 - 1, t0_ticks=2**62))
+    late.records["sweep"] = 0xFFFF
+    closed += binder.bind(late)[1]
+    assert [clock.sweep for clock in closed] == list(range(len(closed)))
+    assert len(closed) == 5
+
+
+@pytest.mark.parametrize(
+    ("what", "value"),
+    [
+        ("columns", 10**9),
+        ("exposures", 10**9),
+        ("rows", 10**9),
+        ("width", 10**9),
+        ("window", 10**9),
+        ("sweep_points", 10**9),
+        ("frame_rate_hz", "1e999999999"),
+        ("point_rate_hz", "-1"),
+        ("commands", {"dtype": "U1000000", "values": ["a"] * 10}),
+        ("x0", {"dtype": "int32", "values": [2**30] * 10}),
+    ],
+)
+def test_numbers_of_a_plan_fit_its_arrays(tmp_path: Path, what: str, value: object) -> None:
+    write_inputs(tmp_path, plan_of(scan()), None)
+    file = tmp_path / PLAN_FILE
+    content = yaml.safe_load(file.read_text())
+    assert what in content["plan"]
+    content["plan"][what] = value
+    file.write_text(yaml.safe_dump(content))
+    with little_memory(), pytest.raises(UsageError, match=what):
+        read_plan(tmp_path)
+
+
+def test_aliases_of_a_plan_are_not_multiplied(tmp_path: Path) -> None:
+    write_inputs(tmp_path, plan_of(scan()), None)
+    file = tmp_path / PLAN_FILE
+    nested = "\n".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}' if i else '0.0'] * 10)}]" for i in range(12))
+    file.write_text(f"{nested}\n{file.read_text()}")
+    with little_memory(), pytest.raises(UsageError, match="aliases"):
+        read_plan(tmp_path)
+
+
+def test_a_plan_of_another_sensor_makes_no_counters(tmp_path: Path) -> None:
+    folder = forged(tmp_path / "run", lambda i, _: {})
+    content = yaml.safe_load((folder / PLAN_FILE).read_text())
+    content["plan"]["rows"] = 0xFFFF
+    (folder / PLAN_FILE).write_text(yaml.safe_dump(content))
+    with little_memory(), pytest.raises(RigError, match=r"plan\.yaml is for"):
+        reconstruct(folder)
+
+
+def npy(shape: tuple[int, ...], dtype: str, data: bytes = b"", version: tuple[int, int] = (1, 0)) -> bytes:
+    """A .npy file whose header says what it likes."""
+    stream = io.BytesIO()
+    header = {"descr": dtype, "fortran_order": False, "shape": shape}
+    if version == (1, 0):
+        np.lib.format.write_array_header_1_0(stream, header)
+    else:
+        np.lib.format.write_array_header_2_0(stream, header)
+    return stream.getvalue() + data
+
+
+def npz(member: bytes, method: int = zipfile.ZIP_STORED) -> bytes:
+    """An archive with one array."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", method) as archive:
+        archive.writestr("depth_m.npy", member)
+    return stream.getvalue()
+
+
+LARGE = (2**20, 2**14)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        npy(LARGE, "<f4"),
+        npy((2**40, 2**40), "<f4"),
+        npy((1,), "<U100000000", b"\0" * 4),
+        npy((2**62,), "|V0"),
+        npy(LARGE, "<f4", version=(2, 0)),
+        b"\x93NUMPY\x02\x00\xff\xff\xff\xff",
+        npz(npy(LARGE, "<f4")),
+        npz(npy(LARGE, "<f4"), zipfile.ZIP_DEFLATED),
+    ],
+)
+@pytest.mark.parametrize("mmap_mode", [None, "r"])
+def test_headers_of_arrays_fit_their_files(tmp_path: Path, content: bytes, mmap_mode: Any) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(content)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"says that it holds|header of"):
+        load_numpy(file, mmap_mode)
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
+
+
+def test_an_archive_does_not_hold_more_than_its_bytes_can_stand_for(tmp_path: Path) -> None:
+    raw = bytearray(npz(npy((4,), "<f4", b"\0" * 16)))
+    directory = raw.rindex(b"PK\x01\x02")
+    raw[directory + 24 : directory + 28] = (2**31).to_bytes(4, "little")  # the size of its member, unpacked
+    (tmp_path / "file").write_bytes(raw)
+    with pytest.raises(ValueError, match="which it cannot"):
+        load_numpy(tmp_path / "file")
+
+
+def test_sound_arrays_are_read(tmp_path: Path) -> None:
+    array = np.arange(12, dtype=np.float32).reshape(3, 4)
+    np.save(tmp_path / "a.npy", array)
+    np.savez(tmp_path / "b.npz", array=array, one=np.array("text"), none=np.zeros((0, 5)))
+    np.savez_compressed(tmp_path / "c.npz", array=array, zeros=np.zeros((1000, 1000)))
+    assert np.array_equal(load_numpy(tmp_path / "a.npy"), array)
+    assert np.array_equal(load_numpy(tmp_path / "a.npy", mmap_mode="r"), array)
+    for name in ("b.npz", "c.npz"):
+        with load_numpy(tmp_path / name) as archive:
+            assert np.array_equal(archive["array"], array)
+            assert all(archive[each] is not None for each in archive.files)
+
+
+def test_a_table_of_compressed_blocks_holds_no_more_than_they_can() -> None:
+    packed = np.frombuffer(bytes(100) + table_bytes([(100, 1 << 31)]), np.uint8)
+    assert FrameTable.read(packed).size == 0

@@ -1,0 +1,267 @@
+"""`repair` of what is false with the right checksums, and of what is gone at the ends: it costs itself and is told."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.frames import FrameBlock
+from drivers.recorded import INDEX_FILE, RunRecording
+from drivers.spb1.layout import HEADER, IDLE, PACKED, REGISTER_ACK, SPARSE, SUMMED, TRAILER
+from rig.recording.cut import cut
+from rig.recording.open import info
+from rig.recording.repair import repair
+from rig.recording.verify import Integrity, Verification, verify
+from rig.run_folder.manifest import read_manifest
+from tests.unit.rig.recording.forging import (
+    HEADER_FIELDS,
+    TRAILER_FIELDS,
+    forge_header,
+    forge_index,
+    forge_payload,
+    forge_trailer,
+    most_of,
+)
+from tests.unit.rig.recording.recorded import read, record, run_blocks
+
+PAGE = 4096
+"""Each block of these recordings takes one."""
+
+Place = tuple[Path, int]
+"""A segment and where in it a block begins."""
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[list[FrameBlock]]:
+    return [run_blocks(run_id=1), run_blocks(run_id=2, lost=range(100, 103), seed=1)]
+
+
+@pytest.fixture(scope="module")
+def pristine(runs: list[list[FrameBlock]], tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of a sound recording: writing one through to the disk takes long."""
+    folder = record(tmp_path_factory.mktemp("pristine"), runs)
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def copied(pristine: dict[str, bytes], folder: Path) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, data in pristine.items():
+        (folder / name).write_bytes(data)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _no_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody pulls the plug here."""
+    monkeypatch.setattr("rig.recording.repair.os.fsync", lambda fd: None)
+
+
+def places(folder: Path, start: int) -> list[Place]:
+    recording = RunRecording(folder)
+    return [
+        (folder / f"frames-{entry['segment']:06d}.spb", int(entry["offset"])) for entry in recording.runs[start].entries
+    ]
+
+
+def forge(place: Place, change: Callable[[bytearray, int], None]) -> None:
+    data = bytearray(place[0].read_bytes())
+    change(data, place[1])
+    place[0].write_bytes(data)
+
+
+def content(blocks: list[FrameBlock]) -> set[tuple[int, int, bytes]]:
+    return {
+        (block.header.run_id, number, bits.tobytes())
+        for block in blocks
+        for number, bits in zip(block.frame_numbers.tolist(), block.bits, strict=True)
+    }
+
+
+def salvaged(folder: Path, runs: list[list[FrameBlock]], lost: FrameBlock | None) -> Verification:
+    """Repair; AssertionError where anything but the frames of one block is gone, or `verify` is not content."""
+    after = repair(folder).after
+    assert after.problems == []
+    assert after.verdict in (Integrity.INTACT, Integrity.GAPS)
+    recording = RunRecording(folder)
+    assert recording.problems == []
+    found = content([block for run in read(recording) for block in run])
+    may_go = content([] if lost is None else [lost])
+    gone = content([block for run in runs for block in run]) - found
+    assert gone <= may_go, f"{len(gone - may_go)} frames of other blocks are gone"
+    there = sum(block.n_frames for run in read(recording) for block in run)
+    if there < sum(block.n_frames for run in runs for block in run):
+        assert after.verdict is Integrity.GAPS
+        assert after.lost >= len(gone)
+    assert repair(folder).done == []
+    return after
+
+
+def values_of(name: str, old: int) -> list[int]:
+    most = most_of(HEADER, HEADER_FIELDS, name)
+    values = {0, 1, old - 1, old + 1, old + 17, old * 2, most // 2 + 1, most}
+    if name == "payload_type":
+        values |= {PACKED, SPARSE, SUMMED, REGISTER_ACK, IDLE, 5}
+    return sorted(value for value in values if 0 <= value <= most and value != old)
+
+
+@pytest.mark.parametrize("where", ["first", "middle", "second last", "last"])
+@pytest.mark.parametrize("name", [name for name in HEADER_FIELDS if name not in ("magic", "header_crc")])
+def test_a_forged_header_costs_its_block_alone(
+    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], name: str, where: str
+) -> None:
+    number = {"first": 0, "middle": len(runs[0]) // 2, "second last": -2, "last": -1}[where]
+    folder = copied(pristine, tmp_path / "whole")
+    file, at = places(folder, 0)[number]
+    old = HEADER.unpack_from(file.read_bytes(), at)[HEADER_FIELDS.index(name)]
+    for value in values_of(name, old):
+        folder = copied(pristine, tmp_path / f"{value}")
+        forge(places(folder, 0)[number], lambda data, at, value=value: forge_header(data, at, **{name: value}))
+        salvaged(folder, runs, runs[0][number])
+
+
+@pytest.mark.parametrize("index", ["there", "lost"])
+@pytest.mark.parametrize("name", ["block_seq", "first_frame", "t0_ticks", "sweep", "run_id", "lost_before", "height"])
+def test_a_forged_header_in_the_middle_costs_its_block_alone_without_an_index_too(
+    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], name: str, index: str
+) -> None:
+    number = 3
+    for value in (0, 1, 2**15, 2**16 - 1):
+        folder = copied(pristine, tmp_path / f"{value}")
+        forge(places(folder, 1)[number], lambda data, at, value=value: forge_header(data, at, **{name: value}))
+        if index == "lost":
+            (folder / INDEX_FILE).unlink()
+        salvaged(folder, runs, runs[1][number])
+
+
+@pytest.mark.parametrize("where", ["first", "middle", "last"])
+@pytest.mark.parametrize("name", [name for name in TRAILER_FIELDS if name not in ("magic", "crc")])
+def test_a_forged_trailer_costs_its_block_alone(
+    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], name: str, where: str
+) -> None:
+    number = {"first": 0, "middle": len(runs[0]) // 2, "last": -1}[where]
+    most = most_of(TRAILER, TRAILER_FIELDS, name)
+    for value in (0, 1, 700, most // 2, most):
+        folder = copied(pristine, tmp_path / f"{value}")
+        file, at = places(folder, 0)[number]
+        fields = dict(zip(HEADER_FIELDS, HEADER.unpack_from(file.read_bytes(), at), strict=True))
+        end = fields["header_len"] + fields["payload_len"]
+        forge((file, at), lambda data, at, value=value, end=end: forge_trailer(data, at + end, **{name: value}))
+        salvaged(folder, runs, runs[0][number])
+
+
+@pytest.mark.parametrize("where", [0, 4, -1])
+@pytest.mark.parametrize("name", ["marks", "ticks", "x0", "y0", "line", "sweep"])
+def test_forged_records_of_frames_cost_their_block_at_most(
+    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], name: str, where: int
+) -> None:
+    def change(records: np.ndarray) -> None:  # type: ignore[type-arg]
+        records[name][frames] = value
+
+    for frames in (slice(0, 1), slice(7, 8), slice(-1, None), slice(None)):
+        for value in (0, 1, np.iinfo(np.uint32 if name in ("marks", "ticks") else np.uint16).max):
+            folder = copied(pristine, tmp_path / f"{frames.start}-{frames.stop}-{value}")
+            forge(places(folder, 0)[where], lambda data, at: forge_payload(data, at, change))
+            salvaged(folder, runs, runs[0][where])
+
+
+@pytest.mark.parametrize("payload_type", [REGISTER_ACK, IDLE])
+@pytest.mark.parametrize("size", [0, 1, 3000, 4000, 40_000, 2**31, 2**32 - 1])
+def test_a_control_block_with_a_strange_size_costs_itself(
+    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], payload_type: int, size: int
+) -> None:
+    for number in (0, 3, -1):
+        folder = copied(pristine, tmp_path / f"{number}")
+        change = {"payload_type": payload_type, "payload_len": size}
+        forge(places(folder, 0)[number], lambda data, at, change=change: forge_header(data, at, **change))
+        salvaged(folder, runs, runs[0][number])
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["segment", "flags", "offset", "length", "run_id", "block_seq", "first_frame", "n_frames", "sweep", "t0_ticks"],
+)
+def test_a_forged_record_of_the_index_costs_nothing(
+    tmp_path: Path, pristine: dict[str, bytes], runs: list[list[FrameBlock]], name: str
+) -> None:
+    for number in (0, 4, -1):
+        for value in (0, 2, 3, 17, 4096, 65_536, 2**31):
+            folder = copied(pristine, tmp_path / f"{number}-{value}")
+            forge_index(folder, number, name, value)
+            reader = content([block for run in read(RunRecording(folder)) for block in run])
+            gone = content([block for run in runs for block in run]) - reader
+            assert len(gone) <= 16, f"{name} = {value} in record {number} costs a reader {len(gone)} frames"
+            after = salvaged(folder, runs, None)
+            assert after.lost == 3
+
+
+def test_blocks_that_were_cut_away_at_either_end_are_gaps(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    for number in (0, -1):
+        folder = record(tmp_path / f"{number}", runs[:1])
+        block = runs[0][number]
+        forge(places(folder, 0)[number], lambda data, at: data.__setitem__(at + 500, data[at + 500] ^ 1))
+        after = salvaged(folder, runs[:1], block)
+        first, last = block.header.first_frame, block.header.first_frame + block.n_frames - 1
+        assert after.gaps == [(0, first, last)]
+        assert (after.verdict, after.exit_code, after.lost, after.run) == (Integrity.GAPS, 1, block.n_frames, "gaps")
+        told = info(folder).runs[0]
+        assert (told.gaps, told.lost) == (1, block.n_frames)
+
+
+@pytest.mark.parametrize("index", ["there", "lost"])
+@pytest.mark.parametrize("end", ["first", "last"])
+def test_what_is_gone_at_an_end_of_a_part_is_a_gap(
+    tmp_path: Path, runs: list[list[FrameBlock]], end: str, index: str
+) -> None:
+    cut(record(tmp_path / "run", runs), tmp_path / "part", frames="20:120")
+    part = tmp_path / "part"
+    number = 0 if end == "first" else -1
+    forge(places(part, 0)[number], lambda data, at: data.__setitem__(at + 300, data[at + 300] ^ 1))
+    if index == "lost":
+        (part / INDEX_FILE).unlink()
+    after = repair(part).after
+    assert (after.verdict, after.exit_code) == (Integrity.GAPS, 1)
+    assert after.gaps == [(0, 20, 31) if end == "first" else (0, 112, 119)]
+    told = info(part).runs[0]
+    assert (told.gaps, told.lost) == (1, after.lost)
+    assert verify(part) == after
+
+
+def test_a_last_block_is_known_to_be_gone_by_what_the_device_delivered(
+    tmp_path: Path, runs: list[list[FrameBlock]]
+) -> None:
+    folder = record(tmp_path, runs[:1])
+    forge(places(folder, 0)[-1], lambda data, at: data.__setitem__(at + 500, data[at + 500] ^ 1))
+    (folder / INDEX_FILE).unlink()
+    after = repair(folder).after
+    last = runs[0][-1]
+    assert after.gaps == [(0, last.header.first_frame, last.header.first_frame + last.n_frames - 1)]
+
+
+@pytest.mark.parametrize("counters", [{"delivered": -5, "lost": 0}, {"lost": 2**60}, {"delivered": 1e300}])
+def test_counters_that_cannot_be_are_left_out_and_said(
+    tmp_path: Path, runs: list[list[FrameBlock]], counters: dict[str, float]
+) -> None:
+    folder = record(tmp_path, runs, counters=counters)
+    assert any("which cannot be" in line for line in verify(folder).problems)
+    done = repair(folder)
+    assert any(line.endswith("which cannot be; left out") for line in done.done)
+    assert (done.after.problems, done.after.lost) == ([], 3)
+    assert "counters" not in (read_manifest(folder) or {})
+
+
+def test_a_damaged_compressed_segment_is_unpacked_and_kept(tmp_path: Path, runs: list[list[FrameBlock]]) -> None:
+    pytest.importorskip("zstandard", reason="pip install 'spadrig[compress]'")
+    from rig.recording.compress import compress
+
+    folder = record(tmp_path, runs)
+    compress(folder)
+    file = folder / "frames-000000.spb.zst"
+    damaged = bytearray(file.read_bytes())
+    damaged[40] ^= 1
+    file.write_bytes(damaged)
+    after = salvaged(folder, runs, runs[0][0])
+    assert after.gaps[0] == (0, 0, 15)
+    assert (folder / "frames-000000.torn.zst").read_bytes() == damaged
+    compress(folder)
+    assert verify(folder).verdict is Integrity.GAPS

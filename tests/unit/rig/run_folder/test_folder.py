@@ -1,0 +1,233 @@
+"""The run folder: whole or not there, and files that other programs can read."""
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from drivers.interfaces import SweepTruth
+from rig.depth.reconstruct import FogEstimate, MapResult
+from rig.errors import UsageError
+from rig.geometry.stripe_table import StripeTable
+from rig.run_folder.folder import RunFolder, json_text
+from rig.run_folder.pictures import SCALE_PX, depth_picture
+
+ROWS, WIDTH, COLUMNS = 40, 60, 7
+
+
+def a_map(depth: float = 2.0) -> MapResult:
+    depth_m = np.full((ROWS, WIDTH), depth, np.float32)
+    depth_m[:, 30:] *= 2
+    depth_m[5:9, 10:20] = np.nan
+    intensity = np.arange(ROWS * WIDTH, dtype=np.uint32).reshape(ROWS, WIDTH)
+    return MapResult(StripeTable.empty(ROWS, COLUMNS), depth_m, intensity, FogEstimate(None, None, None), 0.1)
+
+
+def rays() -> tuple[np.ndarray, np.ndarray]:
+    y, x = np.mgrid[:ROWS, :WIDTH]
+    return (x - 29.5) / 100, (y - 19.5) / 100
+
+
+def read_ply(file: Path) -> np.ndarray:
+    """A reader that knows PLY, not our writer."""
+    data = file.read_bytes()
+    head, _, body = data.partition(b"end_header\n")
+    lines = head.decode().splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    (count,) = [int(line.split()[2]) for line in lines if line.startswith("element vertex")]
+    names = [line.split()[2] for line in lines if line.startswith("property float ")]
+    values = np.frombuffer(body, "<f4").reshape(count, len(names))
+    return np.rec.fromarrays(values.T, names=names)  # type: ignore[call-overload,no-any-return]
+
+
+def test_a_map_is_written_in_formats_others_read(tmp_path: Path) -> None:
+    result = a_map()
+    with RunFolder(tmp_path / "run") as folder:
+        folder.write_map(3, result, rays())
+        folder.write_truth(3, SweepTruth(result.stripe.x_px, result.depth_m))
+        folder.write_json("summary.json", {"maps": 1})
+        assert not (tmp_path / "run").exists()
+        assert folder.publish() == tmp_path / "run"
+    run = tmp_path / "run"
+    depth = np.load(run / "depth/000003.npy", allow_pickle=False)
+    assert depth.dtype == np.float32
+    assert np.array_equal(depth, result.depth_m, equal_nan=True)
+    with np.load(run / "stripe/000003.npz", allow_pickle=False) as table:
+        stripe = dict(table)
+    assert {stripe[key].shape for key in ("x_px", "confidence", "x_sd_px", "signal", "haze")} == {(ROWS, COLUMNS)}
+    with np.load(run / "truth/000003.npz") as truth:
+        assert set(truth) == {"x_px", "depth_m"}
+    points = read_ply(run / "cloud/000003.ply")
+    known = np.isfinite(depth)
+    assert len(points) == known.sum()
+    u, v = rays()
+    assert np.allclose(points["z"], depth[known])
+    assert np.allclose(points["x"], u[known] * depth[known], atol=1e-6)
+    assert np.allclose(points["y"], v[known] * depth[known], atol=1e-6)
+    assert np.array_equal(points["intensity"], result.intensity[known])
+    assert {file.name for file in tmp_path.iterdir()} == {"run"}
+
+
+def test_a_map_without_any_depth_after_others_is_black() -> None:
+    picture = depth_picture(np.full((40, 30), np.nan, np.float32), (1.0, 8.0))
+    assert not picture[:, :30].any()
+    assert picture[:, 30:].any()
+
+
+def test_the_depth_picture_is_black_where_there_is_no_depth_and_red_where_it_is_near(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run") as folder:
+        folder.write_map(0, a_map(), rays())
+        folder.publish()
+    picture = cv2.imread(str(tmp_path / "run/depth/000000.png"))
+    assert picture.shape == (ROWS, WIDTH + SCALE_PX, 3)
+    assert not picture[5:9, 10:20].any()
+    near, far = picture[20, 10].astype(int), picture[20, 50].astype(int)
+    assert near[2] > 100 > near[0]
+    assert far[0] > 100 > far[2]
+    assert picture[:, WIDTH:].any()
+    grey = cv2.imread(str(tmp_path / "run/intensity/000000.png"), cv2.IMREAD_UNCHANGED)
+    assert (grey.shape, grey.dtype) == ((ROWS, WIDTH), np.uint8)
+
+
+def test_all_maps_share_the_colours_of_the_first(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run") as folder:
+        folder.write_map(0, a_map(2.0), rays())
+        folder.write_map(1, a_map(1.9), rays())
+        folder.publish()
+    scales = [cv2.imread(str(tmp_path / f"run/depth/00000{i}.png"))[:, WIDTH:] for i in (0, 1)]
+    assert np.array_equal(*scales)
+
+
+def test_a_map_without_any_depth_is_written_all_the_same(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run") as folder:
+        folder.write_map(0, a_map(float("nan")), rays())
+        folder.publish()
+    assert len(read_ply(tmp_path / "run/cloud/000000.ply")) == 0
+
+
+def test_an_uncalibrated_map_has_no_depth_files(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run") as folder:
+        folder.write_map(0, a_map(), None)
+        folder.publish()
+    assert {file.name for file in (tmp_path / "run").iterdir()} == {"stripe", "intensity"}
+
+
+def test_what_is_not_published_leaves_no_trace(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "deep/er/run") as folder:
+        folder.write_map(0, a_map(), rays())
+    assert not list(tmp_path.iterdir())
+
+    def fails() -> None:
+        with RunFolder(tmp_path / "run") as folder:
+            folder.write_json("summary.json", {})
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"):
+        fails()
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupt_in_the_middle_of_a_map_leaves_none_of_its_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, done = Path.write_bytes, []
+
+    def interrupted(self: Path, data: bytes) -> int:
+        done.append(write(self, data))
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        return done[-1]
+
+    with RunFolder(tmp_path / "run") as folder:
+        monkeypatch.setattr(Path, "write_bytes", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            folder.write_map(0, a_map(), rays())
+        folder.write_json("summary.json", {})
+        run = folder.publish()
+    assert [file.name for file in run.rglob("*") if file.is_file()] == ["summary.json"]
+
+
+def test_a_run_whose_name_was_taken_meanwhile_is_kept_beside_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    out = tmp_path / "run"
+    with RunFolder(out) as first, RunFolder(out) as second, RunFolder(out) as third:
+        for folder in (first, second, third):
+            folder.write_json("summary.json", {})
+        published = [folder.publish().name for folder in (first, second, third)]
+    assert published == ["run", "run-2", "run-3"]
+    assert all((tmp_path / name / "summary.json").exists() for name in published)
+    assert len(list(tmp_path.iterdir())) == 3
+    assert [record.getMessage().rpartition("/")[2] for record in caplog.records] == ["run-2", "run-3"]
+
+
+def test_an_empty_folder_that_was_filled_meanwhile_stays_as_it_is(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    with RunFolder(out) as folder:
+        folder.write_json("summary.json", {"mine": 1})
+        (out / "summary.json").write_text("theirs")
+        assert folder.publish() == tmp_path / "run-2"
+    assert (out / "summary.json").read_text() == "theirs"
+    assert list(out.iterdir()) == [out / "summary.json"]
+
+
+def test_parents_are_made_and_kept_with_a_published_run(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "deep/er/run") as folder:
+        folder.write_json("summary.json", {})
+        folder.publish()
+    assert (tmp_path / "deep/er/run/summary.json").exists()
+
+
+def test_an_empty_folder_is_filled_and_stays_when_nothing_comes_of_it(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    with RunFolder(out) as folder:
+        folder.write_json("summary.json", {})
+    assert not list(out.iterdir())
+    with RunFolder(out) as folder:
+        folder.write_map(0, a_map(), rays())
+        folder.write_json("summary.json", {})
+        folder.publish()
+    assert {file.name for file in out.iterdir()} == {"depth", "intensity", "stripe", "cloud", "summary.json"}
+
+
+@pytest.mark.parametrize("name", ["file", "file/below", "full"])
+def test_a_folder_that_cannot_be_is_refused_and_nothing_changes(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/notes").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(UsageError) as caught:
+        RunFolder(tmp_path / name)
+    assert str(tmp_path / name) in str(caught.value)
+    assert len(caught.value.problems) == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_json_is_strict() -> None:
+    content = {
+        "nan": float("nan"),
+        "inf": np.float32("inf"),
+        "array": np.array([1.5, np.nan]),
+        "fraction": Fraction(1, 4),
+        "path": Path("a"),
+        "number": np.int64(3),
+        "truth": np.bool_(True),
+        "none": None,
+        "nested": {"x": (1, float("-inf"))},
+    }
+    assert json.loads(json_text(content), parse_constant=lambda word: pytest.fail(word)) == {
+        "nan": None,
+        "inf": None,
+        "array": [1.5, None],
+        "fraction": 0.25,
+        "path": "a",
+        "number": 3,
+        "truth": True,
+        "none": None,
+        "nested": {"x": [1, None]},
+    }

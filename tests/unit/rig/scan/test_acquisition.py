@@ -1,0 +1,309 @@
+import dataclasses
+import itertools
+import math
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration.model.rig_model import Lag
+from drivers.errors import DeviceDisconnected, DeviceFault, DeviceTimeout, ProtocolError
+from drivers.interfaces import BurstMode
+from rig.count.sweeps import SweepAssembler
+from rig.count.volume import SweepCounter, SweepLayout
+from rig.errors import DevicesError
+from rig.scan.pipeline import Pipeline
+from rig.threads import RowWorkers
+from tests.unit.rig.count.streams import HEIGHT, SPAD, WIDTH, plan_of, scan, stream_of
+from tests.unit.rig.scan.fakes import PATIENCE_S, START, STOP, FakeMaker, acquisition, fake_rig
+
+LAG = Lag(1e-4, 2e-4)
+
+
+PLAN = plan_of(scan(), LAG)
+
+
+def test_the_laser_is_warm_before_the_spad_starts():
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 1, lag=LAG)])
+    start, cold = rig.spad.start, []
+    rig.spad.start = lambda n_frames: (cold.append(rig.laser.cold > 0), start(n_frames))
+    list(acquisition(rig, PLAN, 1).run())
+    assert cold == [False]
+
+
+def test_devices_start_in_order_and_are_made_safe_gate_first():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)])
+    maps = list(acquisition(rig, PLAN, 2).run())
+    assert [found.sweep.index for found in maps] == [0, 1]
+    assert log == START + STOP
+    assert rig.laser.power_w == 0.05  # the limit, since the config names none
+    assert rig.clock.now_ns() > 0  # it waited until the laser was warm
+    assert rig.spad.n_frames is None
+    assert rig.scanner.repeats == 3
+
+
+def test_the_configured_power_is_used():
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 1, lag=LAG)], power="20 mW")
+    list(acquisition(rig, PLAN, 1).run())
+    assert rig.laser.power_w == 0.02
+
+
+def test_leaving_the_iteration_early_makes_the_rig_safe():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
+    run = acquisition(rig, PLAN, 5).run()
+    next(run)
+    assert log == START
+    run.close()
+    assert log == START + STOP
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("estimate failed")])
+def test_an_exception_in_the_caller_makes_the_rig_safe(error):
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
+    run = acquisition(rig, PLAN, 5).run()
+    next(run)
+    with pytest.raises(type(error)):
+        run.throw(error)
+    assert log == START + STOP
+
+
+def test_an_interrupt_while_maps_are_awaited_makes_the_rig_safe():
+    def told(progress):
+        raise KeyboardInterrupt
+
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
+    with pytest.raises(KeyboardInterrupt):
+        list(acquisition(rig, PLAN, 5, on_progress=told).run())
+    assert log == START + STOP
+
+
+@pytest.mark.parametrize(
+    "verb", [("sync", "gate_low"), ("laser", "arm"), ("spad", "start"), ("sync", "run"), ("scanner", "start")]
+)
+def test_a_device_that_fails_to_start_leaves_all_of_them_safe(verb):
+    device, name = verb
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 1, lag=LAG)], {device: {name: DeviceFault("broken")}})
+    with pytest.raises(DeviceFault, match="broken"):
+        list(acquisition(rig, PLAN, 1).run())
+    assert log == [*START[: START.index(f"{device}.{name}") + 1], *STOP]
+
+
+def test_the_gate_goes_low_before_anything_else_ends(monkeypatch):
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
+    end = Pipeline.end_source
+
+    def told(pipeline, why=None):
+        log.append("frames")
+        end(pipeline, why)
+
+    monkeypatch.setattr(Pipeline, "end_source", told)
+    run = acquisition(rig, PLAN, 5).run()
+    next(run)
+    run.close()
+    assert log == [*START, STOP[0], "frames", *STOP[1:]]
+
+
+def test_a_step_that_fails_does_not_keep_the_others_from_running():
+    failing = {"sync": {"abort": DeviceFault("gate reads high")}, "laser": {"pause": OSError("port is gone")}}
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 1, lag=LAG)], failing)
+    with pytest.raises(DevicesError, match="gate: gate reads high\nlaser: port is gone"):
+        list(acquisition(rig, PLAN, 1).run())
+    assert log == START + STOP
+
+
+def test_a_second_interrupt_while_stopping_still_makes_everything_safe():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)], {"sync": {"abort": KeyboardInterrupt()}})
+    run = acquisition(rig, PLAN, 5).run()
+    next(run)
+    with pytest.raises(KeyboardInterrupt):
+        run.throw(ValueError("first"))
+    assert log == START + STOP
+
+
+def test_trouble_while_stopping_is_noted_on_the_error_that_led_there():
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], {"scanner": {"park": DeviceFault("stuck")}})
+    run = acquisition(rig, PLAN, 2).run()
+    next(run)
+    with pytest.raises(ValueError) as caught:
+        run.throw(ValueError("first"))
+    assert caught.value.__notes__ == ["scanner: stuck"]
+
+
+def test_a_guard_that_took_the_light_ends_a_scan_whose_spad_is_silent():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)])
+    failure = DeviceTimeout("the guard took the light")
+    guard = SimpleNamespace(failure=None, beat=lambda frame: None, expect=lambda limits: None, wait=lambda: None)
+    rig = dataclasses.replace(rig, guard=guard)
+    one_map = int(PLAN.frames_for(1)) // rig.spad.size + 2
+
+    def silent(seq):
+        if seq == one_map:
+            guard.failure = failure
+            assert rig.spad.stopped.wait(PATIENCE_S)
+
+    rig.spad.behaviour = silent
+    run = acquisition(rig, PLAN, 2, silence_s=2 * PATIENCE_S).run()
+    assert next(run).sweep.index == 0
+    with pytest.raises(DeviceTimeout, match="the guard took the light"):
+        next(run)
+    assert log == START + STOP
+
+
+def test_an_error_of_the_source_reaches_the_caller():
+    def unplugged(seq):
+        if seq == 1:
+            raise DeviceDisconnected("spad: unplugged")
+
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)], behaviour=unplugged)
+    with pytest.raises(DeviceDisconnected, match="unplugged"):
+        list(acquisition(rig, PLAN, 5).run())
+    assert log == START + STOP
+
+
+def test_a_silent_spad_is_a_time_out_in_its_own_words():
+    def silent(seq):
+        if seq:
+            time.sleep(0.1)
+            raise DeviceTimeout("spad: nothing came")
+
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)], behaviour=silent)
+    with pytest.raises(DeviceTimeout, match="nothing came"):
+        list(acquisition(rig, PLAN, 5).run())
+    assert log == START + STOP
+
+
+def test_a_spad_that_takes_its_time_for_the_first_block_is_not_silent():
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 1, lag=LAG)], behaviour=lambda seq: time.sleep(0.9 if seq == 0 else 0))
+    assert len(list(acquisition(rig, PLAN, 1).run())) == 1
+
+
+def test_a_stream_that_ends_without_the_closing_marker_is_an_error():
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)])
+    with pytest.raises(DeviceFault, match="ended after 2 of 4 sweeps"):
+        list(acquisition(rig, PLAN, 4).run())
+
+
+def test_progress_is_told_on_the_way_and_at_the_end():
+    told = []
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], size=16)
+    list(acquisition(rig, PLAN, 2, on_progress=told.append).run())
+    assert [p.frames for p in told] == sorted(p.frames for p in told)
+    assert told[-1].sweeps == told[-1].maps == 2
+    assert told[-1].lost == 0
+    assert told[-1].stages.counting_s > 0
+
+
+def test_progress_ends_with_the_frames_planned_and_is_never_above_them():
+    told = []
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], size=1000)  # the last block goes on behind the last marker
+    list(acquisition(rig, PLAN, 2, on_progress=told.append).run())
+    assert all(p.frames <= p.frames_planned for p in told)
+    assert {p.frames_planned for p in told} == {math.ceil(PLAN.frames_for(2))}
+    assert told[-1].frames == told[-1].frames_planned
+
+
+@pytest.mark.parametrize("learns", [True, False])
+def test_progress_names_the_stage_that_the_run_is_at(learns):
+    stages, heard = [], threading.Event()
+
+    def told(progress):
+        stages.append(progress.stage)
+        heard.set()
+
+    def wait_to_be_told(_):
+        heard.clear()
+        assert heard.wait(PATIENCE_S)
+
+    rig, _ = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG)], size=16, behaviour=lambda seq: seq or wait_to_be_told(seq))
+    maker = FakeMaker(lambda index: (wait_to_be_told(index), wait_to_be_told(index)))
+    list(acquisition(rig, PLAN, 2, maker, learns=learns, on_progress=told, silence_s=PATIENCE_S).run())
+    assert list(dict.fromkeys(stages)) == ["rendering", *["learning"] * learns, "estimating"]
+
+
+def test_bursts_are_taken_in_groups_and_numbered_through():
+    spad = dataclasses.replace(SPAD, stream=None, burst=BurstMode(900, 1e6))
+    plan = plan_of(scan(columns=40), LAG, spad=spad)
+    per_start = int((900 - 500) / float(plan.frames_per_sweep))
+    assert per_start == 1
+    streams = [stream_of(plan, 1, lag=LAG, latency_s=t) for t in (1e-4, 3e-4, 7e-4)]
+    rig, log = fake_rig(plan, streams)
+    maps = list(acquisition(rig, plan, 3).run())
+    assert [found.sweep.index for found in maps] == [0, 1, 2]
+    assert log == 3 * (START + STOP)
+    assert rig.spad.n_frames <= 900
+
+
+def test_sweeps_are_taken_in_groups_that_a_program_holds():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG), stream_of(PLAN, 1, lag=LAG)])
+    rig.sync.most = 2
+    assert [found.sweep.index for found in acquisition(rig, PLAN, 3).run()] == [0, 1, 2]
+    assert log == 2 * (START + STOP)
+
+
+def test_a_scanner_that_stops_early_ends_the_scan():
+    rig, log = fake_rig(PLAN, [stream_of(PLAN, 5, lag=LAG)])
+    rig.scanner.fault = "scanner: the points ran dry"
+    with pytest.raises(DeviceFault, match="ran dry"):
+        list(acquisition(rig, PLAN, 5).run())
+    assert log == START + STOP
+
+
+def sweeps_of(plan, blocks, maps):
+    layout = SweepLayout(plan.columns, HEIGHT, WIDTH, plan.x0, plan.window, plan.exposures)
+    counter = SweepCounter(layout, RowWorkers(1))
+    assembler = SweepAssembler(plan, counter, maps)
+    found = []
+    for block in blocks:
+        found += assembler.add(block)
+        if assembler.complete:
+            break
+    return found
+
+
+def test_expected_frames_are_received_and_lost_ones_between_the_markers():
+    stream = stream_of(PLAN, 2, lag=LAG)
+    begin, middle, end = stream.scan_frames[:3]
+    lost = [begin - 3, begin + 30, begin + 31, begin + 60, middle - 1, middle, middle + 1]
+    first, second = sweeps_of(PLAN, stream.blocks(itertools.repeat(50), lost), 2)
+    assert (first.first_frame, first.end_frame, second.end_frame) == (begin, middle, end)
+    assert first.gaps == ((begin + 30, begin + 31), (begin + 60, begin + 60), (middle - 1, middle - 1))
+    assert second.gaps == ((middle, middle + 1),)
+    assert (first.frames.expected, first.frames.lost) == (middle - begin, 4)
+    assert (second.frames.expected, second.frames.lost) == (end - middle, 2)
+    for sweep in (first, second):
+        assert sweep.frames.received == sweep.frames.expected - sweep.frames.lost
+        assert sweep.frames.lit == sweep.volume.n_frames.sum()
+        assert sweep.frames.dark == sweep.volume.n_dark
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.lists(st.integers(1, 200), min_size=1, max_size=8), st.lists(st.integers(0, 400), max_size=6))
+def test_counted_sweeps_do_not_depend_on_the_size_of_blocks(sizes, lost):
+    plan = plan_of(scan(bidirectional=True, columns=11), LAG)
+    stream = stream_of(plan, 3, lag=LAG, clock_error=6e-5)
+    whole = sweeps_of(plan, stream.blocks(itertools.repeat(10**6), lost), 3)
+    parts = sweeps_of(plan, stream.blocks(itertools.cycle(sizes), lost), 3)
+    assert len(whole) == 3
+    for one, other in zip(whole, parts, strict=True):
+        for field in dataclasses.fields(one):
+            a, b = getattr(one, field.name), getattr(other, field.name)
+            if field.name not in ("volume", "count_s"):
+                assert a == b or a != a, field.name
+        for name in ("counts", "x0", "n_frames", "column", "dark_counts"):
+            np.testing.assert_array_equal(getattr(one.volume, name), getattr(other.volume, name))
+
+
+def test_blocks_of_another_run_or_size_are_refused():
+    blocks = stream_of(PLAN, 1, lag=LAG).blocks(itertools.repeat(32))
+    stale = dataclasses.replace(blocks[1], header=dataclasses.replace(blocks[1].header, run_id=9))
+    small = dataclasses.replace(blocks[0], header=dataclasses.replace(blocks[0].header, height=2))
+    with pytest.raises(ProtocolError, match="of run 9, not of run 1"):
+        sweeps_of(PLAN, [blocks[0], stale], 1)
+    with pytest.raises(ProtocolError, match="64 x 2 pixels, the plan is for 64 x 4"):
+        sweeps_of(PLAN, [small], 1)
+    with pytest.raises(ProtocolError, match="before frame 32"):
+        sweeps_of(PLAN, [blocks[0], blocks[0]], 1)

@@ -1,0 +1,152 @@
+"""What drivers said is compared with the recording: the first byte that differs is shown, questions do not count."""
+
+import json
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import ProtocolError
+from drivers.recorded.control_words import Spoken
+from drivers.transports.tap import CONTROL_FILE, IN, OUT, TapFile, read_taps
+from rig.scan.control_check import ControlCheck, check_control
+
+MS = 1_000_000
+DEVICES = ("scanner", "laser", "sync")
+
+
+@dataclass
+class Talk:
+    """A file of control traffic, written line by line as a tap does."""
+
+    lines: list[tuple[int, str, str, str, bytes]] = field(default_factory=list)
+
+    def add(self, at_ms: float, device: str, port: str, data: bytes, direction: str = OUT) -> "Talk":
+        self.lines.append((round(at_ms * MS), device, port, direction, data))
+        return self
+
+    def write(self, file: Path) -> Path:
+        text = "".join(
+            f'{{"t_ns": {t}, "device": "{d}", "port": "{p}", "dir": "{way}", "bytes": "{data.hex()}"}}\n'
+            for t, d, p, way, data in self.lines
+        )
+        file.write_text(text)
+        return file
+
+
+def scan(
+    power: bytes = b"slmp 50.0000\r",
+    buffers: tuple[tuple[float, bytes], ...] = ((100, b"one"), (110, b"two"), (160, b"three"), (220, b"four")),
+    tokens: int = 1,
+    polls: int = 3,
+) -> Talk:
+    talk = Talk()
+    for number in range(polls):
+        talk.add(number, "laser", "serial", b"ilk?\r").add(number + 0.5, "laser", "serial", b"OK\r\n", IN)
+        talk.add(number, "sync", "serial", b"#%08x\nsts\n#%08x\n" % (tokens + number, tokens + number + 1))
+        talk.add(number, "scanner", "06", b"\x03\x00").add(number, "scanner", "83", b"\x83\x01", IN)
+    talk.add(10, "laser", "serial", power)
+    talk.add(20, "sync", "serial", b"#%08x\nadm 0 2\n" % tokens).add(21, "sync", "serial", b"\x01\x0a#\x02\x00\x03")
+    talk.add(22, "sync", "serial", b"\x00\x00\x00\x00\x00\x00\n").add(90, "sync", "serial", b"swr\n")
+    for at_ms, data in buffers:
+        talk.add(at_ms, "scanner", "02", data)
+    talk.add(250, "sync", "serial", b"\nabt\nsts\nman 0\n").add(260, "scanner", "02", b"parked from here")
+    return talk
+
+
+def compare(tmp_path: Path, now: Talk, tolerance_s: float | None = 2e-3) -> ControlCheck:
+    recorded = scan().write(tmp_path / "recorded.jsonl")
+    return check_control(recorded, now.write(tmp_path / "now.jsonl"), devices=DEVICES, tolerance_s=tolerance_s)
+
+
+def test_questions_tokens_repeats_and_parking_are_not_compared(tmp_path: Path) -> None:
+    now = scan(tokens=77, polls=9)
+    now.lines[-1] = (260 * MS, "scanner", "02", OUT, b"parked from there")
+    now.add(270, "sync", "serial", b"abt\nman 0\n").add(280, "sync", "serial", b"abt\nman 0\n")
+    found = compare(tmp_path, now)
+    assert found.problems == ()
+    assert found.commands > 5
+    assert found.swaps == 4
+
+
+def test_the_first_byte_that_differs_is_shown(tmp_path: Path) -> None:
+    (problem,) = compare(tmp_path, scan(power=b"slmp 51.0000\r")).problems
+    assert problem == ("laser: command 0: byte 6 is 0x31, recorded was 0x30 ('slmp 51.0000' instead of 'slmp 50.0000')")
+
+
+def test_a_byte_of_a_program_or_a_buffer_counts(tmp_path: Path) -> None:
+    now = scan()
+    at = next(i for i, line in enumerate(now.lines) if line[4].startswith(b"\x01\x0a"))
+    now.lines[at] = (*now.lines[at][:4], b"\x01\x0a#\x03\x00\x03")
+    (problem,) = compare(tmp_path, now).problems
+    assert "sync: command 2: byte 1 is 0x03, recorded was 0x02" in problem
+    (problem,) = compare(
+        tmp_path, scan(buffers=((100, b"one"), (110, b"two"), (160, b"thrEe"), (220, b"four")))
+    ).problems
+    assert "scanner: scan 0, buffer 2: byte 3 is 0x45, recorded was 0x65" in problem
+
+
+def test_what_is_missing_and_what_is_too_much_is_shown(tmp_path: Path) -> None:
+    less, more = scan(), scan()
+    less.lines = [line for line in less.lines if line[4] != b"slmp 50.0000\r"]
+    assert "laser: command 0 is missing: 'slmp 50.0000'" in compare(tmp_path, less).problems[0]
+    more.add(300, "laser", "serial", b"l0\r")
+    assert "laser: command 1 was not recorded: 'l0'" in compare(tmp_path, more).problems[0]
+
+
+def test_a_scan_may_be_stopped_one_buffer_earlier_but_not_two(tmp_path: Path) -> None:
+    buffers = ((100, b"one"), (110, b"two"), (160, b"three"))
+    assert compare(tmp_path, scan(buffers=buffers)).problems == ()
+    assert "scan 0, buffer 2 is missing" in compare(tmp_path, scan(buffers=buffers[:2])).problems[0]
+
+
+def test_swaps_are_timed_from_the_scan_and_the_second_buffer_is_not(tmp_path: Path) -> None:
+    moved = {b"swr\n": 490, b"\nabt\nsts\nman 0\n": 700, b"one": 500, b"two": 530, b"three": 560, b"four": 621.5}
+    recorded = scan().write(tmp_path / "recorded.jsonl")
+    now = Talk([(round(moved.get(data, t / MS) * MS), d, p, way, data) for t, d, p, way, data in scan().lines[:-1]])
+    found = check_control(recorded, now.write(tmp_path / "now.jsonl"), devices=DEVICES, tolerance_s=2e-3)
+    assert found.problems == ()
+    assert found.worst_swap_s == pytest.approx(1.5e-3)
+    found = check_control(recorded, tmp_path / "now.jsonl", devices=DEVICES, tolerance_s=1e-3)
+    assert "scan 0, buffer 3 came +1.5 ms from its recorded time, more than 1 ms; 1 of 4 did" in found.problems[0]
+
+
+def test_taps_of_several_devices_write_one_file_and_are_read_in_time(tmp_path: Path) -> None:
+    file = TapFile.begin(tmp_path / CONTROL_FILE)
+    laser, scanner = file.tap("laser"), file.tap("scanner")
+    laser.note("serial", OUT, b"?\r")
+    scanner.note("02", OUT, bytes(range(256)))
+    laser.note("serial", IN, b"")
+    laser.note("serial", IN, b"OK\r\n")
+    laser.flush()
+    scanner.flush()
+    file.sync()
+    with (tmp_path / CONTROL_FILE).open("a") as torn:
+        torn.write('{"t_ns": 1, "dev')
+    passed = read_taps(tmp_path / CONTROL_FILE)
+    assert [(one.device, one.port, one.direction, one.data) for one in passed] == [
+        ("laser", "serial", OUT, b"?\r"),
+        ("scanner", "02", OUT, bytes(range(256))),
+        ("laser", "serial", IN, b"OK\r\n"),
+    ]
+    assert Spoken.of(passed).commands["laser"] == []
+    (tmp_path / CONTROL_FILE).write_text("{}\n")
+    with pytest.raises(ProtocolError, match="line 1"):
+        read_taps(tmp_path / CONTROL_FILE)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="a pipe with a name stands for a disk that does not answer")
+def test_a_disk_that_hangs_holds_no_device_up_and_loses_nothing(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / CONTROL_FILE)  # opening it waits for somebody who reads
+    tap = TapFile.begin(tmp_path / CONTROL_FILE).tap("sync")
+    begun = time.monotonic()
+    for command in (b"abt\n", b"man 0\n"):
+        tap.note("serial", OUT, command)
+    tap.flush(timeout_s=0.1)
+    assert time.monotonic() - begun < 1.0
+    with (tmp_path / CONTROL_FILE).open("rb", buffering=0) as pipe:
+        tap.flush()
+        lines = pipe.read(10_000).splitlines()
+    assert [bytes.fromhex(json.loads(line)["bytes"]) for line in lines] == [b"abt\n", b"man 0\n"]

@@ -1,0 +1,50 @@
+"""Likelihoods from scores, at the limits of 16 bits too."""
+
+import numba
+import numpy as np
+import pytest
+
+from rig.simd.functions import BIAS, MEAN_EXCESS, lift_to_powers, powers, powers_in_order
+from rig.simd.memory import address_of, load_int16, read_int16, store_float32, store_int16
+from rig.simd.vectors import LANES, UNPACKED
+
+
+@numba.njit
+def likelihoods(scores, best, shift, out, unpacked, lift):
+    lifts = lift_to_powers(load_int16(address_of(best), 0), shift)
+    store_int16(address_of(lift), 0, lifts)
+    store_float32(address_of(out), 0, powers_in_order(load_int16(address_of(scores), 0), lifts, shift))
+    one = read_int16(address_of(lift), 0)
+    store_float32(address_of(unpacked), 0, powers(load_int16(address_of(scores), 0), one, shift))
+
+
+def answers(scores, best, shift):
+    out, unpacked = np.empty((2, LANES), np.float32)
+    lift = np.empty(LANES, np.int16)
+    likelihoods(np.asarray(scores, np.int16), np.full(LANES, best, np.int16), shift, out, unpacked, lift)
+    np.testing.assert_array_equal(out[list(UNPACKED)], unpacked)
+    return out
+
+
+@pytest.mark.parametrize("shift", range(7))
+@pytest.mark.parametrize("best", [-32768, -32767, -31752, -30736, -17000, -1, 0, 1, 12345, 32767])
+def test_the_best_score_counts_and_what_lies_far_below_does_not(best, shift):
+    octave = 128 >> shift
+    below = np.maximum(best - octave * np.array([0, 1, 2, 10, 60, 200, *[300] * 10]), -32768)
+    found = answers(below, best, shift)
+    assert np.isfinite(found).all()
+    assert found[0] > 0 or best < -32700
+    reached = below == best - octave * np.array([0, 1, 2, 10, 60, 200, *[300] * 10])
+    # Exact at whole octaves, where the range of 16 bits does not end first.
+    if best - (int(BIAS) >> shift) >= -32767:
+        assert found[0] > 0
+        np.testing.assert_allclose(found[:5][reached[:5]] / found[0], 0.5 ** np.array([0, 1, 2, 10, 60])[reached[:5]])
+        assert not found[5:][reached[5:]].any()
+
+
+def test_between_octaves_terms_are_too_large_by_the_mean_that_is_said():
+    units = np.arange(128)
+    terms = np.concatenate([answers(1000 + units[i : i + LANES], 1128, 0) for i in range(0, 128, LANES)])
+    excess = terms / terms[0] / 2 ** (units / 128)
+    assert excess.max() < 1.0615
+    assert excess.mean() == pytest.approx(MEAN_EXCESS, rel=1e-3)

@@ -1,0 +1,128 @@
+"""The statistical limit against the yardstick's genie and against what an estimator reaches; bounds on both sides."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from rig.tradeoff.limits import Rivals, bayes_errors, limits, position_sd_px
+from rig.tradeoff.row_light import RowLight
+from tests.reference import kernels
+from tests.reference.genie import Genie
+from tests.reference.geometry import DEPTH_RANGE_M, Geometry
+from tests.reference.scene import Scene, load_scene
+from tests.reference.working_point import POINTS, WorkingPoint, score
+from tests.unit.small_maps import street
+
+ROWS = 16
+EXPOSURES = (1, 3, 10, 20)
+
+
+def row(position=40.3, stripe=0.7, haze=0.1, ambient=0.005, sigma_px=0.6, pixels=90) -> RowLight:
+    behind = np.full(pixels, ambient)
+    before = behind + haze * np.exp(-np.arange(pixels) / 60)
+    return RowLight(before, behind, np.ones(pixels), position, stripe, sigma_px, 10, pixels - 11)
+
+
+def of_point(point: WorkingPoint, y: int, c: int) -> RowLight:
+    """A row of the yardstick, from its own formulas; the scanner on the left."""
+    g, light = point.geometry, point.light
+    u, v = g.u[y], g.v[y]
+    inverse = g.inverse_depth(c)[y]
+    seen = np.flatnonzero((inverse > 1 / DEPTH_RANGE_M[1]) & (inverse < 1 / DEPTH_RANGE_M[0]))
+    x = np.arange(max(seen[0] - 10, 0), min(seen[-1] + 11, g.width))
+    haze = [kernels.haze_at(u[i], v[i], inverse[i], g.scanner_m, light.extinction_per_m) for i in x]
+    path = [kernels.path_length(u[i], v[i], 1 / max(inverse[i], 1e-3), g.scanner_m) for i in x]
+    return RowLight(
+        light.ambient + point.haze_scale * np.array(haze),
+        np.full(len(x), light.ambient),
+        inverse[x].clip(1e-3) ** 2 * np.exp(-light.extinction_per_m * np.array(path)),
+        float(point.x_true[y, c] - x[0]),
+        float(point.stripe[y, c]),
+        light.sigma_px,
+        float(seen[0] - x[0]),
+        float(seen[-1] - x[0]),
+    )
+
+
+def scene(name: str) -> Scene:
+    found = None if name == "procedural" else load_scene(name)
+    return street(ROWS) if found is None else found.crop(ROWS, found.shape[1])
+
+
+@cache
+def beside_the_genie(name: str, light: str) -> tuple[list[float], list[float], list[float]]:
+    """Mean errors over the exposures: limit, its standard error, genie."""
+    world = scene(name)
+    g = Geometry.build(height=ROWS, width=world.shape[1], columns=96)
+    point = WorkingPoint(world, POINTS[light], g)
+    places = np.argwhere(point.trusted)
+    some = places[np.random.default_rng(1).permutation(len(places))[:100]]
+    found = limits([of_point(point, y, c) for y, c in some], EXPOSURES)
+    genie = [
+        score(Genie(labels=4, mean_reach=8).estimate(point, point.counts(k, 1), k), point.truth(), point.trusted)
+        for k in EXPOSURES
+    ]
+    return (
+        [each.mean_abs_px for each in found],
+        [each.mean_abs_se_px for each in found],
+        [each["mean_abs"] for each in genie],
+    )
+
+
+@pytest.mark.parametrize(("name", "light"), [("procedural", "report"), ("cones", "report"), ("art", "dense")])
+def test_the_genie_comes_close_to_the_limit_and_not_below(name, light) -> None:
+    """It is told all but the stripe's brightness, which the limit is told too."""
+    limit, se, genie = map(np.array, beside_the_genie(name, light))
+    assert np.all(genie > limit - 3 * se)
+    assert np.all(genie < 1.5 * (limit + 2 * se))
+
+
+@pytest.mark.parametrize("exposures", [1, 4, 16, 200])
+def test_the_limit_lies_between_cramer_rao_and_the_union_bound(exposures) -> None:
+    for light in (row(), row(stripe=3.0), row(stripe=0.2, haze=0.3)):
+        error = bayes_errors(light, [exposures], 400, np.random.default_rng(1))[0]
+        # The mean of |x| of a Gaussian is 0.8 of its standard deviation.
+        least = math.sqrt(2 / math.pi) * position_sd_px(light, exposures)
+        most = Rivals.of(light).bounds(exposures)[1] + least
+        assert error.mean() > 0.85 * min(least, 1.0)
+        assert error.mean() < 1.1 * most + 0.5
+
+
+def test_with_many_exposures_the_limit_is_that_of_cramer_rao() -> None:
+    for light in (row(), row(position=41.0), row(position=40.5, haze=0.0)):
+        error = bayes_errors(light, [1000], 2000, np.random.default_rng(1))[0]
+        assert error.mean() == pytest.approx(math.sqrt(2 / math.pi) * position_sd_px(light, 1000), rel=0.06)
+
+
+def test_errors_are_no_more_frequent_than_chernoff_allows() -> None:
+    light = row(haze=0.02)
+    for exposures in (1, 5, 20):
+        wrong = np.mean(bayes_errors(light, [exposures], 2000, np.random.default_rng(2))[0] > 1.5)
+        assert wrong <= Rivals.of(light).bounds(exposures)[0] + 0.02
+
+
+def test_neighbours_of_one_surface_count_as_exposures() -> None:
+    lights = [row(position=30 + 0.37 * i) for i in range(40)]
+    (alone,), (coupled,) = limits(lights, [20]), limits(lights, [2], averaged=10)
+    assert coupled.mean_abs_px == alone.mean_abs_px
+    assert coupled.position_sd_px == alone.position_sd_px
+    assert (coupled.exposures, coupled.averaged) == (2, 10)
+    assert limits(lights, [2])[0].mean_abs_px > 2 * coupled.mean_abs_px
+
+
+def test_more_light_is_never_worse() -> None:
+    lights = [row(position=30 + 0.37 * i) for i in range(60)]
+    found = limits(lights, [1, 3, 10, 30, 100])
+    for name in ("mean_abs_px", "position_sd_px", "error_bound_px"):
+        values = [getattr(each, name) for each in found]
+        assert values == sorted(values, reverse=True)
+    within = [each.within_1px for each in found]
+    assert within == sorted(within)
+
+
+def test_a_row_that_says_nothing_leaves_the_middle_of_the_search() -> None:
+    dark = row(position=15.0, stripe=1e-12, haze=0.0, ambient=0.1)
+    error = bayes_errors(dark, [5], 20, np.random.default_rng(1))[0]
+    np.testing.assert_allclose(error, 44.5 - 15.0, atol=0.01)
