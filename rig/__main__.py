@@ -1,6 +1,20 @@
-"""`python -m rig` is `rig`."""
+"""Entry point of `rig` and `python -m rig`.
 
-from rig.cli.main import main
+Loading the program takes a moment, in which Ctrl-C ends it as at any other time: one line and exit code 4.
+"""
+
+import sys
+
+
+def main() -> None:
+    """Load the command line and run it; ends the process with the exit code."""
+    try:
+        from rig.cli.main import main as command_line
+    except KeyboardInterrupt:
+        sys.stderr.write("aborted\n")
+        sys.exit(4)
+    command_line()
+
 
 if __name__ == "__main__":
     main()

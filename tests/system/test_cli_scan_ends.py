@@ -288,3 +288,18 @@ def test_an_interrupt_before_a_command_has_begun_is_one_too(rig: Rig, monkeypatc
     monkeypatch.setattr("typer.core.TyperGroup.resolve_command", lambda *_: interrupted())
     ran = rig("config", "check")
     assert (ran.code, ran.err) == (4, "aborted\n")
+
+
+def test_an_interrupt_while_the_program_is_loaded_is_one_too() -> None:
+    program = (
+        "import sys\n"
+        "class Interrupts:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'typer':\n"
+        "            raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Interrupts())\n"
+        "from rig.__main__ import main\n"
+        "main()\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stderr) == (4, "aborted\n")
