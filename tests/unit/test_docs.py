@@ -94,6 +94,17 @@ def test_command_lines_parse(page: Path) -> None:
             assert problem is None, f"{line}: {problem}"
 
 
+@pytest.mark.parametrize("package", PACKAGES)
+def test_pages_and_sections_that_code_cites_exist(package: str) -> None:
+    for file in (ROOT / package).rglob("*.py"):
+        if file == Path(__file__):
+            continue
+        for name, section in re.findall(r"(?<!\w)(docs/[\w/-]+\.md)(?:, ([A-Z][^.;:)\n]*))?", file.read_text()):
+            assert (ROOT / name).exists(), f"{file}: {name}"
+            heads = re.findall(r"^#+ (.*)$", (ROOT / name).read_text(), re.M)
+            assert not section or section in heads, f"{file}: {name} has no section {section!r}"
+
+
 def test_command_lines_in_configs_and_messages_parse() -> None:
     for file in (*(ROOT / "config").rglob("*.yaml"), *(ROOT / "rig").rglob("*.py"), *(ROOT / "drivers").rglob("*.py")):
         text = file.read_text()
