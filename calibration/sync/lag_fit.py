@@ -14,9 +14,9 @@ the same at all speeds shows with two speeds both ways, or three. The row delay 
 known from elsewhere counts with what the sweeps tell of it, unless they contradict it significantly; nothing known is
 0.
 What no sweep tells: a delay of the markers behind the mirror's command that is always the same (the scanner's colour
-outputs trail its mirror outputs by some microseconds, hardware.md 3.1): it shortens both lags, which are then as they
-have to be for binding with these very markers. It takes an oscilloscope. A marker of the wrong polarity shows in the
-binding, whose residual it breaks; the gate's delay in the frames at its edges (`gate_delay`).
+outputs trail its mirror outputs by some microseconds, docs/hardware.md, Helios): it shortens both lags, which are then
+as they have to be for binding with these very markers. It takes an oscilloscope. A marker of the wrong polarity shows
+in the binding, whose residual it breaks; the gate's delay in the frames at its edges (`gate_delay`).
 """
 
 from collections.abc import Sequence

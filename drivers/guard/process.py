@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 SIGN_OF_LIFE_S = 0.05
 """Between the guard's own signs of life."""
 POLL_S = 1.0
-"""Between questions to an armed laser about interlock and faults (hardware.md section 4: at 1 Hz or more)."""
+"""Between questions to an armed laser about interlock and faults: at 1 Hz or more (docs/hardware.md)."""
 CHECK_S = 0.05
 """Time for the gate to say whether its program has ended, before it is taken for still running."""
 END_CHECK_S = 0.2
@@ -344,7 +344,7 @@ FREE_S = 1.0
 """Time for the kernel to free the ports of a process that ended."""
 _RETRY_S = 0.005
 OFF_TIMES, OFF_GAP_S = 2, 0.11
-"""`Kind.off` is sent so often, so far apart: a Cobolt heeds no command within 0.1 s of another (hardware.md 4.1), and
+"""`Kind.off` is sent so often, so far apart: a Cobolt heeds no command within 0.1 s of another (docs/hardware.md), and
 the guard may just have asked something."""
 
 

@@ -1,6 +1,6 @@
 """The Cobolt (Huebner) 06-01 line laser, gated by its digital modulation input.
 
-hardware.md section 4.1; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope `lights/cobolt.py`.
+docs/hardware.md; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope `lights/cobolt.py`.
 115 200 baud, 8N1. Two languages: 06-MLD and the newer SCPI-like one; 06-DPL is refused, since its regulated power
 follows a gate up to about 1 kHz only. Never sent: whatever changes autostart, key switch or direct control (`@cobas x`,
 `@cobasky`, `@cobasdr`). The laser has no watchdog: where its port is lost it stays as it was, so treat it as on. Its
@@ -11,12 +11,12 @@ key must be turned off and on before the laser starts again.
 
 The two languages of Cobolt 06-01 lasers for the same few things: gate mode, power, dark, bright.
 
-hardware.md section 4.1 (cobolt-lasers/pycobolt 1333e53). Both keep the laser dark by a power of 0 and not by `l0`:
+docs/hardware.md (cobolt-lasers/pycobolt 1333e53). Both keep the laser dark by a power of 0 and not by `l0`:
 after `l0` its key must be turned (pycobolt issue 6), and a power of 0 can be read back, by the next program too.
 
 Commands and replies of a Cobolt laser as bytes.
 
-hardware.md section 4.1 (cobolt-lasers/pycobolt 1333e53): a command ends with CR, its reply is one line that ends with
+docs/hardware.md (cobolt-lasers/pycobolt 1333e53): a command ends with CR, its reply is one line that ends with
 CRLF: a value, `OK` or `Syntax error: illegal command`. Old firmware may put junk before a reply. Commands follow one
 another at 100 ms or more; a reply may take a second (0.1 s was too little: python-microscope issue 234).
 """

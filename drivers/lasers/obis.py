@@ -1,8 +1,8 @@
 """The Coherent OBIS LX/LS line laser, gated by its digital modulation input (`SOUR:AM:EXT DIG`).
 
-hardware.md section 4.2; from python-microscope `lights/obis.py` (69625e0), the bit tables of `obis.h`, the operator's
+docs/hardware.md; from python-microscope `lights/obis.py` (69625e0), the bit tables of `obis.h`, the operator's
 manual (appendix C) and mmCoreAndDevices PRs 645 and 531. 115 200 baud, 8N1 (over USB the rate is ignored). Limits of
-the base plate's temperature are read by `SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not in hardware.md but in
+the base plate's temperature are read by `SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not there but in
 `obis.cpp` beside `obis.h` and in Micro-Manager's `CoherentOBIS.cpp`.
 
 Traps: `AM:STAT ON` during warm-up is deferred, light may come minutes later. So `arm` waits until the laser is ready
@@ -14,7 +14,7 @@ Pause = `AM:STAT OFF`, confirmed by the emission bit; no key is needed to resume
 
 Commands and replies of a Coherent OBIS laser as bytes, with its handshake on or off.
 
-hardware.md section 4.2 (OBIS operator's manual, appendix C; mmCoreAndDevices PR 645): commands end with CRLF. Handshake
+docs/hardware.md (OBIS operator's manual, appendix C; mmCoreAndDevices PR 645): commands end with CRLF. Handshake
 on: a set answers `OK`, a query its value and then `OK`, an error `ERR-nnn` in their place. Handshake off: a set answers
 nothing at all, a query its value. So the handshake is asked for first and never changed, and whatever is set is read
 back. Behind an OBIS Remote a number on SYST and SOUR addresses the laser; bare commands go to the Remote.
@@ -67,7 +67,7 @@ ERRORS = {
     520: "controller timed out",
     900: "CCB timed out",
 }
-"""Meaning of `ERR-nnn` (hardware.md section 4.2)."""
+"""Meaning of `ERR-nnn` (docs/hardware.md)."""
 
 
 class ObisFraming:
@@ -120,7 +120,7 @@ CDRH_DELAY = 0x10
 WARM_UP = 0x100
 KEY_OFF = 0x0200_0000
 INTERLOCK = 0x0400_0000
-"""Bits of `SYST:STAT?`; the last two are inferred from samples (hardware.md section 4.2, confidence M)."""
+"""Bits of `SYST:STAT?`; the last two are inferred from samples (docs/hardware.md), less certain."""
 
 FAULTS = {
     0x1: "base temperature",

@@ -6,7 +6,7 @@ Ways of a mirror between two commands within a scanner's limits: to the first po
     brake  constant deceleration from the speed that the mirror has
 
 DACs hand the steps of their input to the galvo as they are: a full-range jump at every point can overheat it
-(hardware.md 3.1, known bug 6), so that nothing ever jumps.
+(docs/hardware.md, Helios), so that nothing ever jumps.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Scanner kind `helios`: a galvo behind a Helios laser DAC on USB (hardware.md 3.1; vendor's firmware v6 and SDK v11).
+"""Scanner kind `helios`: a galvo behind a Helios laser DAC on USB (docs/hardware.md; vendor's firmware v6 and SDK v11).
 
     config    kind: helios, port: usb or usb:path=1-2, max_velocity, max_acceleration of the galvo behind it
     outputs   X (or Y): mirror. R: lit, i.e. a waveform is being played. G: line marker. B: scan marker. I: backward
@@ -9,7 +9,7 @@ Every frame is SINGLE: a dead host leaves a mirror that stands after two frames,
 centres the mirror in one jump, so that it is for emergencies and for the end; scans end with a brake ramp. The shutter
 pin is never raised and flash is never written; opcode DE (bootloader) does not exist here.
 
-Frames of the Helios laser DAC and its point clock, as bytes and exact numbers (hardware.md 3.1).
+Frames of the Helios laser DAC and its point clock, as bytes and exact numbers (docs/hardware.md).
 
 Sources there: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
 sdk/cpp/HeliosDac.cpp (read for facts; no code taken).
@@ -18,12 +18,12 @@ sdk/cpp/HeliosDac.cpp (read for facts; no code taken).
     trailer (5 B)   u16 LE points per second, u16 LE points, u8 flags        1 start now, 2 single
     clock           SysTick of 112 MHz, floor(112e6 / pps) + 1 cycles a point
 
-Commands of a Helios laser DAC over its USB link (hardware.md 3.1; firmware v6, `Grix/helios_dac` 0952a2a).
+Commands of a Helios laser DAC over its USB link (docs/hardware.md; firmware v6, `Grix/helios_dac` 0952a2a).
 
 Endpoints of alternate setting 1: interrupt OUT 0x06 commands, interrupt IN 0x83 replies, bulk OUT 0x02 frames.
 Only the opcodes below exist here: DE would jump to the bootloader, 06 wears the flash, and 02 is sent with 0 only.
 
-One run of a Helios: frames into its two buffers, and a judgement whether they ever ran dry (hardware.md 3.1).
+One run of a Helios: frames into its two buffers, and a judgement whether they ever ran dry (docs/hardware.md).
 
 The host sees when the pending buffer falls free, no more. Between the last status 'full' and the first 'free' the
 pending frame began to play; that bounds when it ends. A frame that arrives after the earliest such end may have left

@@ -1,4 +1,4 @@
-"""Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (hardware.md 3.2).
+"""Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (docs/hardware.md).
 
     config    kind: lasercube, port: usb or usb:serial=ABC, max_velocity, max_acceleration of its galvo
     outputs   X (or Y): mirror. With `colours: markers` R: backward. G: line marker. B: scan marker. X is not
@@ -8,7 +8,7 @@ The board has a ring of samples that is topped up by a thread: no frames, no sea
 its own unless these are unplugged, so that they stay off until the config says where they lead. Clear and disable are
 its only stop; nothing at all happens when the host dies, so that the gate must not depend on it.
 
-Commands and samples of a LaserCube / LaserDock over its USB link (hardware.md 3.2).
+Commands and samples of a LaserCube / LaserDock over its USB link (docs/hardware.md).
 
 Source there: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp (read for facts; no code taken).
 
@@ -18,7 +18,7 @@ Source there: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp 
 
 The numbers are shared with Lasershark boards, so that the product string decides.
 
-One run of a LaserCube: samples into its ring, and a judgement whether each was played once (hardware.md 3.2).
+One run of a LaserCube: samples into its ring, and a judgement whether each was played once (docs/hardware.md).
 
 Every question 'how many are queued' says when the first sample must have been played, if none was lost, played twice
 or waited for: the moments that all answers allow must have one in common. Samples go out in whole transfers, so that a

@@ -1,6 +1,6 @@
 """Pi Imaging SPAD512S (SPAD512^2) through its vendor's program, which serves commands and pixels on a local TCP port.
 
-Facts and their sources: hardware.md section 2.1; `spad512s_line` and `drivers.spads.spad512s` speak with the program.
+Facts and their sources: docs/hardware.md; `spad512s_line` and `drivers.spads.spad512s` speak with the program.
 In short:
 
 - The vendor's program must run, on this computer or behind a bridge; it serves one client.
@@ -13,7 +13,7 @@ The sensor takes a run into its own memory (BURST). Its frames carry neither tic
 scanner, the records' ticks are nominal. `STOP` is known from other people's code only; a run that does not end soon
 after it is left by closing the connection.
 
-One run of a SPAD512S as it comes over the vendor's line: pixels that may read like its ending (hardware.md 2.1).
+One run of a SPAD512S as it comes over the vendor's line: pixels that may read like its ending (docs/hardware.md).
 
 The answer to `I` is the pixels, then `DONE`; or text that ends with `ERROR`, anywhere. Pixels may well read `DONE` or
 `ERROR`: what counts is the exact length and what stands behind it. A block is given out once so much has come behind it

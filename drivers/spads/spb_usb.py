@@ -1,6 +1,6 @@
-"""A SPAD array on USB that speaks SPB1 (hardware.md section 8, docs/spb1-usb.md): behind a Cypress FX3 or an FT601.
+"""A SPAD array on USB that speaks SPB1 (docs/spb1-usb.md): behind a Cypress FX3 or an FT601.
 
-Section 8 is this project's own proposal. Opening checks product string, identity registers and a test pattern. The
+The protocol is this project's own proposal. Opening checks product string, identity registers and a test pattern. The
 device counts and time-stamps frames itself, follows its window table by the line markers, and drops its gate where no
 PING comes for `heartbeat`. Pings are sent by `fill`, between two blocks: a source thread that hangs ends the light.
 """
@@ -40,7 +40,7 @@ from drivers.units import Seconds
 _log = logging.getLogger(__name__)
 
 _CHECKED_BYTES_PER_S = 0.5e9
-"""Up to so much, payload CRCs are checked live; above, the recorder and `verify` do (section 8.2)."""
+"""Up to so much, payload CRCs are checked live; above, the recorder and `verify` do (docs/spb1-usb.md)."""
 _SLICE_S = 0.05
 """One wait inside `fill`: how late a `stop` from another thread comes at most."""
 _PINGS_PER_HEARTBEAT = 4

@@ -1,8 +1,8 @@
-"""What an SPB1 device is told before START, and its test pattern, run when it is opened (hardware.md section 8).
+"""What an SPB1 device is told before START, and its test pattern, run when it is opened (docs/spb1-usb.md).
 
-Who answers at the other end of an SPB1 control plane, and what it can do (hardware.md section 8.3).
+Who answers at the other end of an SPB1 control plane, and what it can do (docs/spb1-usb.md).
 
-The USB chips of SPB1 boards: ids, endpoints, and the session that an FT601 wants (hardware.md sections 2.4 and 2.5).
+The USB chips of SPB1 boards: ids, endpoints, and the session that an FT601 wants (docs/hardware.md).
 
 Sources there: `VicidominiLab` BrightEyes-TTM 8f8d8d8 (FX3 with the AN65974 firmware, 04B4:00F1, bulk IN 0x81);
 `apertus-open-source-cinema/ft60x-rs` and `lambdaconcept/ft60x_driver` (0403:601F, session commands on 0x01, stream on
@@ -200,7 +200,7 @@ Chip = Literal["fx3", "ft601"]
 LABEL = "SPB1 SPAD"
 _SESSION_OUT = 0x01
 _COMMAND = struct.Struct("<IBBHIII")
-"""index, pipe, command, 0, length, 0, 0 (section 2.5)."""
+"""index, pipe, command, 0, length, 0, 0 (docs/hardware.md, USB chips of SPB1 boards)."""
 _ABORT, _STREAM, _CLEAR = 0, 2, 3
 _STREAM_BYTES = 1 << 20
 _CONFIG_REQUEST, _CONFIG_BYTES = 0xCF, 152

@@ -1,6 +1,6 @@
 """The control plane of an SPB1 device: commands, their acknowledgements, registers (docs/spb1-usb.md).
 
-A command is 16 bytes on a bulk OUT endpoint (hardware.md section 8.3), several may share a transfer. Every one is
+A command is 16 bytes on a bulk OUT endpoint (docs/spb1-usb.md), several may share a transfer. Every one is
 acknowledged with 16 bytes, in order: on an IN endpoint of their own, or as payload of control blocks in the stream.
 
 Commands to an SPB1 device and what it answers, over an endpoint of its own or inside the stream.

@@ -1,14 +1,14 @@
 """PrawnDO, a pulse generator on a Raspberry Pi Pico: sixteen outputs, 10 ns steps, a trigger, text over USB serial.
 
-Facts: hardware.md section 5.1; from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd (BSD).
-Outputs as in hardware.md section 6: GPIO0 triggers the SPAD, GPIO1 is the laser's gate, GPIO2 marks records.
+Facts: docs/hardware.md; from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd (BSD).
+Outputs (docs/hardware.md, Wiring and timing): GPIO0 triggers the SPAD, GPIO1 is the laser's gate, GPIO2 marks records.
 
 The firmware has no loops and no watchdog. So programs are written out in full and end on two words that hold everything
 low, whatever happens to the host. It cannot read its pins while a program runs, nor tell a wait from play.
 
 Turns pulses into the words of a PrawnDO program, and refuses what the board would play otherwise than written.
 
-A word is 16 outputs and a number of cycles (hardware.md section 5.1): 0 cycles wait for the trigger, two such words in
+A word is 16 outputs and a number of cycles (docs/hardware.md): 0 cycles wait for the trigger, two such words in
 a row are the end, with the first one's outputs left on the pins. The trigger is a level, so that a wait passes at once
 while it is high: that is how a held pulse looks at the scan marker.
 """
@@ -120,7 +120,7 @@ def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -
 _log = logging.getLogger(__name__)
 
 INTERNAL_HZ = 100_000_000
-"""The board's own clock (5.1)."""
+"""The board's own clock (docs/hardware.md)."""
 MAX_WORDS = {"board: pico1": 30_000, "board: pico2": 60_000}
 OLDEST_FIRMWARE = (1, 3)
 """`adm` takes a start address, and `brd` exists, from here on."""

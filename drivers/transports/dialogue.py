@@ -1,6 +1,6 @@
 """A dialogue with a device that answers one command at a time: paced, checked, and back in step after a lost reply.
 
-Nothing on a laser's line checks or numbers a reply (hardware.md sections 4.1 and 4.2): one that comes late is taken for
+Nothing on a laser's line checks or numbers a reply (docs/hardware.md): one that comes late is taken for
 the answer to the next command. So the input is dropped before each command, each reply must have the form that its
 command calls for, and after one that has not, or none at all, the line is drained and a question asked whose answer is
 known. What a make's commands and replies look like is its `Framing`.

@@ -3,6 +3,7 @@
 import re
 import shlex
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from rig.cli.main import app
 from rig.config.bundled import bundled_rigs, bundled_scenes
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
+PACKAGES = ("rig", "drivers", "calibration", "sim_backend", "tests")
+TREES = (*PACKAGES, "config", "docs")
 pages = pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
 
 
@@ -50,11 +53,56 @@ def test_modules_that_are_to_be_run_exist(page: Path) -> None:
 
 
 @pages
+def test_files_and_modules_that_are_named_exist(page: Path) -> None:
+    if page.name == "CHANGELOG.md":  # tells of what was, too
+        return
+    for code in inline_code(page.read_text()):
+        for name in missing_files(code) + missing_names(code):
+            pytest.fail(f"`{code}`: there is no {name}")
+
+
+@pytest.mark.parametrize(
+    ("code", "missing"),
+    [
+        ("rig/scan/scan.py", []),
+        ("rig/scan/scam.py", ["rig/scan/scam.py"]),
+        ("scan.py", ["scan.py"]),
+        ("rig/*_scan.py", ["rig/*_scan.py"]),
+        ("rig/simd/", []),
+        ("rig/calibrating/", ["rig/calibrating/"]),
+        ("depth/", []),
+        ("docs/decisions/0003-kernels-on-python-threads.md", []),
+        ("python -m tests.reference.hoose --limits", ["tests.reference.hoose"]),
+        ("rig.scan.scan", []),
+        ("rig.scan.run_scan", ["rig.scan.run_scan"]),
+        ("rig.plan.compile.BLOCK_S", []),
+        ("rig.plan.compile.BLOCK_MS", ["rig.plan.compile.BLOCK_MS"]),
+        ("drivers.interfaces.WindowTable", []),
+        ("rig.json", []),
+        ("rig scan --out take", []),
+    ],
+)
+def test_a_name_of_what_is_not_there_is_found(code: str, missing: list[str]) -> None:
+    assert missing_files(code) + missing_names(code) == missing
+
+
+@pages
 def test_command_lines_parse(page: Path) -> None:
     for line, is_whole in command_lines(page.read_text()):
         for words in alternatives(shlex.split(line.removesuffix(" ..."))):
             problem = refused(words, is_whole and not line.endswith(" ..."))
             assert problem is None, f"{line}: {problem}"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_pages_and_sections_that_code_cites_exist(package: str) -> None:
+    for file in (ROOT / package).rglob("*.py"):
+        if file == Path(__file__):
+            continue
+        for name, section in re.findall(r"(?<!\w)(docs/[\w/-]+\.md)(?:, ([A-Z][^.;:)\n]*))?", file.read_text()):
+            assert (ROOT / name).exists(), f"{file}: {name}"
+            heads = re.findall(r"^#+ (.*)$", (ROOT / name).read_text(), re.M)
+            assert not section or section in heads, f"{file}: {name} has no section {section!r}"
 
 
 def test_command_lines_in_configs_and_messages_parse() -> None:
@@ -105,6 +153,34 @@ def anchors(page: Path) -> set[str]:
 def inline_code(text: str) -> list[str]:
     """Pieces of code within its sentences."""
     return re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S))
+
+
+def missing_files(code: str) -> list[str]:
+    """Python files named in a piece of code, and files and folders named from the root, that do not exist."""
+    named = re.findall(r"(?<![\w./*-])[\w./*-]+(?:\.\w+|/)(?![\w./*-])", code)
+    ours = [name for name in named if name.endswith(".py") or name.startswith(tuple(f"{tree}/" for tree in TREES))]
+    return [name for name in ours if not (ROOT / name).exists()]
+
+
+def missing_names(code: str) -> list[str]:
+    """Dotted names of our packages in a piece of code, such as `rig.x` or `rig.x.Y`, that cannot be imported."""
+    named = re.findall(rf"(?<![\w./*-])(?:{'|'.join(PACKAGES)})(?:\.\w+)+(?![\w./*-])", code)
+    return [name for name in named if not name.endswith((".json", ".yaml")) and not is_importable(name)]
+
+
+def is_importable(name: str) -> bool:
+    """Whether a dotted name is a module, or something in one."""
+    parts = name.split(".")
+    for n in range(len(parts), 0, -1):
+        path = ROOT.joinpath(*parts[:n])
+        if path.is_dir() or path.with_suffix(".py").exists():
+            found: Any = import_module(".".join(parts[:n])) if n < len(parts) else None
+            for part in parts[n:]:
+                found = getattr(found, part, None)
+                if found is None:
+                    return False
+            return True
+    return False
 
 
 def command_lines(text: str) -> Iterator[tuple[str, bool]]:

@@ -1,4 +1,4 @@
-"""The Cobolt driver through real pyserial against a model of its firmware: bytes of hardware.md, and every trap."""
+"""The Cobolt driver through real pyserial against a model of its firmware: bytes of docs/hardware.md, every trap."""
 
 import time
 
@@ -38,7 +38,7 @@ def armed_commands(model: CoboltModel) -> list[str]:
         return [command for command in model.commands if not command.endswith("?")]
 
 
-# The bytes themselves, from hardware.md section 4.1.
+# The bytes themselves, from docs/hardware.md.
 
 
 def test_the_model_answers_as_the_manual_says() -> None:
@@ -95,7 +95,7 @@ def test_06_01_gate_mode_is_set_and_checked_before_the_start() -> None:
     ]
 
 
-# The traps of section 4.1, one test each.
+# The traps of docs/hardware.md, one test each.
 
 
 def test_trap_commands_closer_than_100_ms_are_not_answered() -> None:

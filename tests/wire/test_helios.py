@@ -1,4 +1,4 @@
-"""The Helios driver against the firmware model. Golden bytes and traps: hardware.md 3.1."""
+"""The Helios driver against the firmware model. Golden bytes and traps: docs/hardware.md."""
 
 import logging
 import re

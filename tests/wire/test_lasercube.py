@@ -1,4 +1,4 @@
-"""The LaserCube driver against the firmware model. Golden bytes: hardware.md 3.2."""
+"""The LaserCube driver against the firmware model. Golden bytes: docs/hardware.md."""
 
 import numpy as np
 import pytest

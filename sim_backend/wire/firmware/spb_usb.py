@@ -1,7 +1,7 @@
-"""An SPB1 device on USB (hardware.md section 8, docs/spb1-usb.md): control plane, states, heartbeat, watchdog.
+"""An SPB1 device on USB (docs/spb1-usb.md): control plane, states, heartbeat, watchdog.
 
-Comes as a Cypress FX3 board (section 2.4: commands on 0x01, stream on 0x81, acknowledgements on 0x82) or behind an FTDI
-FT601 (section 2.5: session commands on 0x01, commands on 0x02, stream on 0x82; acknowledgements on 0x83 where it has a
+Comes as a Cypress FX3 board (commands on 0x01, stream on 0x81, acknowledgements on 0x82) or behind an FTDI
+FT601 (session commands on 0x01, commands on 0x02, stream on 0x82; acknowledgements on 0x83 where it has a
 second channel, else in the stream). A pure state machine: what the sensor sees comes from `source`.
 """
 

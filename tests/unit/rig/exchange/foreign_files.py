@@ -1,4 +1,4 @@
-"""Files as foreign cameras and programs write them, made pixel by pixel from their description (hardware.md 2.7)."""
+"""Files as foreign cameras and programs write them, made pixel by pixel from their description (docs/hardware.md)."""
 
 import numpy as np
 
