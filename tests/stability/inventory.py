@@ -17,25 +17,11 @@ from hypothesis import settings
 ROOT = Path(__file__).parents[2]
 SCOPE = (
     "calibration/*.py",
-    *(f"drivers/{name}.py" for name in ("clock", "frames", "mirror_ramps", "replay_pace", "units")),
-    *(
-        f"rig/{name}.py"
-        for name in ("binding*", "blanking*", "counting*", "cube", "depth*", "geometry*", "marker_line")
-    ),
-    *(f"rig/{name}.py" for name in ("mirror_path", "path_search", "plan", "scan_plan", "scoring", "stripes", "sweeps")),
-    *(f"rig/{name}.py" for name in ("calibration_reach", "frame_rates", "gate_pulses", "plan_figures", "waveform")),
-    "rig/bent_light*.py",
-    "rig/plan/waveform.py",
-    *(f"rig/{name}.py" for name in ("error_bounds", "limits", "row_light", "scene_limits")),
-    "rig/fog_*.py",
-    *(f"rig/{name}.py" for name in ("intervals", "multi_line*", "tradeoff_rows")),
-    "rig/estimators/*.py",
-    *(
-        f"sim_backend/{name}.py"
-        for name in ("exponential", "flux", "light_sheet*", "line_width", "medium", "mirror_motion")
-    ),
-    *(f"sim_backend/{name}.py" for name in ("optics", "photon*", "scene", "view", "weather")),
-    "sim_backend/effects/*.py",
+    *(f"drivers/{name}.py" for name in ("clock", "frames", "units", "replay/pace", "scanners/galvo")),
+    *(f"rig/{folder}/*.py" for folder in ("count", "depth", "estimate", "geometry", "plan")),
+    *(f"rig/{name}.py" for name in ("recording/cube", "tradeoff/limits", "tradeoff/row_light", "tradeoff/rows")),
+    *(f"sim_backend/{folder}/*.py" for folder in ("effects", "frames", "light")),
+    *(f"sim_backend/{name}.py" for name in ("mirror_motion", "random_numbers", "scenes/medium", "scenes/scene")),
 )
 """Files whose functions compute; the others move bytes, words and files, which tests/unit and tests/wire hold."""
 NUMERIC = {"int", "float", "complex", "NDArray", "ArrayLike", "Array", "Fraction", "Pixels", "Counts"}

@@ -57,7 +57,9 @@ def closed_forms(setup, extinction: float, plane: np.ndarray, row: int):
 
 
 @covers(
-    "sim_backend.effects.stripe:Stripe.add", "sim_backend.effects.fog:Haze.add", "sim_backend.light.view:View.sheet"
+    "sim_backend.effects.stripe:Stripe.add",
+    "sim_backend.effects.fog:Haze.add",
+    "sim_backend.light.view:CameraView.sheet",
 )
 @pytest.mark.parametrize("depth", [0.0, *DEPTHS])
 def test_stripe_and_haze_follow_beer_and_lambert_to_optical_depth_50(depth, worst) -> None:
@@ -98,7 +100,7 @@ SCENE = st.fixed_dictionaries(
     "sim_backend.frames.flux:FluxModel.*",
     "sim_backend.frames.flux:hold_s",
     "sim_backend.light.sheet:empty_sheet",
-    "sim_backend.light.view:View.*",
+    "sim_backend.light.view:CameraView.*",
 )
 @covers("sim_backend.effects.*:*.rate", "sim_backend.effects.*:*.add", "sim_backend.effects.dark_counts:dark_rates")
 @covers("sim_backend.light.sheet:trace_rows", "sim_backend.light.sheet:span_bounds")

@@ -62,8 +62,8 @@ def test_brakes_come_to_rest_inside_the_range(at, velocity, limits, rate) -> Non
 
 
 @covers(
-    "rig.plan.mirror_path:Segment.command", "rig.plan.mirror_path:SweepPath.command",
-    "rig.plan.mirror_path:SweepPath.rms_acceleration", "rig.plan.mirror_path:Motion.*",
+    "rig.plan.mirror_path:PathSegment.command", "rig.plan.mirror_path:SweepPath.command",
+    "rig.plan.mirror_path:SweepPath.rms_acceleration", "rig.plan.mirror_path:MirrorLimits.*",
     "rig.plan.mirror_path:sweep_path",
 )  # fmt: skip
 @EXAMPLES
