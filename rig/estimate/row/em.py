@@ -22,7 +22,7 @@ from rig.threads import RowWorkers
 LATTICE_LINES = 8192
 """Rows x columns of a sweep that a learning round reads: about 10^6 pixels."""
 NEXT_LINES = 2048
-"""The same of a sweep that carries a model on; what the sweeps before it taught fades by FADE with each."""
+"""Lines read of a sweep that carries a model on; what the sweeps before it taught fades by FADE with each."""
 FADE = 0.7
 WIDTH_STEP = 4
 """Every 4th of those lines is asked for the line's width."""
@@ -31,7 +31,7 @@ WIDTH_EVIDENCE = 3.0
 FIRST_ROUNDS = 8
 LAST_ROUNDS = 3
 MOST_TRUST = np.float32(0.98)
-"""Of what neighbours say of a stripe that is sure: its own row may know better."""
+"""Largest trust in what neighbours say of a stripe, however sure they are: its own row may know better."""
 LEVELS = 14
 """Sums per profile bin of an expectation, see `learn_rows`."""
 PIECES = 4
@@ -62,7 +62,7 @@ class Expectation:
         )  # fmt: skip
 
     def faded(self, share: float) -> "Expectation":
-        """As if only this share of the lines had been seen."""
+        """The sums as if only this share of the lines had been seen."""
         return Expectation(
             share * self.levels, share * self.rows_seen, share * self.columns_seen, share * self.amplitude_mass,
             share * self.evidence,

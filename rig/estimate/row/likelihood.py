@@ -1,10 +1,29 @@
-"""Compiled row likelihood: 'haze, stripe, then less' for every row and column of a sweep.
+"""The likelihood of one image row, exact: the specification of everything that `likelihood` and `joint` compute.
 
-Hypothesis j of a row: pixels nearer than the stripe see haze and ambient light (flux B), pixels behind it the pedestal
-and ambient light (flux E), and 2T + 1 pixels around j see q S psi_k on top. With p' = (1 - e)(1 - exp(-flux)) + e/2 the
-log-likelihood of the counts n of K frames is linear in them, sum n logit p' + K log(1 - p'), so that all positions of a
-row cost one cumulative sum plus 2T + 1 taps. The floor e bounds what a single pixel can say.
-Amplitudes q are marginalised over a log grid whose weights are learned; 'no stripe on this row' is a hypothesis too.
+Along a row, from near to far, the light is 'haze, stripe, then less'. The counts n_t of pixels t = 0..L-1 are ones in
+K one-bit frames. Hypothesis (j, m), 'the stripe stands at pixel j with amplitude a_m', expects photons per exposure of
+
+    flux_t = base_t + a_m psi_|t-j| scale_t                   psi: share of the line at 0..T px from its centre
+    base_t = before_t for t < j                               haze and ambient light
+           = behind_t for t > j                               pedestal and ambient light
+           = (before_t + behind_t) / 2 at t = j
+
+A pixel fires with p' = (1 - e)(1 - exp(-flux)) + e/2; the floor e (FLOOR) bounds what a single pixel can say. Then
+
+    log-likelihood(j, m) = sum over t of n_t logit p'_t + K log(1 - p'_t)
+
+is linear in the counts, so that all positions of a row cost one cumulative sum (pixels before and behind j) and 2T + 1
+taps (pixels around j). Beside the stripes stand three hypotheses without one: the row lies before its stripe all along,
+or behind it, or its haze ends between two pixels and nothing shines there. With priors over positions and amplitudes,
+
+    P(j) ~ prior_j sum over m of weight_m exp(log-likelihood(j, m))
+
+`row_scores` is the log-likelihood, `row_posterior` the sum over amplitudes, `mode_of` the answer: read them in this
+order. Arrays of a row are float32 (L,), scores float32 (M, L). Where `before`, `behind`, `scale` and the priors come
+from is told in `rig.estimate.row.inputs` and `rig.estimate.row.model`. The one approximation is `logit_table`.
+
+`rig.estimate.search` and `rig.estimate.joint.labels` are fast forms of this and are tested against it.
+tests/unit/rig/estimate/row/test_likelihood.py holds this module itself against direct sums, in 50 digits and float64.
 """
 
 from typing import Any, Final

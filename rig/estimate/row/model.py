@@ -1,8 +1,11 @@
-"""What the row likelihood knows of light and medium, all of it learned from counts.
+"""The learned model of light and medium that the row likelihood goes by; all of it comes from counts.
 
-Haze is one profile over path inverse depth (its single-scattering form depends on the two path lengths only) times a
-gain per row; the level behind the stripe is a second profile. Amplitudes are powers q of 1 m-normalised reflectance:
-the stripe at inverse depth w carries q S(w) photons, S = w^2 exp(-2 extinction / w).
+Path inverse depth w is 1 over the mean of the two path lengths, scanner to point and point to camera. Over BINS bins of
+it stand two profiles, haze before the stripe and the level behind it, each times a gain per row and per column:
+single-scattered haze depends on the two path lengths only. A stripe carries a S(w) photons, a out of AMPLITUDES learned
+amplitudes (reflectance and laser power), S = w^2 exp(-2 extinction / w), scaled to 1 in the middle bin.
+
+The line is a Gaussian of learned width, integrated over pixels (`pixel_shares`).
 """
 
 import math

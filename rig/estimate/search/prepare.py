@@ -1,4 +1,9 @@
-"""Makes ready what the compiled search reads: tables per column and band of rows, from model and geometry."""
+"""Makes the tables of the search along a row, per column and band of rows, from a model and a geometry.
+
+The search is a fast form of `rig.estimate.row.likelihood`. Here it is decided how many rows share a table
+(`rows_of_band`), into how fine units likelihood is divided so that no 16-bit sum runs over, and how often counts are
+halved (`judge_of`); tests/unit/rig/estimate/search/test_prepare.py checks those bounds.
+"""
 
 from typing import Any
 
@@ -110,7 +115,7 @@ def judge_of(
 def _hot_of_windows(
     hot: NDArray[np.bool_], geometry: SweepGeometry
 ) -> tuple[NDArray[np.int32], NDArray[np.int16], NDArray[np.int32]]:
-    """hot_start, hot_at and hot_place of a `Judge`; hot: (rows, width)."""
+    """hot_start, hot_at and hot_place of `SearchTables`; hot: (rows, width)."""
     lanes, rows = padded_lanes(geometry.window), geometry.rows
     starts, at, places = [], [np.zeros(0, np.int16)], [np.zeros(0, np.int32)]
     before = 0

@@ -1,7 +1,12 @@
-"""Compiled estimate of one image row: search, close look, and what the row teaches of the light.
+"""Estimate of image rows, compiled: score every position, look closely at the best, and note what the row teaches.
 
-The same `judge_rows` serves frames as they come and counts that are there already (`rig.estimate.search.stream`): the
-answers are the same bit for bit.
+A fast form of `rig.estimate.row.likelihood`: BATCH rows of one column go together through 16-bit scores
+(`rig.estimate.search.scores`, tables of `rig.estimate.search.tables`), with SCREENS amplitudes instead of all, one
+table for a band of rows and counts of 6 bits. Answers are float32 (FIELDS, rows) per column (`RowAnswers`).
+tests/unit/rig/estimate/search/test_rows.py holds it against the exact form.
+
+`judge_rows` serves frames as they come and counts of whole sweeps (`rig.estimate.search.stream`): the answers are the
+same bit for bit.
 """
 
 from typing import Final
@@ -61,7 +66,7 @@ USUAL_PAIRS: Final = 4
 
 @numba.njit(cache=True, nogil=True)
 def halvings(exposures: int, most: int) -> int:
-    """How often counts of so many exposures are halved."""
+    """Number of times that counts of so many exposures are halved, so that none exceeds `most`."""
     times = 0
     while (exposures >> times) > most:
         times += 1
@@ -72,7 +77,7 @@ def halvings(exposures: int, most: int) -> int:
 def _fetch_ahead(desk: SearchPointers, pixels: int, table: int) -> None:
     """Have a table on its way into the cache: few of its numbers are read in order, which no processor foresees.
 
-    The next column's; it saves about 3 % of the time.
+    It is the next column's.
     """
     taps = 2 * SCREENS * desk.taps * pixels
     for at in range(0, taps, CACHE_LINE):
@@ -314,7 +319,7 @@ def turned(
 ) -> None:
     """Rows first_row..last_row-1 of answers (columns, FIELDS, rows) as (FIELDS, rows, columns).
 
-    limits: as of `Judge`; rows without a search window have no answer.
+    limits: as in `SearchTables`; rows without a search window have no answer.
     """
     columns, fields, _ = stripe.shape
     for y0 in range(first_row, last_row, 16):

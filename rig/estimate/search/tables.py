@@ -1,14 +1,16 @@
-"""Tables of the search along a row: what a count at each pixel says of every stripe position, per column and band.
+"""Tables of the search along a row, per column and band of rows, and a thread's buffers.
 
-Haze and pedestal vary slowly from row to row, so the rows of a band share one table per column. Weights are whole
-numbers of 1 / `units` octaves of likelihood, of 8 bits, for what a processor multiplies and adds at once; what does not
-depend on the counts is kept per exposure, since the number of frames differs from column to column.
+They hold the terms of `rig.estimate.row.likelihood` in whole numbers of units, `units` to an octave of likelihood: with
+p'_L and p'_R of a pixel left and right of the stripe and p'_S of one that it lights,
 
-Left and right: the flux of a pixel left and right of the stripe. Where near is left, left is haze and ambient light,
-right is the pedestal; with the scanner on the other side it is the other way round. Scores are relative to 'everything
-is as right of the stripe', in units; a pixel left of position x adds its edge weight, the pixels around x their taps.
+    edge = logit p'_L - logit p'_R                  int8: a count at a pixel left of position x
+    tap  = logit p'_S - logit p'_L or R             int8: a count at a pixel around x, for SCREENS amplitudes
+    constant: the same of log(1 - p'), per exposure, since the number of frames differs from column to column
 
-What the search along a row works with: a table made ready for a column, and a thread's buffers.
+Where near is left, left is haze and ambient light and right is the pedestal; with the scanner on the other side it is
+the other way round. Haze and pedestal vary slowly from row to row, so the rows of a band share one table per column.
+8-bit weights are what a processor multiplies and adds at once. `ScreenTables` has the shapes. Answers are held against
+the exact likelihood in tests/unit/rig/estimate/search/test_rows.py.
 """
 
 from typing import Final, NamedTuple
@@ -49,7 +51,7 @@ class ScreenTables(NamedTuple):
     none: float32 (columns, bands, NONE), units of 'no stripe': all as right, all as left, a change somewhere (per
     lane); first and last lane with pixels of the column.
     neutral: float32 (columns, bands, P), ones per exposure that say nothing, in pixel order.
-    before, scale: float32 (columns, bands, P) as in `Row`, in pixel order.
+    before, scale: float32 (columns, bands, P) as in `RowBuffers`, in pixel order.
     first, last: int32 (columns, bands), first and last position in stored pixels.
     ambient: float32 (columns, bands, P), ambient light and other lines' haze where there are any, else no columns.
     """
@@ -211,7 +213,7 @@ def _pair(x):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def first_pair(s, reach):  # type: ignore[no-untyped-def]
-    """Where the taps of step s begin, in pairs from that of the step itself on."""
+    """First pair of the taps of step s, in pairs from that of the step itself on; reach: px on either side."""
     return ((s - reach) >> 1) - (s >> 1)
 
 
@@ -225,9 +227,9 @@ PLACE_BEFORE: Final = 8
 class ScreenTable(NamedTuple):
     """One table made ready for a number of exposures.
 
-    Addresses, in lane order: edge, tap as in `Tables`, constant as in `Search`; in pixel order, float32 of the stored
-    pixels: before, scale, ambient. Numbers: all_right, all_left: scores of 'no stripe' as of
-    `Tables.none`, that of all pixels lying right complete. searched: whether there is any position to find.
+    Addresses, in lane order: edge, tap as in `ScreenTables`, constant as in `Search`; in pixel order, float32 of the
+    stored pixels: before, scale, ambient. Numbers: all_right, all_left: scores of 'no stripe' as in
+    `ScreenTables.none`; that of all pixels lying right is complete. searched: whether there is any position to find.
     """
 
     edge: int
