@@ -1,20 +1,17 @@
-"""Compiled: how far an answer of `joint` is to be believed by the lessons of the first map.
+"""Reads a map's answers and what they teach, compiled: positions, trust in each, and pixels quiet behind them.
+
+How far the lessons of the first map believe an answer (`fill_trust`, float32 (rows, columns)):
 
     trust = erf(3 px / (sqrt 2 sd)) / (1 + exp(A - B margin)) / (1 + C z^-D)
 
-As `rig.estimate.joint.confidence`, but for z, the stripe's light over its noise, pooled over neighbours: what the light
-is worth, above half of the haze, and not whether answers around agree; and it asks for the right surface, within 3 px.
-Later lessons go by the table's confidence, for by then the model is known.
+This is the confidence of `rig.estimate.joint.confidence` but for z, the stripe's light over its noise, pooled over
+neighbours, above half of the haze; whether answers around agree does not count, and it asks for the right surface,
+within 3 px. Later lessons go by the table's confidence, for by then the model is known.
 
-The numbers are fitted (maximum likelihood) to lessons on random scenes of a second simulator (`random_scenes`, numbers
-20 to 30), in clear air, thin and dense fog, under a halo and with hot pixels at 1 to 10 exposures, places without a
-stripe counted as wrong. All but A: fitted it is 2.5, but lessons that believe so little teach worse, for a line that is
-not believed goes by its own row, and those left out are those that show what the model does not know yet. With A at
-2.5, 1.25 and none the maps that followed had a bias of -0.079, -0.061 and -0.039 px (number 40, one exposure), in dense
-fog errors of 0.76, 0.63 and 0.86 px (number 41): half of it was chosen on these two. On others (42 to 44) errors are
-within 3 % of those under constants fitted to prepared scenes.
-
-Compiled reading of a map's answers: positions in pixels, and what lay quietly behind them.
+B, C and D are fitted by maximum likelihood to lessons on random scenes of a second simulator, in clear air, thin and
+dense fog, under a halo and with hot pixels at 1 to 10 exposures, places without a stripe counted as wrong. A is half of
+its fitted value: lessons that believe so little teach worse, since an answer that is not believed goes by its own row,
+and those left out are those that show what the model does not know yet.
 """
 
 import math

@@ -1,14 +1,17 @@
-"""Second returns: where the counts themselves show another line beside the stripe, and how probably so.
+"""Second returns: a second line of light beside the stripe, from a pane before a wall, a twig, a flake of snow.
 
-In haze a row cannot answer with both: the light behind the nearer one excludes that it ends there, so that the best
-rival of an answer is hardly ever the second surface. `rig.estimate.joint.second_returns` looks for its light instead.
+In haze a row cannot answer with both surfaces: the light behind the nearer one excludes that the haze ends there, so
+that the best rival of an answer is hardly ever the second surface. So its light is looked for in the counts. It stands
+off the haze by too little for a row alone; light is summed over blocks of rows and columns first
+(`rig.estimate.joint.second_return_blocks`) and compared with what haze and ambient light bring, pixel by pixel of
+distance from the far end. Then each row is asked itself, with its neighbours. In standard deviations of the light that
+a candidate shows over its own neighbourhood (own) and its block's (block), the probability that it is right is
 
-Compiled search for light of a second surface beside each stripe: a pane before a wall, a twig, a flake of snow.
+    logit confidence2 = LOG_ODDS . (1, own, block)
 
-Such light stands off the haze by too little for a row alone, and rows that see both surfaces answer with one of them.
-So light is summed over blocks of rows and columns at equal distances from the far end first
-(`rig.estimate.joint.second_return_blocks`), pixel by pixel of distance, and compared with what haze and ambient light
-bring; then each row is asked itself, with its neighbours.
+Positions x2_px and confidence2 are float32 (rows, columns), NaN and 0 where nothing stands out. LOG_ODDS are fitted to
+maps with a pane over a third of them and to maps without any. Limits: light within APART_PX plus LINE_SIGMAS widths
+of the line from a stripe is its own, so that closer surfaces are not told apart.
 """
 
 from typing import Final, NamedTuple
@@ -43,15 +46,15 @@ CANDIDATE: Final = np.float32(4.0)
 REACH: Final = 3
 """Rows and columns to either side that light is pooled over in the end."""
 LOG_ODDS: Final = -16.0, 0.4, 3.0
-"""Log odds that a candidate is right: these times 1, and the standard deviations of its own light and its block's.
+"""Log odds that a candidate is right are these times 1, and the standard deviations of its own light and its block's.
 
-Between what maps with a pane over a third of them ask for and what those without any do: fitted to both, rounded."""
+Fitted to maps with a pane over a third of them and to maps without any, and rounded."""
 _AROUND: Final = -(-(RING_PX + GAP_PX + 6) // LANES) * LANES
 """Room beside the pixels of distance: whatever the line's reach, up to 6 px."""
 
 
 class Candidates(NamedTuple):
-    """What stands out most in each block and its neighbours, float32 (block rows, block columns) each.
+    """The light that stands out most in each block and its neighbours, float32 (block rows, block columns) each.
 
     distance: from the far end in px, NaN where nothing does; sure: standard deviations by which its light does; haze:
     how much stronger haze is there than was learned, at least 1.
@@ -63,7 +66,7 @@ class Candidates(NamedTuple):
 
 
 class Seconds(NamedTuple):
-    """What is known of second returns, float32 (rows, columns) each.
+    """Candidates of second returns, float32 (rows, columns) each.
 
     distance: from the far end in px, NaN where there is no candidate; ones, expected: within the line's reach of it;
     light, moment: ones above those expected, and that times the distance in px.
@@ -263,7 +266,7 @@ LIGHT_SIGMAS = 1.5
 
 
 class SecondLight(NamedTuple):
-    """What the search for second returns takes of a model; made once per model by `second_light`.
+    """Inputs of the search for second returns from a model; made once per model by `second_light`.
 
     state: without ambient light. still: float32, (rows x width) between LANES numbers at either end, probability of no
     one by ambient light alone; LEFT_OUT of pixels that always fire or are not to be used, which show nothing of

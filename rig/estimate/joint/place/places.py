@@ -1,17 +1,17 @@
-"""Compiled sub-pixel placing of stripes: one step of Fisher scoring, pooled over neighbours on the same surface.
+"""Sub-pixel placing of stripes: one step of Fisher scoring, pooled over neighbours on the same surface; counts around.
 
 At its answer each row says how much likelier its counts become with the stripe a little further on (the score g), and
-how much it knows of that at all (the information h). Neighbours on one surface share its distance d from the far end:
+how much it knows of that at all (the information h), `rig.estimate.joint.place.score`. Neighbours on one surface share
+its distance d from the far end, float32 px:
 
     d = sum (h d_n + g_n) / sum h
 
 over them is as good as the maximum of their common likelihood, and 1 / sqrt(sum h) its standard deviation. A stripe's
 brightness is pooled in the same way before: on its own a dark row is taken for a brighter one that stands on haze.
 
-Compiled fetching of what lies around stripes: counts and ambient light of the pixels to both sides.
-
-Counts lie column by column, answers are worked on row by row, sixteen columns to a vector: in tiles of rows and columns
-the counts around all stripes are brought into the order of the answers once, for all that asks for them afterwards.
+Counts lie column by column, answers are worked on row by row, LANES columns to a vector. So the counts around all
+stripes are brought into the order of the answers once, in tiles of rows and columns (`fetch_counts`), for all that asks
+for them afterwards.
 """
 
 from typing import Any, Final, NamedTuple
@@ -49,7 +49,7 @@ FEW_FRAMES_FLUX: Final = 0.5
 
 
 class Places(NamedTuple):
-    """Room for what is known of each stripe, float32 (rows, columns) each.
+    """Light and place of each stripe, float32 (rows, columns) each.
 
     distance: x from the far end in px, NaN where there is none; light: photons per exposure above haze and ambient;
     scale: those of amplitude 1; haze, rest: before and behind it; glow: of the halo at the stripe, photons per pixel

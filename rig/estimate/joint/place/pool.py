@@ -1,23 +1,20 @@
-"""Compiled sums over neighbours on the same surface, sixteen stripes to a vector.
+"""Sums over neighbours on one surface, and places joined by pairs of opposite neighbours, LANES stripes to a vector.
 
-Neighbours whose distances from the far end differ by too much are left out one by one, so that no running sums will do.
-Rows are worked on in copies with a margin of stripes that lie nowhere: no neighbour has to be asked for.
+Pooling: a neighbour whose distance from the far end differs by more than SAME_PX is left out, one by one, so that no
+running sums will do. Rows are worked on in copies with a margin of stripes that lie nowhere (`with_margin`, NaN): no
+neighbour has to be asked for. All arrays are float32 (rows, columns).
 
-Compiled placing by pairs of neighbours opposite each other, sixteen stripes to a vector.
-
-The mean of two places that lie opposite each other on a plane is the place between them, whatever the plane's slope. So
-a stripe is joined by its opposite neighbours some stripes away, each placed with its own neighbourhood before, where
-their mean m agrees with its own place d: within SAME_PX, and within SIGMAS of what the standard deviations of both let
-expect,
+Joining: the mean of two places that lie opposite each other on a plane is the place between them, whatever the plane's
+slope. So a stripe is joined by its opposite neighbours some stripes away, each placed with its own neighbourhood
+before, where their mean m agrees with its own place d: within SAME_PX, and within SIGMAS of what the standard
+deviations of both let expect,
 
     d' = (d / s^2 + sum m / v) / (1 / s^2 + sum 1 / v),    v = (s1^2 + s2^2) / 4
 
 Where a surface ends or bends they do not agree, and the stripe stays where it is. Two such rounds reach as far as 25 x
-25 neighbours for the work of 16: with as many summed one by one (`rig.estimate.joint.place.pool`) slopes have to be
-less than SAME_PX over the whole reach, and half a neighbourhood at an edge is off by its slope.
-
-Neighbourhoods overlap, so that pairs know less than the sum of what each knows: `share` of it, which is what makes the
-standard deviation right where all agree.
+25 neighbours for the work of 16; summed one by one so many would ask for slopes of less than SAME_PX over the whole
+reach, and half a neighbourhood at an edge is off by its slope. Neighbourhoods overlap, so that pairs know less than the
+sum of what each knows: `share` of it, which makes the standard deviation right where all agree.
 """
 
 from typing import Final
@@ -96,7 +93,7 @@ def widen_row(at: tuple[int, int, int], width: int, y: int, inner: int, reach: i
 
 @numba.njit(cache=True, nogil=True)
 def _widen_block(at: tuple[int, int, int], to: int, width: int, here: int, c: int, inner: int, reach: int) -> None:
-    """The same of LANES stripes from number `here` of the copies on, whose sums are those from c on."""
+    """Do what `widen_row` does for LANES stripes, from number `here` of the copies and from c of the sums on."""
     own, columns = load_float32(at[0], here), width - 2 * LANES
     a, b = load_float32(to, c), load_float32(to, columns + c)
     for away in range(-reach, reach + 1):

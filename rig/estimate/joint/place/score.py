@@ -1,7 +1,13 @@
-"""Compiled score and information of stripes' places, see `rig.estimate.joint.place.places`, sixteen stripes to a
-vector.
+"""Score and information of stripes' places, compiled, LANES stripes to a vector.
 
-A pixel that the row does not have, or that is not to be used, is given light in which nothing can be seen.
+With flux of each of the TAPS pixels around a stripe of `light` photons in K frames, and D = 1 / (e^flux - 1),
+
+    slope = light d share / dx (and the step of haze at the centre),
+    g = sum slope (n D - (K - n)),    h = sum K slope^2 D
+
+are the slope of the log-likelihood in the stripe's place and its Fisher information, 1/px and 1/px^2, float32 (rows,
+columns); `rig.estimate.joint.place.places` says what they are for. A pixel that the row does not have, or that is not
+to be used, is given light in which nothing can be seen.
 """
 
 from typing import Final
