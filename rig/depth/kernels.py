@@ -1,6 +1,12 @@
-"""Compiled step from the stripe table to a depth map on the camera grid.
+"""Compiled steps behind the stripe table: the depth map on the camera grid, and the sums of the fog meter.
 
-Compiled sums of the fog meter: what lies clearly before and clearly behind the stripes of a sweep.
+`fill_rows`: between the stripes xa and xb of columns a and b on one row, on one surface, a pixel at x has
+
+    inverse depth = (1 - f) p_a.(u, v, 1) + f p_b.(u, v, 1),    f = (x - xa) / (xb - xa)
+
+with planes p float64 (columns, 3) and rays u, v float32 (rows, width); inverse depth is float32 (rows, width).
+`add_clear_rows`: ones, exposures and exposures weighted with geometry factor and flux, of pixels clearly before and
+clearly behind the stripes of a sweep, float64 per block, side and bin of path.
 """
 
 from typing import Final
@@ -33,7 +39,7 @@ def fill_rows(
 ) -> None:
     """Write inverse depth and its confidence (rows, width) for pixels between stripes of neighbouring columns.
 
-    And the mirror's command there, from the columns' `commands`, where `command` has room for any.
+    Also writes the mirror's command there, from the columns' `commands`, unless `command` is empty.
 
     Two stripes of one row lie on one surface when their columns are at most MAX_COLUMN_GAP apart and their spacing is
     that of equal depth within 1 px + 3 sd. Between them the column is linear in x. The more confident pair wins.

@@ -39,8 +39,8 @@ class RowModel:
     width) float32, photons per exposure of ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at
     S = 1 and their probability. none_weight: probability of a row without stripe. line_sigma_px: width of the line.
     extinction_per_m and its standard deviation: NaN where the haze does not resolve it. halo: (HALO_NODES, reaches)
-    float32, light of the stripe's halo over its own (`halo`), zeros where there is none. before: what the map before
-    left to this one (`temporal`), None where that is nothing.
+    float32, light of the stripe's halo over its own (`rig.estimate.row.inputs`), zeros where there is none. before:
+    labels that the map before left to this one (`rig.estimate.joint.temporal`), None where it left none.
     """
 
     profile: NDArray[np.float32]
@@ -61,7 +61,7 @@ class RowModel:
     before: NDArray[np.uint16] | None = None
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Every field that there is as an array, to be kept with the map."""
+        """Every field that is not None as an array, to be kept with the map."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
