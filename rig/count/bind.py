@@ -227,7 +227,7 @@ class FrameBinder:
         sweep[at], direction[at], column[at], bins[at] = int(self._carried["sweep"][0]), 0, np.nan, BIN_UNUSABLE
 
     def _make_room(self, n: int) -> None:
-        """For n more frames, should there be a marker in each of them."""
+        """Make room for n more frames, should there be a marker in each of them."""
         if n > len(self._records):
             self._records = np.empty(n, FRAME_RECORD)
         have = self._edges.shape[1]

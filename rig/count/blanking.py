@@ -219,11 +219,11 @@ class MarkerLine:
 _log = logging.getLogger(__name__)
 
 SEARCH_S = 10.0
-"""A stream without two patterns a sweep apart for so long, sweeps apart, is given up."""
+"""Seconds, and three sweeps more, after which a stream is given up that shows no two patterns a sweep apart."""
 CLEAR_SCORE = 2 * LEAST_SCORE
 """A pattern that stands out so clearly is surely one: where sweeps are not found, light is not what is missing."""
 ASIDE_PX = 64
-"""In the run-in the stripe is a little beside the window of the first column."""
+"""Pixels counted on both sides of the first column's window: in the run-in the stripe stands a little beside it."""
 
 
 @dataclass(frozen=True, slots=True)

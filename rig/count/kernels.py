@@ -26,9 +26,9 @@ PLANES: Final = 8
 MOST_FRAMES: Final = (1 << PLANES) - 1
 """Frames that a set of planes can count."""
 PAIR_FRAMES: Final = 3
-"""Up to so many frames two planes do."""
+"""Frames that two planes can count."""
 FEW_FRAMES: Final = 15
-"""Up to so many frames four planes do."""
+"""Frames that four planes can count."""
 
 
 @numba.njit(cache=True, nogil=True)

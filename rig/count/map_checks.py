@@ -41,7 +41,7 @@ LEAST_FOLLOWING: Final = 0.25
 fences half of it; columns that do not follow one another have none."""
 SATURATED: Final = 0.99
 DIMMEST: Final = 0.1
-"""Mean rate of a pixel over that of all, below which its noise is taken for that of so much."""
+"""Least mean rate of a pixel, over that of all, that its noise is reckoned with."""
 SURE: Final = 0.9
 GROUPS: Final = 8
 """Groups of sure answers by distance: wrong ones are mostly wrong together, as one surface that is not there."""
@@ -260,7 +260,7 @@ class _Counts:
 
 
 def _deviations(values: Array) -> float:
-    """By how many of its standard deviations a sum of independent values is above 0."""
+    """Standard deviations by which a sum of independent values is above 0."""
     squares = float((values**2).sum())
     return float(values.sum()) / np.sqrt(squares) if squares > 0 else 0.0
 

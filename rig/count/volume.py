@@ -15,7 +15,7 @@ from rig.geometry.windows import WORD_PX
 from rig.threads import RowWorkers
 
 MOST_WIDTH_PX = WORD_PX * 256
-"""A row's words must fit one chunk of the counters."""
+"""Widest row: its words must fit one chunk of the counters."""
 BIN_DARK = -1
 """Bin of a frame with the gate low during the whole exposure."""
 BIN_UNUSABLE = -2

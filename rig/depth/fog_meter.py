@@ -124,7 +124,7 @@ class _Data:
         return np.array([max(level, 0.0) / max(float(np.average(shape, weights=before)), 1e-9), extinction_per_m, 0, 0])
 
     def _light(self, value: Array) -> tuple[Array, Array, Array]:
-        """Shape of the haze, what of it each cell sees, and the flux."""
+        """Shape of the haze, the part of it that each cell sees, and the flux."""
         shape = self.gain * np.exp(np.minimum(-2.0 * value[1] * self.path_m, 50.0))
         part = np.where(self.behind, value[3], 1.0)
         return shape, part, np.clip(self.ambient + value[2] + value[0] * shape * part, FLUX_MIN, FLUX_MAX)
@@ -137,7 +137,7 @@ class _Data:
         )
 
     def prior(self, value: Array) -> Array:
-        """Its slope, downwards."""
+        """Slope of the weak prior, downwards."""
         return np.array([0.0, 1e-3, 0.0, REST_PRIOR]) * value
 
     def slopes(self, value: Array) -> tuple[Array, Array]:

@@ -28,16 +28,16 @@ COUPLED = frozenset({"joint"})
 
 
 class Learned(Protocol):
-    """State that an estimator has learned; fog in it where the haze resolves it, else NaN."""
+    """State that an estimator has learned; its extinction is NaN where the haze does not resolve it."""
 
     @property
     def extinction_per_m(self) -> float:
-        """Extinction of the medium."""
+        """Extinction of the medium, 1/m."""
         ...
 
     @property
     def extinction_sd_per_m(self) -> float:
-        """Its standard deviation."""
+        """Standard deviation of the extinction, 1/m."""
         ...
 
     def arrays(self) -> "dict[str, NDArray[np.generic]]":

@@ -125,7 +125,7 @@ def count_neighbours(distance: NDArray[np.float32], first_row: int, last_row: in
 
 @numba.njit(cache=True, nogil=True)
 def _count_row(distance: int, here: int, width: int, number: int, there: int) -> None:
-    """A row's numbers, from element `there` on, of the distances from element `here` on; both of addresses."""
+    """Count a row's neighbours; elements of distances from `here` on, of numbers from `there` on, both at addresses."""
     one = zero_float32() + np.float32(1.0)
     for c in range(0, width - 2 * LANES, LANES):
         own, same = load_float32(distance, here + c), zero_float32()
@@ -173,7 +173,7 @@ def apart_row(placed: int, width: int, here: int, out: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def light_row(at: tuple[int, int], width: int, here: int, out: int, apart: int) -> None:
-    """Numbers of 3 x 3 neighbours on the surface of each answer of a row, and `apart` further on their light.
+    """Write numbers of 3 x 3 neighbours on the surface of each answer of a row, and `apart` further on their light.
 
     at: addresses of distances and light, copies `with_margin`, width wide; here: the row's first answer in them.
     """

@@ -118,10 +118,10 @@ def add_quiet(
 ) -> None:
     """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, of some columns.
 
-    Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels where there is none: with
-    one it is not dark behind a stripe of `signal` photons, and what is expected of halo and pedestal is taken off. That
-    must not be more than `most_light`, photons per exposure, nor of a stripe that fills its pixels, whose halo is
-    brighter than it seems: what is not taken off would pass for ambient light of pixels that few other stripes show.
+    Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels where there is none. With a
+    halo it is not dark behind a stripe of `signal` photons, and the expected halo and pedestal are taken off the ones.
+    Pixels where these are more than `most_light`, photons per exposure, are left out, and so are stripes that fill
+    their pixels, whose halo is brighter than it seems: what is not taken off would pass for ambient light.
     """
     width = sweep.u.shape[1]
     for y in range(first_row, last_row):

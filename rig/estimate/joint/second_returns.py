@@ -36,11 +36,11 @@ Float32 = NDArray[np.float32]
 RING_PX: Final = 4
 """Pixels to either side of where light is looked for that tell whether haze is as strong as was learned."""
 GAP_PX: Final = 1
-"""Pixels between the two."""
+"""Pixels between the light that is looked for and those."""
 LEAST_RING: Final = 0.25
 """Share of those pixels that must be seen on each side."""
 STEEPER: Final = 1.5
-"""Haze that the ring shows beyond the learned one may be this much more between its two sides: it is not straight."""
+"""Factor on the excess haze of the ring's brighter side: haze between its two sides is not straight."""
 CANDIDATE: Final = np.float32(4.0)
 """Standard deviations from which a block's light is looked at more closely."""
 REACH: Final = 3
@@ -120,7 +120,7 @@ def _add_lines(first: int, apart: int, number: int, size: int, total: int) -> No
 
 @numba.njit(cache=True, nogil=True)
 def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
-    """By how much the light around each pixel exceeds what CANDIDATE allows, and the most; room, excess: addresses."""
+    """Write the light around each pixel above what CANDIDATE allows to `excess`; returns the most. Addresses all."""
     row, most = pixels + 2 * _AROUND, zero_float32()
     for i in range(0, pixels, LANES):
         ones, expected = zero_float32(), zero_float32()
@@ -136,7 +136,7 @@ def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _stands_out(sums: Float32, i: int, reach: int) -> tuple[float, float]:
-    """Standard deviations by which the light around i exceeds what its ring expects of haze; how much more that is."""
+    """Standard deviations of the light around i above the haze that its ring shows; that haze over the learned one."""
     n, e = sums[0, i - reach : i + reach + 1].sum(), sums[1, i - reach : i + reach + 1].sum()
     more = 1.0
     # Light that only falls off to one side is a halo of the stripe or haze that was learned too weak.
@@ -299,7 +299,7 @@ def distance_pixels(grid: LabelGrid) -> int:
 
 
 class SecondRoom(NamedTuple):
-    """Room for the search in one map after the other: memory that is new is slow."""
+    """Room for the search in one map after the other, since new memory is slow."""
 
     blocks: Blocks
     candidates: Candidates

@@ -203,7 +203,7 @@ def _weak_lanes(votes, at, end):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _step(width, k):  # type: ignore[no-untyped-def]
-    """To candidate k in the ballots: the answer itself, then its neighbours left, right, above and below."""
+    """Offset of candidate k in the ballots: the answer itself, then its neighbours left, right, above and below."""
     return (0, -1, 1, -width, width)[k]
 
 

@@ -55,7 +55,7 @@ class Expectation:
     evidence: float
 
     def plus(self, other: "Expectation") -> "Expectation":
-        """Both together."""
+        """Sums of both."""
         return Expectation(
             self.levels + other.levels, self.rows_seen + other.rows_seen, self.columns_seen + other.columns_seen,
             self.amplitude_mass + other.amplitude_mass, self.evidence + other.evidence,
@@ -368,7 +368,7 @@ def _amplitudes(
 def _position_prior(levels: NDArray[np.float64]) -> NDArray[np.float64]:
     """Log density of stripes over the bins (BINS,), 0 where they are spread evenly; smooth, and never against a place.
 
-    It decides only where a row hardly has photons; a quarter of it stays even, so that it can say at most 1.4 against.
+    It decides only where a row hardly has photons; a quarter of it stays even: it says at most 1.4 nats against.
     """
     kernel = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
     found, even = (np.convolve(np.pad(levels[:, i], 2), kernel, "valid") for i in (12, 13))

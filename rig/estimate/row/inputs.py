@@ -179,7 +179,7 @@ def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignor
 
 @numba.njit(inline="always")
 def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-def]
-    """Ambient light, and what the profile brings that is `one` in a bin and `other` in the next."""
+    """Flux of ambient light plus gain times the profile, from `one` in a bin to `other` in the next at `part` of it."""
     return min(max(ambient + gain * (one + part * (other - one)), FLUX_MIN), FLUX_MAX)
 
 
@@ -208,8 +208,9 @@ def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
 def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
     """Haze of the lines that are lit together with column c, at one pixel, whichever side of c's stripe it lies on.
 
-    Where their own stripes lie is not known: their haze has not ended with the share of the depth range that lies
-    behind the pixel's point on their plane, surely where that is nearer than the range begins.
+    Where their own stripes lie is not known. With the probability that is the share of the depth range behind the
+    pixel's point on their plane their haze has not ended there; where the point is nearer than the range it surely has
+    not.
     """
     profile, light = state.profile, 0.0
     ux, vx = np.float64(sweep.u[y, x]), np.float64(sweep.v[y, x])

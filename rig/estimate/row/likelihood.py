@@ -48,7 +48,7 @@ LABEL_PX: Final = 0.25
 LABELS: Final = 13
 """Sub-pixel positions, 1.5 px each way: the mean of the peak, not of its neighbours."""
 LOST: Final = np.float32(24.0)
-"""Log-likelihood below the best at which a hypothesis no longer counts (exp(-24) = 4e-11)."""
+"""Log-likelihood below the best from which on a hypothesis does not count (exp(-24) = 4e-11)."""
 
 
 def logit_table() -> NDArray[np.float32]:
@@ -145,8 +145,8 @@ def none_prior(
 ) -> tuple[float, float, float]:
     """Prior of 'no stripe' as `row_posterior` takes it, from the part of the depth range that the picture shows.
 
-    near, far: ends of the depth range as inverse depths; w_first, w_last: those of the first and last position. What
-    the picture's border cuts off is as likely, per inverse depth, as what it shows.
+    near, far: ends of the depth range as inverse depths; w_first, w_last: those of the first and last position.
+    Positions that the picture's border cuts off are as likely, per inverse depth, as those that it shows.
     """
     span = near - far
     cut_near = min(max((near - w_first) / span, 0.0), 1.0)

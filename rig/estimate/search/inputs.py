@@ -16,13 +16,13 @@ from rig.simd.memory import address_of
 COUNT_LIMIT: Final = 63
 """Largest count the search works with; counts of more exposures are halved until they fit."""
 EXPOSURE_PARTS: Final = 4
-"""Exposures whose counts were halved are broken numbers: 65 become 32.5, 65535 become 63.999."""
+"""Steps per exposure: where counts are halved exposures become fractions, 65 become 32.5, 65535 become 63.999."""
 FIELDS: Final = 5
-"""x_px, confidence, x_sd_px, signal, haze: see `StripeTable`."""
+"""Fields of an answer: x_px, confidence, x_sd_px, signal and haze, see `StripeTable`."""
 
 
 class SearchTables(NamedTuple):
-    """All that is needed to judge the rows of a sweep; fixed while the sweep lasts.
+    """Inputs of the search in the rows of a sweep, fixed while the sweep lasts.
 
     x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, 2, rows + LANES), first and
     last stored pixel of each search window, the first behind the last where there is none. rows: of the picture.

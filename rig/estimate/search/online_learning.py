@@ -54,7 +54,7 @@ class LearningSetting:
     dark: bool
 
     def __post_init__(self) -> None:
-        """Kernels look nothing up twice: what the model has too little of would be read beyond its end."""
+        """Check the model's size: kernels do not, and would read beyond the end of a model that is too small."""
         model, geometry = self.model, self.geometry
         learned = *model.ambient.shape, len(model.column_gain)
         here = geometry.rows, geometry.width, geometry.columns

@@ -36,17 +36,17 @@ CLOSE_SHIFT = 3
 CLOSE_LIMIT = 60000
 """Largest sum of a label's weights times counts if all pixels were full, which no line's are. Sums saturate at half."""
 LOOKED_AT = 32
-"""Columns whose weights say in which units to keep those of all."""
+"""Number of columns whose weights decide the units of all."""
 ROUGH_UNITS = 4.0
 """Units per octave in which no weight reaches its limit: a logit lies within 11 octaves of 0 either way."""
 CUT = 1.25
-"""By so much the largest weights may exceed their limit, where they are cut."""
+"""Factor by which the largest weights may exceed their limit, at which they are cut."""
 FRAMES_OVER_TWICE = 8
 """A column may have this many frames more than twice the nominal number before its counts are halved."""
 HOT_FACTOR, HOT_FLUX = 4.0, 0.02
-"""A pixel is hot for the search from this many times its neighbours' ambient light, and so much more, on."""
+"""A pixel is hot for the search above this many times its neighbours' ambient light plus so many photons."""
 LEAST_VEIL = 0.1
-"""Haze of other lines, over the ambient light, from which it is more than the close-up can overlook."""
+"""Haze of other lines, over the ambient light, from which on the close-up has to know of it."""
 
 
 def judge_of(

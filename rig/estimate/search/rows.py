@@ -55,11 +55,11 @@ from rig.simd.vectors import LANES, as_bytes, larger, larger_float, smaller, sma
 QUIET: Final = 0.9
 """Probability within 1 px from which the pixels behind the stripe teach the ambient light."""
 QUIET_STEP: Final = 8
-"""Every 8th column does so where there are dark frames as well, else every one."""
+"""One column in so many does so where there are dark frames as well, else every one."""
 SIGNAL_REACH_PX: Final = 2
 """Pixels on either side whose light is the stripe's, where the line is narrower."""
 FEW_EXPOSURES: Final = 1
-"""Up to so many a close look says no more than the scores of the neighbours, which are there already."""
+"""Exposures up to which a close look says no more than the scores of the neighbours, which are there already."""
 USUAL_PAIRS: Final = 4
 """Pairs of pixels that the close-up looks at, where the line is no wider than usual."""
 
@@ -75,7 +75,7 @@ def halvings(exposures: int, most: int) -> int:
 
 @numba.njit(forceinline=True)
 def _fetch_ahead(desk: SearchPointers, pixels: int, table: int) -> None:
-    """Have a table on its way into the cache: few of its numbers are read in order, which no processor foresees.
+    """Prefetch a table: few of its numbers are read in order, which no processor foresees.
 
     It is the next column's.
     """
@@ -151,7 +151,7 @@ def _mute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _unmute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
-    """Give them back: what teaches the ambient light must be what was counted."""
+    """Give the hot pixels their counts back: the ambient light is learned from what was counted."""
     n, begin = search.n - first * search.n_bytes, _hot_of_row(desk, x0, first)
     for h in range(begin, _hot_of_row(desk, x0, first + rows)):
         write_byte(n, read_int32(desk.hot_place, h), read_byte(search.muted, h - begin))

@@ -257,7 +257,7 @@ def add_likelihoods(table: ScreenTable, search: Search, rows: int, window: int, 
 
 @numba.njit(forceinline=True)
 def certainties(table: ScreenTable, search: Search, shift: int):  # type: ignore[no-untyped-def]
-    """Probability of each row of the batch to have its stripe within 1 px of x, float32 lanes; the model's."""
+    """Probability of each row of the batch to have its stripe within 1 px of x, float32 lanes."""
     lift, ceiling = load_int16(search.lift, 0), load_int16(search.ceiling, 0)
     all_left = add_saturated(load_int16(search.all_left, 0), table.all_left)
     all_right = zero_int16() + table.all_right

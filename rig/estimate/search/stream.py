@@ -101,7 +101,7 @@ def _finish(desk, state, planes, row_bytes, first_row, last_row):  # type: ignor
 
 @numba.njit(forceinline=True)
 def _finish_rows(desk, search, state, planes, row_bytes, first_row, last_row):  # type: ignore[no-untyped-def]
-    """`_finish` with a thread's buffers."""
+    """Do the work of `_finish` in a thread's buffers."""
     c, k = state.column, state.frames
     halved = halvings(k, desk.most)
     exposures = np.float32(k / 2.0**halved)
@@ -248,7 +248,7 @@ NO_COLUMN = OpenColumn(-1, 0, 0, 0, 0)
 class SearchedSweep(FrameTally):
     """A sweep whose columns have been judged.
 
-    stripe: the stripe table. light: uint32 (rows, width), counts summed over the columns. quiet: int32 (2, rows,
+    stripe: the stripe table. light: uint32 (rows, width), counts summed over the columns. quiet: float64 (2, rows,
     width), ones and exposures of pixels while clearly behind a stripe. lines: what the learning reads. checked: int32
     (3, points, window), counts of the `check_points`.
     """
@@ -399,8 +399,8 @@ def search_volume(
 def nominal_exposures(volume: CountVolume) -> int:
     """Frames nominally taken per column; where only the counts are known, the median of those with any.
 
-    Or more than that, as after passes over a small part of the columns: so many that those of all but a hundredth of
-    them need not be halved.
+    More than that after passes over a small part of the columns: so many that the counts of all but a hundredth of the
+    columns need not be halved.
     """
     if volume.exposures is not None:
         return volume.exposures

@@ -58,7 +58,7 @@ TAPS_LIMIT: Final = 28000
 FRAMES_OVER_HALF_MORE: Final = 4
 """The counts of a column weigh no more than those of one and a half times the nominal exposures plus this many."""
 LOOKED_AT: Final = 32
-"""Columns, and rows, whose rise says in which units to keep those of all."""
+"""Number of columns, and of rows, whose rise decides the units of all."""
 QUARTILES: Final = (0.25, 0.75)
 
 

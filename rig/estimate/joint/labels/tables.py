@@ -43,7 +43,7 @@ from rig.simd.memory import CACHE_LINE, address_of
 from rig.simd.vectors import LANES
 
 LIGHTS: Final = 2
-"""Stripe brightnesses that are tried."""
+"""Stripe brightnesses of which the likelier one counts."""
 WEIGHT_LIMIT: Final = 32767
 """Largest weight: a count that would say more says this much."""
 IMPOSSIBLE: Final = np.float32(-1e9)
@@ -52,7 +52,9 @@ _NEAR, _FAR = 0, 1
 
 
 class LabelTables(NamedTuple):
-    """See the module. P: pixels of a row, V: vectors of pixels that hold labels, the first one being pixel FAR_PX.
+    """Tables of all bands and columns, see the module.
+
+    P: pixels of a row, V: vectors of pixels that hold labels, the first one being pixel FAR_PX.
 
     at: int32 (bands, columns, VARIANTS), index of the table, -1 where there is none.
     edge: int16 (tables, P), weight of a count behind the stripe. edge_sum: float32 (tables, P), nats per exposure of
@@ -156,7 +158,7 @@ def fill_tables(
 
 @numba.njit(cache=True, nogil=True)
 def mark_rows(place: NDArray[np.int16], hot: NDArray[np.bool_], side: int, band_rows: int, tables: LabelTables) -> None:
-    """Fill MEND of the rows: their tables weigh pixels that they do not have, or that are hot."""
+    """Set MEND of rows whose tables weigh pixels that the rows do not have, or that are hot."""
     for c in range(place.shape[0]):
         for y in range(place.shape[1]):
             here = place[c, y]
@@ -276,7 +278,7 @@ def _weight(value):  # type: ignore[no-untyped-def]
 
 
 BATCH: Final = LANES
-"""Rows that go through each part of the work together: what one waits for, the others fill."""
+"""Rows that go through each part of the work together: while one waits for a result, others go on."""
 SUMS_FROM: Final = LANES - 1
 """Sums up to and including a pixel belong to the next one: so they are written at whole vectors."""
 POSITION: Final = PHASES * LIGHTS * LANES

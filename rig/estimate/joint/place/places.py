@@ -38,14 +38,14 @@ CLEAR_SD_PX: Final = 0.2
 BESIDE_PX: Final = 5, 6
 """Pixels to either side, from and to, that show how much of a halo is under a line, and nothing of the line."""
 BLIND_FLUX: Final = np.float32(3.0)
-"""A pixel with so much ambient light fires in 95 % of all frames and shows no more; so does one not to be used."""
+"""Ambient light of a pixel that fires in 95 % of all frames and shows nothing; pixels not to be used have more."""
 LEAST_FRAMES: Final = 2.0
-"""With fewer, light beside a line in a halo is told so badly that the line seems far too narrow."""
+"""With fewer frames light beside a line in a halo is told so badly that the line seems far too narrow."""
 FEW_FRAMES: Final = 3.0
 """Up to so many frames counts are taken as they are: the flux of a full pixel would be a guess."""
 DARK_FRAMES: Final = 1.5
 FEW_FRAMES_FLUX: Final = 0.5
-"""A pixel of FEW_FRAMES is taken to be full from here on."""
+"""Flux from which on a pixel of FEW_FRAMES or fewer is taken to be full."""
 
 
 class Places(NamedTuple):
@@ -144,7 +144,7 @@ Counts = NDArray[np.unsignedinteger[Any]]
 TAPS: Final = 2 * REACH_PX + 1
 """Pixels around a stripe that are looked at; EIGHT are fetched."""
 MOST_FLUX: Final = np.float32(20.0)
-"""In more light no pixel stays dark in a thousand million exposures; ambient light of pixels that there are not."""
+"""Largest flux: no brighter pixel stays dark in 10^8 exposures. Pixels that do not exist get it as ambient light."""
 _TILE: Final = 16
 
 

@@ -136,7 +136,7 @@ def pool_amplitude(
 def pool_places(
     places: Places, reaches: tuple[int, ...], enough: float, first_row: int, last_row: int, moved: Float32, sd: Float32
 ) -> None:
-    """By how far in x each stripe is to move, and the standard deviation of where it is then, in px.
+    """Fill moved, by how far in x each stripe is to move, and sd, the standard deviation of its place then, in px.
 
     reaches: sizes of the neighbourhood, smallest first; the first one that knows `enough` (1/px^2) is taken.
     """
@@ -225,7 +225,7 @@ def join_pairs(
 
 @numba.njit(cache=True, nogil=True)
 def _join_row(at: tuple[int, int], width: int, here: int, step: int, share: float, known: float, out: int) -> None:
-    """One row, whose first stripe is element `here` of the copies; known: variance from which on stripes stay."""
+    """Join one row, whose first stripe is element `here` of the copies; known: variance from which on stripes stay."""
     one, none = zero_float32() + np.float32(1.0), zero_float32()
     quarter, sigmas, shared = np.float32(0.25), np.float32(SIGMAS * SIGMAS), np.float32(share)
     enough = np.float32(known)
