@@ -23,6 +23,7 @@ WORD_BYTES: Final = 8
 CHUNK: Final = 256
 """Words of a frame that are counted together; their planes fill half of a 32 KiB cache."""
 PLANES: Final = 8
+"""Bit planes of a counter."""
 MOST_FRAMES: Final = (1 << PLANES) - 1
 """Frames that a set of planes can count."""
 PAIR_FRAMES: Final = 3

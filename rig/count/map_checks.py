@@ -30,6 +30,7 @@ POINTS: Final = 512
 VOLUME_POINTS: Final = 8192
 """Points of a sweep whose counts are kept."""
 FEWEST_POINTS: Final = 128
+"""Points below which a check says nothing."""
 APART_PX: Final = 6.0
 """The line's motion between a point's column and its partner: more than the line is wide."""
 LIMIT: Final = 4.0
@@ -40,12 +41,15 @@ LEAST_FOLLOWING: Final = 0.25
 """Least light in common with the other column, over that with the next row. Scenes have 0.8 and more, clutter such as
 fences half of it; columns that do not follow one another have none."""
 SATURATED: Final = 0.99
+"""Share of ones among all pixels and frames from which on a map is full."""
 DIMMEST: Final = 0.1
 """Least mean rate of a pixel, over that of all, that its noise is reckoned with."""
 SURE: Final = 0.9
+"""Confidence of answers that must have light."""
 GROUPS: Final = 8
 """Groups of sure answers by distance: wrong ones are mostly wrong together, as one surface that is not there."""
 LEAST_CONTRAST: Final = 0.5
+"""Mean light at sure answers above that behind them, in standard deviations: see the module."""
 LINE_PX, BEHIND_PX = (-1, 1), (3, 9)
 """Pixels from an answer, away from the near side, that hold its light, and light behind it."""
 
@@ -55,6 +59,7 @@ ORDERS: Final = {
     "the bytes of 32-bit words": "bytes as they lie along the row",
     "the bytes of 64-bit words": "bytes as they lie along the row",
 }
+"""Wrong orders of pixels that are tried, each with the order that is expected."""
 
 
 class Points(NamedTuple):

@@ -21,6 +21,7 @@ MAX_COLUMN_GAP: Final = 2
 """Stripes of columns farther apart than this are not joined to one surface."""
 SPACING_TOLERANCE_PX: Final = 1.0
 SPACING_SIGMAS: Final = 3.0
+"""Stripes lie on one surface where their spacing is that of equal depth within these."""
 
 
 @numba.njit(cache=True, nogil=True)

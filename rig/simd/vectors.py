@@ -19,6 +19,7 @@ from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
 
 LANES: Final = 16
+"""Numbers of a vector."""
 
 _INT32 = ir.IntType(32)
 intrinsic_of: Any = intrinsic

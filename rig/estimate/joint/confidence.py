@@ -120,7 +120,7 @@ def count_neighbours(distance: NDArray[np.float32], first_row: int, last_row: in
         at, to, width = signed_address(copy), signed_address(out.number), copy.shape[1]
         for y in range(band, end):
             _count_row(at, (y - band + MARGIN) * width + LANES, width, to, (y + AROUND) * width + LANES)
-        copy[:1] = 0.0  # it lives until here
+        copy[:1] = 0.0  # kept alive up to here: only the address is used above
 
 
 @numba.njit(cache=True, nogil=True)
@@ -253,7 +253,7 @@ def confidences(
     been counted before.
     """
     nothing = np.float32(np.nan)
-    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
+    # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
     scales, lights, hazes, rests = places.scale, places.light, places.haze, places.rest
     number, margins, columns = neighbours.number, answer.margin, x_px.shape[1]
     # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
@@ -292,7 +292,7 @@ def confidences(
                     confidence[y, c] = 0.0
                     signal[y, c] = haze[y, c] = sd_px[y, c] = nothing
         distance[:1] = light[:1] = placed[:1] = 0.0
-    # They live until here: what is known by its address alone would be freed.
+    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
     lines[:1], pairs[:1] = 0.0, 0
 
 

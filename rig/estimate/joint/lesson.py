@@ -36,6 +36,7 @@ D: Final = 1.427
 POOLED: Final = 25.0
 """Answers whose light counts as one: about half of the neighbours that it is pooled over lie on the same surface."""
 LEAST_Z: Final = 0.05
+"""Least z, where a stripe shows no light."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -163,7 +163,7 @@ def along_rows(
     for row in range(first_row, last_row):
         at = row * columns * labels
         _along_row(address_of(cost) + at, address_of(message) + at, columns, labels, penalties, _paths_in(memory))
-    memory[:1] = 0  # it lives until here
+    memory[:1] = 0  # kept alive up to here: only the address is used above
 
 
 @numba.njit(cache=True, nogil=True)
@@ -247,4 +247,4 @@ def along_columns(
         costs, messages = address_of(cost) + at, address_of(message) + at
         _go_down(costs, messages, rows, row_bytes, labels, count, penalties, paths)
         _go_up(costs, messages, rows, row_bytes, count, penalties, paths, column, desk)
-    memory[:1] = desk_bytes[:1] = 0  # they live until here
+    memory[:1] = desk_bytes[:1] = 0  # kept alive up to here: only the address is used above

@@ -226,7 +226,7 @@ def sum_blocks(
                 _copy_lines(counts, still, place, x0, sweep.u.shape[1], number, lines, spare)
             at = 4 * pixels * (by * across + bx)
             sum_lines(table, inner, readable, clear_at + 4 * clear[0].size * bx, pixels, to_ones + at, to_expected + at)
-    # They live until here: what is known by its address alone would be freed.
+    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
     lines[0, 0] = ends[0] = 0
     limits[0, 0] = spare[0, 0, 0] = frames[0] = 0.0
 
@@ -317,7 +317,7 @@ def _clear_beside(sweep: Sweep, state: RowState, y: int, c: int, start: int, sid
 
     Straight lines between every HAZE_STEP pixels. Pixels without a ray have that of the nearest one with a ray.
     """
-    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
+    # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
     u, v, profile, w_lo, per_w = sweep.u, sweep.v, state.profile, state.w_lo, state.per_w
     px, py, pz = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]
     first, last = with_rays(u, y, 0, u.shape[1] - 1)

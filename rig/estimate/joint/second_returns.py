@@ -105,7 +105,7 @@ def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, las
                     if sure > out.sure[by, bx]:
                         out.distance[by, bx] = i - (pixels - 1 if side > 0 else 0)
                         out.sure[by, bx], out.haze[by, bx] = sure, more
-    three[:1] = 0.0  # it lives until here: what is known by its address alone would be freed
+    three[:1] = 0.0  # kept alive up to here: numba would free what only its address still uses
 
 
 @numba.njit(cache=True, nogil=True)
@@ -191,7 +191,7 @@ def measure_seconds(
             x, frames = int(np.rint(place)), np.float32(n_frames[c])
             at = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, at)
-            # Of both sides: what the lesson of the haze took for haze may be light of the second surface itself.
+            # Mean of both sides: part of the learned haze may be light of the second surface itself.
             near, far = max(at - HAZE_STEP // 2, lo), min(at + HAZE_STEP // 2, hi)
             before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, near, c, path_p, strength)
             before_too, behind_too, _, _, _, _, _ = fluxes_at(sweep, state, y, far, c, path_p, strength)

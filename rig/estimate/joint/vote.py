@@ -66,7 +66,7 @@ def new_ballots(rows: int, columns: int) -> Ballots:
 @numba.njit(cache=True, nogil=True)
 def collect(answer: LabelAnswers, first_column: int, last_column: int, out: Ballots) -> None:
     """The ballots of columns first_column..last_column-1."""
-    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
+    # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
     labels, margins, label, whole, votes = answer.label, answer.margin, out.label, out.whole, out.votes
     at_label, at_margin, to_label = signed_address(labels), signed_address(margins), signed_address(label)
     to_whole, to_votes, half = signed_address(whole), signed_address(votes), np.float32(0.5)
@@ -138,7 +138,7 @@ def vote(ballots: Ballots, cost: NDArray[np.uint8], first_row: int, last_row: in
     for y in range(first_row, last_row):
         _elect_row(hall, y)
         _settle_row(hall, y, min(y + REACH, rows - 1) - max(y - REACH, 0) + 1)
-    memory[0, 0] = elected[0] = share[0] = 0  # they live until here
+    memory[0, 0] = elected[0] = share[0] = 0  # kept alive up to here: only the address is used above
 
 
 @numba.njit(cache=True, nogil=True)

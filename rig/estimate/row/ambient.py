@@ -14,6 +14,7 @@ from rig.estimate.row.likelihood import FLUX_MAX
 from rig.geometry.windows import SweepGeometry
 
 NEIGHBOURHOOD_PX = 31
+"""Side of the square of pixels whose mean a pixel is drawn to."""
 DEFECT_FLUX = float(FLUX_MAX)
 """Ambient given to pixels not to be used: one that is always lit says the same of every hypothesis, nothing."""
 HOT_SIGMA = 6.0

@@ -30,11 +30,13 @@ WIDTH_EVIDENCE = 3.0
 """Natural logarithm of the odds from which the width moves."""
 FIRST_ROUNDS = 8
 LAST_ROUNDS = 3
+"""Rounds of a first sweep: with a quarter of the lines and the line's width, then with all lines."""
 MOST_TRUST = np.float32(0.98)
 """Largest trust in what neighbours say of a stripe, however sure they are: its own row may know better."""
 LEVELS = 14
 """Sums per profile bin of an expectation, see `learn_rows`."""
 PIECES = 4
+"""Pieces that lines are summed in, whatever the number of threads."""
 AMPLITUDE_SPAN = 3.4
 """Natural logarithm of the ratio of the largest amplitude to the smallest: a factor of 30."""
 EVEN_SHARE = 0.25
@@ -42,6 +44,7 @@ EVEN_SHARE = 0.25
 PRIOR_PHOTONS = 100.0
 """Weight of the fitted exponential against each bin's own counts."""
 START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
+"""Extinctions that a first sweep is begun with: clear air to dense fog."""
 
 
 @dataclass(frozen=True, slots=True)

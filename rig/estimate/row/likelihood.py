@@ -20,7 +20,7 @@ or behind it, or its haze ends between two pixels and nothing shines there. With
 
 `row_scores` is the log-likelihood, `row_posterior` the sum over amplitudes, `mode_of` the answer: read them in this
 order. Arrays of a row are float32 (L,), scores float32 (M, L). Where `before`, `behind`, `scale` and the priors come
-from is told in `rig.estimate.row.inputs` and `rig.estimate.row.model`. The one approximation is `logit_table`.
+from is told in `rig.estimate.row.inputs` and `rig.estimate.row.model`. Only `logit_table` and LOST approximate.
 
 `rig.estimate.search` and `rig.estimate.joint.labels` are fast forms of this and are tested against it.
 tests/unit/rig/estimate/row/test_likelihood.py holds this module itself against direct sums, in 50 digits and float64.
@@ -35,14 +35,17 @@ from numpy.typing import NDArray
 Real = float | np.floating[Any]
 
 FLOOR: Final = 1e-3
-"""Probability e of a pixel that does not follow the model (physics of defects: 2-4 % of real pixels are defective)."""
+"""Probability e that a pixel does not follow the model; 2 to 4 % of the pixels of real sensors are defective."""
 EXPONENT_LOW: Final = -21
 EXPONENT_HIGH: Final = 8
 CELL_BITS: Final = 8
+"""Octaves of flux that `logit_table` spans, and bits of its cells within an octave."""
 TABLE_BASE: Final = np.uint32((127 + EXPONENT_LOW) << CELL_BITS)
 TABLE_SHIFT: Final = np.uint32(23 - CELL_BITS)
+"""Where the exponent and first mantissa bits of a float32 begin to count cells."""
 FLUX_MIN: Final = np.float32(2.0**EXPONENT_LOW)
 FLUX_MAX: Final = np.float32(2.0**EXPONENT_HIGH * 0.999)
+"""Photons per exposure and pixel that the table begins and ends with."""
 LABEL_PX: Final = 0.25
 """Spacing of the sub-pixel positions around the most probable pixel."""
 LABELS: Final = 13

@@ -20,9 +20,12 @@ from numpy.typing import NDArray
 from rig.estimate.row.likelihood import LABEL_PX, LABELS
 
 BINS = 64
+"""Bins of path inverse depth of the profiles."""
 AMPLITUDES = 4
+"""Stripe amplitudes that are learned, with their probabilities."""
 EXTINCTION_MAX_PER_M = 5.0
 HALO_NODES = 12
+"""Path inverse depths at which the halo is learned."""
 HALO_REACHES_PX = (8.0, 16.0, 32.0, 64.0, 128.0)
 """Reaches of the exponentials that make up a halo: no line is as wide, and the last one is even over most windows."""
 OPTICAL_DEPTH_MAX = 50.0

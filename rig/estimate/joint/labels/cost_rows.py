@@ -311,7 +311,7 @@ def fill_costs(
     room = Fitted(b.constant, b.edge)
     place_at, out_at, counts_at = signed_address(place), signed_address(out), signed_address(counts)
     window, in_bytes = counts.shape[2], counts.itemsize == 1
-    # Of no label are pixels beyond the last vector of any table, and the taps of that; halos weigh all.
+    # Pixels beyond the last vector of any table and its taps belong to no label; only halos weigh them.
     read = pixels
     if halo.weight.size == 0 and tables.used.size > 0:
         read = min(pixels, -(-(FAR_PX + LANES * int(tables.used.max()) + ways.reach) // LANES) * LANES)

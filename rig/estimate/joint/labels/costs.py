@@ -60,6 +60,7 @@ FRAMES_OVER_HALF_MORE: Final = 4
 LOOKED_AT: Final = 32
 """Number of columns, and of rows, whose rise decides the units of all."""
 QUARTILES: Final = (0.25, 0.75)
+"""Shares of the learned amplitudes below those that the costs try."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

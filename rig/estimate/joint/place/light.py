@@ -128,7 +128,7 @@ def measure_light(
             _measure(at + 4 * c, width, taps_at, ambient_at + 8 * c, bin_at + 8 * c)
         for i in range(len(found)):
             copy_floats(at + 4 * width * (_LIGHT + i), found[i] + 4 * columns * y, columns)
-    # They live until here: what is known by its address alone would be freed.
+    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
     spare[:1] = bins[:1] = taps[:1] = lines[:1] = 0.0
     ambient_places[:1] = bin_places[:1] = 0
 

@@ -129,7 +129,7 @@ def pool_amplitude(
                 own = load_float32(at, c) / larger_float(load_float32(at, width + c), _LEAST)
                 store_float32(at, c, smaller_float(larger_float(own, faintest), brightest))
             copy_floats(at, amplitude + 4 * columns * y, columns)
-    sums[:1] = 0.0  # it lives until here: what is known by its address alone would be freed
+    sums[:1] = 0.0  # kept alive up to here: numba would free what only its address still uses
 
 
 @numba.njit(cache=True, nogil=True)
@@ -160,7 +160,7 @@ def pool_places(
                     break
             copy_floats(to + 8 * (width - 2 * LANES), to_moved + 4 * columns * y, columns)
             copy_floats(to + 12 * (width - 2 * LANES), to_sd + 4 * columns * y, columns)
-        # They live until here: what is known by its address alone would be freed.
+        # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
         distance[:1] = score[:1] = known[:1] = 0.0
     lines[:1] = 0.0
 
@@ -218,7 +218,7 @@ def join_pairs(
             _join_row(around, width, (y - band + MARGIN) * width + LANES, step, share, 1.0 / enough, at)
             copy_floats(at, to_distance + 4 * columns * y, columns)
             copy_floats(at + 4 * width, to_sd + 4 * columns * y, columns)
-        # They live until here: what is known by its address alone would be freed.
+        # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
         places[:1] = sds[:1] = 0.0
     lines[:1] = 0.0
 

@@ -113,7 +113,7 @@ def score_places(
             _score(at + 4 * c, width, known, y * columns + c, taps_at, ambient_at + 8 * c, shares_at + 8 * c, side)
         copy_floats(at + 4 * width * _SCORE, to_score + 4 * columns * y, columns)
         copy_floats(at + 4 * width * _KNOWN, to_known + 4 * columns * y, columns)
-    # They live until here: what is known by its address alone would be freed.
+    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
     spare[:1] = taps[:1] = lines[:1] = 0.0
     ambient_places[:1] = share_places[:1] = 0
 
