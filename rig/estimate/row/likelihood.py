@@ -42,7 +42,7 @@ CELL_BITS: Final = 8
 """Octaves of flux that `logit_table` spans, and bits of its cells within an octave."""
 TABLE_BASE: Final = np.uint32((127 + EXPONENT_LOW) << CELL_BITS)
 TABLE_SHIFT: Final = np.uint32(23 - CELL_BITS)
-"""Where the exponent and first mantissa bits of a float32 begin to count cells."""
+"""A float32 shifted right by TABLE_SHIFT bits, less TABLE_BASE, is the number of its cell."""
 FLUX_MIN: Final = np.float32(2.0**EXPONENT_LOW)
 FLUX_MAX: Final = np.float32(2.0**EXPONENT_HIGH * 0.999)
 """Photons per exposure and pixel that the table begins and ends with."""
