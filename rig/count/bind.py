@@ -8,7 +8,8 @@ every sweep and used in the next one. So a frame's column depends on earlier fra
 
     no sweep --scan marker--> sweep 0 --scan marker: its clock is fitted--> sweep 1 --> ...
 
-A compiled walk (`rig/count/bind_kernels.py`) places the frames; Python runs once a block and where a sweep begins.
+Times are whole numbers of 1 / UNITS_PER_TICK ticks (int64), columns float64, bins int32 (`BoundFrames`). A compiled
+walk (`rig.count.bind_kernels`) places the frames; Python runs once a block and where a sweep begins.
 
 The lit frames of a sweep run through its columns in order. One that would fall back to a column already left, as it can
 by the residual where a marker corrects the way from the one before, is not used.
@@ -40,7 +41,7 @@ column is then the same to the last bit in whatever block it comes. Good for 200
 CARRIED = np.dtype(
     [(name, np.int64) for name in ("sweep", "anchor_time", "anchor_point", "edges", "wrong_way", "column", "in_column")]
 )
-"""What the walk takes from block to block.
+"""State that the walk carries from block to block.
 
 sweep: the one that runs, -1 before the first marker. anchor_time, anchor_point: the latest marker, in units and in
 points since the first sweep; point -1: none yet. edges: markers of the sweep so far. wrong_way: as in `SweepClock`.
@@ -50,12 +51,12 @@ column, in_column: the column that the sweep has come to, -1 before the first, a
 
 @dataclass(frozen=True, slots=True)
 class BoundFrames:
-    """Where the frames of a block belong; one entry per frame.
+    """Sweep, direction, column and bin of the frames of a block; one entry per frame.
 
     sweep: int32, -1 before the first marker. direction: int8, +1 where the command rises, -1 where it falls, 0 unknown.
     column: float64, fractional column at the middle of the exposure; NaN before the first marker, continued linearly
-    outside the lit part. bins: int32, column index, BIN_DARK or BIN_UNUSABLE. starts: index 0 and
-    those of the frames with which a sweep begins.
+    outside the lit part. bins: int32, column index, BIN_DARK or BIN_UNUSABLE. starts: indices of frames, 0
+    and those with which a sweep begins.
     """
 
     sweep: NDArray[np.int32]
@@ -67,15 +68,15 @@ class BoundFrames:
 
 @dataclass(frozen=True, slots=True)
 class SweepClock:
-    """What the markers, or the blanking patterns, of one finished sweep say.
+    """Clock of one finished sweep, from its markers or blanking patterns.
 
     clock_error: relative excess of the scanner's clock over nominal, in the SPAD's time. residual_columns: largest
-    distance of a marker from the fitted line, in columns; NaN where there were fewer than two markers. Of blanking
-    patterns: of the one behind the sweep from the line of those before it, or its standard deviation where that is
-    more; NaN where it was not found. markers: how many of either it rests on. first_frame,
-    end_frame: frame numbers from this sweep's scan marker to the next one's. wrong_way: lit frames whose direction
-    level was not the plan's. detection: chance that a blanking pattern as bright as this sweep's is found, 0 where it
-    was not; None: bound by markers.
+    distance of a marker from the fitted line, in columns; NaN where there were fewer than two markers. With blanking
+    patterns it is the distance of the pattern behind the sweep from the line of those before it, or its standard
+    deviation where that is more; NaN where it was not found. markers: number of markers or patterns that the clock
+    rests on. first_frame, end_frame: frame numbers from this sweep's scan marker to the next one's. wrong_way: lit
+    frames whose direction level was not the plan's. detection: chance that a blanking pattern as bright as this sweep's
+    is found, 0 where it was not; None: bound by markers.
     """
 
     sweep: int
@@ -98,7 +99,7 @@ class SweepClock:
 
 
 class PlanTerms(NamedTuple):
-    """What the walk needs of a plan; arrays (legs,). most_in_column: frames that a column may use."""
+    """Numbers of a plan for the walk; arrays (legs,). most_in_column: frames that a column may use."""
 
     columns: int
     column_s: float
@@ -112,7 +113,7 @@ class PlanTerms(NamedTuple):
 
 
 class BlockTerms(NamedTuple):
-    """What the walk needs of a header. start_ticks: from the run's first frame. middle: of an exposure, in units."""
+    """Numbers of a header for the walk. start_ticks: from the run's first frame. middle: of an exposure, in units."""
 
     sweep: int
     start_ticks: int
@@ -215,7 +216,7 @@ class FrameBinder:
         return bool(gone + spare < number * self._plan.sweep_points - int(now["anchor_point"]))
 
     def _pass_over(self, at: int, places: Places, header: BlockHeader) -> None:
-        """Leave out a frame that names a wrong sweep. Raises ProtocolError where that is no accident any more."""
+        """Leave out a frame that names a wrong sweep. Raises ProtocolError after MOST_OUT_OF_TURN such frames."""
         self._passed_over += 1
         if self._passed_over > MOST_OUT_OF_TURN:
             raise ProtocolError(
@@ -226,7 +227,7 @@ class FrameBinder:
         sweep[at], direction[at], column[at], bins[at] = int(self._carried["sweep"][0]), 0, np.nan, BIN_UNUSABLE
 
     def _make_room(self, n: int) -> None:
-        """For n more frames, should there be a marker in each of them."""
+        """Make room for n more frames, should there be a marker in each of them."""
         if n > len(self._records):
             self._records = np.empty(n, FRAME_RECORD)
         have = self._edges.shape[1]
@@ -268,7 +269,7 @@ class FrameBinder:
         return closed
 
     def _begin_in_light(self, at: int, record: np.void, terms: BlockTerms, header: BlockHeader) -> list[SweepClock]:
-        """As `_begin`, where the light has told at which frame sweeps begin and when their scan markers came."""
+        """Begin a sweep where the light has told at which frame sweeps begin and when their scan markers came."""
         assert self._light is not None, "asked for by the caller"
         now = self._carried[0]
         running, number = int(now["sweep"]), _sweep_named(record, terms)

@@ -1,24 +1,24 @@
-"""Writes marks and sweep numbers into the records of frames that carry none, from the blanking pattern in their light.
+"""Finds the sweeps of frames that carry no marks by the blanking pattern in their light, and writes their marks.
 
-    nothing known --a pattern, and the next one a sweep later--> sweep 0 --the pattern where it is expected--> sweep 1
-
-Scan markers lie on a straight line of time, which is fitted to all patterns found so far: one that is missing, because
-frames were lost or nothing was in the light's way, is taken from that line. A sweep begins, for those who count, with
-the frame at which its pattern has surely passed, just before the gate opens for the lit part. All of that depends on
-the frames before it only, not on the size of blocks, and never on the host's time or the device's word for its clock.
-
-Finds the blanking pattern in the ones of frames: where it begins, how sure that is, and how clearly it stands out.
-
-Model of the ones n_i in frame i, about a pattern that begins at t (in frames, frame i being exposed from i on):
+The pattern (`PatternSearch`). Model of the ones n_i in frame i, about a pattern that begins at t (in frames, frame i
+being exposed from i on):
 
     n_i = level + drift i + brightness g_i(t),     g_i = share of frame i's exposure with the gate open
 
-For every t it is fitted by least squares; the best t is where it explains most. Photons of the laser, of daylight and
-of the dark all scatter alike here, so nothing needs to be known about them. `score` is brightness over its standard
-deviation; what remains beyond the scatter of photons must be less than what the pattern explains, which tells it from
-other light that comes and goes. Both are checked against a simulation in tests/unit/rig/count/test_blanking.py.
+For every t it is fitted by least squares (float64); the best t is where it explains most. Photons of the laser, of
+daylight and of the dark all scatter alike here, so nothing needs to be known about them. `score` is brightness over its
+standard deviation; what remains beyond the scatter of photons must be less than what the pattern explains, which tells
+it from other light that comes and goes. tests/unit/rig/count/test_blanking.py checks both against a simulation.
 
-The straight line of time on which the scanner's scan markers lie, fitted to those that were found.
+The sweeps (`BlankingSync`). Scan markers lie on a straight line of time, which is fitted to all patterns found so far
+(`MarkerLine`): one that is missing, because frames were lost or nothing was in the light's way, is taken from that
+line.
+
+    nothing known --a pattern, and the next one a sweep later--> sweep 0 --the pattern where it is expected--> sweep 1
+
+A sweep begins, for those who count, with the frame at which its pattern has surely passed, just before the gate opens
+for the lit part. All of that depends on the frames before it only, not on the size of blocks, and never on the host's
+time or the device's word for its clock.
 """
 
 import logging
@@ -37,10 +37,10 @@ from rig.plan.scan_plan import MARGIN_FRAMES, MAX_CLOCK_ERROR, Blanking, ScanPla
 Array = NDArray[np.float64]
 
 LEAST_SCORE = 4.0
-"""Standard deviations from which on it may be the pattern: by chance in every other burst, but twice at the right
-distance in one of some ten thousand, which the pattern behind the first map then does not bear out."""
+"""Standard deviations from which on light may be the pattern. Chance brings one in every other burst, but two at the
+right distance in one of some ten thousand, and then the pattern behind the first map does not bear them out."""
 MOST_UNEXPLAINED = 1.0
-"""Most of what photons do not explain, as a share of what the pattern does. A pattern in the wrong place leaves 7."""
+"""Largest share, over what the pattern explains, of what photons do not. A pattern in the wrong place leaves 7."""
 LEAST_SHARE = 0.7
 """Share of a search's frames that must have been received."""
 EDGE_FRAMES = 2
@@ -199,7 +199,7 @@ class MarkerLine:
     sd: list[float] = field(default_factory=list)
 
     def add(self, index: int, place: float, sd: float) -> None:
-        """Take up one more."""
+        """Add one more scan marker."""
         self.index.append(index)
         self.place.append(place)
         self.sd.append(max(sd, LEAST_SD_FRAMES))
@@ -219,17 +219,20 @@ class MarkerLine:
 _log = logging.getLogger(__name__)
 
 SEARCH_S = 10.0
-"""A stream without two patterns a sweep apart for so long, sweeps apart, is given up."""
+"""Seconds, and three sweeps more, after which a stream is given up that shows no two patterns a sweep apart."""
 CLEAR_SCORE = 2 * LEAST_SCORE
-"""A pattern that stands out so clearly is one: light is not what is missing."""
+"""A pattern that stands out so clearly is surely one: where sweeps are not found, light is not what is missing."""
 ASIDE_PX = 64
-"""In the run-in the stripe is a little beside the window of the first column."""
+"""Pixels counted on both sides of the first column's window: in the run-in the stripe stands a little beside it."""
 
 
 @dataclass(frozen=True, slots=True)
 class SweepPlace:
-    """Where a sweep lies. frame: from which it counts. scan_frame: place of its scan marker, in frames. ratio: of the
-    scanner's clock to nominal, in the SPAD's time. found: its pattern; None: taken from the line of the others."""
+    """Place of a sweep among the frames.
+
+    frame: the first one that counts. scan_frame: place of its scan marker, in frames. ratio: of the scanner's clock to
+    nominal, in the SPAD's time. found: its pattern; None: the place is taken from the line of the others.
+    """
 
     number: int
     frame: int
@@ -245,8 +248,11 @@ class SweepPlace:
 
 @dataclass(frozen=True, slots=True)
 class SweepEnd:
-    """What the pattern behind a sweep says of it: relative clock error, distance of that pattern from where the ones
-    before it put it (or how surely it is known, where that is more), and how many patterns that rests on."""
+    """Figures of a finished sweep from the pattern behind it.
+
+    clock_error: relative. residual_frames: distance of that pattern from where the ones before it put it, or its
+    standard deviation where that is more. patterns: number of patterns that this rests on.
+    """
 
     clock_error: float
     residual_frames: float
@@ -312,11 +318,11 @@ class BlankingSync:
             self._give_up(header, last)
 
     def place(self, number: int) -> SweepPlace:
-        """Where the sweep of map `number` lies; it is forgotten with the end of the sweep."""
+        """Place of the sweep of map `number`; it is forgotten with the end of the sweep."""
         return self._places[number]
 
     def end(self, number: int) -> SweepEnd:
-        """What is known of that sweep, once the next one has begun."""
+        """Figures of that sweep; call it once the next one has begun."""
         del self._places[number]
         return self._ends.pop(number)
 

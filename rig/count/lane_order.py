@@ -1,4 +1,4 @@
-"""Counts of a row in lane order: what bit planes turn into with shifts and masks alone.
+"""Counts of a row in lane order: the order that bit planes turn into with shifts and masks alone.
 
 Lane i of pair q holds the bytes of pixels 8 i + 2 q and 8 i + 2 q + 1, as the bits of packed bytes lie. A row of counts
 is uint8 (PAIRS, lanes + 2 PAD, 2): PAD zero lanes on both sides of each pair's, so that the pair before and behind any
@@ -49,7 +49,7 @@ def place_of(x, lanes):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def places_of(x: NDArray[np.int64], lanes: int) -> NDArray[np.int32]:
-    """The same of many pixels (n,)."""
+    """Index of each of many pixels (n,) in a row of counts of so many lanes."""
     places = np.empty(x.shape[0], np.int32)
     for i in range(x.shape[0]):
         places[i] = place_of(x[i], lanes)
@@ -115,13 +115,13 @@ def read_planes(
 
 @numba.njit(inline="always")
 def _share(x, times):  # type: ignore[no-untyped-def]
-    """What is added to the count of pixel x before 2^times divide it: 0 to 2^times - 1 by turns."""
+    """Number added to the count of pixel x before it is divided by 2^times: 0 to 2^times - 1 by turns."""
     return ((x & 7) << times) >> 3
 
 
 @numba.njit(inline="always")
 def _fine_share(x, times, turn):  # type: ignore[no-untyped-def]
-    """Like `_share` in 2048 steps, others on every turn: what eight steps would leave of few counts is not their mean.
+    """Like `_share`, in 2048 steps and others on every turn: eight steps would not keep the mean of few counts.
 
     The multipliers are odd, so that 2048 pixels in a row, or turns, take every step once.
     """

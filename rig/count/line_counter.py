@@ -1,9 +1,8 @@
 """The counter of a rig with several lines: each frame is counted once, for one column of every line.
 
-Compiled counting for several lines at once: frames of a place are added once, each line's window is read from that.
-
-As `counting_kernels.add_runs`, whose parts it is made of. With four lines it takes a quarter of the additions that one
-count for each line would take.
+Frames of a place of the mirror are added once, by the parts of `rig.count.kernels.add_runs`, and each line's window is
+read from that: n lines take an n-th of the additions that a count for each line would take. Counts are unsigned
+integers (columns, rows, window), as of one line.
 """
 
 from dataclasses import replace

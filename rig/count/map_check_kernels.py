@@ -1,4 +1,13 @@
-"""Compiled part of `map_checks`: light that lines of counts have in common, and how smooth rows are in other orders."""
+"""Compiled part of `rig.count.map_checks`: light that lines of counts have in common, and how smooth rows are.
+
+With n ones of a pixel in K frames and r its usual rate, a line of counts k is turned into line-shaped excess,
+
+    z = (n - K r) / sqrt(K r),    e_k(j) = mean of z over 3 px around j - mean of z over 3 to 8 px to both sides
+
+and the light in common with a partner at pixel distance s is sum over j of e_0(j) (sum of e_k over j + s - LAGS_PX to
+j + s + LAGS_PX, less the mean of the same BESIDE_PX to either side). Smoothness is the sum of products of neighbouring
+pixels. Lines are int32 (3, points, window), results float64 (points, 2 + orders).
+"""
 
 from typing import Final
 
@@ -9,10 +18,10 @@ from numpy.typing import NDArray
 from rig.geometry.windows import MARGIN_PX, WORD_PX
 
 LAGS_PX: Final = 2
-"""A surface may lean by so much between the lines that are compared."""
+"""Pixels by which a surface may lean between the lines that are compared."""
 
 BESIDE_PX: Final = 9
-"""Light that is still in common so far from where the line should be is haze."""
+"""Pixels from where the line should be at which light that is still in common is haze."""
 
 
 @numba.njit(inline="always")

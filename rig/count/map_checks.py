@@ -8,7 +8,7 @@ line has moved about six pixels. A stripe is seen in all three, at places that t
 - Columns: it moves from column to column as the planes do.
 - Answers of estimators that know their confidence: an answer that is sure, 0.9 for one place of some 150, rests on
   seven nats. At most 7 x 7 lines have a say in it, so that each brings a seventh at least, which is a mean of half a
-  standard deviation: so much light more must stand at the answers than behind them, on lines that did not give them.
+  standard deviation: so much more light must stand at the answers than behind them, on lines that did not give them.
 
 Every limit is in standard deviations, taken from the points themselves, or follows from such a count; where points are
 too few for it a check says nothing.
@@ -26,10 +26,11 @@ from rig.geometry.windows import MARGIN_PX, WORD_PX, SweepGeometry
 Array = NDArray[np.float64]
 
 POINTS: Final = 512
-"""Of a sweep whose counts are not kept: their lines are."""
+"""Points of a sweep whose counts are not kept; only their lines are."""
 VOLUME_POINTS: Final = 8192
-"""Of a sweep whose counts are kept."""
+"""Points of a sweep whose counts are kept."""
 FEWEST_POINTS: Final = 128
+"""Points below which a check says nothing."""
 APART_PX: Final = 6.0
 """The line's motion between a point's column and its partner: more than the line is wide."""
 LIMIT: Final = 4.0
@@ -37,15 +38,18 @@ LIMIT: Final = 4.0
 FEWEST_ROWS: Final = 24
 """With fewer rows than this a mean over rows cannot be LIMIT deviations off."""
 LEAST_FOLLOWING: Final = 0.25
-"""Light in common with the other column, over that with the next row. Scenes have 0.8 and more, clutter as of fences
-half of it; columns that do not follow one another have none."""
+"""Least light in common with the other column, over that with the next row. Scenes have 0.8 and more, clutter such as
+fences half of it; columns that do not follow one another have none."""
 SATURATED: Final = 0.99
+"""Share of ones among all pixels and frames from which on a map is full."""
 DIMMEST: Final = 0.1
-"""Mean rate of a pixel over that of all, below which its noise is taken for that of so much."""
+"""Least mean rate of a pixel, over that of all, that its noise is reckoned with."""
 SURE: Final = 0.9
+"""Confidence of answers that must have light."""
 GROUPS: Final = 8
-"""Sure answers by distance: what is wrong is mostly wrong together, as one surface that is not there."""
+"""Groups of sure answers by distance: wrong ones are mostly wrong together, as one surface that is not there."""
 LEAST_CONTRAST: Final = 0.5
+"""Mean light at sure answers above that behind them, in standard deviations: see the module."""
 LINE_PX, BEHIND_PX = (-1, 1), (3, 9)
 """Pixels from an answer, away from the near side, that hold its light, and light behind it."""
 
@@ -55,6 +59,7 @@ ORDERS: Final = {
     "the bytes of 32-bit words": "bytes as they lie along the row",
     "the bytes of 64-bit words": "bytes as they lie along the row",
 }
+"""Wrong orders of pixels that are tried, each with the order that is expected."""
 
 
 class Points(NamedTuple):
@@ -103,7 +108,7 @@ class MapChecks:
         self._orders = _orders()
 
     def doubts(self, sweep: Any, intensity: NDArray[np.uint32], stripe: StripeTable) -> tuple[str, ...]:
-        """What speaks against a map, a sentence each that says what to look at; empty where nothing does.
+        """Doubts about a map, a sentence each that says what to look at; empty where nothing speaks against it.
 
         sweep: a `CountVolume`, or one with `checked`, the counts of the POINTS. stripe: the estimator's own answers.
         """
@@ -160,7 +165,7 @@ class MapChecks:
         return None
 
     def _compared(self, counts: "_Counts", chosen: NDArray[np.int64], usual: NDArray[np.float32]) -> Array:
-        """What `compare_lines` finds at chosen points."""
+        """Results of `compare_lines` at chosen points."""
         from rig.count.map_check_kernels import compare_lines
 
         geometry, points = self._geometry, counts.points
@@ -173,7 +178,7 @@ class MapChecks:
         return out
 
     def _sure(self, counts: "_Counts", stripe: StripeTable) -> tuple[int, NDArray[np.int64]]:
-        """Into how many groups the sure answers go, and which points they are at."""
+        """Number of groups that the sure answers go into, and the points they are at."""
         y, c = counts.points.row[0], counts.points.column[0]
         sure = np.flatnonzero((stripe.confidence[y, c] >= SURE) & (counts.exposures > 0).all(axis=0))
         return min(len(sure) // FEWEST_POINTS, GROUPS), sure
@@ -260,7 +265,7 @@ class _Counts:
 
 
 def _deviations(values: Array) -> float:
-    """By how many of its standard deviations a sum of independent values is above 0."""
+    """Standard deviations by which a sum of independent values is above 0."""
     squares = float((values**2).sum())
     return float(values.sum()) / np.sqrt(squares) if squares > 0 else 0.0
 

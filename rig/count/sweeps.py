@@ -42,7 +42,7 @@ class FrameCounts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepAccount:
-    """What is kept of a sweep when its counts are gone.
+    """Account of a sweep, kept when its counts are gone.
 
     direction: +1 where the mirror command rose, -1 where it fell; column indices mean the same commands both ways.
     residual_columns: largest distance of a marker from the sweep's clock line; synchronised: whether that and the clock
@@ -76,7 +76,7 @@ class SweepData(SweepAccount):
 
 @dataclass(frozen=True, slots=True)
 class SweepStart:
-    """With which sweep of a run its maps begin: number 0, but where the run is a part that was cut from a recording.
+    """First sweep of a run that becomes a map: number 0, but for a part that was cut from a recording.
 
     clock_ratio: as of `FrameBinder`. Frames of sweeps before it are not counted.
     """
@@ -148,7 +148,7 @@ class SweepAssembler:
             self._count_s += time.perf_counter() - begun
 
     def settle(self, blocks: int) -> None:
-        """Wait until none but the last `blocks` blocks, fewer than MOST_UNDER_WAY, will be read any more."""
+        """Wait until all blocks but the last `blocks`, fewer than MOST_UNDER_WAY, have been read."""
         begun = time.perf_counter()
         self._counter.settle(sum(list(self._adds)[-blocks:]) if blocks else 0)
         self._count_s += time.perf_counter() - begun
@@ -249,7 +249,7 @@ class SweepAssembler:
 
 
 def _warn(sweep: SweepData) -> None:
-    """Say what is wrong with a sweep: once, since a stream that is dropped from may have a gap in every block."""
+    """Log what is wrong with a sweep, once: a stream that loses frames may have a gap in every block."""
     if sweep.gaps:
         lost, gaps, first = sweep.frames.lost, len(sweep.gaps), sweep.gaps[0]
         _log.warning(

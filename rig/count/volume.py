@@ -1,7 +1,8 @@
 """Counts per column from packed frames: bits are added in bit-sliced form and never unpacked outside the window.
 
-How: `rig.count.kernels`. `SweepCounter` keeps the counts of a whole sweep; estimators that judge a column as soon as it
-is complete bring a counter of their own, which keeps less (`Counter`). What both note besides is in `FrameTally`.
+`rig.count.kernels` does the adding. `SweepCounter` keeps the counts of a whole sweep, unsigned integers (columns, rows,
+window); estimators that judge a column as soon as it is complete bring a counter of their own, which keeps less
+(`Counter`). What all of them note besides the counts is in `FrameTally`.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from rig.geometry.windows import WORD_PX
 from rig.threads import RowWorkers
 
 MOST_WIDTH_PX = WORD_PX * 256
-"""A row's words must fit one chunk of the counters."""
+"""Widest row: its words must fit one chunk of the counters."""
 BIN_DARK = -1
 """Bin of a frame with the gate low during the whole exposure."""
 BIN_UNUSABLE = -2
@@ -30,7 +31,7 @@ Counts = NDArray[np.unsignedinteger[Any]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepLayout:
-    """Which pixels of which column are counted.
+    """Pixels of each column that are counted.
 
     columns of `window` pixels from x0 (columns,) on, multiples of 64, on a sensor of rows x width pixels. exposures:
     frames nominally taken per column. used_px: pixels of each frame that are used; None: whole rows. dark: whether
@@ -66,7 +67,7 @@ class SweepLayout:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameTally:
-    """What every counter knows of a sweep besides the counts.
+    """Frames of a sweep, as every counter notes them besides the counts.
 
     n_frames: (columns,) int32, frames in each column's bin; 0 where none were received.
     column: (columns,) float64, mean fractional column of those frames, NaN where none.
@@ -135,11 +136,11 @@ class Counter(Protocol):
         ...
 
     def settle(self, under_way: int = 0) -> None:
-        """Wait until none but the frames of the last `under_way` calls of `add` will be read any more."""
+        """Wait until the frames of all but the last `under_way` calls of `add` have been read."""
         ...
 
     def finish(self) -> FrameTally:
-        """What the sweep gave; the counter must be `reset` before the next one."""
+        """The counted sweep; the counter must be `reset` before the next one."""
         ...
 
 

@@ -1,9 +1,10 @@
 """Depth on the camera grid: a pixel's column is interpolated between the stripes of neighbouring columns on its row.
 
-Columns that are lit together may take one and the same stripe for theirs: at most one of them is right.
+Depth is z in metres, float32 (rows, width), NaN where there is none (`depth_map`; the rule is in `rig.depth.kernels`).
 
-An estimator looks at one column at a time. Where windows of several lines overlap it sees the others' stripes too, and
-the brightest wins in each. So answers of one row and place of the mirror that coincide share what they are worth.
+With several lines, columns that are lit together may take one and the same stripe for theirs: an estimator looks at one
+column at a time, sees the others' stripes too where windows overlap, and the brightest wins in each. At most one of
+them is right. So answers of one row and place of the mirror that coincide share what they are worth (`share_claims`).
 """
 
 from dataclasses import replace
@@ -55,7 +56,7 @@ SAME_PX = 1.5
 
 
 def share_claims(stripes: StripeTable, grid: LineGrid) -> StripeTable:
-    """The table with confidences c of coinciding answers times c over the sum of theirs: of two that are as sure, half.
+    """The table with the confidence c of coinciding answers multiplied with c over their sum; equal ones are halved.
 
     Positions stay as they are.
     """

@@ -1,26 +1,23 @@
 """The fog meter: how dense the medium is and how much light it and the sun bring, from the counts of one map alone.
 
-The rows of a map whose stripe is beyond doubt say what lies before it and behind it; `rig.depth.fog_meter` says how.
-Nothing is carried on from map to map: a reading is that of its map, and the same whenever the map is estimated again.
-
-To the fit's error bars comes what no scatter shows: light scattered more than once flattens the decay all over the
-picture, so REST_SHARE of `rest` is added to the extinction's relative error. Where the fog lays a halo around the
-stripes (`halo`), its light falls off on both sides of them as haze would, and neither extinction nor veil is stated.
-Nor are they of several lines at once: the other lines' haze ends at stripes of their own, where is not known, and takes
-the form of the decay with it. 5 ms a map.
-
-The fog meter's fit: the decay of the haze before stripes and behind them, over the path of the light.
-
-With s the mean of the path lengths from scanner and camera, and G the geometry factor of `RowModel`,
+The rows of a map whose stripe is beyond doubt say what lies before it and behind it. With s the mean of the path
+lengths from scanner and camera in metres, and G the geometry factor of the haze (`rig.estimate.row.inputs`),
 
     flux = ambient + offset + haze G exp(-2 extinction s)           before the stripe
          = ambient + offset + rest haze G exp(-2 extinction s)      behind it
 
-is fitted by maximum likelihood of the counts, binned by s: haze, extinction, the share `rest` that was scattered more
-than once, and by what the learned ambient light is off.
+is fitted by maximum likelihood of the counts, binned by s (float64 sums (blocks, 2, bins, 4), see `add_clear_rows`):
+haze, extinction, the share `rest` that was scattered more than once, and by what the learned ambient light is off.
 
 Error bars are those of the sandwich, H^-1 (sum of g g^T) H^-1, g the likelihood's slope from each block of rows and
 columns: what the model leaves out shows as scatter between them, as in a jackknife, of which this is the first order.
+To them comes what no scatter shows: light scattered more than once flattens the decay all over the picture, so
+REST_SHARE of `rest` is added to the extinction's relative error.
+
+Limits. Nothing is carried on from map to map: a reading is that of its map, and the same whenever the map is estimated
+again. Where the fog lays a halo around the stripes (`halo` of the model), its light falls off on both sides of them as
+haze would, and neither extinction nor veil is stated. Nor are they of several lines at once: the other lines' haze ends
+at stripes of their own, where is not known, and takes the form of the decay with it.
 """
 
 import math
@@ -41,13 +38,13 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 LEAST_EXPOSURES: Final = 50.0
-"""Of a bin that takes part."""
+"""Least exposures of a bin that takes part."""
 STARTS_PER_M: Final = (0.0, 0.05, 0.15, 0.5, 1.5)
 STEPS: Final = 40
 REST_PRIOR: Final = 25.0
-"""Inverse variance of `rest` before any count: 0.2, so that a map without pixels behind its stripes is solvable too."""
+"""Inverse variance of `rest` before any count (sd 0.2), so that a map without pixels behind stripes is solvable too."""
 RIDGE: Final = 1e-11
-"""Keeps the inverse of what says the same twice, as haze that is even and ambient light do, positive."""
+"""Added to the diagonal: keeps the inverse positive where two numbers say the same, as even haze and ambient light."""
 FLUX_MIN: Final = 1e-7
 FLUX_MAX: Final = 50.0
 """Photons per exposure; between these all logarithms are finite."""
@@ -127,7 +124,7 @@ class _Data:
         return np.array([max(level, 0.0) / max(float(np.average(shape, weights=before)), 1e-9), extinction_per_m, 0, 0])
 
     def _light(self, value: Array) -> tuple[Array, Array, Array]:
-        """Shape of the haze, what of it each cell sees, and the flux."""
+        """Shape of the haze, the part of it that each cell sees, and the flux."""
         shape = self.gain * np.exp(np.minimum(-2.0 * value[1] * self.path_m, 50.0))
         part = np.where(self.behind, value[3], 1.0)
         return shape, part, np.clip(self.ambient + value[2] + value[0] * shape * part, FLUX_MIN, FLUX_MAX)
@@ -140,7 +137,7 @@ class _Data:
         )
 
     def prior(self, value: Array) -> Array:
-        """Its slope, downwards."""
+        """Slope of the weak prior, downwards."""
         return np.array([0.0, 1e-3, 0.0, REST_PRIOR]) * value
 
     def slopes(self, value: Array) -> tuple[Array, Array]:
@@ -160,8 +157,8 @@ RESOLVED_SIGMAS: Final = 3.0
 """A figure is stated where it is at least this many standard deviations above zero."""
 CLEAR: Final = 0.85
 CLEAR_PX: Final = 6.0
-"""Lines as certain as this, and pixels as far from their stripe, are read. With fewer and surer lines haze is told too
-thin, since at few exposures it is chance that makes a line sure; with more, stripes are taken for haze."""
+"""Lines as certain as this, and pixels as far from their stripe, are read. Surer lines alone would tell the haze too
+thin, since at few exposures it is chance that makes a line sure; among less sure ones stripes are taken for haze."""
 LEAST_LINES: Final = 30
 """Clear lines below which a map says nothing."""
 BLOCKS: Final = 4
@@ -175,9 +172,10 @@ is flatter by 25 to 40 % where `rest` is 0.35 to 0.45 (Mitsuba rows, docs/fog-me
 
 @dataclass(frozen=True, slots=True)
 class FogEstimate:
-    """What a map says of fog and light, each with its standard deviation; None where it is not resolved.
+    """Fog and light of a map, each with its standard deviation; None where it is not resolved.
 
-    visibility_m: 3.912 / extinction; two of its deviations more are what two of the extinction's less would be.
+    visibility_m: 3.912 / extinction; its standard deviation is half of what two standard deviations less of extinction
+    add to it.
     ambient_per_exposure: photons per pixel and exposure that are not the laser's: surfaces, airlight and dark counts,
     mean over the pixels read. veil_per_exposure: the laser's light that the medium sends back, per pixel just before
     the stripe, mean over the rows read; veil_to_signal: over their stripes' light.
@@ -235,7 +233,7 @@ def read_fog(sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: An
 
 
 def _dark_offset(sweep: Any, ambient: NDArray[np.float32], hot_flux: float) -> tuple[float, float] | None:
-    """By how much the dark frames lie above the learned ambient light, and the standard deviation; None without any."""
+    """Excess of dark frames over the learned ambient light, and its standard deviation; None without dark frames."""
     if sweep.dark_counts is None:
         return None
     frames = np.broadcast_to(sweep.n_dark if sweep.dark_frames is None else sweep.dark_frames, ambient.shape)
@@ -248,8 +246,8 @@ def _dark_offset(sweep: Any, ambient: NDArray[np.float32], hot_flux: float) -> t
 
 
 def _dark_alone(sums: Array, dark: tuple[float, float] | None) -> FogEstimate:
-    """What is stated where light that is no haze of the line's own lies on all that is read, a halo or that of other
-    lines: the ambient light, if dark frames tell of it.
+    """The ambient light alone, if dark frames tell of it: for maps where a halo or the haze of other lines lies on all
+    that is read.
     """
     if dark is None:
         return FogEstimate()

@@ -1,6 +1,12 @@
-"""Compiled step from the stripe table to a depth map on the camera grid.
+"""Compiled steps behind the stripe table: the depth map on the camera grid, and the sums of the fog meter.
 
-Compiled sums of the fog meter: what lies clearly before and clearly behind the stripes of a sweep.
+`fill_rows`: between the stripes xa and xb of columns a and b on one row, on one surface, a pixel at x has
+
+    inverse depth = (1 - f) p_a.(u, v, 1) + f p_b.(u, v, 1),    f = (x - xa) / (xb - xa)
+
+with planes p float64 (columns, 3) and rays u, v float32 (rows, width); inverse depth is float32 (rows, width).
+`add_clear_rows`: ones, exposures and exposures weighted with geometry factor and flux, of pixels clearly before and
+clearly behind the stripes of a sweep, float64 per block, side and bin of path.
 """
 
 from typing import Final
@@ -15,6 +21,7 @@ MAX_COLUMN_GAP: Final = 2
 """Stripes of columns farther apart than this are not joined to one surface."""
 SPACING_TOLERANCE_PX: Final = 1.0
 SPACING_SIGMAS: Final = 3.0
+"""Stripes lie on one surface where their spacing is that of equal depth within these."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -33,7 +40,7 @@ def fill_rows(
 ) -> None:
     """Write inverse depth and its confidence (rows, width) for pixels between stripes of neighbouring columns.
 
-    And the mirror's command there, from the columns' `commands`, where `command` has room for any.
+    Also writes the mirror's command there, from the columns' `commands`, unless `command` is empty.
 
     Two stripes of one row lie on one surface when their columns are at most MAX_COLUMN_GAP apart and their spacing is
     that of equal depth within 1 px + 3 sd. Between them the column is linear in x. The more confident pair wins.

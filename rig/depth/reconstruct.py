@@ -1,4 +1,4 @@
-"""From the counts of a sweep to its stripe table and depth map."""
+"""From the counts of a sweep to its map: stripe table, depth map, intensity, fog and doubts."""
 
 import time
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ class MapResult:
     """One reconstructed map: stripe table, depth_m (rows, width) float32 with NaN, intensity (rows, width) uint32.
 
     learned: the state that the estimator used, None where it learns nothing. doubts: what its own light has against it,
-    a sentence each (`map_checks`).
+    a sentence each (`rig.count.map_checks`).
     """
 
     stripe: StripeTable
@@ -132,6 +132,6 @@ class Reconstructor:
         return self.geometry.bound_to(self._model, commands, sweep.velocity_per_s)
 
     def _fog(self, sweep: FrameTally, stripe: StripeTable) -> FogEstimate:
-        """What the map says of the medium; nothing where its estimator learns none, or without a geometry."""
+        """Fog of the map; nothing where its estimator learns no haze, or without a geometry."""
         state = self.estimator.used
         return FogEstimate() if state is None or self._model is None else read_fog(sweep, stripe, self.geometry, state)

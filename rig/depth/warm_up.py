@@ -25,7 +25,7 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
     rng = np.random.default_rng(0)
     geometry = uncalibrated_geometry(ROWS, WORD_PX, COLUMNS)
     layout = SweepLayout(COLUMNS, ROWS, WORD_PX, geometry.x0, geometry.window, exposures, None, dark)
-    # What a prior compiles comes on top of what is compiled without one.
+    # A prior needs kernels beside those of an estimate without one.
     maker = create_estimator(estimator, 1, temporal_prior=True)
     counter = maker.counter(layout, geometry)
     bins = np.repeat(np.arange(-1 if dark else 0, COLUMNS, dtype=np.int32), exposures)

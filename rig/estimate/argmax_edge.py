@@ -1,10 +1,9 @@
-"""Estimators `argmax` (brightest pixel of the row, the naive reference) and `edge` (the report's).
+"""Estimators `argmax` (brightest pixel of the row, the naive reference) and `edge` (the report's), rows compiled.
 
-`argmax`: largest count inside the window, ties to the smallest x. `edge`: an exponential background fitted to the near
-side of the row, then the largest (count - background) weighted with the drop of the level from the 8 px before to the
-8 px behind. Both refine to sub-pixel with the two neighbours, and both are told nothing and learn nothing.
-
-Compiled rows of the simple estimators `argmax` and `edge`.
+`argmax`: the largest count inside the window, ties to the smallest x. `edge`: an exponential background is fitted to
+the near side of the row, then the largest (count - background) counts, weighted with the drop of the level from the
+8 px before to the 8 px behind. Counts are integers (columns, rows, window); answers float32 (rows, columns), refined
+to sub-pixel with the two neighbours. Both are told nothing and learn nothing.
 """
 
 from dataclasses import dataclass

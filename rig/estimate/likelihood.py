@@ -1,9 +1,9 @@
 """Estimator `likelihood`: maximum likelihood of 'haze, stripe, then less' on every row, told nothing of the medium.
 
-Search along a row: `rig.estimate.search.rows`; what it knows and how that is learned: `rig.estimate.row.model`,
-`rig.estimate.row.em`, `lessons`. The first map is counted whole and estimated twice (the first pass finds which pixels
-were quiet behind the stripe). Every later map is judged column by column while its frames come in, with what earlier
-maps taught: it depends on nothing inside itself.
+The likelihood itself: `rig.estimate.row.likelihood`; the search along a row: `rig.estimate.search.rows`; the model and
+how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.search.online_learning`. The first map
+is counted whole and estimated twice: the first pass finds which pixels were quiet behind the stripe. Every later map is
+judged column by column while its frames come in, under a model learned from earlier maps alone.
 """
 
 import numpy as np
@@ -65,7 +65,7 @@ class Likelihood:
         return stripes
 
     def judge(self, geometry: SweepGeometry, exposures: int, *, dark: bool) -> SearchTables:
-        """What the search under the present model reads; made once per model."""
+        """Tables of the search under the present model; made once per model."""
         assert self.model is not None, "the first map is learned from counts"
         return self._lessons.tables(LearningSetting(self.model, geometry, exposures, dark), self._workers)
 
@@ -101,7 +101,7 @@ class _LikelihoodCounter:
             self._counter.settle(under_way)
 
     def finish(self) -> CountVolume | SearchedSweep:
-        """What the sweep gave."""
+        """Counts of the sweep, or its stripes where its columns were judged on the way."""
         return self._present().finish()
 
     def _present(self) -> SweepCounter | ColumnJudge:

@@ -15,7 +15,7 @@ REACH = 2
 MEDIAN_EFFICIENCY = 1.2533
 """Standard deviation of a median over that of a mean, sqrt(pi / 2), for normal errors."""
 SURE = np.float32(0.999999)
-"""No answer is believed more than that where several are counted together."""
+"""Largest confidence of an answer where several are counted together."""
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,6 +1,7 @@
 """Stripe estimators by name: counts of a sweep in, a stripe table out.
 
-An estimator with the states that maps were once estimated with, one for each map: it gives the same bit for bit.
+`create_estimator` makes a fresh one. `recalling` makes one that is given the states that maps were once estimated with,
+one for each map, and so estimates these maps again bit for bit.
 """
 
 from collections.abc import Sequence
@@ -27,16 +28,16 @@ COUPLED = frozenset({"joint"})
 
 
 class Learned(Protocol):
-    """State that an estimator has learned; fog in it where the haze resolves it, else NaN."""
+    """State that an estimator has learned; its extinction is NaN where the haze does not resolve it."""
 
     @property
     def extinction_per_m(self) -> float:
-        """Extinction of the medium."""
+        """Extinction of the medium, 1/m."""
         ...
 
     @property
     def extinction_sd_per_m(self) -> float:
-        """Its standard deviation."""
+        """Standard deviation of the extinction, 1/m."""
         ...
 
     def arrays(self) -> "dict[str, NDArray[np.generic]]":
@@ -45,7 +46,7 @@ class Learned(Protocol):
 
 
 class Estimator(Protocol):
-    """What every estimator offers. used: the state the last map was estimated with, None where none is learned."""
+    """An estimator. used: the state the last map was estimated with, None where none is learned."""
 
     @property
     def used(self) -> Learned | None:
@@ -62,17 +63,14 @@ class Estimator(Protocol):
 
 
 class LearnsFromStream(Estimator, Protocol):
-    """What those in LEARNING offer besides."""
+    """An estimator out of LEARNING: its model can be set, to go on from a kept state."""
 
     model: Any
     """The state that the next map will be estimated with, None before a map that taught."""
 
 
 def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
-    """The estimator of a name in LEARNING that learned these states, to estimate the map of each again as with it.
-
-    It learns nothing.
-    """
+    """Estimator of a name in LEARNING that estimates each map with a state out of `learned`, and learns nothing."""
 
     return Recalled(_learning(name, threads, learns=False, temporal_prior=temporal_prior), learned)
 
@@ -100,7 +98,7 @@ def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool) ->
 
 
 class Recalled:
-    """Estimates each map with the state of its own, those behind the last with that of the last.
+    """Estimates each map with a state of its own; maps behind the last state are estimated with the last.
 
     of: an estimator that learns nothing by itself.
     """

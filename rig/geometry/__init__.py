@@ -1,3 +1,3 @@
-"""Where a stripe can lie: windows of every row and column from the calibration and the depth range, bent light sheets,
-lines of a fan.
+"""The geometry of a sweep: search windows of every row and column from calibration and depth range, bent light sheets,
+the columns of a fan of lines, and the stripe table.
 """

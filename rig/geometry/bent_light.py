@@ -3,7 +3,9 @@
 Windows, estimators and the joining of stripes take planes and rays (u, v, 1). So they are given rays bent sideways by
 what the bow does in the middle of the depth range: that is nearly the same for all columns that a pixel can see. What
 is left of it, and the delay of the rows, whose sign changes with the direction of the sweep, is below a pixel or two:
-the windows are wider by that, and the depth of a map is put right afterwards, exactly, from each pixel's command.
+the windows are wider by that (`beside_px`), and the depth of a map is put right afterwards, exactly, from each pixel's
+command (`BentLight.inverse_depth`). `calibration.model.light_sheet` has the formula of a bowed sheet. Rays are float32
+(rows, width), commands and sheets float64.
 """
 
 import math
@@ -20,15 +22,15 @@ Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 _SAMPLED_SHEETS = 4097
-"""Over the command range: between two of them a plane is linear to 1e-8 rad."""
+"""Sheets sampled over the command range: between two of them a plane is linear to 1e-8 rad."""
 _SAMPLED_COLUMNS = 9
 _SAMPLED_ROWS = 16
-"""So many columns, and every so manieth row, are looked at for what the bent rays leave."""
+"""So many columns, and one row in so many, are looked at for what the bent rays leave."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BentLight:
-    """What turns a map's commands into depth where the light is bent.
+    """Rays and sheets that turn a map's commands into depth where the light is bent.
 
     u, v: float32 (rows, width), true rays. commands: (columns,) of the columns. velocity_per_s: of the command during
     the sweep, negative where it fell. sheets: (samples, 10), what the kernel reads of the model.
@@ -42,10 +44,7 @@ class BentLight:
     velocity_per_s: float = 0.0
 
     def inverse_depth(self, command: Array, first_row: int = 0) -> Float32:
-        """Inverse depth where the mirror was bound to commands (rows, width) from a row on; NaN stays NaN.
-
-        30 ms for the bowed sheets of 512 x 512 pixels on two busy cores, 5 ms for late rows alone.
-        """
+        """Inverse depth where the mirror was bound to commands (rows, width) from a row on; NaN stays NaN."""
         from rig.geometry.kernels import bent_inverse_depth
 
         model, rows = self.model, slice(first_row, first_row + len(command))
@@ -67,7 +66,7 @@ def bent_light(model: RigModel, u: Float32, v: Float32, commands: Array) -> Bent
 
 
 def bow_per_rad(model: RigModel) -> float:
-    """How much the model's sheets bow."""
+    """Bow of the model's sheets, per radian; 0 for one that has none."""
     return float(getattr(model.scanner, "bow_per_rad", 0.0))
 
 
@@ -97,7 +96,7 @@ def bent_u(model: RigModel, u: Array, v: Array, depth_m: float) -> Array:
 def beside_px(
     model: RigModel, rays: tuple[Array, Array], bent: Array, commands: Array, depth_range_m: tuple[float, float]
 ) -> int:
-    """By how many pixels stripes stand beside where planes and bent rays have them, at most, within the depth range.
+    """Most pixels that stripes stand beside the place that planes and bent rays give, within the depth range.
 
     rays: u and v (rows, width); bent: u as of `bent_u`. For sweeps either way, as fast as the lag was measured.
     """

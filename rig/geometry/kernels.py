@@ -1,6 +1,9 @@
-"""Compiled search of the pixel interval that a depth range leaves on a row.
+"""Compiled geometry: the pixel interval that a depth range leaves on a row, and the depth of pixels on bowed sheets.
 
-Compiled depth of pixels on bowed sheets of light, see `calibration.model.light_sheet` for the formula.
+`row_windows`: inverse depth w = p.(u, v, 1) is monotone along a row, so that both ends of far <= w <= near are found by
+bisection; u, v float32 (rows, width), planes p float64 (columns, 3), ends int32 (rows, columns).
+`bent_inverse_depth`: Newton's steps from the plane on for the sheet of `calibration.model.light_sheet`; float64 within,
+inverse depth float32 (rows, width).
 """
 
 from typing import Final
@@ -63,7 +66,8 @@ def row_windows(
 
 
 NEWTON_STEPS: Final = 2
-"""From the plane on: they leave the rounding of float32, also where sheets bow ten times as much as a bad lens's."""
+"""Newton's steps from the plane on: they leave the rounding of float32, also where sheets bow ten times as much as a
+bad lens's."""
 
 
 @numba.njit(cache=True, nogil=True)

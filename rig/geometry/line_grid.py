@@ -18,9 +18,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineGrid:
-    """offsets: of the lines, in units of the mirror command. step: command from one place of the mirror to the next.
-    line, place: int32 (columns,), which line lights a column and where the mirror stands then. overlap: share of a
-    column's window that windows of other lines at the same place cover; 0 without a calibration.
+    """Line and place of the mirror that light each column of a map.
+
+    offsets: of the lines, in units of the mirror command. step: command from one place of the mirror to the next. line,
+    place: int32 (columns,). overlap: share of a column's window that windows of other lines at the same place cover; 0
+    without a calibration.
     """
 
     offsets: tuple[float, ...]
@@ -31,12 +33,12 @@ class LineGrid:
 
     @property
     def lines(self) -> int:
-        """How many there are."""
+        """Number of lines."""
         return len(self.offsets)
 
     @property
     def places(self) -> int:
-        """Of the mirror in a sweep."""
+        """Number of places of the mirror in a sweep."""
         return len(self.place) // self.lines
 
     def columns_at(self) -> NDArray[np.int32]:
@@ -46,7 +48,7 @@ class LineGrid:
         return columns
 
     def others(self, plane: Array) -> Array:
-        """Of each column the planes (columns, 3) of those that are lit together with it: (columns, lines - 1, 3)."""
+        """Planes of the columns that are lit together with each: (columns, lines - 1, 3); plane: (columns, 3)."""
         together = self.columns_at()[self.place]
         own = together == np.arange(len(self.place))[:, None]
         result: Array = plane[together[~own].reshape(len(self.place), self.lines - 1)]

@@ -1,6 +1,6 @@
-"""The stripe table: for every row and column where the laser line was seen, and how sure that is.
+"""The stripe table: where the laser line was seen on every row and column, how sure that is, and its errors.
 
-Errors of a map against a truth that a world or a test knows.
+All arrays are (rows, columns). The errors are against a truth that a world or a test knows.
 """
 
 from dataclasses import dataclass, fields
@@ -43,7 +43,7 @@ class StripeTable:
 
 
 MISSING_PX = 10.0
-"""What a missing answer is charged, where leaving answers out must not help."""
+"""Error charged for a missing answer, in px, where leaving answers out must not help."""
 
 
 def stripe_errors(x_px: NDArray[np.float32], true_x_px: NDArray[np.float32]) -> dict[str, float | None]:

@@ -1,8 +1,8 @@
-"""Where a column's stripe can lie: windows on every image row from the depth range, and the geometry of each pixel.
+"""Search windows of a column's stripe on every image row, from the depth range, and the geometry of each pixel.
 
 A light plane n.X = d meets the ray (u, v, 1) of a pixel at inverse depth w = (n.r)/d: along a row w is monotone in x,
-so the depth range becomes one interval of pixels. No rectification is assumed; with distortion, roll or tilted planes
-the interval simply moves from row to row.
+so the depth range becomes one interval of pixels, int32 (rows, columns). No rectification is assumed; with distortion,
+roll or tilted planes the interval moves from row to row.
 """
 
 from dataclasses import dataclass, replace
@@ -79,7 +79,7 @@ class SweepGeometry:
         return int(self.plane.shape[0])
 
     def reference_px(self) -> NDArray[np.float64]:
-        """Where each column's line would stand at the middle inverse depth, (rows, columns), as if without distortion.
+        """Position of each column's line at the middle inverse depth, (rows, columns) px, as if without distortion.
 
         Only its differences between neighbouring rows and columns matter; it may lie outside the picture.
         """

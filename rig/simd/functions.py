@@ -1,9 +1,11 @@
-"""Logarithms, powers of e and the error function of sixteen float32 at once: a call of the C library takes one.
+"""Logarithm, powers of e and 2, and the error function of LANES float32 at once: a call of the C library takes one.
 
-Likelihoods from scores: 2^x read off the bits of a bfloat16, which is linear between powers of two.
+`logarithm` and `exponential` split numbers into powers of two and mantissas; `error_function` is Abramowitz and Stegun
+7.1.28. Each states its error.
 
-A score is a whole number of units, 128 >> shift to the octave. A term is exact at whole octaves above
-`nothing_below`, elsewhere up to 6 % too large, 4 % on average.
+`powers` turns scores into likelihoods: a score is a whole number of units (int16), 128 >> shift to the octave, and
+2^(score / units) is read off the bits of a bfloat16, which is linear between powers of two. A term is exact at whole
+octaves above nothing, elsewhere up to 6 % too large, 4 % on average (`MEAN_EXCESS`).
 """
 
 import math
@@ -124,7 +126,7 @@ MEAN_EXCESS: Final = np.float32(1.040684)
 
 @numba.njit(inline="always")
 def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
-    """What to add to scores so that nothing is at 0, 127 octaves below each lane's best score or at the lowest."""
+    """Number to add to scores so that 0 stands for nothing: 127 octaves below each lane's best score, or the lowest."""
     return add_saturated(sub_saturated(zero_int16(), best), np.int16(np.int64(BIAS) >> shift))
 
 
@@ -139,5 +141,5 @@ def powers(scores, lift, shift):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def powers_in_order(scores, lift, shift):  # type: ignore[no-untyped-def]
-    """The same in order."""
+    """2^(score / units) as `powers` gives it, but lane by lane in order."""
     return from_bfloat16(larger(add_saturated(scores, lift), np.int16(0)) << shift)

@@ -1,10 +1,9 @@
-"""Lanes and numbers from memory and to it, named by its address.
+"""Reads and writes of lanes and numbers in memory that is named by its address, and arrays that begin at a cache line.
 
-Not as an array: numba counts references to every array that a compiled function is handed, and on the way through the
-functions of one image row that took 0.95 us, twenty times the work itself. Whoever takes an address (`address_of`)
-keeps the array alive and the index inside it; nothing here checks.
-
-Arrays that begin at a cache line: a vector of 32 bytes then never lies across two, which would be read twice.
+Addresses instead of arrays: numba counts references to every array that a compiled function is handed, and on the way
+through the functions of one image row that takes many times as long as the work itself. Whoever takes an address
+(`address_of`) keeps the array alive and the index inside it; nothing here checks. A vector of 32 bytes in an array that
+begins at a cache line (`aligned_zeros`) never lies across two lines, which would be read twice.
 """
 
 from typing import Any, Final

@@ -1,14 +1,12 @@
-"""What goes from lane to lane: shuffles, sums along the lanes, and masks with a bit for each lane.
+"""Operations across lanes: shuffles, sums along the lanes, masks with a bit for each lane, turned blocks of numbers.
 
-Reductions over the lanes of sixteen rows at once: one number a row, which then is one lane of the answer.
+Reductions (`largest_of_rows`, `totals_of_rows`) take LANES rows at once and give one number a row, which then is one
+lane of the answer. Row by row every step of a reduction would wait for the one before, and take as many instructions
+for one row as here for all.
 
-Taken row by row, every step of a reduction waits for the one before; and it takes as many instructions for one row as
-here for sixteen.
-
-Eight numbers from each of sixteen places, turned so that lane i of eight vectors holds those of place i.
-
-What lies around stripes is fetched in this way: row by row, as it lies in memory, with two instructions a stripe,
-instead of with two a number.
+`fetch_eights` and `spread_eights` take eight numbers from each of LANES places and turn them, so that lane i of eight
+vectors holds those of place i: the pixels around stripes are fetched in this way, with two instructions a stripe
+instead of two a number.
 """
 
 from collections.abc import Callable, Sequence

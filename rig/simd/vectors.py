@@ -1,11 +1,11 @@
-"""Sixteen lanes as one numba value: the vector arithmetic of the hot path, spelled out instead of hoped for.
+"""Sixteen lanes as one numba value: the vector arithmetic of the hot path, spelled out.
 
 LLVM's own vectoriser gives up on the search along a row (several short loops over one small buffer), so its kernels say
 what they mean: `Lanes` is an LLVM vector of 16 numbers, legalised to whatever the processor has (AVX2, AVX-512, NEON).
 Everything here is for code compiled with `numba.njit`; lanes live in registers and cannot leave a kernel. They come
 from memory and go there with `rig.simd.memory`; `rig.simd.shuffles` has what goes from lane to lane.
 
-Lanes of bfloat16, the upper halves of float32 numbers: two bytes with 8 bits of precision and all of the range.
+A bfloat16 is the upper half of a float32: two bytes with 8 bits of precision and all of the range.
 """
 
 import operator
@@ -19,13 +19,14 @@ from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
 
 LANES: Final = 16
+"""Numbers of a vector."""
 
 _INT32 = ir.IntType(32)
 intrinsic_of: Any = intrinsic
 _Signature = Any
 _Codegen = Callable[[Any, Any, Any, Any], Any]
 VectorCode = tuple[_Signature, _Codegen]
-"""What an intrinsic gives: its signature and what writes its LLVM code."""
+"""Result of an intrinsic: its signature, and the function that writes its LLVM code."""
 
 
 class Lanes(types.Type):
@@ -71,13 +72,13 @@ def splat(context: Any, builder: Any, lanes: Lanes, number_type: Any, number: An
 
 
 def place_list(indices: Iterable[int]) -> Any:
-    """Which elements a shuffle takes."""
+    """Indices of the elements that a shuffle takes, as an LLVM constant."""
     places = list(indices)
     return ir.Constant(ir.VectorType(_INT32, len(places)), places)
 
 
 def vector_name(vector: ir.VectorType) -> str:
-    """What LLVM calls a vector in the names of its intrinsics."""
+    """Name of a vector type in the names of LLVM's intrinsics."""
     return f"v{vector.count}" + ("f32" if isinstance(vector.element, ir.FloatType) else f"i{vector.element.width}")
 
 
@@ -309,7 +310,7 @@ def scaled(typing: Any, a: Any, weights: Any) -> VectorCode:
 _INT32_LANES = ir.VectorType(ir.IntType(32), LANES)
 
 UNPACKED: Final = (0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15)
-"""Which lane stands where after `from_bfloat16_unpacked`: the order that costs an x86 processor one instruction."""
+"""Order of the lanes after `from_bfloat16_unpacked`: the one that costs an x86 processor one instruction."""
 
 
 def _unpacked(builder: Any, bits: Any) -> Any:
@@ -334,6 +335,6 @@ def _upper_half(builder: Any, a: Any) -> Any:
 from_bfloat16 = conversion(FLOAT32, _as_float)
 """from_bfloat16(a): 16-bit patterns, the upper halves of float32 numbers, as those numbers."""
 from_bfloat16_unpacked = conversion(FLOAT32, _unpacked)
-"""from_bfloat16_unpacked(a): the same in the order UNPACKED."""
+"""from_bfloat16_unpacked(a): those numbers in the order UNPACKED."""
 to_bfloat16 = conversion(INT16, _upper_half)
 """to_bfloat16(a): upper halves of float32 lanes as 16-bit patterns."""

@@ -1,43 +1,38 @@
-"""Compiled: how probably an answer of `joint` lies within a pixel of a stripe, from three things that can be wrong.
+"""The stripe table of `joint`, compiled: light of each answer, and how probably it lies within a pixel of a stripe.
+
+Three things can be wrong with an answer, and each has its factor:
 
     confidence = erf(1 / (sqrt 2 WIDER sd))                    the stripe is farther off than it should be
                / (1 + exp(A - B margin + G apart))             another position is the right one
                / (1 + exp(C - D ln contrast' + hole            there is no stripe: haze ends, nothing shines
                           + g (E - F ln odds) + H ((1 - g)^2 missing + e unseen)))
 
-margin: by how much the next best place is worse, or what neighbours say for it where there was a vote, over UNITS of
-cost. apart: share of the pairs of opposite neighbours that put the answer elsewhere (`rig.estimate.joint.confidence`).
-contrast' = max(contrast + 3, 1), contrast: light that 3 x 3 neighbours on the surface have in common above the *whole*
-haze before the stripe, over its noise; where haze just ends an answer can lie a little before the end, and half of the
-haze would pass for light. hole: by how much contrast is below -6, 30 at most. odds: of answers around that agree to
-those that do not. They count as far as there is haze, g = k / (k + SOME_HAZE), k photons of it in all exposures: in
-clear air nothing but a stripe makes a margin, and small things, whose surroundings do not agree, are as sure as others.
+- margin: by how much the next best place is worse, or what neighbours say for this one where there was a vote, over
+  UNITS of cost. apart: share of the pairs of opposite neighbours that put the answer elsewhere (`apart_row`).
+- contrast: light that 3 x 3 neighbours on the surface have in common above the *whole* haze before the stripe, over its
+  noise; contrast' = max(contrast + 3, 1). Where haze just ends, an answer can lie a little before the end, and half of
+  the haze would pass for light. hole: by how much contrast is below -FAR_BELOW, 30 at most.
+- odds: of answers around that agree to those that do not. They count as far as there is haze, g = k / (k + SOME_HAZE),
+  k photons of it in all exposures: in clear air nothing but a stripe makes a margin, and small things, whose
+  surroundings do not agree, are as sure as others.
+- missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), light: photons of all that
+  contrast sums, bright: what the model's largest amplitude would bring. Where a dark stripe would still shine, no light
+  is no stripe, and light over its noise cannot tell that.
+- unseen: max(AT_END - CLEARLY max(contrast, 0), 0), with e = 1 up to 1 px from the far end of the depth range and 0
+  from 3 px on. Haze that goes on ends there for want of places, so evenly that answers agree; a stripe so far away has
+  to shine by itself.
 
-missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), light: photons of all that contrast
-sums, bright: what the model's largest amplitude would bring. Where a dark stripe would still shine, no light is no
-stripe, which light over its noise cannot tell. unseen: max(AT_END - CLEARLY max(contrast, 0), 0), with e = 1 up to 1 px
-from the far end of the depth range and 0 from 3 px on: haze that goes on ends there for want of places, so evenly that
-answers agree; a stripe so far away has to shine by itself.
+Agreement tells a surface from nothing at all: where there is no stripe, in a shadow or behind the end of the haze,
+every row finds what its noise looks most like, and four paths tie those answers into streaks but not into surfaces.
+Each answer has a number of 5 x 5 neighbours on the same surface (`count_neighbours`); odds come from the sum of these
+numbers over 7 x 7 answers (`agreement_row`). Thin and slanted things have few such neighbours, but a wrong answer is
+mostly not where those opposite each other put it, whatever the slope.
 
-A and G are chosen, on random scenes 50 to 57 of the tests' simulator beside the five prepared ones: fitted (1.9 and
-1.5, B 0.66) they believe stripes too little where there is no doubt about haze. The others are fitted (maximum
-likelihood) to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, all answers counted, also
-those where there is no stripe. H, DARKER, CLEARLY and AT_END are of a few that were tried: by the likelihood of random
-scenes 120 to 160 of the tests' simulator, most of them open to the sky in part (`tests.reference.open_scenes`); larger
-ones took too much from dim stripes of the prepared scenes in clear air, or lost what is dark beside what is bright.
-
-The stripe table of `joint`: places, light, and how sure each answer is.
-
-Compiled: how far a map's answers agree with those around them, which is what tells a surface from nothing at all.
-
-Where a stripe is, answers lie on a surface. Where there is none, in a shadow or behind the end of the haze, every row
-finds what its noise looks most like; four paths tie those answers into streaks, but not into surfaces. So each answer
-is asked how many of its 5 x 5 neighbours are on the same surface (`count_neighbours`), and a place how many of all
-such pairs there are among the 7 x 7 answers around it (`agreement_row`). Only the former are stored, 16 bits each.
-Thin things have few such neighbours, slanted ones fewer; but an answer that is wrong is mostly not where those opposite
-each other put it, whatever the slope (`apart_row`).
-
-Speed: 0.5 ms for 512 x 500 answers, with all that `rig.estimate.joint.confidence` does 2.1 (Zen 3, AVX2, one thread).
+Arrays are float32 (rows, columns), numbers of neighbours int16. Source of the constants: WIDER, B, C, D, E and F are
+fitted by maximum likelihood to random cluttered scenes of a second simulator, K = 1 to 30 in air and fog, all answers
+counted. A and G are chosen on random scenes of the tests' simulator: fitted ones believe stripes too little where there
+is no doubt about haze. H, DARKER, CLEARLY and AT_END are chosen by the likelihood of random scenes that are open to the
+sky in part (`tests.reference.open_scenes`): larger ones take too much from dim stripes in clear air.
 """
 
 import math
@@ -71,16 +66,16 @@ from rig.threads import RowWorkers
 NEIGHBOURS: Final = 2
 """Rows and columns to either side in which neighbours are counted."""
 AROUND: Final = 3
-"""The same of the answers whose neighbours are counted."""
+"""Rows and columns to either side over which the numbers of neighbours are summed."""
 OPPOSITE: Final = 2, 4
 """Rows and columns to the neighbours that lie opposite each other."""
 ASKED: Final = 4 * len(OPPOSITE)
-"""Pairs of them: along rows, columns and both diagonals."""
+"""Pairs of opposite neighbours: along rows, columns and both diagonals."""
 _ANYWHERE: Final = np.float32(1e6)
 
 
 class Neighbours(NamedTuple):
-    """How many neighbours of each answer lie on its surface, and how many there are to ask.
+    """Numbers of neighbours on the surface of each answer, and numbers of pairs that can be asked.
 
     number: int16 (rows, columns) with AROUND rows and LANES columns around, 0 there. pairs: of `pairs_to_ask`.
     """
@@ -96,7 +91,7 @@ def new_neighbours(pairs: NDArray[np.float32]) -> Neighbours:
 
 
 def pairs_to_ask(there: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """How many pairs of neighbours there are around each place (rows, columns), both of them there; at least 1.
+    """Number of pairs of neighbours around each place (rows, columns) that are both there; at least 1.
 
     there: whether a place is searched and has frames; others have no say.
     """
@@ -125,12 +120,12 @@ def count_neighbours(distance: NDArray[np.float32], first_row: int, last_row: in
         at, to, width = signed_address(copy), signed_address(out.number), copy.shape[1]
         for y in range(band, end):
             _count_row(at, (y - band + MARGIN) * width + LANES, width, to, (y + AROUND) * width + LANES)
-        copy[:1] = 0.0  # it lives until here
+        copy[:1] = 0.0  # kept alive up to here: only the address is used above
 
 
 @numba.njit(cache=True, nogil=True)
 def _count_row(distance: int, here: int, width: int, number: int, there: int) -> None:
-    """A row's numbers, from element `there` on, of the distances from element `here` on; both of addresses."""
+    """Count a row's neighbours; elements of distances from `here` on, of numbers from `there` on, both at addresses."""
     one = zero_float32() + np.float32(1.0)
     for c in range(0, width - 2 * LANES, LANES):
         own, same = load_float32(distance, here + c), zero_float32()
@@ -178,7 +173,7 @@ def apart_row(placed: int, width: int, here: int, out: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def light_row(at: tuple[int, int], width: int, here: int, out: int, apart: int) -> None:
-    """Numbers of 3 x 3 neighbours on the surface of each answer of a row, and `apart` further on their light.
+    """Write numbers of 3 x 3 neighbours on the surface of each answer of a row, and `apart` further on their light.
 
     at: addresses of distances and light, copies `with_margin`, width wide; here: the row's first answer in them.
     """
@@ -197,7 +192,7 @@ def light_row(at: tuple[int, int], width: int, here: int, out: int, apart: int) 
 Float32 = NDArray[np.float32]
 
 WIDER: Final = 1.556
-"""The noise of the counts is not all that moves a stripe: surfaces bend, and neighbours are shared."""
+"""Factor on the stated standard deviation: surfaces bend, and neighbours are shared, which counts do not show."""
 A: Final = 1.0
 B: Final = 0.890
 G: Final = 2.0
@@ -209,7 +204,7 @@ H: Final = 4.0
 DARKER: Final = 2.0
 """Natural logarithm of how much less light than a bright stripe a dark one may bring."""
 CLEARLY: Final = 1.2
-"""What a standard deviation of light above its noise makes up for."""
+"""By how much one standard deviation of light above its noise lessens `missing` and `unseen`."""
 AT_END: Final = 3.0
 """`unseen` of an answer without any light."""
 NEAR_END_PX: Final = 1.0, 3.0
@@ -258,7 +253,7 @@ def confidences(
     been counted before.
     """
     nothing = np.float32(np.nan)
-    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
+    # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
     scales, lights, hazes, rests = places.scale, places.light, places.haze, places.rest
     number, margins, columns = neighbours.number, answer.margin, x_px.shape[1]
     # An odd number of cache lines: one line of numbers after the other does not push the others out of the cache.
@@ -297,7 +292,7 @@ def confidences(
                     confidence[y, c] = 0.0
                     signal[y, c] = haze[y, c] = sd_px[y, c] = nothing
         distance[:1] = light[:1] = placed[:1] = 0.0
-    # They live until here: what is known by its address alone would be freed.
+    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
     lines[:1], pairs[:1] = 0.0, 0
 
 
@@ -336,7 +331,7 @@ def _ending(at, width, c):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _number(at, width, c):  # type: ignore[no-untyped-def]
-    """Of 3 x 3 answers on the surface, this one counted."""
+    """Number of 3 x 3 answers on the surface, this one counted."""
     return larger_float(load_float32(at, _LIT * width + c), zero_float32() + 1.0)
 
 
@@ -372,7 +367,7 @@ def _contrast(at, width, c, ambient):  # type: ignore[no-untyped-def]
 
 
 def brightness_of(model: RowModel) -> Brightness:
-    """What `stripe_table` takes of a learned state."""
+    """Brightness of a learned state, for `stripe_table`."""
     return Brightness(float(model.amplitude[0]), float(model.amplitude[-1]), float(np.median(model.ambient)))
 
 

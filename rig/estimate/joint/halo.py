@@ -1,27 +1,26 @@
-"""Learns haze and halo from the stripes of a sweep, in one weighted fit of least squares.
+"""Learns haze and halo from the stripes of a sweep: the light of each stripe first, then one linear fit.
 
-What is counted beside a stripe is haze, pedestal, halo and ambient light: each of them a sum of known shapes, so that
-one linear fit tells them apart where averages behind and before the stripe cannot: the halo follows the brightness of
-each stripe, haze does not. On its own a row cannot tell a stripe's brightness: neighbours are asked too, and stripes
-that do not agree with theirs teach nothing (`rig.estimate.joint.halo`). Later maps are asked whether there still is a
-halo, or one now.
-
-Compiled sums of the fit of haze and halo, and its solution in numbers that are not negative.
-
-Compiled light of stripes for the fit of the halo: the likeliest one, of a stripe and its neighbours together.
-
-A halo is told by what a stripe brings beside itself, over its own light. The light of `rig.estimate.joint.place.light`
-adds up each pixel's own flux, which ends where pixels are full: bright stripes would pass for dimmer ones with so much
-more halo. Here the counts n of K frames of all pixels around a stripe and around its neighbours on the same surface are
-explained by one amplitude a,
+The light of stripes (`likeliest_light`). A halo is told by what a stripe brings beside itself, over its own light. The
+light of `rig.estimate.joint.place.light` adds up each pixel's own flux, which ends where pixels are full: bright
+stripes would pass for dimmer ones with so much more halo. Here the counts n of K frames of all pixels around a stripe
+and around its 5 x 5 neighbours on the same surface are explained by one amplitude a,
 
     flux = base + a scale (share + glow),   log-likelihood = sum n log(1 - exp(-flux)) - (K - n) flux
 
-with haze and ambient light as base. It is concave in a; Newton's steps come from below, since the slope is convex. What
-full pixels cannot tell those beside them do.
+with haze and ambient light as base. It is concave in a; Newton's steps come from below, since the slope is convex. Full
+pixels tell nothing, those beside them do. Where the amplitude is hardly more than its noise there may be no stripe, and
+where neighbours do not agree on it some are brighter, or in a shadow: the light of such stripes is not known, and they
+teach nothing.
 
-Where that amplitude is hardly more than its noise there may be no stripe, and where neighbours do not agree on it some
-are brighter, or in a shadow: the light of such stripes is not known.
+The fit (`add_equations`, `solve`). What is counted beside a stripe of s photons, at the distance d along the row, is
+
+    flux = ambient + offset + G haze(w)                 before the stripe
+         = ambient + offset + share(w) G haze(w)        behind it,      on both sides + s rho(w, d)
+
+with rho as in `rig.estimate.row.inputs`. That is linear in haze (BINS), share (HALO_NODES), halo (HALO_NODES, reaches)
+and offset, so that one weighted fit of least squares (float64, no number negative) tells them apart: the halo follows
+the brightness of each stripe, haze does not. Means over the pixels behind and before stripes could not do that. Later
+maps are asked whether there still is a halo, or one now.
 """
 
 import math
@@ -57,7 +56,7 @@ from rig.geometry.windows import SweepGeometry
 from rig.threads import RowWorkers
 
 LEAST_FLUX: Final = 2e-3
-"""Flux that a pixel is taken to have at least where its counts are weighed."""
+"""Least flux of a pixel when its counts are weighted."""
 LINE_PX: Final = 4.5
 """Pixels so far from a stripe show nothing of the line itself."""
 SETTLED: Final = 1e-6
@@ -137,7 +136,7 @@ def add_equations(
 
 @numba.njit(cache=True, nogil=True)
 def solve(matrix: NDArray[np.float64], right: NDArray[np.float64], free: int) -> NDArray[np.float64]:
-    """What minimises x' matrix x - 2 right' x with no number below 0, one at a time; number `free` may be."""
+    """The x that minimises x' matrix x - 2 right' x, no number below 0 but number `free`; one number at a time."""
     x, slope = np.zeros_like(right), -right
     for _ in range(MOST_SWEEPS):
         largest = 0.0
@@ -163,9 +162,9 @@ LEAST_ASKED: Final = 10
 LEAST_SURE: Final = 4.0
 """Standard deviations of its noise that the light is more than."""
 DISAGREED: Final = 3.0
-"""Standard deviations by which the stripes' misfit may exceed what chance brings. Of the stripes that the trust of
-`rig.estimate.joint.lesson` lets through 17 to 19 % are none, and light adds up to 0.6 of the true one; of those that
-pass these limits under 1 %, and 0.8 to 0.9 (random scenes 45 and 50, five exposures)."""
+"""Standard deviations by which the stripes' misfit may exceed what chance brings. Of stripes that pass these limits
+less than 1 % are none (random scenes at five exposures); the trust of `rig.estimate.joint.lesson` alone lets 17 to 19 %
+of such through."""
 MOST_STEPS: Final = 8
 MOST_GROWTH: Final = 4.0
 """By so much an amplitude may grow or shrink in a step."""
@@ -192,7 +191,8 @@ def likeliest_light(
 ) -> None:
     """Fill light, photons per exposure, and known of stripes first_line..last_line-1 of those at (rows, columns).
 
-    counts: (columns, rows, window); shares: of `placing.profile_table`; x_px: (rows, columns), of all stripes.
+    counts: (columns, rows, window); shares: of `profile_table` in `rig.estimate.joint.place.place`; x_px: (rows,
+    columns), of all stripes.
     """
     for i in range(first_line, last_line):
         y, c = rows[i], columns[i]
@@ -258,18 +258,18 @@ FIRST_LINES: Final = LATTICE_LINES // 4
 """Rows x columns that tell whether there is a halo at all, and of later maps; once there is one in the first map, twice
 LATTICE_LINES measure it."""
 LEAST_EVIDENCE: Final = 50.0
-"""By how much a halo must better the fit, in chi squared: without one it does by 2 to 10, in fog of optical depth 1 by
-4000 to 30000."""
+"""Least chi squared that a halo must take off the fit: where there is none it takes off 2 to 10, in fog of optical
+depth 1 it takes off 4000 to 30000."""
 SMOOTH_HAZE, SMOOTH_SHARE, SMOOTH_HALO, SMALL_HALO = 3e4, 300.0, 3.0, 0.1
-"""What bends of the haze, steps of its share behind the stripe, steps of the halo and the halo itself cost, over their
-squares: they decide only where there are no data."""
+"""Strengths of the smoothness: cost, over their squares, of bends of the haze, steps of its share behind the stripe,
+steps of the halo and the halo itself. They decide only where there are no data."""
 _SHARE, _HALO = BINS, BINS + HALO_NODES
 _SIZE = _HALO + HALO_NODES * len(HALO_REACHES_PX) + 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BrightLines:
-    """Lines with a clear stripe, and the light of each, photons: what can teach of a halo."""
+    """Lines with a clear stripe, which can teach of a halo, and the light of each stripe in photons."""
 
     lines: Lines
     light: NDArray[np.float32]
@@ -284,7 +284,10 @@ def bright_lines(
     workers: RowWorkers,
     number: int = FIRST_LINES,
 ) -> BrightLines:
-    """Those of about so many lines of a map whose light is known; tables: it was made with, places: of its stripes."""
+    """Lines of a map whose light is known, out of about `number`.
+
+    tables: those that the map was made with; places: of its stripes.
+    """
     rows, columns = lattice(geometry, number)
     clear = stripes.confidence[rows, columns] > CLEAR
     rows, columns = rows[clear], columns[clear]
@@ -314,9 +317,9 @@ def learn_first_halo(
     places: Places,
     workers: RowWorkers,
 ) -> RowModel:
-    """What `learn_halo` gives for the first map; to be called again with the map that is made under it.
+    """The first map's model with the halo of `learn_halo`; to be called again with the map that is made under it.
 
-    Of several lines at once the model stays as it is: what the others bring would be taken for a halo.
+    With several lines at once the model stays as it is: the other lines' haze would be taken for a halo.
     """
     if geometry.others is not None:
         return model
@@ -326,10 +329,10 @@ def learn_first_halo(
 
 
 def learn_next_halo(setting: LearningSetting, seen: BrightLines, workers: RowWorkers) -> RowModel:
-    """The model of a later lesson: with a halo where the map begins to show one, without where it does not any more.
+    """The model of a later lesson: with a halo where the map begins to show one, without where it shows none.
 
-    One that stays is left as it was found. Told again from so few lines, lesson after lesson, halo, haze and the rest
-    behind stripes shift among each other: over eight maps in steady fog errors grew by 10 to 25 %.
+    A halo that stays is left as it was found: learned anew from so few lines, lesson after lesson, halo, haze and the
+    level behind stripes drift against each other (in steady fog errors grow by 10 to 25 % in eight maps).
     """
     model = setting.model
     if setting.geometry.others is not None or (not model.halo.any() and np.isnan(model.extinction_per_m)):
@@ -347,7 +350,7 @@ def learn_halo(
     *,
     dark: bool,
 ) -> RowModel:
-    """The model with the halo that these stripes have, and the haze under it; as it is where they have none.
+    """The model with the halo that these stripes have, and the haze under it; without a halo where they have none.
 
     The scale of stripes stays that of the model, which their light goes by. ambient: of each pixel, (rows, width), that
     the fit begins with. dark: whether there are dark frames.

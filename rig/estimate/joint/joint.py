@@ -1,12 +1,13 @@
 """Estimator `joint`: the row likelihood tied across rows and columns, for a whole map at a time.
 
-Each label of a row and column (`label_grid`) gets a cost from the counts (`rig.estimate.joint.labels.costs`), with the
-halo where there is one (`halo_tables`) and the map before where that is asked for (`temporal`). Costs are tied to those
-of the neighbours along four paths (`rig.estimate.joint.paths`); weak answers are put to the vote of all neighbours
-(`rig.estimate.joint.vote`); the best label of each is placed between labels by what neighbours on its surface know
-(`rig.estimate.joint.place.place`), judged (`rig.estimate.joint.confidence`) and searched for a second line
-(`rig.estimate.joint.second_returns`). What the rows know of light and medium is learned as by `likelihood`, then from
-the map's own stripes.
+Each label (candidate position) of a row and column (`rig.estimate.joint.labels.grid`) gets a cost from the counts
+(`rig.estimate.joint.labels.costs`, a fast form of `rig.estimate.row.likelihood`), with the halo where there is one
+(`rig.estimate.joint.labels.halo_rows`) and the map before where that is asked for (`rig.estimate.joint.temporal`).
+Costs are tied to those of the neighbours along four paths (`rig.estimate.joint.paths`); weak answers are put to the
+vote of all neighbours (`rig.estimate.joint.vote`); the best label of each is placed between labels by what neighbours
+on its surface know (`rig.estimate.joint.place.place`), judged (`rig.estimate.joint.confidence`) and searched for a
+second line (`rig.estimate.joint.second_returns`). The model of light and medium is learned row by row first, as by
+`likelihood`, then from the map's own stripes.
 """
 
 from dataclasses import replace
@@ -38,9 +39,9 @@ from rig.geometry.windows import SweepGeometry
 from rig.threads import RowWorkers
 
 FIRST_ROUNDS = 3
-"""Times that the first map's stripes teach what they are then estimated with again."""
+"""Times that the first map's stripes teach the model that they are then estimated with again."""
 QUIET_COLUMNS = 8
-"""Every so manieth column teaches the ambient light where there are dark frames too."""
+"""One column in so many teaches the ambient light where there are dark frames too."""
 
 
 class Joint:

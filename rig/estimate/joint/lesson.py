@@ -1,20 +1,17 @@
-"""Compiled: how far an answer of `joint` is to be believed by the lessons of the first map.
+"""Reads a map's answers and what they teach, compiled: positions, trust in each, and pixels quiet behind them.
+
+How far the lessons of the first map believe an answer (`fill_trust`, float32 (rows, columns)):
 
     trust = erf(3 px / (sqrt 2 sd)) / (1 + exp(A - B margin)) / (1 + C z^-D)
 
-As `rig.estimate.joint.confidence`, but for z, the stripe's light over its noise, pooled over neighbours: what the light
-is worth, above half of the haze, and not whether answers around agree; and it asks for the right surface, within 3 px.
-Later lessons go by the table's confidence, for by then the model is known.
+This is the confidence of `rig.estimate.joint.confidence` but for z, the stripe's light over its noise, pooled over
+neighbours, above half of the haze; whether answers around agree does not count, and it asks for the right surface,
+within 3 px. Later lessons go by the table's confidence, for by then the model is known.
 
-The numbers are fitted (maximum likelihood) to lessons on random scenes of a second simulator (`random_scenes`, numbers
-20 to 30), in clear air, thin and dense fog, under a halo and with hot pixels at 1 to 10 exposures, places without a
-stripe counted as wrong. All but A: fitted it is 2.5, but lessons that believe so little teach worse, for a line that is
-not believed goes by its own row, and those left out are those that show what the model does not know yet. With A at
-2.5, 1.25 and none the maps that followed had a bias of -0.079, -0.061 and -0.039 px (number 40, one exposure), in dense
-fog errors of 0.76, 0.63 and 0.86 px (number 41): half of it was chosen on these two. On others (42 to 44) errors are
-within 3 % of those under constants fitted to prepared scenes.
-
-Compiled reading of a map's answers: positions in pixels, and what lay quietly behind them.
+B, C and D are fitted by maximum likelihood to lessons on random scenes of a second simulator, in clear air, thin and
+dense fog, under a halo and with hot pixels at 1 to 10 exposures, places without a stripe counted as wrong. A is half of
+its fitted value: lessons that believe so little teach worse, since an answer that is not believed goes by its own row,
+and those left out are those that show what the model does not know yet.
 """
 
 import math
@@ -39,6 +36,7 @@ D: Final = 1.427
 POOLED: Final = 25.0
 """Answers whose light counts as one: about half of the neighbours that it is pooled over lie on the same surface."""
 LEAST_Z: Final = 0.05
+"""Least z, where a stripe shows no light."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -121,10 +119,10 @@ def add_quiet(
 ) -> None:
     """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, of some columns.
 
-    Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels where there is none: with
-    one it is not dark behind a stripe of `signal` photons, and what is expected of halo and pedestal is taken off. That
-    must not be more than `most_light`, photons per exposure, nor of a stripe that fills its pixels, whose halo is
-    brighter than it seems: what is not taken off would pass for ambient light of pixels that few other stripes show.
+    Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels where there is none. With a
+    halo it is not dark behind a stripe of `signal` photons, and the expected halo and pedestal are taken off the ones.
+    Pixels where these are more than `most_light`, photons per exposure, are left out, and so are stripes that fill
+    their pixels, whose halo is brighter than it seems: what is not taken off would pass for ambient light.
     """
     width = sweep.u.shape[1]
     for y in range(first_row, last_row):

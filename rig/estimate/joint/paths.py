@@ -1,17 +1,17 @@
-"""Compiled four-path aggregation: the cost of each label, tied to the labels of the neighbours on rows and columns.
+"""Four-path aggregation, compiled: the cost of each label, tied to the labels of the neighbours on rows and columns.
 
-Along a path, L(p, l) = C(p, l) + m(p, l) with the message m(p, l) = min(L(q, l), L(q, l +- 1) + P1, L(q, l +- 2) + P2,
-L(q, l +- 3) + P3, min L(q) + J) - min L(q) from the pixel q before p (Hirschmueller, PAMI 30, 2008, with steps of up to
-three labels). All numbers are unsigned bytes that stop at 255.
+Along a path, from the pixel q before p,
 
-Speed: 512 x 500 pixels of 128 labels, cycles per pixel (Zen 3, AVX2, one thread): rows 66, columns 95 and their
-answers another 105; instructions 214, 267 and 290. What was tried for two paths:
-- labels in order, neighbours by unaligned loads from the first cache (as it is): 66 with two paths under way, 80 where
-  the addresses did not fit the registers, 65 with the loop unrolled for one number of labels (a kernel for each);
-- in registers, neighbours by shuffles: 70; by turns with loads, so that none crosses a cache line: 61;
-- lane i of vector v holding label i V + v, so that most neighbours are the next vector: 61, and 45 to reorder a cost;
-- up and down with 4, 8, 16, 64 and 250 columns at once: 88, 82, 83, 89, 92; sums of messages beside them instead of in
-  place: 82. Without asking for memory ahead: 10 to 25 more.
+    L(p, l) = C(p, l) + m(p, l)
+    m(p, l) = min(L(q, l), L(q, l +- 1) + P1, L(q, l +- 2) + P2, L(q, l +- 3) + P3, min L(q) + J) - min L(q)
+
+and the total of a label is C plus the messages m of the four paths, left, right, up and down (Hirschmueller, PAMI 30,
+2008, with steps of up to three labels). C, m and totals are uint8 (rows, columns, labels); all sums stop at 255.
+`along_rows` leaves the messages of two paths; `along_columns` adds the other two and reads answers off the totals
+(`rig.estimate.joint.winner`).
+
+Labels stay in order in memory and neighbours are unaligned loads from the first cache: shuffling them in registers
+gains nothing. Several paths are under way at once, because each step of a path waits for the one before.
 """
 
 from typing import Final, NamedTuple
@@ -45,10 +45,10 @@ _SET, _ADD, _TOTAL = 0, 1, 2
 
 
 class Penalties(NamedTuple):
-    """What a change of label between neighbours costs, in units: a step of 1, 2 or 3 labels, or any other.
+    """Costs of a change of label between neighbours, in units: of a step of 1, 2 or 3 labels, or of any other.
 
-    Units of `rig.estimate.joint.labels.costs`, 8 / (1 + K / 8) to a nat of K exposures: in nats a change costs more the
-    more there are.
+    Units of `rig.estimate.joint.labels.costs`, 8 / (1 + K / 8) to a nat of K exposures: counted in nats a change costs
+    more the more exposures there are.
     """
 
     one: int = 16
@@ -71,7 +71,7 @@ def _paths_in(memory):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
-    """Make so many paths begin: no message to their first pixel."""
+    """Begin so many paths: there is no message to their first pixel."""
     for _ in range(2 * paths):
         for v in range(0, labels, VECTOR):
             store_bytes(path, v, zero_bytes())
@@ -88,7 +88,7 @@ def _vectors(penalties):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _step(before, after, cost, message, total, hidden, labels, ahead, penalties, use):  # type: ignore[no-untyped-def]
-    """One pixel of a path: L of its last pixel at `before` to that of this one at `after`; all of these addresses.
+    """One step of a path: from L of its last pixel, at `before`, to L of this one, at `after`; all of these addresses.
 
     use: whether the message is written to `message`, added to it, or all of them and the cost make up `total`, without
     the labels that are `hidden`. ahead: bytes to the cost and message that are to be fetched into the cache; 0: none.
@@ -163,14 +163,14 @@ def along_rows(
     for row in range(first_row, last_row):
         at = row * columns * labels
         _along_row(address_of(cost) + at, address_of(message) + at, columns, labels, penalties, _paths_in(memory))
-    memory[:1] = 0  # it lives until here
+    memory[:1] = 0  # kept alive up to here: only the address is used above
 
 
 @numba.njit(cache=True, nogil=True)
 def _step_down(
     before: int, after: int, cost: int, message: int, labels: int, columns: int, ahead: int, penalties: Penalties
 ) -> None:
-    """Some columns of a row on their way down; all but numbers addresses."""
+    """Step some columns of a row on their way down; all but numbers are addresses."""
     # Apart from what surrounds it: all that the loop needs finds room in the registers.
     vectors = _vectors(penalties)
     for _ in range(columns):
@@ -184,7 +184,7 @@ def _step_up(
     before: int, after: int, cost: int, message: int, labels: int, columns: int, ahead: int, penalties: Penalties,
     total: int, total_bytes: int, hidden: int,
 ) -> None:  # fmt: skip
-    """The same on their way up; writes totals, total_bytes from column to column."""
+    """Step some columns of a row on their way up and write their totals, total_bytes from column to column."""
     vectors = _vectors(penalties)
     for _ in range(columns):
         _step(before, after, cost, message, total, hidden, labels, ahead, vectors, _TOTAL)
@@ -247,4 +247,4 @@ def along_columns(
         costs, messages = address_of(cost) + at, address_of(message) + at
         _go_down(costs, messages, rows, row_bytes, labels, count, penalties, paths)
         _go_up(costs, messages, rows, row_bytes, count, penalties, paths, column, desk)
-    memory[:1] = desk_bytes[:1] = 0  # they live until here
+    memory[:1] = desk_bytes[:1] = 0  # kept alive up to here: only the address is used above

@@ -1,15 +1,13 @@
-"""Compiled sums of light over blocks of rows and columns, sixteen pixels of a line at a time.
+"""Sums of light over blocks of rows and columns at equal distances from the far end, compiled, for second returns.
 
-Rows of a block are added at equal distances from the far end, without what lies near their stripes: the ones counted,
-and those that haze and ambient light bring (`rig.estimate.joint.second_return_blocks`).
-
-Lines of a block of rows and columns: where they lie, once per model, and the sums of their light.
-
-Of frames K, a pixel's share q of no one by ambient light and c by haze,
+A block is BLOCK x BLOCK lines (rows of columns). Lines are added pixel by pixel of distance from the far end, without
+the pixels near their stripes: the ones counted, and those that haze and ambient light bring. With K frames of a line,
+q the probability that ambient light brings a pixel no one and c that haze brings none,
 
     ones expected = sum over lines K (1 - q c) = sum over columns K (number of lines - c sum q)
 
 so that lines only add up what is theirs, left and right of the stripe; the block's haze is multiplied with the sums.
+Sums are float32 (block rows, block columns, pixels of distance), sixteen pixels to a vector.
 """
 
 from typing import Final, NamedTuple
@@ -39,14 +37,14 @@ from rig.simd.vectors import LANES, where_below, zero_float32
 BLOCK: Final = 4
 """Rows, and columns, whose light is summed at once; a block is judged together with its eight neighbours."""
 LEFT_OUT: Final = np.float32(0.0)
-"""Marks pixels that show nothing, among probabilities of no one: those that always fire."""
+"""Marks pixels that show nothing, since they always fire, among the probabilities of no one."""
 PLACE_X, PLACE_BEGIN, PLACE_END, PLACES = 0, 1, 2, 4
 NOWHERE: Final = -(1 << 15)
-"""See `line_places`."""
+"""PLACE_X of a line where nothing is searched, see `line_places`."""
 SEEN, STILL, HERE, FIELDS = range(4)
-"""Of a line: addresses of its counts and of `still` at pixel 0 of distance, and its number in the map."""
+"""Fields of a line: addresses of its counts and of `still` at pixel 0 of distance, and its number in the map."""
 BEGIN, LEFT_END, RIGHT, END, LIMITS = range(5)
-"""Pixels of distance: it begins there, is left of the stripe up to there, right of it from there on, and ends there."""
+"""Limits of a line, in pixels of distance: first, up to where it is left of the stripe, from where right, and end."""
 
 
 class LineTable(NamedTuple):
@@ -65,7 +63,7 @@ class LineTable(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def line_places(sweep: Sweep, x_far: NDArray[np.float64], side: int, pixels: int) -> NDArray[np.int16]:
-    """Where the lines of all rows and columns lie: int16 (rows, columns, PLACES), made once per model.
+    """Places of the lines of all rows and columns, int16 (rows, columns, PLACES); made once per model.
 
     PLACE_X: x of pixel 0 of distance, the leftmost of `pixels`, NOWHERE where nothing is searched; PLACE_BEGIN,
     PLACE_END: pixels of distance that are searched and were stored, from and up to.
@@ -155,10 +153,10 @@ class Blocks(NamedTuple):
 
 
 class _Map(NamedTuple):
-    """What the lines of all blocks are looked up in, by address: every use of an array in the loop would count
-    references to all of its tuple.
+    """Addresses of the arrays that lines are looked up in: each use of an array itself in the loop would count
+    references to its whole tuple.
 
-    x_px, place, x0, n_frames, counts: of their first elements; still: of pixel 0 of the first row.
+    x_px, place, x0, n_frames, counts: first elements; still: pixel 0 of the first row.
     """
 
     x_px: int
@@ -228,7 +226,7 @@ def sum_blocks(
                 _copy_lines(counts, still, place, x0, sweep.u.shape[1], number, lines, spare)
             at = 4 * pixels * (by * across + bx)
             sum_lines(table, inner, readable, clear_at + 4 * clear[0].size * bx, pixels, to_ones + at, to_expected + at)
-    # They live until here: what is known by its address alone would be freed.
+    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
     lines[0, 0] = ends[0] = 0
     limits[0, 0] = spare[0, 0, 0] = frames[0] = 0.0
 
@@ -319,7 +317,7 @@ def _clear_beside(sweep: Sweep, state: RowState, y: int, c: int, start: int, sid
 
     Straight lines between every HAZE_STEP pixels. Pixels without a ray have that of the nearest one with a ray.
     """
-    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
+    # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
     u, v, profile, w_lo, per_w = sweep.u, sweep.v, state.profile, state.w_lo, state.per_w
     px, py, pz = sweep.plane[c, 0], sweep.plane[c, 1], sweep.plane[c, 2]
     first, last = with_rays(u, y, 0, u.shape[1] - 1)

@@ -1,14 +1,17 @@
-"""Second returns: where the counts themselves show another line beside the stripe, and how probably so.
+"""Second returns: a second line of light beside the stripe, from a pane before a wall, a twig, a flake of snow.
 
-In haze a row cannot answer with both: the light behind the nearer one excludes that it ends there, so that the best
-rival of an answer is hardly ever the second surface. `rig.estimate.joint.second_returns` looks for its light instead.
+In haze a row cannot answer with both surfaces: the light behind the nearer one excludes that the haze ends there, so
+that the best rival of an answer is hardly ever the second surface. So its light is looked for in the counts. It stands
+off the haze by too little for a row alone; light is summed over blocks of rows and columns first
+(`rig.estimate.joint.second_return_blocks`) and compared with what haze and ambient light bring, pixel by pixel of
+distance from the far end. Then each row is asked itself, with its neighbours. In standard deviations of the light that
+a candidate shows over its own neighbourhood (own) and its block's (block), the probability that it is right is
 
-Compiled search for light of a second surface beside each stripe: a pane before a wall, a twig, a flake of snow.
+    logit confidence2 = LOG_ODDS . (1, own, block)
 
-Such light stands off the haze by too little for a row alone, and rows that see both surfaces answer with one of them.
-So light is summed over blocks of rows and columns at equal distances from the far end first
-(`rig.estimate.joint.second_return_blocks`), pixel by pixel of distance, and compared with what haze and ambient light
-bring; then each row is asked itself, with its neighbours.
+Positions x2_px and confidence2 are float32 (rows, columns), NaN and 0 where nothing stands out. LOG_ODDS are fitted to
+maps with a pane over a third of them and to maps without any. Limits: light within APART_PX plus LINE_SIGMAS widths
+of the line from a stripe is its own, so that closer surfaces are not told apart.
 """
 
 from typing import Final, NamedTuple
@@ -33,25 +36,25 @@ Float32 = NDArray[np.float32]
 RING_PX: Final = 4
 """Pixels to either side of where light is looked for that tell whether haze is as strong as was learned."""
 GAP_PX: Final = 1
-"""Pixels between the two."""
+"""Pixels between the light that is looked for and those."""
 LEAST_RING: Final = 0.25
 """Share of those pixels that must be seen on each side."""
 STEEPER: Final = 1.5
-"""Haze that the ring shows beyond the learned one may be this much more between its two sides: it is not straight."""
+"""Factor on the excess haze of the ring's brighter side: haze between its two sides is not straight."""
 CANDIDATE: Final = np.float32(4.0)
 """Standard deviations from which a block's light is looked at more closely."""
 REACH: Final = 3
 """Rows and columns to either side that light is pooled over in the end."""
 LOG_ODDS: Final = -16.0, 0.4, 3.0
-"""Log odds that a candidate is right: these times 1, and the standard deviations of its own light and its block's.
+"""Log odds that a candidate is right are these times 1, and the standard deviations of its own light and its block's.
 
-Between what maps with a pane over a third of them ask for and what those without any do: fitted to both, rounded."""
+Fitted to maps with a pane over a third of them and to maps without any, and rounded."""
 _AROUND: Final = -(-(RING_PX + GAP_PX + 6) // LANES) * LANES
 """Room beside the pixels of distance: whatever the line's reach, up to 6 px."""
 
 
 class Candidates(NamedTuple):
-    """What stands out most in each block and its neighbours, float32 (block rows, block columns) each.
+    """The light that stands out most in each block and its neighbours, float32 (block rows, block columns) each.
 
     distance: from the far end in px, NaN where nothing does; sure: standard deviations by which its light does; haze:
     how much stronger haze is there than was learned, at least 1.
@@ -63,7 +66,7 @@ class Candidates(NamedTuple):
 
 
 class Seconds(NamedTuple):
-    """What is known of second returns, float32 (rows, columns) each.
+    """Candidates of second returns, float32 (rows, columns) each.
 
     distance: from the far end in px, NaN where there is no candidate; ones, expected: within the line's reach of it;
     light, moment: ones above those expected, and that times the distance in px.
@@ -102,7 +105,7 @@ def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, las
                     if sure > out.sure[by, bx]:
                         out.distance[by, bx] = i - (pixels - 1 if side > 0 else 0)
                         out.sure[by, bx], out.haze[by, bx] = sure, more
-    three[:1] = 0.0  # it lives until here: what is known by its address alone would be freed
+    three[:1] = 0.0  # kept alive up to here: numba would free what only its address still uses
 
 
 @numba.njit(cache=True, nogil=True)
@@ -117,7 +120,7 @@ def _add_lines(first: int, apart: int, number: int, size: int, total: int) -> No
 
 @numba.njit(cache=True, nogil=True)
 def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
-    """By how much the light around each pixel exceeds what CANDIDATE allows, and the most; room, excess: addresses."""
+    """Write the light around each pixel above what CANDIDATE allows to `excess`; returns the most. Addresses all."""
     row, most = pixels + 2 * _AROUND, zero_float32()
     for i in range(0, pixels, LANES):
         ones, expected = zero_float32(), zero_float32()
@@ -133,7 +136,7 @@ def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _stands_out(sums: Float32, i: int, reach: int) -> tuple[float, float]:
-    """Standard deviations by which the light around i exceeds what its ring expects of haze; how much more that is."""
+    """Standard deviations of the light around i above the haze that its ring shows; that haze over the learned one."""
     n, e = sums[0, i - reach : i + reach + 1].sum(), sums[1, i - reach : i + reach + 1].sum()
     more = 1.0
     # Light that only falls off to one side is a halo of the stripe or haze that was learned too weak.
@@ -188,7 +191,7 @@ def measure_seconds(
             x, frames = int(np.rint(place)), np.float32(n_frames[c])
             at = min(max(x, sweep.x_lo[y, c]), sweep.x_hi[y, c])
             path_p, strength = line_light(sweep, state, y, c, at)
-            # Of both sides: what the lesson of the haze took for haze may be light of the second surface itself.
+            # Mean of both sides: part of the learned haze may be light of the second surface itself.
             near, far = max(at - HAZE_STEP // 2, lo), min(at + HAZE_STEP // 2, hi)
             before, behind, _, _, _, _, _ = fluxes_at(sweep, state, y, near, c, path_p, strength)
             before_too, behind_too, _, _, _, _, _ = fluxes_at(sweep, state, y, far, c, path_p, strength)
@@ -263,7 +266,7 @@ LIGHT_SIGMAS = 1.5
 
 
 class SecondLight(NamedTuple):
-    """What the search for second returns takes of a model; made once per model by `second_light`.
+    """Inputs of the search for second returns from a model; made once per model by `second_light`.
 
     state: without ambient light. still: float32, (rows x width) between LANES numbers at either end, probability of no
     one by ambient light alone; LEFT_OUT of pixels that always fire or are not to be used, which show nothing of
@@ -296,7 +299,7 @@ def distance_pixels(grid: LabelGrid) -> int:
 
 
 class SecondRoom(NamedTuple):
-    """Room for the search in one map after the other: memory that is new is slow."""
+    """Room for the search in one map after the other, since new memory is slow."""
 
     blocks: Blocks
     candidates: Candidates

@@ -1,4 +1,4 @@
-"""What `joint` makes once per model, and the room that it keeps from map to map."""
+"""Tables that `joint` makes once per model, and the memory that it keeps from map to map."""
 
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ MOST_BYTES = 4 << 30
 
 
 class JointTables(NamedTuple):
-    """What is made once per model."""
+    """Everything that is made once per model, and what it is made of; see the module that makes each."""
 
     grid: LabelGrid
     costs: Costs
@@ -37,7 +37,7 @@ class JointTables(NamedTuple):
     bright: Brightness
     dark: bool
     pairs: NDArray[np.float32]
-    """Of maps whose columns all have frames."""
+    """Pairs of `pairs_to_ask`, for maps whose columns all have frames."""
 
 
 class Memory(NamedTuple):

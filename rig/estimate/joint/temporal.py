@@ -29,9 +29,9 @@ LEAST_SURE = 0.5
 
 
 class TemporalPrior:
-    """What the last map leaves to the next one; `on`: whether maps leave anything.
+    """Memory of the last map for the next one; `on`: whether maps leave anything.
 
-    before: uint16 (2, rows, columns), the last map's labels and what others cost more at most (0: nothing is known);
+    before: uint16 (2, rows, columns), the last map's labels and the most that others cost more (0: nothing is known);
     None where there is nothing, as behind a map without frames and before the first of a geometry.
     """
 
@@ -46,7 +46,7 @@ class TemporalPrior:
         self.before, self._of = before, None
 
     def begin(self, geometry: SweepGeometry, grid: LabelGrid) -> None:
-        """Before a map's costs are made: forget what is of another geometry."""
+        """Get ready for a map's costs: forget a map of another geometry."""
         if self.before is not None:
             other = self._of is not None and self._of is not geometry
             if other or self.before.shape[1:] != grid.x_far.shape:
@@ -61,7 +61,7 @@ class TemporalPrior:
             _add_ramps(self.before, volume.n_frames, self._ramps, first, last, cost)
 
     def leave(self, stripes: StripeTable, grid: LabelGrid, workers: RowWorkers) -> None:
-        """After a map: what it leaves to the next."""
+        """Keep of a map what it leaves to the next."""
         if not self.on:
             self.before = None
             return
@@ -77,7 +77,7 @@ class TemporalPrior:
 
 
 def _ramps(labels: int) -> NDArray[np.uint8]:
-    """(MOST + 1, 2 labels): what the label i - labels beyond the last one costs more, for each most that it may be."""
+    """Cost that is added to the label i - labels beyond the last one, for each limit of it: (MOST + 1, 2 labels)."""
     away = np.abs(np.arange(2 * labels) - labels)
     ramp = SLOPE * np.maximum(away - FREE, 0)
     return np.asarray(np.minimum(ramp, np.arange(MOST + 1)[:, None]), np.uint8)

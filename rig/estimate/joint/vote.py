@@ -1,4 +1,4 @@
-"""Compiled vote on weak answers of the aggregation: what the neighbours on all sides together say.
+"""Vote on weak answers of the aggregation, compiled: what the neighbours on all sides together say.
 
 Four paths carry evidence along rows and columns only. Where few photons come back, single rows or columns go astray
 as a whole, in streaks. So an answer whose margin is below WEAK is put to the vote: of its own label and those of the
@@ -8,15 +8,8 @@ four nearest neighbours the one is taken that has least
 
 unless the row's own counts make it worse than the old one by more than OBJECTION. Its margin is then what the
 neighbours say for the label less what they say for others, over their number: what streaks disagree on is not sure.
-Scene `art` in clear air at one exposure, where half of the stripes send no photon: 1.57 to 0.91 px, and dense fog at
-three exposures 0.50 to 0.44. Tried: 3 x 3 neighbours 1.0; all nine candidates 0.89; a second vote 0.89, but 0.45 in
-fog; no objections 0.80, but 0.05 more in thin fog.
-
-Speed: 2 to 4 ms for 512 x 500 answers, by how many are weak (Zen 3, AVX2, one busy thread); in float32 twice that.
-
-Compiled ballots of a vote (`rig.estimate.joint.vote`): labels and margins of all answers with a margin around.
-
-Speed: 0.2 ms for 512 x 500 answers (Zen 3, AVX2, one busy thread).
+Labels are int16, margins uint8 in units of cost; sums fit 16 bits (SHARE). There is one vote, and rows may object,
+since a second vote and votes without objections gain in clear air at one exposure but lose in fog.
 """
 
 from typing import Final, NamedTuple
@@ -73,7 +66,7 @@ def new_ballots(rows: int, columns: int) -> Ballots:
 @numba.njit(cache=True, nogil=True)
 def collect(answer: LabelAnswers, first_column: int, last_column: int, out: Ballots) -> None:
     """The ballots of columns first_column..last_column-1."""
-    # Named apart: every use of a tuple with arrays in the loop would count references to all of them.
+    # Local names: each use of the tuple itself in the loop would count references to all of its arrays.
     labels, margins, label, whole, votes = answer.label, answer.margin, out.label, out.whole, out.votes
     at_label, at_margin, to_label = signed_address(labels), signed_address(margins), signed_address(label)
     to_whole, to_votes, half = signed_address(whole), signed_address(votes), np.float32(0.5)
@@ -92,7 +85,7 @@ def collect(answer: LabelAnswers, first_column: int, last_column: int, out: Ball
 
 
 NEIGHBOURS_PX: Final = 3.0
-"""Columns farther apart have no vote: at 5 px, in dense fog, they know too little of one another (0.34 to 0.42 px)."""
+"""Columns farther apart have no vote: in dense fog they know too little of one another."""
 WEAK: Final = 48
 """Margin, in units of cost, from which an answer stands."""
 OBJECTION: Final = 8
@@ -145,12 +138,12 @@ def vote(ballots: Ballots, cost: NDArray[np.uint8], first_row: int, last_row: in
     for y in range(first_row, last_row):
         _elect_row(hall, y)
         _settle_row(hall, y, min(y + REACH, rows - 1) - max(y - REACH, 0) + 1)
-    memory[0, 0] = elected[0] = share[0] = 0  # they live until here
+    memory[0, 0] = elected[0] = share[0] = 0  # kept alive up to here: only the address is used above
 
 
 @numba.njit(cache=True, nogil=True)
 def _elect_row(hall: _Hall, y: int) -> None:
-    """Which candidate the neighbours of each answer of row y are for."""
+    """Elect the candidate that the neighbours of each answer of row y are for."""
     line = (y + REACH) * hall.width + REACH
     for c in range(0, hall.columns, LANES):
         weak = _weak_lanes(hall.votes, line + c, hall.columns - c)
@@ -203,20 +196,20 @@ def _settle_row(hall: _Hall, y: int, high: int) -> None:
 
 @numba.njit(forceinline=True)
 def _weak_lanes(votes, at, end):  # type: ignore[no-untyped-def]
-    """Which of LANES answers, as bits, are weak; there are none from `end` on."""
+    """Bits of those of LANES answers that are weak; there are none from `end` on."""
     strong = equal_mask(smaller(load_int16(votes, at), np.int16(WEAK // SHARE)), np.int16(WEAK // SHARE))
     return ~np.int64(strong) & ((1 << min(LANES, end)) - 1)
 
 
 @numba.njit(forceinline=True)
 def _step(width, k):  # type: ignore[no-untyped-def]
-    """To candidate k in the ballots: the answer itself, then its neighbours left, right, above and below."""
+    """Offset of candidate k in the ballots: the answer itself, then its neighbours left, right, above and below."""
     return (0, -1, 1, -width, width)[k]
 
 
 @numba.njit(cache=True, nogil=True)
 def _count_votes(whole: int, votes: int, at: int, width: int, room: int) -> None:
-    """How much speaks against each candidate of LANES answers, to room (candidates, LANES); all addresses."""
+    """Write votes against each candidate of LANES answers to room (candidates, LANES); all addresses."""
     own, left, right = load_int16(whole, at), load_int16(whole, at - 1), load_int16(whole, at + 1)
     above, below = load_int16(whole, at - width), load_int16(whole, at + width)
     a = b = c = d = e = zero_int16()
@@ -253,7 +246,7 @@ def _elect(against):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _count_support(whole: int, votes: int, at: int, width: int, elected: int, room: int) -> None:
-    """What speaks for the elected labels of LANES answers less what speaks for others; all addresses."""
+    """Write votes for the elected labels of LANES answers less those for others to `room`; all addresses."""
     own, none = load_int16(elected, 0), zero_int16()
     support, total = none, none
     for line in range(at - REACH * width, at + REACH * width + 1, width):

@@ -1,9 +1,13 @@
-"""Compiled reading of answers off the totals of all labels, some columns of a row at a time.
+"""Answers read off the totals of all labels, compiled: sub-label position and margin of each pixel.
 
-In rounds over the columns, each short: what one column waits for, others fill. All arrays come by their addresses, see
-`rig.simd.memory`.
+With S(l) the totals of a pixel (uint8, LARGEST where a label is excluded) and l* the label of the least one,
 
-What the aggregation answers for each pixel, and the tables that its answers are read off with.
+    label  = sum of l w(l) / sum of w(l) over |l - l*| <= r,     w(l) = exp(-beta (S(l) - S(l*)) / UNITS)
+    margin = min of S(l) over |l - l*| >= MARGIN_FROM  -  S(l*)
+
+r is REACH, or less where labels on either side are excluded. label is float32, margin uint8, (rows, columns). Some
+columns of a row are read at a time, in short rounds over the columns, so that while one waits others go on. All arrays
+come by their addresses, see `rig.simd.memory`.
 """
 
 from typing import Final, NamedTuple
@@ -38,7 +42,7 @@ LARGEST: Final = 255
 """Largest cost and total: of a label that is excluded."""
 TAPS: Final = 2 * REACH + 1
 POWERS: Final = 4
-"""Numbers that are summed at once: powers 0 and 1 of the distance, and nothing."""
+"""Numbers that are summed at once: powers 0 and 1 of the distance, and two zeros."""
 VECTOR: Final = 32
 """Labels that are worked on at once."""
 MIDDLE: Final = VECTOR // 2
@@ -49,12 +53,12 @@ UNITS: Final = 8.0
 
 
 class AnswerSettings(NamedTuple):
-    """Which labels there are, stripes at 0..stripes-1, and tables of `answer_settings`.
+    """Number of labels that are stripes, 0..stripes-1, and the tables of `answer_settings`.
 
-    weights: float32 (256,), of a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), for each
-    reach those of the taps within it. reach: uint8 (2^TAPS,), how far labels reach to both sides where the taps of the
-    set bits are excluded. near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST at labels that do not count for the
-    margin.
+    weights: float32 (256,), of a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), powers of
+    the distance for each reach, 0 at taps beyond it. reach: uint8 (2^TAPS,), how far labels reach to both sides where
+    the taps of the set bits are excluded. near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST at labels that do
+    not count for the margin.
     """
 
     stripes: int
@@ -65,7 +69,7 @@ class AnswerSettings(NamedTuple):
 
 
 class LabelAnswers(NamedTuple):
-    """Per (row, column). Labels are counted in labels, costs in units (`UNITS`).
+    """Answers, (rows, columns) each. Positions are counted in labels, costs in units (`UNITS`).
 
     label: float32, mean of the labels around the winner, the stripe of the least total (ties: the smaller label), only
     as far as both sides have labels: one side alone would draw every answer to it. margin: uint8, the least total at
@@ -100,7 +104,7 @@ _BLOCK: Final = BLOCK.count
 
 
 class Fields(NamedTuple):
-    """Addresses of what `Answer` has."""
+    """Addresses of the arrays of `LabelAnswers`."""
 
     label: int
     margin: int
@@ -115,12 +119,11 @@ class ColumnAnswers(NamedTuple):
 
 
 class ReadoutPointers(NamedTuple):
-    """What columns are answered with: numbers (labels, end, size) and addresses.
+    """Numbers (labels, end, size) and addresses that columns are answered with.
 
     totals: uint8, `size` bytes from column to column, at least a vector of LARGEST before and behind each. end: labels
-    up to the end of the last block with stripes. ring: uint8 of each column, the least total of labels that count for
-    the margin, but may be no rival. hidden: uint8 (labels,), LARGEST where there is no stripe. The tables are those of
-    `AnswerSettings`.
+    up to the end of the last block with stripes. hidden: uint8 (labels,), LARGEST where there is no stripe. The tables
+    are those of `AnswerSettings`.
     """
 
     labels: int
@@ -138,7 +141,7 @@ class ReadoutPointers(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def desk_memory(settings: AnswerSettings, columns: int, labels: int) -> NDArray[np.uint8]:
-    """Memory of a desk for so many columns; must live as long as the desk."""
+    """Memory that `desk_of` hands out for so many columns; must live as long as its addresses are used."""
     memory = np.full(labels + columns * (labels + 2 * _BLOCK) + 2 * VECTOR, LARGEST, np.uint8)
     memory[: settings.stripes] = 0
     return memory
@@ -148,7 +151,7 @@ def desk_memory(settings: AnswerSettings, columns: int, labels: int) -> NDArray[
 def desk_of(
     settings: AnswerSettings, out: LabelAnswers, memory: NDArray[np.uint8], columns: int, labels: int
 ) -> ReadoutPointers:
-    """A desk for so many columns; its totals begin at a multiple of their vectors."""
+    """Addresses for so many columns; totals begin at a multiple of their vectors."""
     hidden = address_of(memory)
     totals = -(-(hidden + labels) // VECTOR) * VECTOR + VECTOR
     size = -(-labels // _BLOCK) * _BLOCK + 2 * VECTOR
@@ -222,7 +225,7 @@ def _write_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def answer_columns(pixel: int, columns: int, desk: ReadoutPointers) -> None:
-    """Answer columns from the desk's totals, which are not the same afterwards; pixel: the first one's answer."""
+    """Answer columns from their totals, which are overwritten; pixel: place of the first one's answer."""
     _find_winners(columns, desk)
     _weigh(columns, desk)
     _hide_winners(columns, desk)
@@ -231,7 +234,7 @@ def answer_columns(pixel: int, columns: int, desk: ReadoutPointers) -> None:
 
 @numba.njit(forceinline=True)
 def fetch_answers(pixel, columns, desk):  # type: ignore[no-untyped-def]
-    """Have the places of answers brought into the cache."""
+    """Prefetch the places of answers."""
     answer = desk.answer
     for at in (pixel, pixel + columns - 1):
         prefetch(answer.label + 4 * at)

@@ -1,5 +1,5 @@
-"""The likelihood of one image row: haze, then the stripe, then nothing.
+"""The likelihood of one image row: haze, then the stripe, then less.
 
-`likelihood` is the exact form and the specification of all faster ones; `model` and `inputs` are what it depends on,
-`em` learns the model's background from a sweep.
+`likelihood` is the exact form and the specification of the fast ones; `model` and `inputs` hold what it depends on,
+`em` and `ambient` learn that from a sweep.
 """

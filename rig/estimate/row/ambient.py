@@ -1,8 +1,8 @@
-"""Ambient light and dark counts of every pixel, from dark frames, the quiet side of the stripe and the pixel view.
+"""Ambient light and dark counts of every pixel, from dark frames, quiet pixels behind stripes and sums over columns.
 
-Both are constant for a pixel over the columns (the pixel view of the counts): a pixel that fires far more often than
-its neighbours while the laser crosses the whole picture is hot, whatever the scene. Few counts are drawn to the local
-mean.
+Both are constant for a pixel over the columns of a sweep, so the counts summed over all columns show them: a pixel that
+fires far more often than its neighbours while the laser crosses the whole picture is hot, whatever the scene. Where
+there are few counts, the estimate is drawn to the mean of the pixels around.
 """
 
 import cv2
@@ -14,6 +14,7 @@ from rig.estimate.row.likelihood import FLUX_MAX
 from rig.geometry.windows import SweepGeometry
 
 NEIGHBOURHOOD_PX = 31
+"""Side of the square of pixels whose mean a pixel is drawn to."""
 DEFECT_FLUX = float(FLUX_MAX)
 """Ambient given to pixels not to be used: one that is always lit says the same of every hypothesis, nothing."""
 HOT_SIGMA = 6.0

@@ -22,7 +22,7 @@ from rig.threads import RowWorkers
 LATTICE_LINES = 8192
 """Rows x columns of a sweep that a learning round reads: about 10^6 pixels."""
 NEXT_LINES = 2048
-"""The same of a sweep that carries a model on; what the sweeps before it taught fades by FADE with each."""
+"""Lines read of a sweep that carries a model on; what the sweeps before it taught fades by FADE with each."""
 FADE = 0.7
 WIDTH_STEP = 4
 """Every 4th of those lines is asked for the line's width."""
@@ -30,11 +30,13 @@ WIDTH_EVIDENCE = 3.0
 """Natural logarithm of the odds from which the width moves."""
 FIRST_ROUNDS = 8
 LAST_ROUNDS = 3
+"""Rounds of a first sweep: with a quarter of the lines and the line's width, then with all lines."""
 MOST_TRUST = np.float32(0.98)
-"""Of what neighbours say of a stripe that is sure: its own row may know better."""
+"""Largest trust in what neighbours say of a stripe, however sure they are: its own row may know better."""
 LEVELS = 14
 """Sums per profile bin of an expectation, see `learn_rows`."""
 PIECES = 4
+"""Pieces that lines are summed in, whatever the number of threads."""
 AMPLITUDE_SPAN = 3.4
 """Natural logarithm of the ratio of the largest amplitude to the smallest: a factor of 30."""
 EVEN_SHARE = 0.25
@@ -42,6 +44,7 @@ EVEN_SHARE = 0.25
 PRIOR_PHOTONS = 100.0
 """Weight of the fitted exponential against each bin's own counts."""
 START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
+"""Extinctions that a first sweep is begun with: clear air to dense fog."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +58,14 @@ class Expectation:
     evidence: float
 
     def plus(self, other: "Expectation") -> "Expectation":
-        """Both together."""
+        """Sums of both."""
         return Expectation(
             self.levels + other.levels, self.rows_seen + other.rows_seen, self.columns_seen + other.columns_seen,
             self.amplitude_mass + other.amplitude_mass, self.evidence + other.evidence,
         )  # fmt: skip
 
     def faded(self, share: float) -> "Expectation":
-        """As if only this share of the lines had been seen."""
+        """The sums as if only this share of the lines had been seen."""
         return Expectation(
             share * self.levels, share * self.rows_seen, share * self.columns_seen, share * self.amplitude_mass,
             share * self.evidence,
@@ -368,7 +371,7 @@ def _amplitudes(
 def _position_prior(levels: NDArray[np.float64]) -> NDArray[np.float64]:
     """Log density of stripes over the bins (BINS,), 0 where they are spread evenly; smooth, and never against a place.
 
-    It decides only where a row hardly has photons; a quarter of it stays even, so that it can say at most 1.4 against.
+    It decides only where a row hardly has photons; a quarter of it stays even: it says at most 1.4 nats against.
     """
     kernel = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
     found, even = (np.convolve(np.pad(levels[:, i], 2), kernel, "valid") for i in (12, 13))

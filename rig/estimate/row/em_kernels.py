@@ -1,4 +1,9 @@
-"""Compiled expectation step of the row likelihood: what rows of counts, each with its posterior, say of the model."""
+"""Expectation step of the row likelihood, compiled: sums of rows of counts, each weighted with its own posterior.
+
+For each line `judge_line` gives the posterior P(j) over positions; pixel t lies before the stripe with the probability
+that the stripe is farther, sum over j > t of P(j), and behind it with the rest. Ones and exposures are added with these
+weights per bin of path inverse depth (`learn_rows` has the shapes); sums are float64.
+"""
 
 from typing import Final
 

@@ -1,13 +1,20 @@
-"""What the compiled row likelihood reads: the sweep, the learned state, and one row of it in near-to-far order.
+"""Inputs of the compiled row likelihood: the sweep, the learned state, and one row's fluxes in near-to-far order.
 
-Light of the stripe that the fog scatters once more: a halo on both sides of it, part of each position's hypothesis.
+For a pixel at the point where its ray meets the column's light plane, with paths c from the camera and p from the
+scanner to it, G = row gain x column gain x c x p (both per unit of depth), w' = 2 w / (c + p) the path inverse depth
+and haze, rest, S the profiles of `rig.estimate.row.model` at w',
 
-At the distance d along the row from a stripe of s photons stand, per pixel,
+    before = ambient + G haze(w') + others,    behind = ambient + G rest(w') + others,    scale = S(w')
 
-    s rho(w, d),   rho(w, d) = sum over k of halo(w, k) exp(-|d| / HALO_REACHES_PX[k]) / (2 HALO_REACHES_PX[k])
+in photons per exposure; `others` is the haze of lines lit at the same time (`others_at`). All float32, fluxes cut to
+FLUX_MIN..FLUX_MAX. `judge_line` fills them in and gives the row's posterior.
 
-photons; halo(w, k) is learned (`rig.estimate.joint.halo`) at HALO_NODES path inverse depths, in between by straight
-lines.
+Fog scatters the stripe's own light once more, into a halo on both sides of it. At the distance d along the row from a
+stripe of s photons stand, per pixel,
+
+    s rho(w', d),   rho(w', d) = sum over k of halo(w', k) exp(-|d| / HALO_REACHES_PX[k]) / (2 HALO_REACHES_PX[k])
+
+photons; halo is learned (`rig.estimate.joint.halo`) at HALO_NODES path inverse depths, with straight lines in between.
 """
 
 from typing import NamedTuple
@@ -29,7 +36,7 @@ def halo_shares(model: RowModel, pixels: int) -> NDArray[np.float32]:
 
 
 def over_bins(values: NDArray[np.floating], bins: int) -> NDArray[np.float64]:
-    """What stands at HALO_NODES nodes (nodes, n) at each profile bin, (bins, n)."""
+    """Values given at HALO_NODES nodes, (nodes, n), interpolated at each profile bin: (bins, n)."""
     at = np.linspace(0, len(values) - 1, bins)
     low = np.minimum(at.astype(int), len(values) - 2)
     part = (at - low)[:, None]
@@ -75,7 +82,7 @@ class Lines(NamedTuple):
 class RowState(NamedTuple):
     """A RowModel as the kernels read it: log weights instead of weights, the line's profiles instead of its width.
 
-    glow: (BINS,) of the halo at the stripe itself, photons per pixel over those of the stripe.
+    glow: (BINS,), the halo at the stripe itself, photons per pixel over those of the stripe.
     """
 
     profile: Float32
@@ -172,7 +179,7 @@ def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignor
 
 @numba.njit(inline="always")
 def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-def]
-    """Ambient light, and what the profile brings that is `one` in a bin and `other` in the next."""
+    """Flux of ambient light plus gain times the profile, from `one` in a bin to `other` in the next at `part` of it."""
     return min(max(ambient + gain * (one + part * (other - one)), FLUX_MIN), FLUX_MAX)
 
 
@@ -201,8 +208,9 @@ def line_light(sweep, state, y, c, middle):  # type: ignore[no-untyped-def]
 def others_at(sweep, state, y, c, x):  # type: ignore[no-untyped-def]
     """Haze of the lines that are lit together with column c, at one pixel, whichever side of c's stripe it lies on.
 
-    Where their own stripes lie is not known: their haze has not ended with the share of the depth range that lies
-    behind the pixel's point on their plane, surely where that is nearer than the range begins.
+    Where their own stripes lie is not known. With the probability that is the share of the depth range behind the
+    pixel's point on their plane their haze has not ended there; where the point is nearer than the range it surely has
+    not.
     """
     profile, light = state.profile, 0.0
     ux, vx = np.float64(sweep.u[y, x]), np.float64(sweep.v[y, x])

@@ -1,10 +1,29 @@
-"""Compiled row likelihood: 'haze, stripe, then less' for every row and column of a sweep.
+"""The likelihood of one image row, exact: the specification of everything that `likelihood` and `joint` compute.
 
-Hypothesis j of a row: pixels nearer than the stripe see haze and ambient light (flux B), pixels behind it the pedestal
-and ambient light (flux E), and 2T + 1 pixels around j see q S psi_k on top. With p' = (1 - e)(1 - exp(-flux)) + e/2 the
-log-likelihood of the counts n of K frames is linear in them, sum n logit p' + K log(1 - p'), so that all positions of a
-row cost one cumulative sum plus 2T + 1 taps. The floor e bounds what a single pixel can say.
-Amplitudes q are marginalised over a log grid whose weights are learned; 'no stripe on this row' is a hypothesis too.
+Along a row, from near to far, the light is 'haze, stripe, then less'. The counts n_t of pixels t = 0..L-1 are ones in
+K one-bit frames. Hypothesis (j, m), 'the stripe stands at pixel j with amplitude a_m', expects photons per exposure of
+
+    flux_t = base_t + a_m psi_|t-j| scale_t                   psi: share of the line at 0..T px from its centre
+    base_t = before_t for t < j                               haze and ambient light
+           = behind_t for t > j                               pedestal and ambient light
+           = (before_t + behind_t) / 2 at t = j
+
+A pixel fires with p' = (1 - e)(1 - exp(-flux)) + e/2; the floor e (FLOOR) bounds what a single pixel can say. Then
+
+    log-likelihood(j, m) = sum over t of n_t logit p'_t + K log(1 - p'_t)
+
+is linear in the counts, so that all positions of a row cost one cumulative sum (pixels before and behind j) and 2T + 1
+taps (pixels around j). Beside the stripes stand three hypotheses without one: the row lies before its stripe all along,
+or behind it, or its haze ends between two pixels and nothing shines there. With priors over positions and amplitudes,
+
+    P(j) ~ prior_j sum over m of weight_m exp(log-likelihood(j, m))
+
+`row_scores` is the log-likelihood, `row_posterior` the sum over amplitudes, `mode_of` the answer: read them in this
+order. Arrays of a row are float32 (L,), scores float32 (M, L). Where `before`, `behind`, `scale` and the priors come
+from is told in `rig.estimate.row.inputs` and `rig.estimate.row.model`. Only `logit_table` and LOST approximate.
+
+`rig.estimate.search` and `rig.estimate.joint.labels` are fast forms of this and are tested against it.
+tests/unit/rig/estimate/row/test_likelihood.py holds this module itself against direct sums, in 50 digits and float64.
 """
 
 from typing import Any, Final
@@ -16,20 +35,23 @@ from numpy.typing import NDArray
 Real = float | np.floating[Any]
 
 FLOOR: Final = 1e-3
-"""Probability e of a pixel that does not follow the model (physics of defects: 2-4 % of real pixels are defective)."""
+"""Probability e that a pixel does not follow the model; 2 to 4 % of the pixels of real sensors are defective."""
 EXPONENT_LOW: Final = -21
 EXPONENT_HIGH: Final = 8
 CELL_BITS: Final = 8
+"""Octaves of flux that `logit_table` spans, and bits of its cells within an octave."""
 TABLE_BASE: Final = np.uint32((127 + EXPONENT_LOW) << CELL_BITS)
 TABLE_SHIFT: Final = np.uint32(23 - CELL_BITS)
+"""A float32 shifted right by TABLE_SHIFT bits, less TABLE_BASE, is the number of its cell."""
 FLUX_MIN: Final = np.float32(2.0**EXPONENT_LOW)
 FLUX_MAX: Final = np.float32(2.0**EXPONENT_HIGH * 0.999)
+"""Photons per exposure and pixel that the table begins and ends with."""
 LABEL_PX: Final = 0.25
 """Spacing of the sub-pixel positions around the most probable pixel."""
 LABELS: Final = 13
 """Sub-pixel positions, 1.5 px each way: the mean of the peak, not of its neighbours."""
 LOST: Final = np.float32(24.0)
-"""Log-likelihood below the best at which a hypothesis no longer counts (exp(-24) = 4e-11)."""
+"""Log-likelihood below the best from which on a hypothesis does not count (exp(-24) = 4e-11)."""
 
 
 def logit_table() -> NDArray[np.float32]:
@@ -126,8 +148,8 @@ def none_prior(
 ) -> tuple[float, float, float]:
     """Prior of 'no stripe' as `row_posterior` takes it, from the part of the depth range that the picture shows.
 
-    near, far: ends of the depth range as inverse depths; w_first, w_last: those of the first and last position. What
-    the picture's border cuts off is as likely, per inverse depth, as what it shows.
+    near, far: ends of the depth range as inverse depths; w_first, w_last: those of the first and last position.
+    Positions that the picture's border cuts off are as likely, per inverse depth, as those that it shows.
     """
     span = near - far
     cut_near = min(max((near - w_first) / span, 0.0), 1.0)

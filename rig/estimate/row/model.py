@@ -1,8 +1,11 @@
-"""What the row likelihood knows of light and medium, all of it learned from counts.
+"""The learned model of light and medium that the row likelihood goes by; all of it comes from counts.
 
-Haze is one profile over path inverse depth (its single-scattering form depends on the two path lengths only) times a
-gain per row; the level behind the stripe is a second profile. Amplitudes are powers q of 1 m-normalised reflectance:
-the stripe at inverse depth w carries q S(w) photons, S = w^2 exp(-2 extinction / w).
+Path inverse depth w is 1 over the mean of the two path lengths, scanner to point and point to camera. Over BINS bins of
+it stand two profiles, haze before the stripe and the level behind it, each times a gain per row and per column:
+single-scattered haze depends on the two path lengths only. A stripe carries a S(w) photons, a out of AMPLITUDES learned
+amplitudes (reflectance and laser power), S = w^2 exp(-2 extinction / w), scaled to 1 in the middle bin.
+
+The line is a Gaussian of learned width, integrated over pixels (`pixel_shares`).
 """
 
 import math
@@ -17,9 +20,12 @@ from numpy.typing import NDArray
 from rig.estimate.row.likelihood import LABEL_PX, LABELS
 
 BINS = 64
+"""Bins of path inverse depth of the profiles."""
 AMPLITUDES = 4
+"""Stripe amplitudes that are learned, with their probabilities."""
 EXTINCTION_MAX_PER_M = 5.0
 HALO_NODES = 12
+"""Path inverse depths at which the halo is learned."""
 HALO_REACHES_PX = (8.0, 16.0, 32.0, 64.0, 128.0)
 """Reaches of the exponentials that make up a halo: no line is as wide, and the last one is even over most windows."""
 OPTICAL_DEPTH_MAX = 50.0
@@ -36,8 +42,8 @@ class RowModel:
     width) float32, photons per exposure of ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at
     S = 1 and their probability. none_weight: probability of a row without stripe. line_sigma_px: width of the line.
     extinction_per_m and its standard deviation: NaN where the haze does not resolve it. halo: (HALO_NODES, reaches)
-    float32, light of the stripe's halo over its own (`halo`), zeros where there is none. before: what the map before
-    left to this one (`temporal`), None where that is nothing.
+    float32, light of the stripe's halo over its own (`rig.estimate.row.inputs`), zeros where there is none. before:
+    labels that the map before left to this one (`rig.estimate.joint.temporal`), None where it left none.
     """
 
     profile: NDArray[np.float32]
@@ -58,7 +64,7 @@ class RowModel:
     before: NDArray[np.uint16] | None = None
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Every field that there is as an array, to be kept with the map."""
+        """Every field that is not None as an array, to be kept with the map."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: np.asarray(value) for name, value in values.items() if value is not None}
 

@@ -1,8 +1,14 @@
-"""Compiled close look at the best position of a row: where within the pixel the line lies, and how bright it is.
+"""Close look at the best position of a row, compiled: where within the pixel the line lies, and how bright it is.
 
-The counts of the few pixels around the position are compared with lines a quarter pixel apart, all at once: one label
-to a lane. What a count says of each label is tabled over the two fluxes that matter, haze and line, half an octave
-apart; the line's brightness is taken from the counts themselves.
+A fast form of the likelihood of `rig.estimate.row.likelihood` for LABELS lines LABEL_PX apart, one label to a lane of a
+vector. With L and R the flux left and right of the line, s its light and f_i,t its share in pixel t at label i,
+
+    score_i = K constant_i + sum over t of n_t weight_i,t,   from flux_i,t = share L + (1 - share) R + s f_i,t
+
+in units of 1 / (128 >> shift) octaves of likelihood, saturating int16; the position is the posterior mean over labels,
+float32. weight (int8) and constant (float32) are tabled over two fluxes, haze and line, two levels an octave; s is
+taken from the counts themselves. tests/unit/rig/estimate/search/test_closeup.py holds it against a posterior summed
+label by label.
 """
 
 from typing import Final, NamedTuple
@@ -58,10 +64,10 @@ class Closeup(NamedTuple):
 def label_weights(
     ambient: float, share: float, near_is_left: bool, fine: NDArray[np.float32], table: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What a count says of each label, octaves (LEVELS, LEVELS, F, LABELS), and an exposure (LEVELS, LEVELS, LABELS).
+    """Weight of a count for each label, (LEVELS, LEVELS, F, LABELS), and of an exposure, (LEVELS, LEVELS, LABELS).
 
-    Both less their mean over the labels. For ambient light of so many photons per exposure and a pedestal of so large a
-    share of the haze; fine: (LABELS, F) as `row_model.fine_profiles`; table: `logit_table`.
+    Both in octaves of likelihood, less their mean over the labels. ambient: photons per exposure; share: the pedestal's
+    over the haze; fine: (LABELS, F) as `fine_profiles` of `rig.estimate.row.model`; table: `logit_table`.
     """
     pixels = fine.shape[1]
     reach = (pixels - 1) // 2

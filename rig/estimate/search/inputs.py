@@ -1,5 +1,6 @@
-"""What the search along a row reads and writes: a sweep's `SearchTables`, what is `RowAnswers`, and a thread's
-`SearchPointers` for both.
+"""Arrays of the search along a row: `SearchTables` go in, `RowAnswers` come out, `SearchPointers` are the addresses.
+
+The search is a fast form of `rig.estimate.row.likelihood`, see `rig.estimate.search.rows`.
 """
 
 from typing import Final, NamedTuple
@@ -15,13 +16,13 @@ from rig.simd.memory import address_of
 COUNT_LIMIT: Final = 63
 """Largest count the search works with; counts of more exposures are halved until they fit."""
 EXPOSURE_PARTS: Final = 4
-"""Exposures whose counts were halved are broken numbers: 65 become 32.5, 65535 become 63.999."""
+"""Steps per exposure: where counts are halved exposures become fractions, 65 become 32.5, 65535 become 63.999."""
 FIELDS: Final = 5
-"""x_px, confidence, x_sd_px, signal, haze: see `StripeTable`."""
+"""Fields of an answer: x_px, confidence, x_sd_px, signal and haze, see `StripeTable`."""
 
 
 class SearchTables(NamedTuple):
-    """All that is needed to judge the rows of a sweep; fixed while the sweep lasts.
+    """Inputs of the search in the rows of a sweep, fixed while the sweep lasts.
 
     x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, 2, rows + LANES), first and
     last stored pixel of each search window, the first behind the last where there is none. rows: of the picture.
@@ -29,7 +30,7 @@ class SearchTables(NamedTuple):
     each word the first entry of each row in hot_at, int16, stored pixels whose counts say nothing, and hot_place,
     int32, their places in the counts of all rows of the picture. nominal: exposures the tables are for. faintest,
     brightest: photons of a stripe at scale 1. reach: half the line's width in px. shift: units of the scores are
-    128 >> shift an octave, close_shift: of the close-up's. most: largest count. quiet_step: every so manieth column
+    128 >> shift an octave, close_shift: of the close-up's. most: largest count. quiet_step: one column in so many
     teaches the ambient light. flux: see `count_fluxes`.
     """
 
@@ -57,13 +58,13 @@ class SearchTables(NamedTuple):
 
 
 class RowAnswers(NamedTuple):
-    """What a sweep gives, to be filled.
+    """Answers of a sweep, to be filled.
 
     stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 where there is nothing. quiet: int32 (rows, PAIRS,
     lanes of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
     (rows, lanes + 1), their exposures in 1/EXPOSURE_PARTS as steps up and down. light: int32, like quiet, ones of every
-    pixel within the windows. The last ones of both are still in quiet_here and light_here, uint8 (rows, PAIRS, lanes of
-    the window, 2). lines: int32 (lines, window), counts of the rows that the learning reads; line_start:
+    pixel within the windows. The latest ones of both are still in quiet_here and light_here, uint8 (rows, PAIRS, lanes
+    of the window, 2). lines: int32 (lines, window), counts of the rows that the learning reads; line_start:
     int32 (columns + 1,) and line_row: int32, the rows of each column in order.
     """
 
@@ -79,7 +80,7 @@ class RowAnswers(NamedTuple):
 
 
 class SearchPointers(NamedTuple):
-    """Judge, Found and a thread's own memory as addresses and sizes: see `rig.simd.vectors` for why."""
+    """SearchTables, RowAnswers and a thread's memory as addresses and sizes; `rig.simd.memory` says why addresses."""
 
     memory: int
     lanes: int
@@ -161,11 +162,10 @@ def desk_of(judge: SearchTables, found: RowAnswers, memory: NDArray[np.uint8]) -
 
 
 def count_fluxes() -> NDArray[np.float32]:
-    """Photons per exposure that n ones in k exposures speak for, float32: nearly unbiased, finite also at n = k.
+    """Photons per exposure that n ones in k exposures speak for, float32: log (k + 1/2) / (k - n + 1/2).
 
-    Rows are k in steps of 1/EXPOSURE_PARTS, columns n.
-
-    Halved counts are rounded up, so that n may exceed the limit by one.
+    Nearly unbiased, finite also at n = k. Rows are k in steps of 1/EXPOSURE_PARTS, columns n: up to one more than
+    COUNT_LIMIT, since halved counts are rounded up.
     """
     parts, n = np.mgrid[: EXPOSURE_PARTS * (COUNT_LIMIT + 1), : COUNT_LIMIT + 2]
     k = parts / EXPOSURE_PARTS

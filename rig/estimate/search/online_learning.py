@@ -1,7 +1,8 @@
-"""When an estimator learns, and what it goes by until then.
+"""Decides when an estimator learns, and holds the model that it goes by until then.
 
-The first map is learned from before it is estimated. Now and then a later map teaches, on a thread beside the stream,
-and is heeded a fixed number of frames later, so that a live scan never waits and results do not depend on speed.
+The first map is estimated with a model learned from that map itself. A later map teaches when enough frames have come
+since the last lesson (TEACH_FRAMES), on a thread beside the stream. The new model is used a fixed number of frames
+later (LAG_FRAMES), so that a live scan hardly ever waits and results do not depend on the speed of the machine.
 """
 
 from collections.abc import Callable
@@ -35,12 +36,14 @@ KEPT = 2
 """Tables that are kept under one model: passes of a map are looked at with all of their counts and half of them."""
 
 Tables = TypeVar("Tables")
-"""What an estimator makes ready under a model, for sweeps of one geometry."""
+"""Tables that an estimator makes ready under a model, for sweeps of one geometry."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearningSetting:
-    """What tables are made for. exposures: of most columns; dark: whether sweeps have dark frames.
+    """A model and the kind of sweep that tables are made for.
+
+    exposures: of most columns; dark: whether sweeps have dark frames.
 
     UsageError where the model was learned from a sweep of another size.
     """
@@ -51,7 +54,7 @@ class LearningSetting:
     dark: bool
 
     def __post_init__(self) -> None:
-        """Kernels look nothing up twice: what the model has too little of would be read beyond its end."""
+        """Check the model's size: kernels do not, and would read beyond the end of a model that is too small."""
         model, geometry = self.model, self.geometry
         learned = *model.ambient.shape, len(model.column_gain)
         here = geometry.rows, geometry.width, geometry.columns
@@ -62,11 +65,11 @@ class LearningSetting:
             )
 
     def same(self, other: "LearningSetting") -> bool:
-        """Whether the other's tables would be the same ones."""
+        """Whether the other has the same tables."""
         return self.akin(other) and (self.exposures, self.dark) == (other.exposures, other.dark)
 
     def akin(self, other: "LearningSetting") -> bool:
-        """Whether the other is of the same model and geometry."""
+        """Whether the other has the same model and geometry."""
         return self.model is other.model and self.geometry is other.geometry
 
 
@@ -76,10 +79,10 @@ def _size(rows: int, pixels: int, columns: int) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What a sweep can teach: its tally, ones and exposures of pixels behind clear stripes, some lines of counts.
+    """The part of a sweep that teaches: its tally, ones and exposures behind clear stripes, some lines of counts.
 
-    intensity: of the tally, taken at once: counts may grow by another pass while the lesson is learned. more: what the
-    estimator itself learns from, see `OnlineLearner`.
+    intensity: of the tally, taken when the map was made: counts may grow by another pass while the lesson is learned.
+    more: input of the estimator's own `learn_more`, see `OnlineLearner`.
     """
 
     tally: FrameTally
@@ -90,10 +93,10 @@ class Seen:
 
 
 class OnlineLearner(Generic[Tables]):
-    """The model that an estimator goes by, `None` before a map that taught, and the tables it made under it.
+    """The model that an estimator goes by, `None` before a map that taught, and the tables made under it.
 
-    make: makes tables; called on the thread beside the stream too, as is learn_more: it learns from what `Seen` has for
-    it in `more`, on top of what every estimator does. learns: whether later maps change the model.
+    make: makes tables. learn_more: learns from `more` of a `Seen`, on top of what every estimator learns. Both are
+    called on the thread beside the stream too. learns: whether later maps change the model.
     """
 
     def __init__(
@@ -109,7 +112,7 @@ class OnlineLearner(Generic[Tables]):
         self._learns = learns
         self.model = model
         self._made: list[tuple[LearningSetting, Tables]] = []
-        """Those of one model and geometry, the last used last."""
+        """Tables of one model and geometry, the last used last."""
         self._taught: Expectation | None = None
         self._lesson: Future[tuple[LearningSetting, Expectation, Tables]] | None = None
         self._tutor = ThreadPoolExecutor(1, thread_name_prefix="learning", initializer=yield_to_others)
@@ -129,7 +132,7 @@ class OnlineLearner(Generic[Tables]):
         return self._made[-1][1]
 
     def attend(self, stripes: StripeTable, used: RowModel, frames: int, see: Callable[[], Seen]) -> None:
-        """After a map of so many lit frames, estimated with `used`; see: called where the map is to teach."""
+        """Note a map of so many lit frames, estimated with `used`; `see` is called only where the map is to teach."""
         self._frames_since += frames
         sure = bool(np.mean(stripes.confidence > 0.5) >= LEAST_SURE)
         if sure and self.model is None:

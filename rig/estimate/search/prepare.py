@@ -1,4 +1,9 @@
-"""Makes ready what the compiled search reads: tables per column and band of rows, from model and geometry."""
+"""Makes the tables of the search along a row, per column and band of rows, from a model and a geometry.
+
+The search is a fast form of `rig.estimate.row.likelihood`. Here it is decided how many rows share a table
+(`rows_of_band`), into how fine units likelihood is divided so that no 16-bit sum runs over, and how often counts are
+halved (`judge_of`); tests/unit/rig/estimate/search/test_prepare.py checks those bounds.
+"""
 
 from typing import Any
 
@@ -31,17 +36,17 @@ CLOSE_SHIFT = 3
 CLOSE_LIMIT = 60000
 """Largest sum of a label's weights times counts if all pixels were full, which no line's are. Sums saturate at half."""
 LOOKED_AT = 32
-"""Columns whose weights say in which units to keep those of all."""
+"""Number of columns whose weights decide the units of all."""
 ROUGH_UNITS = 4.0
 """Units per octave in which no weight reaches its limit: a logit lies within 11 octaves of 0 either way."""
 CUT = 1.25
-"""By so much the largest weights may exceed their limit, where they are cut."""
+"""Factor by which the largest weights may exceed their limit, at which they are cut."""
 FRAMES_OVER_TWICE = 8
 """A column may have this many frames more than twice the nominal number before its counts are halved."""
 HOT_FACTOR, HOT_FLUX = 4.0, 0.02
-"""A pixel is hot for the search from this many times its neighbours' ambient light, and so much more, on."""
+"""A pixel is hot for the search above this many times its neighbours' ambient light plus so many photons."""
 LEAST_VEIL = 0.1
-"""Haze of other lines, over the ambient light, from which it is more than the close-up can overlook."""
+"""Haze of other lines, over the ambient light, from which on the close-up has to know of it."""
 
 
 def judge_of(
@@ -110,7 +115,7 @@ def judge_of(
 def _hot_of_windows(
     hot: NDArray[np.bool_], geometry: SweepGeometry
 ) -> tuple[NDArray[np.int32], NDArray[np.int16], NDArray[np.int32]]:
-    """hot_start, hot_at and hot_place of a `Judge`; hot: (rows, width)."""
+    """hot_start, hot_at and hot_place of `SearchTables`; hot: (rows, width)."""
     lanes, rows = padded_lanes(geometry.window), geometry.rows
     starts, at, places = [], [np.zeros(0, np.int16)], [np.zeros(0, np.int32)]
     before = 0

@@ -1,7 +1,12 @@
-"""Compiled estimate of one image row: search, close look, and what the row teaches of the light.
+"""Estimate of image rows, compiled: score every position, look closely at the best, and note what the row teaches.
 
-The same `judge_rows` serves frames as they come and counts that are there already (`rig.estimate.search.stream`): the
-answers are the same bit for bit.
+A fast form of `rig.estimate.row.likelihood`: BATCH rows of one column go together through 16-bit scores
+(`rig.estimate.search.scores`, tables of `rig.estimate.search.tables`), with SCREENS amplitudes instead of all, one
+table for a band of rows and counts of 6 bits. Answers are float32 (FIELDS, rows) per column (`RowAnswers`).
+tests/unit/rig/estimate/search/test_rows.py holds it against the exact form.
+
+`judge_rows` serves frames as they come and counts of whole sweeps (`rig.estimate.search.stream`): the answers are the
+same bit for bit.
 """
 
 from typing import Final
@@ -50,18 +55,18 @@ from rig.simd.vectors import LANES, as_bytes, larger, larger_float, smaller, sma
 QUIET: Final = 0.9
 """Probability within 1 px from which the pixels behind the stripe teach the ambient light."""
 QUIET_STEP: Final = 8
-"""Every 8th column does so where there are dark frames as well, else every one."""
+"""One column in so many does so where there are dark frames as well, else every one."""
 SIGNAL_REACH_PX: Final = 2
 """Pixels on either side whose light is the stripe's, where the line is narrower."""
 FEW_EXPOSURES: Final = 1
-"""Up to so many a close look says no more than the scores of the neighbours, which are there already."""
+"""Exposures up to which a close look says no more than the scores of the neighbours, which are there already."""
 USUAL_PAIRS: Final = 4
 """Pairs of pixels that the close-up looks at, where the line is no wider than usual."""
 
 
 @numba.njit(cache=True, nogil=True)
 def halvings(exposures: int, most: int) -> int:
-    """How often counts of so many exposures are halved."""
+    """Number of times that counts of so many exposures are halved, so that none exceeds `most`."""
     times = 0
     while (exposures >> times) > most:
         times += 1
@@ -70,9 +75,9 @@ def halvings(exposures: int, most: int) -> int:
 
 @numba.njit(forceinline=True)
 def _fetch_ahead(desk: SearchPointers, pixels: int, table: int) -> None:
-    """Have a table on its way into the cache: few of its numbers are read in order, which no processor foresees.
+    """Prefetch a table: few of its numbers are read in order, which no processor foresees.
 
-    The next column's; it saves about 3 % of the time.
+    It is the next column's.
     """
     taps = 2 * SCREENS * desk.taps * pixels
     for at in range(0, taps, CACHE_LINE):
@@ -146,7 +151,7 @@ def _mute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _unmute_hot(desk, search, first, rows, x0):  # type: ignore[no-untyped-def]
-    """Give them back: what teaches the ambient light must be what was counted."""
+    """Give the hot pixels their counts back: the ambient light is learned from what was counted."""
     n, begin = search.n - first * search.n_bytes, _hot_of_row(desk, x0, first)
     for h in range(begin, _hot_of_row(desk, x0, first + rows)):
         write_byte(n, read_int32(desk.hot_place, h), read_byte(search.muted, h - begin))
@@ -314,7 +319,7 @@ def turned(
 ) -> None:
     """Rows first_row..last_row-1 of answers (columns, FIELDS, rows) as (FIELDS, rows, columns).
 
-    limits: as of `Judge`; rows without a search window have no answer.
+    limits: as in `SearchTables`; rows without a search window have no answer.
     """
     columns, fields, _ = stripe.shape
     for y0 in range(first_row, last_row, 16):

@@ -1,9 +1,14 @@
-"""Compiled search along a row: every position scored at once, sixteen to a vector, then the best one looked at closely.
+"""Scores of every position of a row at once, compiled, and the best one with how sure it is.
 
-A row of 128 pixels is eight vectors of counts (`rig.count.lane_order`). Prefix sums run over the steps within a lane
-and then once over the lanes. Scores are saturating 16-bit numbers (`rig.estimate.search.tables`).
+A fast form of the log-likelihood of `rig.estimate.row.likelihood`, less that of 'everything is right of the stripe':
 
-The best position of each row once all are scored, and how sure it is: likelihoods from scores, and their sums.
+    score_m(x) = K constant_m(x) + sum over pixels left of x of n edge + sum over pixels t around x of n_t tap_m,t(x)
+
+n: uint8, at most COUNT_LIMIT. Scores: saturating int16, in units of 1 / (128 >> shift) octaves of likelihood. Tables:
+`rig.estimate.search.tables`. A row of 128 pixels is eight vectors of counts in lane order (`rig.count.lane_order`):
+prefix sums run over the steps within a lane and then once over the lanes. For the probability of the best position
+scores become likelihoods (`rig.simd.functions`), which are summed over the row.
+tests/unit/rig/estimate/search/test_rows.py holds scores against whole numbers and answers against the exact form.
 """
 
 from typing import Final
@@ -83,7 +88,7 @@ def score_rows(table: ScreenTable, reach: int, search: Search, rows: int) -> Non
 
 @numba.njit(forceinline=True)
 def _rise(table, search, r, q, v):  # type: ignore[no-untyped-def]
-    """What pair q of lanes v.. of row r adds to the score of what lies right of it."""
+    """Score that the counts of pair q in lanes v.. of row r add to all positions right of them."""
     n = search.n + r * search.n_bytes + 2 * (PAD + v) + q * pair_bytes(search.lanes)
     return dot_pairs(load_bytes(n, 0), load_bytes(table.edge, 2 * (q * search.lanes + v)))
 
@@ -252,7 +257,7 @@ def add_likelihoods(table: ScreenTable, search: Search, rows: int, window: int, 
 
 @numba.njit(forceinline=True)
 def certainties(table: ScreenTable, search: Search, shift: int):  # type: ignore[no-untyped-def]
-    """Probability of each row of the batch to have its stripe within 1 px of x, float32 lanes; the model's."""
+    """Probability of each row of the batch to have its stripe within 1 px of x, float32 lanes."""
     lift, ceiling = load_int16(search.lift, 0), load_int16(search.ceiling, 0)
     all_left = add_saturated(load_int16(search.all_left, 0), table.all_left)
     all_right = zero_int16() + table.all_right

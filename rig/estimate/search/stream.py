@@ -1,12 +1,13 @@
-"""The counter of `likelihood`: judges each column as soon as it is complete and stores no counts of it.
+"""Counting and judging of a sweep's columns while its frames come in, and of a sweep that is counted already.
 
-Compiled counting and estimation in one pass over a block of frames: counts never leave the cache.
+A fast form of `rig.estimate.row.likelihood`, see `rig.estimate.search.rows`; that judging on the way gives the very
+bits of judging afterwards is tested in tests/unit/rig/estimate/search/test_stream.py.
 
-Rows are worked through in chunks. A chunk's counters take the frames of a column as they come; with the first frame of
-the next column the rows of the finished one are read out of the bit planes into registers, judged, and forgotten. A
-column may lie in several blocks; its counters wait in memory in between.
-
-The search along rows over the counts of a whole sweep.
+`ColumnJudge` is the counter of `likelihood`: it judges each column as soon as it is complete and keeps no counts of it.
+Rows are worked through in chunks, so that counts never leave the cache. A chunk's counters, uint64 bit planes
+(`rig.count.kernels`), take the frames of a column as they come; with the first frame of the next column the rows of the
+finished one are read out of the planes into registers, judged, and forgotten. Where a column goes on in the next block
+its counters wait in memory. `search_volume` judges the counts of a whole sweep, integers (columns, rows, window).
 """
 
 import math
@@ -50,7 +51,7 @@ class OpenColumn(NamedTuple):
     """The column whose frames are being counted; the same for every chunk between two blocks.
 
     column: -1 where none is open. first_word: of the frames' window. frames: counted so far. sums_x0: where the window
-    of `Found.light_here` and `quiet_here` begins; summed: exposures that they hold.
+    of `RowAnswers.light_here` and `quiet_here` begins; summed: exposures that they hold.
     """
 
     column: int
@@ -100,7 +101,7 @@ def _finish(desk, state, planes, row_bytes, first_row, last_row):  # type: ignor
 
 @numba.njit(forceinline=True)
 def _finish_rows(desk, search, state, planes, row_bytes, first_row, last_row):  # type: ignore[no-untyped-def]
-    """`_finish` with a thread's buffers."""
+    """Do the work of `_finish` in a thread's buffers."""
     c, k = state.column, state.frames
     halved = halvings(k, desk.most)
     exposures = np.float32(k / 2.0**halved)
@@ -247,7 +248,7 @@ NO_COLUMN = OpenColumn(-1, 0, 0, 0, 0)
 class SearchedSweep(FrameTally):
     """A sweep whose columns have been judged.
 
-    stripe: the stripe table. light: uint32 (rows, width), counts summed over the columns. quiet: int32 (2, rows,
+    stripe: the stripe table. light: uint32 (rows, width), counts summed over the columns. quiet: float64 (2, rows,
     width), ones and exposures of pixels while clearly behind a stripe. lines: what the learning reads. checked: int32
     (3, points, window), counts of the `check_points`.
     """
@@ -264,7 +265,7 @@ class SearchedSweep(FrameTally):
 
 
 class ColumnJudge:
-    """The `Counter` that judges: counts and estimates one sweep after the other, each under one `Judge`.
+    """The `Counter` that judges: counts and estimates one sweep after the other, each under one `SearchTables`.
 
     Its memory is made once; `begin` clears it for the next sweep.
     """
@@ -282,7 +283,7 @@ class ColumnJudge:
         order = np.lexsort((rows, columns))
         self._found: RowAnswers = nothing_found(geometry, (rows[order], columns[order]))
         self._kept_at = np.argsort(order)
-        """Where the lines of the lattice are among all that are kept, and then those of the points."""
+        """Index among all kept lines: first of those of the lattice, then of those of the check points."""
         self._tally = SweepTally(layout)
         self._row_words = 0
         self._open: dict[int, OpenColumn] = {}
@@ -324,7 +325,7 @@ class ColumnJudge:
         self._workers.settle(under_way)
 
     def finish(self) -> SearchedSweep:
-        """What the sweep gave; the last column is judged now."""
+        """Judge the last column; the sweep with all its columns judged."""
         layout, found = self._layout, self._found
         if self._row_words:
             nothing = np.zeros(0, np.int32)
@@ -369,7 +370,7 @@ class ColumnJudge:
         self._workers.post(chunks, work)
 
     def _desk(self, first: int) -> SearchPointers:
-        """What the thread that begins at chunk `first` works with."""
+        """Addresses for the thread that begins at chunk `first`; made with its first block."""
         if first not in self._benches:
             self._benches[first] = search_memory(padded_lanes(self._layout.window))
         if first not in self._desks:
@@ -398,8 +399,8 @@ def search_volume(
 def nominal_exposures(volume: CountVolume) -> int:
     """Frames nominally taken per column; where only the counts are known, the median of those with any.
 
-    Or more than that, as after passes over a small part of the columns: so many that those of all but a hundredth of
-    them need not be halved.
+    More than that after passes over a small part of the columns: so many that the counts of all but a hundredth of the
+    columns need not be halved.
     """
     if volume.exposures is not None:
         return volume.exposures

@@ -1,14 +1,16 @@
-"""Tables of the search along a row: what a count at each pixel says of every stripe position, per column and band.
+"""Tables of the search along a row, per column and band of rows, and a thread's buffers.
 
-Haze and pedestal vary slowly from row to row, so the rows of a band share one table per column. Weights are whole
-numbers of 1 / `units` octaves of likelihood, of 8 bits, for what a processor multiplies and adds at once; what does not
-depend on the counts is kept per exposure, since the number of frames differs from column to column.
+They hold the terms of `rig.estimate.row.likelihood` in whole numbers of units, `units` to an octave of likelihood: with
+p'_L and p'_R of a pixel left and right of the stripe and p'_S of one that it lights,
 
-Left and right: the flux of a pixel left and right of the stripe. Where near is left, left is haze and ambient light,
-right is the pedestal; with the scanner on the other side it is the other way round. Scores are relative to 'everything
-is as right of the stripe', in units; a pixel left of position x adds its edge weight, the pixels around x their taps.
+    edge = logit p'_L - logit p'_R                  int8: a count at a pixel left of position x
+    tap  = logit p'_S - logit p'_L or R             int8: a count at a pixel around x, for SCREENS amplitudes
+    constant: the same of log(1 - p'), per exposure, since the number of frames differs from column to column
 
-What the search along a row works with: a table made ready for a column, and a thread's buffers.
+Where near is left, left is haze and ambient light and right is the pedestal; with the scanner on the other side it is
+the other way round. Haze and pedestal vary slowly from row to row, so the rows of a band share one table per column.
+8-bit weights are what a processor multiplies and adds at once. `ScreenTables` has the shapes. Answers are held against
+the exact likelihood in tests/unit/rig/estimate/search/test_rows.py.
 """
 
 from typing import Final, NamedTuple
@@ -25,20 +27,22 @@ from rig.simd.shuffles import FOLDED
 from rig.simd.vectors import LANES
 
 SCREENS: Final = 2
-"""Stripe amplitudes of the search; all of them take part in what follows it."""
+"""Stripe amplitudes of the search, for the dim and the bright half of the learned ones; the likelier one counts."""
 OUTSIDE: Final = -32000
 """Score of a position where the column's stripe cannot lie."""
 NONE: Final = 5
 SLOPE: Final = 8
 WEIGHT_LIMIT: Final = 127
-"""Weights are cut there: a count that would say more says this much."""
+"""Largest weight: a count that would say more says this much."""
 LN2: Final = 0.6931471805599453
 FLUX_LEFT, FLUX_RIGHT, GAIN_LEFT, GAIN_RIGHT, LOSS_LEFT, LOSS_RIGHT = range(6)
-"""Rows of what is kept of each pixel: flux on either side of a stripe, and its entries of the logit table."""
+"""Numbers kept of each pixel: flux on either side of a stripe, and its entries of the logit table."""
 
 
 class ScreenTables(NamedTuple):
-    """See the module. P: stored pixels per row, padded to whole vectors; in order of step and lane unless said.
+    """Tables of all columns and bands, see the module.
+
+    P: stored pixels per row, padded to whole vectors; in order of step and lane unless said.
 
     edge: int8 (columns, bands, PAIRS, lanes, 2), weight of a count left of the stripe.
     tap: int8 (columns, bands, SCREENS, STEPS, T + 1, lanes, 2), weights at each position of the counts of T + 1 pairs
@@ -49,7 +53,7 @@ class ScreenTables(NamedTuple):
     none: float32 (columns, bands, NONE), units of 'no stripe': all as right, all as left, a change somewhere (per
     lane); first and last lane with pixels of the column.
     neutral: float32 (columns, bands, P), ones per exposure that say nothing, in pixel order.
-    before, scale: float32 (columns, bands, P) as in `Row`, in pixel order.
+    before, scale: float32 (columns, bands, P) as in `RowBuffers`, in pixel order.
     first, last: int32 (columns, bands), first and last position in stored pixels.
     ambient: float32 (columns, bands, P), ambient light and other lines' haze where there are any, else no columns.
     """
@@ -82,7 +86,7 @@ def fill_tables(
 ) -> None:
     """Tables of bands first_band..last_band-1.
 
-    sweep, state: as of a sweep whose rows are the bands (see `banded`), its counts unused. light, log_share:
+    sweep, state: as of a sweep whose rows are the bands (`rig.estimate.search.prepare`). light, log_share:
     (SCREENS,), amplitudes of the search and the logarithm of their probability. units: per octave. nominal: exposures.
     """
     columns = sweep.plane.shape[0]
@@ -149,7 +153,7 @@ def _positions(sweep, state, light, log_share, per_nat, nominal, b, c, span, row
             within = np.float32(0.0)
         s, lane = x % STEPS, x // STEPS
         place = s * lanes + lane
-        # Of the first one of the pairs that the taps are of.
+        # First pixel of the pairs that the taps are for.
         first_px = 2 * (x // 2 + first_pair(s, reach))
         for m in range(light.shape[0]):
             constant = within
@@ -211,13 +215,13 @@ def _pair(x):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def first_pair(s, reach):  # type: ignore[no-untyped-def]
-    """Where the taps of step s begin, in pairs from that of the step itself on."""
+    """First pair of the taps of step s, in pairs from that of the step itself on; reach: px on either side."""
     return ((s - reach) >> 1) - (s >> 1)
 
 
 BATCH: Final = LANES
-"""Rows that go through each part of the search together: what one row waits for, the others fill, and what is one
-number a row fills the lanes."""
+"""Rows that go through each part of the search together: while one waits for a result, others go on, and numbers of
+which a row has one fill the lanes."""
 PLACE_BEFORE: Final = 8
 """Pixels before the first one, and behind the last one, of which the place is known."""
 
@@ -225,9 +229,9 @@ PLACE_BEFORE: Final = 8
 class ScreenTable(NamedTuple):
     """One table made ready for a number of exposures.
 
-    Addresses, in lane order: edge, tap as in `Tables`, constant as in `Search`; in pixel order, float32 of the stored
-    pixels: before, scale, ambient. Numbers: all_right, all_left: scores of 'no stripe' as of
-    `Tables.none`, that of all pixels lying right complete. searched: whether there is any position to find.
+    Addresses, in lane order: edge, tap as in `ScreenTables`, constant as in `Search`; in pixel order, float32 of the
+    stored pixels: before, scale, ambient. Numbers: all_right, all_left: scores of 'no stripe' as in
+    `ScreenTables.none`; that of all pixels lying right is complete. searched: whether there is any position to find.
     """
 
     edge: int
@@ -246,11 +250,11 @@ class Search(NamedTuple):
 
     n: counts, see `rig.count.lane_order`. int16: score (STEPS, lanes); start (lanes,), score of a change at the lane's
     first pixel; tops (LANES,), best scores of some lanes each; constant (SCREENS, STEPS, lanes), the tables' part per
-    exposure times the exposures; lane (lanes,), the same; change (lanes,), what a change without a stripe in the lane
-    adds; label (LANES,), scores of the close-up; place: index of pixel -PLACE_BEFORE on in a row of counts. neutral,
-    muted: bytes, counts of hot pixels, see `rig.estimate.search.rows`. Of each row of the batch, int16: all_left, score
-    of all pixels lying left; best, x: best score and its pixel; left, right: the scores beside it; levels: of the
-    close-up; lift: what makes a score a power; ceiling: what no score exceeds. float32: light, before, scale, ambient:
+    exposure times the exposures; lane (lanes,), the same; change (lanes,), score added by a change without a stripe in
+    the lane; label (LANES,), scores of the close-up; place: index of pixel -PLACE_BEFORE on in a row of counts.
+    neutral, muted: bytes, counts of hot pixels, see `rig.estimate.search.rows`. Of each row of the batch, int16:
+    all_left, score of all pixels lying left; best, x: best score and its pixel; left, right: the scores beside it;
+    levels: of the close-up; lift: see `lift_to_powers`; ceiling: largest score. float32: light, before, scale, ambient:
     see `rig.estimate.search.rows`; answer: one field of the answers on its way out. Folded (`rig.simd.shuffles`): mass,
     sum of all likelihoods; moment, square: sums of the close-up.
     """

@@ -1,16 +1,17 @@
-"""Compiled parts of the label costs that a batch of rows goes through: sums, scores, costs.
+"""Label costs of a batch of rows, compiled: counts read, edges summed, positions scored, costs written.
 
-Running sums carry the evidence of all pixels behind a label, taps that of the pixels around it; scores are saturating
-16-bit numbers. The two phases of a pixel make the low and the high byte of the same 16 bits, which is their order.
-Each part is a function of its own, not inlined: all in one, the compiler keeps a register for every address.
+A fast form of `rig.estimate.row.likelihood` in saturating int16, LANES pixels to a vector. Against 'everything is
+before the stripe', with weights and constants of `rig.estimate.joint.labels.tables` in units,
 
-Compiled label costs: every label of a row at once, sixteen to a vector, from counts and
-`rig.estimate.joint.labels.tables`.
+    sums(p)  = sum over pixels p' < p of (n edge + constant edge)        evidence of all pixels behind
+    score(x) = sums + max over LIGHTS of (constant + sum over taps n tap)
+    cost(x)  = (best score of the row - score(x)) / 2^down               uint8, at most COST_LIMIT
 
-A column's rows go through each part of the work (`rig.estimate.joint.labels.cost_rows`) sixteen together. A row of 128
-labels and five taps takes 250 cycles on one thread of a busy core (Zen 3), a fifth of them to wait for memory, 765
-instructions: the loop over taps unrolled, which took 105 off. Asking for costs and places ahead: 20 cycles less; for
-tables and counts earlier, or two rows of one table at once: nothing. All parts in one function took 1.6 times as long.
+Counts n are int16 fractions of what they can be (COUNT_BITS). The two phases of a pixel make the low and the high byte
+of the same 16 bits, which is their order. BATCH rows of a column go through each part together. Parts are functions of
+their own, not inlined: in one function the compiler keeps a register for every address. The loop over taps is unrolled
+for the usual width of the line. tests/unit/rig/estimate/joint/test_label_volume.py holds the costs against
+log-likelihoods written out in numpy.
 """
 
 from typing import Any, Final
@@ -101,7 +102,7 @@ def read_bytes(
     """Fill n, from far to near; what lies outside the stored pixels is of any value.
 
     counts: address of the first of all, begin: place of the first row's. stored: first pixel, pixels of a row, all
-    counts, counts of a column. times: what counts are multiplied with.
+    counts, counts of a column. times: factor on counts.
     """
     x0, window, size, column = stored
     factor = np.int16(times)
@@ -208,7 +209,7 @@ def _score_row(sums, n, tap, constant, score, vectors, taps):  # type: ignore[no
 
 @numba.njit(cache=True, nogil=True)
 def score_rows(at: At, constants: int, which: int, taps: int, b: Buffers, batch: int) -> None:
-    """Fill score and top; constants: address of those of positions, which: of what each row's number there is.
+    """Fill score and top; constants: address of those of positions, which: of the number of each row among them.
 
     taps: pixels around a position.
     """
@@ -295,7 +296,7 @@ def fill_costs(
     memory: NDArray[np.uint8],
     out: NDArray[np.uint8],
 ) -> None:
-    """Costs of rows first_row..last_row-1, see `label_volume.Costs.fill`.
+    """Costs of rows first_row..last_row-1, see `Costs.fill` in `rig.estimate.joint.labels.costs`.
 
     hot_x: hot pixels, those of row y from hot_start[y] to hot_start[y + 1]. memory: of `room_for`, kept by the caller,
     since what is known by its address alone would be freed in here.
@@ -310,7 +311,7 @@ def fill_costs(
     room = Fitted(b.constant, b.edge)
     place_at, out_at, counts_at = signed_address(place), signed_address(out), signed_address(counts)
     window, in_bytes = counts.shape[2], counts.itemsize == 1
-    # Of no label are pixels beyond the last vector of any table, and the taps of that; halos weigh all.
+    # Pixels beyond the last vector of any table and its taps belong to no label; only halos weigh them.
     read = pixels
     if halo.weight.size == 0 and tables.used.size > 0:
         read = min(pixels, -(-(FAR_PX + LANES * int(tables.used.max()) + ways.reach) // LANES) * LANES)
@@ -370,10 +371,10 @@ def fill_costs(
 
 @numba.njit(cache=True, nogil=True)
 def _times(exposures: int, ways: Ways) -> float:
-    """What counts of a column are multiplied with, a whole number where it is not below 1; products fit 16 bits.
+    """Factor on the counts of a column, a whole number where it is not below 1; products fit 16 bits.
 
-    A nat of more exposures is worth fewer units, as it would be in a map where all columns had so many: else columns
-    with few would count for less beside others with many, and the penalties between neighbours for more.
+    A nat of more exposures is worth fewer units, as in a map where all columns have so many: else columns with few
+    would count for less beside others with many, and the penalties between neighbours for more.
     """
     full = 2.0 ** (COUNT_BITS - ways.bits)
     worth = (ways.sharp + ways.exposures) / (ways.sharp + exposures)
@@ -398,7 +399,7 @@ def _fetch_table(at: At, i: int, fitted: Fitted) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def fit_tables(tables: LabelTables, ways: Ways, first: int, last: int, memory: NDArray[np.uint8]) -> None:
-    """Fill the fitted parts of tables first..last-1: what they say at the usual number of exposures."""
+    """Fill the fitted parts of tables first..last-1, which are for the usual number of exposures."""
     at = _at(tables, tables.span, tables.span)
     fitted = _usually(tables)
     for i in range(first, last):
@@ -407,7 +408,7 @@ def fit_tables(tables: LabelTables, ways: Ways, first: int, last: int, memory: N
 
 @numba.njit(forceinline=True)
 def _usually(tables):  # type: ignore[no-untyped-def]
-    """What the tables say at the usual number of exposures."""
+    """Addresses of the parts of the tables that are fitted to the usual number of exposures."""
     return Fitted(signed_address(tables.fitted_constant), signed_address(tables.fitted_edge))
 
 
@@ -446,7 +447,7 @@ def _read_any(
     counts: NDArray[np.unsignedinteger[Any]], c: int, y: int, places: int, x0: int, side: int, pixels: int,
     times: float, b: Buffers, batch: int,
 ) -> None:  # fmt: skip
-    """The same as `read_bytes` of counts of any size."""
+    """Fill n as `read_bytes` does, from counts of any size."""
     for r in range(batch):
         start = read_int16(places, PLACES * r + START) - x0
         for p in range(pixels):

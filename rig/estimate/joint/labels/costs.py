@@ -1,9 +1,14 @@
-"""Cost of every label on every row of every column: how much less likely than the best one its counts make it.
+"""Cost of every label on every row of every column: how much less likely it makes the counts than the best label does.
 
-A label is a position of the stripe half a pixel nearer than the one before (`label_grid`); that there is none is not
-among the answers, since a row that is taken for empty would pass nothing on from its neighbours. The likelihood is that
-of `rig.estimate.row.likelihood`, with the line's profile at the label's own fraction of a pixel, from tables that the
-rows of a band share (`rig.estimate.joint.labels.tables`).
+A fast form of `rig.estimate.row.likelihood`: with the line's profile at the label's own eighth of a pixel, LIGHTS
+amplitudes, and tables that the rows of a band share (`rig.estimate.joint.labels.tables`),
+
+    cost(l) = units_per_nat (max log-likelihood - log-likelihood(l)),   uint8 (rows, columns, labels), <= COST_LIMIT
+    units_per_nat = UNITS / (1 + K / SHARP) for K exposures
+
+or less where 16 bits would not hold the scores. EXCLUDED marks labels that cannot be. 'No stripe' is not among the
+labels, since a row that is taken for empty would pass nothing on from its neighbours.
+tests/unit/rig/estimate/joint/test_label_volume.py holds the costs against log-likelihoods written out in numpy.
 """
 
 from dataclasses import dataclass
@@ -38,8 +43,8 @@ from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 
 SHARP: Final = 8.0
-"""Exposures at which a nat is worth half as many: with sharp rows the labels beside the best one must still count. In
-maps taken in passes that goes by each column's own."""
+"""Exposures at which a nat is worth half as many units: where rows are sharp, the labels beside the best one must still
+count. In maps taken in passes each column goes by its own exposures."""
 BAND_ROWS: Final = 64
 """Rows that share tables."""
 FINEST: Final = 64.0
@@ -51,10 +56,11 @@ RISE_LIMIT: Final = 22000
 TAPS_LIMIT: Final = 28000
 """Most that the pixels around a position may add to its score."""
 FRAMES_OVER_HALF_MORE: Final = 4
-"""Half more than the nominal exposures and so many on top is the most that the counts of a column may say."""
+"""The counts of a column weigh no more than those of one and a half times the nominal exposures plus this many."""
 LOOKED_AT: Final = 32
-"""Columns, and rows, whose rise says in which units to keep those of all."""
+"""Number of columns, and of rows, whose rise decides the units of all."""
 QUARTILES: Final = (0.25, 0.75)
+"""Shares of the learned amplitudes below those that the costs try."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,8 +174,8 @@ def _ways(
 def _largest(sweep: Sweep, state: RowState, row: RowBuffers, light: float) -> tuple[float, float]:
     """Largest sums along some rows, in nats.
 
-    Per exposure, what all pixels of a row say by lying behind the stripe instead of before it; per count, what the
-    pixels that a stripe of this light falls on say.
+    Per exposure, of all pixels of a row lying behind the stripe instead of before it; per count, of the pixels that a
+    stripe of this light falls on.
     """
     rise = gain = 0.0
     rows, columns = sweep.x_lo.shape

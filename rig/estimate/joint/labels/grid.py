@@ -1,12 +1,14 @@
 """Positions as labels that neighbours on one surface share: steps of disparity from the far end of the depth range.
 
 On a surface of even depth the stripe of the next column stands one column spacing further on, so that positions in
-pixels tell nothing about neighbours; distances from where the stripe would stand at the far end do.
+pixels tell nothing about neighbours; distances from where the stripe would stand at the far end do. Label l of a row
+and column is at
 
-Where the labels of each row and column lie in its pixels: a table of small numbers, made once per geometry.
+    x = x_far - side l / PER_PX,     x_far: float64 (rows, columns), side: 1 where near is left, else -1
 
-Pixels are numbered from far to near: pixel p of a row is at x = START - side * p, and FAR_PX of them come before the
-one that label 0 is in, so that neighbouring rows of a leaning line have the same depth at the same p. A pixel holds two
+Where labels lie in the pixels of each row is tabled once per geometry (`places_of`, int16 (columns, rows, PLACES)).
+Pixels are numbered from far to near: pixel p of a row is at x = START - side p, and FAR_PX of them come before the one
+that label 0 is in, so that neighbouring rows of a leaning line have the same depth at the same p. A pixel holds two
 labels, half a pixel apart, of phase 0 (its far half) and 1 (its near half); where between the pixels they lie is the
 variant, in eighths of a pixel: 0 to 3.
 """
@@ -22,12 +24,12 @@ from rig.estimate.row.inputs import Sweep, with_rays
 from rig.geometry.windows import MARGIN_PX, SweepGeometry
 
 PER_PX: Final = 2
-"""Labels a pixel: at whole pixels the stripe's place between two of them costs 0.05 px of error at 10 exposures."""
+"""Labels per pixel: with one, the stripe's place between two of them costs 0.05 px of error at 10 exposures."""
 SPARE: Final = 1
 """Labels beyond the searched pixels at either end, for the mean of a peak there."""
 VECTOR: Final = 32
 _ROWS_APART: Final = 8
-"""Rows that are looked at for the distance of columns."""
+"""One row in so many is looked at for the distance of columns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,9 +73,9 @@ def far_ends(
     x_hi: NDArray[np.int32],
     w_far: float,
 ) -> NDArray[np.float64]:
-    """Where each column's line would stand on each row at inverse depth w_far: (rows, columns) pixels.
+    """Position of each column's line on each row at inverse depth w_far: (rows, columns) pixels.
 
-    Between pixels by straight lines, outside the picture by that through the last two; NaN where x_lo > x_hi.
+    Interpolated between pixels, continued outside the picture along its last two; NaN where x_lo > x_hi.
     """
     rows, columns = x_lo.shape
     width = u.shape[1]
@@ -108,7 +110,7 @@ VARIANTS: Final = FRACTIONS // 2
 PHASES: Final = 2
 FAR_PX: Final = MARGIN_PX
 SLACK_PX: Final = 1
-"""How far outside the row's search window a label may lie: the mean of a peak at its end needs both sides."""
+"""Pixels that a label may lie outside the row's search window: the mean of a peak at its end needs both sides."""
 START, VARIANT, ODD, LABEL, LABEL_END, VALID, VALID_END, MEND = range(8)
 """START: x of pixel 0; VARIANT: -1 where nothing is searched; ODD: 1 where label 0 is of phase 1; LABEL, LABEL_END:
 labels that can be, from and up to; VALID, VALID_END: pixels p that were stored and are looked at; MEND: 1 where some
@@ -117,7 +119,7 @@ PLACES: Final = 8
 
 
 def label_pixels(grid: LabelGrid) -> int:
-    """Pixels that labels lie in."""
+    """Number of pixels that labels lie in."""
     return grid.stripes // PHASES + 1
 
 

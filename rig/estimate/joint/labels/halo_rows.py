@@ -1,11 +1,11 @@
-"""Compiled part of the label costs: what the halo says, added to the constants of each row of a batch.
+"""The halo's part of the label costs, compiled: tables over blocks of pixels, and their share in each row's constants.
 
-What the halo adds to the label costs: tables over blocks of pixels, per column and band of rows.
-
-The tables of `rig.estimate.joint.labels.tables` take the halo for as bright everywhere as it is where the stripe
-stands: right where the stripe's place is decided. What it is less beyond varies slowly with the stripe's place and from
-pixel to pixel. So it is told for stripes BLOCK_PX apart, in between by straight lines, from the mean counts of as many
-pixels.
+A fast form of `rig.estimate.row.likelihood` with the halo of `rig.estimate.row.inputs` in every hypothesis. The tables
+of `rig.estimate.joint.labels.tables` take the halo for as bright everywhere as it is at the stripe, which is right
+where the stripe's place is decided. The difference elsewhere varies slowly with the stripe's place and from pixel to
+pixel. So it is tabled for stripes BLOCK_PX apart, with straight lines in between, and for the mean counts of blocks of
+as many pixels (`HaloTables`: int16 weights, float32 constants in nats per exposure).
+tests/unit/rig/estimate/joint/test_halo.py holds the costs against those of a stripe with its halo, pixel by pixel.
 """
 
 from typing import Final, NamedTuple
@@ -97,7 +97,10 @@ def fill_halo(
     tables: LabelTables,
     out: HaloTables,
 ) -> None:
-    """Tables of bands first_band..last_band-1, as `label_tables.fill_tables`; halo: (BINS, pixels) of `halo_shares`."""
+    """Fill bands first_band..last_band-1; arguments as of `rig.estimate.joint.labels.tables.fill_tables`.
+
+    halo: (BINS, pixels) of `halo_shares`.
+    """
     side = 1 if sweep.near_is_left else -1
     pixels = tables.edge.shape[1]
     row, middle_light = row_buffers(sweep.window, 1), np.sqrt(light[0] * light[-1])
@@ -168,8 +171,8 @@ _POSSIBLE: Final = np.int16(28000)
 class HaloAt(NamedTuple):
     """Addresses, for `rig.simd.memory`, and numbers of elements: tables, see there, and room.
 
-    fitted: constants of all places for a column's exposures; mean: counts of blocks; level: what the halo says of a
-    stripe at each place; constant: of the positions, of each row of a batch; which: int32, its number there.
+    fitted: constants of all places for a column's exposures; mean: counts of blocks; level: evidence of the halo
+    for a stripe at each place; constant: of the positions, of each row of a batch; which: int32, its number there.
     """
 
     weight: int
@@ -187,7 +190,7 @@ class HaloAt(NamedTuple):
 
 @numba.njit(forceinline=True)
 def halo_at(tables, begin, constants):  # type: ignore[no-untyped-def]
-    """Where all of it lies, with room from an address on, and where that ends; constants: of positions of a row."""
+    """Addresses of tables and room, the room from `begin` on, and where it ends; constants: of positions of a row."""
     blocks, places = tables.weight.shape[2], tables.weight.shape[4]
     mean = begin + 2 * LIGHTS * places
     level = mean + 2 * (blocks + LANES)
@@ -214,7 +217,7 @@ def fit_halo(halo: HaloAt, column: int, per_nat: float) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def halo_rows(halo: HaloAt, column: int, at: At, fitted: Fitted, b: Buffers, batch: int) -> None:
-    """Fill constant: those of the rows' tables and what the halo says."""
+    """Fill constant: the constants of the rows' tables plus the evidence of the halo."""
     vectors = b.score_row // (PHASES * LANES)
     weights = halo.weight + 2 * column * halo.per_column
     for r in range(batch):

@@ -1,17 +1,20 @@
-"""Tables of the label costs: what a count at each pixel says of every label, per column, band of rows and variant.
+"""Tables of the label costs, per column, band of rows and variant, and the addresses of tables and buffers.
+
+They hold the terms of `rig.estimate.row.likelihood`, relative to 'everything is before the stripe': with p'_B and p'_E
+of a pixel before and behind the stripe, p'_S of one that it lights,
+
+    edge = logit p'_E - logit p'_B                  int16: a count at a pixel behind the stripe
+    tap  = logit p'_S - logit of the above          int16: a count at a pixel around a label, for LIGHTS amplitudes
+    constant, edge_sum: the same of log(1 - p'), float32 per exposure: the number of frames differs between columns
 
 Haze, pedestal and ambient light vary slowly along a line, so the rows of a band share a table for each variant of
-`rig.estimate.joint.labels.grid` that occurs among them. Scores are relative to 'everything is before the stripe': a
-pixel behind it adds its edge weight, the pixels around a label their taps. Weights are for counts as `scaled`
-multiplies them; what does not depend on the counts is kept per exposure, since the number of frames differs from column
-to column.
+`rig.estimate.joint.labels.grid` that occurs among them. Weights are for counts as `scaled` multiplies them.
+`LabelTables` has the shapes. tests/unit/rig/estimate/joint/test_label_volume.py holds the costs against
+log-likelihoods written out in numpy.
 
 The stripe's brightness is not known: of two lights, the quartiles of what was learned, the likelier one counts, both
-as probable. After aggregation that errs by 0.251, 0.155 and 0.117 px at 1, 3 and 10 exposures (`cones`); the mean over
-all four learned ones, weighted, by 0.264, 0.170 and 0.116, a single light by 0.303, 0.216 and 0.210. The learned depth
-histogram as a prior made it 3 to 7 % worse.
-
-Where the compiled label costs find their tables and keep what they work on: addresses, for `rig.simd.memory`.
+equally probable. A single light errs by a fifth to four fifths more; all four learned amplitudes are no better. The
+learned prior of positions does not enter, since it makes errors larger.
 """
 
 from typing import Final, NamedTuple
@@ -40,16 +43,18 @@ from rig.simd.memory import CACHE_LINE, address_of
 from rig.simd.vectors import LANES
 
 LIGHTS: Final = 2
-"""Stripe brightnesses that are tried."""
+"""Stripe brightnesses of which the likelier one counts."""
 WEIGHT_LIMIT: Final = 32767
-"""Weights are cut there: a count that would say more says this much."""
+"""Largest weight: a count that would say more says this much."""
 IMPOSSIBLE: Final = np.float32(-1e9)
 """Constant of a position where no row of the band has a label."""
 _NEAR, _FAR = 0, 1
 
 
 class LabelTables(NamedTuple):
-    """See the module. P: pixels of a row, V: vectors of pixels that hold labels, the first one being pixel FAR_PX.
+    """Tables of all bands and columns, see the module.
+
+    P: pixels of a row, V: vectors of pixels that hold labels, the first one being pixel FAR_PX.
 
     at: int32 (bands, columns, VARIANTS), index of the table, -1 where there is none.
     edge: int16 (tables, P), weight of a count behind the stripe. edge_sum: float32 (tables, P), nats per exposure of
@@ -153,7 +158,7 @@ def fill_tables(
 
 @numba.njit(cache=True, nogil=True)
 def mark_rows(place: NDArray[np.int16], hot: NDArray[np.bool_], side: int, band_rows: int, tables: LabelTables) -> None:
-    """Fill MEND of the rows: their tables weigh pixels that they do not have, or that are hot."""
+    """Set MEND of rows whose tables weigh pixels that the rows do not have, or that are hot."""
     for c in range(place.shape[0]):
         for y in range(place.shape[1]):
             here = place[c, y]
@@ -273,7 +278,7 @@ def _weight(value):  # type: ignore[no-untyped-def]
 
 
 BATCH: Final = LANES
-"""Rows that go through each part of the work together: what one waits for, the others fill."""
+"""Rows that go through each part of the work together: while one waits for a result, others go on."""
 SUMS_FROM: Final = LANES - 1
 """Sums up to and including a pixel belong to the next one: so they are written at whole vectors."""
 POSITION: Final = PHASES * LIGHTS * LANES
@@ -281,7 +286,7 @@ POSITION: Final = PHASES * LIGHTS * LANES
 
 
 class Ways(NamedTuple):
-    """How scores and costs are counted.
+    """Units and limits of scores and costs.
 
     units: of scores per nat, of columns with the usual number of `exposures`; bits: of the largest count; most: what a
     column's exposures may count as; sharp: exposures at which a nat is worth half as many units; down: power of two
@@ -302,7 +307,7 @@ class Ways(NamedTuple):
 
 
 class At(NamedTuple):
-    """Addresses of what tables and places hold, see there, and the elements from table to table."""
+    """Addresses of the arrays of `LabelTables` and of hot pixels, and the elements from table to table."""
 
     edge: int
     edge_sum: int
@@ -318,7 +323,7 @@ class At(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """Addresses of what tables say at a number of exposures, int16: of all tables, or of a column's variants."""
+    """Addresses of constants and edges at a number of exposures, int16: of all tables, or of a column's variants."""
 
     constant: int
     edge: int

@@ -1,7 +1,13 @@
-"""Compiled light of stripes, see `rig.estimate.joint.place.places`, sixteen stripes to a vector.
+"""Light of stripes and haze around them, compiled, LANES stripes to a vector.
 
-Light is the sum over the pixels around a stripe of log (K + 1/2) / (K - n + 1/2): one logarithm of a product. Haze is
-looked up between bins of its profile, from a table with all that is wanted of a bin beside one another.
+With counts n of K frames at the pixels t within LIGHT_PX of a stripe, and the haze taken as half of that before and
+half of that behind,
+
+    light = (sum over t of log (K + 1/2) / (K - n_t + 1/2) - ambient_t - haze) / (1 + (2 LIGHT_PX + 1) glow)
+
+photons per exposure: one logarithm of a product. Blind pixels count as the expected light. Haze is looked up between
+bins of its profile, from a table with all that is wanted of a bin beside one another. Arrays are float32 (rows,
+columns), see `Places` (`rig.estimate.joint.place.places`).
 """
 
 from typing import Final
@@ -122,14 +128,14 @@ def measure_light(
             _measure(at + 4 * c, width, taps_at, ambient_at + 8 * c, bin_at + 8 * c)
         for i in range(len(found)):
             copy_floats(at + 4 * width * (_LIGHT + i), found[i] + 4 * columns * y, columns)
-    # They live until here: what is known by its address alone would be freed.
+    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
     spare[:1] = bins[:1] = taps[:1] = lines[:1] = 0.0
     ambient_places[:1] = bin_places[:1] = 0
 
 
 @numba.njit(cache=True, nogil=True)
 def _bins(profile: Float32, glow: Float32) -> Float32:
-    """Of each bin haze before and behind a stripe, its scale and the halo's glow, and what the next bin has more."""
+    """Table (bins, EIGHT) of haze before and behind a stripe, its scale and glow, and the steps to the next bin."""
     bins = np.zeros((profile.shape[0], EIGHT), np.float32)
     half = EIGHT // 2
     bins[:, : half - 1], bins[:, half - 1] = profile[:, : half - 1], glow
@@ -139,7 +145,7 @@ def _bins(profile: Float32, glow: Float32) -> Float32:
 
 @numba.njit(cache=True, nogil=True)
 def _find_bins(at: int, width: int, gain: np.float32, w_lo: np.float32, per_w: np.float32, last: np.float32) -> None:
-    """Where stripes lie among the profile's bins, and the strength of haze there."""
+    """Write the places of stripes among the profile's bins, and the strength of haze there."""
     for c in range(0, width, LANES):
         px, py = load_float32(at, _PX * width + c), load_float32(at, _PY * width + c)
         pz, u, v = load_float32(at, _PZ * width + c), load_float32(at, _U * width + c), load_float32(at, _V * width + c)

@@ -1,4 +1,9 @@
-"""Sub-pixel places of stripes whose labels are known; see `rig.estimate.joint.place.places`."""
+"""Sub-pixel places of stripes whose labels are known: their light, their pooled places, and the width of the line.
+
+Steps: light of each stripe, pooled brightness, score and information of its place, the place pooled over neighbours,
+then joined by pairs of opposite neighbours. The formulas are in `rig.estimate.joint.place.places` and
+`rig.estimate.joint.place.pool`. Positions are float32 (rows, columns) in px, moved by at most MOST_MOVED_PX.
+"""
 
 from itertools import pairwise
 
@@ -20,10 +25,10 @@ from rig.threads import RowWorkers
 LIGHT_REACH = 3
 """Rows and columns to either side that a stripe's brightness is pooled over."""
 REACHES = (1, 2)
-"""The same of its place: as many as it takes to know it."""
+"""Rows and columns to either side that its place is pooled over: the first of these that tells it well enough."""
 LESSON_REACHES = (1, 2, 3, 4)
-"""The same for the lessons of the first map, whose places no pairs join: those of weak stripes are so smooth that their
-brightness was learned too dark, and behind a halo `motorcycle` then erred by 1.22 instead of 0.68 px."""
+"""REACHES for the lessons of the first map, whose places no pairs join: joined places of weak stripes are so smooth
+that their brightness would be learned too dark."""
 ENOUGH = 1 / 0.06**2
 """Information, 1/px^2, from which a place is known well enough: surfaces bend over more neighbours."""
 PAIRS = ((4, 0.576), (6, 0.280))
@@ -31,8 +36,8 @@ PAIRS = ((4, 0.576), (6, 0.280))
 the share that they know of what each knows: 5 x 5 neighbours count as 25 stripes, joined with eight such as 140, and
 with eight of those as 454, since these overlap."""
 MOST_MOVED_PX = 0.9
-"""By which a stripe moves, all rounds together: labels, half a pixel apart, end a pixel beyond what is searched, and
-answers 2 px beyond it. Pictures with full pixels alone were moved by more."""
+"""Farthest that a stripe moves, all rounds together: labels, half a pixel apart, end a pixel beyond what is searched,
+and answers 2 px beyond it. Only pictures of full pixels would move stripes farther."""
 BEYOND = 3.0
 """Brightness may exceed the learned amplitudes by this factor either way."""
 DARKEST = 300.0
@@ -41,7 +46,7 @@ SLOPE_STEP_PX = 0.05
 LEAST_PHOTONS = 100.0
 """Photons per exposure, over all stripes, that can tell the width of the line."""
 LINE_SIGMA_PX = np.array([0.25, 2.4])
-"""Widths that are looked for."""
+"""Smallest and largest width that is looked for."""
 
 
 def profile_table(sigma_px: float) -> NDArray[np.float32]:

@@ -1,17 +1,17 @@
-"""Compiled sub-pixel placing of stripes: one step of Fisher scoring, pooled over neighbours on the same surface.
+"""Sub-pixel placing of stripes: one step of Fisher scoring, pooled over neighbours on the same surface; counts around.
 
 At its answer each row says how much likelier its counts become with the stripe a little further on (the score g), and
-how much it knows of that at all (the information h). Neighbours on one surface share its distance d from the far end:
+how much it knows of that at all (the information h), `rig.estimate.joint.place.score`. Neighbours on one surface share
+its distance d from the far end, float32 px:
 
     d = sum (h d_n + g_n) / sum h
 
 over them is as good as the maximum of their common likelihood, and 1 / sqrt(sum h) its standard deviation. A stripe's
 brightness is pooled in the same way before: on its own a dark row is taken for a brighter one that stands on haze.
 
-Compiled fetching of what lies around stripes: counts and ambient light of the pixels to both sides.
-
-Counts lie column by column, answers are worked on row by row, sixteen columns to a vector: in tiles of rows and columns
-the counts around all stripes are brought into the order of the answers once, for all that asks for them afterwards.
+Counts lie column by column, answers are worked on row by row, LANES columns to a vector. So the counts around all
+stripes are brought into the order of the answers once, in tiles of rows and columns (`fetch_counts`), for all that asks
+for them afterwards.
 """
 
 from typing import Any, Final, NamedTuple
@@ -38,18 +38,18 @@ CLEAR_SD_PX: Final = 0.2
 BESIDE_PX: Final = 5, 6
 """Pixels to either side, from and to, that show how much of a halo is under a line, and nothing of the line."""
 BLIND_FLUX: Final = np.float32(3.0)
-"""A pixel with so much ambient light fires in 95 % of all frames and shows no more; so does one not to be used."""
+"""Ambient light of a pixel that fires in 95 % of all frames and shows nothing; pixels not to be used have more."""
 LEAST_FRAMES: Final = 2.0
-"""With fewer, light beside a line in a halo is told so badly that the line seems far too narrow."""
+"""With fewer frames light beside a line in a halo is told so badly that the line seems far too narrow."""
 FEW_FRAMES: Final = 3.0
 """Up to so many frames counts are taken as they are: the flux of a full pixel would be a guess."""
 DARK_FRAMES: Final = 1.5
 FEW_FRAMES_FLUX: Final = 0.5
-"""A pixel of FEW_FRAMES is taken to be full from here on."""
+"""Flux from which on a pixel of FEW_FRAMES or fewer is taken to be full."""
 
 
 class Places(NamedTuple):
-    """Room for what is known of each stripe, float32 (rows, columns) each.
+    """Light and place of each stripe, float32 (rows, columns) each.
 
     distance: x from the far end in px, NaN where there is none; light: photons per exposure above haze and ambient;
     scale: those of amplitude 1; haze, rest: before and behind it; glow: of the halo at the stripe, photons per pixel
@@ -144,7 +144,7 @@ Counts = NDArray[np.unsignedinteger[Any]]
 TAPS: Final = 2 * REACH_PX + 1
 """Pixels around a stripe that are looked at; EIGHT are fetched."""
 MOST_FLUX: Final = np.float32(20.0)
-"""In more light no pixel stays dark in a thousand million exposures; ambient light of pixels that there are not."""
+"""Largest flux: no brighter pixel stays dark in 10^8 exposures. Pixels that do not exist get it as ambient light."""
 _TILE: Final = 16
 
 

@@ -1,23 +1,20 @@
-"""Compiled sums over neighbours on the same surface, sixteen stripes to a vector.
+"""Sums over neighbours on one surface, and places joined by pairs of opposite neighbours, LANES stripes to a vector.
 
-Neighbours whose distances from the far end differ by too much are left out one by one, so that no running sums will do.
-Rows are worked on in copies with a margin of stripes that lie nowhere: no neighbour has to be asked for.
+Pooling: a neighbour whose distance from the far end differs by more than SAME_PX is left out, one by one, so that no
+running sums will do. Rows are worked on in copies with a margin of stripes that lie nowhere (`with_margin`, NaN): no
+neighbour has to be asked for. All arrays are float32 (rows, columns).
 
-Compiled placing by pairs of neighbours opposite each other, sixteen stripes to a vector.
-
-The mean of two places that lie opposite each other on a plane is the place between them, whatever the plane's slope. So
-a stripe is joined by its opposite neighbours some stripes away, each placed with its own neighbourhood before, where
-their mean m agrees with its own place d: within SAME_PX, and within SIGMAS of what the standard deviations of both let
-expect,
+Joining: the mean of two places that lie opposite each other on a plane is the place between them, whatever the plane's
+slope. So a stripe is joined by its opposite neighbours some stripes away, each placed with its own neighbourhood
+before, where their mean m agrees with its own place d: within SAME_PX, and within SIGMAS of what the standard
+deviations of both let expect,
 
     d' = (d / s^2 + sum m / v) / (1 / s^2 + sum 1 / v),    v = (s1^2 + s2^2) / 4
 
 Where a surface ends or bends they do not agree, and the stripe stays where it is. Two such rounds reach as far as 25 x
-25 neighbours for the work of 16: with as many summed one by one (`rig.estimate.joint.place.pool`) slopes have to be
-less than SAME_PX over the whole reach, and half a neighbourhood at an edge is off by its slope.
-
-Neighbourhoods overlap, so that pairs know less than the sum of what each knows: `share` of it, which is what makes the
-standard deviation right where all agree.
+25 neighbours for the work of 16; summed one by one so many would ask for slopes of less than SAME_PX over the whole
+reach, and half a neighbourhood at an edge is off by its slope. Neighbourhoods overlap, so that pairs know less than the
+sum of what each knows: `share` of it, which makes the standard deviation right where all agree.
 """
 
 from typing import Final
@@ -96,7 +93,7 @@ def widen_row(at: tuple[int, int, int], width: int, y: int, inner: int, reach: i
 
 @numba.njit(cache=True, nogil=True)
 def _widen_block(at: tuple[int, int, int], to: int, width: int, here: int, c: int, inner: int, reach: int) -> None:
-    """The same of LANES stripes from number `here` of the copies on, whose sums are those from c on."""
+    """Do what `widen_row` does for LANES stripes, from number `here` of the copies and from c of the sums on."""
     own, columns = load_float32(at[0], here), width - 2 * LANES
     a, b = load_float32(to, c), load_float32(to, columns + c)
     for away in range(-reach, reach + 1):
@@ -132,14 +129,14 @@ def pool_amplitude(
                 own = load_float32(at, c) / larger_float(load_float32(at, width + c), _LEAST)
                 store_float32(at, c, smaller_float(larger_float(own, faintest), brightest))
             copy_floats(at, amplitude + 4 * columns * y, columns)
-    sums[:1] = 0.0  # it lives until here: what is known by its address alone would be freed
+    sums[:1] = 0.0  # kept alive up to here: numba would free what only its address still uses
 
 
 @numba.njit(cache=True, nogil=True)
 def pool_places(
     places: Places, reaches: tuple[int, ...], enough: float, first_row: int, last_row: int, moved: Float32, sd: Float32
 ) -> None:
-    """By how far in x each stripe is to move, and the standard deviation of where it is then, in px.
+    """Fill moved, by how far in x each stripe is to move, and sd, the standard deviation of its place then, in px.
 
     reaches: sizes of the neighbourhood, smallest first; the first one that knows `enough` (1/px^2) is taken.
     """
@@ -163,7 +160,7 @@ def pool_places(
                     break
             copy_floats(to + 8 * (width - 2 * LANES), to_moved + 4 * columns * y, columns)
             copy_floats(to + 12 * (width - 2 * LANES), to_sd + 4 * columns * y, columns)
-        # They live until here: what is known by its address alone would be freed.
+        # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
         distance[:1] = score[:1] = known[:1] = 0.0
     lines[:1] = 0.0
 
@@ -221,14 +218,14 @@ def join_pairs(
             _join_row(around, width, (y - band + MARGIN) * width + LANES, step, share, 1.0 / enough, at)
             copy_floats(at, to_distance + 4 * columns * y, columns)
             copy_floats(at + 4 * width, to_sd + 4 * columns * y, columns)
-        # They live until here: what is known by its address alone would be freed.
+        # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
         places[:1] = sds[:1] = 0.0
     lines[:1] = 0.0
 
 
 @numba.njit(cache=True, nogil=True)
 def _join_row(at: tuple[int, int], width: int, here: int, step: int, share: float, known: float, out: int) -> None:
-    """One row, whose first stripe is element `here` of the copies; known: variance from which on stripes stay."""
+    """Join one row, whose first stripe is element `here` of the copies; known: variance from which on stripes stay."""
     one, none = zero_float32() + np.float32(1.0), zero_float32()
     quarter, sigmas, shared = np.float32(0.25), np.float32(SIGMAS * SIGMAS), np.float32(share)
     enough = np.float32(known)

@@ -1,7 +1,13 @@
-"""Compiled score and information of stripes' places, see `rig.estimate.joint.place.places`, sixteen stripes to a
-vector.
+"""Score and information of stripes' places, compiled, LANES stripes to a vector.
 
-A pixel that the row does not have, or that is not to be used, is given light in which nothing can be seen.
+With flux of each of the TAPS pixels around a stripe of `light` photons in K frames, and D = 1 / (e^flux - 1),
+
+    slope = light d share / dx (and the step of haze at the centre),
+    g = sum slope (n D - (K - n)),    h = sum K slope^2 D
+
+are the slope of the log-likelihood in the stripe's place and its Fisher information, 1/px and 1/px^2, float32 (rows,
+columns); `rig.estimate.joint.place.places` says what they are for. A pixel that the row does not have, or that is not
+to be used, is given light in which nothing can be seen.
 """
 
 from typing import Final
@@ -107,7 +113,7 @@ def score_places(
             _score(at + 4 * c, width, known, y * columns + c, taps_at, ambient_at + 8 * c, shares_at + 8 * c, side)
         copy_floats(at + 4 * width * _SCORE, to_score + 4 * columns * y, columns)
         copy_floats(at + 4 * width * _KNOWN, to_known + 4 * columns * y, columns)
-    # They live until here: what is known by its address alone would be freed.
+    # Keeps the arrays alive up to here: numba would free those of which only the address is still used.
     spare[:1] = taps[:1] = lines[:1] = 0.0
     ambient_places[:1] = share_places[:1] = 0
 
