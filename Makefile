@@ -28,7 +28,7 @@ unit: .venv/.installed-tests
 	$(BIN)/pytest -n $(WORKERS) --dist loadfile
 
 # Over the scenes of ../shared/scenes or, where there are none, the built-in one.
-accuracy: accuracy-rows accuracy-joint accuracy-calibration  ## the three below: tables of docs/results.md (hours)
+accuracy: accuracy-rows accuracy-joint accuracy-calibration  ## the three below: tables of docs/results/ (hours)
 
 accuracy-rows: .venv/.installed-tests  ## argmax, edge and likelihood beside the genie
 	$(BIN)/python -m tests.reference.accuracy

@@ -1,7 +1,7 @@
 """Made-up frames of a known truth, enough of them that they come from memory and not from a cache.
 
 Haze falls off with distance and ends, but for a tenth, at a stripe whose place and brightness are drawn anew on every
-row for every `PLACE_FRAMES` frames. The light is that of the working point `report` (docs/results.md).
+row for every `PLACE_FRAMES` frames. The light is that of the working point `report` (docs/results/README.md).
 
 One made-up surface for the rows that make whole maps: as frames of a sweep, and as a pair of pictures.
 

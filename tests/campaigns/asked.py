@@ -1,4 +1,4 @@
-"""Whether the figures of a campaign are what is asked for (docs/results.md), so that a shortfall is an exit code."""
+"""Whether the figures of a campaign are what is asked for (docs/results/), so that a shortfall is an exit code."""
 
 import math
 import sys

@@ -1,4 +1,4 @@
-"""The table of the largest errors that the stability tests find, printed at their end as docs/results.md has it."""
+"""The table of the largest errors that the stability tests find, printed at their end (docs/results/stability.md)."""
 
 from collections.abc import Callable
 
