@@ -1,4 +1,4 @@
-"""The calls about a rig and its computer: check a config, look at devices and scenes, switch the laser off, benchmark."""
+"""The calls about a rig and its computer: check a config, look at devices and scenes, laser off, benchmarks."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
