@@ -1,12 +1,11 @@
-"""The command line: its entry point; the commands are in `rig/cli_*.py`.
+"""The entry point of `rig`; the commands are in the other modules of this package.
 
-Each command is one call of `rig.api` and some printing. Results go to stdout, everything else to stderr. Exit codes:
-0 done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted, 70 an error in the program itself.
+Each command is one call of `rig.api` and some printing. Results go to stdout, everything else to stderr. Exit codes: 0
+done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted, 70 an error in the program itself.
 Nothing heavy is imported before a command runs.
 
-Where numba keeps compiled kernels when neither the package's folder nor the user's own can be written.
-
-Service accounts and containers often have neither, and numba then refuses to compile at all.
+Service accounts and containers often have no folder that numba can keep compiled kernels in, and numba then refuses to
+compile at all: `ensure_kernel_cache` names one.
 """
 
 import logging
@@ -61,7 +60,7 @@ def _private_folder() -> Path:
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
 """Signals that end a program, beside Ctrl-C; no system has all of them."""
 _TYPER_INTERRUPTED = 130
-"""What typer returns where an interrupt reaches it."""
+"""Exit code that typer returns where an interrupt reaches it."""
 
 app = typer.Typer(
     name="rig",
@@ -104,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _ignore_interrupts() -> None:
-    """Let this process, over but for its threads, end with its exit code, however often it is interrupted."""
+    """Ignore interrupts from now on: only threads are left to end, and the exit code stands."""
     if threading.current_thread() is threading.main_thread():
         for name in ("SIGINT", *_ENDING):
             if (number := getattr(signal, name, None)) is not None:
@@ -113,9 +112,9 @@ def _ignore_interrupts() -> None:
 
 @contextmanager
 def _signals_interrupt() -> Iterator[None]:
-    """Let the signals that end a program raise KeyboardInterrupt, so that they make the rig safe as Ctrl-C does.
+    """Within the context, signals that end a program raise KeyboardInterrupt and make the rig safe as Ctrl-C does.
 
-    One that is ignored (nohup) stays ignored; threads other than the main one get none.
+    A signal that is ignored (nohup) stays ignored; threads other than the main one get none.
     """
 
     def interrupt(number: int, frame: object) -> None:
@@ -164,13 +163,13 @@ def _say_why(error: BaseException, arguments: list[str]) -> int:
 
 
 def _values(option: str, arguments: list[str]) -> list[str]:
-    """What the command line gives an option."""
+    """Values that the command line gives an option."""
     after = [value for name, value in pairwise(arguments) if name == option]
     return after + [word.removeprefix(f"{option}=") for word in arguments if word.startswith(f"{option}=")]
 
 
 def _require_no_empty(arguments: list[str]) -> None:
-    """UsageError for an argument without a character: a shell's variable that is not set, which would mean '.'."""
+    """Raise UsageError for an argument without a character: an unset shell variable, which would mean '.'."""
     for before, word in pairwise(["rig", *arguments]):
         if not word or (word.startswith("--") and word.endswith("=")):
             place = f"the argument behind '{before}'" if not word else f"'{word}'"
@@ -193,7 +192,7 @@ def _root(
 
 
 def _join_save(arguments: list[str]) -> list[str]:
-    """`--save every 5` as one value, which is what an option takes."""
+    """Join `--save every 5` into one value, which is what an option takes."""
     for i in range(len(arguments) - 2):
         if arguments[i : i + 2] == ["--save", "every"]:
             return [*arguments[: i + 1], f"every {arguments[i + 2]}", *arguments[i + 3 :]]

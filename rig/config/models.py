@@ -3,10 +3,9 @@
 Times, rates and lengths are text with a unit in YAML ("10 us", "100 kHz", "8 m"). Slots of devices hold the config
 model of their kind, which stands beside its driver. Files are read by `rig.config.files`.
 
-Several lines at once, as a config says it: where they stand, whose power they have, and what is wrong with that.
-
-With L lines the mirror sweeps one L-th of the field, so a map takes one L-th of the frames. `scan.command_range` is
-what the mirror does, and line l's columns lie at its commands plus `line_offsets[l]`.
+A rig may send out several lines at once. With L lines the mirror sweeps one L-th of the field, so a map takes one L-th
+of the frames. `scan.command_range` is what the mirror does, and line l's columns lie at its commands plus
+`line_offsets[l]`.
 """
 
 from collections.abc import Sequence
@@ -32,7 +31,7 @@ from drivers.units import Age, ExactHertz, Metres, Seconds, Watts
 
 MOST_LINES = 16
 LEAST_FRESH = 0.5
-"""Share of the mirror's sweep by which neighbouring lines stand apart at least: closer ones light the same places."""
+"""Least distance of neighbouring lines, as a share of the mirror's sweep: closer ones light the same places."""
 
 LinePower = Literal["shared", "each"]
 
@@ -59,7 +58,7 @@ LineOffsets = Annotated[
 
 
 def line_problems(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> list[str]:
-    """What stands against a map of so many columns, taken by these lines while the mirror sweeps `command_range`."""
+    """Problems with taking a map of so many columns by these lines while the mirror sweeps `command_range`."""
     lines = len(offsets)
     problems = []
     if columns % lines:
@@ -81,7 +80,7 @@ def line_problems(offsets: Sequence[float], columns: int, command_range: tuple[f
 
 
 def with_lines(config: "RigConfig", lines: int, power: LinePower = "shared") -> "RigConfig":
-    """The same rig and field with so many lines, evenly spaced, and the mirror sweeping the share that is left to it.
+    """The config of this rig and field with so many evenly spaced lines; the mirror sweeps the share left to it.
 
     config: of one line. Columns are rounded down to a multiple of `lines`. Raises UsageError where that cannot be.
     """
@@ -140,7 +139,7 @@ Command = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
 
 
 class ScanConfig(ConfigSection):
-    """What one sweep does."""
+    """Settings of one sweep."""
 
     columns: Columns = 500
     exposures: Exposures = 10
@@ -187,7 +186,7 @@ class ScanConfig(ConfigSection):
 
 
 class EstimateConfig(ConfigSection):
-    """How depth is estimated from the counts."""
+    """Settings of the estimate: how depth follows from the counts."""
 
     estimator: Estimator = Field(
         default="likelihood", description="how the stripe is found on each row", examples=["likelihood"]
@@ -223,7 +222,7 @@ class EstimateConfig(ConfigSection):
 
 
 def _of_slot(slot: str) -> BeforeValidator:
-    """Validates a mapping with the config model of the kind it names."""
+    """Validate a mapping with the config model of the kind that it names."""
 
     def validate(value: object, info: ValidationInfo) -> object:
         if isinstance(value, KindConfig):

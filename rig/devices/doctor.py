@@ -201,7 +201,8 @@ KNOWN = (("helios", HELIOS), ("lasercube", LASERCUBE), *(("spb-usb", one) for on
 
 @dataclass(frozen=True, slots=True)
 class Attached:
-    """One attached device. address: what a config's `port` says to mean it. kind: its driver's; None for a serial port."""
+    """One attached device. address: what a config's `port` says to mean it. kind: its driver's; None on serial ports.
+    """
 
     address: str
     what: str

@@ -96,7 +96,7 @@ class Source:
 
 
 def blocks(reader: RingReader, source: Source, silence_s: float) -> Iterator[FrameBlock]:
-    """The blocks of the run. Raises DeviceTimeout, in the SPAD's own words, where it is silent and the ring is empty."""
+    """The blocks of the run. DeviceTimeout, in the SPAD's own words, where it is silent while the ring is empty."""
     while True:
         heard = len(source.silences)
         waited_s = 0.0
