@@ -1,13 +1,12 @@
 """A bare cube of packed frames, made by any program: checked against its plan, counted map by map.
 
-In a .npy file: uint8 (maps x columns x exposures, height, ceil(width/8)), most significant bit first (numpy packbits).
-Or in a recording of frames alone, as `rig import` writes it, whose frames may have gaps in their numbers. Frame f of a
-map belongs to column f // exposures, exactly; there are no dark frames.
+The frames are in a .npy file: uint8 (maps x columns x exposures, height, ceil(width / 8)), packed along the width, most
+significant bit first (`numpy.packbits(frames, axis=2)`). Nothing in an array tells which end of a byte is the left one.
+An array of another form is refused with the line of numpy that converts it. Or the frames are in a recording of frames
+alone, as `rig import` writes it, whose frames may have gaps in their numbers.
 
-Arrays of frames in `.npy` files: opened, or refused with the line of numpy that makes what is wanted.
-
-Wanted is uint8 (frames, height, ceil(width / 8)), packed along the width, most significant bit first
-(`numpy.packbits(frames, axis=2)`). Nothing in an array tells which end of a byte is the left one.
+Frame f of a map belongs to column f // exposures, exactly; there are no dark frames. `open_cube` checks a cube and
+`count_map` counts a map of it.
 """
 
 import io
@@ -34,11 +33,11 @@ from rig.errors import UsageError
 from rig.recording.open import open_recording
 
 PACK: Final = "numpy.packbits(frames, axis=2)"
-"""What packs frames of one byte or number a pixel."""
+"""Line of numpy that packs frames of one byte or number a pixel."""
 LOOK_BYTES: Final = 16 << 20
 _HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _UNREADABLE: Final = (ValueError, EOFError, SyntaxError, OverflowError, MemoryError, tokenize.TokenError)
-"""What numpy raises for bytes that are no array."""
+"""Errors that numpy raises for bytes that are no array."""
 
 
 def open_array(file: Path) -> NDArray[Any]:
@@ -55,7 +54,7 @@ def open_array(file: Path) -> NDArray[Any]:
 
 
 def _archive(file: Path) -> str:
-    """What a file of several arrays is, and how one of them is taken out."""
+    """Message about a file of several arrays, with the line that takes one of them out."""
     with zipfile.ZipFile(file) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist()]
     one = f": numpy.save('cube.npy', numpy.load('{file.name}')['{names[0]}'])" if names else ""
@@ -78,9 +77,9 @@ def holds_bits(frames: NDArray[Any]) -> bool:
 
 
 def numpy_line(frames: NDArray[Any], height: int, width: int) -> str | None:
-    """What numpy makes uint8 (frames, height, ceil(width / 8)) of such an array with; None where its size is another.
+    """The line of numpy that makes uint8 (frames, height, ceil(width / 8)) of an array; None for another size.
 
-    Of several ways the one that changes least.
+    Where there are several ways it is the one that changes least.
     """
     line, shape = "frames", frames.shape
     packed, whole = (height, -(-width // 8)), (height, width)
@@ -113,7 +112,7 @@ def numpy_line(frames: NDArray[Any], height: int, width: int) -> str | None:
 
 
 def _as_bytes(line: str, dtype: np.dtype[Any]) -> str | None:
-    """Packed frames of another type as bytes; None where that holds no bytes."""
+    """Extend the line by what makes bytes of packed frames of another type; None where the type holds no bytes."""
     if dtype == np.uint8:
         return line
     if dtype == np.int8:
@@ -126,7 +125,7 @@ def _pack(line: str, dtype: np.dtype[Any]) -> str:
 
 
 def _why_unreadable(file: Path) -> str:
-    """What is wrong with a file that numpy does not load, and the next step."""
+    """Message about a file that numpy does not load, with the next step."""
     with file.open("rb") as opened:
         header = _header(opened)
         begin, end = opened.tell(), opened.seek(0, io.SEEK_END)
@@ -154,21 +153,21 @@ def _header(opened: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]] | N
 
 
 CHUNK_BYTES = 16 << 20
-"""Frames are read in pieces of this size; larger ones only cost memory."""
+"""Bytes of the pieces that frames are read in; larger ones only cost memory."""
 RATE_TOLERANCE: Final = 1e-3
-"""Relative. Rates are written with three digits or so."""
+"""Relative tolerance of frame rates, which are written with three digits or so."""
 
 Piece = tuple[int, NDArray[np.uint8]]
-"""Number of the first frame, and uint8 (n, height, ceil(width/8) or more) of it and those that follow it."""
+"""Number of the first frame, and uint8 (n, height, ceil(width/8) or more) of this frame and those that follow it."""
 Gap = tuple[int, int]
-"""First and last number of frames that are not there."""
+"""First and last number of frames that are missing."""
 
 
 class Frames(Protocol):
-    """Where a cube's frames lie."""
+    """Source of a cube's frames."""
 
     def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
-        """The frames there are from number `first` to before `end`, at most `step` at a time."""
+        """Give the frames that exist from number `first` to before `end`, at most `step` at a time."""
         ...
 
 
@@ -179,20 +178,20 @@ class ArrayFrames:
     array: NDArray[np.uint8]
 
     def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
-        """The frames from `first` to before `end`."""
+        """Give the frames from `first` to before `end`, at most `step` at a time."""
         for start in range(first, end, step):
             yield start, self.array[start : min(start + step, end)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedFrames:
-    """Frames of a recording's one run, by their own numbers. Those of damaged blocks are left out."""
+    """Frames of a recording's only run, by their own numbers. Those of damaged blocks are left out."""
 
     recording: RunRecording
     run: RecordedRun
 
     def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
-        """The frames there are from `first` to before `end`, in the blocks they lie in."""
+        """Give the frames that exist from `first` to before `end`, in the blocks they lie in."""
         for block in self.recording.blocks(self.run, first, end):
             for start in range(0, block.n_frames, step):
                 yield block.header.first_frame + start, block.bits[start : start + step]
@@ -200,7 +199,7 @@ class RecordedFrames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cube:
-    """Checked frames of whole maps. first_frame: number of the first map's first one. maps: whole sweeps."""
+    """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: whole sweeps."""
 
     path: Path
     frames: Frames
@@ -253,9 +252,9 @@ def column_commands(plan: CubePlan) -> NDArray[np.float64]:
 
 
 def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, list[Gap]]:
-    """Counts of one map, and its frames that are not there. `counter` is made for the cube's columns and size.
+    """Count one map; return the counts and the gaps in its frames.
 
-    The counter is reset first.
+    counter: made for the cube's columns and size; it is reset first.
     """
     counter.reset()
     first = cube.first_frame + index * cube.frames_per_map
@@ -300,7 +299,7 @@ def _array_problems(file: Path, array: NDArray[Any], plan: CubePlan, camera: Cam
 
 
 def _recording_problems(recording: RunRecording, plan: CubePlan, camera: Camera) -> list[str]:
-    """Why the frames of a recording are not those of the plan."""
+    """Reasons why the frames of a recording are not those of the plan."""
     path, run, header = recording.path, recording.runs[0], recording.runs[0].header
     if len(recording.runs) > 1:
         return [

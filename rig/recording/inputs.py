@@ -1,10 +1,9 @@
-"""What stands beside the frames of a recording so that they mean something without the rig: plan and calibration.
+"""Plan and calibration beside the frames of a recording, which give them meaning without the rig.
 
-Dataclasses as plain values for YAML and JSON, and back, exactly: what a recording keeps of its plan and devices.
-
-Fractions become text ("100000/3"), arrays their dtype and values; floats are written so that they read back as the same
-number. Fields that a dataclass computes for itself (init=False) are left out, and so are those marked `SINCE` while
-they have no value: files written before there were any are read as they are.
+`write_inputs` writes them, `read_plan` and `read_model` read them. `to_plain` and `from_plain` turn dataclasses into
+plain values for YAML and JSON and back, exactly: fractions become text ("100000/3"), arrays their dtype and values;
+floats are written so that they read back as the same number. Fields that a dataclass computes for itself (init=False)
+are left out, and so are fields marked `SINCE` while they have no value, so that older files can still be read.
 """
 
 import re
@@ -34,11 +33,11 @@ T = TypeVar("T")
 _FRACTION = re.compile(r"-?\d+(/\d+)?", re.ASCII)
 
 SINCE = "since"
-"""Key of a field's metadata: came later than the first recordings, None by default."""
+"""Key in the metadata of a field that the first recordings did not have; its default is None."""
 
 
 def to_plain(value: Any) -> Any:
-    """Numbers, text, lists and mappings that `from_plain` reads. TypeError for what has no such form."""
+    """Numbers, text, lists and mappings that `from_plain` reads. TypeError for a value that has no such form."""
     if is_dataclass(value):
         kept = [(field, getattr(value, field.name)) for field in fields(value) if field.init]
         return {field.name: to_plain(one) for field, one in kept if one is not None or SINCE not in field.metadata}
@@ -58,7 +57,7 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], content: Any) -> T:
-    """The value of type `kind` that `to_plain` wrote. ValueError where `content` is none."""
+    """The value of type `kind` that `to_plain` wrote. ValueError where `content` is not one."""
     value: T = _read(kind, content, kind.__name__)
     return value
 
@@ -112,9 +111,9 @@ def _need(content: Any, kind: Any, where: str) -> Any:
 PLAN_FILE: Final = "plan.yaml"
 PLAN_VERSION: Final = 1
 MOST_EXPOSURES: Final = 0xFFFF
-"""As of a config."""
+"""Most exposures per column, as in a config."""
 MOST_PIXELS: Final = 0xFFFF
-"""Each way, which is what a block's header can say."""
+"""Most pixels each way, which is what a block's header can say."""
 
 
 def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None) -> None:
@@ -133,7 +132,7 @@ def write_plan(file: Path, plan: ScanPlan) -> None:
 
 
 def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
-    """The plan that a recording was taken with. UsageError where there is none that this program reads."""
+    """Read the plan that a recording was taken with. UsageError where there is none that this program reads."""
     file = folder / name
     try:
         content = load_yaml(file, "a plan", f"format: {PLAN_FORMAT}").content
@@ -159,7 +158,7 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
 
 
 def _require_sizes(plan: ScanPlan) -> None:
-    """ValueError where numbers that sizes are made of do not fit the arrays beside them, or what a block can hold."""
+    """Raise ValueError for numbers of a plan that do not fit its arrays, or that a block cannot hold."""
     row = -(-plan.width // WORD_PX) * WORD_PX
     points = (plan.sweep_points * len(plan.legs),)
     blanking = plan.blanking or Blanking(0.0, 0.0, 0.0)
@@ -192,8 +191,10 @@ def _require_sizes(plan: ScanPlan) -> None:
 
 
 def holds_frames_alone(folder: Path) -> bool:
-    """Whether a recording has no plan and never had one, as imported frames: neither its manifest nor a marker tells
-    of one. DamagedRecordingError where the manifest is damaged.
+    """Whether a recording has no plan and never had one, as imported frames.
+
+    That is so where neither its manifest nor a marker tells of one. DamagedRecordingError where the manifest is
+    damaged.
     """
     if (folder / PLAN_FILE).exists() or PLAN_FILE in ((read_manifest(folder) or {}).get("inputs") or {}):
         return False
@@ -201,14 +202,14 @@ def holds_frames_alone(folder: Path) -> bool:
 
 
 def reconstruct_line(folder: Path) -> str:
-    """The command that makes depth of a recording, with the options for what does not stand beside its frames."""
+    """The command that makes depth of a recording, with options for the files that are missing beside its frames."""
     plan = " --plan PLAN" if holds_frames_alone(folder) else ""
     calibration = "" if (folder / CALIBRATION_FILE).exists() else " --calibration CALIBRATION"
     return f"rig reconstruct {folder}{plan}{calibration} --out DIR"
 
 
 def read_model(folder: Path) -> RigModel | None:
-    """The calibration that a recording was taken with; None where the rig had none. UsageError where it is damaged."""
+    """Read the calibration that a recording was taken with; None where it has none. UsageError where it is damaged."""
     file = folder / CALIBRATION_FILE
     if not file.exists():
         return None
