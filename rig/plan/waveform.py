@@ -1,11 +1,12 @@
-"""What the scanner plays: commands and markers of every point, and when the gate opens on its way.
+"""The scanner's waveform: commands and markers of every point, when the gate opens on the way, and the SPAD's windows.
 
-The windows that a scan needs of its SPAD: which pixels of a row from one line marker to the next.
+`waveform_of` makes commands and markers. `moving_windows` makes the table of windows that a scan needs of its SPAD:
+which pixels of a row from one line marker to the next.
 
 A frame is bound to the column in the middle of its exposure, so an entry of the table holds what every column needs
 that the mirror, its lag included, passes between one marker and the next, and the frame that a marker falls into. After
-the lit part, in the dark, markers of their own take the window over all pixels that columns use: they too are to have
-dark frames. A mirror that turns round at once leaves little room for that.
+the lit part, in the dark, markers of their own move the window over all pixels that columns use: these too need dark
+frames. A mirror that turns round at once leaves little room for that.
 """
 
 import math
@@ -22,9 +23,9 @@ from rig.plan.mirror_path import SweepPath, mirrored
 from rig.plan.scan_plan import Leg, ScanPlan
 
 LEAST_MARKER_POINTS = 4
-"""A marker needs a high and a low point, and as many again before a comparator sees the next one for sure."""
+"""Points of a marker: one high and one low, and as many again before a comparator is sure to see the next one."""
 LEAST_MARKER_FRAMES = 2
-"""Edges this far apart never share a frame, whose record has room for the position of one."""
+"""Frames between edges, so that they never share a frame, whose record has room for the position of one."""
 SLACK_COLUMNS = 1.0
 """Columns kept on either side of those that an entry should see: room for clock errors and late markers."""
 
@@ -110,7 +111,7 @@ def line_markers(path: SweepPath, columns: int, exposures: int) -> tuple[int, ND
 
 
 def _scan_marker_points(leg: Leg, rate: Fraction) -> int:
-    """How long the scan marker, which holds the gate, stays high: until the middle of the gate's last slice.
+    """Points for which the scan marker, which holds the gate, stays high: until the middle of the gate's last slice.
 
     So neither the scanner's clock nor the sync source's decides when the gate closes, while they differ by less.
     """
