@@ -1,14 +1,13 @@
 """`rig calibrate sync`: lag of the mirror each way and delay of the rows, from one unmoved scene at several speeds.
 
-How late the light follows the gate, from the frames of a recorded run at the two ends of its sweeps.
-
-The plan says when the gate opens and closes after the scan marker; the frames say when the light does. A pattern
-generator, a long cable and a laser's driver each add to that. What is seen is the sum, on the SPAD's clock; the line
-has to be in the picture where the gate opens or closes.
+`run_sync` measures them. `gate_delay` measures how late the light follows the gate, from the frames of a recorded run
+at the two ends of its sweeps. The plan says when the gate opens and closes after the scan marker; the frames say when
+the light does. A pattern generator, a long cable and a laser's driver each add to that. What is seen is the sum, on the
+SPAD's clock; the line has to be in the picture where the gate opens or closes.
 
 A line so bright that pixels saturate makes a frame that is lit for a part of its exposure look lit for more, and tells
-little of the moment within it. How much its pixels saturate is told by those that fire in two frames one after the
-other; by what the line moves from one to the next fewer do, which the frame after the next one tells.
+little of the moment within it. Saturation shows in the pixels that fire in two frames in succession; the line's motion
+from one frame to the next makes these fewer, by as much as the frame after the next one shows.
 """
 
 import math
@@ -50,27 +49,31 @@ from rig.scan.run import OutFolder, versions
 Array = NDArray[np.float64]
 
 AROUND_FRAMES = 12
-"""Frames looked at on either side of where an edge is planned."""
+"""Frames looked at on either side of the planned place of an edge."""
 LEAST_FRAMES = 4
-"""On either side of it."""
+"""Fewest frames on either side of an edge."""
 SETTLED_FRAMES = 3
-"""So far from the edge frames and the two that follow are all dark, or all lit."""
+"""Frames from the edge at which a frame and the two that follow are all dark, or all lit."""
 MOST_LATE_FRAMES = 3
-"""A delay is looked for up to here: gates take microseconds; a line that comes into the picture later is no edge."""
+"""Longest delay that is looked for, in frames.
+
+Gates take microseconds; a line that comes into the picture later is not an edge.
+"""
 MOST_SCATTER = 10.0
-"""Ones that vary more than that around an edge, in units of photons' variance, are those of the scene."""
+"""Most variance of the ones around an edge, in units of photons' variance; more comes from the scene."""
 STEPS = 32
 """Delays tried per frame."""
 LEAST_BRIGHTNESS_SDS = 6.0
-"""Light that is no brighter is none."""
+"""Standard deviations by which light must be brighter than dark to count as light."""
 MOST_SWEEPS = 20
 
 
 @dataclass(frozen=True, slots=True)
 class GateDelay:
-    """opens_s, closes_s: how much later than planned, NaN where the line was not in the picture then; their sds.
+    """Delay of the light against the gate of a plan, in seconds.
 
-    edges: so many were seen.
+    opens_s, closes_s: how much later than planned; NaN where the line was not in the picture then. opens_sd_s,
+    closes_sd_s: their standard deviations. edges: number of edges seen.
     """
 
     opens_s: float
@@ -81,19 +84,20 @@ class GateDelay:
 
     @property
     def delay_s(self) -> float:
-        """The mean of both; NaN where one was not seen."""
+        """Mean of both delays; NaN where one was not seen."""
         return (self.opens_s + self.closes_s) / 2
 
     @property
     def sd_s(self) -> float:
-        """Its standard deviation, NaN likewise."""
+        """Standard deviation of the mean; NaN where one was not seen."""
         return math.hypot(self.opens_sd_s, self.closes_sd_s) / 2
 
 
 def gate_delay(run: Path) -> GateDelay | None:
-    """Of a recorded run; None where its SPAD carries no markers: the light itself gives the time then.
+    """Measure the gate's delay in a recorded run.
 
-    UsageError where the run has no plan, ProtocolError where it has no frames.
+    None where its SPAD carries no markers: the light itself gives the time then. UsageError where the run has no plan,
+    ProtocolError where it has no frames.
     """
     plan = read_plan(run)
     if plan.blanking is not None:
@@ -117,9 +121,9 @@ def _is_told(edge: Edge) -> bool:
 
 
 def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises: bool) -> Edge | None:
-    """The edge at delays (delays,) among the frames near where it is planned, at 0; None where some are not there.
+    """The edge at delays (delays,) among the frames near its planned place, at 0; None where some are missing.
 
-    ones: (frames, 3) as of `_ones`. middle_s: (frames,) of their exposures.
+    ones: (frames, 3), see `_ones`. middle_s: (frames,), middle of each exposure.
     """
     frame_s = float(1 / plan.frame_rate_hz)
     near = np.abs(middle_s) < AROUND_FRAMES * frame_s
@@ -132,7 +136,8 @@ def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises:
 
 
 def _saturation(lit: Array, dark: Array) -> float:
-    """Sum of p^2 over sum of p, of pixels that the line lights with probability p; 1, the worst, where none tell."""
+    """Sum of p^2 over sum of p for pixels that the line lights with probability p; 1, the worst, if it cannot be told.
+    """
     if not (len(lit) and len(dark)):
         return 1.0
     whole, next_one, after = (lit.mean(axis=0) - dark.mean(axis=0)).tolist()
@@ -140,7 +145,7 @@ def _saturation(lit: Array, dark: Array) -> float:
 
 
 def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
-    """Number, ones (frames, 3) and middle of exposure (frames,) after the scan marker, of each of the first sweeps."""
+    """Number, ones (frames, 3) and middle of exposure (frames,) after the scan marker, for each of the first sweeps."""
     recording = RunRecording(run)
     found: list[tuple[int, Array, Array]] = []
     for start in recording.runs:
@@ -161,7 +166,7 @@ def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
 
 
 def _ones(block: FrameBlock) -> Array:
-    """(frames, 3): 1s of each frame; those that are 1s of the next frame, too; and of the one after that.
+    """Counts (frames, 3): ones of a frame, those that are ones in the next frame too, and in the one after that.
 
     NaN at the end of a block, and where the window has moved.
     """
@@ -185,7 +190,10 @@ def _after_marker(column: Array, plan: ScanPlan, sweep: int) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class SyncAsked:
-    """exposures: per column, a speed each; none: those of `speeds_of`. accuracy_m: as for planes."""
+    """Request for a measurement of the lags.
+
+    exposures: per column, one speed each; empty is those of `speeds_of`. accuracy_m, at_m: as in `PlanesAsked`.
+    """
 
     exposures: tuple[int, ...] = ()
     accuracy_m: float | None = None
@@ -202,9 +210,12 @@ def run_sync(
     out: OutFolder = None,
     tell: Tell | None = None,
 ) -> CalibrationResult:
-    """Measure the lags. calibration: the file they go into, by default that of the live rig; without one nothing but
-    the figures is written. Raises Degenerate where the sweeps cannot tell, CalibrationError where the file cannot be
-    read or its line does not reach the distance asked.
+    """Measure the lags.
+
+    calibration: file of the model that they go into; None is that of the live rig, and without one only the figures are
+    written.
+    Raises Degenerate where the sweeps cannot tell, CalibrationError where the file cannot be read or its line does not
+    reach the distance asked.
     """
     live = sources.live
     made_from = _own(live) if calibration is None else (calibration, load_rig_model(calibration))
@@ -264,7 +275,7 @@ def _own(live: RigConfig | None) -> Made | None:
 
 
 def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigModel:
-    """The model with the lags found, the gate's delay and where they are from. It fails where they did."""
+    """The model with the lags, the gate's delay and their origin; its verdict fails where the measurement's did."""
     identity = model.identity
     if identity is not None and not verdict.passed:
         identity = replace(identity, verdict="failed", reasons=(*identity.reasons, *verdict.codes))

@@ -132,7 +132,7 @@ def _draft(
 def path_demand(
     scan: ScanConfig, places: int, frame_rate: Fraction, model: RigModel | None, *, markers: bool
 ) -> PathDemand:
-    """What a scan of so many line positions demands of the mirror. markers: whether the SPAD has any."""
+    """The demand of a scan of so many line positions on the mirror. markers: whether the SPAD has any."""
     blanking = None if markers else blanking_for(places, scan.exposures, frame_rate)
     return PathDemand(
         edges=scan.command_range,
@@ -226,7 +226,7 @@ def _transported(plan: ScanPlan, burst: BurstMode | None) -> ScanPlan:
 def _windows(
     model: RigModel | None, commands: NDArray[np.float64], scan: ScanConfig, info: SpadInfo, lines: LineGrid | None
 ) -> tuple[NDArray[np.int32], int, LineGrid | None]:
-    """First pixel of each column's window, the windows' width, and the lines with their share of the windows."""
+    """First pixel of each column's window, the windows' width, and the lines with the overlap of their windows."""
     if model is None:
         return np.zeros(scan.columns, np.int32), -(-info.width // 64) * 64, lines
     from rig.geometry.windows import sweep_geometry

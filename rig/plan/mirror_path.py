@@ -181,7 +181,7 @@ MOST_EXPOSURES = 65535
 
 @dataclass(frozen=True, slots=True)
 class PathDemand:
-    """What a scan demands of the mirror.
+    """The demand of a scan on the mirror.
 
     edges: commands of the lit part's two ends.
     column_s, frame_s: exact seconds of a column and of a frame.

@@ -221,7 +221,7 @@ class Replayed:
         return ENDLESS_S if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
 
     def groups(self) -> Iterator[int]:
-        """Numbers of sweeps of the starts, one after the other."""
+        """Give the number of sweeps of each start, one after the other."""
         sweeps = [start.sweeps for start in self._played]
         return itertools.cycle(sweeps) if self._spad.loops else iter(sweeps)
 
