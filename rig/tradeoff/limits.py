@@ -3,23 +3,22 @@
 The ideal is told haze, ambient light, the line's width and how bright the stripe is, and asked only where it is. Where
 stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the posterior.
 `bayes_errors` draws counts and takes that median: the limit itself, no bound of it, within the noise of the draw, at 5
-ms a row for four numbers of exposures. Chernoff's union bound (`rig.tradeoff.limits`) is 3 to 30 times as large, since
-it counts every rival alone; Cramer-Rao's is too small wherever a rival may win.
+ms a row for four numbers of exposures. Chernoff's union bound is 3 to 30 times as large, since it counts every rival
+alone; Cramer-Rao's is too small wherever a rival may win.
 
 Neighbours on one surface say the same: M of them, of equal disparity and equally bright, count as M times the
-exposures. What coupling can gain is held against that.
+exposures. The gain of coupling neighbours is compared with that.
 
-How often at least, and by how much, a row's photons lead to the wrong position: Chernoff exponents and Cramer-Rao.
-
-B ~ Bernoulli(1 - exp(-flux)) per pixel and exposure, pixels independent, p and q = 1 - p of one position of the stripe,
-p' and q' of another:
+`chernoff_exponent`, `Rivals` and `position_sd_px` say how often at least, and by how much, a row's photons lead to the
+wrong position. B ~ Bernoulli(1 - exp(-flux)) per pixel and exposure, pixels independent, p and q = 1 - p of one
+position of the stripe, p' and q' of another:
 
     C = max over t of -sum log(p^t p'^(1-t) + q^t q'^(1-t))     Chernoff, per exposure
-    P(k beats j) <= exp(-K C)                                   a bound at any K; as K grows, the true exponent
-    E|error| <= sum |k - j| exp(-K C(j, k))                     the union bound: loose where many rival
+    P(k beats j) <= exp(-K C)                                   a bound at any K; as K grows, the true exponent E|error|
+    <= sum |k - j| exp(-K C(j, k))                     the union bound: loose where many rival
     sd >= 1 / sqrt(K I), I = sum flux'^2 / (exp(flux) - 1)      Cramer-Rao, for answers without bias near the truth
 
-How far errors are from what the light of a scene allows: `rig.tradeoff.limits`, beside the rows of a trade-off.
+`SceneLimits` puts the limits beside the rows of a trade-off.
 """
 
 import math
@@ -35,7 +34,7 @@ from rig.tradeoff.row_light import FLUX_MIN, Array, RowLight, scene_lights
 from rig.tradeoff.rows import LOCAL_PX, TradeoffRow
 
 NEWTON_STEPS: Final = 60
-"""Most steps to the best exponent t; bisection alone gets there."""
+"""Most steps to the best exponent t; bisection alone would get there."""
 GAP_EXACT: Final = 0.5
 """1 minus a pixel's overlap below which it is summed from its small parts."""
 SERIES_BELOW: Final = 0.05
@@ -107,9 +106,9 @@ def _convexity(share: Array, x: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rivals:
-    """Places of a row that are whole pixels off the true one: how far, and the Chernoff exponents, (places,) each.
+    """Positions of a row that are whole pixels off the true one: distances and Chernoff exponents, (places,) each.
 
-    reach_px: the farthest an answer within the search can be off.
+    reach_px: the farthest that an answer within the search can be off.
     """
 
     away_px: Array
@@ -118,7 +117,7 @@ class Rivals:
 
     @classmethod
     def of(cls, light: RowLight) -> "Rivals":
-        """The rivals of a row."""
+        """Find the rivals of a row."""
         places = light.whole_positions()
         exponent = chernoff_exponent(light.flux(places), light.flux(np.array([light.position])))
         reach = max(light.position - light.first, light.last - light.position)
@@ -167,13 +166,13 @@ def position_sd_px(light: RowLight, exposures: float) -> float:
 
 
 COUPLED_ROWS: Final = 25
-"""Rows that an estimator which couples neighbours is granted: 5 x 5 of equal disparity."""
+"""Rows that an estimator which couples neighbours is assumed to see together: 5 x 5 of equal disparity."""
 BOUNDED_ROWS: Final = 24
 """Rows of a scene whose exponents and union bounds are computed."""
 COARSE_PX: Final = 0.5
 """Spacing of positions far from the true one."""
 FINE_SHARE: Final = 8.0
-"""Near the true position they lie an eighth of their distance from it apart."""
+"""Positions near the true one lie this part (an eighth) of their distance from it apart."""
 
 
 def bayes_errors(light: RowLight, exposures: Sequence[int], draws: int, rng: np.random.Generator) -> Array:
@@ -193,7 +192,7 @@ def bayes_errors(light: RowLight, exposures: Sequence[int], draws: int, rng: np.
 
 
 def _places(light: RowLight, exposures: int) -> tuple[Array, Array]:
-    """Positions over the search and what each stands for in px: the denser, the nearer to the true one."""
+    """Positions over the search and the pixels that each stands for: the nearer to the true one, the denser."""
     finest = min(max(position_sd_px(light, exposures), 1e-3), 1.0) / FINE_SHARE
     reach = math.ceil(FINE_SHARE * math.log(COARSE_PX / finest))
     steps = finest * np.expm1(np.arange(1, reach + 1) / FINE_SHARE) * FINE_SHARE
@@ -205,7 +204,7 @@ def _places(light: RowLight, exposures: int) -> tuple[Array, Array]:
 
 
 def _medians(score: Array, places: Array, spacing: Array) -> Array:
-    """Median of each posterior (rows, places), even within what a place stands for."""
+    """Median of each posterior (rows, places), which is even within the pixels that a place stands for."""
     mass = np.exp(score - score.max(1, keepdims=True))
     below = np.cumsum(mass, axis=1)
     half = 0.5 * below[:, -1]
@@ -216,12 +215,14 @@ def _medians(score: Array, places: Array, spacing: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class StatisticalLimit:
-    """What rows of a scene allow at a number of exposures; means over its rows.
+    """Limits of rows of a scene at a number of exposures; means over its rows.
 
-    mean_abs_px and its standard error: least mean |error| of any answer from one row, or from `averaged` like ones.
-    within_1px: share of those answers within 1 px. exponent: median over rows of the least Chernoff exponent per
-    exposure to a position more than 1 px off. position_sd_px: median Cramer-Rao bound. error_bound_px: mean union
-    bound on |error| over whole pixels.
+    mean_abs_px, mean_abs_se_px: least mean |error| of any answer from one row, or from `averaged` like ones, and its
+    standard error.
+    within_1px: share of those answers within 1 px.
+    exponent: median over rows of the least Chernoff exponent per exposure to a position more than 1 px off.
+    position_sd_px: median Cramer-Rao bound.
+    error_bound_px: mean union bound on |error| over whole pixels.
     """
 
     exposures: int
@@ -237,11 +238,11 @@ class StatisticalLimit:
 def limits(
     lights: Sequence[RowLight], exposures: Sequence[int], *, averaged: int = 1, draws: int = 32, seed: int = 0
 ) -> list[StatisticalLimit]:
-    """The limit of each number of exposures over some rows of a scene, the same for the same seed.
+    """Compute the limit of each number of exposures over some rows of a scene; the same seed gives the same limit.
 
-    averaged: neighbours of equal disparity that each row may be seen together with, 1 for an estimator of single
-    rows. draws: of each row. 200 rows take a second for four numbers of exposures, and BOUNDED_ROWS of them a second
-    for their exponents and bounds.
+    averaged: neighbours of equal disparity that each row may be seen together with; 1 for an estimator of single rows.
+    draws: of each row. 200 rows take a second for four numbers of exposures, and BOUNDED_ROWS of them a second for
+    their exponents and bounds.
     """
     if not lights:
         raise ValueError("a limit needs at least one row of light")
@@ -269,20 +270,20 @@ def limits(
 
 
 ROWS = 200
-"""Rows of a scene that its limit is the mean of."""
+"""Number of rows of a scene that its limit is the mean of."""
 COUPLED = "joint"
-"""The estimator that sees a row together with its neighbours; the median filter sees as many."""
+"""The estimator that sees a row together with its neighbours; the median filter sees as many rows."""
 LEAST_WRONG = 0.003
-"""Share of the ideal's answers more than 1 px off from which there is a ratio to it: twenty of 200 rows x 32 draws."""
+"""Least share of the ideal's answers more than 1 px off that a ratio is taken to: twenty of 200 rows x 32 draws."""
 LOCAL_SDS = 3.0
-"""Answers within LOCAL_PX are all of those that found the stripe where so many standard deviations fit into that."""
+"""Standard deviations that must fit into LOCAL_PX, so that answers within it are all that found the stripe."""
 
 Place = tuple[str, str | None]
 """Scene and fog."""
 
 
 class SceneLimits:
-    """The limits of scenes and fogs, each worked out once. exposures: all that will be tried."""
+    """Limits of scenes and fogs, each computed once. exposures: all that will be tried."""
 
     def __init__(self, exposures: Sequence[int]) -> None:
         self._exposures = tuple(exposures)
@@ -290,7 +291,7 @@ class SceneLimits:
         self._found: dict[tuple[Place, int], dict[int, StatisticalLimit]] = {}
 
     def beside(self, rows: Sequence[TradeoffRow], config: RigConfig) -> list[TradeoffRow]:
-        """The rows of one scene and fog with what they can be held against; as they are where there is no limit.
+        """Add the limits to the rows of one scene and fog; rows without a limit stay as they are.
 
         config: of their scan.
         """
@@ -322,7 +323,7 @@ def _averaged(row: TradeoffRow) -> int:
 
 
 def _beside(row: TradeoffRow, limit: StatisticalLimit) -> TradeoffRow:
-    """A row beside its limit; each figure None where it is not known, or would say something else."""
+    """Add the limit to a row; each figure is None where it is not known or would mislead."""
     wrong, least_wrong = 1.0 - row.within_1px, 1.0 - limit.within_1px
     bound_px, sd_px = limit.position_sd_px, row.local_sd_px
     local = LOCAL_SDS * bound_px <= LOCAL_PX
