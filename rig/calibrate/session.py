@@ -72,8 +72,7 @@ def load_view(file: Path) -> View:
 
 
 def load_views(folder: Path) -> tuple[View, ...]:
-    """Read all views of a folder, in the order of their files. UsageError where one is not readable or there is none.
-    """
+    """Read all views of a folder, in the order of their files. UsageError where one is not readable or there is none."""
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise UsageError(f"{folder} holds no view (*.npz); name the folder of an earlier calibration")

@@ -136,8 +136,7 @@ def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises:
 
 
 def _saturation(lit: Array, dark: Array) -> float:
-    """Sum of p^2 over sum of p for pixels that the line lights with probability p; 1, the worst, if it cannot be told.
-    """
+    """Sum of p^2 over sum of p for pixels that the line lights with probability p; 1, the worst, if it cannot be told."""
     if not (len(lit) and len(dark)):
         return 1.0
     whole, next_one, after = (lit.mean(axis=0) - dark.mean(axis=0)).tolist()

@@ -134,7 +134,9 @@ def _signals_interrupt() -> Iterator[None]:
 
 
 def _say_why(error: BaseException, arguments: list[str]) -> int:
-    """Say what ended a command that did not handle it: a usage error of click's, an interrupt or a mistake of ours."""
+    """Say what ended a command that did not handle it: a usage error of click's, an interrupt or a mistake of the
+    program.
+    """
     as_json = "--json" in arguments
     if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
         return _TYPER_INTERRUPTED

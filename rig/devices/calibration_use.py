@@ -40,7 +40,7 @@ class Refusal:
     text: str
 
     def __str__(self) -> str:
-        """One line, as summaries have it."""
+        """The reason in one line, as summaries have it."""
         return f"{self.code}: {self.text}"
 
 
@@ -140,7 +140,7 @@ class CalibrationUse:
     accepted: tuple[Refusal, ...] = ()
 
     def content(self) -> dict[str, Any]:
-        """For the manifest."""
+        """Describe it for the manifest."""
         return {
             "id": self.model.fingerprint(),
             "provenance": dict(self.model.provenance),

@@ -45,7 +45,7 @@ class Finding:
     text: str
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """Return it as plain values."""
         return asdict(self)
 
 
@@ -201,15 +201,14 @@ KNOWN = (("helios", HELIOS), ("lasercube", LASERCUBE), *(("spb-usb", one) for on
 
 @dataclass(frozen=True, slots=True)
 class Attached:
-    """One attached device. address: what a config's `port` says to mean it. kind: its driver's; None on serial ports.
-    """
+    """One attached device. address: what a config's `port` says to mean it. kind: its driver's; None on serial ports."""
 
     address: str
     what: str
     kind: str | None
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """Return it as plain values."""
         return asdict(self)
 
 

@@ -101,7 +101,7 @@ def export_run(
 
 
 class _Export:
-    """One export on its way: a method for each kind."""
+    """An export under way: a method for each kind."""
 
     def __init__(self, run: Path, folder: RunFolder, options: ExportOptions, progress: Progress | None) -> None:
         self._run, self._folder, self._options = run, folder, options

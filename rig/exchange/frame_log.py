@@ -53,7 +53,7 @@ class FrameLog:
         return self._header
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """One array (frames,) per property: number, run, ticks and the fields of the records."""
+        """Arrays (frames,): number, run, ticks and the fields of the records."""
         header = self.header
         records = np.concatenate(self._records)
         runs = np.repeat(np.array(self._runs, np.uint16), [len(part) for part in self._records])

@@ -60,9 +60,10 @@ class PathSegment:
 class SweepPath:
     """One sweep from its scan marker (point 0) to the next one.
 
-    points: length of the sweep. lit_start: points from the start to the command of the first lit edge; lit_points:
-    points between the two lit edges. cruise: first and last point of the constant-velocity part. low, high: extreme
-    commands.
+    points: length of the sweep.
+    lit_start: points from the start to the command of the first lit edge. lit_points: points between the two lit edges.
+    cruise: first and last point of the constant-velocity part.
+    low, high: extreme commands.
     """
 
     segments: tuple[PathSegment, ...]

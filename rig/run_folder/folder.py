@@ -313,7 +313,7 @@ _EVERY = re.compile(r"every[\s:=]+(?P<step>\d+)", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class SavePolicy:
-    """Which maps of a run are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last map."""
+    """Policy for which maps of a run are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last."""
 
     step: int | None = 1
 

@@ -96,7 +96,7 @@ class RunFrames:
 
 @dataclass(frozen=True, slots=True)
 class Synchronisation:
-    """How the frames of a run were bound to columns, and how well.
+    """The binding of a run's frames to columns: by what, and how well.
 
     residual_columns, clock_error: the largest of its sweeps; None where one could not be checked.
     detection_probability: the least over the sweeps, of finding a blanking pattern as bright as theirs; None where

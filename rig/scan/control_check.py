@@ -40,7 +40,7 @@ class ControlCheck:
         return asdict(self)
 
     def __str__(self) -> str:
-        """For people."""
+        """Say in one line what was compared."""
         return (
             f"{self.commands} commands as recorded, {self.swaps} buffer swaps at most {self.worst_swap_s * 1e3:.1f} ms "
             "from their times"
