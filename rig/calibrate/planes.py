@@ -33,65 +33,6 @@ from rig.config.models import RigConfig
 from rig.progress import tell_stage
 from rig.scan.run import OutFolder, versions
 
-START_POSES = 3
-"""Number of poses that are shown before anything is fitted."""
-
-
-class Guide:
-    """Chooses poses by how much they lower the expected error, until the accuracy asked for is expected."""
-
-    def __init__(
-        self, start: FixedPoses, board: Board, depth_range_m: tuple[float, float], taken: Taken,
-        fit: Callable[[], RigFit], judge: Callable[[RigFit], Judged], tell: Tell | None,
-    ) -> None:  # fmt: skip
-        """Prepare the guide.
-
-        start: poses for as long as no fit can be judged. taken: all views so far, those kept earlier too. fit, judge:
-        fit and judge these views as the calibration itself will be.
-        """
-        self._start = start
-        self._board = board
-        self._depth_range_m = depth_range_m
-        self._taken = taken
-        self._fitted = fit
-        self._judged = judge
-        self._tell = tell
-        self._asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
-
-    def next(self, views: Sequence[View]) -> Advice | None:
-        """The next pose; None where the expected error is small enough."""
-        known = self._taken.views
-        told = self._told() if len(known) >= START_POSES else None
-        if told is None:
-            return self._start.next(views)
-        fit, judged = told
-        at_m = judged.asked.at_m
-        now_m = judged.evidence.expected_m
-        if self._tell is not None:
-            self._tell(f"expected error {judged.uncertainty.line()}; asked {mm(judged.asked.accuracy_m)}")
-        if judged.verdict.passed:
-            return None
-        choices = [
-            choice
-            for choice in candidates(fit.model.camera, self._board, self._depth_range_m)
-            if (choice.fill, choice.place, choice.tilt) not in self._asked
-        ]
-        if not choices:
-            return None
-        advice = next_pose(len(known), choices, at_m, now_m, Forecast(fit, at_m))
-        chosen = advice.candidate
-        self._asked.add((chosen.fill, chosen.place, chosen.tilt))  # a board that was not found there will not be again
-        return advice
-
-    def _told(self) -> tuple[RigFit, Judged] | None:
-        """Fit and judge the views so far; None where they make no model yet, or its line misses the distance asked."""
-        try:
-            fit = self._fitted()
-            return fit, self._judged(fit)
-        except CalibrationError:
-            return None
-
-
 POSES = 12
 SPEEDS = ((1.0, 1), (0.3, 2), (2.0, 4))
 """Exposures per column by turns: factors of the config's, and the least number for each.
@@ -298,3 +239,62 @@ def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None, camera: Cam
         rows.append(("truth", f"median {mm(truth.median_m)}, worst {mm(truth.worst_m)} at "
                               f"{truth.depth_m:g} m, {truth.ratio:.2f} of the expected sd"))  # fmt: skip
     return rows
+
+
+START_POSES = 3
+"""Number of poses that are shown before anything is fitted."""
+
+
+class Guide:
+    """Chooses poses by how much they lower the expected error, until the accuracy asked for is expected."""
+
+    def __init__(
+        self, start: FixedPoses, board: Board, depth_range_m: tuple[float, float], taken: Taken,
+        fit: Callable[[], RigFit], judge: Callable[[RigFit], Judged], tell: Tell | None,
+    ) -> None:  # fmt: skip
+        """Prepare the guide.
+
+        start: poses for as long as no fit can be judged. taken: all views so far, those kept earlier too. fit, judge:
+        fit and judge these views as the calibration itself will be.
+        """
+        self._start = start
+        self._board = board
+        self._depth_range_m = depth_range_m
+        self._taken = taken
+        self._fitted = fit
+        self._judged = judge
+        self._tell = tell
+        self._asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
+
+    def next(self, views: Sequence[View]) -> Advice | None:
+        """The next pose; None where the expected error is small enough."""
+        known = self._taken.views
+        told = self._told() if len(known) >= START_POSES else None
+        if told is None:
+            return self._start.next(views)
+        fit, judged = told
+        at_m = judged.asked.at_m
+        now_m = judged.evidence.expected_m
+        if self._tell is not None:
+            self._tell(f"expected error {judged.uncertainty.line()}; asked {mm(judged.asked.accuracy_m)}")
+        if judged.verdict.passed:
+            return None
+        choices = [
+            choice
+            for choice in candidates(fit.model.camera, self._board, self._depth_range_m)
+            if (choice.fill, choice.place, choice.tilt) not in self._asked
+        ]
+        if not choices:
+            return None
+        advice = next_pose(len(known), choices, at_m, now_m, Forecast(fit, at_m))
+        chosen = advice.candidate
+        self._asked.add((chosen.fill, chosen.place, chosen.tilt))  # a board that was not found there will not be again
+        return advice
+
+    def _told(self) -> tuple[RigFit, Judged] | None:
+        """Fit and judge the views so far; None where they make no model yet, or its line misses the distance asked."""
+        try:
+            fit = self._fitted()
+            return fit, self._judged(fit)
+        except CalibrationError:
+            return None

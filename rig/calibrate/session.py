@@ -40,71 +40,6 @@ from rig.errors import UsageError
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import OutFolder
 
-VERSION: Final = 1
-Arrays = Mapping[str, NDArray[Any]]
-
-
-def save_view(view: View, file: Path) -> None:
-    """Write a view, in one step. UsageError where it cannot be written."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, allow_pickle=False, **_arrays(view))
-    part = file.with_name(f".{file.name}.part")
-    try:
-        part.write_bytes(stream.getvalue())
-        part.replace(file)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise UsageError(
-            f"cannot write {file}: {error.strerror or error}; name another folder or free the space it needs"
-        ) from error
-
-
-def load_view(file: Path) -> View:
-    """Read a view. UsageError where the file holds none."""
-    try:
-        with load_numpy(file) as arrays:
-            version = int(arrays["format_version"])
-            if version != VERSION:
-                raise UsageError(f"{file} is a view of version {version}, this program reads version {VERSION}")
-            return _view(arrays)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise UsageError(f"{file} is no view of a calibration ({error}); take it out of the folder") from error
-
-
-def load_views(folder: Path) -> tuple[View, ...]:
-    """Read all views of a folder, in the order of their files. UsageError where one is not readable or there is none."""
-    files = sorted(folder.glob("*.npz"))
-    if not files:
-        raise UsageError(f"{folder} holds no view (*.npz); name the folder of an earlier calibration")
-    return tuple(load_view(file) for file in files)
-
-
-def _arrays(view: View) -> dict[str, NDArray[Any]]:
-    arrays: dict[str, NDArray[Any]] = {"format_version": np.array(VERSION), "name": np.array(view.name)}
-    if view.picture is not None:
-        arrays["picture"] = view.picture
-    if view.corners is not None:
-        arrays |= {"corner_ids": view.corners.ids, "corner_px": view.corners.px}
-        if view.corners.sd_px is not None:
-            arrays["corner_sd_px"] = view.corners.sd_px
-    for number, sweep in enumerate(view.passages):
-        arrays[f"passages_{number}"] = np.stack([sweep.x_px, sweep.y_px, sweep.command, sweep.sd])
-        arrays[f"sweep_{number}"] = np.array([sweep.direction, sweep.speed_per_s])
-    return arrays
-
-
-def _view(arrays: Arrays) -> View:
-    corners = None
-    if "corner_ids" in arrays:
-        corners = Corners(arrays["corner_ids"], arrays["corner_px"], arrays.get("corner_sd_px"))
-    passages: list[Passages] = []
-    while (key := f"passages_{len(passages)}") in arrays:
-        direction, speed_per_s = arrays[f"sweep_{len(passages)}"]
-        x_px, y_px, command, sd = arrays[key]
-        passages.append(Passages(x_px, y_px, command, sd, int(direction), float(speed_per_s)))
-    return View(str(arrays["name"]), corners, tuple(passages), arrays.get("picture"))
-
-
 Made = tuple[Path, RigModel]
 """A calibration: its file, and what it holds."""
 
@@ -280,3 +215,68 @@ def truth_content(errors: DepthErrors) -> dict[str, Any]:
         "worst_m": errors.worst_m,
         "ratio_to_sd": errors.ratio,
     }
+
+
+VERSION: Final = 1
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def save_view(view: View, file: Path) -> None:
+    """Write a view, in one step. UsageError where it cannot be written."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, **_arrays(view))
+    part = file.with_name(f".{file.name}.part")
+    try:
+        part.write_bytes(stream.getvalue())
+        part.replace(file)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise UsageError(
+            f"cannot write {file}: {error.strerror or error}; name another folder or free the space it needs"
+        ) from error
+
+
+def load_view(file: Path) -> View:
+    """Read a view. UsageError where the file holds none."""
+    try:
+        with load_numpy(file) as arrays:
+            version = int(arrays["format_version"])
+            if version != VERSION:
+                raise UsageError(f"{file} is a view of version {version}, this program reads version {VERSION}")
+            return _view(arrays)
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise UsageError(f"{file} is no view of a calibration ({error}); take it out of the folder") from error
+
+
+def load_views(folder: Path) -> tuple[View, ...]:
+    """Read all views of a folder, in the order of their files. UsageError without any, or for a damaged one."""
+    files = sorted(folder.glob("*.npz"))
+    if not files:
+        raise UsageError(f"{folder} holds no view (*.npz); name the folder of an earlier calibration")
+    return tuple(load_view(file) for file in files)
+
+
+def _arrays(view: View) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {"format_version": np.array(VERSION), "name": np.array(view.name)}
+    if view.picture is not None:
+        arrays["picture"] = view.picture
+    if view.corners is not None:
+        arrays |= {"corner_ids": view.corners.ids, "corner_px": view.corners.px}
+        if view.corners.sd_px is not None:
+            arrays["corner_sd_px"] = view.corners.sd_px
+    for number, sweep in enumerate(view.passages):
+        arrays[f"passages_{number}"] = np.stack([sweep.x_px, sweep.y_px, sweep.command, sweep.sd])
+        arrays[f"sweep_{number}"] = np.array([sweep.direction, sweep.speed_per_s])
+    return arrays
+
+
+def _view(arrays: Arrays) -> View:
+    corners = None
+    if "corner_ids" in arrays:
+        corners = Corners(arrays["corner_ids"], arrays["corner_px"], arrays.get("corner_sd_px"))
+    passages: list[Passages] = []
+    while (key := f"passages_{len(passages)}") in arrays:
+        direction, speed_per_s = arrays[f"sweep_{len(passages)}"]
+        x_px, y_px, command, sd = arrays[key]
+        passages.append(Passages(x_px, y_px, command, sd, int(direction), float(speed_per_s)))
+    return View(str(arrays["name"]), corners, tuple(passages), arrays.get("picture"))

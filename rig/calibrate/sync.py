@@ -93,100 +93,6 @@ class GateDelay:
         return math.hypot(self.opens_sd_s, self.closes_sd_s) / 2
 
 
-def gate_delay(run: Path) -> GateDelay | None:
-    """Measure the gate's delay in a recorded run.
-
-    None where its SPAD carries no markers: the light itself gives the time then. UsageError where the run has no plan,
-    ProtocolError where it has no frames.
-    """
-    plan = read_plan(run)
-    if plan.blanking is not None:
-        return None
-    steps = STEPS * MOST_LATE_FRAMES
-    late_s = np.arange(-steps, steps + 1) / (STEPS * float(plan.frame_rate_hz))
-    found: dict[bool, list[Edge]] = {True: [], False: []}
-    for sweep, ones, middle_s in _sweeps(run, plan):
-        leg = plan.leg(sweep)
-        for rises, planned_s in ((True, leg.gate_open_s), (False, leg.gate_close_s)):
-            edge = _edge(ones, middle_s - planned_s, late_s, plan, rises=rises)
-            if edge is not None and _is_told(edge):
-                found[rises].append(edge)
-    nan = math.nan, math.nan
-    opens, closes = (edge_time(found[rises], late_s) if found[rises] else nan for rises in (True, False))
-    return GateDelay(*opens, *closes, edges=len(found[True]) + len(found[False]))
-
-
-def _is_told(edge: Edge) -> bool:
-    return edge.brightness > LEAST_BRIGHTNESS_SDS * edge.brightness_sd and edge.scatter < MOST_SCATTER
-
-
-def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises: bool) -> Edge | None:
-    """The edge at delays (delays,) among the frames near its planned place, at 0; None where some are missing.
-
-    ones: (frames, 3), see `_ones`. middle_s: (frames,), middle of each exposure.
-    """
-    frame_s = float(1 / plan.frame_rate_hz)
-    near = np.abs(middle_s) < AROUND_FRAMES * frame_s
-    if min((near & (middle_s < 0)).sum(), (near & (middle_s > 0)).sum()) < LEAST_FRAMES:
-        return None
-    settled = near & (np.abs(middle_s) > SETTLED_FRAMES * frame_s) & np.isfinite(ones).all(axis=1)
-    lit = (middle_s > 0) == rises
-    starts_s, saturation = middle_s[near] - plan.exposure_s / 2, _saturation(ones[settled & lit], ones[settled & ~lit])
-    return fit_edge(ones[near, 0], starts_s, plan.exposure_s, late_s, rises=rises, saturation=saturation)
-
-
-def _saturation(lit: Array, dark: Array) -> float:
-    """Sum of p^2 over sum of p for pixels that the line lights with probability p; 1, the worst, if it cannot be told."""
-    if not (len(lit) and len(dark)):
-        return 1.0
-    whole, next_one, after = (lit.mean(axis=0) - dark.mean(axis=0)).tolist()
-    return min(max(2 * next_one - after, next_one, 0.0) / whole, 1.0) if whole > 0 else 1.0
-
-
-def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
-    """Number, ones (frames, 3) and middle of exposure (frames,) after the scan marker, for each of the first sweeps."""
-    recording = RunRecording(run)
-    found: list[tuple[int, Array, Array]] = []
-    for start in recording.runs:
-        binder = FrameBinder(plan)
-        parts: dict[int, list[tuple[Array, Array]]] = {}
-        for block in recording.blocks(start):
-            bound, _ = binder.bind(block)
-            ones = _ones(block)
-            for sweep in np.unique(bound.sweep[bound.sweep >= 0]).tolist():
-                here = bound.sweep == sweep
-                parts.setdefault(sweep, []).append((ones[here], _after_marker(bound.column[here], plan, sweep)))
-            if len(found) + len(parts) > MOST_SWEEPS:
-                break
-        for sweep, blocks in parts.items():
-            ones, middle_s = (np.concatenate(each) for each in zip(*blocks, strict=True))
-            found.append((sweep, ones, middle_s))
-    return found[:MOST_SWEEPS]
-
-
-def _ones(block: FrameBlock) -> Array:
-    """Counts (frames, 3): ones of a frame, those that are ones in the next frame too, and in the one after that.
-
-    NaN at the end of a block, and where the window has moved.
-    """
-    bits, x0 = block.bits, block.records["x0"]
-    ones = np.full((len(bits), 3), np.nan)
-    for apart in range(3):
-        n = len(bits) - apart
-        both = bits[:n] & bits[apart:]
-        ones[:n, apart] = np.bitwise_count(both).sum(axis=(1, 2), dtype=np.float64)
-        ones[:n, apart][x0[:n] != x0[apart:]] = np.nan
-    return ones
-
-
-def _after_marker(column: Array, plan: ScanPlan, sweep: int) -> Array:
-    """Time after the scan marker at which the mirror was due at fractional columns; undoes `ScanPlan.column`."""
-    leg = plan.leg(sweep)
-    done = column + 0.5 if leg.columns_rise else plan.places - 0.5 - column
-    after: Array = plan.lit_start_s(leg) + done * float(plan.column_s)
-    return after
-
-
 @dataclass(frozen=True, slots=True)
 class SyncAsked:
     """Request for a measurement of the lags.
@@ -343,3 +249,97 @@ def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Se
         lag = truth.lag_s
         rows.append(("truth", f"lag {lag.forward * 1e6:.1f} us up, {lag.backward * 1e6:.1f} us down"))
     return rows
+
+
+def gate_delay(run: Path) -> GateDelay | None:
+    """Measure the gate's delay in a recorded run.
+
+    None where its SPAD carries no markers: the light itself gives the time then. UsageError where the run has no plan,
+    ProtocolError where it has no frames.
+    """
+    plan = read_plan(run)
+    if plan.blanking is not None:
+        return None
+    steps = STEPS * MOST_LATE_FRAMES
+    late_s = np.arange(-steps, steps + 1) / (STEPS * float(plan.frame_rate_hz))
+    found: dict[bool, list[Edge]] = {True: [], False: []}
+    for sweep, ones, middle_s in _sweeps(run, plan):
+        leg = plan.leg(sweep)
+        for rises, planned_s in ((True, leg.gate_open_s), (False, leg.gate_close_s)):
+            edge = _edge(ones, middle_s - planned_s, late_s, plan, rises=rises)
+            if edge is not None and _is_told(edge):
+                found[rises].append(edge)
+    nan = math.nan, math.nan
+    opens, closes = (edge_time(found[rises], late_s) if found[rises] else nan for rises in (True, False))
+    return GateDelay(*opens, *closes, edges=len(found[True]) + len(found[False]))
+
+
+def _is_told(edge: Edge) -> bool:
+    return edge.brightness > LEAST_BRIGHTNESS_SDS * edge.brightness_sd and edge.scatter < MOST_SCATTER
+
+
+def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises: bool) -> Edge | None:
+    """The edge at delays (delays,) among the frames near its planned place, at 0; None where some are missing.
+
+    ones: (frames, 3), see `_ones`. middle_s: (frames,), middle of each exposure.
+    """
+    frame_s = float(1 / plan.frame_rate_hz)
+    near = np.abs(middle_s) < AROUND_FRAMES * frame_s
+    if min((near & (middle_s < 0)).sum(), (near & (middle_s > 0)).sum()) < LEAST_FRAMES:
+        return None
+    settled = near & (np.abs(middle_s) > SETTLED_FRAMES * frame_s) & np.isfinite(ones).all(axis=1)
+    lit = (middle_s > 0) == rises
+    starts_s, saturation = middle_s[near] - plan.exposure_s / 2, _saturation(ones[settled & lit], ones[settled & ~lit])
+    return fit_edge(ones[near, 0], starts_s, plan.exposure_s, late_s, rises=rises, saturation=saturation)
+
+
+def _saturation(lit: Array, dark: Array) -> float:
+    """Sum of p^2 over sum of p for pixels that the line lights with probability p; 1, the worst, if none can tell."""
+    if not (len(lit) and len(dark)):
+        return 1.0
+    whole, next_one, after = (lit.mean(axis=0) - dark.mean(axis=0)).tolist()
+    return min(max(2 * next_one - after, next_one, 0.0) / whole, 1.0) if whole > 0 else 1.0
+
+
+def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
+    """Number, ones (frames, 3) and middle of exposure (frames,) after the scan marker, for each of the first sweeps."""
+    recording = RunRecording(run)
+    found: list[tuple[int, Array, Array]] = []
+    for start in recording.runs:
+        binder = FrameBinder(plan)
+        parts: dict[int, list[tuple[Array, Array]]] = {}
+        for block in recording.blocks(start):
+            bound, _ = binder.bind(block)
+            ones = _ones(block)
+            for sweep in np.unique(bound.sweep[bound.sweep >= 0]).tolist():
+                here = bound.sweep == sweep
+                parts.setdefault(sweep, []).append((ones[here], _after_marker(bound.column[here], plan, sweep)))
+            if len(found) + len(parts) > MOST_SWEEPS:
+                break
+        for sweep, blocks in parts.items():
+            ones, middle_s = (np.concatenate(each) for each in zip(*blocks, strict=True))
+            found.append((sweep, ones, middle_s))
+    return found[:MOST_SWEEPS]
+
+
+def _ones(block: FrameBlock) -> Array:
+    """Counts (frames, 3): ones of a frame, those that are ones in the next frame too, and in the one after that.
+
+    NaN at the end of a block, and where the window has moved.
+    """
+    bits, x0 = block.bits, block.records["x0"]
+    ones = np.full((len(bits), 3), np.nan)
+    for apart in range(3):
+        n = len(bits) - apart
+        both = bits[:n] & bits[apart:]
+        ones[:n, apart] = np.bitwise_count(both).sum(axis=(1, 2), dtype=np.float64)
+        ones[:n, apart][x0[:n] != x0[apart:]] = np.nan
+    return ones
+
+
+def _after_marker(column: Array, plan: ScanPlan, sweep: int) -> Array:
+    """Time after the scan marker at which the mirror was due at fractional columns; undoes `ScanPlan.column`."""
+    leg = plan.leg(sweep)
+    done = column + 0.5 if leg.columns_rise else plan.places - 0.5 - column
+    after: Array = plan.lit_start_s(leg) + done * float(plan.column_s)
+    return after

@@ -39,26 +39,6 @@ from rig.errors import UsageError
 from rig.progress import part, tell_stage
 
 
-def told(view: View, refused: Degenerate | None) -> str:
-    """Describe a view in one line: what is seen in it or, where it was `refused`, why it has no corners."""
-    if refused is not None:
-        return f"view {view.name}: {refused}"
-    parts = [] if view.corners is None else [f"{len(view.corners.ids)} corners"]
-    if view.passages:
-        counts = ", ".join(str(len(sweep.command)) for sweep in view.passages)
-        parts.append(f"{counts} passages of the line" + ("" if shows_line(view) else _too_few(view)))
-    return f"view {view.name}: {', '.join(parts) or 'neither corners nor passages'}"
-
-
-def _too_few(view: View) -> str:
-    """Say why so few passages are as good as none, and what to do about it."""
-    where = "" if view.corners is None else ", or hold the board where the line passes"
-    return (
-        f", too few to count (limit {FEWEST_PASSAGES} a sweep): the line does not stand out in single pixels; give it "
-        f"more exposures per column (2 to 5 do in a dark room) or more power{where}"
-    )
-
-
 class Taken:
     """The views taken so far.
 
@@ -361,3 +341,23 @@ def _of_views(refused: Degenerate, taken: Taken) -> Degenerate:
         return refused
     (reason, _), *_ = Counter(why.reason for why in taken.refused.values()).most_common()
     return Degenerate(reason, f"none of {len(taken.views)} views shows the board as it should")
+
+
+def told(view: View, refused: Degenerate | None) -> str:
+    """Describe a view in one line: what is seen in it or, where it was `refused`, why it has no corners."""
+    if refused is not None:
+        return f"view {view.name}: {refused}"
+    parts = [] if view.corners is None else [f"{len(view.corners.ids)} corners"]
+    if view.passages:
+        counts = ", ".join(str(len(sweep.command)) for sweep in view.passages)
+        parts.append(f"{counts} passages of the line" + ("" if shows_line(view) else _too_few(view)))
+    return f"view {view.name}: {', '.join(parts) or 'neither corners nor passages'}"
+
+
+def _too_few(view: View) -> str:
+    """Say why so few passages are as good as none, and what to do about it."""
+    where = "" if view.corners is None else ", or hold the board where the line passes"
+    return (
+        f", too few to count (limit {FEWEST_PASSAGES} a sweep): the line does not stand out in single pixels; give it "
+        f"more exposures per column (2 to 5 do in a dark room) or more power{where}"
+    )

@@ -26,37 +26,6 @@ import typer
 from rig.cli import bench, calibrate, devices, recordings, replay, scan, tradeoff
 from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, fail, refused_file, say
 
-VARIABLE = "NUMBA_CACHE_DIR"
-"""Numba's own setting, see its manual; a value that the user has set is left alone."""
-
-
-def ensure_kernel_cache() -> None:
-    """Name a private temporary folder to numba where it would find none; to be called before numba is imported."""
-    package = Path(__file__).parent
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
-    if VARIABLE in os.environ or _writable(package / "__pycache__") or _writable(home):
-        return
-    os.environ[VARIABLE] = str(_private_folder())
-
-
-def _writable(folder: Path) -> bool:
-    """Whether the folder, or the nearest one above it that exists, can be written."""
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return folder.is_dir() and os.access(folder, os.W_OK)
-
-
-def _private_folder() -> Path:
-    """A folder that only this user can write: kernels are code, and temporary folders are everybody's."""
-    user = os.getuid() if hasattr(os, "getuid") else 0
-    folder = Path(tempfile.gettempdir()) / f"spadrig-kernels-{user}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    seen = folder.lstat()
-    if hasattr(os, "getuid") and (seen.st_uid != user or seen.st_mode & 0o077 or folder.is_symlink()):
-        return Path(tempfile.mkdtemp(prefix="spadrig-kernels-"))
-    return folder
-
-
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
 """Signals that end a program, beside Ctrl-C; no system has all of them."""
 _TYPER_INTERRUPTED = 130
@@ -134,9 +103,7 @@ def _signals_interrupt() -> Iterator[None]:
 
 
 def _say_why(error: BaseException, arguments: list[str]) -> int:
-    """Say what ended a command that did not handle it: a usage error of click's, an interrupt or a mistake of the
-    program.
-    """
+    """Say what ended a command that did not handle it: click's usage error, an interrupt or a mistake of ours."""
     as_json = "--json" in arguments
     if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
         return _TYPER_INTERRUPTED
@@ -199,3 +166,34 @@ def _join_save(arguments: list[str]) -> list[str]:
         if arguments[i : i + 2] == ["--save", "every"]:
             return [*arguments[: i + 1], f"every {arguments[i + 2]}", *arguments[i + 3 :]]
     return arguments
+
+
+VARIABLE = "NUMBA_CACHE_DIR"
+"""Numba's own setting, see its manual; a value that the user has set is left alone."""
+
+
+def ensure_kernel_cache() -> None:
+    """Name a private temporary folder to numba where it would find none; to be called before numba is imported."""
+    package = Path(__file__).parent
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+    if VARIABLE in os.environ or _writable(package / "__pycache__") or _writable(home):
+        return
+    os.environ[VARIABLE] = str(_private_folder())
+
+
+def _writable(folder: Path) -> bool:
+    """Whether the folder, or the nearest one above it that exists, can be written."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK)
+
+
+def _private_folder() -> Path:
+    """A folder that only this user can write: kernels are code, and temporary folders are everybody's."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = Path(tempfile.gettempdir()) / f"spadrig-kernels-{user}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    seen = folder.lstat()
+    if hasattr(os, "getuid") and (seen.st_uid != user or seen.st_mode & 0o077 or folder.is_symlink()):
+        return Path(tempfile.mkdtemp(prefix="spadrig-kernels-"))
+    return folder

@@ -57,50 +57,6 @@ LineOffsets = Annotated[
 ]
 
 
-def line_problems(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> list[str]:
-    """Problems with taking a map of so many columns by these lines while the mirror sweeps `command_range`."""
-    lines = len(offsets)
-    problems = []
-    if columns % lines:
-        below, above = columns // lines * lines, -(-columns // lines) * lines
-        fits = f"{above}" if below == 0 else f"{below} or {above}"
-        problems.append(f"scan.columns is {columns}, no multiple of the {lines} lines of line_offsets; make it {fits}")
-    span = abs(command_range[1] - command_range[0])
-    spare = span * lines / columns  # a column: beyond its neighbours' reach nothing is lit
-    for first, second in pairwise(offsets):
-        apart = second - first
-        told = f"line_offsets {first:g} and {second:g} are {apart:g} apart, scan.command_range spans {span:g}"
-        if apart > span + spare:
-            problems.append(
-                f"{told}: what lies between them is never lit; widen it to {apart:g} or bring the lines closer"
-            )
-        elif apart < LEAST_FRESH * span:
-            problems.append(f"{told}: most of it would be lit twice; narrow it to {apart:g}")
-    return problems
-
-
-def with_lines(config: "RigConfig", lines: int, power: LinePower = "shared") -> "RigConfig":
-    """The config of this rig and field with so many evenly spaced lines; the mirror sweeps the share left to it.
-
-    config: of one line. Columns are rounded down to a multiple of `lines`. Raises UsageError where that cannot be.
-    """
-    from rig.config.files import parse_config
-    from rig.errors import UsageError
-
-    if len(config.line_offsets) > 1:
-        raise UsageError(f"{config.name} has {len(config.line_offsets)} lines already; name a config with one")
-    if not 1 <= lines <= MOST_LINES:
-        raise UsageError(f"lines is {lines}; it must be 1 to {MOST_LINES}")
-    first, last = config.scan.command_range
-    pitch, middle = (last - first) / lines, (first + last) / 2
-    offsets = sorted((line - (lines - 1) / 2) * pitch for line in range(lines))
-    content = config.model_dump(mode="json")
-    content["scan"]["columns"] = max(1, config.scan.columns // lines) * lines
-    if lines > 1:
-        content["scan"]["command_range"] = [middle - pitch / 2, middle + pitch / 2]
-    return parse_config({**content, "line_offsets": offsets if lines > 1 else [0.0], "line_power": power})
-
-
 MIN_DARK_FRACTION = 0.05
 """Share of a live sweep's frames that must be dark: the dark rate is learned from them."""
 
@@ -292,3 +248,47 @@ class CubePlan(ConfigSection):
     exposures: Exposures
     frame_rate: FrameRate
     depth_range: DepthRange
+
+
+def line_problems(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> list[str]:
+    """Problems with taking a map of so many columns by these lines while the mirror sweeps `command_range`."""
+    lines = len(offsets)
+    problems = []
+    if columns % lines:
+        below, above = columns // lines * lines, -(-columns // lines) * lines
+        fits = f"{above}" if below == 0 else f"{below} or {above}"
+        problems.append(f"scan.columns is {columns}, no multiple of the {lines} lines of line_offsets; make it {fits}")
+    span = abs(command_range[1] - command_range[0])
+    spare = span * lines / columns  # a column: beyond its neighbours' reach nothing is lit
+    for first, second in pairwise(offsets):
+        apart = second - first
+        told = f"line_offsets {first:g} and {second:g} are {apart:g} apart, scan.command_range spans {span:g}"
+        if apart > span + spare:
+            problems.append(
+                f"{told}: what lies between them is never lit; widen it to {apart:g} or bring the lines closer"
+            )
+        elif apart < LEAST_FRESH * span:
+            problems.append(f"{told}: most of it would be lit twice; narrow it to {apart:g}")
+    return problems
+
+
+def with_lines(config: "RigConfig", lines: int, power: LinePower = "shared") -> "RigConfig":
+    """The config of this rig and field with so many evenly spaced lines; the mirror sweeps the share left to it.
+
+    config: of one line. Columns are rounded down to a multiple of `lines`. Raises UsageError where that cannot be.
+    """
+    from rig.config.files import parse_config
+    from rig.errors import UsageError
+
+    if len(config.line_offsets) > 1:
+        raise UsageError(f"{config.name} has {len(config.line_offsets)} lines already; name a config with one")
+    if not 1 <= lines <= MOST_LINES:
+        raise UsageError(f"lines is {lines}; it must be 1 to {MOST_LINES}")
+    first, last = config.scan.command_range
+    pitch, middle = (last - first) / lines, (first + last) / 2
+    offsets = sorted((line - (lines - 1) / 2) * pitch for line in range(lines))
+    content = config.model_dump(mode="json")
+    content["scan"]["columns"] = max(1, config.scan.columns // lines) * lines
+    if lines > 1:
+        content["scan"]["command_range"] = [middle - pitch / 2, middle + pitch / 2]
+    return parse_config({**content, "line_offsets": offsets if lines > 1 else [0.0], "line_power": power})

@@ -44,75 +44,6 @@ class Refusal:
         return f"{self.code}: {self.text}"
 
 
-def failed_verdict(verdict: str | None, reasons: Sequence[str]) -> list[Refusal]:
-    """The reason that a calibration's own verdict gives: none where it passed, or where nobody judged it (None)."""
-    if verdict != "failed":
-        return []
-    why = ", ".join(reasons) or "no reason noted"
-    return [Refusal("failed-verdict", f"its verdict is 'failed' ({why}), 'passed' is needed")]
-
-
-def require_accepted(name: str, found: Sequence[Refusal], accepted: Container[str]) -> None:
-    """Raise UsageError with a line for each reason whose code is not accepted; each line begins with `name`."""
-    if refused := [each for each in found if each.code not in accepted]:
-        raise UsageError.of(f"{name}: {each.text}; {NEXT}" for each in refused)
-
-
-def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
-    """Describe for a manifest how the comparison ended: `checked`, or 'accepted' with the reasons accepted."""
-    if not accepted:
-        return {"check": checked}
-    return {"check": "accepted", "accepted": [[each.code, each.text] for each in accepted]}
-
-
-def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons: tuple[str, ...] = ()) -> Path:
-    """Note beside a calibration file how a check of it ended; `what`: check or pixels. Raises OSError."""
-    beside = _beside(file)
-    notes = _read_notes(beside)
-    date = datetime.now(UTC).isoformat(timespec="seconds")
-    notes[what] = {"calibration": model.fingerprint(), "date": date, "passed": passed, "reasons": list(reasons)}
-    scratch = beside.with_name(f".{beside.name}.part")
-    scratch.write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
-    scratch.replace(beside)
-    return beside
-
-
-def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:
-    """Copy the notes on failed checks from a calibration to the one that was made from it. Raises OSError.
-
-    new_pixels: the new one has pixels of its own, so that notes on the old ones do not apply.
-    """
-    failed = {what: note for what, note in notes_on(old, before).items() if not note.get("passed", True)}
-    if new_pixels:
-        failed.pop("pixels", None)
-    for what, note in failed.items():
-        note_check(new, after, what, passed=False, reasons=tuple(note.get("reasons") or ()))
-
-
-def _beside(file: Path) -> Path:
-    return file.with_name(f"{file.stem}-checks.json")
-
-
-def notes_on(file: Path | None, model: RigModel) -> dict[str, dict[str, Any]]:
-    """Notes on this very calibration, by the name of the check; empty where there is no file."""
-    if file is None:
-        return {}
-    notes = _read_notes(_beside(file))
-    return {what: note for what, note in notes.items() if note.get("calibration") == model.fingerprint()}
-
-
-def _read_notes(file: Path) -> dict[str, dict[str, Any]]:
-    try:
-        notes = parse_json(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{file} cannot be read ({error}); remove it and check the calibration again") from error
-    if not isinstance(notes, dict) or not all(isinstance(note, dict) for note in notes.values()):
-        raise UsageError(f"{file} holds no notes on a calibration; remove it and check the calibration again")
-    return notes
-
-
 DAY_S: Final = 86400.0
 _SLOTS: Final = ("spad", "scanner")
 """Devices that depth depends on: laser and sync source only let the light out."""
@@ -306,3 +237,72 @@ def _accepted_before(rig: OpenRig) -> frozenset[str]:
 def accepted_by(use: CalibrationUse | None) -> tuple[str, ...]:
     """The reasons in spite of which a run's calibration was used, for its summary."""
     return () if use is None else tuple(map(str, use.accepted))
+
+
+def failed_verdict(verdict: str | None, reasons: Sequence[str]) -> list[Refusal]:
+    """The reason that a calibration's own verdict gives: none where it passed, or where nobody judged it (None)."""
+    if verdict != "failed":
+        return []
+    why = ", ".join(reasons) or "no reason noted"
+    return [Refusal("failed-verdict", f"its verdict is 'failed' ({why}), 'passed' is needed")]
+
+
+def require_accepted(name: str, found: Sequence[Refusal], accepted: Container[str]) -> None:
+    """Raise UsageError with a line for each reason whose code is not accepted; each line begins with `name`."""
+    if refused := [each for each in found if each.code not in accepted]:
+        raise UsageError.of(f"{name}: {each.text}; {NEXT}" for each in refused)
+
+
+def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
+    """Describe for a manifest how the comparison ended: `checked`, or 'accepted' with the reasons accepted."""
+    if not accepted:
+        return {"check": checked}
+    return {"check": "accepted", "accepted": [[each.code, each.text] for each in accepted]}
+
+
+def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons: tuple[str, ...] = ()) -> Path:
+    """Note beside a calibration file how a check of it ended; `what`: check or pixels. Raises OSError."""
+    beside = _beside(file)
+    notes = _read_notes(beside)
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    notes[what] = {"calibration": model.fingerprint(), "date": date, "passed": passed, "reasons": list(reasons)}
+    scratch = beside.with_name(f".{beside.name}.part")
+    scratch.write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
+    scratch.replace(beside)
+    return beside
+
+
+def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:
+    """Copy the notes on failed checks from a calibration to the one that was made from it. Raises OSError.
+
+    new_pixels: the new one has pixels of its own, so that notes on the old ones do not apply.
+    """
+    failed = {what: note for what, note in notes_on(old, before).items() if not note.get("passed", True)}
+    if new_pixels:
+        failed.pop("pixels", None)
+    for what, note in failed.items():
+        note_check(new, after, what, passed=False, reasons=tuple(note.get("reasons") or ()))
+
+
+def _beside(file: Path) -> Path:
+    return file.with_name(f"{file.stem}-checks.json")
+
+
+def notes_on(file: Path | None, model: RigModel) -> dict[str, dict[str, Any]]:
+    """Notes on this very calibration, by the name of the check; empty where there is no file."""
+    if file is None:
+        return {}
+    notes = _read_notes(_beside(file))
+    return {what: note for what, note in notes.items() if note.get("calibration") == model.fingerprint()}
+
+
+def _read_notes(file: Path) -> dict[str, dict[str, Any]]:
+    try:
+        notes = parse_json(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{file} cannot be read ({error}); remove it and check the calibration again") from error
+    if not isinstance(notes, dict) or not all(isinstance(note, dict) for note in notes.values()):
+        raise UsageError(f"{file} holds no notes on a calibration; remove it and check the calibration again")
+    return notes

@@ -201,7 +201,10 @@ KNOWN = (("helios", HELIOS), ("lasercube", LASERCUBE), *(("spb-usb", one) for on
 
 @dataclass(frozen=True, slots=True)
 class Attached:
-    """One attached device. address: what a config's `port` says to mean it. kind: its driver's; None on serial ports."""
+    """One attached device.
+
+    address: what a config's `port` says to mean it. kind: kind of its driver; None for a serial port of any kind.
+    """
 
     address: str
     what: str

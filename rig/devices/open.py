@@ -117,7 +117,7 @@ def open_rig(
 
 @contextmanager
 def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
-    """Open the gate and the laser alone, without a guard; None and a line in `trouble` for one that cannot be opened."""
+    """Open the gate and the laser alone, without a guard; None, with a line in `trouble`, for one that fails."""
     with ExitStack() as stack:
         surroundings = _surroundings(config, None, 0, stack)
         opened: dict[str, Any] = {"sync": None, "laser": None}

@@ -28,86 +28,6 @@ from rig.plan.scan_plan import MOST_CHIP_FRAMES, Blanking, ScanPlan
 from rig.recording.open import open_recording
 from rig.run_folder.manifest import read_manifest
 
-T = TypeVar("T")
-
-_FRACTION = re.compile(r"-?\d+(/\d+)?", re.ASCII)
-
-SINCE = "since"
-"""Key in the metadata of a field that the first recordings did not have; its default is None."""
-
-
-def to_plain(value: Any) -> Any:
-    """Numbers, text, lists and mappings that `from_plain` reads. TypeError for a value that has no such form."""
-    if is_dataclass(value):
-        kept = [(field, getattr(value, field.name)) for field in fields(value) if field.init]
-        return {field.name: to_plain(one) for field, one in kept if one is not None or SINCE not in field.metadata}
-    if isinstance(value, np.ndarray):
-        return {"dtype": value.dtype.name, "values": value.tolist()}
-    if isinstance(value, Fraction):
-        return str(value)
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, Mapping):
-        return {str(key): to_plain(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [to_plain(item) for item in value]
-    if value is None or isinstance(value, str | int | float | bool):
-        return value
-    raise TypeError(f"a {type(value).__name__} has no plain form")
-
-
-def from_plain(kind: type[T], content: Any) -> T:
-    """The value of type `kind` that `to_plain` wrote. ValueError where `content` is not one."""
-    value: T = _read(kind, content, kind.__name__)
-    return value
-
-
-def _read(kind: Any, content: Any, where: str) -> Any:
-    origin, inner = get_origin(kind), get_args(kind)
-    if origin in (Union, types.UnionType):
-        return None if content is None else _read(next(one for one in inner if one is not type(None)), content, where)
-    if is_dataclass(kind):
-        return _read_dataclass(kind, content, where)
-    if origin is np.ndarray:
-        dtype = np.dtype(_need(content, Mapping, where)["dtype"])
-        if dtype.kind not in "biuf":
-            raise ValueError(f"{where} holds {dtype}, which are no numbers")
-        return np.array(content["values"], dtype)
-    if origin is tuple:
-        items = _need(content, Sequence, where)
-        kinds = [inner[0]] * len(items) if inner[1:] == (...,) else inner
-        return tuple(_read(one, item, f"{where}[{i}]") for i, (one, item) in enumerate(zip(kinds, items, strict=True)))
-    if kind is Fraction:
-        if _FRACTION.fullmatch(_need(content, str, where)) is None:  # 1e999999999 is one too, of a gigabyte
-            raise ValueError(f"{where} is {content!r}, which is no fraction of whole numbers")
-        return Fraction(content)
-    if kind is float:
-        return float(_need(content, int | float, where))
-    if origin is Literal:
-        if content in inner:
-            return content
-        raise ValueError(f"{where} is {content!r}; it must be one of {', '.join(map(str, inner))}")
-    return _need(content, kind, where)
-
-
-def _read_dataclass(kind: Any, content: Any, where: str) -> Any:
-    given = _need(content, Mapping, where)
-    hints = get_type_hints(kind)
-    names = [
-        field.name for field in fields(kind) if field.init and (SINCE not in field.metadata or field.name in given)
-    ]
-    if set(names) != set(given):
-        odd = ", ".join(sorted(set(names) ^ set(given)))
-        raise ValueError(f"{where}: {odd} is unknown or missing; it was written by another version of the program")
-    return kind(**{name: _read(hints[name], given[name], f"{where}.{name}") for name in names})
-
-
-def _need(content: Any, kind: Any, where: str) -> Any:
-    if not isinstance(content, kind) or (isinstance(content, bool) and kind is not bool):
-        raise ValueError(f"{where} is {content!r}, which is not what belongs there")
-    return content
-
-
 PLAN_FILE: Final = "plan.yaml"
 PLAN_VERSION: Final = 1
 MOST_EXPOSURES: Final = 0xFFFF
@@ -217,3 +137,81 @@ def read_model(folder: Path) -> RigModel | None:
         return load_rig_model(file)
     except CalibrationError as error:
         raise UsageError(str(error)) from error
+
+
+T = TypeVar("T")
+_FRACTION = re.compile(r"-?\d+(/\d+)?", re.ASCII)
+SINCE = "since"
+"""Key in the metadata of a field that the first recordings did not have; its default is None."""
+
+
+def to_plain(value: Any) -> Any:
+    """Numbers, text, lists and mappings that `from_plain` reads. TypeError for a value that has no such form."""
+    if is_dataclass(value):
+        kept = [(field, getattr(value, field.name)) for field in fields(value) if field.init]
+        return {field.name: to_plain(one) for field, one in kept if one is not None or SINCE not in field.metadata}
+    if isinstance(value, np.ndarray):
+        return {"dtype": value.dtype.name, "values": value.tolist()}
+    if isinstance(value, Fraction):
+        return str(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [to_plain(item) for item in value]
+    if value is None or isinstance(value, str | int | float | bool):
+        return value
+    raise TypeError(f"a {type(value).__name__} has no plain form")
+
+
+def from_plain(kind: type[T], content: Any) -> T:
+    """The value of type `kind` that `to_plain` wrote. ValueError where `content` is not one."""
+    value: T = _read(kind, content, kind.__name__)
+    return value
+
+
+def _read(kind: Any, content: Any, where: str) -> Any:
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        return None if content is None else _read(next(one for one in inner if one is not type(None)), content, where)
+    if is_dataclass(kind):
+        return _read_dataclass(kind, content, where)
+    if origin is np.ndarray:
+        dtype = np.dtype(_need(content, Mapping, where)["dtype"])
+        if dtype.kind not in "biuf":
+            raise ValueError(f"{where} holds {dtype}, which are no numbers")
+        return np.array(content["values"], dtype)
+    if origin is tuple:
+        items = _need(content, Sequence, where)
+        kinds = [inner[0]] * len(items) if inner[1:] == (...,) else inner
+        return tuple(_read(one, item, f"{where}[{i}]") for i, (one, item) in enumerate(zip(kinds, items, strict=True)))
+    if kind is Fraction:
+        if _FRACTION.fullmatch(_need(content, str, where)) is None:  # 1e999999999 is one too, of a gigabyte
+            raise ValueError(f"{where} is {content!r}, which is no fraction of whole numbers")
+        return Fraction(content)
+    if kind is float:
+        return float(_need(content, int | float, where))
+    if origin is Literal:
+        if content in inner:
+            return content
+        raise ValueError(f"{where} is {content!r}; it must be one of {', '.join(map(str, inner))}")
+    return _need(content, kind, where)
+
+
+def _read_dataclass(kind: Any, content: Any, where: str) -> Any:
+    given = _need(content, Mapping, where)
+    hints = get_type_hints(kind)
+    names = [
+        field.name for field in fields(kind) if field.init and (SINCE not in field.metadata or field.name in given)
+    ]
+    if set(names) != set(given):
+        odd = ", ".join(sorted(set(names) ^ set(given)))
+        raise ValueError(f"{where}: {odd} is unknown or missing; it was written by another version of the program")
+    return kind(**{name: _read(hints[name], given[name], f"{where}.{name}") for name in names})
+
+
+def _need(content: Any, kind: Any, where: str) -> Any:
+    if not isinstance(content, kind) or (isinstance(content, bool) and kind is not bool):
+        raise ValueError(f"{where} is {content!r}, which is not what belongs there")
+    return content

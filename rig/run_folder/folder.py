@@ -36,27 +36,6 @@ from rig.errors import UsageError
 from rig.run_folder.manifest import MANIFEST, sealed_text
 from rig.run_folder.pictures import cloud, depth_limits, depth_picture, intensity_picture, ply_bytes, png_bytes
 
-
-def sync_file(path: Path) -> None:
-    """Make sure that what was written to a file survives a loss of power. Raises OSError."""
-    fd = os.open(path, os.O_RDWR)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
-
-
-def sync_folder(path: Path) -> None:
-    """Make sure that the names of the files in a folder survive a loss of power. Raises OSError."""
-    if os.name == "nt":
-        return  # Windows opens no folders; NTFS keeps its names in a journal
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
-
-
 _log = logging.getLogger(__name__)
 
 Rays = tuple[NDArray[np.floating], NDArray[np.floating]]
@@ -240,6 +219,37 @@ def json_text(content: Mapping[str, Any]) -> str:
     return json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
 
 
+_EVERY = re.compile(r"every[\s:=]+(?P<step>\d+)", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class SavePolicy:
+    """Policy for which maps of a run are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last."""
+
+    step: int | None = 1
+
+    @classmethod
+    def parse(cls, text: str) -> "SavePolicy":
+        """Parse "all", "last" or "every 5". Raises UsageError for anything else."""
+        cleaned = text.strip().lower()
+        if cleaned == "all":
+            return cls(1)
+        if cleaned == "last":
+            return cls(None)
+        match = _EVERY.fullmatch(cleaned)
+        if match is None or int(match["step"]) == 0:
+            raise UsageError(f"--save is {text!r}; write 'all', 'last' or 'every N' with N of 1 or more")
+        return cls(int(match["step"]))
+
+    def count(self, maps: int) -> int:
+        """Number of maps written of a run of `maps` maps."""
+        return min(maps, 1) if self.step is None else -(-maps // self.step)
+
+    def keeps(self, index: int) -> bool:
+        """Whether map `index` is written as soon as it is there."""
+        return self.step is not None and index % self.step == 0
+
+
 def _renamed(folder: Path, target: Path) -> bool:
     """Move a folder; False where something is at `target` already."""
     try:
@@ -308,32 +318,21 @@ def is_held(file: Path) -> bool:
     return False
 
 
-_EVERY = re.compile(r"every[\s:=]+(?P<step>\d+)", re.ASCII)
+def sync_file(path: Path) -> None:
+    """Make sure that what was written to a file survives a loss of power. Raises OSError."""
+    fd = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
 
 
-@dataclass(frozen=True, slots=True)
-class SavePolicy:
-    """Policy for which maps of a run are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last."""
-
-    step: int | None = 1
-
-    @classmethod
-    def parse(cls, text: str) -> "SavePolicy":
-        """Parse "all", "last" or "every 5". Raises UsageError for anything else."""
-        cleaned = text.strip().lower()
-        if cleaned == "all":
-            return cls(1)
-        if cleaned == "last":
-            return cls(None)
-        match = _EVERY.fullmatch(cleaned)
-        if match is None or int(match["step"]) == 0:
-            raise UsageError(f"--save is {text!r}; write 'all', 'last' or 'every N' with N of 1 or more")
-        return cls(int(match["step"]))
-
-    def count(self, maps: int) -> int:
-        """Number of maps written of a run of `maps` maps."""
-        return min(maps, 1) if self.step is None else -(-maps // self.step)
-
-    def keeps(self, index: int) -> bool:
-        """Whether map `index` is written as soon as it is there."""
-        return self.step is not None and index % self.step == 0
+def sync_folder(path: Path) -> None:
+    """Make sure that the names of the files in a folder survive a loss of power. Raises OSError."""
+    if os.name == "nt":
+        return  # Windows opens no folders; NTFS keeps its names in a journal
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

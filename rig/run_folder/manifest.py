@@ -29,7 +29,7 @@ def sealed_text(text: str) -> str:
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Read the manifest of a run without its seal; None where there is none. DamagedRecordingError for a damaged one."""
+    """Read the manifest of a run without its seal; None where there is none. DamagedRecordingError if damaged."""
     try:
         raw = (folder / MANIFEST).read_bytes()
     except FileNotFoundError:

@@ -32,31 +32,6 @@ from rig.scan.monitor import Watch
 from rig.scan.pipeline import FEWEST_SLOTS, Overload, require_policy
 from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
 
-
-def devices_content(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> dict[str, Any]:
-    """Describe each device for the manifest: identity, limits and timing.
-
-    `from_plain` reads `SpadInfo`, `SpadTiming` and the limits back.
-    """
-    kinds = {slot: getattr(rig.config, slot).kind for slot in ("spad", "scanner", "laser", "sync")}
-    return {
-        "spad": {
-            "kind": kinds["spad"],
-            "name": rig.spad.name,
-            "info": to_plain(rig.spad.info),
-            "timing": to_plain(timing),
-        },
-        "scanner": {
-            "kind": kinds["scanner"],
-            "name": rig.scanner.name,
-            "limits": to_plain(rig.scanner.limits),
-            "point_rate_hz": to_plain(plan.point_rate_hz),
-        },
-        "laser": {"kind": kinds["laser"], "name": rig.laser.name, "limits": to_plain(rig.laser.limits)},
-        "sync": {"kind": kinds["sync"], "name": rig.sync.name},
-    }
-
-
 _log = logging.getLogger(__name__)
 OnSpace = Callable[[Space], None]
 """A callback that gets the room a recording will take, before anything moves, once it is known to fit."""
@@ -249,3 +224,27 @@ def _collect(
                 truth = rig.world.truth(plan.line_commands(found.column), velocity_per_s)
             sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
             run.add(found.result, found.compute_s, truth)
+
+
+def devices_content(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> dict[str, Any]:
+    """Describe each device for the manifest: identity, limits and timing.
+
+    `from_plain` reads `SpadInfo`, `SpadTiming` and the limits back.
+    """
+    kinds = {slot: getattr(rig.config, slot).kind for slot in ("spad", "scanner", "laser", "sync")}
+    return {
+        "spad": {
+            "kind": kinds["spad"],
+            "name": rig.spad.name,
+            "info": to_plain(rig.spad.info),
+            "timing": to_plain(timing),
+        },
+        "scanner": {
+            "kind": kinds["scanner"],
+            "name": rig.scanner.name,
+            "limits": to_plain(rig.scanner.limits),
+            "point_rate_hz": to_plain(plan.point_rate_hz),
+        },
+        "laser": {"kind": kinds["laser"], "name": rig.laser.name, "limits": to_plain(rig.laser.limits)},
+        "sync": {"kind": kinds["sync"], "name": rig.sync.name},
+    }

@@ -33,76 +33,6 @@ from rig.errors import UsageError
 from rig.tradeoff.row_light import FLUX_MIN, Array, RowLight, scene_lights
 from rig.tradeoff.rows import LOCAL_PX, TradeoffRow
 
-NEWTON_STEPS: Final = 60
-"""Most steps to the best exponent t; bisection alone would get there."""
-GAP_EXACT: Final = 0.5
-"""1 minus a pixel's overlap below which it is summed from its small parts."""
-SERIES_BELOW: Final = 0.05
-"""Ratio of chances, as a logarithm, below which a series stands for differences that cancel."""
-
-
-def chernoff_exponent(flux: Array, other: Array) -> Array:
-    """C per exposure of telling rows of light `flux` from rows of `other`, (..., pixels) each; 0 where they are alike.
-
-    The probability that `other` is the likelier one although `flux` is true is at most exp(-K C), either way round.
-    """
-    first, second = np.broadcast_arrays(np.maximum(flux, FLUX_MIN), np.maximum(other, FLUX_MIN))
-    low, high = np.minimum(first, second), np.maximum(first, second)
-    # The brighter row's chances to fire and not to fire, over the darker one's: no difference of rounded numbers.
-    fired = np.log1p(-np.expm1(low - high) / np.expm1(np.minimum(low, 700.0)))
-    dark = low - high
-    sign = np.where(first >= second, 1.0, -1.0)
-    t = _best_share(log_fired(second), -second, sign * fired, sign * dark)
-    # Exponent of the brighter of the two in each pixel.
-    share = np.where(sign > 0, t[..., None], 1.0 - t[..., None])
-    return np.asarray(_overlap_exponent(low, high, fired, dark, share).sum(-1))
-
-
-def log_fired(flux: Array) -> Array:
-    """Logarithm of the chance that a pixel of this flux fires."""
-    return np.asarray(np.log(-np.expm1(-flux)))
-
-
-def _best_share(log_p: Array, log_q: Array, fired: Array, dark: Array) -> Array:
-    """The t in 0 to 1 at which sum log(p' e^(t fired) + q' e^(t dark)) is least: Newton's steps within a bracket."""
-    t = np.full(log_p.shape[:-1], 0.5)
-    low, high = np.zeros_like(t), np.ones_like(t)
-    for _ in range(NEWTON_STEPS):
-        a, b = log_p + t[..., None] * fired, log_q + t[..., None] * dark
-        whole = np.logaddexp(a, b)
-        p, q = np.exp(a - whole), np.exp(b - whole)
-        slope = (p * fired + q * dark).sum(-1)
-        curve = (p * q * (fired - dark) ** 2).sum(-1)
-        low, high = np.where(slope < 0, t, low), np.where(slope > 0, t, high)
-        step = t - np.divide(slope, curve, out=np.zeros_like(t), where=curve > 0)
-        moved = np.where((step > low) & (step < high), step, 0.5 * (low + high))
-        moved = np.where(slope != 0, moved, t)
-        settled = bool(np.all(np.abs(moved - t) < 1e-9))
-        t = moved
-        if settled:
-            break
-    return t
-
-
-def _overlap_exponent(low: Array, high: Array, fired: Array, dark: Array, share: Array) -> Array:
-    """-log(p^s p'^(1-s) + q^s q'^(1-s)) of each pixel, p of the flux `high` and s its share; fired >= 0 >= dark.
-
-    1 minus the sum, p [(1 - s) expm1(-fired) - expm1(-(1 - s) fired)] and so for q, is exact however alike the two are.
-    """
-    gap = -np.expm1(-high) * _convexity(1.0 - share, -fired) + np.exp(-low) * _convexity(share, dark)
-    apart = np.logaddexp(log_fired(high) - (1.0 - share) * fired, share * dark - low)
-    near = gap < GAP_EXACT
-    return np.where(near, -np.log1p(-np.where(near, gap, 0.0)), -apart)
-
-
-def _convexity(share: Array, x: Array) -> Array:
-    """share expm1(x) - expm1(share x) for x <= 0; its series, sum (s - s^n) x^n / n!, where the two nearly cancel."""
-    total, term, power = np.zeros_like(x), x, share
-    for n in range(2, 10):
-        term, power = term * x / n, power * share
-        total = total + (share - power) * term
-    return np.where(x > -SERIES_BELOW, total, share * np.expm1(x) - np.expm1(share * x))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rivals:
@@ -339,3 +269,74 @@ def _beside(row: TradeoffRow, limit: StatisticalLimit) -> TradeoffRow:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+NEWTON_STEPS: Final = 60
+"""Most steps to the best exponent t; bisection alone would get there."""
+GAP_EXACT: Final = 0.5
+"""1 minus a pixel's overlap below which it is summed from its small parts."""
+SERIES_BELOW: Final = 0.05
+"""Ratio of chances, as a logarithm, below which a series stands for differences that cancel."""
+
+
+def chernoff_exponent(flux: Array, other: Array) -> Array:
+    """C per exposure of telling rows of light `flux` from rows of `other`, (..., pixels) each; 0 where they are alike.
+
+    The probability that `other` is the likelier one although `flux` is true is at most exp(-K C), either way round.
+    """
+    first, second = np.broadcast_arrays(np.maximum(flux, FLUX_MIN), np.maximum(other, FLUX_MIN))
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    # The brighter row's chances to fire and not to fire, over the darker one's: no difference of rounded numbers.
+    fired = np.log1p(-np.expm1(low - high) / np.expm1(np.minimum(low, 700.0)))
+    dark = low - high
+    sign = np.where(first >= second, 1.0, -1.0)
+    t = _best_share(log_fired(second), -second, sign * fired, sign * dark)
+    # Exponent of the brighter of the two in each pixel.
+    share = np.where(sign > 0, t[..., None], 1.0 - t[..., None])
+    return np.asarray(_overlap_exponent(low, high, fired, dark, share).sum(-1))
+
+
+def log_fired(flux: Array) -> Array:
+    """Logarithm of the chance that a pixel of this flux fires."""
+    return np.asarray(np.log(-np.expm1(-flux)))
+
+
+def _best_share(log_p: Array, log_q: Array, fired: Array, dark: Array) -> Array:
+    """The t in 0 to 1 at which sum log(p' e^(t fired) + q' e^(t dark)) is least: Newton's steps within a bracket."""
+    t = np.full(log_p.shape[:-1], 0.5)
+    low, high = np.zeros_like(t), np.ones_like(t)
+    for _ in range(NEWTON_STEPS):
+        a, b = log_p + t[..., None] * fired, log_q + t[..., None] * dark
+        whole = np.logaddexp(a, b)
+        p, q = np.exp(a - whole), np.exp(b - whole)
+        slope = (p * fired + q * dark).sum(-1)
+        curve = (p * q * (fired - dark) ** 2).sum(-1)
+        low, high = np.where(slope < 0, t, low), np.where(slope > 0, t, high)
+        step = t - np.divide(slope, curve, out=np.zeros_like(t), where=curve > 0)
+        moved = np.where((step > low) & (step < high), step, 0.5 * (low + high))
+        moved = np.where(slope != 0, moved, t)
+        settled = bool(np.all(np.abs(moved - t) < 1e-9))
+        t = moved
+        if settled:
+            break
+    return t
+
+
+def _overlap_exponent(low: Array, high: Array, fired: Array, dark: Array, share: Array) -> Array:
+    """-log(p^s p'^(1-s) + q^s q'^(1-s)) of each pixel, p of the flux `high` and s its share; fired >= 0 >= dark.
+
+    1 minus the sum, p [(1 - s) expm1(-fired) - expm1(-(1 - s) fired)] and so for q, is exact however alike the two are.
+    """
+    gap = -np.expm1(-high) * _convexity(1.0 - share, -fired) + np.exp(-low) * _convexity(share, dark)
+    apart = np.logaddexp(log_fired(high) - (1.0 - share) * fired, share * dark - low)
+    near = gap < GAP_EXACT
+    return np.where(near, -np.log1p(-np.where(near, gap, 0.0)), -apart)
+
+
+def _convexity(share: Array, x: Array) -> Array:
+    """share expm1(x) - expm1(share x) for x <= 0; its series, sum (s - s^n) x^n / n!, where the two nearly cancel."""
+    total, term, power = np.zeros_like(x), x, share
+    for n in range(2, 10):
+        term, power = term * x / n, power * share
+        total = total + (share - power) * term
+    return np.where(x > -SERIES_BELOW, total, share * np.expm1(x) - np.expm1(share * x))

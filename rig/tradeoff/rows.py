@@ -22,61 +22,7 @@ from rig.depth.reconstruct import MapResult
 from rig.errors import UsageError
 from rig.geometry.stripe_table import MISSING_PX, depth_errors
 
-BLOCK_ROWS, BLOCK_COLUMNS = 32, 25
-"""Rows and columns of a block: more than the reach of filters and of the coupling of neighbours."""
-RESAMPLES = 1000
-_Z = 1.959964
-"""97.5 % quantile of the normal distribution."""
-_T = {1: 12.7062, 2: 4.3027, 3: 3.1824, 4: 2.7764, 5: 2.5706}
-"""97.5 % quantiles of Student's t by degrees of freedom, where the series of `t_quantile` is off by more than 0.1 %."""
-
 Interval = tuple[float, float]
-
-
-def repeats_interval(means: Sequence[float]) -> Interval:
-    """Interval of the mean of at least two independent means of absolute errors; so it is never below zero."""
-    half = t_quantile(len(means) - 1) * statistics.stdev(means) / math.sqrt(len(means))
-    middle = statistics.fmean(means)
-    return max(0.0, middle - half), middle + half
-
-
-def blocks_interval(sums: NDArray[np.float64], numbers: NDArray[np.int64], seed: int = 0) -> Interval:
-    """Interval of the mean error sum(sums) / sum(numbers).
-
-    sums, numbers: (blocks,), sum and number of the errors in each block. The interval is between percentiles of the
-    means of drawn blocks (Efron and Tibshirani, 'An introduction to the bootstrap', 1993, chapters 8 and 13).
-    """
-    some = numbers > 0
-    sums, numbers = sums[some], numbers[some]
-    drawn = np.random.default_rng(seed).integers(0, len(sums), (RESAMPLES, len(sums)))
-    means = sums[drawn].sum(axis=1) / numbers[drawn].sum(axis=1)
-    low, high = np.percentile(means, [2.5, 97.5])
-    return float(low), float(high)
-
-
-def blocks_of(errors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sum and number of the errors (rows, columns) in each block, arrays (blocks,); NaN is no error."""
-    rows, columns = errors.shape
-    down, across = np.arange(0, rows, BLOCK_ROWS), np.arange(0, columns, BLOCK_COLUMNS)
-    known = np.isfinite(errors)
-
-    def added(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.add.reduceat(np.add.reduceat(values, down, axis=0), across, axis=1).ravel()
-
-    return added(np.where(known, errors, 0.0)), added(known.astype(np.float64)).astype(np.int64)
-
-
-def t_quantile(freedom: int) -> float:
-    """97.5 % quantile of Student's t (Abramowitz and Stegun 26.7.5), within 0.1 %."""
-    if freedom in _T:
-        return _T[freedom]
-    z, n = _Z, float(freedom)
-    return (
-        z
-        + (z**3 + z) / (4 * n)
-        + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
-        + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
-    )
 
 
 MOST_MISSING = 0.05
@@ -262,3 +208,58 @@ def _least_so_far(
     for i in sorted(here, key=lambda i: (time_ms(rows[i]), rows[i].mean_abs_px)):
         yield i, rows[i].mean_abs_px < best
         best = min(best, rows[i].mean_abs_px)
+
+
+BLOCK_ROWS, BLOCK_COLUMNS = 32, 25
+"""Rows and columns of a block: more than the reach of filters and of the coupling of neighbours."""
+RESAMPLES = 1000
+_Z = 1.959964
+"""97.5 % quantile of the normal distribution."""
+_T = {1: 12.7062, 2: 4.3027, 3: 3.1824, 4: 2.7764, 5: 2.5706}
+"""97.5 % quantiles of Student's t by degrees of freedom, where the series of `t_quantile` is off by more than 0.1 %."""
+
+
+def repeats_interval(means: Sequence[float]) -> Interval:
+    """Interval of the mean of at least two independent means of absolute errors; so it is never below zero."""
+    half = t_quantile(len(means) - 1) * statistics.stdev(means) / math.sqrt(len(means))
+    middle = statistics.fmean(means)
+    return max(0.0, middle - half), middle + half
+
+
+def blocks_interval(sums: NDArray[np.float64], numbers: NDArray[np.int64], seed: int = 0) -> Interval:
+    """Interval of the mean error sum(sums) / sum(numbers).
+
+    sums, numbers: (blocks,), sum and number of the errors in each block. The interval is between percentiles of the
+    means of drawn blocks (Efron and Tibshirani, 'An introduction to the bootstrap', 1993, chapters 8 and 13).
+    """
+    some = numbers > 0
+    sums, numbers = sums[some], numbers[some]
+    drawn = np.random.default_rng(seed).integers(0, len(sums), (RESAMPLES, len(sums)))
+    means = sums[drawn].sum(axis=1) / numbers[drawn].sum(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def blocks_of(errors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Sum and number of the errors (rows, columns) in each block, arrays (blocks,); NaN is no error."""
+    rows, columns = errors.shape
+    down, across = np.arange(0, rows, BLOCK_ROWS), np.arange(0, columns, BLOCK_COLUMNS)
+    known = np.isfinite(errors)
+
+    def added(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.add.reduceat(np.add.reduceat(values, down, axis=0), across, axis=1).ravel()
+
+    return added(np.where(known, errors, 0.0)), added(known.astype(np.float64)).astype(np.int64)
+
+
+def t_quantile(freedom: int) -> float:
+    """97.5 % quantile of Student's t (Abramowitz and Stegun 26.7.5), within 0.1 %."""
+    if freedom in _T:
+        return _T[freedom]
+    z, n = _Z, float(freedom)
+    return (
+        z
+        + (z**3 + z) / (4 * n)
+        + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
+        + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
+    )
