@@ -50,13 +50,14 @@ def calibrate_planes(
     board: file of the board; None is the bundled one.
     poses: number of board poses to show to a live rig; the most of them where `guided`.
     guided: after each view ask for the pose that helps most, until the accuracy is reached.
-    calibration: file to start from; the defects of the line that it holds are kept.
+    calibration: file to start from; its map of defective pixels is kept.
     camera: camera.yaml that `calibrate_camera` wrote from other views.
     stated_baseline: measured distance from mirror to camera, such as '300 mm'.
     accuracy: standard deviation of depth that is good enough at the distance `at`, such as '10 mm' at '5 m'; None is
       what a tenth of a pixel costs there.
     scene: of a simulated rig.
     exposures: exposures per column; the views take them by turns.
+    seed: of everything simulated.
     arm: must be True where laser or gate are real.
     accept_calibration: use a `camera` whose verdict failed all the same; otherwise that is a UsageError.
     ask: called to have the board of a real rig moved; it returns once that is done.

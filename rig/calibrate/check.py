@@ -41,7 +41,7 @@ class CheckAsked:
     """Request for a check.
 
     poses: of a live rig. angle_rad: stated angle between the boards of the first two views; None where nobody states
-    one.
+      one.
     accuracy_m: standard deviation of depth at `at_m` that is good enough; None is what a tenth of a pixel costs there.
     """
 

@@ -205,7 +205,7 @@ def run_pixels(
     """Map the pixels of a sensor (`rig calibrate pixels`).
 
     source: a rig, whose SPAD then takes frames in the dark; or the folder of a recorded run, whose dark and lit frames
-    are taken.
+      are taken.
     frames: number of dark frames; None is as many as the limit of hot pixels needs.
     spread_s: seconds over which they are spread, at least.
     lit: a recorded run whose lit frames tell dead pixels.

@@ -75,8 +75,9 @@ def run_planes(
 ) -> CalibrationResult:
     """Calibrate the planes from the sources.
 
-    base: a model to start from, whose defects are kept. camera: what other views say of the camera. ask: gets a person
-    to move the board. tell: gets a line about each view.
+    base: a model to start from, whose defective pixels are kept.
+    camera: what other views say of the camera.
+    ask: gets a person to move the board. tell: gets a line about each view.
     Raises Degenerate where the views make no calibration; its notes say why, root cause first.
     """
     live, known = sources.live, None if camera is None else camera.known

@@ -199,9 +199,9 @@ class Live:
 
     poses: number of good views wanted. choose: chooses the poses. ask: gets a person to move the board.
     exposures: per column, by turns, so that the mirror is seen at several speeds; speeds that the rig cannot do are
-    left out, and those that never show the line where more exposures do; empty is as the config says.
+      left out, and those that never show the line where more exposures do; empty is as the config says.
     line: whether the line has to be seen on the board. defects: (rows, width), pixels that are not used. seed: of
-    everything simulated.
+      everything simulated.
     """
 
     config: RigConfig

@@ -42,7 +42,7 @@ class DarkLook:
     """Frames of a sweep with the gate low, and what came with them.
 
     records: (n,), records of all frames. dark_share: share of ones. n_bytes: bytes of pixels; seconds: time to send
-    them.
+      them.
     counters: the SPAD's own, before it was stopped. triggered: the sync source's program ran to its end.
     """
 

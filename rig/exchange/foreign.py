@@ -25,7 +25,7 @@ class ForeignFrames:
     """Frames of one size in their order.
 
     chunks: gives them anew at each call, uint8 (n, height, ceil(width / 8)), most significant bit = leftmost pixel; n
-    may differ and be 0.
+      may differ and be 0.
     origin: for the manifest, where the frames come from.
     ranges: [first frame, frames] of consecutive numbers, where the file tells of lost ones.
     hints: lines for the user about what may be wrong.

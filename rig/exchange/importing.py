@@ -72,7 +72,7 @@ class ImportOptions:
     """Options of reading foreign files.
 
     form: packed or sparse (pi-imaging), half or full (swissspad2), packed (photoncube); None is as seen from the file,
-    or half.
+      or half.
     frame_rate: None where it is not known.
     turn_deg: counter-clockwise; None is 90 for pi-imaging, otherwise 0.
     rows: of the sensor, pi-imaging only; None is 512.

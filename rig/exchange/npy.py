@@ -1,4 +1,4 @@
-"""Writes a recording as a photon cube: `frames.npy` for `photoncube`, `visionsim` and `rig reconstruct`, with JSON.
+"""Writes a recording as a photon cube: `frames.npy` for `photoncube`, `visionsim` and `rig reconstruct`, and its JSON.
 
 The array is uint8 (frames, height, ceil(width / 8)), most significant bit first, the frames that were received one
 after the other. `frames.json` says what it cannot: clock, numbers and gaps, markers, windows. `transforms.json`, where

@@ -132,7 +132,7 @@ def sweep_path(
 
     margin_s: time that the constant velocity lasts before the first edge and, likewise, after the last.
     fly_back: return to the start before the sweep ends (unidirectional); otherwise the sweep ends where the return
-    begins.
+      begins.
     least_points: least length of the sweep; a rest makes up the difference.
     """
     rate = motion.point_rate_hz

@@ -107,10 +107,10 @@ class ScanPlan:
     frame_rate_hz, point_rate_hz: exact nominal rates of SPAD and scanner.
     sweep_points: points from one scan marker to the next.
     marker_points: int64 (markers,), point of line marker j within a sweep. It marks the command of the edge j *
-    columns_per_marker columns into the lit part; markers behind the lit part only move the window in the dark.
+      columns_per_marker columns into the lit part; markers behind the lit part only move the window in the dark.
     commands: float64 (columns,), mirror command of each column's centre.
     x0: int32 (columns,), first stored pixel of each column's window. window: stored pixels per row. Both are multiples
-    of 64.
+      of 64.
     link_bytes_per_s: rate that the SPAD's link carries; None where it cannot stream.
     windows: the pixels of each frame that are used, by the markers before it; None: all.
     windowed: whether the SPAD sends only these.

@@ -31,7 +31,7 @@ class PipelineStats:
     dropped_blocks, dropped_frames: found no free slot.
     counting_s: binding and counting. estimation_s: from counts to map.
     map_wait_s: waiting for room among the maps that the caller has not taken yet; map_queue is that room, and at most
-    map_queue_high_water maps waited.
+      map_queue_high_water maps waited.
     recorder_s: computing checksums and writing.
     monitor_updates: views shown. monitor_skipped_blocks: blocks that the monitor did not look at.
     """
@@ -100,7 +100,7 @@ class Synchronisation:
 
     residual_columns, clock_error: the largest of its sweeps; None where one could not be checked.
     detection_probability: the least over the sweeps, of finding a blanking pattern as bright as theirs; None where
-    markers bound the frames.
+      markers bound the frames.
     """
 
     by: Literal["markers", "blanking pattern"]

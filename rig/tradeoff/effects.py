@@ -63,9 +63,9 @@ class Effect:
     changed_decisions_bound: largest share of decisions that can change without it; None where there is no bound.
     cost_us_per_frame: of one thread; None where it is worked in elsewhere.
     stripe_error_change_px: how much larger the mean stripe error is with it than without it, with its standard error;
-    None where neither is known.
+      None where neither is known.
     basis: 'trial' where that was measured in a pair of trial scans, 'bound' where it is the bound of an effect that is
-    left out.
+      left out.
     """
 
     effect: str

@@ -148,7 +148,7 @@ class StatisticalLimit:
     """Limits of rows of a scene at a number of exposures; means over its rows.
 
     mean_abs_px, mean_abs_se_px: least mean |error| of any answer from one row, or from `averaged` like ones, and its
-    standard error.
+      standard error.
     within_1px: share of those answers within 1 px.
     exponent: median over rows of the least Chernoff exponent per exposure to a position more than 1 px off.
     position_sd_px: median Cramer-Rao bound.
@@ -172,7 +172,7 @@ def limits(
 
     averaged: neighbours of equal disparity that each row may be seen together with; 1 for an estimator of single rows.
     draws: of each row. 200 rows take a second for four numbers of exposures, and BOUNDED_ROWS of them a second for
-    their exponents and bounds.
+      their exponents and bounds.
     """
     if not lights:
         raise ValueError("a limit needs at least one row of light")

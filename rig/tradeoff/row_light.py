@@ -33,7 +33,7 @@ class RowLight:
     """Expected light of one image row in photons per exposure, nearest pixel first; arrays (pixels,) float64.
 
     before, behind: light of a pixel in front of the stripe, and of the same pixel behind it; each above 0 (dark
-    counts).
+      counts).
     strength: brightness of a stripe of the same reflectance at each pixel, in any unit.
     position: of the stripe, in pixels. stripe: its photons, summed across it. sigma_px: width of the Gaussian line.
     first, last: first and last pixel of the search, around the position.

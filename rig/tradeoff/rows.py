@@ -86,12 +86,12 @@ class TradeoffRow:
     ci95: confidence interval of mean_abs_px.
     local_sd_px: standard deviation of the errors of answers within LOCAL_PX.
     pareto, pareto_compute: whether no other setting in the same scene and fog has less error in as little time of
-    sensor or computer, and no less time.
+      sensor or computer, and no less time.
 
     The others compare it with what the light allows (`rig.tradeoff.limits`); each is None where that is not known.
     times_limit: mean_abs_px over the statistical limit.
     exponent_nats: Chernoff's exponent per exposure. times_wrong_limit: share of answers more than 1 px off over the
-    ideal's.
+      ideal's.
     position_sd_px: Cramer-Rao's bound. times_position_limit: local_sd_px over that.
     """
 
