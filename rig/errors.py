@@ -1,4 +1,4 @@
-"""What can go wrong above the devices, each with the exit code of the command line it leads to.
+"""Errors of the application above the devices, each with the exit code that the command line ends with.
 
 A message names the thing, the value, the limit and the next step. Several problems found together are one error with
 one line each, so that nobody repairs a config one key at a time.
@@ -46,8 +46,8 @@ class RecordingError(RigError):
 
 
 class DivergedError(RigError):
-    """A driver said to its device other than in the recording that is played, or at another time."""
+    """A driver sent its device something else than in the recording that is played, or sent it at another time."""
 
 
 class DamagedRecordingError(RigError):
-    """What was recorded is not what is on the disk any more: nothing is to be made of it before 'rig repair'."""
+    """The files of a recording are not what was recorded; nothing is made of them before 'rig repair'."""

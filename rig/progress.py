@@ -1,7 +1,7 @@
-"""How far a command is: named stages, with a count where one is known, told to whoever listens.
+"""Progress of a command: named stages, with a count where one is known, told to whoever listens.
 
-It goes the way of a log: told from where the work is done to the listener of the calling thread, if there is one, and
-handed down through no call.
+It goes the way of a log: from where the work is done to the listener of the calling thread, if there is one, without
+being handed down through calls.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 
 Progress = Callable[[int, int], None]
-"""Called now and then with what is done and what there is to do, in frames, maps or rows."""
+"""A callback that gets what is done and what there is to do, in frames, maps or rows, now and then."""
 
 
 PREPARING = "preparing"
@@ -19,10 +19,12 @@ PREPARING = "preparing"
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One moment of a command. total: None where nobody knows how many there will be; else `done` is never more.
+    """One moment of a command.
 
-    part: of which of several pieces of the whole this is, as 'pose 3 of 12'. unit: of the counts, in the plural.
-    note: what else is to be said.
+    total: None where the number is not known; otherwise `done` is never more.
+    unit: of the counts, in the plural.
+    note: anything else to say.
+    part: piece of the whole that the stage belongs to, such as 'pose 3 of 12'.
     """
 
     stage: str
@@ -47,7 +49,7 @@ def tell_stage(stage: str, done: int = 0, total: int | None = None, unit: str = 
 
 
 def counted(stage: str, unit: str, progress: Progress | None = None) -> Progress:
-    """Tells of a stage whatever it is called with; `progress`, which a caller of the API gave, hears the same."""
+    """A callback that reports the counts it gets as progress of this stage, and passes them on to `progress`."""
 
     def count(done: int, total: int) -> None:
         tell_stage(stage, done, total, unit)
@@ -59,7 +61,7 @@ def counted(stage: str, unit: str, progress: Progress | None = None) -> Progress
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Within it `listener` hears all that is told on this thread."""
+    """Within the context, `listener` hears all that is told on this thread."""
     token = _listener.set(listener)
     try:
         yield
@@ -69,7 +71,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def part(name: str) -> Iterator[None]:
-    """Within it everything told is of this part of the whole, which begins with being prepared."""
+    """Within the context, everything told belongs to this part of the whole. It begins with the stage PREPARING."""
     token = _part.set(name)
     tell_stage(PREPARING)
     try:

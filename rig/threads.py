@@ -1,6 +1,6 @@
-"""Compiled work on image rows, shared out between threads; kernels release the interpreter's lock while they run.
+"""Threads of the pipeline: `RowWorkers` share compiled work on image rows, `StageThread` is one stage of the pipeline.
 
-The thread of one stage of the pipeline.
+Kernels release the interpreter's lock while they run, so that row threads work at the same time.
 """
 
 import os
@@ -16,17 +16,18 @@ from typing import Self
 import numpy as np
 
 Work = Callable[[int, int], None]
-"""Called with the first row and the one behind the last."""
+"""Work on a range of rows; it is called with the first row and the one behind the last."""
 _Job = tuple[Work, int, int]
 _LEAST_URGENT = 19
 
 
 class RowWorkers:
-    """Threads that share the rows of a picture, each one always the same: what it touched is still in its cache.
+    """Threads that share the rows of a picture, each one always the same rows: what it touched is still in its cache.
 
-    Work can be left with them (`post`): each goes through it in order, none waits for the others, and handing over
-    costs the caller little. Work that fails is raised again at the next call, and what was left behind it is not begun.
-    With one thread all is done at once. The threads end with `close`, or when nobody has the workers any more.
+    Work can be left with them (`post`): each thread goes through it in order, none waits for the others, and handing
+    over costs the caller little. An error in the work is raised at the next call, and work left behind it is not begun.
+    With one thread everything is done at once. The threads end with `close`, or when nothing refers to the workers any
+    more.
     """
 
     def __init__(self, threads: int) -> None:
@@ -42,7 +43,7 @@ class RowWorkers:
         self.settle()
 
     def post(self, rows: int, work: Work) -> None:
-        """The same without waiting for it."""
+        """Hand over work as `over` does, without waiting for the work to be done."""
         state = self._state
         if not state.queues:
             if rows:
@@ -56,7 +57,10 @@ class RowWorkers:
             queue.put((work, first, last))
 
     def settle(self, under_way: int = 0) -> None:
-        """Wait until no more than the last `under_way` posts are not done; all of them where one failed."""
+        """Wait until at most the last `under_way` posts are still at work; where one failed, wait for all.
+
+        Raises the error of a post that failed.
+        """
         state = self._state
         if not state.queues:
             return
@@ -85,7 +89,7 @@ class RowWorkers:
 
 
 class _State:
-    """What the threads know; they must not keep the workers themselves alive."""
+    """State that the threads share; it must not keep the workers themselves alive."""
 
     def __init__(self, threads: int) -> None:
         self.queues: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(threads)]
@@ -99,9 +103,9 @@ class _State:
 
 
 def yield_to_others() -> None:
-    """Let the calling thread work only while others leave a core idle, where the system knows priorities of threads.
+    """Let the calling thread work only while others leave a core idle, on systems that know priorities of threads.
 
-    Row threads work in step: one that shares its core with work of no hurry slows all of them.
+    Row threads work in step: one that shares its core with less urgent work slows all of them.
     """
     if sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LEAST_URGENT)
@@ -131,9 +135,9 @@ def _end(state: _State) -> None:
 
 
 class StageThread:
-    """Runs `run`, which handles all that it raises, once and beside the caller; a program that ends leaves it behind.
+    """A thread that runs `run` once beside the caller; a program that ends does not wait for it.
 
-    A run may fail before its threads are started: `join` may come without `start`.
+    `run` handles all that it raises. A stage may fail before its thread is started: `join` may come without `start`.
     """
 
     def __init__(self, run: Callable[[], None], name: str) -> None:

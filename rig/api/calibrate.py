@@ -1,9 +1,12 @@
-"""The calls that calibrate: `calibrate_planes`, `camera`, `pixels`, `sync` and `check`.
+"""The calls that calibrate a rig: camera, light planes, timing and bad pixels, and the check of a finished calibration.
 
-Sources are a rig (a config, a bundled one's name or its file), folders of runs taken with `record`, folders of earlier
-calibrations (for their views), and for the camera pictures; none: the bundled simulated rig, whose world moves the
-board. All raise CalibrationError (Degenerate, with `.reason`) where the views make no calibration, UsageError for what
-cannot be, DeviceError or DevicesError where devices fail; views that were taken by then are in `out`.
+`sources` may be a rig (a config, the name of a bundled one, or its file), folders of runs taken with `record`, folders
+of earlier calibrations (for their views) and, for the camera alone, pictures. Without any it is the bundled simulated
+rig, whose world moves the board.
+
+All of them raise CalibrationError where the views make no calibration (Degenerate, with `.reason`, where more or other
+views would help), UsageError for a request that cannot be met, and DeviceError or DevicesError where devices fail.
+Views that were taken by then are in `out`.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,14 +47,22 @@ def calibrate_planes(
 ) -> "CalibrationResult":
     """Calibrate camera, light planes and lag together from views of a board (`rig calibrate planes`).
 
-    board: a board's file; None: the bundled one. poses: to show to a live rig, the most where guided. guided: after
-    each view the pose that helps most is asked for, until the accuracy is reached. calibration: one to start from,
-    whose defects are kept. camera: the camera.yaml of `calibrate_camera`, made of other views. stated_baseline: of
-    mirror and camera as measured, such as '300 mm'. accuracy: sd of the depth that is good enough, such as '10 mm', at
-    the distance `at`, such as '5 m'; None: what a tenth of a pixel costs there. scene: of a simulated rig. exposures:
-    per column, by turns. arm: must be True where laser or gate are real. accept_calibration: take a `camera` whose
-    verdict failed all the same (else UsageError). ask: has the board of a real rig moved and returns once it is. tell:
-    takes a line for each view. out: a folder to write, None: nothing.
+    board: file of the board; None is the bundled one.
+    poses: number of board poses to show to a live rig; the most of them where `guided`.
+    guided: after each view ask for the pose that helps most, until the accuracy is reached.
+    calibration: file to start from; its map of defective pixels is kept.
+    camera: camera.yaml that `calibrate_camera` wrote from other views.
+    stated_baseline: measured distance from mirror to camera, such as '300 mm'.
+    accuracy: standard deviation of depth that is good enough at the distance `at`, such as '10 mm' at '5 m'; None is
+      what a tenth of a pixel costs there.
+    scene: of a simulated rig.
+    exposures: exposures per column; the views take them by turns.
+    seed: of everything simulated.
+    arm: must be True where laser or gate are real.
+    accept_calibration: use a `camera` whose verdict failed all the same; otherwise that is a UsageError.
+    ask: called to have the board of a real rig moved; it returns once that is done.
+    tell: called with a line about each view.
+    out: folder to write; None writes nothing.
     """
     from calibration.verdict import AT_M
     from rig.calibrate.planes import POSES, PlanesAsked, run_planes
@@ -95,9 +106,11 @@ def calibrate_camera(
     ask: "Ask | None" = None,
     tell: "Tell | None" = None,
 ) -> "CalibrationResult":
-    """Calibrate the camera alone (`rig calibrate camera`). sources: pictures and folders of pictures too.
+    """Calibrate the camera alone (`rig calibrate camera`).
 
-    terms: of the lens model: 0, 4, 5, 8, 12 or 14, as OpenCV counts them. All else as `calibrate_planes`.
+    sources: pictures and folders of pictures as well.
+    terms: number of terms of the lens model: 0, 4, 5, 8, 12 or 14, as OpenCV counts them.
+    Everything else is as in `calibrate_planes`.
     """
     from calibration.model.camera import TERM_COUNTS
     from rig.calibrate.camera import CameraAsked, run_camera
@@ -129,9 +142,12 @@ def calibrate_pixels(
 ) -> "PixelResult":
     """Map hot, dead and noisy pixels and the dark rate from dark frames (`rig calibrate pixels`).
 
-    source: a rig, or the folder of a recorded run. frames: dark ones, None: as many as the limit of hot pixels needs.
-    lit: a recorded run whose lit frames tell dead pixels; light: take such now. against: an older map; None: the one
-    beside the rig's calibration. covered: called where a person has to cover the lens, returns once it is.
+    source: a rig, or the folder of a recorded run.
+    frames: number of dark frames; None is as many as the limit of hot pixels needs.
+    lit: folder of a recorded run, in whose lit frames dead pixels show.
+    light: take lit frames now instead.
+    against: an older map to compare with; None is the one beside the rig's calibration.
+    covered: called where a person has to cover the lens; it returns once that is done.
     """
     from rig.calibrate.pixels import run_pixels
 
@@ -154,10 +170,11 @@ def calibrate_sync(
     out: OutFolder = None,
     tell: "Tell | None" = None,
 ) -> "CalibrationResult":
-    """Measure the mirror's lag each way and the rows' delay from one unmoved scene (`rig calibrate sync`).
+    """Measure the mirror's lag each way and the rows' delay from one scene that does not move (`rig calibrate sync`).
 
-    calibration: the model they go into; None: that of the live rig. exposures: per column, a speed each. All else as
-    `calibrate_planes`.
+    calibration: file of the model that the results go into; None is that of the live rig.
+    exposures: exposures per column; each number is one scan speed.
+    Everything else is as in `calibrate_planes`.
     """
     from calibration.verdict import AT_M
     from rig.calibrate.sources import sort_sources
@@ -192,8 +209,9 @@ def calibrate_check(
 ) -> "CalibrationResult":
     """Judge a calibration by a flat board that it was not made with (`rig calibrate check`).
 
-    calibration: a file; None: that of the live rig. angle: between the boards of the first two views, such as '30 deg'.
-    All else as `calibrate_planes`.
+    calibration: its file; None is that of the live rig.
+    angle: known angle between the boards of the first two views, such as '30 deg'.
+    Everything else is as in `calibrate_planes`.
     """
     from calibration.verdict import AT_M
     from rig.calibrate.check import CheckAsked, run_check

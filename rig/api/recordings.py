@@ -1,4 +1,4 @@
-"""The calls for recordings: `verify`, `repair`, `recording_info`, `cut`, `compress`, `import_frames`, `export_run`."""
+"""The calls for recordings: check, mend, describe, cut and compress them, and exchange them with other programs."""
 
 from collections.abc import Sequence
 from fractions import Fraction
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def verify(run: PathLike) -> "Verification":
-    """Whether a recording is what was recorded, every byte of it read (`rig verify`)."""
+    """Read every byte of a recording and report whether it is what was recorded (`rig verify`)."""
     from rig.recording.verify import verify as read_all
 
     return read_all(Path(run))
@@ -35,7 +35,7 @@ def repair(run: PathLike) -> "Repair":
 
 
 def recording_info(run: PathLike) -> "RecordingInfo":
-    """What a recording holds, as its index and manifest tell (`rig info`)."""
+    """Describe a recording from its index and manifest, without reading the frames (`rig info`)."""
     from rig.recording.open import info
 
     return info(Path(run))
@@ -50,10 +50,10 @@ def cut(
     time: str | None = None,
     start: int = 0,
 ) -> dict[str, Any]:
-    """Write a part of a recording to the folder `out` (`rig cut`); its manifest.
+    """Write a part of a recording to the folder `out` and return the manifest of the part (`rig cut`).
 
-    Exactly one of: maps, frames, time (seconds from the first frame), each 'A:B', from A to before B. start: the start
-    of the SPAD that frames and time are of, counted from 0.
+    Give exactly one of `maps`, `frames` and `time` (seconds from the first frame), each as 'A:B', from A to before B.
+    start: number of the SPAD start that frames and time are counted in, from 0.
     """
     from rig.recording.cut import cut as cut_out
 
@@ -61,7 +61,7 @@ def cut(
 
 
 def compress(run: PathLike) -> "Compression":
-    """Compress a recording with zstd; it is read as before (`rig compress`). Needs the extra `compress`."""
+    """Compress a recording with zstd; it is read as any other (`rig compress`). Needs the extra `compress`."""
     from rig.recording.compress import compress as pack
 
     return pack(Path(run))
@@ -78,11 +78,16 @@ def import_frames(
     rows: int | None = None,
     progress: Progress | None = None,
 ) -> "ImportResult":
-    """Make a recording of another program's frames (`rig import`): pi-imaging, swissspad2 or photoncube.
+    """Make a recording from the frames of another program (`rig import`).
 
-    files: in order; a folder stands for those in it. form: packed or sparse, half or full. frame_rate: "97.7 kHz" or
-    hertz exactly; None where it is not known. turn_deg: counter-clockwise. rows: of a SPAD512S, 512 or 1024.
-    progress: called with frames done and all. Raises UsageError, a line per problem.
+    kind: pi-imaging, swissspad2 or photoncube.
+    files: in order; a folder stands for the files in it.
+    form: packed or sparse, half or full, where the kind has several.
+    frame_rate: '97.7 kHz', or hertz as an exact fraction; None where it is not known.
+    turn_deg: turn of the picture, counter-clockwise.
+    rows: rows of a SPAD512S, 512 or 1024.
+    progress: called with frames done and frames to do.
+    Raises UsageError, one line per problem.
     """
     from rig.exchange.importing import ImportOptions
     from rig.exchange.importing import import_frames as take
@@ -104,11 +109,14 @@ def export_run(
     pictures_per_s: float | None = None,
     progress: Progress | None = None,
 ) -> "ExportResult":
-    """Write a run for other programs (`rig export`): npy, hdf5, ply, png or mp4, to `out` or to RUN-KIND beside it.
+    """Write a run for other programs (`rig export`): npy, hdf5, ply, png or mp4.
 
-    view: what png and mp4 show, depth, intensity or frames; None: the first of them that there is. frames_per_picture:
-    summed where frames are shown, None: 100. pictures_per_s: of a film, None: 25. progress: called with frames done and
-    all. Raises UsageError where there is nothing of that kind.
+    out: where to; None is RUN-KIND beside the run.
+    view: what png and mp4 show: depth, intensity or frames; None is the first of these that the run has.
+    frames_per_picture: number of frames summed in a picture of frames; None is 100.
+    pictures_per_s: rate of a film; None is 25.
+    progress: called with frames done and frames to do.
+    Raises UsageError where the run has nothing of that kind.
     """
     from rig.exchange.exporting import ExportOptions
     from rig.exchange.exporting import export_run as write

@@ -1,4 +1,4 @@
-"""The calls about a rig and its computer: what a scene calls for, what is attached, whether it could run, how fast."""
+"""The calls about a rig and its computer: check a config, look at devices and scenes, laser off, benchmarks."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def check_config(config: Config = SIMULATED) -> "RigConfig":
-    """The config, once every file that it names was opened as a scan opens it (`rig config check`).
+    """Return the config once every file that it names was opened as a scan opens it (`rig config check`).
 
     Raises UsageError with one line per problem.
     """
@@ -32,10 +32,10 @@ def check_config(config: Config = SIMULATED) -> "RigConfig":
 def effects(
     config: Config = SIMULATED, *, scene: str | None = None, trials: bool = True, progress: Progress | None = None
 ) -> "SceneEffects":
-    """Which effects a simulated scene calls for, why, and what each is worth (`rig effects`).
+    """List the physical effects that a simulated scene calls for, why, and what each is worth (`rig effects`).
 
-    trials: measure by how much each changes the stripe error, in pairs of short scans (seconds); progress: called with
-    those done and all.
+    trials: measure how much each effect changes the stripe error, in pairs of short scans; takes seconds.
+    progress: called with scans done and scans to do.
     """
     from rig.tradeoff.effects import scene_effects
 
@@ -45,7 +45,7 @@ def effects(
 def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int | None, column: int | None) -> "Flux":
     """Noise-free photons per exposure of one image row while the line is at a column's centre (`rig effects --row`).
 
-    Arrays (width,): x_px, total, and by name what each effect brings.
+    The result has float arrays (width,): x_px, total, and the share of each effect by its name.
     """
     from rig.tradeoff.effects import flux_row as row_of
 
@@ -55,9 +55,9 @@ def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int |
 
 
 def doctor(config: Config = SIMULATED, *, out: PathLike = "runs") -> "list[Finding]":
-    """Whether a scan could run (`rig doctor`): devices, plan, frames, markers, dark counts, disk; no light leaves.
+    """Examine whether a scan could run: devices, plan, frames, markers, dark counts and disk (`rig doctor`).
 
-    The mirror moves. out: where a scan would write.
+    The mirror moves, but no light leaves. out: folder where a scan would write.
     """
     from rig.devices.doctor import examine
 
@@ -65,23 +65,27 @@ def doctor(config: Config = SIMULATED, *, out: PathLike = "runs") -> "list[Findi
 
 
 def devices() -> "list[Attached]":
-    """USB devices that a driver knows and serial ports, as far as can be seen without opening them (`rig devices`)."""
+    """List USB devices that a driver knows, and serial ports, without opening any of them (`rig devices`)."""
     from rig.devices.doctor import attached
 
     return attached()
 
 
 def laser_off(config: Config = SIMULATED) -> list[str]:
-    """Take the gate low and disarm the laser (`rig laser off`); says what was done. Raises DevicesError."""
+    """Take the gate low, disarm the laser, and return lines that say what was done (`rig laser off`).
+
+    Raises DevicesError where a device does not answer.
+    """
     from rig.devices.doctor import laser_off as switch_off
 
     return switch_off(configure(config))
 
 
 def bench(*, threads: int | None = None, progress: Progress | None = None) -> "SpeedReport":
-    """How fast this machine counts and estimates, within a minute (`rig bench`).
+    """Measure how fast this machine counts and estimates, within a minute (`rig bench`).
 
-    threads: the most to measure, by default one for each core. progress: called with rows done and all, of all rounds.
+    threads: the most threads to measure with; None is one for each core.
+    progress: called with rows done and rows to do, over all rounds.
     """
     from rig.bench.speed import measure_speed
 
@@ -91,9 +95,9 @@ def bench(*, threads: int | None = None, progress: Progress | None = None) -> "S
 
 
 def bench_disk(folder: PathLike, *, progress: Progress | None = None) -> "DiskReport":
-    """How fast recordings are written to and read from the disk of `folder`, beside what it does at its best.
+    """Measure how fast recordings are written to and read from the disk of `folder`, beside the best it does.
 
-    Some 2 GB are written there and removed again. progress: called with measurements done and all.
+    Some 2 GB are written there and removed again. progress: called with measurements done and to do.
     """
     from rig.bench.disk import measure_disk
 
@@ -101,9 +105,9 @@ def bench_disk(folder: PathLike, *, progress: Progress | None = None) -> "DiskRe
 
 
 def bench_simulator(config: Config = SIMULATED, *, progress: Progress | None = None) -> "SimulatorReport":
-    """How fast the simulator draws frames of a clear, a foggy and a crowded scene, beside plain numpy.
+    """Measure how fast the simulator draws frames of a clear, a foggy and a crowded scene, beside plain numpy.
 
-    progress: called with rows done and all, of all rounds.
+    progress: called with rows done and rows to do, over all rounds.
     """
     from rig.bench.simulator import measure_simulator
 
@@ -121,8 +125,10 @@ def soak(
 ) -> "SoakReport":
     """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`).
 
-    window: windows that move with the line, instead of whole frames. slow_consumer_s: added to every map. on_overload:
-    as of `scan`; a stream that it ends is a report too. progress: called with frames done and planned.
+    window: send windows that move with the line instead of whole frames.
+    slow_consumer_s: time added to every map, to see what an overload does.
+    on_overload: as in `scan`; a stream that is ended by it gives a report too.
+    progress: called with frames done and frames planned.
     """
     from rig.bench.soak import SoakOptions
     from rig.bench.soak import soak as play
@@ -132,7 +138,7 @@ def soak(
 
 
 def warm_up(config: Config = SIMULATED) -> float:
-    """Compile every kernel that a scan with this config can need (`rig warmup`); the seconds it took.
+    """Compile every kernel that a scan with this config can need and return the seconds it took (`rig warmup`).
 
     Real devices are not opened.
     """

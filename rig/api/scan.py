@@ -1,7 +1,4 @@
-"""The calls that acquire: `scan`, `plan_scan`, and `replay`, which does so from a recording.
-
-The call that makes depth of frames that are there: `reconstruct`.
-"""
+"""The calls that make depth maps: `scan` with a rig, `replay` and `reconstruct` from frames that exist; `plan_scan`."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -55,18 +52,26 @@ def scan(
     monitor: "Watch | None" = None,
     on_space: "OnSpace | None" = None,
 ) -> RunResult:
-    """Acquire and reconstruct `maps` depth maps (`rig scan`).
+    """Scan with a rig and return its depth maps (`rig scan`).
 
-    config and options: as `configure`. save: 'all', 'last' or 'every N' maps. arm: must be True where laser or gate are
-    real. accept_calibration: use a calibration that is of another rig, has failed or is too old all the same (else it
-    is refused); what speaks against it is in manifest and summary. out: a folder to write, None to write nothing.
-    record: write the frames into it too. on_overload: 'abort', 'drop' or 'block', what to do with frames that come too
-    fast. progress: called with frames done and planned; live: with a `ScanProgress`, the figures of every stage in it;
-    both several times a second. monitor: called with the newest frames as a `MonitorView`, at most ten times a second,
-    on a thread of its own; the run never waits for it. on_space: called with a `Space`, what the recording will take on
-    the disk at most, before anything moves.
-    Raises UsageError for what cannot be, DeviceError or DevicesError where devices fail; maps that were whole by then
-    are in `out`. An interrupt ends the scan after its last whole map, with verdict 'aborted'.
+    config, scene, exposures, estimator, filter, min_confidence, temporal_prior: as in `configure`.
+    maps: number of depth maps to take.
+    seed: of a simulated rig's random numbers.
+    save: maps to write: 'all', 'last' or 'every N'.
+    arm: must be True where laser or gate are real.
+    accept_calibration: use a calibration that is of another rig, has failed or is too old, which is refused otherwise;
+      the manifest and the summary then say what speaks against it.
+    out: folder to write; None writes nothing.
+    record: write the frames into it too.
+    on_overload: what to do with frames that come too fast: 'abort', 'drop' or 'block'.
+    progress: called several times a second with frames done and frames planned.
+    live: called as often with a `ScanProgress`, which has the figures of every stage.
+    monitor: called with the newest frames as a `MonitorView`, at most ten times a second and on a thread of its own;
+      the run never waits for it.
+    on_space: called before anything moves with a `Space`: the most that the recording will take on the disk.
+
+    Raises UsageError for a request that cannot be met, DeviceError or DevicesError where devices fail; maps that were
+    whole by then are in `out`. An interrupt ends the scan after its last whole map, with verdict 'aborted'.
     """
     from rig.devices.open import open_rig
     from rig.scan.scan import ScanOptions, run_scan
@@ -101,14 +106,15 @@ def plan_scan(
     on_space: "OnSpace | None" = None,
     **options: Any,
 ) -> "ScanPlan":
-    """The compiled plan of a scan, checked against its devices' limits (`rig scan --dry-run`).
+    """Compile the plan of a scan and check it against the limits of its devices (`rig scan --dry-run`).
 
-    maps, seed, save, on_overload, accept_calibration, record: checked as `scan` would, the room on the disk of `out`
-    too; the plan does not depend on them. on_space: as of `scan`.
-    options: as `configure`.
+    maps, seed, save, on_overload, accept_calibration, record: checked as in `scan`, the room on the disk of `out` too;
+      the plan does not depend on them.
+    on_space: as in `scan`.
+    options: as in `configure`.
 
-    Devices are opened, asked for their limits and closed again: nothing moves and nothing shines, so that no `arm` is
-    needed. Raises DevicesError, a line per device, where real ones are not there.
+    Devices are opened, asked for their limits and closed again: nothing moves and no light leaves, so that `arm` is not
+    needed. Raises DevicesError, one line per device, where real ones are not there.
     """
     from rig.devices.calibration_use import calibration_use
     from rig.devices.open import open_rig, prepare, require_memory
@@ -159,15 +165,22 @@ def replay(
     on_space: "OnSpace | None" = None,
     steps: "Callable[[Pace], None] | None" = None,
 ) -> RunResult:
-    """Play a recording through the live stack (`rig replay`); the same depth, bit for bit, at any clock.
+    """Play a recording through the live stack; the depth is the same, bit for bit, at any clock (`rig replay`).
 
-    run: folder of a run taken with `record`. clock: 'realtime', 'max', 'x4' or 'x0.1', 'step'. loop: again and again,
-    until `maps` are made or for ever. config: a rig whose scanner, laser and sync source take part; None: they are
-    recorded too. against_recording: the recording's own drivers take part, against what their devices answered then.
-    calibration: a file made since; None: the recording's own. estimator, filter, min_confidence, threads: as the
-    recording says where None. block_frames: most frames of a block. steps: called before the start, with what takes
-    `step()` and `run_on()` from any thread where clock is 'step'. All else as `scan`. Raises UsageError where there is
-    no recording, DivergedError where drivers said other than recorded or more than 2 ms from their times.
+    run: folder of a run taken with `record`.
+    clock: 'realtime', 'max', a factor such as 'x4' or 'x0.1', or 'step'.
+    loop: play it again and again, until `maps` are made or without end.
+    config: rig whose scanner, laser and sync source take part; None plays those of the recording too.
+    against_recording: the drivers of the recording take part, and get the answers that their devices gave then.
+    calibration: file made since the recording; None is the recording's own.
+    estimator, filter, min_confidence, threads: None is as the recording says.
+    block_frames: most frames of a block.
+    steps: called before the start with an object whose `step()` and `run_on()` may be called from any thread; for the
+      clock 'step'.
+    Everything else is as in `scan`.
+
+    Raises UsageError where there is no recording, and DivergedError where drivers sent something else than in the
+    recording or sent it more than 2 ms from its time.
     """
     from rig.recording.replay import ReplayOptions, replay_config
     from rig.scan.replay import play
@@ -187,7 +200,7 @@ def replay(
 
 
 def _problems(settings: RigConfig, arm: bool, out: OutFolder, record: bool) -> list[str]:
-    """What there is against letting light out and recording."""
+    """List the problems that keep a run from letting light out or from recording."""
     from rig.devices.open import require_simulated_or_armed
 
     problems = require_simulated_or_armed(settings, arm)
@@ -197,7 +210,7 @@ def _problems(settings: RigConfig, arm: bool, out: OutFolder, record: bool) -> l
 
 
 def _both(progress: Progress | None, live: "Callable[[ScanProgress], None] | None") -> "Callable[[ScanProgress], None]":
-    """Tells both, where they are wanted."""
+    """A callback that passes progress on to both of these, as far as they are given."""
 
     def tell(done: "ScanProgress") -> None:
         if progress is not None:
@@ -216,7 +229,7 @@ def _new_run(settings: RigConfig, out: OutFolder, save: SavePolicy, record: bool
 def _checked_policies(
     maps: int, seed: int, save: str, on_overload: str, others: Sequence[str] = ()
 ) -> "tuple[SavePolicy, Overload]":
-    """The policies of `save` and `on_overload`; UsageError, with `others`, for what is wrong with any of these."""
+    """Parse `save` and `on_overload`. Raises UsageError with `others` and all that is wrong with the arguments."""
     from rig.scan.pipeline import Overload
 
     problems = list(others)
@@ -249,15 +262,19 @@ def reconstruct(
     out: OutFolder = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Depth from a recording, or from packed frames that any program made (`rig reconstruct`).
+    """Make depth maps of a recording, or of packed frames that any program wrote (`rig reconstruct`).
 
     source: folder of a run taken with `record`; or frames alone: an .npy of uint8 (maps x columns x exposures, height,
-    ceil(width/8)), or the folder that `rig import` made of such. plan, calibration: frames alone need both; a run has
-    its own, but may be given a calibration file that was made since.
-    Settings that are None are those of the recording; of a cube likelihood, none and 0.5. accept_calibration: as of
-    `scan`. out: a folder to write, None to write nothing. progress: called with frames or maps done and all. Raises
-    UsageError, a line per problem, for files that do not fit together. An interrupt ends the run after its last whole
-    map, with verdict 'aborted'.
+      ceil(width/8)), or the folder that `rig import` made of such.
+    plan, calibration: both are needed for frames alone. A run has its own; it may be given a calibration file that was
+      made since.
+    estimator, filter, min_confidence: None is as the recording says; for frames alone 'likelihood', 'none' and 0.5.
+    accept_calibration: as in `scan`.
+    out: folder to write; None writes nothing.
+    progress: called with frames or maps done and to do.
+
+    Raises UsageError, one line per problem, for files that do not fit together. An interrupt ends the run after its
+    last whole map, with verdict 'aborted'.
     """
     source = Path(source)
     if source.is_dir():

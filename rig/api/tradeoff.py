@@ -1,4 +1,4 @@
-"""The call that tries settings: `tradeoff`."""
+"""The call that tries settings on a simulated rig: `tradeoff`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rig.tradeoff.trials import Tradeoff
 
 EXPOSURES = (1, 3, 10)
-"""Tried where no others are asked for."""
+"""Exposures per column that are tried where the caller names none."""
 
 
 def tradeoff(
@@ -38,13 +38,19 @@ def tradeoff(
 ) -> "Tradeoff":
     """Scan a simulated rig with all combinations of settings and score them by the world's truth (`rig tradeoff`).
 
-    scenes: as `configure`; fogs: visibilities such as '20 m', or 'clear'; lines: at once; none: as the config says.
-    exposures: none: EXPOSURES; estimators: none: all but argmax; filters: none: both. repeat: scans of each setting,
-    seeds from `seed` on. limits: compare each error with the least that the scene's light allows, some seconds each.
-    time_budget, such as '5 ms', or error, such as '0.1 px': ask for the setting to use; of: whose time, 'sensor' or
-    'compute'. accept_calibration: as `scan`; asked is the rig with the lines that it has. out: a folder to write, None
-    to write nothing. progress: called with frames done and all. Raises UsageError, a line per problem. An interrupt
-    ends it after the last whole row, with verdict 'aborted'.
+    scenes: as in `configure`. fogs: visibilities such as '20 m', or 'clear'. lines: numbers of lines at once. Where one
+      of these is empty, the config decides.
+    exposures: exposures per column; empty is EXPOSURES.
+    estimators: empty is all but argmax. filters: empty is all.
+    repeat: scans of each setting, with seeds from `seed` on.
+    limits: compare each error with the least that the light of the scene allows; takes some seconds each.
+    time_budget, error: ask which setting to use within a time such as '5 ms', or for an error such as '0.1 px'.
+    of: whose time counts, 'sensor' or 'compute'.
+    accept_calibration: as in `scan`, judged for the rig with the number of lines that its config has.
+    out: folder to write; None writes nothing.
+    progress: called with frames done and frames to do.
+
+    Raises UsageError, one line per problem. An interrupt ends it after the last whole row, with verdict 'aborted'.
     """
     from rig.config.models import with_lines
     from rig.devices.calibration_use import accepted_by, calibration_use
@@ -113,7 +119,7 @@ def tradeoff(
 
 
 def _of_rig(config: RigConfig) -> list[str]:
-    """What there is against trying settings on a rig."""
+    """List the problems that keep settings from being tried on this rig."""
     if config.world is None:
         return [f"{config.name} is a real rig, whose truth nobody knows; name a simulated one, such as '{SIMULATED}'"]
     if config.world.real_time:

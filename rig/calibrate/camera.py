@@ -1,4 +1,4 @@
-"""`rig calibrate camera`: the camera alone, from views of a board or from picture files."""
+"""`rig calibrate camera`: calibrates the camera alone, from views of a board or from picture files."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -24,12 +24,15 @@ from rig.scan.run import OutFolder, versions
 
 CAMERA_FILE = "camera.yaml"
 FEWEST_VIEWS = 3
-"""Of a camera: of fewer the second takes up whatever is wrong with the first."""
+"""Fewest views of a camera: with fewer, one view takes up whatever is wrong with the other."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraAsked:
-    """poses: of a live rig. terms: of the lens model, as OpenCV counts them."""
+    """Request for a calibration of the camera.
+
+    poses: of a live rig. terms: number of terms of the lens model, as OpenCV counts them.
+    """
 
     poses: int = POSES
     terms: int = 5
@@ -78,7 +81,7 @@ def run_camera(
 
 
 def _fitted(taken: Taken, board: Board, terms: int) -> CameraFit:
-    """The camera; Degenerate where it would hang on so few views that they cannot contradict each other."""
+    """Fit the camera; Degenerate where it would hang on so few views that they cannot contradict each other."""
     fit = fit_camera(taken.views, board, taken.size, distortion_terms=terms)
     if len(fit.kept) < FEWEST_VIEWS:
         raise Degenerate(

@@ -1,20 +1,19 @@
-"""One view of the board, from a scan of it: the board's picture, its corners, and the passages of every sweep.
+"""Takes one view of the board from a scan of it: the board's picture, its corners, and the passages of every sweep.
 
-The scan is done without the calibration that there is, so that nothing of it enters the new one: whole rows are
-counted, and a passage is the command at that instant as if the mirror had no lag. A SPAD that cannot send or keep whole
-frames fast enough sends the windows of that calibration, though, and the plan allows for its lag; both are of no
-consequence for the passages, but that a line outside the windows is not seen.
+`capture_view` scans a live rig, `capture_recorded` reads a recorded run. The scan is done without the calibration that
+there is, so that nothing of it enters the new one: whole rows are counted, and a passage is the command at that instant
+as if the mirror had no lag. A SPAD that cannot send or keep whole frames fast enough sends the windows of that
+calibration, though, and the plan allows for its lag; neither changes the passages, except that a line outside the
+windows is not seen.
 
 Passages are kept of pixels spread evenly over the board, away from the edges of its print; over the whole picture where
 no board was found. The first half millisecond of a sweep is left out: the mirror, which follows late, is still
 accelerating then.
 
-At how many exposures per column a live rig is looked at, pose by pose, so that the mirror is seen at several speeds.
-
-A speed that the rig cannot do is left out. Where one does not show the line on the board, the pose is scanned again at
+`shown` gets the board where it is wanted: a person is asked to hold it there, or the simulated world moves it.
+`SpeedTurns` scans the poses by turns at several exposures per column, so that the mirror is seen at several speeds. A
+speed that the rig cannot do is left out. Where one does not show the line on the board, the pose is scanned again at
 the slowest, before the board is moved; a speed that never showed the line where the slowest did is left out too.
-
-How the board gets where it is wanted: a person is asked to hold it there, or the simulated world moves it.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,16 +49,19 @@ from rig.scan.run import OutFolder, Run
 from rig.scan.scan import ScanOptions, run_scan
 
 MOST_LAG_S = 5e-4
-"""Longest lag that is allowed for: small galvos follow their command within 100 to 300 us."""
+"""Seconds; longest lag that is allowed for: small galvos follow their command within 100 to 300 us."""
 MOST_SWEEPS = 4
-"""Of a recording that are looked at."""
+"""Most sweeps of a recording that are looked at."""
 PLAIN = {"estimator": "argmax", "filter": "none", "temporal_prior": False}
 """Estimate settings of a scan whose maps nobody wants."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """A view as it was taken. refused: why there are no corners in it. identity: of the rig that took it."""
+    """A view as it was taken.
+
+    refused: the reason why there are no corners in it; None where there are. identity: of the rig that took it.
+    """
 
     view: View
     refused: Degenerate | None
@@ -78,12 +80,15 @@ def capture_view(
     defects: NDArray[np.bool_] | None = None,
     out: OutFolder = None,
 ) -> Capture:
-    """Scan once, in both directions, and give what calibrates.
+    """Scan once, in both directions, and take the view.
 
-    board: None where none is to be looked for; passages are then of the whole picture. seed: of everything simulated.
-    exposures: per column, in place of the config's. arm: must be True where laser or gate are real. defects: (rows,
-    width), pixels not to be used. out: a folder to record the scan into; None: nothing is written. Raises UsageError
-    for what cannot be, DeviceError or DevicesError where devices fail, as `rig.api.scan`.
+    board: None where none is to be looked for; passages are then of the whole picture.
+    seed: of everything simulated.
+    exposures: per column; None is as the config says.
+    arm: must be True where laser or gate are real.
+    defects: (rows, width), pixels that are not used.
+    out: folder to record the scan into; None writes nothing.
+    Raises UsageError for a scan that cannot be, DeviceError or DevicesError where devices fail, as `rig.api.scan`.
     """
     settings = _settings(config, exposures, bidirectional=bidirectional)
     if problems := require_simulated_or_armed(settings, arm):
@@ -99,7 +104,7 @@ def capture_view(
 
 
 def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDArray[np.bool_] | None = None) -> Capture:
-    """The same from the first sweeps of a recorded run. UsageError where there is none."""
+    """Take the view from the first sweeps of a recorded run. UsageError where there is none."""
     config = replay_config(run, ReplayOptions("max"), None, {"estimator": "argmax", "filter": "none"})
     if not read_plan(run).windowed:
         config = config.model_copy(update={"calibration": None})
@@ -156,7 +161,7 @@ def _captured(
 
 
 def _sweeps(rig: OpenRig, maps: int, seed: int, out: OutFolder) -> list[SweepData]:
-    """The counted sweeps of a scan. An interrupt is raised again, once the rig is safe."""
+    """Count the sweeps of a scan. An interrupt is raised again, once the rig is safe."""
     found: list[SweepData] = []
     scan, estimate = rig.config.scan, rig.config.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
@@ -181,7 +186,7 @@ def _leg(plan: ScanPlan, direction: int) -> Leg:
 
 
 def _steady(passages: Passages, plan: ScanPlan) -> Passages:
-    """Those that came when the mirror had long been told to move as fast as it does."""
+    """The passages that came when the mirror had long been moving as fast as it was told to."""
     first = plan.command_range[0 if _leg(plan, passages.direction).columns_rise else 1]
     since_s = passages.direction * (passages.command - first) / passages.speed_per_s
     keep = since_s >= MOST_LAG_S
@@ -203,9 +208,10 @@ def _corners(
 
 
 Tell = Callable[[str], None]
-"""Takes a line for people."""
+"""A callback that takes a line for people."""
 Ask = Callable[[str], None]
-"""Says what to do with the board and returns once it is done; raises KeyboardInterrupt to end the session."""
+"""A callback that has the board moved as a text says and returns once it is done; KeyboardInterrupt ends the session.
+"""
 
 
 def world_moves_board(config: RigConfig) -> bool:
@@ -224,7 +230,7 @@ def with_board_pose(config: RigConfig, pose: BoardPose) -> RigConfig:
 
 
 def require_live(config: RigConfig | None, ask: Ask | None, arm: bool) -> None:
-    """UsageError where a live rig may not shine, or nobody is there to move its board; None: no live rig."""
+    """Raise UsageError where a live rig may not shine, or nobody is there to move its board; None is no live rig."""
     if config is None:
         return
     problems = require_simulated_or_armed(config, arm)
@@ -238,7 +244,7 @@ def require_live(config: RigConfig | None, ask: Ask | None, arm: bool) -> None:
 
 
 def shown(config: RigConfig, what: str, pose: Candidate, ask: Ask | None, tell: Tell | None) -> RigConfig:
-    """The config to capture the next pose with, once the board is there; `what` says where."""
+    """Get the board to the next pose, which `what` describes, and return the config to capture it with."""
     if world_moves_board(config):
         if tell is not None:
             tell(what)
@@ -249,21 +255,25 @@ def shown(config: RigConfig, what: str, pose: Candidate, ask: Ask | None, tell: 
 
 
 Scan = Callable[[int | None], Capture]
-"""Takes a view at so many exposures per column; None: as the config says. PlanError where the rig cannot do that."""
+"""A function that takes a view at so many exposures per column; None is the config's. PlanError where that cannot be.
+"""
 
 
 class SpeedTurns:
-    """Takes each view at the speed whose turn it is."""
+    """Takes the views at several speeds by turns."""
 
     def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: Tell | None = None) -> None:
-        """exposures: per column, by turns; none: as the config says. sees: whether a capture has what it is for."""
+        """Prepare the turns.
+
+        exposures: per column, by turns; empty is the config's. sees: whether a capture has what it was taken for.
+        """
         self.turns = list(exposures)
         self._sees = sees
         self._tell = tell
         self._shown: set[int] = set()
 
     def capture(self, pose: int, scan: Scan) -> Capture:
-        """The view of a pose, the number of which says whose turn it is."""
+        """Take the view of a pose at the speed whose turn it is, by the number of the pose."""
         exposures, capture = self._in_turn(pose, scan)
         if exposures is None or capture.refused is not None:
             return capture
@@ -284,7 +294,7 @@ class SpeedTurns:
                 self.turns.remove(exposures)
 
     def _again(self, capture: Capture, exposures: int, slowest: int, scan: Scan) -> Capture:
-        """The same pose at the slowest speed; the first capture where the rig cannot do it."""
+        """Take the pose again at the slowest speed; returns the first capture where the rig cannot do that."""
         self._say(f"at {_of(exposures)} the line does not stand out on the board: again at {slowest}")
         try:
             again = scan(slowest)

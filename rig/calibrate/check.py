@@ -1,4 +1,4 @@
-"""`rig calibrate check`: a calibration judged by scans of a flat board that it was not made with."""
+"""`rig calibrate check`: judges a calibration by scans of a flat board that it was not made with."""
 
 import math
 from collections.abc import Sequence
@@ -33,12 +33,17 @@ from rig.scan.run import OutFolder, versions
 
 NO_COVARIANCE = "the calibration has no covariance: nothing tells what depth error to expect"
 SEED_APART = 1 << 20
-"""From that of a calibration: a simulated rig shows a check other poses, and other photons."""
+"""Offset of a check's seeds from a calibration's: a simulated rig then shows other poses and other photons."""
 
 
 @dataclass(frozen=True, slots=True)
 class CheckAsked:
-    """What is to be checked. poses: of a live rig. angle_rad: between the boards of the first two views, as stated."""
+    """Request for a check.
+
+    poses: of a live rig. angle_rad: stated angle between the boards of the first two views; None where nobody states
+      one.
+    accuracy_m: standard deviation of depth at `at_m` that is good enough; None is what a tenth of a pixel costs there.
+    """
 
     poses: int = 1
     accuracy_m: float | None = None
@@ -58,8 +63,9 @@ def run_check(
     ask: Ask | None = None,
     tell: Tell | None = None,
 ) -> CalibrationResult:
-    """Check a calibration, by default that of the live rig; how it ended is noted beside its file, if it is of a rig.
+    """Check a calibration and note the result beside its file, if the calibration says of which rig it is.
 
+    calibration: its file; None is that of the live rig.
     Raises Degenerate where the board was not scanned, UsageError where there is no calibration, or one made of these
     very views.
     """
@@ -106,7 +112,7 @@ def run_check(
 
 
 def _require_others(views: Sequence[View], model: RigModel) -> None:
-    """UsageError for views that the model was made of: it was fitted to their errors too."""
+    """Raise UsageError for views that the model was made of: it was fitted to their errors too."""
     made_of = model.provenance.get(CORNERS) or ()
     same = [view.name for view in views if corners_digest(view) in made_of]
     if same:
@@ -117,7 +123,7 @@ def _require_others(views: Sequence[View], model: RigModel) -> None:
 
 
 def _with_board(taken: Taken, least: int) -> list[View]:
-    """The views that show it. Degenerate, with what is wrong with each, where they are fewer."""
+    """The views that show the board. Degenerate, with the trouble of each view, where they are too few."""
     views = [view for view in taken.views if view.corners is not None]
     if len(views) < least:
         reason = next((why.reason for why in taken.refused.values()), "no-board")
@@ -168,7 +174,7 @@ def _summary(
 
 
 def _consequence(verdict: Verdict, model: RigModel, file: Path) -> list[tuple[str, str]]:
-    """What a check that failed means from now on, and how that is taken back; nothing without an identity."""
+    """Say what a failed check changes from now on and how to undo that; nothing for a calibration without identity."""
     if verdict.passed or model.identity is None:
         return []
     said = (

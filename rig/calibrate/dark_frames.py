@@ -1,6 +1,6 @@
-"""Frames for the map of the pixels: in the dark from the SPAD alone, or the dark and lit ones of a recorded run.
+"""Takes frames for the map of the pixels: dark ones from the SPAD alone, or the dark and lit ones of a recorded run.
 
-In the dark nothing moves and nothing shines: the gate is low, the laser is not armed, the scanner stands. The frames
+In the dark nothing moves and no light leaves: the gate is low, the laser is not armed, the scanner stands. The frames
 come in short starts spread over a while, since rates that jump do so within milliseconds or minutes.
 """
 
@@ -36,13 +36,13 @@ from rig.scan.source import Source, blocks
 from rig.threads import RowWorkers
 
 STARTS: Final = 32
-"""Of the SPAD, and blocks whose counts are compared."""
+"""Number of starts of the SPAD, and so of blocks whose counts are compared."""
 BLOCK_FRAMES: Final = 128
 SPARE_SLOTS: Final = 4
-"""Where a device sends shorter blocks than it was asked for, it waits or drops some."""
+"""Slots of the ring beyond those needed, for a device that sends shorter blocks than asked for, and would drop some."""
 SILENCE_S: Final = 5.0
 SPREAD_S: Final = 10.0
-"""From the first start to the last one."""
+"""Seconds from the first start to the last one."""
 
 Sums = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Ones and frames of every pixel, (rows, width) each."""
@@ -59,13 +59,13 @@ class CoversLens(Protocol):
 
 @dataclass(slots=True)
 class SweepSums:
-    """Adds up the dark and the lit frames of counted sweeps; `add` is a scan's `sweeps` hook."""
+    """Adds up the dark and the lit frames of counted sweeps; `add` fits the `sweeps` option of a scan."""
 
     tally: DarkTally | None = None
     lit: Sums | None = None
 
     def add(self, sweep: SweepData) -> None:
-        """Take a sweep. A block of dark frames each."""
+        """Add a sweep; its dark frames are one block."""
         volume = sweep.volume
         if not isinstance(volume, CountVolume) or volume.dark_counts is None:
             return
@@ -85,9 +85,9 @@ def take_dark(
     progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
 ) -> tuple[DarkTally, float]:
-    """At least so many frames of an open rig in the dark, and their exposure in seconds. DeviceError.
+    """Take at least so many frames with an open rig in the dark; returns them with their exposure in seconds.
 
-    covered: called before the first start, to have the lens covered where a person has to do it.
+    covered: called before the first start, where a person has to cover the lens. Raises DeviceError.
     """
     if isinstance(rig.world, CoversLens):
         rig.world.cover_lens()
@@ -119,7 +119,7 @@ def take_dark(
 
 
 def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None = None) -> SweepSums:
-    """The frames of a scan with light, or of all sweeps of a recording, which takes the SPAD's place.
+    """Take the frames of a scan with light, or of all sweeps of a recording that takes the SPAD's place.
 
     An interrupt is raised again, once the rig is safe.
     """
@@ -138,12 +138,12 @@ def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None
 
 
 def recorded_exposure_s(run: Path) -> float:
-    """Exposure of a recording's frames."""
+    """Exposure of a recording's frames, seconds."""
     return float(read_plan(run).exposure_s)
 
 
 def _request(scan: ScanConfig, info: SpadInfo, frames: int) -> SpadRequest:
-    """Full frames of the scan's exposure, as fast as the link carries them."""
+    """Request for full frames of the scan's exposure, as fast as the link carries them."""
     rate = Fraction(scan.frame_rate)
     if info.stream is not None:
         rate = min(rate, Fraction(math.floor(info.stream.bytes_per_s / frame_bytes(info.width, info.height))))
@@ -152,12 +152,12 @@ def _request(scan: ScanConfig, info: SpadInfo, frames: int) -> SpadRequest:
 
 
 def _layout(rows: int, width: int) -> SweepLayout:
-    """Of dark frames only: no column will ever be counted."""
+    """Layout for dark frames only: no column will ever be counted."""
     return SweepLayout(1, rows, width, np.zeros(1, np.int32), WORD_PX, 1)
 
 
 def _blocks(rig: OpenRig, frames: int, stride: int, block_frames: int) -> Iterator[FrameBlock]:
-    """The blocks of a start of so many frames, all of which the ring has room for."""
+    """Blocks of a start of so many frames, for all of which the ring has room."""
     ring = BlockRing(-(-frames // block_frames) + SPARE_SLOTS, stride)
     source = Source(rig.spad, ring, SILENCE_S, lambda: None)
     with ring.reader("pixels") as reader:

@@ -1,9 +1,7 @@
-"""`rig calibrate pixels`: dark frames in, a map of the pixels out, compared with the last one (`calibration.pixels`).
+"""`rig calibrate pixels`: maps the pixels from dark frames and compares the map with the last one.
 
 The folder: pixels.npz (the map with its version), calibration.yaml (that of the config with the new defects and dark
-rates, where it has one), dark_rate.png, report.html, summary.json.
-
-What a map of the pixels came to: its figures, what changed since the last one, and whether they may be believed.
+rates, where it has one), dark_rate.png, report.html, summary.json. The statistics are in `calibration.pixels`.
 """
 
 import logging
@@ -54,13 +52,17 @@ from rig.run_folder.pictures import png_bytes
 MOST_LEAK: Final = 0.1
 """Correlation of neighbouring pixels' rates beyond which the lens was not covered; crosstalk makes 0.01."""
 WORST_PRECISION: Final = 0.2
-"""Relative sd of a rate at the limit beyond which hot pixels cannot be told."""
+"""Relative standard deviation of a rate at the limit, beyond which hot pixels cannot be told."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelResult:
-    """What became of it. drift: against the map `against`, None without one. folder, calibration: None where nothing
-    was written, or nothing to write into."""
+    """A map of the pixels and its verdict.
+
+    drift: change since the older map `against`; None without one.
+    leak: correlation of neighbouring pixels' rates, a sign of light in the dark frames.
+    folder, calibration: where everything, and the changed calibration, was written; None where it was not.
+    """
 
     found: PixelVersion
     drift: PixelDrift | None
@@ -72,7 +74,7 @@ class PixelResult:
 
     @property
     def exit_code(self) -> int:
-        """Of the command line: 1 where the map is not to be trusted, or the last one no more."""
+        """Exit code of the command line: 1 where the map is not to be trusted, or the last one no longer holds."""
         return 0 if self.verdict.passed else EXIT_NOT_TRUSTWORTHY
 
     def rows(self) -> list[tuple[str, str]]:
@@ -97,7 +99,7 @@ class PixelResult:
         return rows
 
     def as_json(self) -> dict[str, Any]:
-        """For programs: what summary.json holds."""
+        """Return what summary.json holds, as plain values."""
         pixels, drift = self.found.pixels, self.drift
         content: dict[str, Any] = {
             "sensor": self.found.sensor,
@@ -124,7 +126,7 @@ class PixelResult:
 
 
 def pixel_verdict(pixels: PixelMap, drift: PixelDrift | None, leak: float, signal: float) -> Verdict:
-    """Whether map and drift may be believed: the root cause first."""
+    """Judge whether map and drift may be believed; the root cause comes first."""
     reasons = []
     if leak > MOST_LEAK:
         said = f"the rates of neighbouring pixels correlate by {leak:.2f}, in the dark by {MOST_LEAK:g} at most"
@@ -182,7 +184,7 @@ _log = logging.getLogger(__name__)
 
 PIXELS_FILE: Final = "pixels.npz"
 LIT_FRAMES: Final = 100
-"""Exposures with the line on a pixel: one that sees a photon in three is judged."""
+"""Exposures taken with the line on each pixel: enough to judge one that sees a photon in a third of them."""
 
 
 def run_pixels(
@@ -202,12 +204,16 @@ def run_pixels(
 ) -> PixelResult:
     """Map the pixels of a sensor (`rig calibrate pixels`).
 
-    source: a rig, whose SPAD then takes `frames` frames in the dark (by default as many as the limit of hot pixels
-    needs) within `spread_s` seconds or more; or the folder of a recorded run, whose dark and lit frames are taken. lit:
-    a recorded run whose lit frames tell dead pixels; light: have the rig take such now, a few maps, which needs
-    `arm` where light is real. against: an older pixels.npz or its folder; by default the one beside the config's
-    calibration. signal: photons per pixel and exposure of the weakest stripes, which sets the limit. covered: called
-    where a person has to cover the lens. Raises UsageError, DeviceError.
+    source: a rig, whose SPAD then takes frames in the dark; or the folder of a recorded run, whose dark and lit frames
+      are taken.
+    frames: number of dark frames; None is as many as the limit of hot pixels needs.
+    spread_s: seconds over which they are spread, at least.
+    lit: a recorded run whose lit frames tell dead pixels.
+    light: have the rig take such frames now, a few maps, which needs `arm` where light is real.
+    against: an older pixels.npz or its folder; None is the one beside the config's calibration.
+    signal: photons per pixel and exposure of the weakest stripes, which sets the limit.
+    covered: called where a person has to cover the lens.
+    Raises UsageError, DeviceError.
     """
     recorded = _recorded(source)
     config = _quick(replay_config(recorded, ReplayOptions(), None, {}) if recorded else configure(source))
@@ -254,13 +260,13 @@ def _recorded(source: Config) -> Path | None:
 
 
 def _quick(config: RigConfig) -> RigConfig:
-    """With the estimator that leaves the counts whole."""
+    """The config with the estimator that leaves the counts whole."""
     estimate = config.estimate.model_copy(update={"estimator": "argmax", "filter": "none", "temporal_prior": False})
     return config.model_copy(update={"estimate": estimate})
 
 
 def _recorded_sums(run: Path, progress: Progress | None) -> tuple[DarkTally, Sums | None, str]:
-    """What a recording's sweeps add up to, and the sensor that took them."""
+    """Dark and lit sums of a recording's sweeps, and the sensor that took them."""
     with open_rig(_quick(replay_config(run, ReplayOptions(), None, {}))) as rig:
         sums, sensor = take_sweeps(rig, progress=progress), _sensor(rig)
     assert sums.tally is not None, "else it would have been refused"
@@ -272,7 +278,7 @@ def _sensor(rig: OpenRig) -> str:
 
 
 def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) -> PixelVersion | None:
-    """The map to compare with. UsageError where one was named that is none."""
+    """The older map to compare with; None where there is none. UsageError where a file was named that is no map."""
     if against is not None:
         path = Path(against)
         path = path / PIXELS_FILE if path.is_dir() else path
@@ -315,7 +321,7 @@ def _note(config: RigConfig, drift: PixelDrift) -> None:
 
 
 def _written(result: PixelResult, folder: RunFolder, calibration: Path | None) -> PixelResult:
-    """The folder's files; UsageError where they cannot be written."""
+    """Write the folder's files. UsageError where they cannot be written."""
     pixels = result.found.pixels
     try:
         save_pixels(result.found, folder.place(PIXELS_FILE))
@@ -335,7 +341,7 @@ def _written(result: PixelResult, folder: RunFolder, calibration: Path | None) -
 
 
 def _save_calibration(old: Path, pixels: PixelMap, file: Path) -> None:
-    """The calibration of the config with what is known of the pixels now, and with what speaks against it."""
+    """Write the config's calibration with the new map of the pixels, and carry over notes that speak against it."""
     before: RigModel = load_rig_model(old)
     rate = np.nan_to_num(pixels.rate_per_s, nan=pixels.ordinary_per_s).astype(np.float32)
     after = replace(before, defects=pixels.defects, dark_rate_per_s=rate)

@@ -1,6 +1,7 @@
-"""`rig calibrate planes`: the whole rig, camera and mirror and lag together, from views of a board.
+"""`rig calibrate planes`: calibrates the whole rig, camera, mirror and lag together, from views of a board.
 
-The guided mode: after each view the rig is fitted, and the pose is shown that makes the expected error fall most.
+In the guided mode (`Guide`) the rig is fitted after each view, and the pose is asked for that lowers the expected error
+most.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,75 +33,23 @@ from rig.config.models import RigConfig
 from rig.progress import tell_stage
 from rig.scan.run import OutFolder, versions
 
-START_POSES = 3
-"""Before anything is fitted."""
-
-
-class Guide:
-    """Chooses poses by what they are worth. Stops where the accuracy that was asked for is expected."""
-
-    def __init__(
-        self, start: FixedPoses, board: Board, depth_range_m: tuple[float, float], taken: Taken,
-        fit: Callable[[], RigFit], judge: Callable[[RigFit], Judged], tell: Tell | None,
-    ) -> None:  # fmt: skip
-        """start: poses for as long as no fit can be judged. taken: all views so far, those kept earlier too. fit,
-        judge: of these, as the calibration itself will be fitted and judged."""
-        self._start = start
-        self._board = board
-        self._depth_range_m = depth_range_m
-        self._taken = taken
-        self._fitted = fit
-        self._judged = judge
-        self._tell = tell
-        self._asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
-
-    def next(self, views: Sequence[View]) -> Advice | None:
-        """The next pose; None where the error is small enough."""
-        known = self._taken.views
-        told = self._told() if len(known) >= START_POSES else None
-        if told is None:
-            return self._start.next(views)
-        fit, judged = told
-        at_m = judged.asked.at_m
-        now_m = judged.evidence.expected_m
-        if self._tell is not None:
-            self._tell(f"expected error {judged.uncertainty.line()}; asked {mm(judged.asked.accuracy_m)}")
-        if judged.verdict.passed:
-            return None
-        choices = [
-            choice
-            for choice in candidates(fit.model.camera, self._board, self._depth_range_m)
-            if (choice.fill, choice.place, choice.tilt) not in self._asked
-        ]
-        if not choices:
-            return None
-        advice = next_pose(len(known), choices, at_m, now_m, Forecast(fit, at_m))
-        chosen = advice.candidate
-        self._asked.add((chosen.fill, chosen.place, chosen.tilt))  # a board that was not found there will not be again
-        return advice
-
-    def _told(self) -> tuple[RigFit, Judged] | None:
-        """What the views so far tell; None where that is no model yet, or one whose line misses the distance asked."""
-        try:
-            fit = self._fitted()
-            return fit, self._judged(fit)
-        except CalibrationError:
-            return None
-
-
 POSES = 12
 SPEEDS = ((1.0, 1), (0.3, 2), (2.0, 4))
-"""Exposures per column by turns, in units of the config's, and at least so many: the lags of both directions need
-several speeds, and hold between the lowest and the highest of them. One exposure shows the line in bright light only,
-so that it is tried where it is the config's own."""
+"""Exposures per column by turns: factors of the config's, and the least number for each.
+
+The lags of both directions need several speeds, and hold between the lowest and the highest of them. One exposure shows
+the line in bright light only, so that it is tried only where it is the config's own.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanesAsked:
-    """What a calibration of planes is to be. poses: of a live rig, the most where guided.
+    """Request for a calibration of the planes.
 
-    accuracy_m: sd of depth at `at_m` that is good enough, None: what a tenth of a pixel costs there. stated_baseline_m:
-    as somebody measured it, None: nobody has. exposures: per column, by turns; none: SPEEDS times the config's.
+    poses: of a live rig; the most of them where guided.
+    accuracy_m: standard deviation of depth at `at_m` that is good enough; None is what a tenth of a pixel costs there.
+    stated_baseline_m: as somebody measured it; None where nobody has.
+    exposures: per column, by turns; empty is SPEEDS times the config's.
     """
 
     poses: int = POSES
@@ -124,9 +73,11 @@ def run_planes(
     ask: Ask | None = None,
     tell: Tell | None = None,
 ) -> CalibrationResult:
-    """Calibrate. base: a model to start from, whose defects are kept. camera: what other views told of it. ask: gets a
-    person to move the board; tell: is told of each view.
+    """Calibrate the planes from the sources.
 
+    base: a model to start from, whose defective pixels are kept.
+    camera: what other views say of the camera.
+    ask: gets a person to move the board. tell: gets a line about each view.
     Raises Degenerate where the views make no calibration; its notes say why, root cause first.
     """
     live, known = sources.live, None if camera is None else camera.known
@@ -166,12 +117,12 @@ def run_planes(
 
 
 def speeds_of(live: RigConfig) -> tuple[int, ...]:
-    """Exposures per column at which a rig is looked at by turns."""
+    """Exposures per column for a rig's views, by turns."""
     return tuple(dict.fromkeys(max(least, round(times * live.scan.exposures)) for times, least in SPEEDS))
 
 
 def _fit(taken: Taken, board: Board, base: RigModel | None, camera: KnownCamera | None) -> RigFit:
-    """Of the views so far, with all that is known from elsewhere."""
+    """Fit the rig to the views so far, with all that is known from elsewhere."""
     tell_stage("fitting", len(taken.views), unit="views")
     return fit_rig(
         taken.views,
@@ -201,7 +152,7 @@ def _fitted(taken: Taken, board: Board, base: RigModel | None, camera: KnownCame
 def _signed(
     fit: RigFit, judged: Judged, identity: Identity | None, digests: list[str], camera: CameraUse | None
 ) -> RigModel:
-    """The model with its verdict, of which rig it is, and of which corners: those cannot check it."""
+    """The model with its verdict, its rig, and the digests of its corners, which must not be used to check it."""
     verdict = judged.verdict
     created = datetime.now(UTC).isoformat(timespec="seconds")
     if identity is not None:
@@ -225,7 +176,7 @@ def _signed(
 
 
 def _accepted(camera: CameraUse | None) -> dict[str, list[str]]:
-    """As the summary of a scan has it."""
+    """Accepted reasons against the camera, in the form of a scan's summary."""
     return {"accepted_calibration": [str(each) for each in camera.accepted]} if camera and camera.accepted else {}
 
 
@@ -289,3 +240,62 @@ def _figures(fit: RigFit, judged: Judged, truth: DepthErrors | None, camera: Cam
         rows.append(("truth", f"median {mm(truth.median_m)}, worst {mm(truth.worst_m)} at "
                               f"{truth.depth_m:g} m, {truth.ratio:.2f} of the expected sd"))  # fmt: skip
     return rows
+
+
+START_POSES = 3
+"""Number of poses that are shown before anything is fitted."""
+
+
+class Guide:
+    """Chooses poses by how much they lower the expected error, until the accuracy asked for is expected."""
+
+    def __init__(
+        self, start: FixedPoses, board: Board, depth_range_m: tuple[float, float], taken: Taken,
+        fit: Callable[[], RigFit], judge: Callable[[RigFit], Judged], tell: Tell | None,
+    ) -> None:  # fmt: skip
+        """Prepare the guide.
+
+        start: poses for as long as no fit can be judged. taken: all views so far, those kept earlier too. fit, judge:
+        fit and judge these views as the calibration itself will be.
+        """
+        self._start = start
+        self._board = board
+        self._depth_range_m = depth_range_m
+        self._taken = taken
+        self._fitted = fit
+        self._judged = judge
+        self._tell = tell
+        self._asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
+
+    def next(self, views: Sequence[View]) -> Advice | None:
+        """The next pose; None where the expected error is small enough."""
+        known = self._taken.views
+        told = self._told() if len(known) >= START_POSES else None
+        if told is None:
+            return self._start.next(views)
+        fit, judged = told
+        at_m = judged.asked.at_m
+        now_m = judged.evidence.expected_m
+        if self._tell is not None:
+            self._tell(f"expected error {judged.uncertainty.line()}; asked {mm(judged.asked.accuracy_m)}")
+        if judged.verdict.passed:
+            return None
+        choices = [
+            choice
+            for choice in candidates(fit.model.camera, self._board, self._depth_range_m)
+            if (choice.fill, choice.place, choice.tilt) not in self._asked
+        ]
+        if not choices:
+            return None
+        advice = next_pose(len(known), choices, at_m, now_m, Forecast(fit, at_m))
+        chosen = advice.candidate
+        self._asked.add((chosen.fill, chosen.place, chosen.tilt))  # a board that was not found there will not be again
+        return advice
+
+    def _told(self) -> tuple[RigFit, Judged] | None:
+        """Fit and judge the views so far; None where they make no model yet, or its line misses the distance asked."""
+        try:
+            fit = self._fitted()
+            return fit, self._judged(fit)
+        except CalibrationError:
+            return None

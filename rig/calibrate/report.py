@@ -1,6 +1,6 @@
-"""Reports of `rig calibrate`, one HTML file each: verdict and reasons first, then the pictures.
+"""Writes the reports of `rig calibrate`, one HTML file each: verdict and reasons first, then the pictures.
 
-The map of the pixels as pictures and as one HTML page.
+`planes_report`, `camera_report`, `check_report`, `sync_report` and `pixel_page` make them.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ Figures = Sequence[tuple[str, str]]
 def planes_report(
     fit: RigFit, views: Sequence[View], judged: Judged, line: str, figures: Figures, about: Figures = ()
 ) -> str:
-    """Of a whole rig. about: `subject`, as for the others."""
+    """Report on a calibration of camera and planes. about: rows of `subject`, as in the other reports."""
     by_name = {view.name: view for view in views}
     used = [by_name[name] for name in fit.views]
     sections = [
@@ -59,7 +59,7 @@ def planes_report(
 
 
 def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequence[Array]) -> list[ReportSection]:
-    """Where corners were seen and how far the model's are from them."""
+    """Sections with the places where corners were seen and their distances from the model's."""
     size = (camera.width, camera.height)
     seen = [corners_px(view) for view in views]
     coverage = coverage_picture([view.name for view in views], seen, size)
@@ -71,13 +71,13 @@ def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequenc
 
 
 def planes_section(judged: Judged) -> ReportSection:
-    """What is left of the planes."""
+    """Section with the residuals of the planes."""
     chart = plane_residuals(judged.waves, judged.residuals, judged.sensitivity.per_command_m, judged.asked.at_m)
     return ReportSection("Residuals of the planes", chart)
 
 
 def uncertainty_section(uncertainty: DepthUncertainty) -> ReportSection:
-    """The expected depth error as a map."""
+    """Section with a map of the expected depth error."""
     if not np.isfinite(uncertainty.sd_m).any():
         return ReportSection("Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m."))
     caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
@@ -94,7 +94,7 @@ def camera_report(
     figures: Figures,
     about: Figures = (),
 ) -> str:
-    """Of a camera alone; views: those of the fit."""
+    """Report on a calibration of the camera alone. views: those that the fit used."""
     seen = [corners_px(view) for view in views]
     rows = [
         (
@@ -119,7 +119,7 @@ def check_report(
     figures: Figures,
     about: Figures = (),
 ) -> str:
-    """Of a check."""
+    """Report on a check of a calibration."""
     sections = []
     for board in boards:
         caption = "How far the board's squares lie off their plane, negative and red: in front; black: not scanned."
@@ -138,7 +138,7 @@ def check_report(
 
 
 def sync_report(fit: SyncFit, verdict: Verdict, line: str, figures: Figures, about: Figures = ()) -> str:
-    """Of lags and delays."""
+    """Report on lags and delays."""
     rows = [
         (
             "up" if sweep.direction > 0 else "down",
@@ -155,7 +155,7 @@ def sync_report(fit: SyncFit, verdict: Verdict, line: str, figures: Figures, abo
 
 
 def corners_px(view: View) -> Array:
-    """The corners that were seen and used, (n, 2)."""
+    """Corners of a view that were seen and used, (n, 2)."""
     if view.corners is None:
         return np.zeros((0, 2))
     px = np.asarray(view.corners.px, np.float64)
@@ -164,7 +164,7 @@ def corners_px(view: View) -> Array:
 
 
 def pose_words(pose: BoardPose, board: Board) -> tuple[str, str]:
-    """Distance of a board's middle, and how far it is tilted from facing the camera."""
+    """Distance of a board's middle in metres and its tilt from facing the camera in degrees, as text."""
     middle = pose.to_camera([board.size_m[0] / 2, board.size_m[1] / 2, 0.0])
     tilt = np.degrees(np.arccos(np.clip(pose.matrix[2, 2], -1, 1)))
     return f"{middle[2]:.2f}", f"{tilt:.0f}"
@@ -208,7 +208,10 @@ _DEAD_BGR = (0, 0, 0)
 
 
 def dark_rate_picture(pixels: PixelMap) -> NDArray[np.uint8]:
-    """Dark rates (rows, width, 3) BGR on a logarithmic scale from a third of the usual to the fastest; dead black."""
+    """Dark rates as a picture (rows, width, 3) BGR, dead pixels black.
+
+    The scale is logarithmic, from a third of the usual rate to the fastest.
+    """
     rate = np.nan_to_num(pixels.rate_per_s, nan=0.0).astype(np.float64)
     low = max(pixels.ordinary_per_s / 3, 1e-3)
     high = max(float(rate.max(initial=0.0)), 10 * low)
@@ -222,7 +225,7 @@ def dark_rate_picture(pixels: PixelMap) -> NDArray[np.uint8]:
 def pixel_sections(
     pixels: PixelMap, drift: PixelDrift | None = None, against: PixelVersion | None = None
 ) -> list[ReportSection]:
-    """Parts of a report: the map, the distribution of the rates beside the older one, and what changed."""
+    """Sections with the map, the distribution of the rates beside the older one, and what changed."""
     middle = pixels.ordinary_per_s
     fastest = float(np.nanmax(pixels.rate_per_s))
     caption = f"Dark rate of each pixel, {digits(middle / 3)} to {digits(fastest)} counts/s on a logarithmic scale."
@@ -242,7 +245,7 @@ def pixel_sections(
 
 
 def rate_chart(pixels: PixelMap, older: PixelMap | None = None) -> str:
-    """SVG: how many pixels have which dark rate, and where hot begins."""
+    """Chart (SVG) of how many pixels have which dark rate, and from where on they are hot."""
     maps = [(pixels, "this map", _NEW), *([(older, "the last one", _OLD)] if older is not None else [])]
     rates = [one.rate_per_s[np.isfinite(one.rate_per_s)].astype(np.float64) for one, _, _ in maps]
     # Pixels that never fired stand at half a count.
@@ -270,6 +273,6 @@ def pixel_page(
     drift: PixelDrift | None,
     against: PixelVersion | None,
 ) -> str:
-    """The whole report."""
+    """Report on a map of the pixels."""
     line = f"{int(pixels.defects.sum())} of {pixels.defects.size} pixels are not to be used."
     return page("Pixels", verdict, line, rows, pixel_sections(pixels, drift, against))

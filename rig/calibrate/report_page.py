@@ -1,12 +1,7 @@
-"""A report as one HTML file: text first, pictures inline, nothing loaded from elsewhere.
+"""Parts of a report: the page as one HTML file, its tables and numbers, pictures and charts of a calibration.
 
-Figures of a report with their units, in as many digits as are known.
-
-What a report is of, so that two of them on a desk can be told apart.
-
-Pictures of a calibration: where corners were seen, by how much they miss, how large the depth error is where.
-
-Charts of a calibration: what is left of the planes over the mirror's command, sweep by sweep.
+`page` makes the file: text first, pictures inline, nothing loaded from elsewhere. Numbers have their units and as many
+digits as are known; `subject` says what a report is of, so that two of them on a desk can be told apart.
 """
 
 import base64
@@ -46,7 +41,7 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class ReportSection:
-    """A part of a report. body: HTML."""
+    """A part of a report. body: its HTML."""
 
     title: str
     body: str
@@ -60,7 +55,7 @@ def page(
     sections: Sequence[ReportSection],
     about: Sequence[tuple[str, str]] = (),
 ) -> str:
-    """The whole file: verdict with its reasons, the one line that matters, the figures, what it is of, the sections."""
+    """Make the HTML file: verdict with its reasons, the one line that matters, the figures, `about`, the sections."""
     parts = [
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>',
         f"<style>{_STYLE}</style></head><body><h1>{escape(title)}</h1>",
@@ -73,12 +68,12 @@ def page(
 
 
 def paragraph(text: str, *, small: bool = False) -> str:
-    """A paragraph of plain text."""
+    """Make a paragraph of plain text."""
     return f"<p{' class=' + chr(34) + 'small' + chr(34) if small else ''}>{escape(text)}</p>"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; columns whose cells are all numbers, or dashes in their place, stand to the right."""
+    """Make a table; columns whose cells are all numbers, or dashes in their place, are aligned right."""
     numbers = [bool(rows) and all(_NUMBER.fullmatch(row[i]) for row in rows) for i in range(len(head))]
 
     def cells(row: Sequence[str], tag: str) -> str:
@@ -90,7 +85,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def picture(pixels: Picture, caption: str) -> str:
-    """A picture, BGR or grey, with a line below it."""
+    """Show a picture, BGR or grey, with a caption below it."""
     data = base64.b64encode(png_bytes(pixels)).decode()
     return f'<img alt="{escape(caption)}" src="data:image/png;base64,{data}">{paragraph(caption, small=True)}'
 
@@ -107,7 +102,10 @@ _UNITS = {
     "offset_0": ("mm", 1e3), "offset": ("mm/rad^{order}", 1e3),
     "lag": ("us", 1e6), "row_delay": ("ns/row", 1e9),
 }  # fmt: skip
-"""Of the model's terms (`calibration.model.parameters`), and how many of it SI's is. A command has none."""
+"""Unit of each term of the model (`calibration.model.parameters`), and how many of them make one of SI's.
+
+Terms in units of the mirror command have none.
+"""
 
 
 def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
@@ -123,14 +121,14 @@ def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
 
 
 def in_mm_with_sign(length_m: float) -> str:
-    """A length that goes one way or the other, in millimetres: '+3.1'. For a table whose head says so."""
+    """A length with its sign in millimetres, such as '+3.1', for a table whose head names the unit."""
     return f"+{in_mm(length_m)}" if length_m > 0 else in_mm(length_m)
 
 
 def subject(
     identity: Identity | None, board: Board | None, versions: Mapping[str, str], now: datetime
 ) -> list[tuple[str, str]]:
-    """Rig and serial numbers, board, date and versions, by name; `identity`, `board` None where there is none."""
+    """Rows that name rig and serial numbers, board, date and versions; `identity` and `board` may be None."""
     rows = []
     if identity is not None:
         rows.append(("rig", identity.name or "unnamed"))
@@ -143,7 +141,7 @@ def subject(
 
 
 def board_words(board: Board) -> str:
-    """A board in one line."""
+    """Describe a board in one line."""
     squares = f"{board.squares[0]} x {board.squares[1]} squares of {board.square_m * 1e3:.6g} mm"
     if board.marker_m is None:
         return f"chessboard, {squares}"
@@ -163,19 +161,19 @@ Array = NDArray[np.float64]
 _WIDTH_PX = 640
 _GROUND, _RIM, _INK = (255, 255, 255), (200, 194, 189), (77, 64, 51)
 _ERROR = (0, 94, 213)
-"""Colours are BGR."""
+"""Colour of errors; colours here are BGR."""
 _COLOURS = ((178, 114, 0), (0, 94, 213), (115, 158, 0), (167, 121, 204), (0, 159, 230), (233, 180, 86), (66, 228, 240))
-"""Of Okabe and Ito, told apart by the colour-blind too; by turns for the views."""
+"""Colours of the views, by turns: those of Okabe and Ito, which the colour-blind can tell apart."""
 ARROW_TIMES = (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1)
 
 
 def view_colour(view: int) -> tuple[int, int, int]:
-    """BGR, of the view with this number, in all pictures and charts."""
+    """Colour (BGR) of the view with this number, in all pictures and charts."""
     return _COLOURS[view % len(_COLOURS)]
 
 
 def coverage_picture(names: Sequence[str], corners_px: Sequence[Array], size: tuple[int, int]) -> Picture:
-    """The corners of all views, a colour and its name for each view, in the outline of the picture (width, height)."""
+    """Draw the corners of all views in the outline of the picture (width, height), in colours and with names."""
     picture, scale = _sheet(size)
     for i, (name, corners) in enumerate(zip(names, corners_px, strict=True)):
         for x, y in corners:
@@ -189,7 +187,7 @@ def coverage_picture(names: Sequence[str], corners_px: Sequence[Array], size: tu
 def residual_picture(
     corners_px: Sequence[Array], residuals_px: Sequence[Array], size: tuple[int, int]
 ) -> tuple[Picture, int]:
-    """Arrows from corners along their residuals, and by how much they are drawn longer than they are."""
+    """Draw arrows from corners along their residuals; returns also how many times too long they are drawn."""
     picture, scale = _sheet(size)
     lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals_px if len(residual)] or [np.ones(1)])
     typical = float(np.percentile(lengths, 90)) * scale
@@ -203,14 +201,14 @@ def residual_picture(
 
 
 def error_picture(uncertainty: DepthUncertainty) -> Picture:
-    """The expected depth error in colour, red where it is large; black where the scan does not reach at this depth."""
+    """Draw the expected depth error, red where it is large, black where the scan does not reach at this depth."""
     large = _enlarged_mm(uncertainty.sd_m)
     limits = depth_limits(large)
     return depth_picture(large, None if limits is None else (limits[1], limits[0]), unit="mm")  # red: large
 
 
 def cells_picture(cells_m: Array) -> Picture:
-    """How far the squares of a board lie off their plane, red in front of it; black where they were not scanned."""
+    """Draw how far a board's squares lie off their plane: red in front of it, black where they were not scanned."""
     large = _enlarged_mm(cells_m)
     known = large[np.isfinite(large)]
     most = max(float(np.abs(known).max()), 1e-3) if known.size else 1.0
@@ -239,7 +237,10 @@ _WAYS = {1: "rising command", -1: "falling command"}
 
 
 def plane_residuals(waves: SweepWaves, sweeps: Sequence[SweepResidual], metres_per_command: float, at_m: float) -> str:
-    """SVG: medians of each sweep's residuals over the command, in millimetres of depth at `at_m`; a panel each way."""
+    """Chart (SVG) of the medians of each sweep's residuals over the command, a panel for each direction.
+
+    They are in millimetres of depth at `at_m`.
+    """
     views = list(dict.fromkeys(sweep.view for sweep in sweeps))
     panels = [
         Panel(

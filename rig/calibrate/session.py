@@ -3,19 +3,13 @@
     views/000.npz ...  rig.json (whose they are)  board.yaml (of what)  calibration.yaml (+ .npy)  report.html
     summary.json
 
-A session that was interrupted, or whose views made no calibration, leaves its views, which are a source for the next.
-
-Views on disk, `views/000.npz`: all that a fit needs of a pose, so that a calibration can be made anew from them.
+`Session` writes it, `CalibrationResult` is what a calibration gives back. A session that was interrupted, or whose
+views made no calibration, leaves its views, which are a source for the next. A view's file, `views/000.npz`, has all
+that a fit needs of a pose, and is there whole or not at all:
 
     format_version () int   name () str   picture (height, width) float32, where there is one
-    corner_ids (n,) int32   corner_px (n, 2) float64   corner_sd_px (n,) float64, where the board was found
-    passages_0 (4, m) float64: x_px, y_px, command, sd   sweep_0 (2,) float64: direction, speed_per_s   passages_1 ...
-
-A file is there whole or not at all.
-
-What a calibration gives back: verdict, figures, the model and where everything was written.
-
-What a calibration found beside what a simulated rig's world knows.
+    corner_ids (n,) int32   corner_px (n, 2) float64   corner_sd_px (n,) float64, where the board was found passages_0
+    (4, m) float64: x_px, y_px, command, sd   sweep_0 (2,) float64: direction, speed_per_s   passages_1 ...
 """
 
 import io
@@ -46,71 +40,6 @@ from rig.errors import UsageError
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import OutFolder
 
-VERSION: Final = 1
-Arrays = Mapping[str, NDArray[Any]]
-
-
-def save_view(view: View, file: Path) -> None:
-    """Write a view, in one step. UsageError where it cannot be written."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, allow_pickle=False, **_arrays(view))
-    part = file.with_name(f".{file.name}.part")
-    try:
-        part.write_bytes(stream.getvalue())
-        part.replace(file)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise UsageError(
-            f"cannot write {file}: {error.strerror or error}; name another folder or free the space it needs"
-        ) from error
-
-
-def load_view(file: Path) -> View:
-    """A view as it was written. UsageError where the file holds none."""
-    try:
-        with load_numpy(file) as arrays:
-            version = int(arrays["format_version"])
-            if version != VERSION:
-                raise UsageError(f"{file} is a view of version {version}, this program reads version {VERSION}")
-            return _view(arrays)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise UsageError(f"{file} is no view of a calibration ({error}); take it out of the folder") from error
-
-
-def load_views(folder: Path) -> tuple[View, ...]:
-    """All views of a folder, in the order of their files. UsageError where there is none, or one is not readable."""
-    files = sorted(folder.glob("*.npz"))
-    if not files:
-        raise UsageError(f"{folder} holds no view (*.npz); name the folder of an earlier calibration")
-    return tuple(load_view(file) for file in files)
-
-
-def _arrays(view: View) -> dict[str, NDArray[Any]]:
-    arrays: dict[str, NDArray[Any]] = {"format_version": np.array(VERSION), "name": np.array(view.name)}
-    if view.picture is not None:
-        arrays["picture"] = view.picture
-    if view.corners is not None:
-        arrays |= {"corner_ids": view.corners.ids, "corner_px": view.corners.px}
-        if view.corners.sd_px is not None:
-            arrays["corner_sd_px"] = view.corners.sd_px
-    for number, sweep in enumerate(view.passages):
-        arrays[f"passages_{number}"] = np.stack([sweep.x_px, sweep.y_px, sweep.command, sweep.sd])
-        arrays[f"sweep_{number}"] = np.array([sweep.direction, sweep.speed_per_s])
-    return arrays
-
-
-def _view(arrays: Arrays) -> View:
-    corners = None
-    if "corner_ids" in arrays:
-        corners = Corners(arrays["corner_ids"], arrays["corner_px"], arrays.get("corner_sd_px"))
-    passages: list[Passages] = []
-    while (key := f"passages_{len(passages)}") in arrays:
-        direction, speed_per_s = arrays[f"sweep_{len(passages)}"]
-        x_px, y_px, command, sd = arrays[key]
-        passages.append(Passages(x_px, y_px, command, sd, int(direction), float(speed_per_s)))
-    return View(str(arrays["name"]), corners, tuple(passages), arrays.get("picture"))
-
-
 Made = tuple[Path, RigModel]
 """A calibration: its file, and what it holds."""
 
@@ -119,7 +48,7 @@ BOARD_FILE = "board.yaml"
 
 
 def session_rig(folder: Path) -> Identity | None:
-    """Which rig the views of a session are of; None where it does not say."""
+    """The rig that the views of a session are of; None where it does not say."""
     try:
         content = parse_json((folder / RIG_FILE).read_text(encoding="utf-8"))
         return Identity(**{**content, "reasons": tuple(content["reasons"])})
@@ -130,23 +59,23 @@ def session_rig(folder: Path) -> Identity | None:
 
 
 def session_board(folder: Path) -> Board | None:
-    """The board that a session's corners are of; None where none was looked for."""
+    """The board that a session's corners are of; None where no board was looked for."""
     file = folder / BOARD_FILE
     return load_board(file) if file.is_file() else None
 
 
 class Session:
-    """Takes views one by one, then what was made of them."""
+    """Writes the views of a calibration one by one, then what was made of them."""
 
     def __init__(self, out: OutFolder, board: Board | None = None) -> None:
-        """Claim the folder; None: write nothing. board: what the views show. UsageError where it cannot be."""
+        """Claim the folder; None writes nothing. board: what the views show. UsageError where it cannot be claimed."""
         self._board = board
         self._folder = None if out is None else RunFolder(out, in_place=True)
         self._views = 0
 
     @property
     def path(self) -> Path | None:
-        """The folder."""
+        """Path of the folder; None where nothing is written."""
         return None if self._folder is None else self._folder.path
 
     def __enter__(self) -> Self:
@@ -189,9 +118,10 @@ class Session:
     def finish(
         self, summary: dict[str, Any], report: str, model: RigModel | None, made_from: Made | None = None
     ) -> Path | None:
-        """Write what was made of the views; the calibration's file, None where there is none.
+        """Write what was made of the views; returns the calibration's file, None where there is none.
 
-        made_from: file and content of the calibration that the model is a change of; what failed on it goes with it.
+        made_from: file and content of the calibration that the model is a change of; notes on failed checks of it are
+        carried over.
         """
         if self._folder is None:
             return None
@@ -208,7 +138,7 @@ class Session:
 
 
 def _board_text(board: Board) -> str:
-    """What `load_board` reads."""
+    """A board as YAML that `load_board` reads."""
     content: dict[str, Any] = {"kind": board.kind, "squares": list(board.squares), "square": _mm(board.square_m)}
     if board.marker_m is not None:
         content |= {"marker": _mm(board.marker_m), "dictionary": board.dictionary}
@@ -224,11 +154,13 @@ EXIT_NOT_TRUSTWORTHY = 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
-    """Of `rig calibrate camera`, `planes`, `sync` and `check`.
+    """Result of `rig calibrate camera`, `planes`, `sync` and `check`.
 
-    line: the one that matters, as 'at 5 m: 8 mm, 6 of them from the baseline'. figures: for people, by name. summary:
-    for programs. model: what was calibrated, or checked; None where only a camera is. folder, calibration: where they
-    were written, None where they were not.
+    line: the one line that matters, such as 'at 5 m: 8 mm, 6 of them from the baseline'.
+    figures: for people, (name, text).
+    summary: for programs; what summary.json holds.
+    model: the calibrated or checked model; None where only a camera was calibrated.
+    folder, calibration: where they were written; None where they were not.
     """
 
     verdict: Verdict
@@ -241,7 +173,7 @@ class CalibrationResult:
 
     @property
     def exit_code(self) -> int:
-        """0 for a calibration to be used, 1 for one whose verdict failed."""
+        """Exit code of the command line: 0 for a calibration to be used, 1 for one whose verdict failed."""
         return 0 if self.verdict.passed else EXIT_NOT_TRUSTWORTHY
 
     def rows(self) -> list[tuple[str, str]]:
@@ -249,17 +181,17 @@ class CalibrationResult:
         return list(self.figures)
 
     def as_json(self) -> Mapping[str, Any]:
-        """What summary.json holds."""
+        """Return what summary.json holds, as plain values."""
         return self.summary
 
 
 def named(names: Sequence[str]) -> str:
-    """How many, and which."""
+    """The number of these names, and the names, as text."""
     return f"{len(names)} ({', '.join(names)})" if names else "0"
 
 
 def true_model(live: RigConfig) -> RigModel | None:
-    """The rig as its world knows it; asked after everything was estimated."""
+    """The rig as its world knows it; None for a real one. It is asked after everything was estimated."""
     if live.world is None:
         return None
     with open_rig(live.model_copy(update={"calibration": None})) as rig:
@@ -267,7 +199,7 @@ def true_model(live: RigConfig) -> RigModel | None:
 
 
 def true_errors(model: RigModel, live: RigConfig, at_m: float) -> DepthErrors | None:
-    """How far depths are off, where the rig's world knows."""
+    """Errors of depth against the rig's world; None for a real rig."""
     truth = true_model(live)
     if truth is None:
         return None
@@ -276,10 +208,75 @@ def true_errors(model: RigModel, live: RigConfig, at_m: float) -> DepthErrors | 
 
 
 def truth_content(errors: DepthErrors) -> dict[str, Any]:
-    """For programs."""
+    """Describe the true errors for the summary."""
     return {
         "at_m": errors.depth_m,
         "median_m": errors.median_m,
         "worst_m": errors.worst_m,
         "ratio_to_sd": errors.ratio,
     }
+
+
+VERSION: Final = 1
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def save_view(view: View, file: Path) -> None:
+    """Write a view, in one step. UsageError where it cannot be written."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, **_arrays(view))
+    part = file.with_name(f".{file.name}.part")
+    try:
+        part.write_bytes(stream.getvalue())
+        part.replace(file)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise UsageError(
+            f"cannot write {file}: {error.strerror or error}; name another folder or free the space it needs"
+        ) from error
+
+
+def load_view(file: Path) -> View:
+    """Read a view. UsageError where the file holds none."""
+    try:
+        with load_numpy(file) as arrays:
+            version = int(arrays["format_version"])
+            if version != VERSION:
+                raise UsageError(f"{file} is a view of version {version}, this program reads version {VERSION}")
+            return _view(arrays)
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise UsageError(f"{file} is no view of a calibration ({error}); take it out of the folder") from error
+
+
+def load_views(folder: Path) -> tuple[View, ...]:
+    """Read all views of a folder, in the order of their files. UsageError without any, or for a damaged one."""
+    files = sorted(folder.glob("*.npz"))
+    if not files:
+        raise UsageError(f"{folder} holds no view (*.npz); name the folder of an earlier calibration")
+    return tuple(load_view(file) for file in files)
+
+
+def _arrays(view: View) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {"format_version": np.array(VERSION), "name": np.array(view.name)}
+    if view.picture is not None:
+        arrays["picture"] = view.picture
+    if view.corners is not None:
+        arrays |= {"corner_ids": view.corners.ids, "corner_px": view.corners.px}
+        if view.corners.sd_px is not None:
+            arrays["corner_sd_px"] = view.corners.sd_px
+    for number, sweep in enumerate(view.passages):
+        arrays[f"passages_{number}"] = np.stack([sweep.x_px, sweep.y_px, sweep.command, sweep.sd])
+        arrays[f"sweep_{number}"] = np.array([sweep.direction, sweep.speed_per_s])
+    return arrays
+
+
+def _view(arrays: Arrays) -> View:
+    corners = None
+    if "corner_ids" in arrays:
+        corners = Corners(arrays["corner_ids"], arrays["corner_px"], arrays.get("corner_sd_px"))
+    passages: list[Passages] = []
+    while (key := f"passages_{len(passages)}") in arrays:
+        direction, speed_per_s = arrays[f"sweep_{len(passages)}"]
+        x_px, y_px, command, sd = arrays[key]
+        passages.append(Passages(x_px, y_px, command, sd, int(direction), float(speed_per_s)))
+    return View(str(arrays["name"]), corners, tuple(passages), arrays.get("picture"))

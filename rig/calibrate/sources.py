@@ -1,8 +1,7 @@
-"""What a calibration is made from: a live or simulated rig, recorded runs, views kept earlier, picture files.
+"""Reads what a calibrating call is given: sources of views, files and quantities. All problems are listed together.
 
-Reads what a calibrating call is given: sources, files and quantities; what is wrong with them is listed together.
-
-Whether the camera of `rig calibrate camera` may go into a calibration of the planes, by its verdict.
+A source is a live or simulated rig, a recorded run, a session with views kept earlier, or a file of pictures.
+`camera_use` decides by its verdict whether a camera of its own may go into a calibration of the planes.
 """
 
 import os
@@ -33,8 +32,9 @@ BOARD_SCENE = "board"
 
 @dataclass(frozen=True, slots=True)
 class ViewSources:
-    """live: the rig that takes new views, None: none is named; the others in the order they were named. notes: what
-    is to be said of them.
+    """Sources of views, each kind in the order in which they were named.
+
+    live: the rig that takes new views; None where none is named. notes: lines to tell the user about them.
     """
 
     live: RigConfig | None
@@ -45,9 +45,10 @@ class ViewSources:
 
 
 def sort_sources(sources: Sequence[Config], *, pictures: bool = False, scene: str | None = None) -> ViewSources:
-    """Tell what each source is; none at all: the bundled simulated rig. scene: of a simulated rig, by default its own,
-    the bundled one with a board where that has none. Raises UsageError with a line per problem, DeviceError where its
-    scene cannot be read.
+    """Tell what each source is; without any it is the bundled simulated rig.
+
+    scene: of a simulated rig; None is its own or, where that has no board, the bundled one with a board. Raises
+    UsageError with a line per problem, DeviceError where a scene cannot be read.
     """
     live: list[RigConfig] = []
     sessions: list[Path] = []
@@ -93,7 +94,7 @@ def sort_sources(sources: Sequence[Config], *, pictures: bool = False, scene: st
 
 
 def _named_twice(paths: Sequence[Path]) -> list[str]:
-    """A line for each source that an earlier one is already."""
+    """A line for each source that was named before."""
     problems, known = [], dict[Path, Path]()
     for path in paths:
         first = known.setdefault(path.resolve(), path)
@@ -104,7 +105,7 @@ def _named_twice(paths: Sequence[Path]) -> list[str]:
 
 
 def _live(source: Config, scene: str | None, notes: list[str]) -> RigConfig:
-    """The rig. What is shown to a simulated one in place of its own scene goes to the notes."""
+    """The config of a rig. A note says where a simulated one is shown another scene than its own."""
     loaded = configure(source, scene=scene)
     world = loaded.world
     if scene is not None or world is None or "board_pose" not in type(world).model_fields:
@@ -120,26 +121,26 @@ SourcesLike = Config | Sequence[Config]
 
 
 def listed(sources: SourcesLike) -> Sequence[Config]:
-    """The sources, where only one was given too."""
+    """The sources as a sequence, for a single one as well."""
     return [sources] if isinstance(sources, RigConfig | str | os.PathLike) else list(sources)
 
 
 def read_board(file: PathLike | None) -> "Board":
-    """A board's file, None: the bundled one. Raises CalibrationError."""
+    """Read a board's file; None is the bundled board. Raises CalibrationError."""
     from calibration.board.board import BUNDLED_BOARD, load_board
 
     return load_board(BUNDLED_BOARD if file is None else file)
 
 
 def read_base(file: PathLike | None) -> "RigModel | None":
-    """The calibration to start from, if any. Raises CalibrationError."""
+    """Read the calibration to start from; None without one. Raises CalibrationError."""
     from calibration.files.rig_file import load_rig_model
 
     return None if file is None else load_rig_model(file)
 
 
 def problems_of(poses: int | None, seed: int, exposures: Sequence[int] = ()) -> list[str]:
-    """What is wrong with numbers that calls have in common."""
+    """Problems with numbers that several calls take."""
     problems = [f"exposures has {k}; it must be at least 1" for k in exposures if k < 1]
     if poses is not None and poses < 1:
         problems.append(f"poses is {poses}; it must be at least 1")
@@ -147,7 +148,7 @@ def problems_of(poses: int | None, seed: int, exposures: Sequence[int] = ()) -> 
 
 
 def quantity(problems: list[str], name: str, text: str | None, dimension: str) -> float | None:
-    """The number that a text means, above 0; what is wrong with it goes to the problems."""
+    """The number above 0 that a text means, in SI units; a mistake in it is added to `problems`."""
     if text is None:
         return None
     try:
@@ -161,25 +162,27 @@ def quantity(problems: list[str], name: str, text: str | None, dimension: str) -
 
 
 def length_m(problems: list[str], name: str, text: str | None) -> float | None:
-    """The same of a length."""
+    """The metres that a text means; a mistake in it is added to `problems`."""
     return quantity(problems, name, text, "length")
 
 
 @dataclass(frozen=True, slots=True)
 class CameraUse:
-    """A camera that is known from elsewhere. accepted: what it was used in spite of."""
+    """A camera that is known from elsewhere. accepted: reasons in spite of which it is used."""
 
     known: KnownCamera
     accepted: tuple[Refusal, ...] = ()
 
     def content(self) -> dict[str, Any]:
-        """For the provenance of what is made with it."""
+        """Describe it for the provenance of a calibration made with it."""
         return check_content("unchecked" if self.known.verdict is None else "passed", self.accepted)
 
 
 def camera_use(file: Path, *, accept: bool = False) -> CameraUse:
-    """Read a camera file. UsageError where its verdict failed, unless `accept`; one that says nothing of a verdict, as
-    written by hand or of old, is used unchecked. Raises CalibrationError where it cannot be read."""
+    """Read a camera file. UsageError where its verdict failed, unless `accept`; CalibrationError for an unreadable one.
+
+    A file without a verdict, such as one written by hand, is used unchecked.
+    """
     known = load_camera(file)
     found = failed_verdict(known.verdict, known.reasons)
     require_accepted(f"camera {file}", found, {each.code for each in found} if accept else ())

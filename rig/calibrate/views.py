@@ -1,12 +1,8 @@
-"""Views that were taken, of whichever source: kept as they come, none of them twice, all of one rig.
+"""Takes views from all sources: kept as they come, none of them twice, all of one rig.
 
-Views of a live rig, pose by pose: which poses, and until when.
-
-Views that need no live rig: those of earlier sessions, of recorded runs, and pictures.
-
-What is said of a view when it was taken.
-
-What is said where views make no calibration.
+`Taken` collects them. `take_live` takes them with a live rig, pose by pose, as `Live` says; `take_kept` takes those of
+earlier sessions, recorded runs and pictures. `told` and `refusal` are the messages about views, and about views that
+make no calibration.
 """
 
 import math
@@ -43,33 +39,17 @@ from rig.errors import UsageError
 from rig.progress import part, tell_stage
 
 
-def told(view: View, refused: Degenerate | None) -> str:
-    """One line: what is seen in it, or why nothing is. refused: why there are no corners."""
-    if refused is not None:
-        return f"view {view.name}: {refused}"
-    parts = [] if view.corners is None else [f"{len(view.corners.ids)} corners"]
-    if view.passages:
-        counts = ", ".join(str(len(sweep.command)) for sweep in view.passages)
-        parts.append(f"{counts} passages of the line" + ("" if shows_line(view) else _too_few(view)))
-    return f"view {view.name}: {', '.join(parts) or 'neither corners nor passages'}"
-
-
-def _too_few(view: View) -> str:
-    """Why that is as good as none, and what to do about it."""
-    where = "" if view.corners is None else ", or hold the board where the line passes"
-    return (
-        f", too few to count (limit {FEWEST_PASSAGES} a sweep): the line does not stand out in single pixels; give it "
-        f"more exposures per column (2 to 5 do in a dark room) or more power{where}"
-    )
-
-
 class Taken:
-    """What was taken. views: all of them. refused: why some have no corners, by the view's name. identity: of the rig,
-    None: not known.
+    """The views taken so far.
+
+    views: all of them. refused: the reasons why some have no corners, by the view's name. identity: of the rig; None
+    where it is not known.
     """
 
     def __init__(self, session: Session, tell: Tell | None = None, of_camera: Collection[str] = ()) -> None:
-        """session: where views are kept; tell: is told of each; of_camera: `corners_digest` of the views that a camera
+        """Begin without views.
+
+        session: keeps the views. tell: gets a line about each. of_camera: `corners_digest` of the views that a camera
         known from elsewhere was made of.
         """
         self.views: list[View] = []
@@ -87,8 +67,9 @@ class Taken:
         identity: Identity | None = None,
         source: Path | None = None,
     ) -> None:
-        """One more; a name that there is already gets a number. source: the file or run that it is from. UsageError for
-        one that there is already: it would count twice.
+        """Add a view; where its name is taken it gets a number.
+
+        source: the file or run that it is from. UsageError for a view that is there already: it would count twice.
         """
         self._require_new(view, str(source or view.name))
         if view.name in [known.name for known in self.views]:
@@ -101,7 +82,7 @@ class Taken:
         self.say(told(view, refused))
 
     def say(self, line: str) -> None:
-        """Tell whoever listens."""
+        """Pass a line on to `tell`, if there is one."""
         if self.tell is not None:
             self.tell(line)
 
@@ -134,7 +115,7 @@ class Taken:
         self.identity = identity
 
     def add_capture(self, capture: Capture, source: Path | None = None) -> None:
-        """The view of a scan, of a recorded one where a source is named."""
+        """Add the view of a scan; source: the run, where it was recorded."""
         self.add(capture.view, capture.refused, capture.identity, source)
 
     @property
@@ -153,17 +134,17 @@ def _devices(identity: Identity) -> str:
 
 
 MISSED_SHARE = 0.5
-"""So many more poses than asked for are shown where the board is not found in some."""
+"""Share of further poses that are shown where the board is not found in some."""
 
 LASTING = (["wrong-board"] * 3, ["mirrored"] * 3)
-"""Why the first views of a session are refused where no pose of the board will change that."""
+"""Refusals of a session's first views which no pose of the board will change: the session ends with them."""
 
 
 class ChoosesPoses(Protocol):
-    """Says which pose to show next."""
+    """Chooses the pose that is shown next."""
 
     def next(self, views: Sequence[View]) -> Advice | None:
-        """After these views; None: no more are needed."""
+        """The pose to show after these views; None where no more are needed."""
         ...
 
 
@@ -174,12 +155,12 @@ class FixedPoses:
     poses: Sequence[Advice]
 
     def next(self, views: Sequence[View]) -> Advice | None:
-        """The one that follows."""
+        """The next pose of the sequence; None at its end."""
         return self.poses[len(views)] if len(views) < len(self.poses) else None
 
 
 def require_poses(taken: Taken, poses: int) -> None:
-    """UsageError where so many poses of a live rig, and the views there are, can never pass, whatever they show."""
+    """Raise UsageError where so many poses, with the views taken already, are too few whatever they show."""
     there = sum(view.corners is not None for view in taken.views)
     if there + poses < FEWEST_POSES:
         beside = f" and {there} view{'s' * (there > 1)} taken before" if there else ""
@@ -189,9 +170,9 @@ def require_poses(taken: Taken, poses: int) -> None:
 
 
 def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> FixedPoses:
-    """Poses that tell most about any rig, and a few more for those in which the board is missed.
+    """Choose poses that tell most about any rig, and a few more in case the board is missed in some.
 
-    behind: so many of the sequence were shown before, by an earlier session: the next tell more than the same again.
+    behind: number of poses of the sequence that an earlier session has shown; it goes on from there.
     """
     choices = candidates(first_camera(config), board, config.scan.depth_range)
     if not choices:
@@ -202,7 +183,7 @@ def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: i
 
 
 def first_camera(config: RigConfig) -> Camera:
-    """A camera to place boards with: that of the config's calibration, else a rough one of the sensor's size."""
+    """A camera to place boards with: that of the config's calibration, or a rough one of the sensor's size."""
     if config.calibration is not None:
         try:
             return load_rig_model(config.calibration).camera
@@ -214,11 +195,13 @@ def first_camera(config: RigConfig) -> Camera:
 
 @dataclass(frozen=True, slots=True)
 class Live:
-    """How a live rig takes views. poses: good ones wanted; choose: which. ask: gets a person to move the board.
+    """Settings of `take_live`: views with a live rig.
 
-    exposures: per column, by turns, so that the mirror is seen at several speeds; those that it cannot do are left out,
-    and those that never show the line where more exposures do; none: as the config says. line: whether it is to be seen
-    on the board. defects: (rows, width), pixels not to be used. seed: of everything simulated.
+    poses: number of good views wanted. choose: chooses the poses. ask: gets a person to move the board.
+    exposures: per column, by turns, so that the mirror is seen at several speeds; speeds that the rig cannot do are
+      left out, and those that never show the line where more exposures do; empty is as the config says.
+    line: whether the line has to be seen on the board. defects: (rows, width), pixels that are not used. seed: of
+      everything simulated.
     """
 
     config: RigConfig
@@ -259,7 +242,7 @@ def take_live(taken: Taken, live: Live, board: Board) -> None:
 
 
 def _scan(taken: Taken, live: Live, config: RigConfig, board: Board, exposures: int | None) -> Capture:
-    """One view of the board as it stands."""
+    """Take one view of the board where it is."""
     at = len(taken.views)
     return capture_view(
         config, f"{at:03d}", board, seed=live.seed + at, exposures=exposures, arm=live.arm, defects=live.defects
@@ -269,9 +252,9 @@ def _scan(taken: Taken, live: Live, config: RigConfig, board: Board, exposures: 
 def take_kept(
     taken: Taken, sources: ViewSources, board: Board | None, defects: NDArray[np.bool_] | None = None
 ) -> None:
-    """Take the views that need no live rig. board: None where nothing moves and none is looked for.
+    """Take the views that need no live rig.
 
-    defects: (rows, width), pixels not to be used.
+    board: None where nothing moves and none is looked for. defects: (rows, width), pixels that are not used.
     """
     for note in sources.notes:
         taken.say(note)
@@ -289,8 +272,9 @@ def take_kept(
 
 
 def _require_alike(folder: Path, board: Board | None) -> None:
-    """UsageError where a session's views do not show what is looked for. The squares' side may be another now: it is
-    what is corrected where it was measured wrong.
+    """Raise UsageError where a session's views do not show the board that is looked for.
+
+    The side of the squares may differ: it is what a user corrects where it was measured wrong.
     """
     known = session_board(folder)
     if known is None:
@@ -313,7 +297,7 @@ def _print(board: Board) -> str:
 
 
 def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]:
-    """A picture of the board, taken with anything."""
+    """Read a picture of the board, taken with any camera, as a view."""
     pixels = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     if pixels is None:
         raise UsageError(f"{file} cannot be read as a picture; convert it to PNG")
@@ -326,11 +310,12 @@ def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]
 
 
 def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = True, line: bool = True) -> Degenerate:
-    """The root cause; as notes what the fit said, the other reasons, and what was wrong with single views unless that
-    was told when they were taken.
+    """The error for views that make no calibration: its root cause.
 
-    photons: whether the pictures count photons; those from files do not. line: whether it was to be seen, or a camera
-    alone was asked for.
+    Its notes are what the fit said, the other reasons, and the trouble of single views unless that was told when they
+    were taken.
+    photons: whether the pictures count photons; those from files do not. line: whether the line was to be seen; False
+    for a camera alone.
     """
     refused = _of_views(refused, taken)
     reasons = judge_refused(refused, taken.views, board, taken.size, photons=photons, line=line).reasons
@@ -345,14 +330,34 @@ def refusal(refused: Degenerate, taken: Taken, board: Board, *, photons: bool = 
 
 
 def note_views(error: Degenerate, taken: Taken) -> None:
-    """Add what was wrong with single views, unless that was told when they were taken."""
+    """Add the trouble of single views as notes, unless it was told when they were taken."""
     for name, why in taken.refused.items() if taken.tell is None else ():
         error.add_note(f"view {name}: {why}")
 
 
 def _of_views(refused: Degenerate, taken: Taken) -> Degenerate:
-    """Why most views have no board, where that is why there is no model."""
+    """The reason why most views have no board, where that is why there is no model; otherwise the error as it is."""
     if refused.reason != "no-board" or not taken.refused:
         return refused
     (reason, _), *_ = Counter(why.reason for why in taken.refused.values()).most_common()
     return Degenerate(reason, f"none of {len(taken.views)} views shows the board as it should")
+
+
+def told(view: View, refused: Degenerate | None) -> str:
+    """Describe a view in one line: what is seen in it or, where it was `refused`, why it has no corners."""
+    if refused is not None:
+        return f"view {view.name}: {refused}"
+    parts = [] if view.corners is None else [f"{len(view.corners.ids)} corners"]
+    if view.passages:
+        counts = ", ".join(str(len(sweep.command)) for sweep in view.passages)
+        parts.append(f"{counts} passages of the line" + ("" if shows_line(view) else _too_few(view)))
+    return f"view {view.name}: {', '.join(parts) or 'neither corners nor passages'}"
+
+
+def _too_few(view: View) -> str:
+    """Say why so few passages are as good as none, and what to do about it."""
+    where = "" if view.corners is None else ", or hold the board where the line passes"
+    return (
+        f", too few to count (limit {FEWEST_PASSAGES} a sweep): the line does not stand out in single pixels; give it "
+        f"more exposures per column (2 to 5 do in a dark room) or more power{where}"
+    )

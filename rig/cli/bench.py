@@ -40,7 +40,7 @@ def bench_command(
     ] = False,
     as_json: JsonOption = False,
 ) -> int:
-    """How fast this machine counts and estimates, beside how fast it reads its memory."""
+    """Measure how fast this machine counts and estimates, beside how fast it reads its memory."""
     from rig import api
 
     _require_used(
@@ -73,10 +73,10 @@ def bench_command(
 
 
 def _require_used(measured: list[bool], *, of_rows: bool, of_soak: bool) -> None:
-    """UsageError for options without effect, since a minute's measurement would be of something else.
+    """Raise UsageError for options that have no effect: a minute's measurement would be of something else.
 
-    measured: whether simulator, disk and a soak are asked for; of_rows: whether something is that the first two have
-    not; of_soak: whether something is that only a soak has.
+    measured: whether simulator, disk and a soak are asked for. of_rows: whether an option is given that the first two
+    do not have. of_soak: whether an option is given that only a soak has.
     """
     from rig.errors import UsageError
 

@@ -1,6 +1,6 @@
-"""The rig model estimated and judged: `rig calibrate pixels`, `camera`, `planes`, `sync`, `check`.
+"""Commands that estimate and judge the rig model: `rig calibrate pixels`, `camera`, `planes`, `sync`, `check`.
 
-What the commands of `rig calibrate` share: options, the person at the terminal, the printed result.
+First comes what they share: options, the person at the terminal, the printed result.
 """
 
 import sys
@@ -59,7 +59,7 @@ SeedOption = Annotated[int, typer.Option("--seed", help="of everything simulated
 
 
 def ask_at_terminal() -> "Ask | None":
-    """Asks the person at the terminal; None where nobody is there."""
+    """A callback that asks the person at the terminal; None where nobody is there."""
     if not sys.stdin.isatty():
         return None
 
@@ -74,7 +74,7 @@ def ask_at_terminal() -> "Ask | None":
 
 
 def print_report(result: "CalibrationResult", as_json: bool) -> int:
-    """Print a result, for programs or people; its exit code."""
+    """Print a result, for programs or people, and return its exit code."""
     if as_json:
         print_json(result.as_json())
     else:

@@ -1,4 +1,7 @@
-"""What all commands have in common: their errors become lines and exit codes, their results text or one JSON object."""
+"""The frame of every command: errors become lines and exit codes, results become text or one JSON object.
+
+Options that several commands have are defined here too.
+"""
 
 import errno
 import functools
@@ -72,7 +75,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="print exactly one JSON
 
 
 def command(function: Callable[P, int | None]) -> Callable[P, None]:
-    """Turns what a command raises for its user's mistakes and its devices' faults into lines and exit codes."""
+    """Wrap a command so that its user's mistakes and its devices' faults become lines and exit codes."""
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -134,7 +137,7 @@ def _code_of(error: Exception) -> int | None:
 
 
 def report(result: "RunResult", as_json: bool) -> int:
-    """Print a run's summary, for programs or people; its exit code."""
+    """Print a run's summary, for programs or people, and return its exit code."""
     from rig.run_folder.summary import RunVerdict
 
     if result.summary.valid_fraction == 0 and result.summary.verdict is not RunVerdict.UNCALIBRATED:
@@ -149,19 +152,19 @@ def report(result: "RunResult", as_json: bool) -> int:
 
 
 def print_json(content: Mapping[str, Any]) -> None:
-    """The one JSON object of a command, to stdout."""
+    """Print the one JSON object of a command to stdout."""
     from rig.run_folder.folder import json_text
 
     print(json_text(content))
 
 
 def say_space(space: "Space") -> None:
-    """What a recording will take on the disk, before it begins."""
+    """Say how much room a recording will take on the disk, before it begins."""
     say(f"recording: {space}")
 
 
 def split_option(option: str, given: list[str] | None) -> list[str]:
-    """The parts of an option that may be given several times and with commas; UsageError where it names nothing."""
+    """Split an option that may be given several times and with commas. UsageError where it names nothing."""
     from rig.errors import UsageError
 
     parts = (part.strip() for value in given or () for part in value.split(","))
@@ -172,7 +175,7 @@ def split_option(option: str, given: list[str] | None) -> list[str]:
 
 
 def whole_numbers(option: str, given: list[str] | None) -> list[int]:
-    """The same of an option that takes whole numbers."""
+    """Split an option as `split_option` does, into whole numbers. UsageError for anything else."""
     from rig.errors import UsageError
 
     parts = split_option(option, given)
@@ -183,10 +186,10 @@ def whole_numbers(option: str, given: list[str] | None) -> list[int]:
 
 
 def default_out() -> Path:
-    """Where a run is written that names no folder."""
+    """Folder of a run whose user names none: runs/DATE-TIME."""
     return Path("runs") / datetime.now().strftime("%Y%m%d-%H%M%S")
 
 
 def say(line: str) -> None:
-    """A line for people, to stderr."""
+    """Print a line for people to stderr."""
     print(line, file=sys.stderr, flush=True)

@@ -38,7 +38,7 @@ def filter_names() -> Iterable[str]:
 
 
 def one_of(names: Names) -> Callable[[str], list[str]]:
-    """Completes a value that is one of `names`."""
+    """A completer for a value that is one of `names`."""
 
     def complete(incomplete: str) -> list[str]:
         return [name for name in names() if name.startswith(incomplete)]
@@ -47,7 +47,7 @@ def one_of(names: Names) -> Callable[[str], list[str]]:
 
 
 def some_of(names: Names) -> Callable[[str], list[str]]:
-    """Completes the last of several `names` with commas between them."""
+    """A completer for the last of several `names` with commas between them."""
 
     def complete(incomplete: str) -> list[str]:
         before, comma, last = incomplete.rpartition(",")

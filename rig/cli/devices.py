@@ -1,7 +1,4 @@
-"""Commands for the devices: `rig doctor`, `devices`, `laser off`.
-
-Commands for configs and scenes: `rig config check`, `show`, `schema`, `rig scenes`.
-"""
+"""Commands for devices (`rig doctor`, `devices`, `laser off`), configs (`rig config`) and scenes (`rig scenes`)."""
 
 from pathlib import Path
 from typing import Annotated
@@ -40,7 +37,7 @@ def doctor_command(
 
 @command
 def devices_command(as_json: JsonOption = False) -> int:
-    """What is attached: USB devices that a driver knows, and serial ports."""
+    """List what is attached: USB devices that a driver knows, and serial ports."""
     from rig import api
 
     found = api.devices()
@@ -65,7 +62,7 @@ def laser_off_command(config: ConfigArgument = "simulated") -> int:
 
 
 def register_config(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
+    """Add the commands for configs and scenes to `app`."""
     config = typer.Typer(name="config", help="Check, show or describe a config.", rich_markup_mode=None)
     config.command("check")(check_command)
     config.command("show")(show_command)
@@ -111,7 +108,7 @@ def schema_command() -> int:
 
 @command
 def scenes_command(as_json: JsonOption = False) -> int:
-    """The bundled scenes (--scene) and rigs (CONFIG), with a sentence on each."""
+    """List the bundled scenes (--scene) and rigs (CONFIG), with a sentence on each."""
     from rig import api
 
     listed = {"scenes": api.bundled_scenes(), "rigs": api.bundled_rigs()}

@@ -1,12 +1,11 @@
-"""The command line: its entry point; the commands are in `rig/cli_*.py`.
+"""The entry point of `rig`; the commands are in the other modules of this package.
 
-Each command is one call of `rig.api` and some printing. Results go to stdout, everything else to stderr. Exit codes:
-0 done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted, 70 an error in the program itself.
+Each command is one call of `rig.api` and some printing. Results go to stdout, everything else to stderr. Exit codes: 0
+done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted, 70 an error in the program itself.
 Nothing heavy is imported before a command runs.
 
-Where numba keeps compiled kernels when neither the package's folder nor the user's own can be written.
-
-Service accounts and containers often have neither, and numba then refuses to compile at all.
+Service accounts and containers often have no folder that numba can keep compiled kernels in, and numba then refuses to
+compile at all: `ensure_kernel_cache` names one.
 """
 
 import logging
@@ -27,41 +26,10 @@ import typer
 from rig.cli import bench, calibrate, devices, recordings, replay, scan, tradeoff
 from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, fail, refused_file, say
 
-VARIABLE = "NUMBA_CACHE_DIR"
-"""Numba's own setting, see its manual; a value that the user has set is left alone."""
-
-
-def ensure_kernel_cache() -> None:
-    """Name a private temporary folder to numba where it would find none; to be called before numba is imported."""
-    package = Path(__file__).parent
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
-    if VARIABLE in os.environ or _writable(package / "__pycache__") or _writable(home):
-        return
-    os.environ[VARIABLE] = str(_private_folder())
-
-
-def _writable(folder: Path) -> bool:
-    """Whether the folder, or the nearest one above it that exists, can be written."""
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return folder.is_dir() and os.access(folder, os.W_OK)
-
-
-def _private_folder() -> Path:
-    """A folder that only this user can write: kernels are code, and temporary folders are everybody's."""
-    user = os.getuid() if hasattr(os, "getuid") else 0
-    folder = Path(tempfile.gettempdir()) / f"spadrig-kernels-{user}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    seen = folder.lstat()
-    if hasattr(os, "getuid") and (seen.st_uid != user or seen.st_mode & 0o077 or folder.is_symlink()):
-        return Path(tempfile.mkdtemp(prefix="spadrig-kernels-"))
-    return folder
-
-
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
 """Signals that end a program, beside Ctrl-C; no system has all of them."""
 _TYPER_INTERRUPTED = 130
-"""What typer returns where an interrupt reaches it."""
+"""Exit code that typer returns where an interrupt reaches it."""
 
 app = typer.Typer(
     name="rig",
@@ -104,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _ignore_interrupts() -> None:
-    """Let this process, over but for its threads, end with its exit code, however often it is interrupted."""
+    """Ignore interrupts from now on: only threads are left to end, and the exit code stands."""
     if threading.current_thread() is threading.main_thread():
         for name in ("SIGINT", *_ENDING):
             if (number := getattr(signal, name, None)) is not None:
@@ -113,9 +81,9 @@ def _ignore_interrupts() -> None:
 
 @contextmanager
 def _signals_interrupt() -> Iterator[None]:
-    """Let the signals that end a program raise KeyboardInterrupt, so that they make the rig safe as Ctrl-C does.
+    """Within the context, signals that end a program raise KeyboardInterrupt and make the rig safe as Ctrl-C does.
 
-    One that is ignored (nohup) stays ignored; threads other than the main one get none.
+    A signal that is ignored (nohup) stays ignored; threads other than the main one get none.
     """
 
     def interrupt(number: int, frame: object) -> None:
@@ -135,7 +103,7 @@ def _signals_interrupt() -> Iterator[None]:
 
 
 def _say_why(error: BaseException, arguments: list[str]) -> int:
-    """Say what ended a command that did not handle it: a usage error of click's, an interrupt or a mistake of ours."""
+    """Say what ended a command that did not handle it: click's usage error, an interrupt or a mistake of ours."""
     as_json = "--json" in arguments
     if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
         return _TYPER_INTERRUPTED
@@ -164,13 +132,13 @@ def _say_why(error: BaseException, arguments: list[str]) -> int:
 
 
 def _values(option: str, arguments: list[str]) -> list[str]:
-    """What the command line gives an option."""
+    """Values that the command line gives an option."""
     after = [value for name, value in pairwise(arguments) if name == option]
     return after + [word.removeprefix(f"{option}=") for word in arguments if word.startswith(f"{option}=")]
 
 
 def _require_no_empty(arguments: list[str]) -> None:
-    """UsageError for an argument without a character: a shell's variable that is not set, which would mean '.'."""
+    """Raise UsageError for an argument without a character: an unset shell variable, which would mean '.'."""
     for before, word in pairwise(["rig", *arguments]):
         if not word or (word.startswith("--") and word.endswith("=")):
             place = f"the argument behind '{before}'" if not word else f"'{word}'"
@@ -193,8 +161,39 @@ def _root(
 
 
 def _join_save(arguments: list[str]) -> list[str]:
-    """`--save every 5` as one value, which is what an option takes."""
+    """Join `--save every 5` into one value, which is what an option takes."""
     for i in range(len(arguments) - 2):
         if arguments[i : i + 2] == ["--save", "every"]:
             return [*arguments[: i + 1], f"every {arguments[i + 2]}", *arguments[i + 3 :]]
     return arguments
+
+
+VARIABLE = "NUMBA_CACHE_DIR"
+"""Numba's own setting, see its manual; a value that the user has set is left alone."""
+
+
+def ensure_kernel_cache() -> None:
+    """Name a private temporary folder to numba where it would find none; to be called before numba is imported."""
+    package = Path(__file__).parent
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+    if VARIABLE in os.environ or _writable(package / "__pycache__") or _writable(home):
+        return
+    os.environ[VARIABLE] = str(_private_folder())
+
+
+def _writable(folder: Path) -> bool:
+    """Whether the folder, or the nearest one above it that exists, can be written."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK)
+
+
+def _private_folder() -> Path:
+    """A folder that only this user can write: kernels are code, and temporary folders are everybody's."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = Path(tempfile.gettempdir()) / f"spadrig-kernels-{user}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    seen = folder.lstat()
+    if hasattr(os, "getuid") and (seen.st_uid != user or seen.st_mode & 0o077 or folder.is_symlink()):
+        return Path(tempfile.mkdtemp(prefix="spadrig-kernels-"))
+    return folder

@@ -1,4 +1,4 @@
-"""How far a command is, on stderr: one line with a clock at a terminal, else a line where a stage begins."""
+"""Shows on stderr how far a command is: one line with a clock at a terminal, otherwise a line where a stage begins."""
 
 import logging
 import math
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
 COMPILING = "compiling, about a minute, the first time only"
 PATIENCE_S = 2.0
-"""Where there is no terminal a command that takes less says nothing of its progress."""
+"""Seconds; without a terminal, a command that takes less says nothing of its progress."""
 BAR_CELLS = 20
 
 _live: ContextVar["Live | None"] = ContextVar("live", default=None)
 
 
 class ProgressLine:
-    """What there is to say of a command now. It may be told and asked on any thread."""
+    """The present progress of a command, as text. It may be told and asked on any thread."""
 
     def __init__(self) -> None:
-        """The clock starts."""
+        """Start the clock."""
         self._begun_s = time.monotonic()
         self._compilers = 0
         self._compiling = False
@@ -40,17 +40,17 @@ class ProgressLine:
         self._compiling = self._compilers > 0
 
     def compiler_began(self) -> None:
-        """Code is being compiled, on some thread."""
+        """Note that code is being compiled, on some thread."""
         self._compilers += 1
         self._compiling = True
 
     def compiler_ended(self) -> None:
-        """That is over; it is called compiling until the next step is told, since there is mostly more."""
+        """Note that a compilation is over; the stage stays 'compiling' until the next step: more usually follows."""
         self._compilers -= 1
 
     @property
     def stage(self) -> str:
-        """What the command is at."""
+        """Name of the stage that the command is at."""
         return COMPILING if self._compiling else self.step.stage
 
     @property
@@ -72,7 +72,7 @@ class ProgressLine:
         return f"{step.part}: {words}" if step.part else words
 
     def __rich__(self) -> "Table":
-        """The same with clock and bar, cut off at the terminal's edge."""
+        """Stage, counts and notes with clock and bar, cut off at the terminal's edge."""
         from rich.progress_bar import ProgressBar
         from rich.table import Table
         from rich.text import Text
@@ -108,7 +108,7 @@ class _Announcer:
         self._timer.cancel()
 
     def changed(self) -> None:
-        """A step was told, or a compiler began."""
+        """Handle a step that was told, or a compilation that began."""
         with self._lock:
             line = self._line
             key = line.step.part if line.step.part and line.stage != COMPILING else line.stage
@@ -124,7 +124,7 @@ class _Announcer:
 
 @contextmanager
 def progress(*, compiles: bool = True) -> Iterator[None]:
-    """Within it stderr says how far the work is. compiles: whether any of it is compiled code."""
+    """Within the context, stderr says how far the work is. compiles: whether any of it is compiled code."""
     line = ProgressLine()
     with ExitStack() as stack:
         if sys.stderr.isatty():
@@ -152,7 +152,7 @@ def progress(*, compiles: bool = True) -> Iterator[None]:
 
 @contextmanager
 def paused() -> Iterator[None]:
-    """Within it no line is drawn, so that a person can be asked something."""
+    """Within the context no line is drawn, so that a person can be asked something."""
     live = _live.get()
     if live is None:
         yield
@@ -166,7 +166,7 @@ def paused() -> Iterator[None]:
 
 @contextmanager
 def _drawn(line: ProgressLine) -> Iterator[None]:
-    """Within it the line stands at the bottom of the terminal, below all else that goes to stderr."""
+    """Within the context the line stands at the bottom of the terminal, below all else that goes to stderr."""
     from rich.console import Console
     from rich.live import Live
 
@@ -189,7 +189,7 @@ def _drawn(line: ProgressLine) -> Iterator[None]:
 
 @contextmanager
 def _watched_compiler(began: Any, ended: Any) -> Iterator[None]:
-    """Within it both are called for each kernel that numba finds in none of its caches."""
+    """Within the context both are called for each kernel that numba finds in none of its caches."""
     from numba.core import event
 
     class Watch(event.Listener):

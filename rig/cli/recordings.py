@@ -1,7 +1,4 @@
-"""Commands for recordings: `rig verify`, `repair`, `info`, `cut`, `compress`.
-
-Commands that take frames from other programs and give runs to them: `rig import`, `rig export`.
-"""
+"""Commands for recordings: `rig verify`, `repair`, `info`, `cut`, `compress`, `import` and `export`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,7 +15,7 @@ if TYPE_CHECKING:
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a recorded run", show_default=False)]
 
 MOST_LINES = 20
-"""Problems shown to people; `--json` has all."""
+"""Most problems that are shown to people; `--json` has all."""
 
 
 def register(app: typer.Typer) -> None:
@@ -62,7 +59,7 @@ def repair_command(run: RunArgument, as_json: JsonOption = False) -> int:
 
 
 def info_command(run: RunArgument, as_json: JsonOption = False) -> int:
-    """What a recording holds."""
+    """Describe what a recording holds."""
     from rig import api
 
     found = api.recording_info(run)
@@ -104,7 +101,7 @@ def cut_command(
 
 
 def compress_command(run: RunArgument, as_json: JsonOption = False) -> int:
-    """Compress a recording with zstd; every command reads it as before."""
+    """Compress a recording with zstd; every command reads it as any other."""
     from rig import api
 
     with progress(compiles=False):
@@ -161,7 +158,7 @@ def _megabytes(size: int) -> str:
 
 
 def register_exchange(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
+    """Add the commands that exchange frames with other programs to `app`."""
     app.command("import")(import_command)
     app.command("export")(export_command)
 
@@ -201,7 +198,7 @@ def import_command(
     ] = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Make a recording of the frames in another program's files."""
+    """Make a recording from the frames in another program's files."""
     from rig import api
 
     with progress(compiles=False):

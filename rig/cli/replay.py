@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from drivers.replay.pace import Pace
 
 _LOOK_S = 0.2
-"""One wait for a key."""
+"""Seconds of one wait for a key."""
 
 
 def register(app: typer.Typer) -> None:
@@ -111,7 +111,7 @@ def replay_command(
 
 
 def _step_by_keys(pace: "Pace") -> None:
-    """A step for each line of the standard input, from a thread; behind its end the rest as fast as may be."""
+    """Make a step for each line of the standard input, on a thread; at its end, play the rest at full speed."""
     if sys.stdin.isatty():
         say("Enter: one sweep more; Ctrl-C ends")
     threading.Thread(target=_follow, args=(pace, sys.stdin.fileno()), name="steps", daemon=True).start()

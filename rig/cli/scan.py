@@ -1,4 +1,4 @@
-"""Commands that make depth maps, and what to expect of a scene: `rig scan`, `reconstruct`, `effects`."""
+"""Commands that make depth maps, and one on what to expect of a scene: `rig scan`, `reconstruct`, `effects`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -137,7 +137,7 @@ def reconstruct_command(
     accept_calibration: AcceptOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Depth from a recording, from imported frames or from a packed .npy cube of them."""
+    """Make depth maps from a recording, from imported frames or from a packed .npy cube of them."""
     from rig import api
 
     # Names that are none are refused by the call, which knows which there are.
@@ -173,7 +173,10 @@ def effects_command(
     ] = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Which physical effects a scene calls for, why, and what each is worth; or the noise-free flux of an image row."""
+    """List which physical effects a scene calls for, why, and what each is worth; or the flux of an image row.
+
+    With --row and --column, print the noise-free flux of that row instead.
+    """
     from rig import api
     from rig.cli.tables import effects_table, flux_table
 

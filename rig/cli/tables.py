@@ -1,11 +1,4 @@
-"""Results for people: a run's pictures, errors and verdict; the effects of a scene.
-
-A trade-off for people: tables of at most 80 characters, the setting to use and where the files are.
-
-The figures of `rig bench` for people, in 100 columns.
-
-The result of a calibration for people at a terminal.
-"""
+"""Results as tables in a terminal: runs, scenes, trade-offs (80 columns), `rig bench` (100 columns), calibrations."""
 
 import sys
 import textwrap
@@ -32,12 +25,12 @@ from rig.tradeoff.rows import TradeoffRow
 from rig.tradeoff.trials import Tradeoff
 
 WIDE = 300
-"""Characters; wider than any line here."""
+"""Characters of a line that goes to a file or a pipe; no line here is as long."""
 
 _NAME_CELLS = 17
-"""Of an effect's name, on each of its lines."""
+"""Characters that an effect's name takes on each of its lines."""
 LEAST_WAIT_S = 1e-3
-"""Shorter waits of the source are not worth words."""
+"""Shortest wait of the source that is mentioned."""
 
 _NEXT_STEP = {
     RunVerdict.GAPS: "frames were lost; lower frame_rate or free the computer, then scan again",
@@ -50,7 +43,7 @@ _NEXT_STEP = {
 
 
 def run_table(result: RunResult) -> None:
-    """Print the table to stdout."""
+    """Print the table of a run to stdout."""
     summary = result.summary
     table = Table.grid(padding=(0, 2))
     table.add_column(style="bold")
@@ -70,7 +63,7 @@ def run_table(result: RunResult) -> None:
 
 
 def _advice(result: RunResult) -> str | None:
-    """What follows from the verdict; of an aborted run what of it is there."""
+    """The next step that the verdict calls for; for an aborted run, how much of it there is."""
     summary = result.summary
     if summary.verdict is not RunVerdict.ABORTED or (summary.maps and result.folder is not None):
         return _NEXT_STEP.get(summary.verdict)
@@ -124,14 +117,14 @@ def _error_change(effect: Effect) -> str:
 
 
 def _of_maps(maps: tuple[int, ...], of: int) -> str:
-    """Which maps a reason is about, where there are several."""
+    """Beginning of a line that names the maps a reason is about, where a run has several."""
     if of == 1:
         return ""
     return f"map {maps[0]}: " if len(maps) == 1 else f"{len(maps)} of {of} maps, the first is {maps[0]}: "
 
 
 def console() -> Console:
-    """Writes to stdout."""
+    """A console that writes to stdout."""
     # Into a file or a pipe nothing is wrapped.
     return Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
 
@@ -212,10 +205,10 @@ def _percent(value: float | None) -> str:
 
 
 WIDTH = 80
-"""Characters; no line here is longer but those that name files."""
+"""Most characters of a line of a trade-off, except lines that name files."""
 
 Column = tuple[str, Callable[[TradeoffRow], str]]
-"""Heading and cell."""
+"""Heading, and the function that gives the cell of a row."""
 
 _SETTING: tuple[Column, ...] = (
     ("estimator", lambda row: row.estimator),
@@ -246,9 +239,9 @@ _LEFT = ("estimator", "filter", "")
 
 
 def tradeoff_table(done: Tradeoff) -> None:
-    """Print it to stdout, the setting to take first.
+    """Print a trade-off to stdout, the setting to take first.
 
-    * marks what lies on the front of error over sensor time, + on that over compute time.
+    * marks rows on the front of error over sensor time, + those on the front over compute time.
     """
     print(textwrap.fill(done.advice, WIDTH))
     print()
@@ -285,7 +278,7 @@ def _print(title: str, columns: Sequence[Column], rows: Sequence[TradeoffRow]) -
 
 
 def _short(value: float | None) -> str:
-    """At most five characters below 100 000, never with an exponent."""
+    """A number of at most five characters below 100 000, never with an exponent."""
     if value is None:
         return "-"
     return f"{value:.{3 if value < 9.9995 else 1 if value < 999.95 else 0}f}"
@@ -296,7 +289,7 @@ def _times(value: float | None) -> str:
 
 
 BENCH_WIDTH = 100
-"""Characters; no line here is longer."""
+"""Most characters of a line of `rig bench`."""
 
 _TITLES = {
     "count": "counting alone, frames of just the window",
@@ -380,7 +373,7 @@ def simulator_table(report: SimulatorReport) -> None:
 
 
 def soak_table(report: SoakReport) -> None:
-    """Print what a soak found to stdout."""
+    """Print the result of a soak to stdout."""
     console = Console(highlight=False, width=BENCH_WIDTH)
     table = Table.grid(padding=(0, 2))
     table.add_column(style="bold")
@@ -458,7 +451,7 @@ class Printable(Protocol):
 
     @property
     def folder(self) -> Path | None:
-        """Where everything was written."""
+        """Folder that everything was written to; None where nothing was."""
         ...
 
     @property
@@ -472,7 +465,7 @@ class Printable(Protocol):
 
 
 def print_result(result: Printable, line: str = "") -> None:
-    """The verdict and its reasons, the one line, the figures and the files, to stdout."""
+    """Print the verdict and its reasons, the one line, the figures and the files to stdout."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style="bold")
     table.add_column()

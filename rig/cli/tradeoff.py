@@ -1,4 +1,4 @@
-"""What accuracy costs in time, and which setting to use: `rig tradeoff`."""
+"""The command that finds what accuracy costs in time, and which setting to use: `rig tradeoff`."""
 
 from typing import Annotated
 
@@ -77,8 +77,7 @@ def tradeoff_command(
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """What accuracy costs in time: error of a simulated rig over sensor time and compute time, and which setting to
-    use."""
+    """Scan a simulated rig with many settings: error over sensor time and compute time, and which setting to use."""
     from rig import api
 
     with progress():

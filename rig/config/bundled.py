@@ -1,4 +1,4 @@
-"""The rigs and scenes that travel with the program: names, files, and what each file says of itself first.
+"""The rigs and scenes that travel with the program: their names, their files, and a sentence on each.
 
 Light to import: shells ask for the names at every Tab.
 """
@@ -11,7 +11,7 @@ from typing import Any
 BUNDLED = Path(__file__).parents[2] / "config"
 """Folder of the configs that travel with the program."""
 SCENES = BUNDLED / "scenes"
-"""Folder of its scenes."""
+"""Folder of the scenes that travel with the program."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class Bundled:
     file: Path
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """Return it as plain values."""
         return {"name": self.name, "about": self.about, "file": str(self.file)}
 
 
@@ -52,5 +52,5 @@ def _bundled(path: Path) -> Bundled:
 
 
 def _is_rig(path: Path) -> bool:
-    """Whether it is a rig's config; boards and calibrations lie in the same folder."""
+    """Whether a file is a rig's config; boards and calibrations lie in the same folder."""
     return re.search(r"^scan:", path.read_text(encoding="utf-8"), re.MULTILINE) is not None

@@ -1,4 +1,4 @@
-"""Fills a YAML file's text in: what it leaves out is added where it belongs, all that is written stays as it is."""
+"""Fills in the text of a YAML file: what it leaves out is added where it belongs, what is written stays as it is."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import yaml
 
 MOST_COLUMNS = 110
-"""A line that is filled in goes on in the next one from here on."""
+"""Column from which on a line that is filled in continues on the next one."""
 
 
 class _Edit(NamedTuple):
-    """Text from `begin` to before `end`, and what takes its place."""
+    """A replacement: the text from `begin` to before `end`, and what takes its place."""
 
     begin: int
     end: int
@@ -18,9 +18,9 @@ class _Edit(NamedTuple):
 
 
 def completed(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full: Mapping[str, Any]) -> str:
-    """The text with other values where `values` has others than it, and with the keys of `full` that it has not.
+    """Give the text the values of `values` where it has others, and add the keys of `full` that it lacks.
 
-    node: of the text. values: has the text's keys.
+    node: parsed node of the text. values: has the text's keys.
     """
     done, at = [], 0
     for edit in sorted(_edits(text, node, values, full), key=lambda edit: edit.begin):
@@ -30,7 +30,7 @@ def completed(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full
 
 
 def _edits(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full: Mapping[str, Any]) -> Iterator[_Edit]:
-    """What is to be changed; of several places that are the same, the inner one first."""
+    """Replacements for the text; where several begin at one place, the inner one comes first."""
     for key, value in node.value:
         given = values.get(key.value)
         if isinstance(value, yaml.MappingNode) and isinstance(given, Mapping):

@@ -1,6 +1,6 @@
-"""Finds and reads config files: bundled ones by name, others by path, options laid over them, all problems at once.
+"""Finds and reads config files: bundled ones by name, others by path, with options laid over them.
 
-What is particular to a rig's config when it is checked: options that stand for keys, kinds that slots name.
+All problems are listed at once, each by the name under which the user gave the value: a key of the file or an option.
 """
 
 import copy
@@ -33,7 +33,7 @@ FLAGS: Mapping[Key, str] = {
     ("estimate", "temporal_prior"): "--temporal-prior",
     ("estimate", "threads"): "--threads",
 }
-"""Keys that the command line has an option for."""
+"""Keys that the command line has an option for, with that option."""
 
 
 def kind_of(slot: str, content: Any) -> type[BaseModel] | None:
@@ -54,20 +54,20 @@ _OTHERS = {
     FORMAT: "a calibration",
     CAMERA_FORMAT: "the calibration of a camera alone",
 }
-"""Files of ours that are taken for others, by their `format`."""
+"""Other files of this program that are taken for configs, by their `format`."""
 _CONFIG = ("a config", "scan: {columns: 500}")
 MAX_PATH = 1000
-"""Longer text is no path, characters."""
+"""Characters; longer text is no path."""
 SCENE = ("world", "scene")
-"""A path, or a bundled scene's name."""
+"""Key of the scene: a path, or a bundled scene's name."""
 NO_CONFIG = "no config"
-"""Begins what is said of a name that means none."""
+"""Beginning of the message about a name that means no config."""
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
 def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, object] | None = None) -> RigConfig:
-    """The rig config of a bundled name ("simulated") or a file, with `overrides` laid over it.
+    """Load the rig config of a bundled name ("simulated") or a file, with `overrides` laid over it.
 
     overrides: value by dotted key, e.g. {"scan.exposures": 4, "world.scene": "street"}; None values are skipped. Paths
     in the file are relative to its folder, those in overrides to the working directory. Raises UsageError with one line
@@ -86,7 +86,7 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
 
 
 def load_cube_plan(path: str | Path) -> CubePlan:
-    """The `plan.yaml` of a bare cube. Raises UsageError with one line per problem."""
+    """Load the `plan.yaml` of a bare cube. Raises UsageError with one line per problem."""
     read = _read(Path(path), "a plan", "columns: 500")
     leave = "leave --plan out; " if read.content.get("format") == PLAN_FORMAT else ""
     _refuse_others(path, read.content, f"{leave}the plan of frames alone has {', '.join(CubePlan.model_fields)}")
@@ -94,10 +94,10 @@ def load_cube_plan(path: str | Path) -> CubePlan:
 
 
 def completed_text(name_or_path: str | Path) -> str:
-    """A config as it is written, its comments with it, with every default filled in and every path absolute.
+    """The text of a config, its comments included, with every default filled in and every path absolute.
 
-    What it says is the same in a file of any folder. Where aliases or the like leave no place to fill defaults in, it
-    is written anew without comments. Raises UsageError as `load_config`.
+    It means the same in a file of any folder. Where aliases or the like leave no place to fill defaults in, the text is
+    made anew without comments. Raises UsageError as `load_config` does.
     """
     path = find_config(name_or_path)
     read = read_config(path)
@@ -117,7 +117,7 @@ def completed_text(name_or_path: str | Path) -> str:
 
 
 def config_content(text: str) -> dict[str, Any]:
-    """The keys and values of a config's text. Raises UsageError."""
+    """The keys and values of a config's text. Raises UsageError where it is not one."""
     try:
         return parse_yaml(text, *_CONFIG, "config").content
     except FileError as error:
@@ -125,9 +125,9 @@ def config_content(text: str) -> dict[str, Any]:
 
 
 def parse_config(content: Mapping[str, object], folder: Path | None = None, options: Iterable[str] = ()) -> RigConfig:
-    """A config from a mapping, such as a notebook's or a manifest's. Raises UsageError with one line per problem.
+    """Validate a config from a mapping, such as a notebook's or a manifest's. UsageError with one line per problem.
 
-    options: dotted keys whose values were given as options, for these problems.
+    options: dotted keys whose values were given as options, so that problems name the options.
     """
     return _validated(RigConfig, dict(content), ValueSources("config", options=_keys(options), flags=FLAGS), folder)
 
@@ -155,7 +155,7 @@ def bundled_configs() -> tuple[str, ...]:
 
 
 def find_config(name_or_path: str | Path) -> Path:
-    """The file that a name or path means. Raises UsageError where there is none."""
+    """Find the file that a name or path means. Raises UsageError where there is none."""
     path = Path(name_or_path)
     if os.path.isfile(path):  # unlike Path.is_file, it takes any text for a name
         return path
@@ -196,7 +196,7 @@ def config_schema() -> dict[str, Any]:
 
 
 def read_config(path: Path) -> YamlFile:
-    """A config file as it is written. Raises UsageError; a key given twice is one."""
+    """Read a config file without filling anything in. Raises UsageError, for a key given twice as well."""
     return _read(path, *_CONFIG)
 
 
@@ -208,7 +208,7 @@ def _read(path: Path, what: str, example: str) -> YamlFile:
 
 
 def _refuse_others(path: str | Path, content: Mapping[str, Any], then: str) -> None:
-    """UsageError for a file of ours that is neither a config nor the plan of a cube; then: the next step."""
+    """Raise UsageError for a file of this program that is no config and no plan of a cube. then: the next step."""
     if (what := _OTHERS.get(str(content.get("format")))) is not None:
         raise UsageError(f"{path} is {what}; {then}")
 
@@ -246,7 +246,7 @@ def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
 
 
 def _absolute(path: Path) -> str:
-    """Without '..'; what is itself a link stays, as those of /dev/serial/by-id/ must."""
+    """Make a path absolute and free of '..'; a link itself is not followed: /dev/serial/by-id/ has stable names."""
     return str(path.parent.resolve() / path.name)
 
 

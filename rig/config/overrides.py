@@ -28,10 +28,14 @@ def configure(
     min_confidence: float | None = None,
     temporal_prior: bool | None = None,
 ) -> RigConfig:
-    """The validated config that `scan` would use; options that are None stay as the config says.
+    """Load and validate the config that `scan` would use; options that are None stay as the config says.
 
-    config: a bundled rig's name, a file or a RigConfig. fog: in place of the scene's, a visibility such as '20 m', or
-    'clear'. temporal_prior: `joint` holds each map to the last one a little.
+    config: the name of a bundled rig, a file or a RigConfig.
+    scene: of a simulated rig, a bundled name or a path.
+    fog: in place of the scene's, a visibility such as '20 m', or 'clear'.
+    exposures: frames per column.
+    estimator, filter, min_confidence: as in the config's `estimate`.
+    temporal_prior: have `joint` hold each map to the last one a little.
     Raises UsageError with one line per problem.
     """
     options: dict[str, object | None] = {
@@ -56,7 +60,7 @@ def configure(
 
 
 def seed_problems(seed: int) -> list[str]:
-    """What is wrong with a seed."""
+    """Problems with a seed; empty where it is usable."""
     if 0 <= seed <= MAX_SEED:
         return []
     return [f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})"]

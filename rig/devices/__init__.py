@@ -1,3 +1,5 @@
-"""The devices of a rig as a whole: opened and closed together, checked, looked at in the dark, matched with a
-calibration.
+"""The devices of a rig as a whole: open and close them together, check them, and match them with a calibration.
+
+`open` opens them, `calibration_use` compares a calibration with them, `dark_look` runs a sweep without light, and
+`doctor` reports whether a scan could run.
 """

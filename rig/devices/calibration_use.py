@@ -1,19 +1,13 @@
-"""Whether a calibration is that of this rig, and still good: what scan, replay and reconstruct ask before they use one.
+"""Decides whether a calibration may be used: whether it is of this rig, passed its checks, and is not too old.
 
 A calibration that was estimated says of which devices it is, when it was made and with what verdict
 (`calibration.Identity`); one written by hand says nothing, and is used unchecked. What depth depends on is compared:
-kinds and serial numbers of sensor and scanner, how they are mounted, the laser lines; of a simulated rig, its
-geometry. Settings of a scan are not. A recording is compared with the devices that it was taken with, at the date on
-which it was taken.
+kinds and serial numbers of sensor and scanner, how they are mounted, the laser lines; of a simulated rig, its geometry.
+Settings of a scan are not. A recording is compared with the devices that it was taken with, at the date on which it was
+taken.
 
-A check that fails later is noted in a file beside the calibration (`rig.devices.calibration_use`), which itself stays
-as it is.
-
-Why a calibration is not to be used, said in a line each, or that it was accepted all the same.
-
-Of a rig's calibration (`rig.devices.calibration_use`), and of the file of a camera alone (`calibrating.camera_use`).
-
-How later checks of a calibration ended, noted in a file beside it: the calibration itself stays as it is.
+Each reason against a calibration is a `Refusal`, which the user may accept. A check that fails later is noted in a file
+beside the calibration (`note_check`, `notes_on`); the calibration itself stays as it is.
 """
 
 import hashlib
@@ -37,84 +31,17 @@ NEXT: Final = "calibrate again, or add --accept-calibration to use it all the sa
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a calibration is not to be used. code: other-spad, other-scanner, other-world, other-lines, failed-verdict,
-    failed-check or too-old."""
+    """One reason not to use a calibration, for a rig or for a camera alone.
+
+    code: other-spad, other-scanner, other-world, other-lines, failed-verdict, failed-check or too-old.
+    """
 
     code: str
     text: str
 
     def __str__(self) -> str:
-        """One line, as summaries have it."""
+        """The reason in one line, as summaries have it."""
         return f"{self.code}: {self.text}"
-
-
-def failed_verdict(verdict: str | None, reasons: Sequence[str]) -> list[Refusal]:
-    """What a calibration's own verdict says against it: nothing where it passed, or where nobody judged it (None)."""
-    if verdict != "failed":
-        return []
-    why = ", ".join(reasons) or "no reason noted"
-    return [Refusal("failed-verdict", f"its verdict is 'failed' ({why}), 'passed' is needed")]
-
-
-def require_accepted(name: str, found: Sequence[Refusal], accepted: Container[str]) -> None:
-    """UsageError, a line for each reason whose code is not among the accepted. name: of what, for these lines."""
-    if refused := [each for each in found if each.code not in accepted]:
-        raise UsageError.of(f"{name}: {each.text}; {NEXT}" for each in refused)
-
-
-def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
-    """How the check ended, for a manifest: `checked`, or 'accepted' and in spite of what."""
-    if not accepted:
-        return {"check": checked}
-    return {"check": "accepted", "accepted": [[each.code, each.text] for each in accepted]}
-
-
-def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons: tuple[str, ...] = ()) -> Path:
-    """Note beside a calibration file how a check of it ended; `what`: check or pixels. Raises OSError."""
-    beside = _beside(file)
-    notes = _read_notes(beside)
-    date = datetime.now(UTC).isoformat(timespec="seconds")
-    notes[what] = {"calibration": model.fingerprint(), "date": date, "passed": passed, "reasons": list(reasons)}
-    scratch = beside.with_name(f".{beside.name}.part")
-    scratch.write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
-    scratch.replace(beside)
-    return beside
-
-
-def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:
-    """Have what failed on a calibration speak against the one that was made from it. Raises OSError.
-
-    new_pixels: what was said of the old ones is no longer so.
-    """
-    failed = {what: note for what, note in notes_on(old, before).items() if not note.get("passed", True)}
-    if new_pixels:
-        failed.pop("pixels", None)
-    for what, note in failed.items():
-        note_check(new, after, what, passed=False, reasons=tuple(note.get("reasons") or ()))
-
-
-def _beside(file: Path) -> Path:
-    return file.with_name(f"{file.stem}-checks.json")
-
-
-def notes_on(file: Path | None, model: RigModel) -> dict[str, dict[str, Any]]:
-    """Notes on this very calibration, by what was checked; none where there is no file."""
-    if file is None:
-        return {}
-    notes = _read_notes(_beside(file))
-    return {what: note for what, note in notes.items() if note.get("calibration") == model.fingerprint()}
-
-
-def _read_notes(file: Path) -> dict[str, dict[str, Any]]:
-    try:
-        notes = parse_json(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{file} cannot be read ({error}); remove it and check the calibration again") from error
-    if not isinstance(notes, dict) or not all(isinstance(note, dict) for note in notes.values()):
-        raise UsageError(f"{file} holds no notes on a calibration; remove it and check the calibration again")
-    return notes
 
 
 DAY_S: Final = 86400.0
@@ -122,7 +49,7 @@ _SLOTS: Final = ("spad", "scanner")
 """Devices that depth depends on: laser and sync source only let the light out."""
 _NO_SERIAL: Final = ("", "none")
 _GEOMETRY: Final = "geometry"
-"""What a simulated rig really is like, by its numbers; `world` is the name of its file, which says less."""
+"""Key of a simulated rig's true geometry, by its numbers; `world` is the name of its file, which says less."""
 _CHECKS: Final = {"check": "rig calibrate check", "pixels": "rig calibrate pixels"}
 
 
@@ -137,14 +64,14 @@ class KnowsRig(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CalibrationUse:
-    """The calibration of a run. checked: whether it says of which rig it is. accepted: what it was used in spite of."""
+    """The calibration of a run. checked: it says of which rig it is. accepted: reasons in spite of which it is used."""
 
     model: RigModel
     checked: bool
     accepted: tuple[Refusal, ...] = ()
 
     def content(self) -> dict[str, Any]:
-        """For the manifest."""
+        """Describe it for the manifest."""
         return {
             "id": self.model.fingerprint(),
             "provenance": dict(self.model.provenance),
@@ -153,7 +80,10 @@ class CalibrationUse:
 
 
 def identity_of(rig: OpenRig, created: datetime | None = None) -> Identity:
-    """Of an open rig, for a calibration of it that is made now. A rig that plays a recording is the one recorded."""
+    """Identity of an open rig, for a calibration of it that is made now.
+
+    A rig that plays a recording has the identity of the rig that was recorded.
+    """
     if isinstance(rig.spad, PlaysRecording):
         return recorded_identity(rig.spad.recording.path)
     config, info = rig.config, rig.spad.info
@@ -173,20 +103,20 @@ def identity_of(rig: OpenRig, created: datetime | None = None) -> Identity:
 
 
 def recorded_identity(run: Path) -> Identity:
-    """Of the rig that a recording was taken with, `created` when it was taken; as far as its manifest says."""
+    """Identity of the rig that a recording was taken with, as far as its manifest says; `created` is that date."""
     noted = (read_manifest(run) or {}).get("rig") or {}
     kinds, serials = noted.get("kinds") or {}, noted.get("serials") or {}
     return _identity(str(noted.get("name", "")), kinds, serials, str(noted.get("taken", "")))
 
 
 def same_rig(one: Identity, other: Identity) -> bool:
-    """Whether views of these two are of one rig."""
+    """Whether views with these two identities are of one rig."""
     kinds, others = _comparable(one, other)
     return kinds == others and one.serials == other.serials
 
 
 def rig_content(identity: Identity) -> dict[str, Any]:
-    """Of which rig a run is, for its manifest; `recorded_identity` reads it."""
+    """Describe the rig of a run for its manifest; `recorded_identity` reads it."""
     return {
         "name": identity.name,
         "id": identity.rig,
@@ -199,8 +129,8 @@ def rig_content(identity: Identity) -> dict[str, Any]:
 def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None = None) -> CalibrationUse | None:
     """The calibration of an open rig, compared with it; None where it has none. UsageError, a line for each reason.
 
-    accept: use it in spite of them. here: of the rig, where the caller has it. What a recording's own calibration was
-    accepted in spite of when it was taken stays accepted.
+    accept: use it in spite of the reasons. here: identity of the rig, where the caller has it. Reasons that were
+    accepted when a recording was taken stay accepted for the recording's own calibration.
     """
     if rig.model is None:
         return None
@@ -219,7 +149,7 @@ def cube_calibration_use(model: RigModel, file: Path | None, *, accept: bool = F
 def refusals(
     model: RigModel, file: Path | None, here: Identity | None, max_age_s: float | None = None
 ) -> tuple[Refusal, ...]:
-    """What speaks against a calibration for the rig `here` at the time `here.created`; None: an unknown rig."""
+    """Reasons against a calibration for the rig `here` at the time `here.created`; None is a rig that is not known."""
     found: list[Refusal] = []
     identity = model.identity
     if identity is not None:
@@ -247,7 +177,7 @@ def _used(model: RigModel, file: Path | None, found: tuple[Refusal, ...], accept
 
 
 def _foreign(made: Identity, here: Identity) -> list[Refusal]:
-    """Parts that both know and that differ."""
+    """Reasons for each part that both identities name and that differs."""
     of = f" of the rig '{made.name}'" if made.name else ""
     found = []
     for what, ours, theirs in (("", *_comparable(made, here)), (" serial number", made.serials, here.serials)):
@@ -258,7 +188,7 @@ def _foreign(made: Identity, here: Identity) -> list[Refusal]:
 
 
 def _comparable(made: Identity, here: Identity) -> tuple[dict[str, str], dict[str, str]]:
-    """Kinds of both; simulated worlds by their geometry, or by its file's name where one knows no more, as of old."""
+    """Kinds of both; simulated worlds by their geometry, or by the file's name where one of the two has no geometry."""
     both = dict(made.kinds), dict(here.kinds)
     digests = [kinds.pop(_GEOMETRY, "") for kinds in both]
     if all(digests):
@@ -280,7 +210,7 @@ def _aged(made: Identity, here: Identity, max_age_s: float | None) -> list[Refus
 
 
 def _span(time_s: float) -> str:
-    """In the largest unit that the config takes and of which there is one."""
+    """A time in the largest unit of the config of which it has at least one."""
     units = (("days", DAY_S), ("hours", 3600.0))
     unit, size = next((of for of in units if time_s >= of[1]), ("seconds", 1.0))
     return f"{time_s / size:.4g} {unit}"
@@ -295,7 +225,7 @@ def _date(text: str) -> datetime | None:
 
 
 def _accepted_before(rig: OpenRig) -> frozenset[str]:
-    """Codes of what a recording's own calibration was accepted in spite of."""
+    """Codes of the reasons that were accepted for a recording's own calibration when it was taken."""
     assert isinstance(rig.spad, PlaysRecording)
     run = rig.spad.recording.path
     if rig.config.calibration is None or rig.config.calibration.resolve() != (run / CALIBRATION_FILE).resolve():
@@ -305,5 +235,74 @@ def _accepted_before(rig: OpenRig) -> frozenset[str]:
 
 
 def accepted_by(use: CalibrationUse | None) -> tuple[str, ...]:
-    """What a run's calibration was used in spite of, for its summary."""
+    """The reasons in spite of which a run's calibration was used, for its summary."""
     return () if use is None else tuple(map(str, use.accepted))
+
+
+def failed_verdict(verdict: str | None, reasons: Sequence[str]) -> list[Refusal]:
+    """The reason that a calibration's own verdict gives: none where it passed, or where nobody judged it (None)."""
+    if verdict != "failed":
+        return []
+    why = ", ".join(reasons) or "no reason noted"
+    return [Refusal("failed-verdict", f"its verdict is 'failed' ({why}), 'passed' is needed")]
+
+
+def require_accepted(name: str, found: Sequence[Refusal], accepted: Container[str]) -> None:
+    """Raise UsageError with a line for each reason whose code is not accepted; each line begins with `name`."""
+    if refused := [each for each in found if each.code not in accepted]:
+        raise UsageError.of(f"{name}: {each.text}; {NEXT}" for each in refused)
+
+
+def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
+    """Describe for a manifest how the comparison ended: `checked`, or 'accepted' with the reasons accepted."""
+    if not accepted:
+        return {"check": checked}
+    return {"check": "accepted", "accepted": [[each.code, each.text] for each in accepted]}
+
+
+def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons: tuple[str, ...] = ()) -> Path:
+    """Note beside a calibration file how a check of it ended; `what`: check or pixels. Raises OSError."""
+    beside = _beside(file)
+    notes = _read_notes(beside)
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    notes[what] = {"calibration": model.fingerprint(), "date": date, "passed": passed, "reasons": list(reasons)}
+    scratch = beside.with_name(f".{beside.name}.part")
+    scratch.write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
+    scratch.replace(beside)
+    return beside
+
+
+def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:
+    """Copy the notes on failed checks from a calibration to the one that was made from it. Raises OSError.
+
+    new_pixels: the new one has pixels of its own, so that notes on the old ones do not apply.
+    """
+    failed = {what: note for what, note in notes_on(old, before).items() if not note.get("passed", True)}
+    if new_pixels:
+        failed.pop("pixels", None)
+    for what, note in failed.items():
+        note_check(new, after, what, passed=False, reasons=tuple(note.get("reasons") or ()))
+
+
+def _beside(file: Path) -> Path:
+    return file.with_name(f"{file.stem}-checks.json")
+
+
+def notes_on(file: Path | None, model: RigModel) -> dict[str, dict[str, Any]]:
+    """Notes on this very calibration, by the name of the check; empty where there is no file."""
+    if file is None:
+        return {}
+    notes = _read_notes(_beside(file))
+    return {what: note for what, note in notes.items() if note.get("calibration") == model.fingerprint()}
+
+
+def _read_notes(file: Path) -> dict[str, dict[str, Any]]:
+    try:
+        notes = parse_json(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{file} cannot be read ({error}); remove it and check the calibration again") from error
+    if not isinstance(notes, dict) or not all(isinstance(note, dict) for note in notes.values()):
+        raise UsageError(f"{file} holds no notes on a calibration; remove it and check the calibration again")
+    return notes

@@ -19,7 +19,7 @@ LOOK_S = 30.0
 """Longest look at the stream."""
 FILL_S = 5.0
 DARK_PROGRAM = (Pulse(0, None), Pulse(0, 1e-3))
-"""Ends once it was triggered; all outputs low throughout."""
+"""Program that ends once it was triggered; all outputs stay low throughout."""
 _LEAST_LINES = 3
 
 
@@ -33,14 +33,18 @@ class LineMarkers:
 
     @property
     def clock_fits(self) -> bool:
-        """Whether that is a crystal's error, and not markers that are missing or another's."""
+        """Whether the clock error is that of a crystal; a larger one means missing or foreign markers."""
         return abs(self.clock_error) <= MAX_CLOCK_ERROR
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DarkLook:
-    """What was seen. records (n,): of all frames; dark_share: of ones; n_bytes, seconds: of pixels, and to send them;
-    counters: the SPAD's own, before it was stopped; triggered: the sync source's program ran to its end."""
+    """Frames of a sweep with the gate low, and what came with them.
+
+    records: (n,), records of all frames. dark_share: share of ones. n_bytes: bytes of pixels; seconds: time to send
+      them.
+    counters: the SPAD's own, before it was stopped. triggered: the sync source's program ran to its end.
+    """
 
     records: NDArray[np.void]
     dark_share: float
@@ -51,16 +55,16 @@ class DarkLook:
 
     @property
     def scans(self) -> int:
-        """Scan markers."""
+        """Number of scan markers."""
         return _count(self.records, Mark.SCAN)
 
     @property
     def line_markers(self) -> int:
-        """Line markers, of all sweeps and parts of them."""
+        """Number of line markers, of all sweeps and parts of sweeps."""
         return _count(self.records, Mark.LINE)
 
     def lines(self, plan: ScanPlan) -> LineMarkers | None:
-        """Those behind the first scan marker, as far as they were seen; None: too few."""
+        """The line markers behind the first scan marker, as far as they were seen; None where there are too few."""
         marks = self.records["marks"].astype(np.int64)
         scans, at = (np.flatnonzero(marks & int(mark)) for mark in (Mark.SCAN, Mark.LINE))
         planned_s = np.flatnonzero(plan.waveform.markers & MARKER_LINE) / float(plan.point_rate_hz)
@@ -78,7 +82,7 @@ class DarkLook:
 
 
 def look(rig: OpenRig, plan: ScanPlan, stride: int) -> DarkLook:
-    """Run the scanner for a sweep with the gate low. DeviceError."""
+    """Run the scanner for a sweep with the gate low. Raises DeviceError."""
     rig.scanner.load(plan.waveform, plan.scanner_repeats(1))
     rig.sync.program(DARK_PROGRAM, 1)
     if rig.guard is not None:  # frames may come late here: nothing can shine

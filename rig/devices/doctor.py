@@ -1,8 +1,7 @@
-"""Could a scan run? Opens everything, looks at frames with the gate low, and says what was found (`rig doctor`).
+"""Examines whether a scan could run (`rig doctor`), lists attached devices, and switches the laser off.
 
-The mirror moves, as in a scan; no light leaves: the gate is low throughout and the laser is never armed.
-
-What is attached to this computer, and the laser's way to safety without a scan.
+`examine` opens everything and looks at frames. The mirror moves, as in a scan; no light leaves: the gate is low
+throughout and the laser is never armed.
 """
 
 import os
@@ -39,19 +38,19 @@ LEAST_FREE_BYTES = 2**30
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at. ok: False where a scan could not run like this."""
+    """Result of one examination. ok: False where a scan could not run like this."""
 
     name: str
     ok: bool
     text: str
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """Return it as plain values."""
         return asdict(self)
 
 
 def examine(config: RigConfig, folder: Path) -> list[Finding]:
-    """Look at everything; folder: where a scan would write. Raises nothing that a device can do wrong."""
+    """Examine everything. folder: where a scan would write. A device's fault becomes a finding and is not raised."""
     findings: list[Finding] = []
     try:
         with open_rig(config) as rig:
@@ -109,7 +108,7 @@ def _laser(rig: OpenRig) -> Finding:
 
 
 def _calibration(rig: OpenRig) -> Finding:
-    """A rig without one can scan: there are stripes then, and no depth."""
+    """Finding on the calibration. A rig without one can scan: there are stripes then, and no depth."""
     file, model = rig.config.calibration, rig.model
     if model is None:
         return Finding("calibration", True, "none: a scan gives stripes but no depth")
@@ -122,7 +121,7 @@ def _calibration(rig: OpenRig) -> Finding:
 
 
 def _plan(plan: ScanPlan) -> Finding:
-    """A plan that the link cannot carry is refused before it comes here."""
+    """Finding on the plan; one that the link cannot carry is refused before it comes here."""
     link = f"{plan.bytes_per_s / 1e6:.0f} MB/s"
     if plan.readout_bytes_per_s is not None:
         link = f"read out at {plan.readout_bytes_per_s / 1e6:.0f} MB/s"
@@ -176,7 +175,7 @@ def _memory(rig: OpenRig) -> list[Finding]:
 
 
 def _disk(folder: Path) -> Finding:
-    """Free space, and how fast a file is written there."""
+    """Finding on the disk: free space, and how fast a file is written there."""
     here = folder.resolve()
     while not here.exists():
         here = here.parent
@@ -202,19 +201,22 @@ KNOWN = (("helios", HELIOS), ("lasercube", LASERCUBE), *(("spb-usb", one) for on
 
 @dataclass(frozen=True, slots=True)
 class Attached:
-    """One device. address: what a config's `port` says to mean it; kind: its driver's, None: a port that may be any."""
+    """One attached device.
+
+    address: what a config's `port` says to mean it. kind: kind of its driver; None for a serial port of any kind.
+    """
 
     address: str
     what: str
     kind: str | None
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """Return it as plain values."""
         return asdict(self)
 
 
 def attached() -> list[Attached]:
-    """USB devices that a driver knows, then serial ports. Opens nothing."""
+    """List USB devices that a driver knows, then serial ports. Opens nothing."""
     found = [
         Attached(one.address, f"{kind}: {one.product_name or wanted.label}", kind)
         for kind, wanted in KNOWN
@@ -227,7 +229,10 @@ def attached() -> list[Attached]:
 
 
 def laser_off(config: RigConfig) -> list[str]:
-    """Gate low, emission off; says what was done. Each is tried whatever the other did: DevicesError names failures."""
+    """Take the gate low and switch emission off; return what was done.
+
+    Both are tried, whatever the other did; DevicesError names the failures.
+    """
     done: list[str] = []
     trouble: list[str] = []
     with open_light(config, trouble) as (sync, laser):

@@ -1,8 +1,8 @@
 """Opens all devices of a rig together, lists every failure at once, and closes them gate first, whatever happens.
 
-Who may let light out: a real laser or gate needs the user's word, a simulated one none.
-
-A burst: what of a SPAD's memory goes to the time until the scanner has started, and whether the rest holds a map.
+`open_rig` does it and `prepare` compiles the plan of a scan. Here is also who may let light out (a real laser or gate
+needs the user's word, a simulated one none), and how a burst shares a SPAD's memory between the time until the scanner
+has started and the maps.
 """
 
 import logging
@@ -40,7 +40,7 @@ GUARDED = ("laser", "sync")
 DEVICES = ("spad", "scanner", "laser", "sync")
 """Slots of devices, in the order in which they are opened."""
 HOLD_EXPOSURES = 10
-"""From so many frames per column on, simulated light is held within columns; with fewer, within parts of them."""
+"""Exposures per column from which simulated light is held within columns; with fewer, within parts of columns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class OpenRig:
     sync: SyncSource
     model: RigModel | None
     guard: Guard | None = None
-    """What owns the ports of a real laser and its gate."""
+    """The process that owns the ports of a real laser and its gate."""
 
 
 @runtime_checkable
@@ -92,7 +92,7 @@ class EmulatesDevices(Protocol):
 
     @property
     def ports(self) -> Mapping[str, Endpoint]:
-        """Where they are, by the names that `port: emulated:NAME` means."""
+        """Endpoints of the devices, by the names that `port: emulated:NAME` means."""
         ...
 
     def close(self) -> None:
@@ -106,8 +106,9 @@ def open_rig(
 ) -> Iterator[OpenRig]:
     """Open every device of the config; on exit the sync source is closed first, then laser, scanner and SPAD.
 
-    clock: by default virtual time for a simulated rig and the host's for a real one. seed: of everything simulated.
-    tap: records what passes the ports of all devices, of the SPAD's its control traffic.
+    clock: None is virtual time for a simulated rig and the host's for a real one.
+    seed: of everything simulated.
+    tap: file that records what passes the ports of all devices; of the SPAD, its control traffic.
     Raises UsageError where config or calibration are at fault, DevicesError where devices are; each lists all problems.
     """
     with ExitStack() as stack:
@@ -116,7 +117,7 @@ def open_rig(
 
 @contextmanager
 def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
-    """The gate and the laser alone, directly; None where one cannot be opened, which `trouble` then says."""
+    """Open the gate and the laser alone, without a guard; None, with a line in `trouble`, for one that fails."""
     with ExitStack() as stack:
         surroundings = _surroundings(config, None, 0, stack)
         opened: dict[str, Any] = {"sync": None, "laser": None}
@@ -149,9 +150,10 @@ def check_files(config: RigConfig) -> None:
 def prepare(
     rig: OpenRig, scan: ScanConfig | None = None, windows: ColumnWindows | None = None
 ) -> tuple[ScanPlan, SpadTiming]:
-    """Configure the SPAD and compile the plan; nothing moves and nothing lights. scan: the config's by default.
+    """Configure the SPAD and compile the plan; nothing moves and no light leaves.
 
-    windows: of the columns where the scan is a part of another one, which has been prepared before; None: it is not.
+    scan: None is the config's. windows: windows of the columns where the scan is a part of another one that was
+    prepared before; None where it is not.
     """
     scan = rig.config.scan if scan is None else scan
     if isinstance(rig.spad, PlaysRecording):  # what was scanned is bound by the plan that it was scanned with
@@ -209,7 +211,7 @@ def _open(config: RigConfig, clock: Clock | None, seed: int, tap: TapFile | None
 def _create_surroundings(
     config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack, problems: list[str]
 ) -> Surroundings | None:
-    """Clock and world; None where there is no world, which `problems` then says."""
+    """Clock and world; None where the world cannot be made, with lines in `problems`."""
     try:
         return _surroundings(config, clock, seed, stack)
     except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
@@ -218,7 +220,7 @@ def _create_surroundings(
 
 
 def _surroundings(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -> Surroundings:
-    """Clock and world of the config, with the devices that the world plugs in. DeviceError where there is no world."""
+    """Clock and world of the config, with the devices that the world plugs in. DeviceError where it cannot be made."""
     virtual = config.world is not None and not config.world.real_time
     clock = clock or (VirtualClock() if virtual else SystemClock())
     bare = Surroundings(clock, None, seed)
@@ -235,7 +237,7 @@ def _surroundings(config: RigConfig, clock: Clock | None, seed: int, stack: Exit
 
 
 def _tapped(surroundings: Surroundings, slot: str, file: TapFile | None, stack: ExitStack) -> Surroundings:
-    """With a tap for the device of a slot, where its traffic is recorded; it is written once the device is closed."""
+    """Surroundings with a tap for a slot's device, where traffic is recorded; written once the device is closed."""
     if file is None:
         return surroundings
     tap = file.tap(slot)
@@ -244,7 +246,7 @@ def _tapped(surroundings: Surroundings, slot: str, file: TapFile | None, stack: 
 
 
 def _guard_of(config: RigConfig, ports: Mapping[str, Endpoint], tap: TapFile | None, stack: ExitStack) -> Guard | None:
-    """The guard of a laser and a gate that are not simulated, at work until the rig is closed; None: there are none."""
+    """The guard of a laser and a gate that are not simulated, at work until the rig is closed; None without such."""
     guarded = {slot: kind for slot in GUARDED if (kind := getattr(config, slot)).real_time}
     return stack.enter_context(Guard(**guarded, ports=ports, tap=tap)) if guarded else None
 
@@ -277,7 +279,7 @@ def _load_model(config: RigConfig, problems: list[str]) -> RigModel | None:
 
 
 def _pause_if_emitting(laser: LineLaser) -> list[str]:
-    """A laser that emits before anybody armed it is paused, and the scan refused: somebody else is using it."""
+    """Pause a laser that emits before anybody armed it, and refuse the scan: somebody else is using it."""
     try:
         if not laser.status.emission:
             return []
@@ -302,12 +304,16 @@ def _made_here(device: KindConfig) -> bool:
 
 
 BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
-"""Time between the SPAD's start and the first scan marker that a burst must have room for, on virtual time and where a
-host starts one device after the other over USB and serial ports."""
+"""Seconds between the SPAD's start and the first scan marker that a burst must have room for.
+
+The first is for virtual time, the second for a host that starts one device after the other over USB and serial ports.
+"""
 
 SPARE_LEAD_S = 0.35
-"""More of it where the memory has it and reading ends with the last scan marker: a host that has much else to do starts
-its devices late."""
+"""Further seconds before the first marker, where the memory has room and reading ends with the last scan marker.
+
+A busy host starts its devices late.
+"""
 
 
 def lead_s(rig: OpenRig) -> float:
@@ -316,12 +322,12 @@ def lead_s(rig: OpenRig) -> float:
 
 
 def spare_lead_s(rig: OpenRig) -> float:
-    """More seconds, which a burst may have room for."""
+    """Further seconds before the first marker that a burst may have room for."""
     return 0.0 if isinstance(rig.clock, VirtualClock) or not rig.spad.info.markers else SPARE_LEAD_S
 
 
 def most_sweeps(rig: OpenRig, plan: ScanPlan) -> int | None:
-    """Sweeps of one start: as many as the SPAD's memory holds in a burst and the sync source's program; None: any.
+    """The most sweeps of one start that fit a burst's memory and the sync source's program; None: any number.
 
     At least 1, which either may still refuse.
     """
@@ -335,7 +341,7 @@ def most_sweeps(rig: OpenRig, plan: ScanPlan) -> int | None:
 
 
 def require_memory(rig: OpenRig, plan: ScanPlan) -> None:
-    """PlanError where the SPAD's memory would be full before one map is whole."""
+    """Raise PlanError where the SPAD's memory would be full before one map is whole."""
     if plan.burst_frames is None:
         return
     need = math.ceil(plan.frames_for(1) + lead_s(rig) * float(plan.frame_rate_hz))

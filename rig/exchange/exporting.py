@@ -1,4 +1,4 @@
-"""`rig export`: a run for other programs, as arrays, one HDF5 file, point clouds, pictures or a film."""
+"""`rig export`: writes a run for other programs, as arrays, one HDF5 file, point clouds, pictures or a film."""
 
 import os
 import shutil
@@ -25,17 +25,18 @@ from rig.run_folder.manifest import read_manifest
 ExportKind = Literal["npy", "hdf5", "ply", "png", "mp4"]
 EXPORT_KINDS: Final[tuple[ExportKind, ...]] = get_args(ExportKind)
 PICTURE_KINDS: Final = ("png", "mp4")
-"""Those that have a view."""
+"""Kinds that show a view."""
 FILMS_PER_S: Final = 25.0
 FRAMES_PER_PICTURE: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
-    """What is shown (png, mp4) and how.
+    """Options of pictures and films (png, mp4).
 
-    view: depth, intensity or frames; None: the first of them that there is. frames_per_picture: frames summed for one
-    picture of view frames, None: FRAMES_PER_PICTURE. pictures_per_s: of a film, None: FILMS_PER_S.
+    view: depth, intensity or frames; None is the first of these that the run has.
+    frames_per_picture: frames summed for one picture of frames; None is FRAMES_PER_PICTURE.
+    pictures_per_s: rate of a film; None is FILMS_PER_S.
     """
 
     view: str | None = None
@@ -45,7 +46,10 @@ class ExportOptions:
 
 @dataclass(frozen=True, slots=True)
 class ExportResult:
-    """What an export wrote. gaps: [run id, first, last] of missing frames; damage: what could not be read, and why."""
+    """Result of an export.
+
+    gaps: missing frames, [run id, first, last]. damage: a line for each part that could not be read, with the reason.
+    """
 
     folder: Path
     kind: str
@@ -57,11 +61,11 @@ class ExportResult:
 
     @property
     def exit_code(self) -> int:
-        """1 where parts of the recording are missing in what was written, else 0."""
+        """Exit code of the command line: 1 where parts of the recording are missing in what was written."""
         return 1 if self.damage else 0
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return it as plain values."""
         return {name: getattr(self, name) for name in self.__slots__}
 
 
@@ -97,7 +101,7 @@ def export_run(
 
 
 class _Export:
-    """One export on its way: a method for each kind."""
+    """An export under way: a method for each kind."""
 
     def __init__(self, run: Path, folder: RunFolder, options: ExportOptions, progress: Progress | None) -> None:
         self._run, self._folder, self._options = run, folder, options
@@ -109,7 +113,7 @@ class _Export:
         self.damage: list[str] = []
 
     def write_npy(self) -> None:
-        """The frames as a cube."""
+        """Write the frames as a cube."""
         if not self._recorded:
             require_recording(self._run)
         model = read_model(self._run)
@@ -117,7 +121,7 @@ class _Export:
         self.log = write_npy(self._blocks(), self._folder, source, None if model is None else model.camera)
 
     def write_hdf5(self) -> None:
-        """Frames and maps, as far as there are any."""
+        """Write frames and maps to one file, as far as there are any."""
         if not self._maps.indices and not self._recorded:
             require_recording(self._run)
         blocks = self._blocks() if self._recorded else iter(())
@@ -126,7 +130,7 @@ class _Export:
         self.n_maps = len(self._maps.indices)
 
     def write_ply(self) -> None:
-        """The point clouds of all maps."""
+        """Write the point clouds of all maps."""
         clouds = self._maps.files("cloud", ".ply")
         if not clouds:
             raise UsageError(f"{self._run} holds no point clouds; {self._make_maps()}")
@@ -135,12 +139,12 @@ class _Export:
         self.n_maps = len(clouds)
 
     def write_png(self) -> None:
-        """Single pictures."""
+        """Write single pictures."""
         view = self._view()
         self._count(view, pictures.write_pngs(self._pictures(view), self._folder, view))
 
     def write_mp4(self) -> None:
-        """A film."""
+        """Write a film."""
         view = self._view()
         film = self._folder.place(f"{view}.mp4")
         self._count(view, pictures.write_mp4(self._pictures(view), film, self._options.pictures_per_s or FILMS_PER_S))
@@ -150,7 +154,7 @@ class _Export:
         return bool(segment_files(self._run)) and (self._run.is_dir() or self._run.match(f"{SEGMENTS}*"))
 
     def _blocks(self) -> Iterator[FrameBlock]:
-        """All sound blocks of the recording; what is not sound is noted as damage."""
+        """Give all sound blocks of the recording; other blocks are noted as damage."""
         try:
             recording = RunRecording(self._run)
             done = 0
@@ -172,7 +176,7 @@ class _Export:
             return {}
 
     def _view(self) -> View:
-        """What is shown, once it is clear that there is some of it."""
+        """The view to show. UsageError where the run has nothing of it."""
         there = {
             "depth": bool(self._maps.files("depth", ".npy")),
             "intensity": bool(self._maps.files("intensity", ".png")),
@@ -191,7 +195,7 @@ class _Export:
         return view
 
     def _make_maps(self) -> str:
-        """The next step where there are no maps. UsageError where there are no frames to make them of either."""
+        """The next step where there are no maps. UsageError where there are no frames to make maps of either."""
         require_recording(self._run)
         return f"make them first: {reconstruct_line(self._run)}, and export that folder"
 

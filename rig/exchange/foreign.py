@@ -1,4 +1,4 @@
-"""Frames in the file of another program, as any importer hands them on."""
+"""Frames in the file of another program, in the form in which every importer returns them."""
 
 import os
 import re
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from rig.errors import UsageError
 
 CHUNK_BYTES: Final = 16 << 20
-"""Files are read in pieces of about this size."""
+"""Bytes of the pieces that files are read in, about."""
 
 LSB_FIRST: Final = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8), bitorder="little"))
-"""Bytes turned round, for cameras that send the leftmost pixel in the least significant bit."""
+"""Bytes with their bits reversed, for cameras that send the leftmost pixel in the least significant bit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,8 +25,10 @@ class ForeignFrames:
     """Frames of one size in their order.
 
     chunks: gives them anew at each call, uint8 (n, height, ceil(width / 8)), most significant bit = leftmost pixel; n
-    may differ and be 0. ranges: [first frame, frames] of consecutive numbers, where the file tells of lost ones.
-    origin: what the manifest is to know of where they come from. hints: lines for the user, about what may be amiss.
+      may differ and be 0.
+    origin: for the manifest, where the frames come from.
+    ranges: [first frame, frames] of consecutive numbers, where the file tells of lost ones.
+    hints: lines for the user about what may be wrong.
     """
 
     width: int
@@ -40,7 +42,7 @@ class ForeignFrames:
 
 
 def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
-    """The files given, in that order; a folder stands for all its files with `suffix`, those within folders too.
+    """List the given files in that order; a folder stands for all its files with `suffix`, in inner folders too.
 
     A folder's files come in natural order (2 before 10), as the cameras number them. UsageError where one is missing.
     """
@@ -67,7 +69,7 @@ def bytes_of(file: Path) -> NDArray[np.uint8]:
 
 
 def chunks_of(frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
-    """`frames` (n, ...) in pieces of `CHUNK_BYTES`."""
+    """Give `frames` (n, ...) in pieces of `CHUNK_BYTES`."""
     step = max(1, CHUNK_BYTES // max(1, frames[:1].nbytes))
     for first in range(0, len(frames), step):
         yield frames[first : first + step]

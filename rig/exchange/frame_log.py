@@ -1,4 +1,4 @@
-"""What a recording says of its frames beside their pixels, gathered block by block while the pixels go elsewhere."""
+"""Gathers what a recording says of its frames beside their pixels, block by block, while the pixels go elsewhere."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -15,7 +15,7 @@ Ranges = list[tuple[int, int, int]]
 
 
 class FrameLog:
-    """The records of all frames in order; every block must be of the first one's size and clock (UsageError)."""
+    """The records of all frames in order; UsageError where a block has another size or clock than the first one."""
 
     def __init__(self) -> None:
         self._header: BlockHeader | None = None
@@ -26,7 +26,7 @@ class FrameLog:
         self.n_frames = 0
 
     def add(self, block: FrameBlock) -> None:
-        """Take a block's records."""
+        """Add a block's records."""
         header = block.header
         first = self._header = self._header or header
         if (header.width, header.height) != (first.width, first.height):
@@ -53,7 +53,7 @@ class FrameLog:
         return self._header
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """One array (frames,) per property: number, run, ticks and the fields of the records."""
+        """Arrays (frames,): number, run, ticks and the fields of the records."""
         header = self.header
         records = np.concatenate(self._records)
         runs = np.repeat(np.array(self._runs, np.uint16), [len(part) for part in self._records])
@@ -70,7 +70,7 @@ class FrameLog:
         }
 
     def ranges(self) -> Ranges:
-        """Consecutive frames, in order."""
+        """Ranges of consecutive frames, in order."""
         ranges: Ranges = []
         for run, numbers in zip(self._runs, self._numbers, strict=True):
             if len(numbers) == 0:
@@ -83,7 +83,7 @@ class FrameLog:
         return ranges
 
     def gaps(self) -> Ranges:
-        """[run id, first, last] of the frames that are missing between others of their run."""
+        """Frames that are missing between others of their run, [run id, first, last]."""
         return [
             (run, first + n, next_first - 1)
             for (run, first, n), (next_run, next_first, _) in pairwise(self.ranges())
@@ -91,7 +91,7 @@ class FrameLog:
         ]
 
     def content(self) -> dict[str, Any]:
-        """All that an array of the pixels cannot say, for a JSON file beside it. Places are indices of the array."""
+        """Describe, for a JSON file, all that an array of the pixels cannot say. Places are indices of the array."""
         header = self.header
         columns = self.columns()
         marks = columns["marks"]

@@ -1,11 +1,11 @@
-"""A run as one HDF5 file that h5py opens and MATLAB too, with `h5read` or, as a MAT-file of version 7.3, with `load`.
+"""Writes a run as one HDF5 file, which h5py opens, and MATLAB with `h5read` or, as a MAT-file of version 7.3, `load`.
 
     /frames/bits uint8 (frames, height, row bytes)  /frames/number run ticks time_s marks x0 y0 line sweep (1, frames)
     /maps/depth_m float32 (maps, height, width)  /maps/x_px confidence x_sd_px signal haze (maps, rows, columns)
     /maps/number (1, maps)  /clock/tick_hz frame_period_ticks exposure_ticks (1, 1)  /manifest UTF-16 (n, 1)
 
-MATLAB sees dimensions in reverse order and has no arrays below two. What makes a MAT-file: 512 bytes of header before
-the HDF5 part, and the name of a MATLAB class with each array and group (MAT-file format 7.3, as MATLAB writes it).
+MATLAB sees dimensions in reverse order and has no arrays below two. A MAT-file has 512 bytes of header before the HDF5
+part, and the name of a MATLAB class with each array and group (MAT-file format 7.3, as MATLAB writes it).
 """
 
 import errno
@@ -32,14 +32,14 @@ FILE: Final = "run.h5"
 _USER_BLOCK: Final = 512
 _HEADER_TEXT: Final = 116
 _HEADER_END: Final = b"\0" * 8 + b"\x00\x02" + b"IM"
-"""No subsystem data, version 2.0, little-endian."""
+"""End of the MAT-file's header: no subsystem data, version 2.0, little-endian."""
 _CHUNK_BYTES: Final = 1 << 20
 _CLASSES: Final = {"float32": "single", "float64": "double"}
-"""MATLAB's names; integers are named as in numpy."""
+"""MATLAB's names of types; integers have the same names as in numpy."""
 
 
 _ROOM_BYTES: Final = 16 << 20
-"""Left free for what HDF5 itself keeps and writes late."""
+"""Bytes left free for what HDF5 itself keeps and writes late."""
 
 
 def require_h5py() -> Any:
@@ -78,7 +78,7 @@ def write_hdf5(blocks: Iterable[FrameBlock], maps: MapFiles, manifest: Mapping[s
 
 
 def _require_room(path: Path, n_bytes: int) -> None:
-    """OSError before the disk is full: HDF5 cannot close a file that it cannot write, and takes the process with it."""
+    """Raise OSError before the disk is full: HDF5 cannot close a file then, and ends the whole process."""
     if shutil.disk_usage(path.parent).free < n_bytes + _ROOM_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
@@ -99,7 +99,7 @@ def _write_frames(file: Any, log: FrameLog) -> None:
 
 
 def _write_maps(group: Any, maps: MapFiles) -> None:
-    """Maps one by one: a run may hold more than memory does."""
+    """Write the maps one by one: a run may hold more than memory does."""
     for place, index in enumerate(maps.indices):
         arrays = dict(maps.stripe(index))
         depth = maps.depth_m(index)
@@ -126,7 +126,7 @@ def _array(group: Any, name: str, values: NDArray[Any], matlab: str | None = Non
 
 
 def _growing(group: Any, name: str, first: NDArray[Any]) -> Any:
-    """A dataset of arrays like those of `first` (n, ...), as yet without any."""
+    """Make a dataset for arrays like those of `first` (n, ...), empty for now."""
     shape = first.shape[1:]
     chunk = max(1, _CHUNK_BYTES // max(1, math.prod(shape) * first.itemsize))
     fill = np.nan if first.dtype.kind == "f" else 0

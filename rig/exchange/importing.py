@@ -1,7 +1,7 @@
-"""`rig import`: the frames of another program as a recording of ours.
+"""`rig import`: makes a recording of the frames of another program.
 
-Foreign files carry pixels and little else. What they do not say stays open in the recording: no markers, and without
-a frame rate no clock (`frame_period_ticks` 0, one tick a frame). The pixels are the files' own, bit by bit.
+Foreign files carry pixels and little else. What they do not say stays open in the recording: no markers, and without a
+frame rate no clock (`frame_period_ticks` 0, one tick a frame). The pixels are the files' own, bit by bit.
 """
 
 import os
@@ -43,13 +43,13 @@ _UPRIGHT_DEG: Final[dict[str, QuarterTurn]] = {"pi-imaging": 90}
 _RUN_ID: Final = 1
 _BLOCK_BYTES: Final = 1 << 20
 _MAX_TICK_HZ: Final = 0xFFFFFFFF
-"""Numerator and denominator of a clock that a block's header can say."""
+"""Largest numerator and denominator of a clock that a block's header can say."""
 _MIN_RATE_HZ: Final = 0.001
 
 
 @dataclass(frozen=True, slots=True)
 class ImportResult:
-    """What an import wrote. gaps: [first, last] numbers of frames that the source says were lost."""
+    """Result of an import. gaps: [first, last] numbers of frames that the source says were lost."""
 
     folder: Path
     kind: str
@@ -63,18 +63,19 @@ class ImportResult:
     hints: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return it as plain values."""
         return {name: getattr(self, name) for name in self.__slots__}
 
 
 @dataclass(frozen=True, slots=True)
 class ImportOptions:
-    """How files are read.
+    """Options of reading foreign files.
 
-    form: packed or sparse (pi-imaging), half or full (swissspad2), packed (photoncube); None: as seen from the file, or
-    half.
-    frame_rate: None where it is not known. turn_deg: counter-clockwise; None: 90 for pi-imaging, else 0. rows: of the
-    sensor, pi-imaging only; None: 512.
+    form: packed or sparse (pi-imaging), half or full (swissspad2), packed (photoncube); None is as seen from the file,
+      or half.
+    frame_rate: None where it is not known.
+    turn_deg: counter-clockwise; None is 90 for pi-imaging, otherwise 0.
+    rows: of the sensor, pi-imaging only; None is 512.
     """
 
     form: str | None = None
@@ -92,7 +93,7 @@ def import_frames(
 ) -> ImportResult:
     """Write the frames of `files` to a new run folder `out`; it appears whole or not at all.
 
-    Raises UsageError, a line per problem, for files or options that cannot be.
+    Raises UsageError, a line per problem, for files or options that cannot be used.
     """
     options = options or ImportOptions()
     turn = _checked_turn(kind, options)
@@ -151,7 +152,7 @@ def import_frames(
 
 
 def _checked_turn(kind: str, options: ImportOptions) -> QuarterTurn:
-    """The quarter turn, once all options fit the kind."""
+    """Check that all options fit the kind, and return the quarter turn."""
     if kind not in IMPORT_KINDS:
         raise UsageError(f"import kind {kind!r} is unknown; choose one of {', '.join(IMPORT_KINDS)}")
     problems = []
@@ -181,7 +182,7 @@ def _opened(kind: str, sources: list[Path], options: ImportOptions) -> ForeignFr
 
 
 def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.uint8]]:
-    """Chunks uint8 (n, height, row bytes) with rows padded to whole words and clean pad bits, upright."""
+    """Give upright chunks uint8 (n, height, row bytes), with rows padded to whole words and clean pad bits."""
     width, height = turned_size(foreign.width, foreign.height, turn)
     last_byte = np.uint8(0xFF << (-foreign.width % 8) & 0xFF)
     for chunk in foreign.chunks():
@@ -199,7 +200,7 @@ def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.ui
 class _Clock:
     tick_hz: Fraction
     period_ticks: int
-    """0: not known."""
+    """Ticks of the clock from one frame to the next; 0 where it is not known."""
     ticks_per_frame: int
 
 
@@ -215,7 +216,7 @@ def _clock(rate: Fraction | None) -> _Clock:
 def _blocks(
     chunks: Iterable[NDArray[np.uint8]], width: int, height: int, ranges: Iterable[tuple[int, int]], clock: _Clock
 ) -> Iterator[FrameBlock]:
-    """Blocks of consecutive frames; the first and the last one are marked as such."""
+    """Make blocks of consecutive frames; the first and the last one are marked as such."""
     stride = max(_BLOCK_BYTES, BlockLayout(1, width, height).min_stride)
     most = frames_per_block(stride, width, height)
     left = [[first, n] for first, n in ranges]

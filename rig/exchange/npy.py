@@ -1,10 +1,8 @@
-"""A recording as a photon cube: `frames.npy` for `photoncube`, `visionsim` and `rig reconstruct`, JSON beside it.
+"""Writes a recording as a photon cube: `frames.npy` for `photoncube`, `visionsim` and `rig reconstruct`, and its JSON.
 
 The array is uint8 (frames, height, ceil(width / 8)), most significant bit first, the frames that were received one
 after the other. `frames.json` says what it cannot: clock, numbers and gaps, markers, windows. `transforms.json`, where
-there is a camera, makes it a data set of visionsim.
-
-The maps in a run's folder: which there are, and their arrays.
+there is a camera, makes it a data set of visionsim. `MapFiles` lists the maps in a run's folder and reads their arrays.
 """
 
 import json
@@ -26,13 +24,13 @@ from rig.run_folder.folder import RunFolder, json_text
 
 CUBE: Final = "frames.npy"
 _POSE: Final = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
-"""The camera does not move, and its own frame is the world's."""
+"""Pose for visionsim: the camera does not move, and its own frame is the world's."""
 
 
 def write_npy(
     blocks: Iterable[FrameBlock], folder: RunFolder, source: Mapping[str, Any], camera: Camera | None
 ) -> FrameLog:
-    """Write the cube of `blocks` and what belongs beside it. UsageError where they do not make one array."""
+    """Write the cube of `blocks` and the files beside it. UsageError where the blocks do not make one array."""
     log = FrameLog()
     with folder.place(CUBE).open("wb") as file:
         for block in blocks:
@@ -54,13 +52,13 @@ def write_npy(
 
 
 def _write_header(file: BinaryIO, block: FrameBlock, n_frames: int) -> None:
-    """The header takes the same room for any number of frames (numpy leaves it for arrays that grow)."""
+    """Write the header, which takes the same room for any number of frames (numpy leaves it for arrays that grow)."""
     shape = (n_frames, block.header.height, -(-block.header.width // 8))
     np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
 
 
 def _transforms(camera: Camera, n_frames: int) -> str:
-    """visionsim's description of a data set (visionsim 0.1, dataset/schema.py)."""
+    """Describe the data set as visionsim does (visionsim 0.1, dataset/schema.py)."""
     matrix = camera.matrix
     content = {
         "fl_x": float(matrix[0, 0]),
@@ -86,22 +84,22 @@ class MapFiles:
         self.indices = sorted(int(file.stem) for file in run.glob("stripe/*.npz") if file.stem.isdigit())
 
     def files(self, folder: str, suffix: str) -> list[Path]:
-        """Files of one sort, in order of the maps: depth, .npy; intensity, .png; cloud, .ply."""
+        """Files of one kind, in order of the maps: depth, .npy; intensity, .png; cloud, .ply."""
         return sorted(self._run.glob(f"{folder}/*{suffix}"))
 
     def depth_m(self, index: int) -> NDArray[np.float32] | None:
-        """float32 (height, width); None of an uncalibrated rig."""
+        """Depth of a map, float32 (height, width); None for an uncalibrated rig."""
         file = self._run / "depth" / f"{index:06d}.npy"
         return load(file) if file.exists() else None
 
     def stripe(self, index: int) -> Mapping[str, NDArray[np.float32]]:
-        """The stripe table, float32 (rows, columns) each."""
+        """Stripe table of a map, float32 (rows, columns) each."""
         with load(self._run / "stripe" / f"{index:06d}.npz") as table:
             return {name: table[name] for name in table.files}
 
 
 def load(file: Path) -> Any:
-    """What numpy loads of `file`; UsageError, one line, where it cannot."""
+    """Load a file with numpy; UsageError, one line, where that fails."""
     try:
         return load_numpy(file)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:

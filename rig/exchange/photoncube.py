@@ -24,7 +24,7 @@ TRANSFORMS: Final = "transforms.json"
 _MOST_PIXELS: Final = 0xFFFF
 """Width and height that a block's header can say."""
 _MOST_FRAMES: Final = 2**48
-"""Frame numbers beyond are no frame numbers: three years of 100 kHz are a thirtieth of it."""
+"""First number that is too large for a frame: three years of 100 kHz are a thirtieth of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,9 +36,9 @@ class _Cube:
 
 
 def open_photoncube(files: Sequence[Path], *, packed: bool = False) -> ForeignFrames:
-    """Frames of all cubes, one after the other. UsageError, a line per problem, for files that are no such cubes.
+    """Open cubes as frames one after the other. UsageError, a line per problem, for files that are no such cubes.
 
-    packed: they are, also those of bytes 0 and 1 only, which else are refused.
+    packed: take them for packed even where all bytes are 0 or 1, which is refused otherwise.
     """
     problems: list[str] = []
     cubes: list[_Cube] = []
@@ -99,14 +99,14 @@ def _open(file: Path, *, packed: bool) -> _Cube:
 
 
 def _advice(array: NDArray[Any]) -> str:
-    """What numpy may make a cube of such an array with, as far as that is seen without its size."""
+    """The line of numpy that may make a cube of an array, as far as that is seen without the frames' size."""
     if array.ndim != 3:
         return f"frames.reshape(number, height, width), then {PACK}"
     return PACK if array.dtype.kind in "biu" else PACK.replace("frames", "frames != 0")
 
 
 def _beside(file: Path) -> Mapping[str, Any]:
-    """What `rig export` or visionsim wrote beside a cube; nothing where there is no such file."""
+    """The JSON that `rig export` or visionsim wrote beside a cube; empty where there is no such file."""
     for sidecar in (file.with_suffix(".json"), file.with_name(TRANSFORMS)):
         try:
             content = parse_json(sidecar.read_text(encoding="utf-8"))
@@ -154,7 +154,7 @@ def _frame_rate(beside: Mapping[str, Any]) -> Fraction | None:
 
 
 def _ranges(beside: Mapping[str, Any], n_frames: int) -> tuple[tuple[int, int], ...]:
-    """[first frame, frames] of a cube whose frames are of one start of the SPAD; none where that is not so."""
+    """Ranges [first frame, frames] of a cube whose frames are of one start of the SPAD; empty for any other."""
     stated = beside.get("ranges", ())
     try:
         ranges = tuple((int(first), int(n)) for _, first, n in stated)

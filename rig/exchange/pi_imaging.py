@@ -21,13 +21,13 @@ COLUMNS: Final = 512
 ROWS: Final = 512
 DONE: Final = b"DONE"
 _SPARSE_BATCH: Final = 64
-"""Frames expanded at a time."""
+"""Number of frames expanded at a time."""
 
 
 def open_pi_imaging(files: Sequence[Path], form: Form | None, rows: int = ROWS) -> ForeignFrames:
-    """Frames of all files, one after the other. form: None to see from each file which it is.
+    """Open files as frames one after the other. form: None to see from each file which it is.
 
-    rows: 512, or 1024 of the 1M flavour. UsageError, a line per file, for what is no whole number of frames.
+    rows: 512, or 1024 of the 1M flavour. UsageError, a line per file, for contents that are no whole number of frames.
     """
     problems: list[str] = []
     opened: list[tuple[Form, NDArray[np.uint8]]] = []
@@ -53,7 +53,7 @@ def open_pi_imaging(files: Sequence[Path], form: Form | None, rows: int = ROWS) 
 
 
 def _open(file: Path, form: Form | None, rows: int) -> tuple[Form, NDArray[np.uint8]]:
-    """Which form a file has, and its frames' bytes."""
+    """Find out the form of a file, and return it with the bytes of the frames."""
     content = bytes_of(file)
     frame_bytes = rows * COLUMNS // 8
     ended = content[-len(DONE) :].tobytes() == DONE

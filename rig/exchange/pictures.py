@@ -1,4 +1,4 @@
-"""A run as pictures: the depth maps, the intensity of each, or sums of recorded frames; single PNGs or an MP4 film."""
+"""Makes pictures of a run: depth maps, their intensity, or sums of recorded frames; as PNG files or as an MP4 film."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -16,17 +16,17 @@ from rig.run_folder.pictures import depth_limits, depth_picture, png_bytes
 View = Literal["depth", "intensity", "frames"]
 VIEWS: Final[tuple[View, ...]] = get_args(View)
 _BRIGHT_SHARE: Final = 0.999
-"""Of the first picture's pixels so many are darker than what is shown as white."""
+"""Share of the first picture's pixels that are darker than what is shown as white."""
 
 _MOST_PIXELS: Final = 1 << 24
-"""Of a picture of frames: five times as many as the largest SPAD array has."""
+"""Most pixels of a picture of frames: five times as many as the largest SPAD array has."""
 
 Picture = NDArray[np.uint8]
 """Grey (height, width) or BGR (height, width, 3)."""
 
 
 def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
-    """One picture a map, all of the same size; the colours of the first depth map hold for all."""
+    """Make one picture of each map, all of the same size; the colours of the first depth map hold for all."""
     if view == "intensity":
         import cv2
 
@@ -44,7 +44,7 @@ def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
 
 
 def frame_pictures(blocks: Iterable[FrameBlock], frames_per_picture: int) -> Iterator[Picture]:
-    """Sums of so many received frames on the whole sensor, square-root grey; what is over at the end is left out.
+    """Sum so many received frames at a time on the whole sensor, square-root grey; a rest at the end is left out.
 
     White is where the brightest pixels of the first picture are, so that a film does not flicker.
     """
@@ -55,7 +55,7 @@ def frame_pictures(blocks: Iterable[FrameBlock], frames_per_picture: int) -> Ite
 
 
 def write_pngs(pictures: Iterable[Picture], folder: RunFolder, name: str) -> int:
-    """Write NAME-000000.png, ...; how many there were."""
+    """Write NAME-000000.png and so on; returns how many there were."""
     n = 0
     for n, picture in enumerate(pictures, start=1):
         folder.place(f"{name}-{n - 1:06d}.png").write_bytes(png_bytes(picture))
@@ -63,7 +63,7 @@ def write_pngs(pictures: Iterable[Picture], folder: RunFolder, name: str) -> int
 
 
 def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) -> int:
-    """Write a film (MPEG-4 part 2); how many pictures it has. UsageError where OpenCV cannot write it here."""
+    """Write a film (MPEG-4 part 2) and return its number of pictures. UsageError where OpenCV cannot write it here."""
     import cv2
 
     film = None
@@ -87,7 +87,7 @@ def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) ->
 
 
 def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
-    """Counts (sensor height, sensor width) of every n frames, each window where it lay."""
+    """Counts (sensor height, sensor width) of every n frames, each window at its place."""
     counts: NDArray[np.uint32] | None = None
     missing = n
     for block in blocks:
@@ -111,7 +111,7 @@ def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
 
 
 def _require_picture(width: int, height: int) -> None:
-    """UsageError for a sensor larger than any: its header is all that says so, and the picture is made of it."""
+    """Raise UsageError for a sensor larger than any: only its header says so, and the picture is made of it."""
     if width * height > _MOST_PIXELS:
         raise UsageError(
             f"the recording says that its sensor has {width} x {height} pixels; pictures have at most {_MOST_PIXELS}; "
@@ -120,7 +120,7 @@ def _require_picture(width: int, height: int) -> None:
 
 
 def _even(picture: Picture) -> Picture:
-    """BGR with even sides, which the film format asks for."""
+    """Make a picture BGR with even sides, which the film format asks for."""
     bgr = np.repeat(picture[:, :, None], 3, axis=2) if picture.ndim == 2 else picture
     height, width = bgr.shape[:2]
     return np.pad(bgr, ((0, height % 2), (0, width % 2), (0, 0)))

@@ -27,11 +27,11 @@ _ZONE_BYTES: Final = _ROW_BYTES // _QUARTERS
 
 _JUDGED_FRAMES: Final = 512
 _JUDGED_SIGMAS: Final = 10.0
-"""Even and odd frames of one scene differ by chance; so many standard deviations are no chance."""
+"""Standard deviations by which even and odd frames of one scene do not differ by chance."""
 
 
 def open_swissspad2(files: Sequence[Path], form: Form | None) -> ForeignFrames:
-    """Frames of all files, one after the other; form None: half. UsageError, a line per file, for parts of frames."""
+    """Open files as frames one after the other; form None is half. UsageError, a line per file, for parts of frames."""
     full = form == "full"
     frame_bytes = _HALF_BYTES * (2 if full else 1)
     contents = [bytes_of(file) for file in files]

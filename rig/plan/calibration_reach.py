@@ -1,6 +1,7 @@
-"""Whether a calibration holds for a scan: its sensor, its mirror's speed and the commands it passes.
+"""Checks whether a calibration holds for a scan: its sensor, its mirror's speed and the commands it passes.
 
-The plan of a recording for a calibration made since: what was scanned stays, where it is seen may change.
+`recalibrated` adapts the plan of a recording to a calibration made since: what was scanned stays, where it is seen may
+change.
 """
 
 import math
@@ -19,13 +20,13 @@ from rig.geometry.windows import WORD_PX, sweep_geometry
 from rig.plan.scan_plan import ScanPlan
 
 MOST_TIMES = 1000.0
-"""As many exposures as a scan that a calibration at its speed is advised to look at: more say nothing of a mirror."""
+"""Most exposures that a calibration is advised to be made at, as a multiple of the scan's: more teach nothing."""
 
 
 def model_problems(
     scan: ScanConfig, model: RigModel | None, info: SpadInfo, speed_per_s: float, line_offsets: Sequence[float]
 ) -> list[str]:
-    """What keeps a calibration from being that of this scan: sensor, speed, commands; nothing where there is none."""
+    """Reasons why a calibration does not fit this scan: sensor, speed, commands; none where there is no calibration."""
     if model is None:
         return []
     problems = []
@@ -43,10 +44,10 @@ def model_problems(
 
 
 def require_speed(model: RigModel, speed_per_s: float, exposures: int) -> None:
-    """CalibrationError where the lag was not measured around this speed, with the command that measures it here too.
+    """Raise CalibrationError where the lag was not measured around this speed, with the command that measures it.
 
-    A sweep is as many times faster as it has fewer exposures: named are this scan's, and those of the end of the old
-    range that is farther off, so that what was scanned before still can be.
+    A sweep is as many times faster as it has fewer exposures. The command names this scan's exposures and those of the
+    farther end of the old range, so that scans that were possible stay possible.
     """
     try:
         model.check_speed(speed_per_s)
@@ -60,16 +61,16 @@ def require_speed(model: RigModel, speed_per_s: float, exposures: int) -> None:
 
 
 def whole_rows(plan: ScanPlan) -> ScanPlan:
-    """The plan of whole frames, where nothing is known of the rig any more: every pixel can be anybody's."""
+    """The plan with whole frames, for a rig without calibration: any pixel may see any column."""
     padded = -(-plan.width // WORD_PX) * WORD_PX
     return replace(plan, x0=np.zeros_like(plan.x0), window=padded, windows=None)
 
 
 def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
-    """The plan with the lag and the windows of `model`: the same plan where it was compiled for that.
+    """The plan with the lag and the windows of `model`; it is unchanged where it was compiled for that model.
 
-    Mirror, gate and markers are those that there were, and so are the pixels that the SPAD sent: where they do not hold
-    a column's window its frames do not count. UsageError where the calibration is not one of this rig and scan.
+    Mirror, gate and markers stay as they were, and so do the pixels that the SPAD sent: frames that do not hold a
+    column's window do not count for it. UsageError where the calibration is not one of this rig and scan.
     """
     try:
         model.check_sensor(plan.width, plan.rows)

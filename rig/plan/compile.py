@@ -28,10 +28,12 @@ from rig.plan.waveform import legs_of, line_markers, moving_windows, waveform_of
 CLOCK_TOLERANCE = 2e-4
 """Relative difference allowed for between SPAD, scanner and sync clocks: three crystals of +-50 ppm, and margin."""
 GUARD_FRAMES = 1.0
-"""Frames the gate opens before the first and closes after the last column, so that their own frames are wholly lit."""
+"""Frames by which the gate opens before the first and closes after the last column, to light their frames wholly."""
 BLOCK_S = 5e-3
-"""Time that the frames of a block span. Each block costs Python some 0.3 ms, part of it on every thread; an estimate
-waits for its block to fill."""
+"""Seconds that the frames of a block span.
+
+Each block costs Python some 0.3 ms, part of it on every thread; an estimate waits for its block to fill.
+"""
 BLOCK_BYTES = 16 << 20
 """Most bytes of a block's frames: 512 whole frames of 512 x 512 pixels."""
 
@@ -41,7 +43,7 @@ PointClock = Callable[[float], Fraction]
 
 
 def spad_request(scan: ScanConfig, plan: ScanPlan) -> SpadRequest:
-    """What the scan wants of the SPAD that the plan was compiled for."""
+    """The request to the SPAD for the scan that a plan was compiled from."""
     return SpadRequest(
         frame_rate_hz=scan.frame_rate,
         exposure_s=scan.exposure_s,
@@ -61,12 +63,14 @@ def compile_plan(
     line_offsets: Sequence[float] = (0.0,),
     windows: ColumnWindows | None = None,
 ) -> ScanPlan:
-    """The plan of a scan, checked.
+    """Compile the plan of a scan and check it.
 
-    point_clock: the scanner's exact clock for a requested rate (`BeamScanner.point_clock`). model: None where the rig
-    is not calibrated; there is then no lag and the window is the whole row. timing: what the SPAD answered to
-    `spad_request`; its nominal rate where None. line_offsets: of the rig, which fit the scan. windows: of the columns,
-    where they are given; else as narrow as the depth range allows. Raises PlanError with one line per problem.
+    point_clock: the scanner's exact clock for a requested rate (`BeamScanner.point_clock`).
+    model: None where the rig is not calibrated; there is then no lag and the window is the whole row.
+    timing: answer of the SPAD to `spad_request`; None uses its nominal rate.
+    line_offsets: of the rig, which fit the scan.
+    windows: of the columns, where they are given; None makes them as narrow as the depth range allows.
+    Raises PlanError with one line per problem.
     """
 
     def draft(scan: ScanConfig) -> tuple[ScanPlan | None, list[str]]:
@@ -99,7 +103,7 @@ def _draft(
     line_offsets: Sequence[float],
     windows: ColumnWindows | None,
 ) -> tuple[ScanPlan | None, list[str]]:
-    """The plan, where there is a mirror path for it, and everything that stands against scanner and calibration."""
+    """The plan, where there is a mirror path for it, and all problems with scanner and calibration."""
     places, lines = scan.columns // len(line_offsets), None
     commands = column_command(np.arange(scan.columns), scan.command_range, scan.columns)
     if len(line_offsets) > 1:
@@ -128,7 +132,7 @@ def _draft(
 def path_demand(
     scan: ScanConfig, places: int, frame_rate: Fraction, model: RigModel | None, *, markers: bool
 ) -> PathDemand:
-    """What a scan of so many line positions asks of the mirror. markers: whether the SPAD has any."""
+    """The demand of a scan of so many line positions on the mirror. markers: whether the SPAD has any."""
     blanking = None if markers else blanking_for(places, scan.exposures, frame_rate)
     return PathDemand(
         edges=scan.command_range,
@@ -158,7 +162,7 @@ def _plan(
     lines: LineGrid | None,
     windows: ColumnWindows | None,
 ) -> ScanPlan:
-    """The plan along a mirror path; whether the SPAD's link carries it is for the caller to judge."""
+    """The plan along a mirror path, without judging whether the SPAD's link carries it."""
     legs = legs_of(path, scan, model.lag_s if model is not None else Lag(), demand.gate_margin_s, rate)
     step, markers = line_markers(path, demand.columns, scan.exposures)
     x0, window, lines = (*windows, lines) if windows is not None else _windows(model, commands, scan, info, lines)
@@ -206,7 +210,7 @@ def _with_windows(plan: ScanPlan, step_px: int) -> ScanPlan:
 
 
 def _transported(plan: ScanPlan, burst: BurstMode | None) -> ScanPlan:
-    """How the frames come: whole where the link carries them, else their windows, else in bursts; else not at all."""
+    """The plan with the way its frames come: whole where the link carries them, or windows, or bursts, or unchanged."""
     rate = float(plan.frame_rate_hz)
     if rate <= (plan.full_frames_hz or 0.0):
         return plan
@@ -222,7 +226,7 @@ def _transported(plan: ScanPlan, burst: BurstMode | None) -> ScanPlan:
 def _windows(
     model: RigModel | None, commands: NDArray[np.float64], scan: ScanConfig, info: SpadInfo, lines: LineGrid | None
 ) -> tuple[NDArray[np.int32], int, LineGrid | None]:
-    """First pixel of each column's window and their width; the lines, told how far they share them."""
+    """First pixel of each column's window, the windows' width, and the lines with the overlap of their windows."""
     if model is None:
         return np.zeros(scan.columns, np.int32), -(-info.width // 64) * 64, lines
     from rig.geometry.windows import sweep_geometry

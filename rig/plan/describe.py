@@ -1,7 +1,4 @@
-"""A plan's figures, for people and for programs.
-
-Frame rates that the sensor does and its link carries, and what is said where a scan asks for more.
-"""
+"""Describes a plan, for people and for programs, and the frame rates that sensor and link can do."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -17,7 +14,7 @@ from rig.plan.waveform import window_widths
 
 
 def plan_text(plan: ScanPlan) -> str:
-    """A plan for people, a few lines."""
+    """Describe a plan for people, in a few lines."""
     low, high = plan.command_range
     rate = float(plan.frame_rate_hz)
     sides = "both ways" if len(plan.legs) == 2 else "one way"
@@ -42,7 +39,7 @@ def plan_text(plan: ScanPlan) -> str:
 
 
 def _window(plan: ScanPlan) -> str:
-    """Stored rows are padded to whole words, sensors need not be."""
+    """Pixels of the windows, for people. Stored rows are padded to whole words, sensors' rows need not be."""
     return f"all {plan.width} pixels" if plan.window >= plan.width else f"{plan.window} of {plan.width} pixels"
 
 
@@ -81,7 +78,7 @@ def _link(plan: ScanPlan) -> str:
 
 
 def plan_content(plan: ScanPlan) -> dict[str, Any]:
-    """A plan for the manifest and for programs."""
+    """Describe a plan for the manifest and for programs."""
     return {
         "columns": plan.columns,
         "exposures": plan.exposures,
@@ -118,7 +115,7 @@ def plan_content(plan: ScanPlan) -> dict[str, Any]:
 
 
 def rounded(value: float) -> str:
-    """A figure for people, four digits and no exponent."""
+    """A number for people, with four digits and no exponent."""
     return f"{float(f'{value:.4g}'):g}"
 
 

@@ -1,6 +1,6 @@
-"""What the sync source plays: when the gate opens, sweep by sweep, and the blanking pattern before it.
+"""The program of the sync source: when the gate opens, sweep by sweep, and the blanking pattern before it.
 
-Whether the camera sees the blanking pattern, for which the line stands beside the first column.
+`unseen_pattern` checks whether the camera sees that pattern, for which the line stands beside the first column.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from rig.plan.scan_plan import ScanPlan
 def sync_program(plan: ScanPlan, maps: int) -> tuple[tuple[Pulse, ...], int]:
     """Pulses and repeats that open the gate once in each of `maps` sweeps and then leave it low.
 
-    With a blanking pattern there is one in each of them, in the pilots before them and in the sweep behind them.
+    Where the plan has a blanking pattern, it comes in each of these sweeps, in the pilots before and the sweep behind.
     """
     if plan.blanking is not None:
         lit = range(plan.pilots, plan.pilots + maps)
@@ -46,11 +46,11 @@ def _pulses(plan: ScanPlan, sweep: int, lit: bool) -> list[Pulse]:
 
 DEPTHS_TRIED = 32
 COMMANDS_TRIED = 256
-"""Places at which it is tried whether the camera sees the line."""
+"""Number of places at which it is tried whether the camera sees the line."""
 
 
 def unseen_pattern(plan: ScanPlan, model: RigModel | None) -> list[str]:
-    """What stands against a blanking pattern of which the camera sees no light within the depth range."""
+    """Problems with a blanking pattern of which the camera sees no light within the depth range."""
     if plan.blanking is None or model is None:
         return []
     u, _ = model.camera.tangents()

@@ -1,11 +1,11 @@
 """The mirror's path over one sweep: run-in, constant velocity, run-out, fly-back, rest, all with bounded acceleration.
 
 Ramps raise the velocity along half a cosine, v(t) = v (1 - cos(pi t/T))/2, so the acceleration starts and ends at zero
-and peaks at pi v/(2 T). Moves from rest to rest are cycloids, x(t) = D (t/T - sin(2 pi t/T)/(2 pi)), peak velocity
-2 D/T, peak acceleration 2 pi D/T^2. Every segment lasts a whole number of points, so a sweep does too and nothing
-drifts; the lit part lies in the middle of the cruise and lasts exactly as long as its frames.
+and peaks at pi v/(2 T). Moves from rest to rest are cycloids, x(t) = D (t/T - sin(2 pi t/T)/(2 pi)), peak velocity 2
+D/T, peak acceleration 2 pi D/T^2. Every segment lasts a whole number of points, so a sweep does too and nothing drifts;
+the lit part lies in the middle of the cruise and lasts exactly as long as its frames.
 
-Finds the quickest mirror path that a scanner can follow for a scan, or says what stands against it and helps.
+`find_path` finds the quickest path that a scanner can follow for a scan, or the problems; `remedy` says what helps.
 """
 
 import math
@@ -23,15 +23,15 @@ from drivers.interfaces import ScannerLimits
 Array = NDArray[np.float64]
 
 MIN_RAMP_POINTS = 4
-"""A ramp of fewer points is a step to the galvo, whatever its formula says."""
+"""Fewest points of a ramp: with fewer it is a step to the galvo, whatever its formula says."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathSegment:
     """A piece of the path that begins at `start` (command) and `start_point` (points) and lasts `points` points.
 
-    cruise: constant velocity; ramp: velocity from v0 to v1 along half a cosine; move: from rest over `distance` to
-    rest; hold: at rest. Velocities are command per point.
+    cruise: constant velocity. ramp: velocity from v0 to v1 along half a cosine. move: from rest over `distance` to
+    rest. hold: at rest. Velocities are command per point.
     """
 
     kind: Literal["ramp", "cruise", "move", "hold"]
@@ -60,9 +60,10 @@ class PathSegment:
 class SweepPath:
     """One sweep from its scan marker (point 0) to the next one.
 
-    points: length of the sweep. lit_start: points from the start to the command of the first lit edge; lit_points:
-    points between the two lit edges. cruise: first and last point of the constant-velocity part. low, high: extreme
-    commands.
+    points: length of the sweep.
+    lit_start: points from the start to the command of the first lit edge. lit_points: points between the two lit edges.
+    cruise: first and last point of the constant-velocity part.
+    low, high: extreme commands.
     """
 
     segments: tuple[PathSegment, ...]
@@ -98,7 +99,7 @@ class SweepPath:
 
 @dataclass(frozen=True, slots=True)
 class MirrorLimits:
-    """What bounds the mirror: velocity, acceleration, the point clock that samples it, and the shortest ramp."""
+    """Limits of the mirror's motion: velocity, acceleration, the point clock that samples it, and the shortest ramp."""
 
     velocity_per_s: float
     acceleration_per_s2: float
@@ -127,11 +128,12 @@ def sweep_path(
     fly_back: bool,
     least_points: int = 0,
 ) -> SweepPath:
-    """The path that crosses `edges` (commands of the first and the last lit edge) at constant velocity within `lit_s`.
+    """Make the path that crosses `edges` (commands of the first and last lit edge) at constant velocity in `lit_s`.
 
-    margin_s: time the constant velocity lasts before the first edge and, likewise, after the last.
-    fly_back: return to the start before the sweep ends (unidirectional); else the sweep ends where the return begins.
-    least_points: the sweep is drawn out by a rest to at least this length.
+    margin_s: time that the constant velocity lasts before the first edge and, likewise, after the last.
+    fly_back: return to the start before the sweep ends (unidirectional); otherwise the sweep ends where the return
+      begins.
+    least_points: least length of the sweep; a rest makes up the difference.
     """
     rate = motion.point_rate_hz
     lit_points = lit_s * rate
@@ -180,11 +182,13 @@ MOST_EXPOSURES = 65535
 
 @dataclass(frozen=True, slots=True)
 class PathDemand:
-    """What the scan asks of the mirror.
+    """The demand of a scan on the mirror.
 
-    edges: commands of the lit part's two ends. column_s, frame_s: exact seconds of a column and of a frame. lag_s:
-    longest lag; guard_s: extra time the gate is open on either side; clock_tolerance: relative error of its clock;
-    lead_s: further time at constant velocity, not dark.
+    edges: commands of the lit part's two ends.
+    column_s, frame_s: exact seconds of a column and of a frame.
+    lag_s: longest lag of the mirror.
+    guard_s: extra time that the gate is open on either side. clock_tolerance: relative error of its clock.
+    lead_s: further time at constant velocity, not counted as dark.
     """
 
     edges: tuple[float, float]
@@ -222,7 +226,7 @@ class PathDemand:
 
 @dataclass(frozen=True, slots=True)
 class PathFound:
-    """A path with its point clock, or the problems that stand against it, each without the remedy."""
+    """A path with its point clock, or the problems with it, each without the remedy."""
 
     path: SweepPath | None
     rate_hz: Fraction
@@ -230,7 +234,7 @@ class PathFound:
 
 
 def find_path(demand: PathDemand, limits: ScannerLimits, point_clock: Callable[[float], Fraction]) -> PathFound:
-    """The quickest path within the limits, on the fastest point clock that its points fit in."""
+    """Find the quickest path within the limits, on the fastest point clock that its points fit in."""
     low_hz, high_hz = limits.point_rate_hz
     asked = high_hz
     sweeps = 2 if demand.bidirectional else 1
@@ -258,7 +262,7 @@ def find_path(demand: PathDemand, limits: ScannerLimits, point_clock: Callable[[
 def _within_limits(
     demand: PathDemand, limits: ScannerLimits, rate: Fraction, speed_limit: float
 ) -> tuple[SweepPath, list[str]]:
-    """The quickest path at this point clock whose RMS acceleration and reach are allowed; else one and why not."""
+    """The quickest path at this point clock with RMS acceleration and reach allowed; else a path and the problems."""
     low, high = limits.command_range
     heat_limit = limits.rms_duty * limits.acceleration_per_s2 * HEADROOM
     acceleration = limits.acceleration_per_s2 * HEADROOM
@@ -295,7 +299,7 @@ def _path(demand: PathDemand, motion: MirrorLimits) -> SweepPath:
 
 
 def remedy(demand: PathDemand, exposures: int, limits: ScannerLimits, point_clock: Callable[[float], Fraction]) -> str:
-    """What to change so that the scanner can follow: the fewest exposures, or the widest range, that work."""
+    """Say what to change so that the scanner can follow: the fewest exposures, or the widest range, that work."""
 
     def works(changed: PathDemand) -> bool:
         return not find_path(changed, limits, point_clock).problems

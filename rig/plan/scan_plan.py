@@ -6,14 +6,12 @@ point i and runs straight to the next; through the lit part it runs linearly. Th
 spans c - 0.5 to c + 0.5; column 0 begins at `command_range[0]`, the last ends at `command_range[1]`, on the way back
 too.
 
-The blanking pattern: flashes in each sweep's run-in, by which frames without markers are bound to columns.
-
-The sync source waits for the scan marker and then opens the gate in a known order of flashes, before it opens it for
-the lit part. The mirror moves at constant velocity by then, a few columns before the first one. Where the pattern lies
-among the frames says when the scan marker came; from one sweep's to the next one's is the ratio of scanner and SPAD.
-
-A chip is no whole number of frames: the edges of the flashes then fall on all parts of a frame, so that their place is
-known to a small part of one whatever the phase of the two clocks.
+`Blanking` is a pattern of flashes in each sweep's run-in, by which frames without markers are bound to columns. The
+sync source waits for the scan marker and then opens the gate in a known order of flashes, before it opens it for the
+lit part. The mirror moves at constant velocity by then, a few columns before the first one. The place of the pattern
+among the frames says when the scan marker came; the time from one sweep's pattern to the next gives the ratio of the
+scanner's clock and the SPAD's. A chip is not a whole number of frames: the edges of the flashes then fall on all parts
+of a frame, so that their place is known to a small part of a frame whatever the phase of the two clocks.
 """
 
 import math
@@ -29,22 +27,27 @@ from rig.geometry.line_grid import LineGrid
 from rig.plan.mirror_path import SweepPath
 
 CODE = "101011101100011111001101001"
-"""Chips, 1 = gate open: the maximum-length sequence of x^5 + x^2 + 1 without its run of zeros. Shifted against itself,
-or against its reverse, it correlates to at most 0.36; it has 16 edges."""
+"""Chips, 1 = gate open: the maximum-length sequence of x^5 + x^2 + 1 without its run of zeros.
+
+Shifted against itself, or against its reverse, it correlates to at most 0.36; it has 16 edges.
+"""
 MAX_CLOCK_ERROR = 1e-3
 """Clock ratios further from nominal than this are a fault, not a crystal."""
 CHIPS_PER_COLUMN = 5
-"""A chip is about this part of a column long: the longer, the fewer photons it takes to find it."""
+"""Length of a column in chips, about: the longer a chip, the fewer photons it takes to find it."""
 MOST_CHIP_FRAMES = 8
 VERNIER_FRAMES = 0.382
-"""Added to whole frames (one minus the golden ratio, whose multiples spread most evenly)."""
+"""Fraction added to whole frames: one minus the golden ratio, whose multiples spread most evenly."""
 MARGIN_FRAMES = 2.0
-"""Dark frames kept before the pattern, and behind the last one that belongs to its search."""
+"""Dark frames kept before the pattern, and behind the last frame of its search."""
 
 
 @dataclass(frozen=True, slots=True)
 class Blanking:
-    """The pattern of a plan. guard_s: dark time between pattern and lit part; tolerance_s: how far off it may lie."""
+    """The blanking pattern of a plan.
+
+    guard_s: dark time between pattern and lit part. tolerance_s: how far the pattern may lie from its planned time.
+    """
 
     chip_s: float
     guard_s: float
@@ -68,7 +71,7 @@ class Blanking:
 
 
 def blanking_for(columns: int, exposures: int, frame_rate_hz: Fraction) -> Blanking:
-    """The pattern for a scan, whose clocks may differ by up to `MAX_CLOCK_ERROR`."""
+    """Make the pattern for a scan, whose clocks may differ by up to `MAX_CLOCK_ERROR`."""
     frame_s = 1 / float(frame_rate_hz)
     chip = min(max(1, round(exposures / CHIPS_PER_COLUMN)), MOST_CHIP_FRAMES) + VERNIER_FRAMES
     # From one pattern to the next; sweeps are rarely longer than twice their lit part.
@@ -83,8 +86,10 @@ Array = NDArray[np.float64]
 class Leg:
     """One direction of the scan. A unidirectional period has one leg, a bidirectional one two.
 
-    direction: +1 where the command rises while lit, -1 where it falls. columns_rise: whether column numbers rise with
-    time. lag_s: the mirror is where the command was this much earlier. gate_open_s, gate_close_s: from the scan marker.
+    direction: +1 where the command rises while lit, -1 where it falls.
+    columns_rise: whether column numbers rise with time.
+    lag_s: the mirror is where the command was this much earlier.
+    gate_open_s, gate_close_s: seconds from the scan marker.
     """
 
     path: SweepPath
@@ -99,14 +104,18 @@ class Leg:
 class ScanPlan:
     """Everything about a scan that is known before it starts.
 
-    frame_rate_hz, point_rate_hz: exact nominal rates of SPAD and scanner. sweep_points: points from one scan marker to
-    the next. marker_points: int64 (markers,), point of line marker j within a sweep; it marks the command of the edge
-    j * columns_per_marker columns into the lit part; those behind the lit part only move the window in the dark.
-    commands: float64 (columns,), mirror command of each column's centre. x0: int32 (columns,), first stored pixel of
-    each column's window; window: stored pixels per row; both multiples of 64. windows: the pixels of each frame that
-    are used, by the markers before it; None: all. windowed: whether the SPAD sends only these. link_bytes_per_s: what
-    its link carries, None where it cannot stream. blanking: the pattern that binds frames where the SPAD has no markers
-    for them; None: it has. lines: which line lights which column where there are several; None: one lights all.
+    frame_rate_hz, point_rate_hz: exact nominal rates of SPAD and scanner.
+    sweep_points: points from one scan marker to the next.
+    marker_points: int64 (markers,), point of line marker j within a sweep. It marks the command of the edge j *
+      columns_per_marker columns into the lit part; markers behind the lit part only move the window in the dark.
+    commands: float64 (columns,), mirror command of each column's centre.
+    x0: int32 (columns,), first stored pixel of each column's window. window: stored pixels per row. Both are multiples
+      of 64.
+    link_bytes_per_s: rate that the SPAD's link carries; None where it cannot stream.
+    windows: the pixels of each frame that are used, by the markers before it; None: all.
+    windowed: whether the SPAD sends only these.
+    blanking: the pattern that binds frames where the SPAD has no markers; None where it has.
+    lines: which line lights which column where there are several; None: one lights all.
     """
 
     columns: int
@@ -137,7 +146,7 @@ class ScanPlan:
 
     @property
     def places(self) -> int:
-        """Places of the mirror in a sweep: as many as columns where one line lights them all."""
+        """Positions of the mirror in a sweep: as many as columns where one line lights them all."""
         return self.columns if self.lines is None else self.lines.places
 
     @property
@@ -203,7 +212,7 @@ class ScanPlan:
 
     @property
     def bytes_per_s(self) -> float:
-        """What the SPAD sends, or stores in a burst."""
+        """Bytes per second that the SPAD sends, or stores in a burst."""
         return float(self.frame_rate_hz) * self.frame_bytes
 
     @property
@@ -221,9 +230,10 @@ class ScanPlan:
     def window_x0(
         self, marks: NDArray[np.integer], line: NDArray[np.integer], sweep: NDArray[np.integer]
     ) -> NDArray[np.int32]:
-        """First pixel used of each frame, int32 (n,), from marks and line of its record and the number of its sweep.
+        """First used pixel of each frame, int32 (n,), from marks and line of its record and the number of its sweep.
 
-        The same for a frame whether the SPAD sent it whole or only its window; sweep is -1 before the first marker.
+        It does not depend on whether the SPAD sent the frame whole or only its window. sweep is -1 before the first
+        marker.
         """
         if self.windows is None:
             return np.zeros(len(line), np.int32)
@@ -245,7 +255,7 @@ class ScanPlan:
         return out
 
     def lit_start_s(self, leg: Leg) -> float:
-        """When the mirror enters the first column, from the scan marker of a sweep of this leg."""
+        """Seconds from the scan marker of a sweep of this leg until the mirror enters the first column."""
         return float(leg.path.lit_start / self.point_rate_hz) + leg.lag_s
 
     def column(self, tau_s: Array, leg: Leg) -> Array:
@@ -261,16 +271,16 @@ class ScanPlan:
         return column_command(column, self.command_range, self.places)
 
     def line_commands(self, column: Array) -> Array:
-        """Commands (columns,) at which one line alone would stand where each column's did: its bound column's."""
+        """Commands (columns,) at which a single line would stand where each column's line did, at its bound column."""
         return self.command_at(column) if self.lines is None else self.lines.bound_commands(self.commands, column)
 
     @property
     def pilots(self) -> int:
-        """Sweeps with the blanking pattern alone, before the first map: they and its own give the clock ratio."""
+        """Number of sweeps with the blanking pattern alone, before the first map; they help to find the clock ratio."""
         return 0 if self.blanking is None else len(self.legs)
 
     def pattern_s(self, leg: Leg) -> float:
-        """When the blanking pattern begins, from the scan marker of a sweep of this leg."""
+        """Seconds from the scan marker of a sweep of this leg until the blanking pattern begins."""
         return leg.gate_open_s - (0.0 if self.blanking is None else self.blanking.lead_s)
 
     def frames_for(self, maps: int) -> float:
@@ -282,7 +292,7 @@ class ScanPlan:
         return frames + known_s * float(self.frame_rate_hz)
 
     def scanner_repeats(self, maps: int) -> int:
-        """Repetitions of the waveform that hold pilots, `maps` sweeps and what closes the last one."""
+        """Repetitions of the waveform that hold pilots, `maps` sweeps and the marker that closes the last one."""
         return -(-(self.pilots + maps + 1) // len(self.legs))
 
     def readout_s(self, frames: int) -> float:

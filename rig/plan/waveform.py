@@ -1,11 +1,12 @@
-"""What the scanner plays: commands and markers of every point, and when the gate opens on its way.
+"""The scanner's waveform: commands and markers of every point, when the gate opens on the way, and the SPAD's windows.
 
-The windows that a scan needs of its SPAD: which pixels of a row from one line marker to the next.
+`waveform_of` makes commands and markers. `moving_windows` makes the table of windows that a scan needs of its SPAD:
+which pixels of a row from one line marker to the next.
 
 A frame is bound to the column in the middle of its exposure, so an entry of the table holds what every column needs
 that the mirror, its lag included, passes between one marker and the next, and the frame that a marker falls into. After
-the lit part, in the dark, markers of their own take the window over all pixels that columns use: they too are to have
-dark frames. A mirror that turns round at once leaves little room for that.
+the lit part, in the dark, markers of their own move the window over all pixels that columns use: these too need dark
+frames. A mirror that turns round at once leaves little room for that.
 """
 
 import math
@@ -22,13 +23,59 @@ from rig.plan.mirror_path import SweepPath, mirrored
 from rig.plan.scan_plan import Leg, ScanPlan
 
 LEAST_MARKER_POINTS = 4
-"""A marker needs a high and a low point, and as many again before a comparator sees the next one for sure."""
+"""Points of a marker: one high and one low, and as many again before a comparator is sure to see the next one."""
 LEAST_MARKER_FRAMES = 2
-"""Edges this far apart never share a frame, whose record has room for the position of one."""
+"""Frames between edges, so that they never share a frame, whose record has room for the position of one."""
 SLACK_COLUMNS = 1.0
 """Columns kept on either side of those that an entry should see: room for clock errors and late markers."""
 
 Pixels = NDArray[np.int64]
+
+
+def legs_of(path: SweepPath, scan: ScanConfig, lag: Lag, margin_s: float, rate: Fraction) -> tuple[Leg, ...]:
+    """The scan's one or two directions; the gate is open `margin_s` before and behind their lit part."""
+    rising = scan.command_range[1] > scan.command_range[0]
+
+    def leg(path: SweepPath, rises: bool, columns_rise: bool) -> Leg:
+        lag_s = lag.forward if rises else lag.backward
+        enter_s = float(path.lit_start / rate) + lag_s
+        leave_s = enter_s + float(path.lit_points / rate)
+        return Leg(path, 1 if rises else -1, columns_rise, lag_s, enter_s - margin_s, leave_s + margin_s)
+
+    out = leg(path, rising, True)
+    return (out, leg(mirrored(path), not rising, False)) if scan.bidirectional else (out,)
+
+
+def line_markers(path: SweepPath, columns: int, exposures: int) -> tuple[int, NDArray[np.int64]]:
+    """Columns per line marker, and the point of each marker within a sweep."""
+    points_per_column = path.lit_points / columns
+    step = max(
+        math.ceil(LEAST_MARKER_POINTS / points_per_column),
+        math.ceil(LEAST_MARKER_FRAMES / Fraction(exposures)),
+    )
+    points = [math.floor(path.lit_start + j * step * points_per_column) for j in range(columns // step + 1)]
+    return step, np.array(points, np.int64)
+
+
+def _scan_marker_points(leg: Leg, rate: Fraction) -> int:
+    """Points for which the scan marker, which holds the gate, stays high: until the middle of the gate's last slice.
+
+    So neither the scanner's clock nor the sync source's decides when the gate closes, while they differ by less.
+    """
+    lit_s = leg.gate_close_s - leg.gate_open_s
+    return max(1, math.floor((leg.gate_close_s - lit_s / slices(lit_s) / 2) * rate))
+
+
+def waveform_of(legs: tuple[Leg, ...], marker_points: NDArray[np.int64], rate: Fraction) -> ScanWaveform:
+    """Commands and markers of one repetition, point by point."""
+    commands, words = [], []
+    for leg in legs:
+        commands.append(leg.path.command(np.arange(leg.path.points, dtype=np.float64)))
+        markers = np.full(leg.path.points, LEVEL_BACKWARD if leg.direction < 0 else 0, np.uint8)
+        markers[: _scan_marker_points(leg, rate)] |= MARKER_SCAN
+        markers[marker_points] |= MARKER_LINE
+        words.append(markers)
+    return ScanWaveform(np.concatenate(commands), np.concatenate(words), rate)
 
 
 def moving_windows(plan: ScanPlan, step_px: int) -> tuple[WindowTable, NDArray[np.int64]] | None:
@@ -82,49 +129,3 @@ def _dark_points(plan: ScanPlan, wanted: int) -> NDArray[np.int64]:
     room = plan.sweep_points - begin
     n = max(0, min(wanted, math.floor(room / least)))
     return np.array([begin + math.floor(Fraction(i * room, n)) for i in range(n)], np.int64)
-
-
-def legs_of(path: SweepPath, scan: ScanConfig, lag: Lag, margin_s: float, rate: Fraction) -> tuple[Leg, ...]:
-    """The scan's one or two directions; the gate is open `margin_s` before and behind their lit part."""
-    rising = scan.command_range[1] > scan.command_range[0]
-
-    def leg(path: SweepPath, rises: bool, columns_rise: bool) -> Leg:
-        lag_s = lag.forward if rises else lag.backward
-        enter_s = float(path.lit_start / rate) + lag_s
-        leave_s = enter_s + float(path.lit_points / rate)
-        return Leg(path, 1 if rises else -1, columns_rise, lag_s, enter_s - margin_s, leave_s + margin_s)
-
-    out = leg(path, rising, True)
-    return (out, leg(mirrored(path), not rising, False)) if scan.bidirectional else (out,)
-
-
-def line_markers(path: SweepPath, columns: int, exposures: int) -> tuple[int, NDArray[np.int64]]:
-    """Columns per line marker, and the point of each marker within a sweep."""
-    points_per_column = path.lit_points / columns
-    step = max(
-        math.ceil(LEAST_MARKER_POINTS / points_per_column),
-        math.ceil(LEAST_MARKER_FRAMES / Fraction(exposures)),
-    )
-    points = [math.floor(path.lit_start + j * step * points_per_column) for j in range(columns // step + 1)]
-    return step, np.array(points, np.int64)
-
-
-def _scan_marker_points(leg: Leg, rate: Fraction) -> int:
-    """How long the scan marker, which holds the gate, stays high: until the middle of the gate's last slice.
-
-    So neither the scanner's clock nor the sync source's decides when the gate closes, while they differ by less.
-    """
-    lit_s = leg.gate_close_s - leg.gate_open_s
-    return max(1, math.floor((leg.gate_close_s - lit_s / slices(lit_s) / 2) * rate))
-
-
-def waveform_of(legs: tuple[Leg, ...], marker_points: NDArray[np.int64], rate: Fraction) -> ScanWaveform:
-    """Commands and markers of one repetition, point by point."""
-    commands, words = [], []
-    for leg in legs:
-        commands.append(leg.path.command(np.arange(leg.path.points, dtype=np.float64)))
-        markers = np.full(leg.path.points, LEVEL_BACKWARD if leg.direction < 0 else 0, np.uint8)
-        markers[: _scan_marker_points(leg, rate)] |= MARKER_SCAN
-        markers[marker_points] |= MARKER_LINE
-        words.append(markers)
-    return ScanWaveform(np.concatenate(commands), np.concatenate(words), rate)

@@ -1,8 +1,7 @@
-"""Reading every byte of a recording: which blocks are sound, what is damaged, and whether frames follow on frames.
+"""Reads every byte of a recording: which blocks are sound, what is damaged, and whether frames follow on frames.
 
-Frames that a recording had before its first and behind its last sound blocks, as index, manifest and part tell.
-
-A gap between two blocks shows in their numbers; one at an end only in what else is known of the run.
+`check_segments` finds the sound blocks and `continuity` the gaps between them, which show in the blocks' numbers. Gaps
+at the ends of a recording show only in what else is known of the run: `lost_ends` looks at index, manifest and part.
 """
 
 import zlib
@@ -25,26 +24,28 @@ from rig.progress import tell_stage
 from rig.run_folder.manifest import device_counters, ended_early
 
 CHECKING: Final = "checking every block"
-"""The stage's name."""
+"""Name of the stage."""
 CHECKERS: Final = 2
-"""Segments checked at a time."""
+"""Number of segments checked at a time."""
 _STEP_BYTES: Final = 64 * 2**20
 _CLOCK_SHARE: Final = 0.01
-"""Ticks may be so far from those that the frame numbers say, as a share of them, beside half a frame."""
+"""Tolerance of ticks against frame numbers, as a share of the frames, beside half a frame."""
 _NEIGHBOURS: Final = 2
-"""Blocks before and behind that one is compared with."""
+"""Number of blocks before and behind that a block is compared with."""
 _FEW: Final = 4
-"""One in so many blocks of a run at most is left out for its ticks or sweep."""
+"""At most one in so many blocks of a run is left out for its ticks or sweep."""
 
 
 @dataclass(frozen=True, slots=True)
 class SoundBlock:
-    """A block whose every byte is right. entry: its index record. lost_before: as the device counted. sweep,
-    last_sweep: scan markers up to its first and its last frame.
+    """A block whose every byte is right.
 
-    header: what holds for it. first_tick, last_tick: of its frames, 0 where it has none. repeated: (first, last)
-    numbers of frames whose ticks do not rise: they count as lost. objection: why it cannot be what was recorded; else
-    None.
+    entry: its index record. header: the values in it that hold.
+    first_tick, last_tick: of its frames; 0 where it has none.
+    lost_before: frames lost before it, as the device counted.
+    sweep, last_sweep: number of scan markers up to its first and its last frame.
+    repeated: (first, last) numbers of frames whose ticks do not rise; they count as lost.
+    objection: why the block cannot be what was recorded; None where it can.
     """
 
     entry: bytes
@@ -63,12 +64,12 @@ class SoundBlock:
 
     @property
     def end_frame(self) -> int:
-        """One behind its last frame."""
+        """Number of the frame behind its last one."""
         return self.first_frame + self.n_frames
 
 
 def check_segments(segments: Sequence[SegmentReader]) -> tuple[list[SoundBlock], list[str]]:
-    """All sound blocks by place, and a line for each piece that is damaged."""
+    """Find all sound blocks, by place, and write a line for each piece that is damaged."""
     if sum(segment.size for segment in segments) < _STEP_BYTES:  # threads would take longer to start
         found = list(map(_check, segments))
     else:
@@ -81,13 +82,15 @@ def check_segments(segments: Sequence[SegmentReader]) -> tuple[list[SoundBlock],
 
 
 Gap = tuple[int, int, int]
-"""Number of the run, first and last frame that is not there."""
+"""Number of the run, and first and last frame that are missing."""
 
 
 @dataclass(slots=True)
 class Continuity:
-    """What joins the blocks of a recording. gaps: frames that the device lost, or that a repair found missing, and said
-    so; missing: others.
+    """Gaps and problems between the blocks of a recording.
+
+    gaps: frames that the device lost, or that a repair found missing, and that the recording says are lost.
+    missing: frames that are not there and of which nothing is said.
     """
 
     gaps: list[Gap] = field(default_factory=list)
@@ -106,10 +109,10 @@ class Continuity:
 
 
 def continuity(runs: Iterable[Sequence[SoundBlock]], *, is_part: bool, known: Collection[Gap] | None) -> Continuity:
-    """Whether the blocks of each run follow on each other, but for what the device says that it lost.
+    """Check whether the blocks of each run follow on each other, apart from frames that the device says it lost.
 
-    is_part: the recording was cut from another one, so that it need not begin with the first block. known: what a
-    repair found missing, and said so; None where there was none.
+    is_part: the recording was cut from another one, so that it need not begin with the first block. known: gaps that a
+    repair found and noted; None where there was no repair.
     """
     found = Continuity()
     for number, run in enumerate(runs):
@@ -118,15 +121,15 @@ def continuity(runs: Iterable[Sequence[SoundBlock]], *, is_part: bool, known: Co
 
 
 def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
-    """Whether so many frames can be so many ticks apart; anything can where they are triggered from outside."""
+    """Whether so many frames can be so many ticks apart; always true where frames are triggered from outside."""
     period = header.frame_period_ticks
     return not period or abs(ticks - frames * period) <= period * (0.5 + _CLOCK_SHARE * abs(frames))
 
 
 def out_of_step(run: Sequence[SoundBlock]) -> list[SoundBlock]:
-    """Blocks of a run whose ticks or sweep cannot be those of their frames, as their neighbours have them.
+    """Blocks of a run whose ticks or sweep disagree with their frame numbers, judged by their neighbours.
 
-    None where those would be more than a few: then it is how the device counts.
+    Empty where those would be more than a few: then the device counts differently.
     """
     votes = [0] * len(run)
     for i, block in enumerate(run):
@@ -188,7 +191,7 @@ def _stretches(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 
 def _objection(segment: SegmentReader, placed: Placed) -> str | None:
-    """Why a block with all its checksums cannot be what was recorded; None where it can."""
+    """Reason why a block with all its checksums cannot be what was recorded; None where it can."""
     if not _has_checksum(segment, placed):
         return "has no checksum of its pixels"
     block = placed.block
@@ -228,7 +231,7 @@ def _follow(
 
 
 def _repeat(number: int, first: int, last: int, where: str, known: Collection[Gap] | None, found: Continuity) -> None:
-    """Frames whose ticks do not rise are there, and count as lost all the same."""
+    """Count frames whose ticks do not rise as lost, although they are there."""
     gap = number, first, last
     if known is not None and gap in known:
         found.gaps.append(gap)
@@ -240,9 +243,9 @@ def _repeat(number: int, first: int, last: int, where: str, known: Collection[Ga
 def _join(
     number: int, before: tuple[int, int, int], block: SoundBlock, known: Collection[Gap] | None, found: Continuity
 ) -> None:
-    """Whether `block` can come behind what was before: its end, the frames lost by then, the number of its block.
+    """Check whether `block` can follow `before`: (end of the frames, frames lost by then, number of the block).
 
-    What a repair found missing takes the place of the device's counts, which may be of blocks that are gone.
+    Gaps that a repair found take the place of the device's counts, which may belong to blocks that are gone.
     """
     end_frame, lost_before, block_seq = before
     missing, lost = block.first_frame - end_frame, block.lost_before - lost_before
@@ -271,9 +274,9 @@ Run = Sequence[SoundBlock]
 def lost_ends(
     contents: Contents, runs: Sequence[Run], joined: Continuity, manifest: dict[str, Any] | None
 ) -> list[Gap]:
-    """What is gone at either end of each run; starts of which nothing is left come behind the others.
+    """Frames that are gone at either end of each run; starts of which nothing is left come behind the others.
 
-    The index tells, then, where blocks are gone that it does not tell of, the range of frames of a part and the frames
+    They show in index records of blocks that are gone, in the range of frames of a part, and in the number of frames
     that the device delivered.
     """
     cut = (manifest or {}).get("cut")
@@ -295,7 +298,7 @@ def lost_ends(
 
 
 def _told_ranges(contents: Contents, runs: Sequence[Run]) -> dict[int, tuple[int, int]]:
-    """First and end frame of each run as the index tells; none where most of its records are of something else."""
+    """First and end frame of each run as the index says; empty where most index records are of something else."""
     sound = {block.entry for run in runs for block in run}
     if len(contents.told) == 0 or 2 * sum(entry.tobytes() in sound for entry in contents.told) < len(sound):
         return {}
@@ -316,7 +319,7 @@ def _believed(told: Entries) -> Entries:
 
 
 def _reaches_beyond(entry: Any, run: Run) -> bool:
-    """Whether the index tells here of frames beyond the ends of a run, of the right size and at the right time."""
+    """Whether an index record is of frames beyond the ends of a run, of the right size and at the right time."""
     n_frames, first = int(entry["n_frames"]), int(entry["first_frame"])
     near = run[-1] if first >= run[-1].end_frame else run[0]
     if near is run[0] and first + n_frames > near.first_frame:
@@ -333,7 +336,7 @@ def _blocks_are_gone(manifest: dict[str, Any], runs: Sequence[Run]) -> bool:
 
 
 def _delivered_behind(runs: Sequence[Run], missing: Sequence[Gap], manifest: dict[str, Any] | None) -> list[Gap]:
-    """Frames that the device delivered and nobody else tells of: behind the end of the last run."""
+    """Frames behind the end of the last run that the device delivered and that nothing else mentions."""
     if manifest is None or not runs or ended_early(manifest) is not None:
         return []
     delivered = device_counters(manifest)[0].get("delivered", 0)

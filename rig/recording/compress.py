@@ -1,4 +1,4 @@
-"""Compressing a recording once it is over: each block a frame of its own, so that any of them is still read alone.
+"""Compresses a recording once it is over: each block by itself, so that any of them can be read alone.
 
 `frames-000000.spb` becomes `frames-000000.spb.zst`; the index stays as it is. Each segment is replaced only once the
 compressed one is on the disk and unpacks to the same bytes.
@@ -27,12 +27,12 @@ from rig.run_folder.folder import sync_folder
 from rig.run_folder.manifest import UNFINISHED
 
 LEVEL: Final = 3
-"""Of zstd, its default: binary frames are noise to it, and higher levels find little more."""
+"""Level of zstd, its default: binary frames look like noise to it, and higher levels find little more."""
 
 
 @dataclass(frozen=True, slots=True)
 class Compression:
-    """What it came to: bytes of all segments before and after."""
+    """Result of a compression: bytes of all segments before and after."""
 
     segments: int
     bytes_before: int
@@ -40,10 +40,10 @@ class Compression:
 
 
 def compress(folder: Path) -> Compression:
-    """Compress the segments of a recording (`rig compress`); those that are already stay as they are.
+    """Compress the segments of a recording (`rig compress`); compressed ones stay as they are.
 
-    UsageError where there is none, or the package zstandard is missing; DamagedRecordingError where it is not whole;
-    RecordingError where the disk is full, with every segment plain or compressed as a whole.
+    UsageError where there is no recording, or the package zstandard is missing; DamagedRecordingError where it is not
+    whole; RecordingError where the disk is full, with every segment plain or compressed as a whole.
     """
     try:
         zstandard_or_error()
@@ -98,7 +98,7 @@ def _compress(segment: PlainSegment, offsets: list[int]) -> None:
 
 
 def _pieces(offsets: list[int], size: int) -> list[tuple[int, int]]:
-    """From each block to the next one; what lies before the first is a piece too."""
+    """Pieces (begin, end) from each block to the next one; bytes before the first block are a piece too."""
     begins = [0, *offsets] if not offsets or offsets[0] else offsets
     ends = [*begins[1:], size]
     return [(begin, end) for begin, end in zip(begins, ends, strict=True) if end > begin]

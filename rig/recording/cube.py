@@ -1,13 +1,12 @@
 """A bare cube of packed frames, made by any program: checked against its plan, counted map by map.
 
-In a .npy file: uint8 (maps x columns x exposures, height, ceil(width/8)), most significant bit first (numpy packbits).
-Or in a recording of frames alone, as `rig import` writes it, whose frames may have gaps in their numbers. Frame f of a
-map belongs to column f // exposures, exactly; there are no dark frames.
+The frames are in a .npy file: uint8 (maps x columns x exposures, height, ceil(width / 8)), packed along the width, most
+significant bit first (`numpy.packbits(frames, axis=2)`). Nothing in an array tells which end of a byte is the left one.
+An array of another form is refused with the line of numpy that converts it. Or the frames are in a recording of frames
+alone, as `rig import` writes it, whose frames may have gaps in their numbers.
 
-Arrays of frames in `.npy` files: opened, or refused with the line of numpy that makes what is wanted.
-
-Wanted is uint8 (frames, height, ceil(width / 8)), packed along the width, most significant bit first
-(`numpy.packbits(frames, axis=2)`). Nothing in an array tells which end of a byte is the left one.
+Frame f of a map belongs to column f // exposures, exactly; there are no dark frames. `open_cube` checks a cube and
+`count_map` counts a map of it.
 """
 
 import io
@@ -33,142 +32,22 @@ from rig.count.volume import Counter, FrameTally
 from rig.errors import UsageError
 from rig.recording.open import open_recording
 
-PACK: Final = "numpy.packbits(frames, axis=2)"
-"""What packs frames of one byte or number a pixel."""
-LOOK_BYTES: Final = 16 << 20
-_HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-_UNREADABLE: Final = (ValueError, EOFError, SyntaxError, OverflowError, MemoryError, tokenize.TokenError)
-"""What numpy raises for bytes that are no array."""
-
-
-def open_array(file: Path) -> NDArray[Any]:
-    """The array of a `.npy` file, mapped into memory. UsageError, one line, where it holds none."""
-    try:
-        if zipfile.is_zipfile(file):
-            raise UsageError(_archive(file))
-        array: NDArray[Any] = np.lib.format.open_memmap(file, mode="r")
-    except OSError as error:
-        raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
-    except _UNREADABLE as error:
-        raise UsageError(f"{file} {_why_unreadable(file)}") from error
-    return array
-
-
-def _archive(file: Path) -> str:
-    """What a file of several arrays is, and how one of them is taken out."""
-    with zipfile.ZipFile(file) as archive:
-        names = [name.removesuffix(".npy") for name in archive.namelist()]
-    one = f": numpy.save('cube.npy', numpy.load('{file.name}')['{names[0]}'])" if names else ""
-    return (
-        f"{file} is an archive of arrays ({', '.join(names) or 'none'}); a cube is one array, written with numpy.save"
-        f"{one}"
-    )
-
-
-def holds_bits(frames: NDArray[Any]) -> bool:
-    """Whether every value is 0 or 1, and one is 1, as in frames that are not packed."""
-    step = max(1, LOOK_BYTES // max(1, frames[:1].nbytes))
-    seen = False
-    for first in range(0, len(frames), step):
-        part = frames[first : first + step]
-        if not ((part == 0) | (part == 1)).all():
-            return False
-        seen = seen or bool(part.any())
-    return seen
-
-
-def numpy_line(frames: NDArray[Any], height: int, width: int) -> str | None:
-    """What numpy makes uint8 (frames, height, ceil(width / 8)) of such an array with; None where its size is another.
-
-    Of several ways the one that changes least.
-    """
-    line, shape = "frames", frames.shape
-    packed, whole = (height, -(-width // 8)), (height, width)
-    if len(shape) == 4 and shape[3] == 1:
-        line, shape = "frames[..., 0]", shape[:3]
-    elif shape in (packed, whole):
-        line, shape = "frames[None]", (1, *shape)
-    elif len(shape) in (1, 2):
-        per_frame = shape[1] if len(shape) == 2 else frames.size
-        sizes = [size for size in (packed, whole) if per_frame % math.prod(size) == 0]
-        sizes = [size for size in sizes if len(shape) == 1 or math.prod(size) == per_frame]
-        if not sizes:
-            return None
-        size = sizes[0] if frames.dtype in (np.uint8, np.int8) and not holds_bits(frames) else sizes[-1]
-        line, shape = f"frames.reshape(-1, {size[0]}, {size[1]})", (frames.size // math.prod(size), *size)
-    if len(shape) != 3:
-        return None
-    for axes in sorted(permutations(range(3)), key=lambda axes: (axes != (0, 1, 2), axes != (2, 0, 1))):
-        turned = line if axes == (0, 1, 2) else f"numpy.transpose({line}, {axes})"
-        size = (shape[axes[1]], shape[axes[2]])
-        if size == packed and (packed != whole or frames.dtype == np.uint8):
-            made = _as_bytes(turned, frames.dtype)
-            if made is not None:
-                return made
-        if size == whole:
-            return _pack(turned, frames.dtype)
-    if shape[1:] == (-(-height // 8), width) and frames.dtype == np.uint8:
-        return f"numpy.packbits(numpy.unpackbits({line}, axis=1, count={height}), axis=2)"
-    return None
-
-
-def _as_bytes(line: str, dtype: np.dtype[Any]) -> str | None:
-    """Packed frames of another type as bytes; None where that holds no bytes."""
-    if dtype == np.uint8:
-        return line
-    if dtype == np.int8:
-        return f"{line}.view(numpy.uint8)"
-    return f"{line}.astype(numpy.uint8)" if dtype.kind in "iuf" else None
-
-
-def _pack(line: str, dtype: np.dtype[Any]) -> str:
-    return f"numpy.packbits({line}, axis=2)" if dtype.kind in "biu" else f"numpy.packbits({line} != 0, axis=2)"
-
-
-def _why_unreadable(file: Path) -> str:
-    """What is wrong with a file that numpy does not load, and the next step."""
-    with file.open("rb") as opened:
-        header = _header(opened)
-        begin, end = opened.tell(), opened.seek(0, io.SEEK_END)
-    if header is not None:
-        shape, _, dtype = header
-        if dtype.hasobject:
-            return (
-                f"holds Python objects of shape {shape}, which are not read; make one array of numbers of them: "
-                "frames = numpy.stack(list(objects))"
-            )
-        size = math.prod(shape) * dtype.itemsize
-        if size > end - begin:
-            return (
-                f"is no whole .npy file: {dtype} of shape {shape} takes {size} bytes, {end - begin} are there; "
-                "copy or write it again"
-            )
-    return "is no whole .npy file of numbers; write it with numpy.save"
-
-
-def _header(opened: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]] | None:
-    try:
-        return _HEADERS[np.lib.format.read_magic(opened)](opened)
-    except (*_UNREADABLE, KeyError):
-        return None
-
-
 CHUNK_BYTES = 16 << 20
-"""Frames are read in pieces of this size; larger ones only cost memory."""
+"""Bytes of the pieces that frames are read in; larger ones only cost memory."""
 RATE_TOLERANCE: Final = 1e-3
-"""Relative. Rates are written with three digits or so."""
+"""Relative tolerance of frame rates, which are written with three digits or so."""
 
 Piece = tuple[int, NDArray[np.uint8]]
-"""Number of the first frame, and uint8 (n, height, ceil(width/8) or more) of it and those that follow it."""
+"""Number of the first frame, and uint8 (n, height, ceil(width/8) or more) of this frame and those that follow it."""
 Gap = tuple[int, int]
-"""First and last number of frames that are not there."""
+"""First and last number of frames that are missing."""
 
 
 class Frames(Protocol):
-    """Where a cube's frames lie."""
+    """Source of a cube's frames."""
 
     def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
-        """The frames there are from number `first` to before `end`, at most `step` at a time."""
+        """Give the frames that exist from number `first` to before `end`, at most `step` at a time."""
         ...
 
 
@@ -179,20 +58,20 @@ class ArrayFrames:
     array: NDArray[np.uint8]
 
     def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
-        """The frames from `first` to before `end`."""
+        """Give the frames from `first` to before `end`, at most `step` at a time."""
         for start in range(first, end, step):
             yield start, self.array[start : min(start + step, end)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedFrames:
-    """Frames of a recording's one run, by their own numbers. Those of damaged blocks are left out."""
+    """Frames of a recording's only run, by their own numbers. Those of damaged blocks are left out."""
 
     recording: RunRecording
     run: RecordedRun
 
     def between(self, first: int, end: int, step: int) -> Iterator[Piece]:
-        """The frames there are from `first` to before `end`, in the blocks they lie in."""
+        """Give the frames that exist from `first` to before `end`, in the blocks they lie in."""
         for block in self.recording.blocks(self.run, first, end):
             for start in range(0, block.n_frames, step):
                 yield block.header.first_frame + start, block.bits[start : start + step]
@@ -200,7 +79,7 @@ class RecordedFrames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cube:
-    """Checked frames of whole maps. first_frame: number of the first map's first one. maps: whole sweeps."""
+    """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: whole sweeps."""
 
     path: Path
     frames: Frames
@@ -253,9 +132,9 @@ def column_commands(plan: CubePlan) -> NDArray[np.float64]:
 
 
 def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, list[Gap]]:
-    """Counts of one map, and its frames that are not there. `counter` is made for the cube's columns and size.
+    """Count one map; return the counts and the gaps in its frames.
 
-    The counter is reset first.
+    counter: made for the cube's columns and size; it is reset first.
     """
     counter.reset()
     first = cube.first_frame + index * cube.frames_per_map
@@ -300,7 +179,7 @@ def _array_problems(file: Path, array: NDArray[Any], plan: CubePlan, camera: Cam
 
 
 def _recording_problems(recording: RunRecording, plan: CubePlan, camera: Camera) -> list[str]:
-    """Why the frames of a recording are not those of the plan."""
+    """Reasons why the frames of a recording are not those of the plan."""
     path, run, header = recording.path, recording.runs[0], recording.runs[0].header
     if len(recording.runs) > 1:
         return [
@@ -353,3 +232,123 @@ def _plane_problems(plan: CubePlan, model: RigModel) -> list[str]:
             "use the calibration made for this cube's plan"
         ]
     return []
+
+
+PACK: Final = "numpy.packbits(frames, axis=2)"
+"""Line of numpy that packs frames of one byte or number a pixel."""
+LOOK_BYTES: Final = 16 << 20
+_HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+_UNREADABLE: Final = (ValueError, EOFError, SyntaxError, OverflowError, MemoryError, tokenize.TokenError)
+"""Errors that numpy raises for bytes that are no array."""
+
+
+def open_array(file: Path) -> NDArray[Any]:
+    """The array of a `.npy` file, mapped into memory. UsageError, one line, where it holds none."""
+    try:
+        if zipfile.is_zipfile(file):
+            raise UsageError(_archive(file))
+        array: NDArray[Any] = np.lib.format.open_memmap(file, mode="r")
+    except OSError as error:
+        raise UsageError(f"cannot read {file}: {error.strerror or error}; check the path") from error
+    except _UNREADABLE as error:
+        raise UsageError(f"{file} {_why_unreadable(file)}") from error
+    return array
+
+
+def _archive(file: Path) -> str:
+    """Message about a file of several arrays, with the line that takes one of them out."""
+    with zipfile.ZipFile(file) as archive:
+        names = [name.removesuffix(".npy") for name in archive.namelist()]
+    one = f": numpy.save('cube.npy', numpy.load('{file.name}')['{names[0]}'])" if names else ""
+    return (
+        f"{file} is an archive of arrays ({', '.join(names) or 'none'}); a cube is one array, written with numpy.save"
+        f"{one}"
+    )
+
+
+def holds_bits(frames: NDArray[Any]) -> bool:
+    """Whether every value is 0 or 1, and one is 1, as in frames that are not packed."""
+    step = max(1, LOOK_BYTES // max(1, frames[:1].nbytes))
+    seen = False
+    for first in range(0, len(frames), step):
+        part = frames[first : first + step]
+        if not ((part == 0) | (part == 1)).all():
+            return False
+        seen = seen or bool(part.any())
+    return seen
+
+
+def numpy_line(frames: NDArray[Any], height: int, width: int) -> str | None:
+    """The line of numpy that makes uint8 (frames, height, ceil(width / 8)) of an array; None for another size.
+
+    Where there are several ways it is the one that changes least.
+    """
+    line, shape = "frames", frames.shape
+    packed, whole = (height, -(-width // 8)), (height, width)
+    if len(shape) == 4 and shape[3] == 1:
+        line, shape = "frames[..., 0]", shape[:3]
+    elif shape in (packed, whole):
+        line, shape = "frames[None]", (1, *shape)
+    elif len(shape) in (1, 2):
+        per_frame = shape[1] if len(shape) == 2 else frames.size
+        sizes = [size for size in (packed, whole) if per_frame % math.prod(size) == 0]
+        sizes = [size for size in sizes if len(shape) == 1 or math.prod(size) == per_frame]
+        if not sizes:
+            return None
+        size = sizes[0] if frames.dtype in (np.uint8, np.int8) and not holds_bits(frames) else sizes[-1]
+        line, shape = f"frames.reshape(-1, {size[0]}, {size[1]})", (frames.size // math.prod(size), *size)
+    if len(shape) != 3:
+        return None
+    for axes in sorted(permutations(range(3)), key=lambda axes: (axes != (0, 1, 2), axes != (2, 0, 1))):
+        turned = line if axes == (0, 1, 2) else f"numpy.transpose({line}, {axes})"
+        size = (shape[axes[1]], shape[axes[2]])
+        if size == packed and (packed != whole or frames.dtype == np.uint8):
+            made = _as_bytes(turned, frames.dtype)
+            if made is not None:
+                return made
+        if size == whole:
+            return _pack(turned, frames.dtype)
+    if shape[1:] == (-(-height // 8), width) and frames.dtype == np.uint8:
+        return f"numpy.packbits(numpy.unpackbits({line}, axis=1, count={height}), axis=2)"
+    return None
+
+
+def _as_bytes(line: str, dtype: np.dtype[Any]) -> str | None:
+    """Extend the line by what makes bytes of packed frames of another type; None where the type holds no bytes."""
+    if dtype == np.uint8:
+        return line
+    if dtype == np.int8:
+        return f"{line}.view(numpy.uint8)"
+    return f"{line}.astype(numpy.uint8)" if dtype.kind in "iuf" else None
+
+
+def _pack(line: str, dtype: np.dtype[Any]) -> str:
+    return f"numpy.packbits({line}, axis=2)" if dtype.kind in "biu" else f"numpy.packbits({line} != 0, axis=2)"
+
+
+def _why_unreadable(file: Path) -> str:
+    """Message about a file that numpy does not load, with the next step."""
+    with file.open("rb") as opened:
+        header = _header(opened)
+        begin, end = opened.tell(), opened.seek(0, io.SEEK_END)
+    if header is not None:
+        shape, _, dtype = header
+        if dtype.hasobject:
+            return (
+                f"holds Python objects of shape {shape}, which are not read; make one array of numbers of them: "
+                "frames = numpy.stack(list(objects))"
+            )
+        size = math.prod(shape) * dtype.itemsize
+        if size > end - begin:
+            return (
+                f"is no whole .npy file: {dtype} of shape {shape} takes {size} bytes, {end - begin} are there; "
+                "copy or write it again"
+            )
+    return "is no whole .npy file of numbers; write it with numpy.save"
+
+
+def _header(opened: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]] | None:
+    try:
+        return _HEADERS[np.lib.format.read_magic(opened)](opened)
+    except (*_UNREADABLE, KeyError):
+        return None

@@ -1,4 +1,4 @@
-"""A part of a recording as a recording of its own: by maps, by frames of a run, or by time.
+"""Cuts a part out of a recording, as a recording of its own: by maps, by frames of a run, or by time.
 
 Frames keep their run and number, so that maps of a part are bound and named as in the whole. What is needed to estimate
 its maps again comes along: plan, calibration, learned states and, where it was known, the truth.
@@ -26,12 +26,12 @@ OF_MAPS: Final = ("learned", "truth")
 """Folders with a file for each map, which a part takes along."""
 
 _VERDICT_WITHOUT_GAPS: Final = {RunVerdict.GAPS: RunVerdict.COMPLETE, UNFINISHED: RunVerdict.ABORTED}
-"""Of a part, by that of the whole: its gaps may lie elsewhere, and a part is over whatever the run is."""
+"""Verdict of a part, by that of the whole: its gaps may lie elsewhere, and a part is over even if the run is not."""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Frames of one run. first_map, end_map: the maps that lie in it whole, by their numbers in the whole recording."""
+    """Frames of one run. first_map, end_map: the maps that lie in it as a whole, by their numbers in the recording."""
 
     run: RecordedRun
     first_frame: int
@@ -49,12 +49,13 @@ def cut(
     time: str | None = None,
     run: int = 0,
 ) -> dict[str, Any]:
-    """Write a part of a recording to a new folder (`rig cut`); its manifest.
+    """Write a part of a recording to a new folder and return its manifest (`rig cut`).
 
-    Exactly one of: maps 'A:B', frames 'A:B' of a run, time 'A:B' in seconds of its frame clock from its first frame;
-    each from A to before B, either left out for the first or the end; a single number for one map or frame.
-    run: of frames and time. UsageError for what there is not, or where `out` cannot be written, DamagedRecordingError
-    for what is not as it was recorded, RecordingError where the disk is full.
+    Give exactly one of: maps 'A:B', frames 'A:B' of a run, time 'A:B' in seconds of its frame clock from its first
+    frame; each from A to before B, either left out for the first or the end; a single number means one map or frame.
+    run: the run that frames and time are of.
+    Raises UsageError for a part that does not exist, or where `out` cannot be written, DamagedRecordingError where the
+    recording is not as it was recorded, RecordingError where the disk is full.
     """
     recording = open_recording(folder)
     manifest, trouble = manifest_or_none(folder)
@@ -122,7 +123,7 @@ def _parts(
 
 
 def _map_parts(recording: RunRecording, spans: Sequence[MapSpan], first: int, end: int) -> list[Part]:
-    """A part of each run that the maps are of, with the frame of the marker that closes its last map."""
+    """One part for each run that the maps are of, with the frame of the marker that closes its last map."""
     if not any(run.entries["sweep"].any() for run in recording.runs):
         raise UsageError(
             f"{recording.path} has no markers to tell maps apart (sweeps are found by the light of a whole run, if at "
@@ -191,7 +192,7 @@ def _manifest(
 
 
 def _missing(known: Sequence[Sequence[int]], parts: Sequence[Part]) -> list[list[int]]:
-    """What a repair found missing in the whole, [run, first, last], as far as it lies within the parts."""
+    """Gaps [run, first, last] that a repair found in the whole, as far as they lie within the parts."""
     return [
         [number, first, last]
         for number, part in enumerate(parts)
@@ -215,7 +216,7 @@ def _seal_of(manifest: dict[str, Any]) -> int:
 
 
 def _copy_inputs(folder: Path, out: Path, manifest: dict[str, Any], maps: Sequence[int]) -> None:
-    """Copy what stands beside the frames; files of maps are numbered from 0 again, as the part's maps are."""
+    """Copy the files beside the frames; files of maps are numbered from 0 again, as the part's maps are."""
     for name in manifest.get("inputs") or {}:
         shutil.copyfile(folder / name, out / name)
     before = (manifest.get("cut") or {}).get("maps", [0])[0]

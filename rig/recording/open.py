@@ -1,12 +1,9 @@
-"""Opening a recording for the commands that read one: what is wrong with the folder is its user's to mend.
+"""Opens recordings for the commands that read one, and says what they hold and which frames belong to which map.
 
-What a recording holds, as its index and manifest tell; `verify` is what reads all of it.
-
-What a part of a recording (`rig cut`) takes over from the whole, so that its maps come out the same bit for bit.
-
-Which frames of a recording belong to which map: as its manifest says and, of a run that ended early, its markers.
-
-Where the starts of a recording begin and end: with which sound blocks, and what is gone there.
+`open_recording` opens one, `info` describes it from index and manifest (`verify` reads all of it), and `map_spans`
+finds the frames of each map: as the manifest says or, for a run that ended early, its markers. The rest is about where
+the starts of a recording begin and end, and what a part (`rig cut`) takes over from the whole, so that its maps come
+out the same bit for bit. What is wrong with a folder is a UsageError: its user can mend it.
 """
 
 import zipfile
@@ -34,11 +31,11 @@ from rig.plan.scan_plan import MAX_CLOCK_ERROR
 from rig.run_folder.manifest import MANIFEST, ended_before_last_map, is_cut_short, known_missing, read_manifest
 
 SEGMENTS: Final = "frames-*.spb"
-"""Files that the frames of a recording lie in."""
+"""Pattern of the files that the frames of a recording lie in."""
 
 
 def open_recording(folder: Path) -> RunRecording:
-    """The recording of a run. UsageError where there is none, DamagedRecordingError where nothing of it is left."""
+    """Open the recording of a run. UsageError without one, DamagedRecordingError where nothing of it is left."""
     require_recording(folder)
     try:
         return RunRecording(folder)
@@ -49,13 +46,13 @@ def open_recording(folder: Path) -> RunRecording:
 
 
 def require_recording(path: Path) -> None:
-    """UsageError where a path is no folder with a recording, saying what it is instead."""
+    """Raise UsageError where a path is no folder with a recording, saying what it is instead."""
     if not (path.is_dir() and segment_files(path)):
         raise UsageError(f"{path} {_instead(path)}")
 
 
 def _instead(path: Path) -> str:
-    """What a path without a recording is, and the next step."""
+    """Say what a path without a recording is, and the next step."""
     if path.is_file():
         recorded = path.match(f"{SEGMENTS}*")
         then = "the folder that it lies in" if recorded else "the folder of a run taken with --record"
@@ -82,7 +79,7 @@ def _instead(path: Path) -> str:
 
 
 def manifest_or_none(folder: Path) -> tuple[dict[str, Any] | None, str | None]:
-    """The manifest, or why there is none."""
+    """The manifest, or the reason why there is none."""
     try:
         manifest = read_manifest(folder)
     except DamagedRecordingError as error:
@@ -92,7 +89,7 @@ def manifest_or_none(folder: Path) -> tuple[dict[str, Any] | None, str | None]:
 
 @dataclass(frozen=True, slots=True)
 class MapSpan:
-    """A map's frames: of one run, from the one with its scan marker to before the one with the next."""
+    """Frames of a map: of one run, from the frame with its scan marker to before the frame with the next."""
 
     run: int
     first_frame: int
@@ -100,7 +97,7 @@ class MapSpan:
 
 
 def map_spans(recording: RunRecording, manifest: dict[str, Any] | None) -> list[MapSpan]:
-    """The whole maps of a recording, in order."""
+    """Find the whole maps of a recording, in order."""
     manifest = manifest or {}
     sweeps = manifest.get("sweeps")
     if sweeps is None:
@@ -115,7 +112,7 @@ def map_spans(recording: RunRecording, manifest: dict[str, Any] | None) -> list[
 
 
 def _stated(recording: RunRecording, sweeps: list[dict[str, Any]]) -> Iterator[MapSpan]:
-    """As the manifest says: frames are counted anew with each run."""
+    """Spans as the manifest states them; frame numbers begin anew with each run."""
     run, end = 0, 0
     for sweep in sweeps:
         first = int(sweep["first_frame"])
@@ -127,14 +124,14 @@ def _stated(recording: RunRecording, sweeps: list[dict[str, Any]]) -> Iterator[M
 
 
 def _marked(recording: RunRecording) -> Iterator[MapSpan]:
-    """As the markers say; a map whose begin or end was lost begins and ends with the frames that are left."""
+    """Spans between markers; a map whose beginning or end was lost has the frames that are left."""
     for run in recording.runs:
         begins = [frame for _, frame in _sweep_begins(recording, run)]
         yield from (MapSpan(run.number, a, b) for a, b in pairwise(begins))
 
 
 def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[tuple[int, int]]:
-    """(scan markers so far, number of the first frame with them), for each scan marker but those before the run."""
+    """(number of scan markers so far, first frame with them), for each scan marker except those before the run."""
     entries = run.entries
     changes = np.flatnonzero(np.diff(entries["sweep"].astype(np.int64), prepend=-1) != 0)
     look_into = sorted({0, len(entries) - 1, *changes.tolist(), *(changes[1:] - 1).tolist()})
@@ -151,20 +148,23 @@ def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[tuple[i
 
 
 def _markers_seen(block: FrameBlock) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Scan markers of the run up to each frame: a record's low 16 bits, continued from the header's 32."""
+    """Number of scan markers in the run up to each frame: a record's low 16 bits, continued from the header's 32."""
     sweep = block.header.sweep
     return sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF)
 
 
 def _marked_first(block: FrameBlock) -> bool:
-    """Whether the first frame has a scan marker of its own."""
+    """Whether the first frame of a block has a scan marker of its own."""
     return bool(int(block.records["marks"][0]) & Mark.SCAN)
 
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """One start of the SPAD. Frames first_frame to end_frame - 1; gaps: how many pieces are missing between them and,
-    as a repair found, at their ends; lost: frames of those.
+    """One start of the SPAD, with frames first_frame to end_frame - 1.
+
+    gaps: number of missing pieces between its frames and, as a repair found, at its ends. lost: frames in these.
+    width, height: pixels of a frame; sensor_width, sensor_height: of the sensor.
+    first_map, end_map: its maps, from the first to before the end; None where it has none.
     """
 
     run_id: int
@@ -185,7 +185,11 @@ class RunInfo:
 
 @dataclass(frozen=True, slots=True)
 class RecordingInfo:
-    """A recording. bytes: on the disk. verdict: the run's; problems: seen without reading the frames."""
+    """Contents of a recording.
+
+    verdict: the run's own. compressed: number of compressed segments. bytes: size on the disk.
+    problems: a line each, as far as they can be seen without reading the frames.
+    """
 
     folder: Path
     verdict: str | None
@@ -202,12 +206,12 @@ class RecordingInfo:
     problems: list[str]
 
     def as_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """Return it as plain values."""
         return {**asdict(self), "folder": str(self.folder)}
 
 
 def info(folder: Path) -> RecordingInfo:
-    """Contents of a recording (`rig info`). UsageError where there is none."""
+    """Describe a recording (`rig info`). UsageError where there is none."""
     recording = open_recording(folder)
     manifest, trouble = manifest_or_none(folder)
     spans = map_spans(recording, manifest)
@@ -234,7 +238,10 @@ def info(folder: Path) -> RecordingInfo:
 
 
 def _is_there(span: MapSpan, run: RecordedRun, manifest: dict[str, Any]) -> bool:
-    """Whether a map can be made of what a repair left: of a part, which has none before it, the whole ones only."""
+    """Whether a map can be made of what a repair left.
+
+    In a part, which has no frames before its first map, only whole maps can.
+    """
     if "repaired" not in manifest:
         return True
     begin = span.first_frame if "cut" in manifest else span.end_frame - 1
@@ -265,14 +272,14 @@ def _run_info(run: RecordedRun, maps: list[int], known: list[tuple[int, int]]) -
 
 
 def _duration_s(run: RecordedRun) -> float:
-    """From the first frame to the end of the last one, to the precision of its last block where that has no period."""
+    """Seconds from the first frame to the end of the last one; without a frame period, to the last block's start."""
     entries, header = run.entries, run.header
     last = int(entries["n_frames"][-1]) * header.frame_period_ticks
     return float((int(entries["t0_ticks"][-1]) - int(entries["t0_ticks"][0]) + last) / header.tick_hz)
 
 
 EndGap = tuple[int, int, int]
-"""Number of the start, first and last frame that is gone."""
+"""Number of the start, and first and last frame that is gone."""
 
 
 def end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> FrameBlock | None:
@@ -282,7 +289,7 @@ def end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> Frame
 
 
 def readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int]:
-    """First frame of a start and one behind its last, of its sound blocks; (first, first) where none is."""
+    """First frame of a start and the one behind its last, in sound blocks; (first, first) where no block is sound."""
     first, last = (end_block(recording, run, last=end) for end in (False, True))
     if first is None or last is None:
         return run.first_frame, run.first_frame
@@ -290,7 +297,7 @@ def readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int]
 
 
 def end_gaps(recording: RunRecording) -> list[EndGap]:
-    """What a repair found missing, and the frames of blocks at the ends of starts that are damaged."""
+    """Gaps that a repair found, and the frames of damaged blocks at the ends of starts."""
     known = known_missing(read_manifest(recording.path)) if recording.path.is_dir() else None
     gaps = list(dict.fromkeys(known or ()))
     for run in recording.runs:
@@ -301,7 +308,7 @@ def end_gaps(recording: RunRecording) -> list[EndGap]:
 
 
 def part_starts(recording: RunRecording) -> list[SweepStart]:
-    """With which sweep the maps of each run begin: the first, but in a part."""
+    """The sweep that the maps of each run begin with: the first one, except in a part."""
     cut = (read_manifest(recording.path) or {}).get("cut") if recording.path.is_dir() else None
     if cut is None:
         return [SweepStart() for _ in recording.runs]
@@ -313,7 +320,7 @@ def part_starts(recording: RunRecording) -> list[SweepStart]:
 
 
 def fitted_ratio(ratio: float, sweeps: Sequence[dict[str, Any]]) -> float:
-    """Ratio of the scanner's clock to nominal behind these sweeps of a manifest; `ratio` is that before the first."""
+    """Ratio of the scanner's clock to nominal after these sweeps of a manifest; `ratio` is the one before the first."""
     for i, sweep in enumerate(sweeps):
         if i and sweep["first_frame"] < sweeps[i - 1]["end_frame"]:
             ratio = 1.0  # another start of the SPAD
@@ -324,9 +331,9 @@ def fitted_ratio(ratio: float, sweeps: Sequence[dict[str, Any]]) -> float:
 
 
 def part_learned(folder: Path, estimate: EstimateConfig, model: RigModel | None) -> list[RowModel]:
-    """The states that the maps of a part were estimated with, where it is estimated as the whole was; else none.
+    """States that the maps of a part were estimated with, where it is estimated as the whole was; otherwise none.
 
-    Nothing of a whole recording, which learns the same again from its first map on.
+    None for a whole recording either: it learns the same again from its first map on.
     """
     manifest: dict[str, Any] = (read_manifest(folder) or {}) if folder.is_dir() else {}
     before = (manifest.get("config") or {}).get("estimate") or {}

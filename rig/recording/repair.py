@@ -1,8 +1,8 @@
-"""Making a torn recording whole: nothing but sound blocks, with an index and a manifest that say so.
+"""Makes a torn recording whole: nothing but sound blocks, with an index and a manifest that say so.
 
 No frame is changed and no byte is thrown away: what is no sound block goes to `frames-000000.torn`, at the place where
 it was in the segment, a damaged compressed segment to `frames-000000.torn.zst` and a damaged manifest to
-`manifest.damaged.json`. What a repair left stays as it is in another one.
+`manifest.damaged.json`. Another repair leaves these files as they are.
 """
 
 import json
@@ -28,19 +28,19 @@ from rig.run_folder.summary import RunVerdict
 _PIECE_BYTES: Final = 1 << 24
 
 Range = tuple[int, int]
-"""Bytes of a segment: from, to before."""
+"""Bytes of a segment, from the first to before the second number."""
 
 
 @dataclass(frozen=True, slots=True)
 class Repair:
-    """What was done, a line for each thing, and what `verify` says afterwards."""
+    """Result of a repair: a line for each thing done, and what `verify` says afterwards."""
 
     done: list[str]
     after: Verification
 
 
 def repair(folder: Path) -> Repair:
-    """Make a recording whole as far as it can be (`rig repair`).
+    """Make a recording whole as far as possible (`rig repair`).
 
     UsageError where there is none, RecordingError where it cannot be written.
     """
@@ -66,7 +66,7 @@ def repair(folder: Path) -> Repair:
 
 
 def _put_in_order(found: Examined, done: list[str]) -> bool:
-    """Rename segments so that their numbers rise with the frames in them; whether that was to be done."""
+    """Rename segments so that their numbers rise with the frames in them; return whether that was necessary."""
     segments = {segment.number: segment.path for segment in found.segments}
     numbers = list(dict.fromkeys(found.entries["segment"].tolist()))  # entries are in the order of their frames
     if numbers == sorted(numbers):
@@ -82,14 +82,14 @@ def _put_in_order(found: Examined, done: list[str]) -> bool:
 
 
 def _blocks_in(segment: SegmentReader, found: Examined) -> list[Range]:
-    """Where the sound blocks of a segment lie, in order."""
+    """Ranges of the sound blocks of a segment, in order."""
     mine = found.entries[found.entries["segment"] == segment.number]
     begin = np.sort(mine, order="offset")
     return list(zip(begin["offset"].tolist(), (begin["offset"] + begin["length"]).tolist(), strict=True))
 
 
 def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
-    """Zero what is no sound block, and end the segment behind the last one; a copy of it is kept."""
+    """Zero what is no sound block and end the segment behind the last one, after copying it to the torn file."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     others = [(a, used) for a, b in _between(blocks, segment.size) if (used := _used(segment, a, b)) > a]
     if others:
@@ -113,7 +113,7 @@ def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None
 
 
 def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
-    """Write the sound blocks of a compressed segment plain where it holds anything else; as it was, it is kept."""
+    """Write the sound blocks of a compressed segment plain where it holds anything else, and keep the old file."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     if blocks and segment.size == end and not any(_is_damaged(segment, a, b) for a, b in _between(blocks, end)):
         return
@@ -137,7 +137,7 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
 
 
 def _is_damaged(segment: SegmentReader, begin: int, stop: int) -> bool:
-    """Whether anything but zeros is between two blocks, or nobody can say."""
+    """Whether anything but zeros lies in a range, or it cannot be read."""
     try:
         return _used(segment, begin, stop) > begin
     except CorruptBlock:
@@ -145,7 +145,7 @@ def _is_damaged(segment: SegmentReader, begin: int, stop: int) -> bool:
 
 
 def _between(blocks: list[Range], size: int) -> Iterator[Range]:
-    """What lies between the blocks, in pieces."""
+    """Ranges between the blocks, in pieces."""
     begin = 0
     for start, stop in [*blocks, (size, size)]:
         for piece in range(begin, start, _PIECE_BYTES):
@@ -154,13 +154,13 @@ def _between(blocks: list[Range], size: int) -> Iterator[Range]:
 
 
 def _used(segment: SegmentReader, begin: int, stop: int) -> int:
-    """Where the last byte ends that is not zero; `begin` where all are."""
+    """End of the last byte in a range that is not zero; `begin` where all are."""
     data = segment.at(begin, stop - begin)
     return stop - int((data[::-1] != 0).argmax()) if data.any() else begin
 
 
 def _keep(segment: SegmentReader, pieces: list[Range], torn: Path) -> None:
-    """Copy pieces of a segment to the same places of another file, which has them by the time this returns."""
+    """Copy pieces of a segment to the same places of another file, which is on the disk when this returns."""
     with torn.open("rb+" if torn.exists() else "wb") as copy:
         for begin, stop in pieces:
             copy.seek(begin)
@@ -220,7 +220,7 @@ def _verdict(manifest: dict[str, Any], recording: dict[str, Any], missing: list[
 
 
 def _recording(found: Examined) -> dict[str, Any]:
-    """What there is, as `Recording.content` says it; the starts only where nobody knows better."""
+    """Describe the recording as `Recording.content` does; its starts only where the manifest does not have them."""
     with_blocks = set(found.entries["segment"].tolist())
     content: dict[str, Any] = {
         "files": [s.path.name.removesuffix(".zst") for s in found.segments if s.number in with_blocks],
@@ -234,13 +234,13 @@ def _recording(found: Examined) -> dict[str, Any]:
 
 
 def _start(found: Examined, run: list[SoundBlock]) -> dict[str, int]:
-    """As `rig.recording.writer.Start`: whole sweeps of a run, as its blocks tell, and its first segment."""
+    """Fields of `rig.recording.writer.Start`: whole sweeps of a run, as its blocks tell, and its first segment."""
     mine = found.entries[found.entries["run_id"] == run[0].run_id]
     return {"sweeps": max(0, run[-1].last_sweep - max(1, run[0].sweep)), "segment": int(mine["segment"].min())}
 
 
 def _replace(file: Path, data: bytes) -> None:
-    """Write a file that is there whole or as it was before."""
+    """Write a file in one step: it is there as a whole, or as it was."""
     scratch = file.with_name(f"{file.name}.part")
     with scratch.open("wb") as stream:
         stream.write(data)

@@ -1,7 +1,8 @@
-"""A recording through the live stack: its plan and its starts, with other devices recorded too, emulated or real.
+"""Prepares a recording for the live stack: its plan and its starts, with other devices recorded, emulated or real.
 
 Frames are bound by the plan that they were taken with (`plan.yaml`), never by one compiled anew, and each start of the
-SPAD is played as one: so a map is made of the very same frames in the very same order, at any clock.
+SPAD is played as one: so a map is made of the very same frames in the very same order, at any clock. `replay_config`
+makes the rig that plays, `Replayed` tells a run what it needs to know of the recording.
 """
 
 import itertools
@@ -47,12 +48,12 @@ from rig.run_folder.manifest import (
 )
 
 SILENCE_S = 5.0
-"""As of a live SPAD, in the time of the recording."""
+"""Silence after which a SPAD has failed, as for a live one, in the time of the recording."""
 ENDLESS_S = 1e6
 ENDLESS = 1_000_000_000
-"""Maps of a loop that nobody counts."""
+"""Number of maps that stands for a loop without end."""
 RECORDED = ("scanner", "laser", "sync")
-"""Slots that a recording can play all by itself."""
+"""Slots whose devices a recording can play as well."""
 
 
 @runtime_checkable
@@ -61,34 +62,38 @@ class PlaysRecording(Protocol):
 
     @property
     def recording(self) -> RunRecording:
-        """What it plays."""
+        """The recording that is played."""
         ...
 
     @property
     def pace(self) -> Pace:
-        """When its frames come due."""
+        """The clock that says when frames come due."""
         ...
 
     @property
     def loops(self) -> bool:
-        """Whether it begins again behind the last start."""
+        """Whether it begins again after the last start."""
         ...
 
     def leave_out(self, runs: Collection[int]) -> None:
-        """Do not play these starts, by their numbers."""
+        """Leave these starts out of the play, by their numbers."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class ReplayOptions:
-    """How a recording is played. block_frames: of a block at most, None for what the plan says."""
+    """Options of playing a recording.
+
+    clock: 'realtime', 'max', a factor such as 'x4', or 'step'. loop: play it again and again.
+    block_frames: most frames of a block; None is as the plan says.
+    """
 
     clock: str = "max"
     loop: bool = False
     block_frames: int | None = None
 
     def __post_init__(self) -> None:
-        """UsageError for a clock that is none."""
+        """Raise UsageError for an unknown clock."""
         try:
             ReplayClock.parse(self.clock)
         except ValueError as error:
@@ -105,10 +110,12 @@ def replay_config(
     *,
     against_recording: bool = False,
 ) -> RigConfig:
-    """The rig that plays a recording. others: whose world, scanner, laser and sync source take part; None: recorded.
+    """Make the config of the rig that plays a recording.
 
-    against_recording: the recording's own drivers take part, against what their devices answered then.
-    estimate: settings laid over those of the recording. UsageError where there is no recording.
+    others: rig whose world, scanner, laser and sync source take part; None plays the recorded ones.
+    against_recording: the recording's own drivers take part, and get the answers that their devices gave then.
+    estimate: settings laid over those of the recording.
+    Raises UsageError where there is no recording.
     """
     require_recording(run)
     plan = read_plan(run)
@@ -149,7 +156,7 @@ def replay_config(
 def replay_plan(
     spad: SpadArray, recording: RunRecording, scan: ScanConfig, model: RigModel | None
 ) -> tuple[ScanPlan, SpadTiming]:
-    """The plan that the frames were taken with, for the calibration that there is, and the SPAD configured for it."""
+    """The plan that the frames were taken with, for the present calibration, and the timing of the configured SPAD."""
     plan = read_plan(recording.path)
     _require_frames_of(plan, recording)
     if model is not None:
@@ -165,7 +172,7 @@ def replay_plan(
 
 
 def _require_frames_of(plan: ScanPlan, recording: RunRecording) -> None:
-    """DamagedRecordingError where the frames are of another size than the plan's: counters are made by the plan."""
+    """Raise DamagedRecordingError where the frames are of another size than the plan's, which counters are made by."""
     widths = {plan.width} if plan.windows is None else {plan.width, plan.windows.width_px}
     for run in recording.runs:
         header = run.header
@@ -177,7 +184,7 @@ def _require_frames_of(plan: ScanPlan, recording: RunRecording) -> None:
 
 
 class Replayed:
-    """What a run needs to know of the recording that its SPAD plays. maps: to take."""
+    """Facts about a recording for the run that plays it. maps: how many the run will take."""
 
     def __init__(self, spad: PlaysRecording, plan: ScanPlan, maps: int | None) -> None:
         self._spad = spad
@@ -199,41 +206,41 @@ class Replayed:
 
     @classmethod
     def of(cls, spad: SpadArray, plan: ScanPlan, maps: int | None) -> "Replayed | None":
-        """None for a SPAD that plays no recording. UsageError where that has not so many maps."""
+        """Make it for a SPAD that plays a recording; None for any other. UsageError where there are too few maps."""
         return cls(spad, plan, maps) if isinstance(spad, PlaysRecording) else None
 
     @property
     def report(self) -> PaceReport:
-        """How its clock was held."""
+        """Report on how the clock was kept."""
         return self._spad.pace.report
 
     @property
     def silence_s(self) -> float:
-        """How long it may give nothing: at a slow clock longer, and while it waits for steps as long as it takes."""
+        """Longest silence of the SPAD that is allowed: more at a slow clock, and no limit while it waits for steps."""
         pace = self._spad.pace
         return ENDLESS_S if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
 
     def groups(self) -> Iterator[int]:
-        """Sweeps of one start after the other."""
+        """Give the number of sweeps of each start, one after the other."""
         sweeps = [start.sweeps for start in self._played]
         return itertools.cycle(sweeps) if self._spad.loops else iter(sweeps)
 
     def starts_for(self, maps: int) -> int:
-        """Starts that give so many maps, at most."""
+        """The most starts that it takes for so many maps."""
         return -(-maps // self._there) * len(self._played)
 
     def starts(self) -> Iterator[SweepStart]:
-        """With which sweep each of the starts begins."""
+        """The sweep that each of the starts begins with."""
         found = [start.begin for start in self._played]
         return itertools.cycle(found) if self._spad.loops else iter(found)
 
     def learned(self, estimate: EstimateConfig, model: RigModel | None) -> Sequence[Learned]:
-        """Of a part of a recording, what its maps were estimated with; empty where they are to be learned anew."""
+        """States that the maps of a part were estimated with; empty where they are to be learned anew."""
         learned = part_learned(self._spad.recording.path, estimate, model)
         return [learned[number] for number in self._numbers if number < len(learned)]
 
     def truth(self, index: int) -> SweepTruth | None:
-        """What was known of a map when it was recorded, where that was kept.
+        """Truth of a map that was recorded with it; None where it was not kept.
 
         DamagedRecordingError where it is of other columns or of another sensor.
         """
@@ -246,9 +253,9 @@ class Replayed:
         return truth
 
     def lost_outside(self, sweeps: Sequence[SweepAccount]) -> list[Gap]:
-        """(first, last) frames known to be gone from the recording that lie in none of these sweeps, its whole ones.
+        """Frames (first, last) known to be gone from the recording and outside all these sweeps.
 
-        None where fewer maps were asked for than there are.
+        Empty where fewer maps were asked for than there are.
         """
         if not self._all:
             return []
@@ -263,15 +270,17 @@ class Replayed:
 
 
 def pace_of(spad: SpadArray) -> Pace:
-    """What steps are told to."""
+    """The clock of a SPAD that plays a recording, which takes steps."""
     assert isinstance(spad, PlaysRecording), "opened from a config of `replay_config`"
     return spad.pace
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedStart:
-    """One start of the SPAD. begin: with which sweep its whole maps begin. first_map: number of the first of them in
-    the recording; sweeps: how many there are. gone: frames at its ends that the manifest tells of and no block has.
+    """One start of the SPAD in a recording.
+
+    begin: the sweep that its whole maps begin with. first_map: number of the first of these in the recording. sweeps:
+    how many there are. gone: frames at its ends that the manifest tells of and no block has.
     """
 
     number: int
@@ -282,7 +291,7 @@ class RecordedStart:
 
 
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedStart]:
-    """The whole sweeps that each start of the SPAD gave, as the run took them, as far as their frames are there.
+    """The whole sweeps of each start of the SPAD, as the run took them, as far as their frames are there.
 
     DamagedRecordingError where a start is missing: its maps would be taken for those of others.
     """
@@ -322,7 +331,10 @@ def _recorded_start(
     manifest: dict[str, Any],
     plan: ScanPlan,
 ) -> RecordedStart:
-    """Of a start that gave `maps` maps from number `first_map` on; sweeps: theirs in the manifest, None: not noted."""
+    """Describe a start that gave `maps` maps from number `first_map` on.
+
+    sweeps: those of the start in the manifest; None where they are not noted.
+    """
     first, end = readable_range(recording, run)
     whole = maps
     cut_short = is_cut_short(manifest) or ended_before_last_map(manifest)
@@ -345,7 +357,7 @@ def _recorded_start(
 
 
 def _merged(gaps: Sequence[EndGap]) -> list[EndGap]:
-    """The gaps of each start in order, those that meet as one."""
+    """The gaps of each start in order; those that meet become one."""
     merged: list[EndGap] = []
     for number, first, last in sorted(gaps):
         if merged and merged[-1][0] == number and first <= merged[-1][2] + 1:
@@ -356,7 +368,7 @@ def _merged(gaps: Sequence[EndGap]) -> list[EndGap]:
 
 
 def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[int, list[Gap]]:
-    """From which frame to before which the sweeps of each start go: frames are counted anew with each."""
+    """Range of frames, from and to before, of the sweeps of each start; frame numbers begin anew with each."""
     spans: dict[int, list[Gap]] = {}
     at, end = 0, 0
     for sweep in sweeps:
@@ -368,7 +380,7 @@ def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[in
 
 
 def recorded_truth(folder: Path, index: int) -> SweepTruth | None:
-    """What a world said of a map when it was recorded; None where there was none or it was not kept."""
+    """Read the truth of a map that a world knew when it was recorded; None where there is none."""
     file = folder / "truth" / f"{index:06d}.npz"
     if not file.exists():
         return None
@@ -380,7 +392,7 @@ def recorded_truth(folder: Path, index: int) -> SweepTruth | None:
 
 
 def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> int:
-    """Sweeps of a start that are there to their end: by its markers, or without such by the number of frames.
+    """Number of sweeps of a start that are complete: by its markers or, without markers, by its number of frames.
 
     Never more than its frames, whatever their headers say.
     """
@@ -395,7 +407,7 @@ def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> 
 
 
 def _own_drivers(run: Path, recorded: dict[str, Any]) -> dict[str, Any]:
-    """The drivers of a recorded config, at ports where what was recorded answers. UsageError where there are none."""
+    """The drivers of a recorded config, at ports where the recorded traffic answers. UsageError without any."""
     parts = {slot: recorded.get(slot) or {} for slot in RECORDED}
     parts = {slot: {**part, "port": f"emulated:{slot}"} for slot, part in parts.items() if "port" in part}
     if not parts:
@@ -407,7 +419,7 @@ def _own_drivers(run: Path, recorded: dict[str, Any]) -> dict[str, Any]:
 
 
 def _scan_of(plan: ScanPlan) -> dict[str, Any]:
-    """The scan section that a plan came from, as far as a run asks for it."""
+    """The scan section that a plan came from, as far as a run needs it."""
     return {
         "columns": plan.columns,
         "exposures": plan.exposures,

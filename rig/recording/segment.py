@@ -1,10 +1,10 @@
-"""One segment of a recording: SPB1 blocks one after the other, each padded with zeros to whole pages.
+"""Writes one segment of a recording: SPB1 blocks one after the other, each padded with zeros to whole pages.
 
 Blocks are written past the page cache where the system can (O_DIRECT), several at a time, pixels straight from where
 they lie: 0.3 s of CPU a GB, nearly all of it for the checksum, where the page cache takes 2 s. What is written is then
 on the disk, and a sync has little to do.
 
-What a recorded run will take on the disk at most, as far as its plan tells, and whether the disk has so much.
+`Space` is the room that a recorded run will take on the disk at most, as far as its plan tells, and what the disk has.
 """
 
 import errno
@@ -28,39 +28,39 @@ from rig.errors import UsageError
 from rig.plan.scan_plan import ScanPlan
 
 PAGE_BYTES: Final = 4096
-"""Places and sizes of what is written past the page cache are multiples of this, in the file and in memory."""
+"""Unit of places and sizes of what is written past the page cache, in the file and in memory."""
 _SHARE_OF_FREE: Final = 2
-"""At most one half of the free space is set aside at a time: maps are written to the same disk."""
+"""At most this part (one half) of the free space is set aside at a time: maps go to the same disk."""
 
 _sync_data = getattr(os, "fdatasync", os.fsync)
 
 
 class Staging:
-    """Page-aligned memory of a thread, in which the parts of a block are put together that do not lie on pages."""
+    """Page-aligned memory of a thread, in which the parts of a block that do not lie on pages are put together."""
 
     def __init__(self) -> None:
         self._memory = mmap.mmap(-1, PAGE_BYTES)
 
     def take(self, size: int) -> memoryview:
-        """`size` bytes, with old content."""
+        """Memory of `size` bytes, with old content."""
         if len(self._memory) < size:
             self._memory = mmap.mmap(-1, paged(size))
         return memoryview(self._memory)[:size]
 
 
 class OpenSegment:
-    """An open segment. Blocks are placed in order, by one thread, and written by any."""
+    """A segment that blocks are written to. One thread places them in order, any thread writes them."""
 
     def __init__(self, folder: Path, number: int, name: str, reserve_bytes: int) -> None:
         """Make the file; set `reserve_bytes` aside for it as far as the disk has them. Raises OSError."""
         self.number = number
         self.path = folder / name
         self.placed = 0
-        """Where the next block goes, bytes."""
+        """Offset of the next block, bytes."""
         self.end = 0
-        """Where the last block ends that is written, as are all before it."""
+        """End of the last block that is written, with all before it, bytes."""
         self.synced = 0
-        """As `end`, at the beginning of the last sync."""
+        """Value of `end` at the beginning of the last sync."""
         self._lock = threading.Lock()
         self._fd = _open_direct(self.path)
         _reserve(self.path, reserve_bytes)
@@ -71,13 +71,13 @@ class OpenSegment:
         return self.end == self.placed
 
     def place(self, size: int) -> int:
-        """The offset of a block of `size` bytes, padding included, which comes next."""
+        """Place the next block, of `size` bytes with padding, and return its offset."""
         offset = self.placed
         self.placed += size
         return offset
 
     def write(self, block: FrameBlock, offset: int, staging: Staging) -> None:
-        """Write a block at its place; its memory has to stay as it is until then. Raises OSError."""
+        """Write a block at its place; its memory must not change until this returns. Raises OSError."""
         pieces = _pieces(block, staging)
         while pieces:
             written = self._write(pieces, offset)
@@ -143,7 +143,7 @@ def _pieces(block: FrameBlock, staging: Staging) -> list[memoryview]:
 
 
 def _behind(pieces: Sequence[memoryview], written: int) -> list[memoryview]:
-    """What is left of `pieces` behind the first `written` bytes."""
+    """The pieces that are left behind the first `written` bytes."""
     left = []
     for piece in pieces:
         if written < len(piece):
@@ -153,7 +153,7 @@ def _behind(pieces: Sequence[memoryview], written: int) -> list[memoryview]:
 
 
 def _open_direct(path: Path) -> int:
-    """A new file, open past the page cache where file system and system can."""
+    """Create a file and open it past the page cache where file system and system can."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     direct = getattr(os, "O_DIRECT", 0)
     fd = os.open(path, flags, 0o644)
@@ -168,7 +168,7 @@ def _open_direct(path: Path) -> int:
 
 
 def _reserve(path: Path, size: int) -> None:
-    """Set space aside, which spares the file system the work while frames come; without it nothing is lost."""
+    """Set space aside, which spares the file system the work while frames come. Nothing is lost where that fails."""
     if not hasattr(os, "posix_fallocate"):
         return
     fd = os.open(path, os.O_WRONLY)
@@ -184,8 +184,10 @@ def _reserve(path: Path, size: int) -> None:
 
 
 BYTES_PER_PIXEL: Final = 40
-"""Files of a map take about so much for every pixel of the camera, and of the stripe table: depth, picture, cloud,
-learned state and, on a simulated rig, truth."""
+"""Bytes that the files of a map take for every pixel of the camera or of the stripe table, whichever is more.
+
+They are depth, picture, cloud, learned state and, on a simulated rig, truth.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,12 +201,12 @@ class Space:
 
     @classmethod
     def on_disk_of(cls, folder: Path, recording_bytes: int, map_bytes: int) -> "Space":
-        """folder: absolute, as it is or as it is to be made."""
+        """Look at the disk of a folder, given as an absolute path, which need not exist."""
         there = next(path for path in (folder, *folder.parents) if path.is_dir())
         return cls(folder, recording_bytes, map_bytes, shutil.disk_usage(there).free)
 
     def require(self) -> None:
-        """UsageError where the disk has not enough room."""
+        """Raise UsageError where the disk has not enough room."""
         if self.recording_bytes + self.map_bytes > self.free_bytes:
             raise UsageError(
                 f"the recording will take at most {_gb(self.recording_bytes)} and the maps {_gb(self.map_bytes)}, the "
@@ -213,12 +215,12 @@ class Space:
             )
 
     def content(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return it as plain values."""
         sizes = {name: getattr(self, name) for name in ("recording_bytes", "map_bytes", "free_bytes")}
         return {"folder": str(self.folder), **sizes}
 
     def __str__(self) -> str:
-        """For people, where there is enough."""
+        """Say that there is enough room, for people."""
         return (
             f"at most {_gb(self.recording_bytes)} of frames and {_gb(self.map_bytes)} of maps, which fit: the disk of "
             f"{self.folder} has {_gb(self.free_bytes)} free"
@@ -228,8 +230,10 @@ class Space:
 def recording_bytes(
     plan: ScanPlan, request: SpadRequest, timing: SpadTiming, maps: int, *, starts: int, spare_s: float
 ) -> int:
-    """Bytes of the segments at most. starts: of the SPAD; spare_s: time of each before its first marker and behind its
-    last one."""
+    """The most bytes that the segments take.
+
+    starts: of the SPAD. spare_s: time of each start before its first marker and behind its last one.
+    """
     frames = plan.frames_for(maps) + (starts - 1) * plan.frames_for(0) + starts * spare_s * float(plan.frame_rate_hz)
     if plan.burst_frames is not None:
         frames = min(frames, starts * plan.burst_frames)

@@ -1,4 +1,7 @@
-"""Whether a recording is what was recorded: every byte of it, its index, its manifest and the device's own counts."""
+"""Verifies a recording: every byte of it, its index, its manifest and the device's own counts.
+
+`verify` gives the verdict, `examine` all that `verify` and `repair` need to know.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -40,7 +43,7 @@ from rig.run_folder.manifest import (
 
 
 class Integrity(StrEnum):
-    """What a recording is worth."""
+    """Verdict on a recording."""
 
     INTACT = "intact"
     GAPS = "gaps"
@@ -52,11 +55,13 @@ class Integrity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """The verdict and what it rests on.
+    """Verdict on a recording, and what it rests on.
 
-    blocks, frames, bytes: sound ones. lost: frames that the device lost or a repair found missing, gaps: [run, first,
-    last] where. problems: a line each; run: the verdict of the run that was recorded. ended: why the recording ended
-    before the run, else None.
+    blocks, frames, bytes: number of sound ones.
+    lost: frames that the device lost or a repair found missing. gaps: where these are, [run, first, last].
+    problems: a line each.
+    run: the verdict of the run that was recorded.
+    ended: reason why the recording ended before the run; None where it did not.
     """
 
     verdict: Integrity
@@ -77,13 +82,13 @@ class Verification:
         return 0 if self.verdict is Integrity.INTACT else 1
 
     def as_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """Return it as plain values."""
         return {**asdict(self), "verdict": self.verdict.value}
 
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """All that can be known of a recording. runs: the sound blocks of each, in order of their frames."""
+    """All that can be known of a recording. runs: the sound blocks of each run, in order of their frames."""
 
     segments: list[SegmentReader]
     contents: Contents
@@ -94,12 +99,12 @@ class Examined:
 
     @property
     def bytes(self) -> int:
-        """What the sound blocks take in their segments."""
+        """Bytes that the sound blocks take in their segments."""
         return int(round_up_to_page(self.entries["length"]).sum())
 
     @property
     def entries(self) -> np.ndarray[Any, Any]:
-        """(n,) of INDEX_RECORD, of the sound blocks."""
+        """Index records of the sound blocks, (n,) of INDEX_RECORD."""
         return np.frombuffer(b"".join(block.entry for run in self.runs for block in run), INDEX_RECORD)
 
 
@@ -123,7 +128,7 @@ def verify(folder: Path) -> Verification:
 
 
 def examine(folder: Path) -> Examined:
-    """Everything that `verify` and `repair` need to know. UsageError where there is no recording."""
+    """Find out everything that `verify` and `repair` need to know. UsageError where there is no recording."""
     require_recording(folder)
     try:
         segments = open_segments(folder)
@@ -200,7 +205,7 @@ def _run_ids(blocks: Sequence[SoundBlock]) -> set[int]:
 
 
 def _usual(headers: Sequence[BlockHeader]) -> BlockHeader:
-    """A header of the size and clock that most have; the earliest of as many."""
+    """A header of the size and clock that most have; among equally frequent ones the earliest."""
     kinds = Counter(run_kind(header) for header in headers)
     most = max(kinds.values())
     return next(header for header in headers if kinds[run_kind(header)] == most)
@@ -213,7 +218,7 @@ def _against_manifest(
     runs: Sequence[Sequence[SoundBlock]],
     joined: Continuity,
 ) -> list[str]:
-    """Where a finished run's manifest tells of other blocks and frames than there are."""
+    """Problems where a finished run's manifest tells of other blocks and frames than there are."""
     recording = manifest.get("recording") or {}
     blocks = sum(len(run) for run in runs)
     frames = sum(block.n_frames for run in runs for block in run)

@@ -1,13 +1,12 @@
-"""Writing a recording: segments of SPB1 blocks and their index, whole to the last block whatever ends the program.
+"""Writes a recording: segments of SPB1 blocks and their index, whole to the last block whatever ends the program.
 
 A block counts once all its bytes and those of every block before it are with the system; then its index record is
 written. So a killed program loses no block that counted, and a loss of power none older than `SYNC_INTERVAL_S`: a
 thread makes the disk keep what was written, blocks before index.
 
-The pipeline's recorder: a thread that hands the blocks of one start of the SPAD to the recording.
-
-It has a required place in the ring: where the disk is slower than the stream, the ring fills and the overload policy
-decides. Blocks are written by the recording's own threads, several at a time, from the slots they lie in.
+`Recording` is that. `Recorder` is the pipeline's thread that hands the blocks of one start of the SPAD to it. It has a
+required place in the ring: where the disk is slower than the stream, the ring fills and the overload policy decides.
+Blocks are written by the recording's own threads, several at a time, from the slots they lie in.
 """
 
 import errno
@@ -31,21 +30,21 @@ from rig.run_folder.folder import hold, sync_folder
 from rig.threads import StageThread
 
 SEGMENT_BYTES: Final = 1 << 30
-"""A segment is no larger, except for a block that is."""
+"""Most bytes of a segment, unless a single block is larger."""
 SYNC_INTERVAL_S: Final = 0.2
-"""What was recorded longer ago than this survives a loss of power."""
+"""Seconds after which a recorded block survives a loss of power."""
 _SYNC_EVERY_S: Final = SYNC_INTERVAL_S / 2
-"""From the end of one sync to the next: the other half is for the sync itself."""
+"""Seconds from the end of one sync to the next: the other half is for the sync itself."""
 WRITERS: Final = 4
-"""Blocks written at a time: one thread makes checksums for some 4 GB/s, and disks like a queue."""
+"""Number of blocks written at a time: one thread makes checksums for some 4 GB/s, and disks like a queue."""
 RESERVE_FILE: Final = ".recording.reserve"
 RESERVE_BYTES: Final = 1 << 20
-"""Kept free beside the recording, so that manifest and summary still find room on the disk that it filled."""
+"""Bytes kept free beside the recording, so that manifest and summary find room on a disk that it filled."""
 
 
 @dataclass(slots=True, eq=False)
 class _Placed:
-    """A block on its way to its place. end: of the block in its segment."""
+    """A block on its way to its place. end: offset of the block's end in its segment."""
 
     segment: OpenSegment
     end: int
@@ -55,7 +54,7 @@ class _Placed:
 
 @dataclass(slots=True)
 class Start:
-    """One start of the SPAD. sweeps: what it was to give; segment: number of its first segment."""
+    """One start of the SPAD. sweeps: how many it was to give. segment: number of its first segment."""
 
     sweeps: int
     segment: int
@@ -64,9 +63,10 @@ class Start:
 class Recording:
     """A recording that grows block by block in a folder; whatever fails, it ends behind a whole block.
 
-    `submit` and `append` belong to one thread. expected_bytes: how much will come, as far as it is known; so much is
-    set aside on the disk. on_begin: called where a start of the SPAD begins. Raises RecordingError where the folder
-    cannot be written.
+    `submit` and `append` belong to one thread.
+
+    expected_bytes: how much will come, as far as that is known; so much is set aside on the disk. on_begin: called
+    where a start of the SPAD begins. Raises RecordingError where the folder cannot be written.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Recording:
         self.blocks = 0
         """Blocks that count."""
         self.bytes = 0
-        """What they take in the segments."""
+        """Bytes that the blocks take in the segments."""
         self.busy_s = 0.0
         """Time of all writers together, for checksums and writing."""
         self.files: list[str] = []
@@ -117,7 +117,7 @@ class Recording:
         self._syncing.start()
 
     def begin(self, sweeps: int) -> None:
-        """A start of the SPAD that is to give `sweeps` sweeps: its blocks come next, in segments of their own."""
+        """Begin a start of the SPAD that is to give `sweeps` sweeps: its blocks come next, in segments of their own."""
         self.starts.append(Start(sweeps, len(self.files)))
         with self._lock:
             self._segment = None
@@ -129,7 +129,7 @@ class Recording:
         self.submit(block).result()
 
     def submit(self, block: FrameBlock) -> "Future[None]":
-        """Begin to write a block behind the others; its memory has to stay as it is until the result is there.
+        """Begin to write a block behind the others; its memory must not change until the result is there.
 
         The result, or this call, raises RecordingError where a block could not be written: none counts from it on.
         """
@@ -176,7 +176,7 @@ class Recording:
             self.files = [name for name in self.files if (self.folder / name).exists()]
 
     def content(self) -> dict[str, object]:
-        """What there is, for the manifest."""
+        """Describe the recording for the manifest."""
         return {
             "files": list(self.files),
             "index": INDEX_FILE,
@@ -189,7 +189,7 @@ class Recording:
         }
 
     def _segment_for(self, size: int, is_for: tuple[int, int]) -> OpenSegment:
-        """The segment that a block goes to: a new one where the old is full, or of another run or width."""
+        """The segment that a block goes to: a new one where the old one is full, or of another run or width."""
         segment = self._segment
         fits = segment is not None and (segment.placed == 0 or segment.placed + size <= self._segment_bytes)
         if segment is not None and fits and self._segment_is_for == is_for:
@@ -210,7 +210,7 @@ class Recording:
         return segment
 
     def _write(self, block: FrameBlock, placed: _Placed, offset: int) -> None:
-        """One writer's work."""
+        """Write one block, on a thread of the pool."""
         begun = time.perf_counter()
         try:
             staging = getattr(self._staging, "of_thread", None)
@@ -229,7 +229,7 @@ class Recording:
                 self.busy_s += time.perf_counter() - begun
 
     def _count(self, placed: _Placed) -> None:
-        """Index every block before which nothing is missing any more: one that could not be written is never done."""
+        """Index every block with nothing missing before it: a block that could not be written is never done."""
         with self._lock:
             placed.done = True
             while self._order and self._order[0].done:
@@ -243,7 +243,7 @@ class Recording:
                 self.blocks += 1
 
     def _sync_on(self) -> None:
-        """The sync thread."""
+        """Sync now and then until the recording is closed; runs as a thread."""
         while not self._closed.wait(_SYNC_EVERY_S):
             try:
                 self._sync()
@@ -287,9 +287,9 @@ def _reason(error: BaseException) -> str:
 
 
 class Recorder:
-    """Records the blocks of one start of the SPAD, up to the last one. on_failure: called on its thread.
+    """Thread that records the blocks of one start of the SPAD, up to the last one.
 
-    reader: holds as many blocks as are to be written at a time.
+    reader: holds as many blocks as are to be written at a time. on_failure: called on this thread.
     """
 
     def __init__(self, reader: RingReader, recording: Recording, on_failure: Callable[[], None]) -> None:
@@ -302,17 +302,17 @@ class Recorder:
 
     @property
     def busy_s(self) -> float:
-        """Time of all writers together, for checksums and writing."""
+        """Seconds of all writers together, for checksums and writing."""
         return self._recording.busy_s - self._before[0]
 
     @property
     def blocks(self) -> int:
-        """Blocks written of this start."""
+        """Number of blocks of this start that are written."""
         return self._recording.blocks - self._before[1]
 
     @property
     def bytes(self) -> int:
-        """What they take in the recording."""
+        """Bytes that the blocks of this start take in the recording."""
         return self._recording.bytes - self._before[2]
 
     def start(self) -> None:
@@ -340,7 +340,7 @@ class Recorder:
                 self._on_failure()
 
     def _next(self) -> FrameBlock | None:
-        """The next block; None where none will come. An error of the source is for counting to tell."""
+        """The next block; None where none will come. An error of the source is reported by the counting thread."""
         try:
             return self._reader.next()
         except Exception:

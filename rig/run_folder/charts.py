@@ -1,7 +1,7 @@
-"""Charts as SVG text: curves over linear or logarithmic axes, side by side, with one legend, on a white ground.
+"""Draws charts as SVG text: curves over linear or logarithmic axes, side by side, with one legend, on a white ground.
 
 Pictures in the repository are SVG (docs/decisions/0008); what these show is a handful of curves, for which no library
-is needed.
+is needed. `chart_svg` makes the file of some `Panel`s.
 """
 
 import math
@@ -21,7 +21,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 58, 14, 30, 46
 _LEGEND_PX = 20
 _TITLE_PX = 30
 _DECADES_WITH_STEPS = 2.3
-"""Axes over fewer decades are labelled at 1, 2 and 5 times their powers of ten."""
+"""Axes over fewer decades than this are labelled at 1, 2 and 5 times their powers of ten."""
 
 Point = tuple[float, float]
 
@@ -46,28 +46,28 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class ChartMark:
-    """Something said about a place: a cross there, with words."""
+    """A cross at a place of a chart, with words beside it."""
 
     at: Point
     text: str
 
 
 class Drawable(Protocol):
-    """What stands in a place of a chart."""
+    """A panel of a chart, as `chart_svg` places it."""
 
     @property
     def legend(self) -> Sequence[Series]:
-        """What the legend has to explain."""
+        """Series that the legend explains."""
         ...
 
     def svg(self) -> str:
-        """Elements from (0, 0) on."""
+        """Draw the SVG elements from (0, 0) on."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """An axis of `pixels` between two values."""
+    """An axis between the values `low` and `high`, from pixel `start_px` to `end_px`."""
 
     low: float
     high: float
@@ -77,7 +77,7 @@ class Axis:
 
     @classmethod
     def over(cls, values: Sequence[float], log: bool, start_px: float, end_px: float) -> "Axis":
-        """An axis that shows all values, with some room; logarithmic ones those above zero."""
+        """Make an axis that shows all values, with some room; a logarithmic one shows those above zero."""
         shown = [value for value in values if math.isfinite(value) and (value > 0 or not log)] or [1.0]
         low, high = min(shown), max(shown)
         if log:
@@ -87,7 +87,7 @@ class Axis:
         return cls(0.0 if 0 <= low < room * 8 else low - room, high + room, False, start_px, end_px)
 
     def px(self, value: float) -> float:
-        """Where a value is; NaN where it cannot be shown."""
+        """Pixel of a value; NaN where it cannot be shown."""
         if not math.isfinite(value) or (self.log and value <= 0):
             return math.nan
         low, high, at = (math.log(v) if self.log else v for v in (self.low, self.high, value))
@@ -105,7 +105,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Curves over one pair of axes. front: points to lie on a broad band, by rising x."""
+    """Curves over one pair of axes. front: points of a broad band behind them, by rising x."""
 
     title: str
     x_label: str
@@ -147,7 +147,7 @@ def chart_svg(
     notes: Sequence[str] = (),
     panel_px: tuple[int, int] = PANEL_PX,
 ) -> str:
-    """An SVG file of panels in rows, `panel_px` for each, a legend and lines of small print below."""
+    """Draw an SVG file of panels in rows, `panel_px` for each, with a legend and lines of small print below."""
     across = min(across, len(panels))
     down = -(-len(panels) // across)
     width, panel_height = across * panel_px[0], panel_px[1]

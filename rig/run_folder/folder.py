@@ -5,13 +5,10 @@
     truth/000000.npz (where a world knows it)  manifest.json  summary.json
 
 Everything is written beside the folder under a hidden name and moved in one step at the end; the folder of a recording
-is there from the start and grows in place.
+is there from the start and grows in place. `RunFolder` does this, and `SavePolicy` says which maps are written.
 
-Making sure that files, and the names of files, survive a loss of power.
-
-Whether somebody is still recording into a folder: the recorder holds its index, until it ends or is killed.
-
-Which maps of a run are written: all, every N-th from the first on, or the last one only (`--save`).
+The rest is for recordings too: `sync_file` and `sync_folder` make files survive a loss of power, and `hold` and
+`is_held` tell whether somebody is still recording into a folder.
 """
 
 import io
@@ -39,27 +36,6 @@ from rig.errors import UsageError
 from rig.run_folder.manifest import MANIFEST, sealed_text
 from rig.run_folder.pictures import cloud, depth_limits, depth_picture, intensity_picture, ply_bytes, png_bytes
 
-
-def sync_file(path: Path) -> None:
-    """What was written to a file survives a loss of power. Raises OSError."""
-    fd = os.open(path, os.O_RDWR)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
-
-
-def sync_folder(path: Path) -> None:
-    """The names of the files in a folder survive a loss of power. Raises OSError."""
-    if os.name == "nt":
-        return  # Windows opens no folders; NTFS keeps its names in a journal
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
-
-
 _log = logging.getLogger(__name__)
 
 Rays = tuple[NDArray[np.floating], NDArray[np.floating]]
@@ -68,7 +44,7 @@ Rays = tuple[NDArray[np.floating], NDArray[np.floating]]
 class RunFolder:
     """Collects the outputs of a run; `publish` makes them appear as `path`, leaving without it removes every trace.
 
-    in_place: they are to be seen at `path` from the start.
+    in_place: the outputs can be seen at `path` from the start.
     Raises UsageError, one line, where the folder exists with something in it or cannot be written.
     """
 
@@ -98,7 +74,7 @@ class RunFolder:
     def write_map(self, index: int, result: MapResult, rays: Rays | None) -> None:
         """Write all files of one map; `rays` (u, v) of the camera, None for an uncalibrated rig (no depth, no cloud).
 
-        Where one cannot be written (disk full), the map's other files go too and UsageError says why.
+        Where one cannot be written (disk full), the map's other files are removed too and UsageError says why.
         """
         name = f"{index:06d}"
         files = {
@@ -116,12 +92,12 @@ class RunFolder:
         self._write(files)
 
     def place(self, name: str) -> Path:
-        """Where to put a file that grows while the run goes on; it must be closed before `publish`."""
+        """Path for a file that grows while the run goes on; it must be closed before `publish`."""
         assert self._scratch is not None, "the run folder is published or discarded already"
         return self._scratch / name
 
     def write_truth(self, index: int, truth: SweepTruth) -> None:
-        """Write what the world says about the sweep of a map."""
+        """Write the world's truth for the sweep of a map."""
         self._write({f"truth/{index:06d}.npz": _npz_bytes({"x_px": truth.x_px, "depth_m": truth.depth_m})})
 
     def remove_map(self, index: int) -> None:
@@ -131,7 +107,7 @@ class RunFolder:
             file.unlink(missing_ok=True)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write `name` (manifest.json, summary.json) as strict JSON; where there is one already, the old or the new."""
+        """Write `name` (manifest.json, summary.json) as strict JSON; a reader sees the old file or the new one."""
         text = json_text(content)
         text = sealed_text(text) if name == MANIFEST else text
         self._write({f"{name}.part": (text + "\n").encode()})
@@ -150,13 +126,13 @@ class RunFolder:
         self._write({name: text.encode()})
 
     def keep(self) -> None:
-        """Leave everything as it is: what a run recorded is kept also where it does not come to its end."""
+        """Leave everything as it is: what a run recorded is kept even where the run does not come to its end."""
         assert self._in_place, "a run folder that is no recording appears whole or not at all"
         self._scratch = None
         self._made_parents.clear()
 
     def publish(self) -> Path:
-        """Make the folder appear under its name, or beside it (NAME-2, ...) where somebody was faster; its path."""
+        """Make the folder appear and return its path: its name, or NAME-2 and so on where somebody else was faster."""
         scratch = self._scratch
         assert scratch is not None, "a run folder is published once"
         try:
@@ -184,7 +160,7 @@ class RunFolder:
         return next(path for path in beside if _renamed(scratch, path))
 
     def discard(self) -> None:
-        """Remove everything not published, and the folders made for it."""
+        """Remove everything that was not published, and the folders made for it."""
         if self._scratch is not None:
             if self._in_place:
                 for child in self._scratch.iterdir():
@@ -239,8 +215,39 @@ class RunFolder:
 
 
 def json_text(content: Mapping[str, Any]) -> str:
-    """Strict JSON: NaN and infinities become null, arrays lists, paths text."""
+    """Write strict JSON: NaN and infinities become null, arrays lists, paths text."""
     return json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
+
+
+_EVERY = re.compile(r"every[\s:=]+(?P<step>\d+)", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class SavePolicy:
+    """Policy for which maps of a run are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last."""
+
+    step: int | None = 1
+
+    @classmethod
+    def parse(cls, text: str) -> "SavePolicy":
+        """Parse "all", "last" or "every 5". Raises UsageError for anything else."""
+        cleaned = text.strip().lower()
+        if cleaned == "all":
+            return cls(1)
+        if cleaned == "last":
+            return cls(None)
+        match = _EVERY.fullmatch(cleaned)
+        if match is None or int(match["step"]) == 0:
+            raise UsageError(f"--save is {text!r}; write 'all', 'last' or 'every N' with N of 1 or more")
+        return cls(int(match["step"]))
+
+    def count(self, maps: int) -> int:
+        """Number of maps written of a run of `maps` maps."""
+        return min(maps, 1) if self.step is None else -(-maps // self.step)
+
+    def keeps(self, index: int) -> bool:
+        """Whether map `index` is written as soon as it is there."""
+        return self.step is not None and index % self.step == 0
 
 
 def _renamed(folder: Path, target: Path) -> bool:
@@ -294,13 +301,13 @@ except ImportError:  # Windows lets nobody else change a file that is open
 
 
 def hold(fd: int) -> None:
-    """Hold an open file for as long as it is open. Raises OSError where somebody else does."""
+    """Hold an open file for as long as it is open. Raises OSError where another process holds it."""
     if fcntl is not None:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_held(file: Path) -> bool:
-    """Whether somebody holds a file; False where there is none."""
+    """Whether a process holds a file; False where there is no such file."""
     if fcntl is None or not file.exists():
         return False
     with file.open("rb") as stream:
@@ -311,32 +318,21 @@ def is_held(file: Path) -> bool:
     return False
 
 
-_EVERY = re.compile(r"every[\s:=]+(?P<step>\d+)", re.ASCII)
+def sync_file(path: Path) -> None:
+    """Make sure that what was written to a file survives a loss of power. Raises OSError."""
+    fd = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
 
 
-@dataclass(frozen=True, slots=True)
-class SavePolicy:
-    """step: write maps 0, step, 2 step, ...; None: the last map only."""
-
-    step: int | None = 1
-
-    @classmethod
-    def parse(cls, text: str) -> "SavePolicy":
-        """The policy that "all", "last" or "every 5" means. Raises UsageError for anything else."""
-        cleaned = text.strip().lower()
-        if cleaned == "all":
-            return cls(1)
-        if cleaned == "last":
-            return cls(None)
-        match = _EVERY.fullmatch(cleaned)
-        if match is None or int(match["step"]) == 0:
-            raise UsageError(f"--save is {text!r}; write 'all', 'last' or 'every N' with N of 1 or more")
-        return cls(int(match["step"]))
-
-    def count(self, maps: int) -> int:
-        """How many of `maps` maps are written."""
-        return min(maps, 1) if self.step is None else -(-maps // self.step)
-
-    def keeps(self, index: int) -> bool:
-        """Whether map `index` is written as soon as it is there."""
-        return self.step is not None and index % self.step == 0
+def sync_folder(path: Path) -> None:
+    """Make sure that the names of the files in a folder survive a loss of power. Raises OSError."""
+    if os.name == "nt":
+        return  # Windows opens no folders; NTFS keeps its names in a journal
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

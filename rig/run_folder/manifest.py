@@ -18,18 +18,18 @@ SEAL: Final = "crc32"
 UNFINISHED: Final = "recording"
 """Verdict of a run that is not over, or was killed."""
 MOST_FRAMES: Final = 1 << 48
-"""Of a run: 80 years at 100 kHz."""
+"""Most frames that a run can have: 80 years at 100 kHz."""
 _PIECE_BYTES: Final = 1 << 20
 
 
 def sealed_text(text: str) -> str:
-    """A manifest, strict JSON, with its seal."""
+    """Add the seal to a manifest in strict JSON."""
     content = json.loads(text)
     return json.dumps({**content, SEAL: _crc32(content)}, indent=1, ensure_ascii=False)
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """The manifest of a run without its seal; None where there is none. DamagedRecordingError where it is damaged."""
+    """Read the manifest of a run without its seal; None where there is none. DamagedRecordingError if damaged."""
     try:
         raw = (folder / MANIFEST).read_bytes()
     except FileNotFoundError:
@@ -47,12 +47,12 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def is_cut_short(manifest: Mapping[str, Any]) -> bool:
-    """Whether it is known that frames behind the first maps may be gone: the disk was full, or it was repaired."""
+    """Whether frames behind the first maps are known to be possibly gone: the disk was full, or it was repaired."""
     return "repaired" in manifest or ended_early(manifest) is not None
 
 
 def ended_early(manifest: Mapping[str, Any]) -> str | None:
-    """Why a recording ended before its run did, a full disk for one; None where it did not, or was repaired since."""
+    """Reason why a recording ended before its run, such as a full disk; None where it did not or was repaired since."""
     if "repaired" in manifest:
         return None
     failed = (manifest.get("recording") or {}).get("failed")
@@ -62,21 +62,21 @@ def ended_early(manifest: Mapping[str, Any]) -> str | None:
 def ended_before_last_map(manifest: Mapping[str, Any]) -> bool:
     """Whether a run ended before it had made maps of all sweeps that its starts were to give.
 
-    Sweeps that it made no maps of may lie whole behind those that it tells of, as where it was killed.
+    Whole sweeps without a map may lie behind those that the manifest lists, for example where the run was killed.
     """
     starts = (manifest.get("recording") or {}).get("starts") or []
     return len(manifest.get("sweeps") or []) < sum(int(start["sweeps"]) for start in starts)
 
 
 def known_missing(manifest: Mapping[str, Any] | None) -> list[tuple[int, int, int]] | None:
-    """What a repair found missing, (number of the run, first, last frame); None where there was none."""
+    """Frames that a repair found missing, (number of the run, first, last frame); None where there was no repair."""
     if manifest is None or "repaired" not in manifest:
         return None
     return [(int(run), int(first), int(last)) for run, first, last in manifest.get("missing") or []]
 
 
 def device_counters(manifest: Mapping[str, Any]) -> tuple[dict[str, int], list[str]]:
-    """The SPAD's own counts of a run's frames as far as they can be, and a line for each that cannot."""
+    """The SPAD's own counts of a run's frames that are possible, and a line for each that is not."""
     counters = {key: value for key, value in (manifest.get("counters") or {}).items() if value is not None}
     sane = {key: value for key, value in counters.items() if isinstance(value, int) and 0 <= value < MOST_FRAMES}
     return sane, [
@@ -96,7 +96,7 @@ def file_crc32(path: Path) -> int:
 
 
 def inputs_problems(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
-    """Files beside the frames that are not what the manifest says."""
+    """List the files beside the frames that are not what the manifest says, a line each."""
     problems = []
     for name, stated in (manifest.get("inputs") or {}).items():
         try:
@@ -108,7 +108,7 @@ def inputs_problems(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
 
 
 def require_inputs(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """DamagedRecordingError, a line each, where files beside the frames are not what the manifest says."""
+    """Raise DamagedRecordingError, a line each, for files beside the frames that are not what the manifest says."""
     if problems := inputs_problems(folder, manifest):
         raise DamagedRecordingError("\n".join(f"{line}; take it from a copy of the recording" for line in problems))
 
@@ -122,7 +122,7 @@ _NEXT: Final = "'rig repair' writes a new one"
 
 
 def require_plain_sweeps(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """UsageError for a recording whose maps spadrig 0.1 took in several passes over part of the columns each."""
+    """Raise UsageError for a recording whose maps spadrig 0.1 took in several passes over part of the columns each."""
     if "passes" in manifest:
         raise UsageError(
             f"{folder} was scanned with --adaptive, in passes that this version cannot put together; take spadrig 0.1 "

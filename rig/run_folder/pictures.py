@@ -1,6 +1,7 @@
-"""Pictures for people: depth in colour with its scale, intensity in grey. The numbers are in the .npy files.
+"""Pictures and point clouds of maps: depth in colour with its scale, intensity in grey, and PLY files.
 
-Point clouds as PLY (binary, little endian): x y z in metres, camera frame, and the intensity of each pixel.
+Pictures are for people; the numbers are in the .npy files. Point clouds are binary PLY, little endian: x y z in metres
+in the camera's frame, and the intensity of each pixel.
 """
 
 import numpy as np
@@ -28,9 +29,9 @@ def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
 def depth_picture(
     depth_m: NDArray[np.float32], limits: tuple[float, float] | None, unit: str = "m"
 ) -> NDArray[np.uint8]:
-    """Colours near (red) to far (blue), black where there is no depth, with a scale at the right; BGR.
+    """Depth in colours from near (red) to far (blue), with a scale at the right; BGR, black where there is no depth.
 
-    limits: of red and of blue, whichever is larger.
+    limits: depths of red and of blue; either may be the larger one.
     """
     import cv2
 
@@ -76,9 +77,9 @@ def png_bytes(picture: NDArray[np.uint8]) -> bytes:
 
 
 def _without_window_steps(intensity: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Counts without the steps where windows begin and end.
+    """Counts as floats, without the steps where windows begin and end.
 
-    A pixel's sum holds haze and ambient of as many columns as have it in their window, and windows are whole words.
+    A pixel's sum holds haze and ambient light of all columns whose window covers it, and windows are whole words.
     """
     level = intensity.astype(np.float64)
     reach = 3

@@ -1,8 +1,7 @@
-"""What a run says of itself: counts of frames, times, fog, errors against the truth, and a verdict.
+"""The summary of a run: counts of frames, times, fog, errors against the truth, and a verdict.
 
-`as_json` is what `--json` prints and what summary.json holds.
-
-What each stage of the pipeline did: times, high-water marks and losses, live and for summary.json.
+`MapTally` adds up the maps and makes the `Summary`; its `as_json` is what `--json` prints and what summary.json holds.
+`PipelineStats` is the part on the stages of the pipeline: times, high-water marks and losses, live too.
 """
 
 import statistics
@@ -20,18 +19,21 @@ from rig.depth.reconstruct import MapResult
 from rig.geometry.stripe_table import depth_errors, stripe_errors
 
 _LARGEST = {"ring_slots", "ring_bytes", "ring_high_water", "map_queue", "map_queue_high_water"}
-"""Figures of which a run with several starts of the SPAD has the largest; of all others it has the sum."""
+"""Figures of which a run with several starts of the SPAD has the largest; it has the sum of all others."""
 
 
 @dataclass(frozen=True, slots=True)
 class PipelineStats:
-    """One moment of a pipeline, or its end. Times are wall time in seconds; None: there is no such stage.
+    """Figures of a pipeline at one moment or at its end. Times are wall time in seconds; None: there is no such stage.
 
-    source_fill_s: in the SPAD's `fill`, without source_wait_s: waiting for a free slot of the ring.
-    ring_high_water: most slots in use at one time, of ring_slots. dropped_*: what found no free slot.
-    counting_s: binding and counting. estimation_s: from counts to map. map_wait_s: waiting for room among the maps that
-    the caller has not taken yet, of which there were at most map_queue_high_water and could be map_queue.
-    recorder_s: computing checksums and writing. monitor_skipped_blocks: blocks that the monitor did not look at.
+    source_fill_s: in the SPAD's `fill`, without source_wait_s, which is spent waiting for a free slot of the ring.
+    ring_high_water: most slots in use at one time, of ring_slots, which take ring_bytes together.
+    dropped_blocks, dropped_frames: found no free slot.
+    counting_s: binding and counting. estimation_s: from counts to map.
+    map_wait_s: waiting for room among the maps that the caller has not taken yet; map_queue is that room, and at most
+      map_queue_high_water maps waited.
+    recorder_s: computing checksums and writing.
+    monitor_updates: views shown. monitor_skipped_blocks: blocks that the monitor did not look at.
     """
 
     source_fill_s: float = 0.0
@@ -53,7 +55,7 @@ class PipelineStats:
     monitor_skipped_blocks: int | None = None
 
     def and_then(self, later: "PipelineStats") -> "PipelineStats":
-        """Figures of both, for runs that start the SPAD several times."""
+        """Figures of both together, for runs that start the SPAD several times."""
         joined: dict[str, Any] = {}
         for name in (each.name for each in fields(self)):
             values = [value for each in (self, later) if (value := getattr(each, name)) is not None]
@@ -62,7 +64,7 @@ class PipelineStats:
 
 
 class RunVerdict(StrEnum):
-    """How a run ended; anything but `complete` is not to be trusted as it is."""
+    """Verdict on a run; any but `complete` means that the result is not to be trusted as it is."""
 
     COMPLETE = "complete"
     GAPS = "gaps"
@@ -73,7 +75,7 @@ class RunVerdict(StrEnum):
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command line."""
+        """Exit code of the command line for this verdict."""
         return {RunVerdict.COMPLETE: 0, RunVerdict.ABORTED: 4}.get(self, 1)
 
 
@@ -81,8 +83,8 @@ class RunVerdict(StrEnum):
 class RunFrames:
     """Frames between the first and the last scan marker, dark and fly-back ones too; expected = received + lost.
 
-    Of a run that ended before its last map: all that came, while lit is of its whole maps.
-    crc_errors: blocks refused for their checksum, None where the source does not say. lit: frames that fell on columns.
+    Where a run ended before its last map these are all that came, while lit counts those of its whole maps.
+    crc_errors: blocks refused for their checksum; None where the source does not say. lit: frames that fell on columns.
     """
 
     expected: int = 0
@@ -94,10 +96,11 @@ class RunFrames:
 
 @dataclass(frozen=True, slots=True)
 class Synchronisation:
-    """By what the frames of a run were bound to columns, and how well.
+    """The binding of a run's frames to columns: by what, and how well.
 
     residual_columns, clock_error: the largest of its sweeps; None where one could not be checked.
-    detection_probability: the least, of a blanking pattern as bright as theirs to be found; None: bound by markers.
+    detection_probability: the least over the sweeps, of finding a blanking pattern as bright as theirs; None where
+      markers bound the frames.
     """
 
     by: Literal["markers", "blanking pattern"]
@@ -108,7 +111,7 @@ class Synchronisation:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """What speaks against some maps of a run. maps: their numbers."""
+    """A reason not to trust some maps of a run. maps: their numbers."""
 
     reason: str
     maps: tuple[int, ...]
@@ -147,12 +150,12 @@ class Summary:
     sync: Synchronisation | None = None
     replay: PaceReport | None = None
     verdict_reasons: tuple[Doubt, ...] = ()
-    """What maps have against themselves, whatever the verdict."""
+    """Reasons against maps, found in the maps themselves, whatever the verdict."""
     accepted_calibration: tuple[str, ...] = ()
-    """What speaks against the calibration that the run was told to use all the same."""
+    """Reasons against the calibration that the user accepted."""
 
     def as_json(self) -> dict[str, Any]:
-        """The summary as plain values; `truth` only where it is known, others only of a scan or of a replay."""
+        """Return the summary as plain values; `truth` only where it is known, some only for a scan or a replay."""
         content = asdict(self)
         content["verdict"] = self.verdict.value
         if self.truth is None:
@@ -175,7 +178,7 @@ class _OfMap(NamedTuple):
     valid: float
     fog: FogEstimate
     errors: tuple[Errors, Errors] | None
-    """Of stripe and depth, where the truth is known."""
+    """Errors of stripe and depth, where the truth is known."""
     doubts: tuple[str, ...]
 
 
@@ -191,12 +194,12 @@ class MapTally:
 
     @property
     def maps(self) -> int:
-        """Maps so far."""
+        """Number of maps so far."""
         return len(self._maps)
 
     @property
     def doubts(self) -> tuple[Doubt, ...]:
-        """What speaks against maps, each reason with its maps; empty where nothing does."""
+        """Reasons against maps, each with its maps; empty where there are none."""
         of_reason: dict[str, list[int]] = {}
         for index, each in enumerate(self._maps):
             for reason in each.doubts:
@@ -221,7 +224,7 @@ class MapTally:
         sync: Synchronisation | None = None,
         replay: PaceReport | None = None,
     ) -> Summary:
-        """The run so far."""
+        """Make the summary of the run so far."""
         errors = [each.errors for each in self._maps if each.errors is not None]
         truth = TruthErrors(*(_over_maps(kind) for kind in zip(*errors, strict=True))) if errors else None
         compute_s = sum(each.compute_s for each in self._maps)

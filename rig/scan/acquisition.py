@@ -33,7 +33,7 @@ from rig.scan.pipeline import JOIN_S, Overload, Pipeline, require_policy, ring_f
 _log = logging.getLogger(__name__)
 
 SILENCE_S = 5.0
-"""A SPAD that sends nothing for so long, with the ring empty, has failed."""
+"""A SPAD that sends nothing for this long, with the ring empty, has failed."""
 WARM_UP_S = 120.0
 """Longest wait for a laser to warm up."""
 TELL_S = 0.1
@@ -42,12 +42,15 @@ TELL_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class ScanProgress:
-    """How far a run is, told several times a second and at its end.
+    """Progress of a run, told several times a second and at its end.
 
-    frames: received, of frames_planned at most, which is what the plan takes from the first scan marker to the last;
-    lost: the SPAD's own count. sweeps: counted, of `maps`. stages: what each stage has done so far. fog: as the newest
-    map says, None before. stage: rendering where the frames are simulated, else scanning or replaying; learning while
-    the first map is learned from, estimating while another one is made.
+    frames: frames received, at most frames_planned, which the plan takes from the first scan marker to the last.
+    lost: frames lost by the SPAD's own count.
+    sweeps: sweeps counted, of `maps`.
+    stages: what each stage has done so far.
+    fog: estimate from the newest map; None before the first.
+    stage: 'rendering' where frames are simulated, otherwise 'scanning' or 'replaying'; 'learning' while the estimator
+      learns from the first map, 'estimating' while another map is made.
     """
 
     frames: int
@@ -61,7 +64,7 @@ class ScanProgress:
 
 
 def told_of(live: Callable[[ScanProgress], None] | None) -> Callable[[ScanProgress], None]:
-    """Tells `rig.progress` and `live` how far a scan is."""
+    """A callback that tells `rig.progress` and `live` how far a scan is."""
 
     def both(now: ScanProgress) -> None:
         notes = [f"{now.sweeps} of {now.maps} maps counted"] if 1 < now.maps < ENDLESS else []
@@ -78,12 +81,16 @@ def told_of(live: Callable[[ScanProgress], None] | None) -> Callable[[ScanProgre
 class Acquisition:
     """A scan of `maps` maps with an open rig, a plan and the SPAD's timing from `rig.devices.open.prepare`.
 
-    Iterate once over `run()`. maker: makes the maps, on the counting thread. first_alone: take the first map with a
-    start of its own, so that a SPAD that cannot wait stands still while it is learned from. learns: whether `maker`
-    learns from its first map. groups: sweeps of each
-    start, where that is not for the scan to choose; starts: with which sweep each begins. recording, watch: what
-    recorder and monitor work for, None for none. on_progress is called on the caller's thread, on_sweep as `Mapping`
-    says.
+    Iterate once over `run()`.
+
+    maker: makes the maps, on the counting thread.
+    first_alone: take the first map with a start of its own, so that a SPAD that cannot wait stands still while the
+      estimator learns from that map.
+    learns: whether `maker` learns from its first map.
+    groups: sweeps of each start, where the scan is not free to choose. starts: the sweep that each start begins with.
+    recording, watch: for the recorder and the monitor; None for none.
+    on_progress: called on the caller's thread. on_sweep: as in `Mapping`.
+
     Raises UsageError where the SPAD cannot do what `policy` asks.
     """
 
@@ -134,14 +141,14 @@ class Acquisition:
 
     @property
     def counters(self) -> SpadCounters:
-        """The SPAD's own counts over all its starts so far. Any thread."""
+        """The SPAD's own counts over all its starts so far. May be asked on any thread."""
         if self._pipeline is None:
             return self._counters_before
         return added_counters(self._counters_before, self._rig.spad.counters)
 
     @property
     def stages(self) -> PipelineStats:
-        """What each stage has done so far. Any thread."""
+        """Figures of each stage so far. May be asked on any thread."""
         return self._stats_before if self._pipeline is None else self._stats_before.and_then(self._pipeline.stats())
 
     def run(self) -> Generator[AcquiredMap, None, None]:
@@ -243,7 +250,7 @@ class Acquisition:
             self._end_group(pipeline, assembler)
 
     def _guard_limits(self, sweeps: int) -> GuardLimits:
-        """What the guard may expect of the frames: a burst is silent until it is read out."""
+        """The guard's limits for the frames of this start: a burst is silent until it is read out."""
         usual, plan = GuardLimits(), self._plan
         block_s = 3 * self._timing.stride / plan.link_bytes_per_s if plan.link_bytes_per_s else 0.0
         exposed_s = (self._burst_frames(sweeps) or 0) / float(plan.frame_rate_hz)
@@ -256,7 +263,7 @@ class Acquisition:
         )
 
     def _silence_of_spad_s(self) -> float:
-        """For how long the SPAD may be asked in vain while light may fall."""
+        """Seconds for which the SPAD may have no answer while light may fall."""
         spad, usual = self._rig.config.spad, GuardLimits()
         if str(getattr(spad, "port", "")).startswith(EMULATED_PREFIX):  # on the processors of this very process
             return usual.busy_within_s
@@ -272,7 +279,7 @@ class Acquisition:
         self._frames_before += assembler.frames_seen
 
     def _check_scanner(self) -> None:
-        """A mirror that has stopped early: frames would go on, markers would not. DeviceFault."""
+        """Raise DeviceFault where the mirror has stopped early: frames would go on without markers."""
         fault = self._rig.scanner.status.fault
         if fault is not None:
             raise DeviceFault(fault)
@@ -341,7 +348,7 @@ def _wait_until_warm(rig: OpenRig, clock: Clock) -> None:
 
 
 def added_counters(before: SpadCounters, now: SpadCounters) -> SpadCounters:
-    """Counts of two runs; None where the device does not say."""
+    """Sum of the counts of two starts; None where the device does not say."""
     counts = (
         None if (a := getattr(before, field.name)) is None or (b := getattr(now, field.name)) is None else a + b
         for field in fields(SpadCounters)

@@ -1,9 +1,9 @@
-"""Whether the drivers said to their devices what they had said when the recording was taken, and when.
+"""Compares what drivers said to their devices in a replay with the recording: the commands, and when each was sent.
 
-Commands are compared byte by byte, and buffers of points in their time as well: how much later than in the recording
-each was sent, against the middle of its scan, since when that began is the host's to choose. Where a scan was stopped
-depends on the host's moment: a last buffer that only one of the two had sent is not compared, nor how the mirror was
-parked.
+Commands are compared byte by byte. Buffers of points are compared in their time as well: how much later than in the
+recording each was sent, relative to the middle of its scan, since the host chooses when a scan begins. Where a scan was
+stopped depends on the host's timing too: a last buffer that only one of the two had sent is not compared, nor how the
+mirror was parked.
 """
 
 import statistics
@@ -16,7 +16,7 @@ from drivers.recorded.control_words import Spoken, Word
 from drivers.transports.tap import read_taps
 
 SWAP_TOLERANCE_S = 2e-3
-"""Most that a buffer may come earlier or later than in the recording."""
+"""Longest time by which a buffer may come earlier or later than in the recording."""
 STOP_BUFFERS = 1
 """Buffers that one of two scans may have sent more than the other before it was stopped."""
 _SHOWN = 24
@@ -25,7 +25,10 @@ _SHOWN = 24
 
 @dataclass(frozen=True, slots=True)
 class ControlCheck:
-    """What was compared. worst_swap_s: of `swaps` buffers the one furthest from its time. problems: a line each."""
+    """Result of a comparison. worst_swap_s: lateness of the buffer, of `swaps`, that is furthest from its time.
+
+    problems: one line each; empty where the two agree.
+    """
 
     commands: int
     swaps: int
@@ -33,11 +36,11 @@ class ControlCheck:
     problems: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """Return it as plain values."""
         return asdict(self)
 
     def __str__(self) -> str:
-        """For people."""
+        """Say in one line what was compared."""
         return (
             f"{self.commands} commands as recorded, {self.swaps} buffer swaps at most {self.worst_swap_s * 1e3:.1f} ms "
             "from their times"
@@ -45,7 +48,10 @@ class ControlCheck:
 
 
 def check_control(recorded: Path, now: Path, *, devices: Sequence[str], tolerance_s: float | None) -> ControlCheck:
-    """Compare two files of control traffic. devices: that took part. tolerance_s: of swaps; None: not timed."""
+    """Compare two files of control traffic.
+
+    devices: those that took part. tolerance_s: for the times of buffers; None does not compare times.
+    """
     before, after = Spoken.of(read_taps(recorded)), Spoken.of(read_taps(now) if now.exists() else ())
     problems: list[str] = []
     commands = swaps = 0
@@ -87,9 +93,9 @@ def _first_difference(device: str, what: str, said: list[Word], says: list[Word]
 
 
 def _swaps_off(said: list[Word], says: list[Word]) -> list[float]:
-    """How much later than recorded each buffer came, in seconds, from when the scan as a whole did.
+    """Seconds by which each buffer came later than recorded, less what the whole scan did.
 
-    The second one, which a device takes as soon as the host has it, has no time of its own: 0.
+    The second one has no time of its own, since a device takes it as soon as the host has it: it gets 0.
     """
     late_s = [(new.t_ns - old.t_ns) / 1e9 for old, new in zip(said, says, strict=False)]
     timed_s = late_s[:1] + late_s[2:]

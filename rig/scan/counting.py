@@ -1,6 +1,6 @@
 """The counting thread: blocks in, maps out. It alone counts and estimates, one sweep after the other.
 
-The bounded queue of maps from the counting thread to the caller's, which also says when the stream is over.
+`Mapping` is the thread, `MapQueue` the bounded queue from it to the caller, which also says when the stream is over.
 """
 
 import threading
@@ -27,8 +27,8 @@ from rig.threads import StageThread
 class AcquiredMap:
     """A map and the account of its sweep, without the counts, which are large.
 
-    column: float64 (columns,), where the frames of each column were bound. compute_s: wall time of binding, counting
-    and estimation.
+    column: float64 (columns,), the place at which the frames of each column were bound.
+    compute_s: wall time of binding, counting and estimation.
     """
 
     sweep: SweepAccount
@@ -38,7 +38,7 @@ class AcquiredMap:
 
 
 class MapQueue:
-    """At most `room` maps that wait for the caller. One thread puts, one takes; any may tell the stream's end."""
+    """At most `room` maps that wait for the caller. One thread puts, one takes; any may end the stream."""
 
     def __init__(self, room: int) -> None:
         self.room = room
@@ -52,7 +52,7 @@ class MapQueue:
 
     @property
     def streaming(self) -> bool:
-        """Whether the rig has still to be kept running."""
+        """Whether the rig still has to be kept running."""
         return self._streaming
 
     @property
@@ -66,7 +66,7 @@ class MapQueue:
         return self._closed
 
     def put(self, found: AcquiredMap) -> None:
-        """Add a map, once there is room. Into a closed queue it goes nowhere."""
+        """Add a map, once there is room. In a closed queue the map is dropped."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._maps) < self.room or self._closed)
             self._maps.append(found)
@@ -74,19 +74,19 @@ class MapQueue:
             self._changed.notify_all()
 
     def end_stream(self) -> None:
-        """The rig can be made safe: all frames are there, or something failed. Maps may still come."""
+        """Say that the rig can be made safe: all frames are there, or something failed. Maps may still come."""
         self._set("_streaming", False)
 
     def end(self) -> None:
-        """No more maps."""
+        """Say that no more maps will come."""
         self._set("_ended", True)
 
     def close(self) -> None:
-        """Nobody takes maps any more: let go of whoever waits to put one."""
+        """Say that nobody takes maps any more, which frees a thread that waits to put one."""
         self._set("_closed", True)
 
     def take_streaming(self, timeout_s: float) -> AcquiredMap | None:
-        """The next map; None after `timeout_s`, or at once where the stream is over, which comes before the maps."""
+        """The next map; None after `timeout_s`, or at once when the stream is over: the rig is made safe first."""
         return self._take(timeout_s, lambda: not self._streaming)
 
     def take_rest(self, timeout_s: float) -> AcquiredMap | None:
@@ -109,23 +109,28 @@ class MapQueue:
 
 
 class MakesMaps(Protocol):
-    """What the counting thread needs of a `Reconstructor`. It uses it from no other thread."""
+    """The part of a `Reconstructor` that the counting thread uses; no other thread does."""
 
     def counter(self, layout: SweepLayout) -> Counter:
-        """A counter whose sweeps `map` takes."""
+        """Make a counter whose sweeps `map` takes."""
         ...
 
     def map(self, sweep: FrameTally) -> MapResult:
-        """The map of one counted sweep."""
+        """Make the map of one counted sweep."""
         ...
 
 
 class Mapping:
-    """Counts the blocks of one start of the SPAD and estimates each sweep where it ends, before any frame behind it.
+    """Thread that counts the blocks of one start of the SPAD and estimates each sweep where it ends.
+
+    A sweep is estimated before any frame behind it is counted.
 
     on_complete: called on this thread as soon as the marker that closes the last sweep is counted; the last map is
-    estimated after that. on_sweep: shown each counted sweep before its map is made, on this thread too. sweeps: how
-    many it is to be. Maps go to `queue`, which ends with this thread; `error` says why, where it was too early.
+      estimated after that.
+    on_sweep: called on this thread with each counted sweep before its map is made.
+    sweeps: how many there will be.
+
+    Maps go to `queue`, which ends with this thread; `error` says why, where it ended too early.
     """
 
     def __init__(

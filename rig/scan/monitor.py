@@ -24,15 +24,16 @@ _log = logging.getLogger(__name__)
 INTERVAL_S = 0.1
 """Least time from one view to the next."""
 MOST_FRAMES = 16
-"""Frames of a block that are summed: enough for a picture, and as much work at any block size."""
+"""Frames of a block that are summed: enough for a picture, and the same work at any block size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MonitorView:
-    """The newest block, small.
+    """A small picture of the newest block.
 
-    counts: uint16 (rows, width) of the sensor, 1s of each pixel over the first `frames` frames of the block, where they
-    have a window there. first_frame: number of the first of them. stages: the pipeline at this moment.
+    first_frame: number of the first frame summed. frames: how many frames were summed.
+    counts: uint16 (rows, width) of the sensor, the ones of each pixel in those frames, where their window covers it.
+    stages: the figures of the pipeline at this moment.
     """
 
     first_frame: int
@@ -50,7 +51,7 @@ Watch = Callable[[MonitorView], None]
 
 
 class Monitor:
-    """The thread that shows the blocks of one start of the SPAD to `watch`. stats: figures to show with them."""
+    """Thread that shows the blocks of one start of the SPAD to `watch`. stats: gives the figures to show with them."""
 
     def __init__(
         self, reader: RingReader, watch: Watch, stats: Callable[[], PipelineStats], interval_s: float = INTERVAL_S

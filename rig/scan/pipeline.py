@@ -4,7 +4,8 @@ One pipeline serves one start of the SPAD. Nothing in it can wait for ever: the 
 counting and recorder, counting for the caller, and `end_source` and `close` let go of each. The monitor is never waited
 for.
 
-What becomes of frames that come faster than they can be worked on: the user's policy, and the ring it asks for.
+`Overload` is the user's policy for frames that come faster than they can be worked on, and `ring_for` makes the ring
+that the policy asks for.
 """
 
 from collections.abc import Callable
@@ -34,10 +35,10 @@ MONITOR_S = 0.5
 
 
 class Pipeline:
-    """source -> ring -> {counting + estimation, recorder, monitor} -> maps, for one start of the SPAD.
+    """The threads of one start of the SPAD: source -> ring -> {counting + estimation, recorder, monitor} -> maps.
 
-    assembler: takes `sweeps` sweeps; maker: makes their maps, on the counting thread. recording, watch: None for no
-    recorder and no monitor. on_sweep: as of `Mapping`.
+    assembler: takes `sweeps` sweeps. maker: makes their maps, on the counting thread. recording, watch: None for no
+    recorder and no monitor. on_sweep: as in `Mapping`.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class Pipeline:
 
     @property
     def streaming(self) -> bool:
-        """Whether the rig has still to be kept running: frames are missing and nothing failed."""
+        """Whether the rig still has to be kept running: frames are missing and nothing failed."""
         return self._queue.streaming
 
     @property
@@ -90,11 +91,11 @@ class Pipeline:
 
     @property
     def estimating(self) -> bool:
-        """Whether a map is being made just now. Any thread."""
+        """Whether a map is being made just now. May be asked on any thread."""
         return self._mapping.estimating
 
     def stats(self) -> PipelineStats:
-        """The figures of this moment. Any thread."""
+        """The figures of this moment. May be asked on any thread."""
         ring, mapping, recorder, monitor = self._ring, self._mapping, self._recorder, self._monitor
         return PipelineStats(
             source_fill_s=self._source.fill_s,
@@ -126,15 +127,15 @@ class Pipeline:
         self._source.start()
 
     def take_streaming(self, timeout_s: float) -> AcquiredMap | None:
-        """The next map; None after `timeout_s`, or at once where the rig can be made safe, which comes first."""
+        """The next map; None after `timeout_s`, and at once when the rig can be made safe, which comes first."""
         return self._queue.take_streaming(timeout_s)
 
     def take_rest(self, timeout_s: float) -> AcquiredMap | None:
-        """The next map of what is left in the ring; None after `timeout_s`, or at once where none will come."""
+        """The next map from what is left in the ring; None after `timeout_s`, and at once when none will come."""
         return self._queue.take_rest(timeout_s)
 
     def end_source(self, why: BaseException | None = None) -> None:
-        """Fill no more. Returns at once. why: what the readers are told behind the last block."""
+        """Stop filling the ring; returns at once. why: error that the readers get behind the last block."""
         self._source.end(why)
 
     def join_source(self) -> bool:
@@ -142,7 +143,7 @@ class Pipeline:
         return self._source.join(JOIN_S)
 
     def error(self) -> BaseException | None:
-        """What ended the pipeline too early, once it is drained; waits until the recording is written."""
+        """The error that ended the pipeline too early, once it is drained; waits until the recording is written."""
         recorder = self._recorder
         if recorder is not None and not recorder.join(DRAIN_S):
             return RecordingError(
@@ -154,7 +155,7 @@ class Pipeline:
         return self._mapping.error
 
     def close(self) -> None:
-        """End all threads, whatever they are at. Maps not taken are gone; what is left in the ring is recorded."""
+        """End all threads, whatever they are doing. Maps not taken are gone; what is left in the ring is recorded."""
         try:
             self._source.end()
             self._queue.close()
@@ -166,20 +167,20 @@ class Pipeline:
                 self._recorder.join(DRAIN_S)
 
     def _complete(self) -> None:
-        """All frames are there: on a link that goes on, the ring must not fill up while the last map is estimated."""
+        """End the source when all frames are there: the ring must not fill up while the last map is estimated."""
         self._source.end()
         self._queue.end_stream()
 
 
 RING_BYTES = 512 * 2**20
-"""Ring of a source that cannot wait: 0.16 s of full frames at 100 kHz, more than any pause of the interpreter."""
+"""Bytes of the ring of a source that cannot wait: 0.16 s of full frames at 100 kHz, longer than a pause of Python."""
 FEWEST_SLOTS = 8
 """Also the slots for a source that can wait: it runs ahead by as many blocks."""
 MOST_SLOTS = 1024
 
 
 class Overload(StrEnum):
-    """What to do with blocks for which the ring has no room (`--on-overload`)."""
+    """Policy for blocks that find no room in the ring (`--on-overload`)."""
 
     ABORT = "abort"
     """Lose nothing: a source that can wait waits, one that cannot ends the run."""
@@ -198,7 +199,7 @@ class Overload(StrEnum):
 
 
 def require_policy(policy: Overload, info: SpadInfo) -> None:
-    """UsageError where the policy asks a source to wait that cannot."""
+    """Raise UsageError where the policy makes a source wait that cannot."""
     if policy is Overload.BLOCK and not info.can_wait:
         raise UsageError(
             f"--on-overload is 'block', but the {info.model} SPAD cannot wait while it exposes; "
@@ -209,9 +210,9 @@ def require_policy(policy: Overload, info: SpadInfo) -> None:
 def ring_for(
     policy: Overload, info: SpadInfo, plan: ScanPlan, timing: SpadTiming, *, keeps_time: bool = False
 ) -> BlockRing:
-    """The ring between this SPAD and its readers, allocated and touched.
+    """Allocate the ring between this SPAD and its readers and touch its memory.
 
-    keeps_time: the SPAD can wait, but should have no need to.
+    keeps_time: the SPAD can wait, but should not need to.
     """
     few = info.can_wait and not keeps_time
     slots = FEWEST_SLOTS if few else min(max(RING_BYTES // timing.stride, FEWEST_SLOTS), MOST_SLOTS)

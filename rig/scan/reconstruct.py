@@ -1,4 +1,4 @@
-"""Depth from a bare cube, map by map."""
+"""Makes depth maps of a bare cube of frames, map by map."""
 
 import os
 import time
@@ -18,7 +18,7 @@ from rig.scan.run import OutFolder, Run, RunResult
 def reconstruct_cube(
     cube: Cube, calibration: CalibrationUse, estimate: EstimateConfig, out: OutFolder, progress: Progress | None = None
 ) -> RunResult:
-    """All maps of a checked cube; those that lack frames have them noted as gaps.
+    """Make all maps of a checked cube; those that lack frames have them noted as gaps.
 
     An interrupt ends the run after its last whole map, with verdict 'aborted'.
     """

@@ -1,4 +1,4 @@
-"""One replay from opening its devices to the word on what their drivers said."""
+"""Plays a recording: opens its devices, scans, and compares what drivers said with what they had said."""
 
 import tempfile
 from collections.abc import Callable, Sequence
@@ -61,7 +61,7 @@ def _check(recording: Path, tap: TapFile, drivers: Sequence[str], tolerance_s: f
 
 
 def _require_no_difference(recording: Path, tap: TapFile, drivers: Sequence[str], error: Exception) -> None:
-    """DivergedError where a run that failed had said something else before; what it never came to is no difference."""
+    """Raise DivergedError where a run that failed had said something else; what it did not come to say is ignored."""
     problems = [one for one in _check(recording, tap, drivers, None).problems if "byte" in one]
     if problems:
         raise _diverged((*problems, str(error)), None) from error

@@ -1,6 +1,7 @@
 """One run from its first map to its folder: what `rig scan` and `rig reconstruct` have in common.
 
-What the sweeps of a scan come to: frames, synchronisation, verdict, and an account of each for the manifest.
+`Run` takes the maps and writes the folder. The functions below it add up the sweeps of a scan: frames, synchronisation,
+verdict, and an account of each sweep for the manifest.
 """
 
 import math
@@ -33,11 +34,12 @@ OutFolder = str | os.PathLike[str] | None
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """What a run gives back.
+    """Result of a run.
 
-    last: the last map, None where the run ended before its first. truth: that map's, where a world knows it.
-    folder: where everything was written, None where nothing was. control: of a replay with drivers that took part, how
-    what they said compares with the recording.
+    last: the last map; None where the run ended before its first.
+    truth: the truth of that map, where a world knows it.
+    folder: where everything was written; None where nothing was.
+    control: for a replay with drivers, the comparison of what they said with the recording.
     """
 
     summary: Summary
@@ -47,7 +49,7 @@ class RunResult:
     control: ControlCheck | None = None
 
     def uninterrupted(self) -> Self:
-        """Itself; raises KeyboardInterrupt where an interrupt ended the run, for those that need all of it."""
+        """Return itself, for callers that need the whole run; KeyboardInterrupt where an interrupt ended it."""
         if self.summary.verdict is RunVerdict.ABORTED:
             raise KeyboardInterrupt
         return self
@@ -56,9 +58,10 @@ class RunResult:
 class Run:
     """Takes the maps of a run one by one, writes those to be kept, and closes with manifest and summary.
 
-    Leaving the context without `finish` removes everything that was written, but for a recording with a block in it.
-    out: folder, None to write nothing. record: the folder is that of a recording. rays: the camera's (u, v) of every
-    pixel, to be set before the first map; None for an uncalibrated rig.
+    Leaving the context without `finish` removes everything that was written, except a recording with a block in it.
+
+    out: folder; None writes nothing. record: the folder is that of a recording.
+    rays: the camera's (u, v) of every pixel, to be set before the first map; None for an uncalibrated rig.
     """
 
     def __init__(
@@ -75,7 +78,7 @@ class Run:
         self._tap: TapFile | None = None
 
     def start_tap(self) -> TapFile:
-        """Where what passes the devices' ports is recorded from now on."""
+        """Record from now on what passes the ports of the devices, and return the file that it goes to."""
         assert self._folder is not None, "asked for with a recording, which needs a folder"
         self._tap = TapFile.begin(self._folder.place(CONTROL_FILE))
         return self._tap
@@ -86,9 +89,9 @@ class Run:
         return self.tally.maps > 0 or (self._recording is not None and self._recording.blocks > 0)
 
     def space(self, recording_bytes: int, map_bytes: int, maps: int) -> Space:
-        """What a recorded run of `maps` maps takes, and what its disk has.
+        """Room that a recorded run of `maps` maps takes, and the room on its disk.
 
-        recording_bytes: of all frames; map_bytes: of one map. UsageError where it has no folder.
+        recording_bytes: of all frames. map_bytes: of one map. Raises UsageError where the run has no folder.
         """
         if self._folder is None:
             raise UsageError("record writes the frames into the run's folder; name one with out")
@@ -100,11 +103,13 @@ class Run:
         write_inputs: Callable[[Path], None],
         space: Space,
     ) -> Recording:
-        """The recording of a run, in its folder; closed with the run.
+        """Begin the recording of a run in its folder; it is closed with the run.
 
-        manifest: what is known before the first frame; it is on the disk before this returns, and again with each start
-        of the SPAD. write_inputs: writes what has to stand beside the frames. space: what all of it will take. Raises
-        UsageError where the disk has not so much, RecordingError where it cannot be written.
+        manifest: what is known before the first frame; it is on the disk before this returns, and written again with
+          each start of the SPAD.
+        write_inputs: writes the files that have to lie beside the frames.
+        space: room that all of it will take.
+        Raises UsageError where the disk has less room, RecordingError where the recording cannot be written.
         """
         folder = self._folder
         assert folder is not None, "its space was looked at"
@@ -138,7 +143,7 @@ class Run:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Remove what was not finished, but what was recorded: 'rig repair' makes it whole."""
+        """Remove what was not finished, except what was recorded: 'rig repair' makes that whole."""
         try:
             if self._recording is not None:
                 self._recording.close()
@@ -149,7 +154,7 @@ class Run:
                 self._folder.discard()
 
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
-        """Take the next map: whole, or, where anything ends it before it is counted, not at all."""
+        """Take the next map: as a whole, or not at all where anything ends it before it is counted."""
         index = self.tally.maps
         before = self._last
         try:
@@ -176,7 +181,7 @@ class Run:
         replay: PaceReport | None = None,
         accepted_calibration: tuple[str, ...] = (),
     ) -> RunResult:
-        """Write manifest and summary and make the folder appear; one without a map or a recorded block leaves none."""
+        """Write manifest and summary and make the folder appear; none is left without a map or a recorded block."""
         summary = self.tally.summary(frames, sensor_time_s, verdict, stages, sync, replay)
         summary = replace(summary, accepted_calibration=accepted_calibration)
         index, result, truth = self._last or (None, None, None)
@@ -213,9 +218,10 @@ def versions() -> dict[str, str]:
 
 
 def frames_of(sweeps: list[SweepAccount], crc_errors: int | None, outside: Sequence[Gap] = ()) -> RunFrames:
-    """Sums over the sweeps; crc_errors: as the SPAD counts them, None where it does not.
+    """Add up the frames of the sweeps.
 
-    outside: frames that are known to be lost beside the sweeps, (first, last).
+    crc_errors: as the SPAD counts them; None where it does not. outside: ranges (first, last) of frames known to be
+    lost outside the sweeps.
     """
     beside = sum(last + 1 - first for first, last in outside)
     return RunFrames(
@@ -228,16 +234,16 @@ def frames_of(sweeps: list[SweepAccount], crc_errors: int | None, outside: Seque
 
 
 def frames_that_came(of_maps: RunFrames, counters: SpadCounters, dropped: int) -> RunFrames:
-    """Frames of a run that ended before its last map: all of them, those behind its last whole map too.
+    """Frames of a run that ended before its last map: all that came, those behind its last whole map too.
 
-    counters: the SPAD's own; dropped: frames that found no free slot, for a SPAD that does not say what got lost.
+    counters: the SPAD's own. dropped: frames that found no free slot, for a SPAD that does not count lost frames.
     """
     lost = dropped if counters.lost is None else counters.lost
     return replace(of_maps, expected=counters.delivered + lost, received=counters.delivered, lost=lost)
 
 
 def synchronisation_of(sweeps: list[SweepAccount]) -> Synchronisation | None:
-    """How well the sweeps were bound: the worst of each figure; None without any."""
+    """Summarise how well the sweeps were bound: the worst of each figure; None without sweeps."""
     if not sweeps:
         return None
     residuals = [sweep.residual_columns for sweep in sweeps]
@@ -258,7 +264,7 @@ def verdict_of(
     doubtful: bool,
     outside: Sequence[Gap] = (),
 ) -> RunVerdict:
-    """The gravest that applies. doubtful: whether a map's own light speaks against it. outside: as of `frames_of`."""
+    """The gravest verdict that applies. doubtful: a map's own light speaks against it. outside: as in `frames_of`."""
     if aborted:
         return RunVerdict.ABORTED
     if not all(sweep.synchronised or _markers_lost(sweep) for sweep in sweeps):
@@ -276,7 +282,7 @@ def _markers_lost(sweep: SweepAccount) -> bool:
 
 
 def sweep_content(sweep: SweepAccount) -> dict[str, Any]:
-    """One sweep for the manifest."""
+    """Describe one sweep for the manifest."""
     return {
         "direction": sweep.direction,
         "first_frame": sweep.first_frame,

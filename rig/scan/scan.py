@@ -1,6 +1,6 @@
 """A scan from open devices to its folder: sweeps in, maps out, and an account of what was lost.
 
-The devices of a recorded run, for its manifest: what they are and what they were set to.
+`run_scan` does it; `devices_content` describes the devices for the manifest.
 """
 
 import logging
@@ -32,40 +32,22 @@ from rig.scan.monitor import Watch
 from rig.scan.pipeline import FEWEST_SLOTS, Overload, require_policy
 from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
 
-
-def devices_content(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> dict[str, Any]:
-    """Identity, limits and timing of each; `from_plain` reads `SpadInfo`, `SpadTiming` and the limits back."""
-    kinds = {slot: getattr(rig.config, slot).kind for slot in ("spad", "scanner", "laser", "sync")}
-    return {
-        "spad": {
-            "kind": kinds["spad"],
-            "name": rig.spad.name,
-            "info": to_plain(rig.spad.info),
-            "timing": to_plain(timing),
-        },
-        "scanner": {
-            "kind": kinds["scanner"],
-            "name": rig.scanner.name,
-            "limits": to_plain(rig.scanner.limits),
-            "point_rate_hz": to_plain(plan.point_rate_hz),
-        },
-        "laser": {"kind": kinds["laser"], "name": rig.laser.name, "limits": to_plain(rig.laser.limits)},
-        "sync": {"kind": kinds["sync"], "name": rig.sync.name},
-    }
-
-
 _log = logging.getLogger(__name__)
 OnSpace = Callable[[Space], None]
-"""Told, before anything moves, what a recording will take on the disk, once it is known to fit."""
+"""A callback that gets the room a recording will take, before anything moves, once it is known to fit."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanOptions:
-    """How a scan is run, apart from its config. record: keep the frames; needs a run with a folder.
+    """Options of a scan apart from its config.
 
-    watch: a monitor's callback, on a thread of its own. live: told of the progress several times a second, on the
-    caller's thread. sweeps: shown each counted sweep before its map is made, on the counting thread.
+    policy: for frames that come too fast.
+    record: keep the frames; needs a run with a folder.
+    watch: a monitor's callback, called on a thread of its own.
+    live: called with the progress several times a second, on the caller's thread.
+    sweeps: called with each counted sweep before its map is made, on the counting thread.
     accept_calibration: use a foreign or stale calibration too, see `rig.devices.calibration_use`.
+    on_space: called with the room that the recording will take.
     """
 
     policy: Overload = Overload.ABORT
@@ -78,12 +60,13 @@ class ScanOptions:
 
 
 def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanOptions | None = None) -> RunResult:
-    """Scan with an open rig; `run` takes the maps. seed: as the rig was opened with, for the manifest.
+    """Scan with an open rig; `run` takes the maps.
 
-    maps: None for all that a recording holds, which takes the SPAD's place.
+    maps: number of maps; None is all that a recording holds which takes the SPAD's place.
+    seed: the one that the rig was opened with, for the manifest.
 
     An interrupt ends the scan after its last whole map, with verdict 'aborted'. So does an error, which is raised again
-    once the whole maps and the recording are safe; one before there is either leaves nothing.
+    once the whole maps and the recording are safe; where there is neither, nothing is left.
     """
     options = options or ScanOptions()
     require_policy(options.policy, rig.spad.info)
@@ -174,9 +157,9 @@ def run_scan(rig: OpenRig, run: Run, maps: int | None, seed: int, options: ScanO
 def recorded_bytes(
     rig: OpenRig, plan: ScanPlan, timing: SpadTiming, maps: int, starts: int | None = None
 ) -> tuple[int, int]:
-    """Bytes that the frames of a scan take at most, and those of one map.
+    """The most bytes that the frames of a scan take, and the bytes of one map.
 
-    starts: of the SPAD, where that is not for the scan to choose.
+    starts: number of starts of the SPAD, where the scan is not free to choose.
     """
     request = spad_request(rig.config.scan, plan)
     spare_s = lead_s(rig) + spare_lead_s(rig)
@@ -189,14 +172,14 @@ def recorded_bytes(
 
 
 def _first_alone(rig: OpenRig) -> bool:
-    """Whether the first map has a start of its own: a live stream cannot stand still while it is learned from."""
+    """Whether the first map gets a start of its own: a live stream cannot stand still while its map is learned from."""
     return rig.config.estimate.estimator in LEARNING and not rig.spad.info.can_wait
 
 
 def _recording(
     rig: OpenRig, run: Run, plan: ScanPlan, manifest: dict[str, Any], space: Space, on_space: OnSpace | None
 ) -> Recording:
-    """The recording of a scan, begun in the run's folder with all that is known before the first frame."""
+    """Begin the recording of a scan in the run's folder, with all that is known before the first frame."""
     recording = run.start_recording(manifest, lambda folder: write_inputs(folder, plan, rig.model), space)
     if on_space is not None:
         on_space(space)
@@ -204,7 +187,7 @@ def _recording(
 
 
 def make_reconstructor(rig: OpenRig, plan: ScanPlan, threads: int, learned: Sequence[Learned] = ()) -> Reconstructor:
-    """What makes the maps of a plan, as the config says."""
+    """Make the reconstructor for the maps of a plan, as the config says."""
     estimate = rig.config.estimate
     return Reconstructor(
         rig.model,
@@ -241,3 +224,27 @@ def _collect(
                 truth = rig.world.truth(plan.line_commands(found.column), velocity_per_s)
             sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
             run.add(found.result, found.compute_s, truth)
+
+
+def devices_content(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> dict[str, Any]:
+    """Describe each device for the manifest: identity, limits and timing.
+
+    `from_plain` reads `SpadInfo`, `SpadTiming` and the limits back.
+    """
+    kinds = {slot: getattr(rig.config, slot).kind for slot in ("spad", "scanner", "laser", "sync")}
+    return {
+        "spad": {
+            "kind": kinds["spad"],
+            "name": rig.spad.name,
+            "info": to_plain(rig.spad.info),
+            "timing": to_plain(timing),
+        },
+        "scanner": {
+            "kind": kinds["scanner"],
+            "name": rig.scanner.name,
+            "limits": to_plain(rig.scanner.limits),
+            "point_rate_hz": to_plain(plan.point_rate_hz),
+        },
+        "laser": {"kind": kinds["laser"], "name": rig.laser.name, "limits": to_plain(rig.laser.limits)},
+        "sync": {"kind": kinds["sync"], "name": rig.sync.name},
+    }

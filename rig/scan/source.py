@@ -1,4 +1,4 @@
-"""The source thread, which lets the SPAD fill the ring, and the blocks as a reader gets them."""
+"""The source thread, which lets the SPAD fill the ring, and `blocks`, which gives the blocks to a reader."""
 
 import threading
 import time
@@ -15,10 +15,12 @@ HANG_S = 180.0
 
 
 class Source:
-    """The thread that fills the ring. on_end: called on that thread when it ends, for whatever reason.
+    """The thread that fills the ring.
 
-    on_frame: told the number of the last frame on that thread whenever there are new ones; what it raises ends the
-    source. What the SPAD raises is handed to the readers, behind the blocks that came before it.
+    on_end: called on that thread when it ends, for whatever reason.
+    on_frame: called on that thread with the number of the last frame whenever there are new ones; what it raises ends
+      the source.
+    What the SPAD raises is handed to the readers, behind the blocks that came before it.
     """
 
     def __init__(
@@ -39,7 +41,7 @@ class Source:
         self._thread = StageThread(self._run, "spad source")
         self._busy_s = 0.0
         self.silences: list[DeviceTimeout] = []
-        """What the SPAD said each time it had nothing for half of `silence_s`."""
+        """The SPAD's own messages, one for each time that it had nothing for half of `silence_s`."""
 
     @property
     def name(self) -> str:
@@ -48,7 +50,7 @@ class Source:
 
     @property
     def fill_s(self) -> float:
-        """Time in the SPAD's `fill`, without that spent waiting for a free slot."""
+        """Seconds spent in the SPAD's `fill`, without waiting for a free slot."""
         return max(0.0, self._busy_s - self._ring.waited_s)
 
     def start(self) -> None:
@@ -56,13 +58,13 @@ class Source:
         self._thread.start()
 
     def end(self, why: BaseException | None = None) -> None:
-        """Fill no more after the present block. Any thread; returns at once. why: handed to the readers behind it."""
+        """Stop filling after the present block. Any thread; returns at once. why: error for the readers behind it."""
         self._why = self._why or why
         self._over.set()
         self._ring.end_waits()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the thread; False where it does not end. Readers get no more blocks in any case."""
+        """Wait for the thread; False where it does not end. Readers get no more blocks in either case."""
         ended = self._thread.join(timeout_s)
         self._ring.finish()
         return ended

@@ -1,4 +1,4 @@
-"""Which setting to use: the least error within a time, or the least time within an error.
+"""Chooses the setting to use: the least error within a time, or the least time within an error.
 
 A setting is judged by its worst among the scenes and fogs that were tried, since what is asked for has to hold in all
 of them.
@@ -18,19 +18,19 @@ _PIXELS = re.compile(r"\s*(\d+\.?\d*(?:[eE][+-]?\d{1,3})?|\.\d+)\s*px\s*", re.AS
 
 
 WORTH = 1.5
-"""Times the least error of all: what a longer scan would still take off is not worth its time to most."""
+"""Factor on the least error of all: what a longer scan would still gain is not worth its time to most users."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What is asked for: exactly one of a time and an error; of: whose time counts."""
+    """The user's wish: exactly one of a time and an error. of: whose time counts."""
 
     time_ms: float | None = None
     error_px: float | None = None
     of: Clock = "sensor"
 
     def __str__(self) -> str:
-        """In words."""
+        """Say the wish in words."""
         if self.time_ms is not None:
             return f"at most {self.time_ms:g} ms of {self.of} time a map"
         return f"at most {self.error_px:g} px of error"
@@ -38,7 +38,7 @@ class Wish:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The setting to use, or where none does what was asked for, the nearest; figures of its worst scene and fog."""
+    """The setting to use or, where none fulfils the wish, the nearest; with the figures of its worst scene and fog."""
 
     wish: Wish
     fits: bool
@@ -48,7 +48,7 @@ class Choice:
     compute_ms: float
 
     def __str__(self) -> str:
-        """In words."""
+        """Say the choice in words."""
         if self.fits:
             return f"for {self.wish}: {self.setting}: {self.figures}"
         nearest = f"{self.setting}: {self.figures}"
@@ -63,7 +63,7 @@ class Choice:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return it as plain values."""
         wish = {"time_budget_ms": self.wish.time_ms, "error_px": self.wish.error_px, "of": self.wish.of}
         return {"asked": wish, "fits": self.fits, **asdict(self.setting), **self._times()}
 
@@ -72,7 +72,7 @@ class Choice:
 
 
 def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
-    """What two options ask for, None where neither is given. UsageError, a line per problem."""
+    """Parse the options of a wish; None where neither time nor error is given. UsageError, a line per problem."""
     problems = []
     time_ms = error_px = None
     if of not in ("sensor", "compute"):
@@ -101,7 +101,7 @@ def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
 
 
 def choose(rows: Sequence[TradeoffRow], wish: Wish) -> Choice | None:
-    """The setting to use; None where too many answers are missing in every one."""
+    """Choose the setting to use; None where every setting leaves too many answers out."""
     by_setting: dict[TrialSetting, list[TradeoffRow]] = {}
     for row in rows:
         by_setting.setdefault(row.setting, []).append(row)
@@ -125,8 +125,10 @@ def choose(rows: Sequence[TradeoffRow], wish: Wish) -> Choice | None:
 
 
 def advice(rows: Sequence[TradeoffRow], wish: Wish | None, answer: Choice | None) -> str:
-    """Which setting to take, in a sentence: what was asked for, or where nothing was, the shortest scan whose error is
-    at most `WORTH` times the least of all. answer: to the wish.
+    """Say in a sentence which setting to take.
+
+    It is the one that was asked for or, without a wish, the shortest scan with an error of at most `WORTH` times the
+    least of all. answer: the choice for the wish.
     """
     if wish is not None and answer is not None:
         return f"take {_named(answer)}, the best for {wish}" if answer.fits else str(answer)

@@ -1,4 +1,4 @@
-"""Which physical effects a simulated scene calls for and what each is worth: the world's word, and trials of ours."""
+"""Tells which physical effects a simulated scene calls for, as its world says, and measures what each is worth."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
@@ -22,7 +22,7 @@ from rig.progress import Progress, part
 
 Array = NDArray[np.float64]
 Flux = dict[str, NDArray[Any]]
-"""x_px, total and the parts of the total by effect, (width,) each, photons per exposure."""
+"""Arrays (width,): x_px, total, and the parts of the total by effect, in photons per exposure."""
 
 TRIAL_COLUMNS = 40
 """Columns of a trial scan, over the config's range: some 10^4 rows with a stripe."""
@@ -33,13 +33,15 @@ class ReportsEffects(World, Protocol):
     """A world that can say what its effects are worth."""
 
     def effects_report(self, power_w: float, exposure_s: float, exposures: int) -> Mapping[str, Any]:
-        """planned_for, changed_decisions_bound, and effects: a mapping each, keys as the first fields of `Effect`, and
-        `removable`: whether `effects` of the world's config may leave it out.
+        """Report on the effects: planned_for, changed_decisions_bound, and effects, a mapping for each.
+
+        A mapping's keys are the first fields of `Effect`, and `removable`: whether `effects` of the world's config may
+        leave it out.
         """
         ...
 
     def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
-        """Choose what is simulated, as for a scan of frames of that exposure, so many to a column, at that power."""
+        """Choose what is simulated, for a scan with frames of that exposure, so many to a column, at that power."""
         ...
 
     def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
@@ -48,7 +50,7 @@ class ReportsEffects(World, Protocol):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Rows and width."""
+        """Number of rows, and width in pixels."""
         ...
 
 
@@ -56,11 +58,14 @@ class ReportsEffects(World, Protocol):
 class Effect:
     """One effect in one scene.
 
-    on, why: whether it is simulated, and the reason. share: of all detected photons. changed_decisions_bound: the share
-    of decisions that can change at most without it, None where there is no bound. cost_us_per_frame: of one thread;
-    None: it is worked in elsewhere. stripe_error_change_px: how much larger the mean stripe error is with it than
-    without it, and its standard error; `basis` says whether that was measured in a pair of trial scans or is the bound
-    of an effect that is left out; None: neither.
+    on, why: whether it is simulated, and the reason.
+    share: share of all detected photons.
+    changed_decisions_bound: largest share of decisions that can change without it; None where there is no bound.
+    cost_us_per_frame: of one thread; None where it is worked in elsewhere.
+    stripe_error_change_px: how much larger the mean stripe error is with it than without it, with its standard error;
+      None where neither is known.
+    basis: 'trial' where that was measured in a pair of trial scans, 'bound' where it is the bound of an effect that is
+      left out.
     """
 
     effect: str
@@ -74,14 +79,16 @@ class Effect:
     basis: Literal["trial", "bound"] | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return it as plain values."""
         return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
 class SceneEffects:
-    """The effects of a scene. planned_for: the most power_w, exposure_s and exposures of a column that the choice of
-    effects holds for; changed_decisions_bound: of all that it leaves out together.
+    """The effects of a scene.
+
+    planned_for: the most power_w, exposure_s and exposures of a column that the choice of effects holds for.
+    changed_decisions_bound: bound for all that it leaves out together.
     """
 
     planned_for: Mapping[str, float]
@@ -93,14 +100,14 @@ class SceneEffects:
         return iter(self.effects)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return it as plain values."""
         return asdict(self)
 
 
 def scene_effects(config: RigConfig, *, trials: bool = True, progress: Progress | None = None) -> SceneEffects:
-    """The effects of a config's scene at its scan's power, exposure and exposures. UsageError without a world.
+    """Find the effects of a config's scene at its scan's power, exposure and exposures. UsageError without a world.
 
-    trials: measure by how much each effect changes the stripe error; progress: called with trial scans done and all.
+    trials: measure by how much each effect changes the stripe error. progress: called with trial scans done and to do.
     """
     scan = config.scan
     with open_world(config) as (world, power_w):
@@ -119,8 +126,8 @@ def scene_effects(config: RigConfig, *, trials: bool = True, progress: Progress 
 def flux_row(config: RigConfig, row: int, column: int) -> Flux:
     """Noise-free photons per exposure of one image row while the line is at a column's centre.
 
-    x_px: pixels (width,); total; and by name what each effect of light and dark counts brings, zeros for those that are
-    off; they add up to the total. UsageError for a row or column that is not there.
+    x_px: pixels (width,); total; and by name the share of each effect of light and dark counts, zeros for effects that
+    are off. The shares add up to the total. UsageError for a row or column that does not exist.
     """
     scan = config.scan
     with open_world(config) as (world, power_w):
@@ -138,7 +145,7 @@ def flux_row(config: RigConfig, row: int, column: int) -> Flux:
 
 
 def _mirror_command(config: RigConfig, column: int) -> float:
-    """Where the mirror stands while a column is lit."""
+    """Mirror command while a column is lit."""
     scan, offsets = config.scan, config.line_offsets
     if len(offsets) > 1:
         grid, _ = line_grid(offsets, scan.columns, scan.command_range)
@@ -148,7 +155,7 @@ def _mirror_command(config: RigConfig, column: int) -> float:
 
 @contextmanager
 def open_world(config: RigConfig) -> Iterator[tuple[ReportsEffects, float]]:
-    """The config's world, planned for its scan, with its simulated devices, and the scan's power in W."""
+    """Open the config's world with its simulated devices, planned for its scan; also gives the scan's power in W."""
     if config.world is None:
         raise UsageError(f"{config.name} has no simulated world; name a config that has one, such as 'simulated'")
     alone = Surroundings(VirtualClock(), None, 0)
@@ -178,8 +185,10 @@ def open_world(config: RigConfig) -> Iterator[tuple[ReportsEffects, float]]:
 def _trials(
     config: RigConfig, on: list[str], tried: list[str], progress: Progress | None
 ) -> dict[str, tuple[float, float]]:
-    """By how many px the mean stripe error grows with each effect, and the standard error: pairs of short scans, same
-    random numbers, all other effects on. Empty for a world that lives in the host's time.
+    """Pixels by which the mean stripe error grows with each effect, and the standard error of that.
+
+    Measured in pairs of short scans with the same random numbers and all other effects on. Empty for a world that lives
+    in the host's time.
     """
     if config.world is None or config.world.real_time:
         return {}
@@ -208,7 +217,10 @@ def _trials(
 
 
 def _trial(config: RigConfig, columns: int, names: list[str]) -> Array:
-    """Charged stripe errors of a scan with so many columns and these effects. An interrupt is raised again."""
+    """Stripe errors of a scan with so many columns and these effects; missing answers are charged.
+
+    An interrupt is raised again.
+    """
     from rig.devices.open import open_rig
     from rig.run_folder.summary import MapTally
     from rig.scan.run import Run

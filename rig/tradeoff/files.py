@@ -1,6 +1,6 @@
-"""The files of a trade-off: tradeoff.json, .csv and .svg, and setting.yaml, the setting to use as a config.
+"""Writes the files of a trade-off: tradeoff.json, .csv and .svg, and setting.yaml, the setting to use as a config.
 
-A trade-off as a picture: error over sensor time and over compute time, a pair of panels for each scene and fog.
+The picture shows error over sensor time and over compute time, a pair of panels for each scene and fog.
 """
 
 import csv
@@ -18,13 +18,53 @@ from rig.scan.run import versions
 from rig.tradeoff.rows import Clock, TradeoffRow
 from rig.tradeoff.trials import Tradeoff
 
+SETTING_FILE = "setting.yaml"
+
+
+def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) -> Tradeoff:
+    """Write everything, make the folder appear and return the trade-off with its folder.
+
+    setting: config with the chosen setting; None where there is none.
+    """
+    folder.write_json("tradeoff.json", {**done.as_json(), "versions": versions()})
+    folder.write_text("tradeoff.csv", csv_text(done.rows))
+    folder.write_text("tradeoff.svg", tradeoff_svg(done.rows, done.ci95_by))
+    if setting is not None:
+        comments = [f"rig tradeoff: {done.answer}"]
+        if done.accepted_calibration:
+            comments.append("its calibration was accepted all the same: scan with --accept-calibration")
+        folder.write_text(SETTING_FILE, config_text(setting, comments))
+    return replace(done, folder=folder.publish())
+
+
+def csv_text(rows: Sequence[TradeoffRow]) -> str:
+    """Rows as CSV, a line each, columns as in the JSON; the interval takes two columns."""
+    stream = io.StringIO()
+    writer: csv.DictWriter[str] | None = None
+    for row in rows:
+        content = row.as_json()
+        low, high = content.pop("ci95")
+        line = {**content, "ci95_low": low, "ci95_high": high}
+        if writer is None:
+            writer = csv.DictWriter(stream, line.keys(), lineterminator="\n")
+            writer.writeheader()
+        writer.writerow(line)
+    return stream.getvalue()
+
+
+def config_text(config: RigConfig, comments: Sequence[str]) -> str:
+    """A config as a YAML file that every command takes, wherever it lies."""
+    head = "".join(f"# {comment}\n" for comment in comments)
+    return head + yaml.safe_dump(portable_content(config), sort_keys=False, allow_unicode=True)
+
+
 COLOURS = {"argmax": "#7b8896", "edge": "#d55e00", "likelihood": "#0072b2", "joint": "#009e73"}
-"""Of estimators; told apart by the colour-blind too (Okabe and Ito, 'Color universal design', 2008)."""
+"""Colours of estimators, which the colour-blind can tell apart (Okabe and Ito, 'Color universal design', 2008)."""
 OTHER_COLOUR = "#cc79a7"
 
 
 def tradeoff_svg(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
-    """The SVG file. Rows with too many answers missing are left out."""
+    """Draw the SVG file. Rows with too many answers missing are left out."""
     places = list(dict.fromkeys((row.scene, row.fog) for row in rows))
     shown = [row for row in rows if row.counts]
     panels = [
@@ -42,7 +82,7 @@ def tradeoff_svg(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
 
 
 def colour_of(estimator: str) -> str:
-    """An estimator's colour, in every picture the same."""
+    """Colour of an estimator, the same in every picture."""
     return COLOURS.get(estimator, OTHER_COLOUR)
 
 
@@ -78,40 +118,3 @@ def _series(key: tuple[str, str, int], rows: Sequence[TradeoffRow], of: Clock) -
         names=[str(row.exposures) for row in rows],
         dashed=filter != "none",
     )
-
-
-SETTING_FILE = "setting.yaml"
-
-
-def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) -> Tradeoff:
-    """Write everything and make the folder appear; the trade-off with its folder. setting: of the answer."""
-    folder.write_json("tradeoff.json", {**done.as_json(), "versions": versions()})
-    folder.write_text("tradeoff.csv", csv_text(done.rows))
-    folder.write_text("tradeoff.svg", tradeoff_svg(done.rows, done.ci95_by))
-    if setting is not None:
-        comments = [f"rig tradeoff: {done.answer}"]
-        if done.accepted_calibration:
-            comments.append("its calibration was accepted all the same: scan with --accept-calibration")
-        folder.write_text(SETTING_FILE, config_text(setting, comments))
-    return replace(done, folder=folder.publish())
-
-
-def csv_text(rows: Sequence[TradeoffRow]) -> str:
-    """A line for each row, columns as in the JSON; the interval in two columns."""
-    stream = io.StringIO()
-    writer: csv.DictWriter[str] | None = None
-    for row in rows:
-        content = row.as_json()
-        low, high = content.pop("ci95")
-        line = {**content, "ci95_low": low, "ci95_high": high}
-        if writer is None:
-            writer = csv.DictWriter(stream, line.keys(), lineterminator="\n")
-            writer.writeheader()
-        writer.writerow(line)
-    return stream.getvalue()
-
-
-def config_text(config: RigConfig, comments: Sequence[str]) -> str:
-    """A config as a YAML file that every command takes, wherever it lies."""
-    head = "".join(f"# {comment}\n" for comment in comments)
-    return head + yaml.safe_dump(portable_content(config), sort_keys=False, allow_unicode=True)

@@ -3,23 +3,22 @@
 The ideal is told haze, ambient light, the line's width and how bright the stripe is, and asked only where it is. Where
 stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the posterior.
 `bayes_errors` draws counts and takes that median: the limit itself, no bound of it, within the noise of the draw, at 5
-ms a row for four numbers of exposures. Chernoff's union bound (`rig.tradeoff.limits`) is 3 to 30 times as large, since
-it counts every rival alone; Cramer-Rao's is too small wherever a rival may win.
+ms a row for four numbers of exposures. Chernoff's union bound is 3 to 30 times as large, since it counts every rival
+alone; Cramer-Rao's is too small wherever a rival may win.
 
 Neighbours on one surface say the same: M of them, of equal disparity and equally bright, count as M times the
-exposures. What coupling can gain is held against that.
+exposures. The gain of coupling neighbours is compared with that.
 
-How often at least, and by how much, a row's photons lead to the wrong position: Chernoff exponents and Cramer-Rao.
-
-B ~ Bernoulli(1 - exp(-flux)) per pixel and exposure, pixels independent, p and q = 1 - p of one position of the stripe,
-p' and q' of another:
+`chernoff_exponent`, `Rivals` and `position_sd_px` say how often at least, and by how much, a row's photons lead to the
+wrong position. B ~ Bernoulli(1 - exp(-flux)) per pixel and exposure, pixels independent, p and q = 1 - p of one
+position of the stripe, p' and q' of another:
 
     C = max over t of -sum log(p^t p'^(1-t) + q^t q'^(1-t))     Chernoff, per exposure
-    P(k beats j) <= exp(-K C)                                   a bound at any K; as K grows, the true exponent
-    E|error| <= sum |k - j| exp(-K C(j, k))                     the union bound: loose where many rival
+    P(k beats j) <= exp(-K C)                                   a bound at any K; as K grows, the true exponent E|error|
+    <= sum |k - j| exp(-K C(j, k))                     the union bound: loose where many rival
     sd >= 1 / sqrt(K I), I = sum flux'^2 / (exp(flux) - 1)      Cramer-Rao, for answers without bias near the truth
 
-How far errors are from what the light of a scene allows: `rig.tradeoff.limits`, beside the rows of a trade-off.
+`SceneLimits` puts the limits beside the rows of a trade-off.
 """
 
 import math
@@ -34,8 +33,246 @@ from rig.errors import UsageError
 from rig.tradeoff.row_light import FLUX_MIN, Array, RowLight, scene_lights
 from rig.tradeoff.rows import LOCAL_PX, TradeoffRow
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rivals:
+    """Positions of a row that are whole pixels off the true one: distances and Chernoff exponents, (places,) each.
+
+    reach_px: the farthest that an answer within the search can be off.
+    """
+
+    away_px: Array
+    exponent: Array
+    reach_px: float
+
+    @classmethod
+    def of(cls, light: RowLight) -> "Rivals":
+        """Find the rivals of a row."""
+        places = light.whole_positions()
+        exponent = chernoff_exponent(light.flux(places), light.flux(np.array([light.position])))
+        reach = max(light.position - light.first, light.last - light.position)
+        return cls(np.abs(places - light.position), exponent, reach)
+
+    def least_exponent(self) -> float:
+        """The smallest C to a place more than 1 px off, by which such errors get rarer in the end; inf without one."""
+        return float(self.exponent[self.away_px > 1.5].min(initial=np.inf))
+
+    def bounds(self, exposures: int) -> tuple[float, float]:
+        """Bounds on P(a rival is the likelier one) and on E|error| in px of the likeliest one, after K exposures.
+
+        True at any K, by adding up all rivals as if each erred alone; at most 1, and at most the reach.
+        """
+        likelier = np.exp(-exposures * self.exponent)
+        return min(float(likelier.sum()), 1.0), min(float((self.away_px * likelier).sum()), self.reach_px)
+
+
+def position_information(light: RowLight) -> float:
+    """Fisher information of the position per exposure, 1/px^2, from the stripe's flanks and from where the haze ends.
+
+    None comes from a pixel that always fires: a stripe so bright and narrow that it saturates the two pixels beside
+    the border that it is centred on has information 0.
+    """
+    pixel = np.arange(len(light.before), dtype=np.float64)
+    away = pixel - light.position
+    flux = np.maximum(light.flux(np.array([light.position]))[0], FLUX_MIN)
+    # Of a Gaussian's values at a pixel's two borders: their difference, exact however wide it is.
+    inner = (np.abs(away) - 0.5) / light.sigma_px
+    flank = np.exp(-0.5 * inner**2) * -np.expm1(-np.abs(away) / light.sigma_px**2)
+    slope = np.sign(away) * flank * (light.stripe / (light.sigma_px * math.sqrt(2.0 * math.pi)))
+    cut = (away >= -0.5) & (away < 0.5)
+    slope = slope + np.where(cut, light.before - light.behind, 0.0)
+    # 1 / (e^flux - 1), which neither overflows nor cancels; multiplied in an order that does not overflow either.
+    return float(np.sum(np.square(slope * np.exp(-0.5 * flux) / np.sqrt(-np.expm1(-flux)))))
+
+
+def position_sd_px(light: RowLight, exposures: float) -> float:
+    """Cramer-Rao bound on the position's standard deviation from K exposures (of M like rows: M K); inf without any.
+
+    It is for answers without bias near the true stripe. Where rows are so dark that other positions rival, no answer
+    comes near it.
+    """
+    information = exposures * position_information(light)
+    return 1.0 / math.sqrt(information) if information > 0 else math.inf
+
+
+COUPLED_ROWS: Final = 25
+"""Rows that an estimator which couples neighbours is assumed to see together: 5 x 5 of equal disparity."""
+BOUNDED_ROWS: Final = 24
+"""Rows of a scene whose exponents and union bounds are computed."""
+COARSE_PX: Final = 0.5
+"""Spacing of positions far from the true one."""
+FINE_SHARE: Final = 8.0
+"""Positions near the true one lie this part (an eighth) of their distance from it apart."""
+
+
+def bayes_errors(light: RowLight, exposures: Sequence[int], draws: int, rng: np.random.Generator) -> Array:
+    """|error| in px of the posterior median for `draws` drawn rows of each number of exposures, (exposures, draws)."""
+    places, spacing = _places(light, max(exposures))
+    flux = np.maximum(light.flux(places), FLUX_MIN)
+    here = np.maximum(light.flux(np.array([light.position]))[0], FLUX_MIN)
+    # log L = sum n log(e^flux - 1) - K flux, an exact identity; all of it is of differences to the true position.
+    gain = log_fired(flux) + flux - (log_fired(here) + here)
+    loss = (flux - here).sum(1)
+    errors = np.empty((len(exposures), draws))
+    for i, k in enumerate(exposures):
+        ones = rng.binomial(k, -np.expm1(-here), (draws, len(here))).astype(np.float64)
+        score = np.log(spacing) + ones @ gain.T - k * loss
+        errors[i] = np.abs(_medians(score, places, spacing) - light.position)
+    return errors
+
+
+def _places(light: RowLight, exposures: int) -> tuple[Array, Array]:
+    """Positions over the search and the pixels that each stands for: the nearer to the true one, the denser."""
+    finest = min(max(position_sd_px(light, exposures), 1e-3), 1.0) / FINE_SHARE
+    reach = math.ceil(FINE_SHARE * math.log(COARSE_PX / finest))
+    steps = finest * np.expm1(np.arange(1, reach + 1) / FINE_SHARE) * FINE_SHARE
+    first, last = light.first - 0.5, light.last + 0.5
+    steps = np.concatenate([steps, np.arange(steps[-1] + COARSE_PX, last - first + COARSE_PX, COARSE_PX)])
+    borders = light.position + np.concatenate([-steps[::-1], steps])
+    borders = np.concatenate([[first], borders[(borders > first) & (borders < last)], [last]])
+    return 0.5 * (borders[1:] + borders[:-1]), np.diff(borders)
+
+
+def _medians(score: Array, places: Array, spacing: Array) -> Array:
+    """Median of each posterior (rows, places), which is even within the pixels that a place stands for."""
+    mass = np.exp(score - score.max(1, keepdims=True))
+    below = np.cumsum(mass, axis=1)
+    half = 0.5 * below[:, -1]
+    at = (below < half[:, None]).sum(1)
+    own = mass[np.arange(len(at)), at]
+    return np.asarray(places[at] + spacing[at] * ((half - below[np.arange(len(at)), at]) / own + 0.5))
+
+
+@dataclass(frozen=True, slots=True)
+class StatisticalLimit:
+    """Limits of rows of a scene at a number of exposures; means over its rows.
+
+    mean_abs_px, mean_abs_se_px: least mean |error| of any answer from one row, or from `averaged` like ones, and its
+      standard error.
+    within_1px: share of those answers within 1 px.
+    exponent: median over rows of the least Chernoff exponent per exposure to a position more than 1 px off.
+    position_sd_px: median Cramer-Rao bound.
+    error_bound_px: mean union bound on |error| over whole pixels.
+    """
+
+    exposures: int
+    averaged: int
+    mean_abs_px: float
+    mean_abs_se_px: float
+    within_1px: float
+    exponent: float
+    position_sd_px: float
+    error_bound_px: float
+
+
+def limits(
+    lights: Sequence[RowLight], exposures: Sequence[int], *, averaged: int = 1, draws: int = 32, seed: int = 0
+) -> list[StatisticalLimit]:
+    """Compute the limit of each number of exposures over some rows of a scene; the same seed gives the same limit.
+
+    averaged: neighbours of equal disparity that each row may be seen together with; 1 for an estimator of single rows.
+    draws: of each row. 200 rows take a second for four numbers of exposures, and BOUNDED_ROWS of them a second for
+      their exponents and bounds.
+    """
+    if not lights:
+        raise ValueError("a limit needs at least one row of light")
+    counted = [k * averaged for k in exposures]
+    drawn = [bayes_errors(light, counted, draws, np.random.default_rng([seed, i])) for i, light in enumerate(lights)]
+    errors = np.stack(drawn, axis=1)
+    rivals = [Rivals.of(light) for light in lights[:: -(-len(lights) // BOUNDED_ROWS)]]
+    exponent = float(np.median([each.least_exponent() for each in rivals]))
+    found = []
+    for k, n, of_k in zip(exposures, counted, errors, strict=True):
+        per_row = of_k.mean(1)
+        found.append(
+            StatisticalLimit(
+                k,
+                averaged,
+                float(per_row.mean()),
+                float(per_row.std() / math.sqrt(max(len(per_row) - 1, 1))),
+                float((of_k <= 1.0).mean()),
+                exponent,
+                float(np.median([position_sd_px(light, n) for light in lights])),
+                float(np.mean([each.bounds(n)[1] for each in rivals])),
+            )
+        )
+    return found
+
+
+ROWS = 200
+"""Number of rows of a scene that its limit is the mean of."""
+COUPLED = "joint"
+"""The estimator that sees a row together with its neighbours; the median filter sees as many rows."""
+LEAST_WRONG = 0.003
+"""Least share of the ideal's answers more than 1 px off that a ratio is taken to: twenty of 200 rows x 32 draws."""
+LOCAL_SDS = 3.0
+"""Standard deviations that must fit into LOCAL_PX, so that answers within it are all that found the stripe."""
+
+Place = tuple[str, str | None]
+"""Scene and fog."""
+
+
+class SceneLimits:
+    """Limits of scenes and fogs, each computed once. exposures: all that will be tried."""
+
+    def __init__(self, exposures: Sequence[int]) -> None:
+        self._exposures = tuple(exposures)
+        self._lights: dict[Place, Sequence[RowLight]] = {}
+        self._found: dict[tuple[Place, int], dict[int, StatisticalLimit]] = {}
+
+    def beside(self, rows: Sequence[TradeoffRow], config: RigConfig) -> list[TradeoffRow]:
+        """Add the limits to the rows of one scene and fog; rows without a limit stay as they are.
+
+        config: of their scan.
+        """
+        if len(config.line_offsets) > 1:
+            return list(rows)
+        place = rows[0].scene, rows[0].fog
+        if place not in self._lights:
+            self._lights[place] = self._lights_of(config)
+        return [self._with_limit(row, place) for row in rows] if self._lights[place] else list(rows)
+
+    def _with_limit(self, row: TradeoffRow, place: Place) -> TradeoffRow:
+        averaged = _averaged(row)
+        if (place, averaged) not in self._found:
+            found = limits(self._lights[place], self._exposures, averaged=averaged)
+            self._found[place, averaged] = {limit.exposures: limit for limit in found}
+        return _beside(row, self._found[place, averaged][row.exposures])
+
+    def _lights_of(self, config: RigConfig) -> Sequence[RowLight]:
+        # What the world leaves out must be too little for the most exposures.
+        scan = config.scan.model_copy(update={"exposures": max(self._exposures)})
+        try:
+            return scene_lights(config.model_copy(update={"scan": scan}), rows=ROWS)
+        except UsageError:  # a scene whose stripe is nowhere whole can still be scored
+            return ()
+
+
+def _averaged(row: TradeoffRow) -> int:
+    return COUPLED_ROWS if row.estimator == COUPLED or row.filter == "median" else 1
+
+
+def _beside(row: TradeoffRow, limit: StatisticalLimit) -> TradeoffRow:
+    """Add the limit to a row; each figure is None where it is not known or would mislead."""
+    wrong, least_wrong = 1.0 - row.within_1px, 1.0 - limit.within_1px
+    bound_px, sd_px = limit.position_sd_px, row.local_sd_px
+    local = LOCAL_SDS * bound_px <= LOCAL_PX
+    return replace(
+        row,
+        times_limit=row.mean_abs_px / limit.mean_abs_px,
+        exponent_nats=_finite(limit.exponent * limit.averaged),
+        times_wrong_limit=wrong / least_wrong if least_wrong >= LEAST_WRONG else None,
+        position_sd_px=_finite(bound_px),
+        times_position_limit=sd_px / bound_px if sd_px is not None and local else None,
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
 NEWTON_STEPS: Final = 60
-"""Most steps to the best exponent t; bisection alone gets there."""
+"""Most steps to the best exponent t; bisection alone would get there."""
 GAP_EXACT: Final = 0.5
 """1 minus a pixel's overlap below which it is summed from its small parts."""
 SERIES_BELOW: Final = 0.05
@@ -103,238 +340,3 @@ def _convexity(share: Array, x: Array) -> Array:
         term, power = term * x / n, power * share
         total = total + (share - power) * term
     return np.where(x > -SERIES_BELOW, total, share * np.expm1(x) - np.expm1(share * x))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rivals:
-    """Places of a row that are whole pixels off the true one: how far, and the Chernoff exponents, (places,) each.
-
-    reach_px: the farthest an answer within the search can be off.
-    """
-
-    away_px: Array
-    exponent: Array
-    reach_px: float
-
-    @classmethod
-    def of(cls, light: RowLight) -> "Rivals":
-        """The rivals of a row."""
-        places = light.whole_positions()
-        exponent = chernoff_exponent(light.flux(places), light.flux(np.array([light.position])))
-        reach = max(light.position - light.first, light.last - light.position)
-        return cls(np.abs(places - light.position), exponent, reach)
-
-    def least_exponent(self) -> float:
-        """The smallest C to a place more than 1 px off, by which such errors get rarer in the end; inf without one."""
-        return float(self.exponent[self.away_px > 1.5].min(initial=np.inf))
-
-    def bounds(self, exposures: int) -> tuple[float, float]:
-        """Bounds on P(a rival is the likelier one) and on E|error| in px of the likeliest one, after K exposures.
-
-        True at any K, by adding up all rivals as if each erred alone; at most 1, and at most the reach.
-        """
-        likelier = np.exp(-exposures * self.exponent)
-        return min(float(likelier.sum()), 1.0), min(float((self.away_px * likelier).sum()), self.reach_px)
-
-
-def position_information(light: RowLight) -> float:
-    """Fisher information of the position per exposure, 1/px^2, from the stripe's flanks and from where the haze ends.
-
-    None comes from a pixel that always fires: a stripe so bright and narrow that it saturates the two pixels beside
-    the border that it is centred on has information 0.
-    """
-    pixel = np.arange(len(light.before), dtype=np.float64)
-    away = pixel - light.position
-    flux = np.maximum(light.flux(np.array([light.position]))[0], FLUX_MIN)
-    # Of a Gaussian's values at a pixel's two borders: their difference, exact however wide it is.
-    inner = (np.abs(away) - 0.5) / light.sigma_px
-    flank = np.exp(-0.5 * inner**2) * -np.expm1(-np.abs(away) / light.sigma_px**2)
-    slope = np.sign(away) * flank * (light.stripe / (light.sigma_px * math.sqrt(2.0 * math.pi)))
-    cut = (away >= -0.5) & (away < 0.5)
-    slope = slope + np.where(cut, light.before - light.behind, 0.0)
-    # 1 / (e^flux - 1), which neither overflows nor cancels; multiplied in an order that does not overflow either.
-    return float(np.sum(np.square(slope * np.exp(-0.5 * flux) / np.sqrt(-np.expm1(-flux)))))
-
-
-def position_sd_px(light: RowLight, exposures: float) -> float:
-    """Cramer-Rao bound on the position's standard deviation from K exposures (of M like rows: M K); inf without any.
-
-    It is for answers without bias near the true stripe. Where rows are so dark that other positions rival, no answer
-    comes near it.
-    """
-    information = exposures * position_information(light)
-    return 1.0 / math.sqrt(information) if information > 0 else math.inf
-
-
-COUPLED_ROWS: Final = 25
-"""Rows that an estimator which couples neighbours is granted: 5 x 5 of equal disparity."""
-BOUNDED_ROWS: Final = 24
-"""Rows of a scene whose exponents and union bounds are computed."""
-COARSE_PX: Final = 0.5
-"""Spacing of positions far from the true one."""
-FINE_SHARE: Final = 8.0
-"""Near the true position they lie an eighth of their distance from it apart."""
-
-
-def bayes_errors(light: RowLight, exposures: Sequence[int], draws: int, rng: np.random.Generator) -> Array:
-    """|error| in px of the posterior median for `draws` drawn rows of each number of exposures, (exposures, draws)."""
-    places, spacing = _places(light, max(exposures))
-    flux = np.maximum(light.flux(places), FLUX_MIN)
-    here = np.maximum(light.flux(np.array([light.position]))[0], FLUX_MIN)
-    # log L = sum n log(e^flux - 1) - K flux, an exact identity; all of it is of differences to the true position.
-    gain = log_fired(flux) + flux - (log_fired(here) + here)
-    loss = (flux - here).sum(1)
-    errors = np.empty((len(exposures), draws))
-    for i, k in enumerate(exposures):
-        ones = rng.binomial(k, -np.expm1(-here), (draws, len(here))).astype(np.float64)
-        score = np.log(spacing) + ones @ gain.T - k * loss
-        errors[i] = np.abs(_medians(score, places, spacing) - light.position)
-    return errors
-
-
-def _places(light: RowLight, exposures: int) -> tuple[Array, Array]:
-    """Positions over the search and what each stands for in px: the denser, the nearer to the true one."""
-    finest = min(max(position_sd_px(light, exposures), 1e-3), 1.0) / FINE_SHARE
-    reach = math.ceil(FINE_SHARE * math.log(COARSE_PX / finest))
-    steps = finest * np.expm1(np.arange(1, reach + 1) / FINE_SHARE) * FINE_SHARE
-    first, last = light.first - 0.5, light.last + 0.5
-    steps = np.concatenate([steps, np.arange(steps[-1] + COARSE_PX, last - first + COARSE_PX, COARSE_PX)])
-    borders = light.position + np.concatenate([-steps[::-1], steps])
-    borders = np.concatenate([[first], borders[(borders > first) & (borders < last)], [last]])
-    return 0.5 * (borders[1:] + borders[:-1]), np.diff(borders)
-
-
-def _medians(score: Array, places: Array, spacing: Array) -> Array:
-    """Median of each posterior (rows, places), even within what a place stands for."""
-    mass = np.exp(score - score.max(1, keepdims=True))
-    below = np.cumsum(mass, axis=1)
-    half = 0.5 * below[:, -1]
-    at = (below < half[:, None]).sum(1)
-    own = mass[np.arange(len(at)), at]
-    return np.asarray(places[at] + spacing[at] * ((half - below[np.arange(len(at)), at]) / own + 0.5))
-
-
-@dataclass(frozen=True, slots=True)
-class StatisticalLimit:
-    """What rows of a scene allow at a number of exposures; means over its rows.
-
-    mean_abs_px and its standard error: least mean |error| of any answer from one row, or from `averaged` like ones.
-    within_1px: share of those answers within 1 px. exponent: median over rows of the least Chernoff exponent per
-    exposure to a position more than 1 px off. position_sd_px: median Cramer-Rao bound. error_bound_px: mean union
-    bound on |error| over whole pixels.
-    """
-
-    exposures: int
-    averaged: int
-    mean_abs_px: float
-    mean_abs_se_px: float
-    within_1px: float
-    exponent: float
-    position_sd_px: float
-    error_bound_px: float
-
-
-def limits(
-    lights: Sequence[RowLight], exposures: Sequence[int], *, averaged: int = 1, draws: int = 32, seed: int = 0
-) -> list[StatisticalLimit]:
-    """The limit of each number of exposures over some rows of a scene, the same for the same seed.
-
-    averaged: neighbours of equal disparity that each row may be seen together with, 1 for an estimator of single
-    rows. draws: of each row. 200 rows take a second for four numbers of exposures, and BOUNDED_ROWS of them a second
-    for their exponents and bounds.
-    """
-    if not lights:
-        raise ValueError("a limit needs at least one row of light")
-    counted = [k * averaged for k in exposures]
-    drawn = [bayes_errors(light, counted, draws, np.random.default_rng([seed, i])) for i, light in enumerate(lights)]
-    errors = np.stack(drawn, axis=1)
-    rivals = [Rivals.of(light) for light in lights[:: -(-len(lights) // BOUNDED_ROWS)]]
-    exponent = float(np.median([each.least_exponent() for each in rivals]))
-    found = []
-    for k, n, of_k in zip(exposures, counted, errors, strict=True):
-        per_row = of_k.mean(1)
-        found.append(
-            StatisticalLimit(
-                k,
-                averaged,
-                float(per_row.mean()),
-                float(per_row.std() / math.sqrt(max(len(per_row) - 1, 1))),
-                float((of_k <= 1.0).mean()),
-                exponent,
-                float(np.median([position_sd_px(light, n) for light in lights])),
-                float(np.mean([each.bounds(n)[1] for each in rivals])),
-            )
-        )
-    return found
-
-
-ROWS = 200
-"""Rows of a scene that its limit is the mean of."""
-COUPLED = "joint"
-"""The estimator that sees a row together with its neighbours; the median filter sees as many."""
-LEAST_WRONG = 0.003
-"""Share of the ideal's answers more than 1 px off from which there is a ratio to it: twenty of 200 rows x 32 draws."""
-LOCAL_SDS = 3.0
-"""Answers within LOCAL_PX are all of those that found the stripe where so many standard deviations fit into that."""
-
-Place = tuple[str, str | None]
-"""Scene and fog."""
-
-
-class SceneLimits:
-    """The limits of scenes and fogs, each worked out once. exposures: all that will be tried."""
-
-    def __init__(self, exposures: Sequence[int]) -> None:
-        self._exposures = tuple(exposures)
-        self._lights: dict[Place, Sequence[RowLight]] = {}
-        self._found: dict[tuple[Place, int], dict[int, StatisticalLimit]] = {}
-
-    def beside(self, rows: Sequence[TradeoffRow], config: RigConfig) -> list[TradeoffRow]:
-        """The rows of one scene and fog with what they can be held against; as they are where there is no limit.
-
-        config: of their scan.
-        """
-        if len(config.line_offsets) > 1:
-            return list(rows)
-        place = rows[0].scene, rows[0].fog
-        if place not in self._lights:
-            self._lights[place] = self._lights_of(config)
-        return [self._with_limit(row, place) for row in rows] if self._lights[place] else list(rows)
-
-    def _with_limit(self, row: TradeoffRow, place: Place) -> TradeoffRow:
-        averaged = _averaged(row)
-        if (place, averaged) not in self._found:
-            found = limits(self._lights[place], self._exposures, averaged=averaged)
-            self._found[place, averaged] = {limit.exposures: limit for limit in found}
-        return _beside(row, self._found[place, averaged][row.exposures])
-
-    def _lights_of(self, config: RigConfig) -> Sequence[RowLight]:
-        # What the world leaves out must be too little for the most exposures.
-        scan = config.scan.model_copy(update={"exposures": max(self._exposures)})
-        try:
-            return scene_lights(config.model_copy(update={"scan": scan}), rows=ROWS)
-        except UsageError:  # a scene whose stripe is nowhere whole can still be scored
-            return ()
-
-
-def _averaged(row: TradeoffRow) -> int:
-    return COUPLED_ROWS if row.estimator == COUPLED or row.filter == "median" else 1
-
-
-def _beside(row: TradeoffRow, limit: StatisticalLimit) -> TradeoffRow:
-    """A row beside its limit; each figure None where it is not known, or would say something else."""
-    wrong, least_wrong = 1.0 - row.within_1px, 1.0 - limit.within_1px
-    bound_px, sd_px = limit.position_sd_px, row.local_sd_px
-    local = LOCAL_SDS * bound_px <= LOCAL_PX
-    return replace(
-        row,
-        times_limit=row.mean_abs_px / limit.mean_abs_px,
-        exponent_nats=_finite(limit.exponent * limit.averaged),
-        times_wrong_limit=wrong / least_wrong if least_wrong >= LEAST_WRONG else None,
-        position_sd_px=_finite(bound_px),
-        times_position_limit=sd_px / bound_px if sd_px is not None and local else None,
-    )
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

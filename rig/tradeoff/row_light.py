@@ -1,6 +1,6 @@
-"""The light that an image row is expected to have, as statistics take it: all is known but where the stripe lies.
+"""The light that an image row is expected to have, with everything known except where the stripe lies.
 
-Rows of a simulated scene as `rig.tradeoff.limits` takes them: the world's own light, which no estimator is ever told.
+`scene_lights` takes it from the world of a simulated scene, for `rig.tradeoff.limits`; no estimator is ever told.
 """
 
 import math
@@ -23,19 +23,20 @@ from rig.tradeoff.effects import ReportsEffects, open_world
 Array = NDArray[np.float64]
 
 FLUX_MIN: Final = 1e-300
-"""Photons; a pixel that can fire at all. Its logarithms are finite."""
+"""Photons; least flux of a pixel, so that it can fire at all and its logarithms are finite."""
 PROFILE_SIGMAS: Final = 8.0
-"""A Gaussian line ends here: 1e-15 of it lies beyond."""
+"""Standard deviations at which a Gaussian line ends: 1e-15 of it lies beyond."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowLight:
     """Expected light of one image row in photons per exposure, nearest pixel first; arrays (pixels,) float64.
 
-    before, behind: of a pixel in front of the stripe, and of the same one behind it, each above 0 (dark counts).
-    strength: how bright a stripe of the same reflectance would be at each pixel, in any unit. position: where the
-    stripe is, in pixels; stripe: its photons, summed across it; sigma_px: width of the Gaussian line. first, last:
-    first and last pixel of the search, around the position.
+    before, behind: light of a pixel in front of the stripe, and of the same pixel behind it; each above 0 (dark
+      counts).
+    strength: brightness of a stripe of the same reflectance at each pixel, in any unit.
+    position: of the stripe, in pixels. stripe: its photons, summed across it. sigma_px: width of the Gaussian line.
+    first, last: first and last pixel of the search, around the position.
     """
 
     before: Array
@@ -59,7 +60,7 @@ class RowLight:
         return np.asarray(haze + (self.stripe * strength)[:, None] * pixel_share(away, self.sigma_px))
 
     def whole_positions(self) -> Array:
-        """Places within the search that are whole pixels off the true one."""
+        """Positions within the search that are whole pixels off the true one."""
         least, most = math.ceil(self.first - self.position), math.floor(self.last - self.position)
         steps = np.arange(least, most + 1, dtype=np.float64)
         return np.asarray(self.position + steps[steps != 0])
@@ -77,7 +78,7 @@ def pixel_share(away_px: Array, sigma_px: float) -> Array:
 
 
 HAZE, STRIPE = "fog", "stripe"
-"""Effects whose light ends at the object, and lies on it; all others are the same wherever the stripe is."""
+"""Effects whose light ends at the object, and lies on it; all others do not depend on where the stripe is."""
 TRIES = 8
 """Rows looked at for each that is wanted: some have no stripe."""
 LEAST_STRIPE = 1e-4
@@ -89,7 +90,7 @@ CLEAR_SIGMAS = 4.0
 
 
 def scene_lights(config: RigConfig, *, rows: int = 200, seed: int = 0) -> list[RowLight]:
-    """Light of some rows of a config's scene, at random over rows and columns; the same for the same seed.
+    """Light of some rows of a config's scene, drawn at random over rows and columns; the same for the same seed.
 
     Halo, drops and ambient light are taken as they are at the true position. Rows whose stripe is split, hidden or
     outside the depth range are left out. UsageError without a world, a calibration or any stripe, and for a rig of
@@ -125,7 +126,7 @@ def _lights(
     world: ReportsEffects, model: RigModel, commands: Array, depth_range_m: tuple[float, float],
     power_w: float, exposure_s: float, rng: np.random.Generator,
 ) -> list[RowLight]:  # fmt: skip
-    """One row of each column that has a stripe there."""
+    """Light of one row of each column, where it has a stripe."""
     geometry = sweep_geometry(model, commands, depth_range_m)
     found = []
     for column, command in enumerate(commands):
@@ -138,9 +139,9 @@ def _lights(
 
 
 def row_light(parts: Mapping[str, Array], geometry: SweepGeometry, row: int, column: int) -> RowLight | None:
-    """One row from its light by effect, (width,) photons per exposure each; None where it has no stripe of its own.
+    """Light of one row from its parts by effect, (width,) photons per exposure each; None without a stripe of its own.
 
-    The haze of places that the object hides is that of an exponential through what is before it.
+    The haze of places that the object hides is that of an exponential fitted to the haze before it.
     """
     stripe, haze = (np.asarray(parts[name], np.float64) for name in (STRIPE, HAZE))
     others = sum((np.asarray(parts[name], np.float64) for name in parts if name not in (STRIPE, HAZE)), 0.0 * haze)
@@ -174,7 +175,7 @@ def row_light(parts: Mapping[str, Array], geometry: SweepGeometry, row: int, col
 
 
 def _free_haze(path_m: Array, haze: Array, clear: NDArray[np.bool_]) -> tuple[Array, float]:
-    """Haze as it would be without the object, and its extinction per metre."""
+    """Haze along the row as if there were no object, and its extinction per metre."""
     if clear.sum() < 3:
         return np.zeros(len(path_m)), 0.0
     slope, level = np.polyfit(path_m[clear], np.log(haze[clear]), 1)

@@ -1,10 +1,11 @@
-"""One line of a trade-off: what a setting's error and its time are, with an interval, and whether anything beats it.
+"""The rows of a trade-off: error and time of a setting, with a confidence interval, and whether another one beats it.
 
-95 % confidence intervals of a mean: over repeats by Student's t, over one map by a bootstrap over blocks of it.
+`score_map` scores one map, `row_of` makes the row of a setting, `with_fronts` marks the Pareto fronts.
 
+95 % confidence intervals of a mean are over repeats by Student's t, or over one map by a bootstrap over blocks of it.
 The two answer different questions. Repeats of a scan differ in their photons: the interval is of this scene. Blocks of
-a map differ in what they look at too: the interval is of scenes like it, and wider. Errors of neighbours hang together,
-since filters and coupled estimators share them out, so that whole blocks are drawn and not single answers.
+a map differ in what they look at too: the interval is of scenes like it, and wider. Errors of neighbours are
+correlated, since filters and coupled estimators share them out; so whole blocks are drawn and not single answers.
 """
 
 import math
@@ -21,78 +22,24 @@ from rig.depth.reconstruct import MapResult
 from rig.errors import UsageError
 from rig.geometry.stripe_table import MISSING_PX, depth_errors
 
-BLOCK_ROWS, BLOCK_COLUMNS = 32, 25
-"""Size of a block: more than the reach of filters and of what couples neighbours."""
-RESAMPLES = 1000
-_Z = 1.959964
-"""97.5 % quantile of the normal distribution."""
-_T = {1: 12.7062, 2: 4.3027, 3: 3.1824, 4: 2.7764, 5: 2.5706}
-"""The same of Student's t by degrees of freedom, where the series of `t_quantile` is off by more than 0.1 %."""
-
 Interval = tuple[float, float]
 
 
-def repeats_interval(means: Sequence[float]) -> Interval:
-    """Of the mean of at least two independent means; never below zero, since they are of absolute errors."""
-    half = t_quantile(len(means) - 1) * statistics.stdev(means) / math.sqrt(len(means))
-    middle = statistics.fmean(means)
-    return max(0.0, middle - half), middle + half
-
-
-def blocks_interval(sums: NDArray[np.float64], numbers: NDArray[np.int64], seed: int = 0) -> Interval:
-    """Of sum(sums) / sum(numbers), both (blocks,): what the errors of each block add up to, and how many there are.
-
-    Percentiles of the means of drawn blocks (Efron and Tibshirani, 'An introduction to the bootstrap', 1993, chapters 8
-    and 13).
-    """
-    some = numbers > 0
-    sums, numbers = sums[some], numbers[some]
-    drawn = np.random.default_rng(seed).integers(0, len(sums), (RESAMPLES, len(sums)))
-    means = sums[drawn].sum(axis=1) / numbers[drawn].sum(axis=1)
-    low, high = np.percentile(means, [2.5, 97.5])
-    return float(low), float(high)
-
-
-def blocks_of(errors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sum and number of the errors (rows, columns) in each block; NaN is no error. Arrays (blocks,)."""
-    rows, columns = errors.shape
-    down, across = np.arange(0, rows, BLOCK_ROWS), np.arange(0, columns, BLOCK_COLUMNS)
-    known = np.isfinite(errors)
-
-    def added(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.add.reduceat(np.add.reduceat(values, down, axis=0), across, axis=1).ravel()
-
-    return added(np.where(known, errors, 0.0)), added(known.astype(np.float64)).astype(np.int64)
-
-
-def t_quantile(freedom: int) -> float:
-    """97.5 % quantile of Student's t (Abramowitz and Stegun 26.7.5), within 0.1 %."""
-    if freedom in _T:
-        return _T[freedom]
-    z, n = _Z, float(freedom)
-    return (
-        z
-        + (z**3 + z) / (4 * n)
-        + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
-        + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
-    )
-
-
 MOST_MISSING = 0.05
-"""A figure counts only where at most this share of the true stripes has no answer."""
+"""Most true stripes without an answer, as a share, with which a figure counts."""
 
 LOCAL_PX = 1.0
-"""Answers within so much of the truth found the stripe; what is left of their errors is that of placing it."""
+"""Pixels of error within which an answer found the stripe; the errors of these are those of placing it."""
 _SD_OF_MEDIAN = 1.4826
 """Standard deviation of a Gaussian over the median of its absolute values."""
 
 Clock = Literal["sensor", "compute"]
-"""Whose time an error is traded for."""
+"""The time that an error is traded for: the sensor's or the computer's."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrialSetting:
-    """What can be chosen: estimator, filter, exposures of a column and lines at once."""
+    """A setting that can be chosen: estimator, filter, exposures of a column and lines at once."""
 
     estimator: str
     filter: str
@@ -100,7 +47,7 @@ class TrialSetting:
     lines: int = 1
 
     def __str__(self) -> str:
-        """In words."""
+        """Say the setting in words."""
         filtered = "" if self.filter == "none" else f" + {self.filter}"
         lines = "" if self.lines == 1 else f", {self.lines} lines"
         return f"{self.estimator}{filtered}, {self.exposures} exposure{'s' * (self.exposures != 1)}{lines}"
@@ -110,8 +57,11 @@ class TrialSetting:
 class MapScore:
     """Errors of one map against the world's truth, over every (row, column) with a true stripe, and its times.
 
-    mean_abs_px: a missing answer counts as `MISSING_PX`. local_sd_px: of the errors of answers within LOCAL_PX, from
-    their median; None where there are none. sums, numbers: of the blocks of `rig.tradeoff.rows`.
+    mean_abs_px: a missing answer counts as `MISSING_PX`.
+    within_1px, missing: shares of the true stripes.
+    sensor_ms, compute_ms: times of the map.
+    sums, numbers: of the blocks, see `blocks_of`.
+    local_sd_px: standard deviation of the errors of answers within LOCAL_PX, from their median; None without any.
     """
 
     mean_abs_px: float
@@ -129,14 +79,20 @@ class MapScore:
 class TradeoffRow:
     """A setting in one scene and fog, over all repeats.
 
-    fog: a visibility or 'clear', None: as the scene says. sensor_ms: of one map, with dark frames and fly-back.
-    compute_ms: of a map after the first, counting and all. depth_mm: None where no pixel has a depth. ci95: of
-    mean_abs_px. local_sd_px: of the errors of answers within LOCAL_PX. pareto, pareto_compute: whether no other setting
-    in the same scene and fog has less error in as little time of sensor or computer, and no less time.
+    fog: a visibility or 'clear'; None is as the scene says.
+    sensor_ms: of one map, with dark frames and fly-back.
+    compute_ms: of a map after the first, with counting and everything else.
+    depth_mm: mean depth error; None where no pixel has a depth.
+    ci95: confidence interval of mean_abs_px.
+    local_sd_px: standard deviation of the errors of answers within LOCAL_PX.
+    pareto, pareto_compute: whether no other setting in the same scene and fog has less error in as little time of
+      sensor or computer, and no less time.
 
-    Beside what the light allows (`rig.tradeoff.limits`), each None where that is not known: times_limit, mean_abs_px
-    over the statistical limit; exponent_nats, Chernoff's per exposure, and times_wrong_limit, the share of answers more
-    than 1 px off over the ideal's; position_sd_px, Cramer-Rao's, and times_position_limit, local_sd_px over that.
+    The others compare it with what the light allows (`rig.tradeoff.limits`); each is None where that is not known.
+    times_limit: mean_abs_px over the statistical limit.
+    exponent_nats: Chernoff's exponent per exposure. times_wrong_limit: share of answers more than 1 px off over the
+      ideal's.
+    position_sd_px: Cramer-Rao's bound. times_position_limit: local_sd_px over that.
     """
 
     scene: str
@@ -168,20 +124,20 @@ class TradeoffRow:
 
     @property
     def setting(self) -> TrialSetting:
-        """What was chosen."""
+        """The setting of this row."""
         return TrialSetting(self.estimator, self.filter, self.exposures, self.lines)
 
     def time_ms(self, of: Clock) -> float:
-        """Of sensor or computer."""
+        """Time of a map on the sensor or on the computer."""
         return self.sensor_ms if of == "sensor" else self.compute_ms
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return it as plain values."""
         return asdict(self)
 
 
 def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms: float) -> MapScore:
-    """Errors of a map. UsageError where the world has no stripe to be found."""
+    """Score a map. UsageError where the world has no stripe to be found."""
     true_px = truth.x_px.astype(np.float64)
     if not np.isfinite(true_px).any():
         raise UsageError("the line is nowhere seen in this scene; check the scene and scan.command_range")
@@ -206,7 +162,7 @@ def score_map(result: MapResult, truth: SweepTruth, sensor_ms: float, compute_ms
 
 
 def row_of(scene: str, fog: str | None, setting: TrialSetting, scores: Sequence[MapScore]) -> TradeoffRow:
-    """The line of a setting from the maps of its repeats."""
+    """Make the row of a setting from the maps of its repeats."""
     mean = statistics.fmean
     errors = [score.mean_abs_px for score in scores]
     depths = [score.depth_mm for score in scores if score.depth_mm is not None]
@@ -231,7 +187,7 @@ def row_of(scene: str, fog: str | None, setting: TrialSetting, scores: Sequence[
 
 
 def with_fronts(rows: Sequence[TradeoffRow]) -> tuple[TradeoffRow, ...]:
-    """The rows, marked where they lie on the Pareto front of their scene and fog."""
+    """Mark the rows that lie on the Pareto front of their scene and fog."""
     sensor, compute = _fronts(rows, lambda row: row.sensor_ms), _fronts(rows, lambda row: row.compute_ms)
     return tuple(replace(row, pareto=i in sensor, pareto_compute=i in compute) for i, row in enumerate(rows))
 
@@ -247,8 +203,63 @@ def _fronts(rows: Sequence[TradeoffRow], time_ms: Callable[[TradeoffRow], float]
 def _least_so_far(
     here: Iterable[int], rows: Sequence[TradeoffRow], time_ms: Callable[[TradeoffRow], float]
 ) -> Iterable[tuple[int, bool]]:
-    """Each row by rising time, and whether it has less error than all before it."""
+    """Give each row by rising time, and whether it has less error than all before it."""
     best = float("inf")
     for i in sorted(here, key=lambda i: (time_ms(rows[i]), rows[i].mean_abs_px)):
         yield i, rows[i].mean_abs_px < best
         best = min(best, rows[i].mean_abs_px)
+
+
+BLOCK_ROWS, BLOCK_COLUMNS = 32, 25
+"""Rows and columns of a block: more than the reach of filters and of the coupling of neighbours."""
+RESAMPLES = 1000
+_Z = 1.959964
+"""97.5 % quantile of the normal distribution."""
+_T = {1: 12.7062, 2: 4.3027, 3: 3.1824, 4: 2.7764, 5: 2.5706}
+"""97.5 % quantiles of Student's t by degrees of freedom, where the series of `t_quantile` is off by more than 0.1 %."""
+
+
+def repeats_interval(means: Sequence[float]) -> Interval:
+    """Interval of the mean of at least two independent means of absolute errors; so it is never below zero."""
+    half = t_quantile(len(means) - 1) * statistics.stdev(means) / math.sqrt(len(means))
+    middle = statistics.fmean(means)
+    return max(0.0, middle - half), middle + half
+
+
+def blocks_interval(sums: NDArray[np.float64], numbers: NDArray[np.int64], seed: int = 0) -> Interval:
+    """Interval of the mean error sum(sums) / sum(numbers).
+
+    sums, numbers: (blocks,), sum and number of the errors in each block. The interval is between percentiles of the
+    means of drawn blocks (Efron and Tibshirani, 'An introduction to the bootstrap', 1993, chapters 8 and 13).
+    """
+    some = numbers > 0
+    sums, numbers = sums[some], numbers[some]
+    drawn = np.random.default_rng(seed).integers(0, len(sums), (RESAMPLES, len(sums)))
+    means = sums[drawn].sum(axis=1) / numbers[drawn].sum(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def blocks_of(errors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Sum and number of the errors (rows, columns) in each block, arrays (blocks,); NaN is no error."""
+    rows, columns = errors.shape
+    down, across = np.arange(0, rows, BLOCK_ROWS), np.arange(0, columns, BLOCK_COLUMNS)
+    known = np.isfinite(errors)
+
+    def added(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.add.reduceat(np.add.reduceat(values, down, axis=0), across, axis=1).ravel()
+
+    return added(np.where(known, errors, 0.0)), added(known.astype(np.float64)).astype(np.int64)
+
+
+def t_quantile(freedom: int) -> float:
+    """97.5 % quantile of Student's t (Abramowitz and Stegun 26.7.5), within 0.1 %."""
+    if freedom in _T:
+        return _T[freedom]
+    z, n = _Z, float(freedom)
+    return (
+        z
+        + (z**3 + z) / (4 * n)
+        + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
+        + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
+    )

@@ -1,8 +1,8 @@
 """One simulated scan that serves several estimators: its frames are kept, and every estimator makes its maps of them.
 
-The first map is learned from. The frames of the last one are counted and estimated when the SPAD stands still, so that
-times are those of the work alone, as on a rig whose frames are not computed by the same machine. Only the pixels that
-the plan uses are kept, as a SPAD would send them that sends windows.
+Estimators learn from the first map. The frames of the last one are counted and estimated when the SPAD stands still, so
+that times are those of the work alone, as on a rig whose frames are not computed by the same machine. Only the pixels
+that the plan uses are kept, as a SPAD that sends windows would send them. `score_methods` does it.
 """
 
 import os
@@ -30,29 +30,29 @@ from rig.scan.scan import make_reconstructor
 from rig.tradeoff.rows import MapScore, score_map
 
 MAPS = 2
-"""The first one is learned from, the last one is scored."""
+"""Maps of a scan: estimators learn from the first one, the last one is scored."""
 TIMED_PASSES = 3
-"""How often the last map is made, for the median of its time."""
+"""Number of times that the last map is made, for the median of its time."""
 LONG_S = 1.0
-"""Passes that take longer than that together are enough."""
+"""Seconds of all passes together after which no more are made."""
 MOST_KEPT_BYTES = 2_000_000_000
-"""Of frames of one sweep in memory."""
+"""Most bytes of frames of one sweep in memory."""
 
 Block = tuple[NDArray[np.uint8], NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]
-"""What a `Counter` takes: bits, bins, columns, x0."""
+"""Arguments of `Counter.add`: bits, bins, columns, x0."""
 Method = tuple[str, str]
 """Estimator and filter."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeptSweep(FrameTally):
-    """The frames of a sweep themselves."""
+    """A counted sweep with its frames."""
 
     blocks: list[Block]
 
 
 class FrameKeeper:
-    """The `Counter` that keeps the frames of a sweep, as far as the plan uses them."""
+    """A `Counter` that keeps the frames of a sweep, as far as the plan uses their pixels."""
 
     def __init__(self, layout: SweepLayout) -> None:
         self._layout = layout
@@ -71,10 +71,10 @@ class FrameKeeper:
         self._blocks.append((self._used(bits, x0), bins.copy(), column.copy(), x0.copy()))
 
     def settle(self, under_way: int = 0) -> None:
-        """Nothing is read on after `add`."""
+        """Do nothing: `add` leaves nothing to be read later."""
 
     def finish(self) -> KeptSweep:
-        """The sweep's frames."""
+        """The sweep with its frames."""
         tally = self._tally.finish()
         return KeptSweep(
             n_frames=tally.n_frames, column=tally.column, dark_counts=tally.dark_counts, n_dark=tally.n_dark,
@@ -95,7 +95,7 @@ class FrameKeeper:
 
 
 class ManyMakers:
-    """Makes the maps of several estimators and filters of the same frames; takes the place of a `Reconstructor`."""
+    """Makes the maps of several estimators and filters from the same frames; takes the place of a `Reconstructor`."""
 
     def __init__(self, makers: Mapping[str, Reconstructor], filters: Sequence[str]) -> None:
         self._makers = makers
@@ -103,15 +103,15 @@ class ManyMakers:
         self._counters: dict[str, Counter] = {}
         self._maps = 0
         self.results: dict[Method, tuple[MapResult, float]] = {}
-        """Of the last map: result, and seconds that counting and estimating took."""
+        """Result of each method for the last map, with the seconds that counting and estimating took."""
 
     def counter(self, layout: SweepLayout) -> FrameKeeper:
-        """What keeps the frames."""
+        """Make the counter that keeps the frames."""
         self._counters = {name: maker.counter(layout) for name, maker in self._makers.items()}
         return FrameKeeper(layout)
 
     def map(self, sweep: FrameTally) -> MapResult:
-        """The first map is learned from, the last one made by all; gives back one of them."""
+        """Learn from the first map, and make the last one with all methods; returns one of the maps."""
         assert isinstance(sweep, KeptSweep), "made by the counter above"
         self._maps += 1
         last = self._maps == MAPS
@@ -125,7 +125,7 @@ class ManyMakers:
         return next(iter(made.values()))[0]
 
     def _timed(self, name: str, sweep: KeptSweep, passes: int) -> dict[str, tuple[MapResult, float]]:
-        """What the first of some passes gave, and the median of their seconds."""
+        """Results of the first of some passes by filter, each with the median of the passes' seconds."""
         begun = time.perf_counter()
         made = [self._all_filters(name, sweep)]
         while len(made) < passes and time.perf_counter() - begun < LONG_S:
@@ -139,7 +139,7 @@ class ManyMakers:
         return {filter: self._makers[name].complete(stripe, counted, filter, estimate_s) for filter in self._filters}
 
     def _estimate(self, name: str, sweep: KeptSweep) -> tuple[StripeTable, FrameTally, float]:
-        """Stripe table, what was counted, and the seconds that counting and estimating took."""
+        """Stripe table, counted sweep, and the seconds that counting and estimating took."""
         maker, counter = self._makers[name], self._counters[name]
         begun = time.perf_counter()
         counter.reset()
@@ -159,7 +159,7 @@ def score_methods(
 ) -> dict[Method, MapScore]:
     """Scan once with a simulated rig and score what each estimator, with each filter, makes of the same frames.
 
-    on_frames: told how many frames have been taken and how many there will be.
+    on_frames: called with the frames taken and the frames to take.
     """
     with open_rig(config, seed=seed) as rig:
         assert rig.world is not None, "only simulated rigs are tried"
@@ -184,7 +184,7 @@ def score_methods(
 
 
 def require_plan(config: RigConfig) -> None:
-    """UsageError where there is no such scan, or its frames are too many to be kept."""
+    """Raise UsageError where the config's scan cannot be done, or has too many frames to be kept."""
     with open_rig(config) as rig:
         plan, _ = prepare(rig)
     frame = plan.rows * (plan.used_px or plan.width) // 8

@@ -1,4 +1,4 @@
-"""What accuracy costs in time: scans of a simulated rig over settings, scored by the world's truth."""
+"""Scans a simulated rig over settings and scores the maps by the world's truth: what accuracy costs in time."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ Made = TypeVar("Made")
 
 
 class Trial(NamedTuple):
-    """What one scan is of. scene, lines: None: as the config says; fog: None: as the scene says."""
+    """One scan to try. scene, lines: None is as the config says. fog: None is as the scene says."""
 
     scene: str | None
     fog: str | None
@@ -29,9 +29,10 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Trials:
-    """What is to be tried: every scene in every fog, with every number of exposures and lines, estimator and filter.
+    """Settings to try: every scene in every fog, with every number of exposures and lines, estimator and filter.
 
-    config_of: makes the config of one of them. repeat: scans of each, seeds `seed`, `seed` + 1 and so on.
+    config_of: makes the config of a trial. repeat: scans of each, with seeds `seed`, `seed` + 1 and so on. limits:
+    whether errors are compared with the statistical limit.
     """
 
     config_of: Callable[[Trial], RigConfig]
@@ -46,19 +47,19 @@ class Trials:
     limits: bool
 
     def __iter__(self) -> Iterator[Trial]:
-        """Every one once; repeats are scans of their own."""
+        """Give every trial once; its repeats are scans of their own."""
         return starmap(Trial, product(self.scenes, self.fogs, self.exposures, self.lines))
 
     def first(self) -> Trial:
-        """One of them, of the lines that the config has."""
+        """The first trial, with the lines that the config has."""
         return next(iter(self))._replace(lines=None)
 
     def configs(self) -> dict[Trial, RigConfig]:
-        """The config of each. UsageError with all that is wrong with any."""
+        """Make the config of each trial. UsageError with all problems of all of them."""
         return _all_or_problems(self, self.config_of)
 
     def require_plans(self) -> None:
-        """UsageError with all that stands against scanning so: of the fewest and the most exposures everywhere."""
+        """Raise UsageError with all problems of such scans; the fewest and the most exposures are tried everywhere."""
         ends = {min(self.exposures), max(self.exposures)}
         configs = self.configs()
         _all_or_problems(
@@ -81,11 +82,13 @@ def _all_or_problems(trials: Iterable[Trial], make: Callable[[Trial], Made]) -> 
 
 @dataclass(frozen=True, slots=True)
 class Tradeoff:
-    """Rows of all settings; answer: the setting to use, where one was asked for and any counts.
+    """Result of a trade-off: the rows of all settings.
 
-    ci95_by: what the intervals are over. verdict: aborted where an interrupt ended it; the rows are those that were
-    whole by then. folder: where everything was written, None where nothing was. accepted_calibration: what the
-    calibration was used in spite of.
+    ci95_by: what the intervals are over.
+    answer: the setting to use, where one was asked for and any counts.
+    verdict: 'aborted' where an interrupt ended it; the rows are then those that were whole.
+    folder: where everything was written; None where nothing was.
+    accepted_calibration: reasons in spite of which the calibration was used.
     """
 
     rows: tuple[TradeoffRow, ...]
@@ -98,12 +101,12 @@ class Tradeoff:
 
     @property
     def advice(self) -> str:
-        """Which setting to take, in a sentence."""
+        """A sentence that says which setting to take."""
         of = "of what was whole by then, " if self.verdict == "aborted" else ""
         return of + advice(self.rows, self.wish, self.answer)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; `answer` only where a setting was asked for."""
+        """Return it as plain values; `answer` only where a setting was asked for."""
         content: dict[str, Any] = {
             "advice": self.advice,
             "rows": [row.as_json() for row in self.rows],
@@ -117,7 +120,7 @@ class Tradeoff:
 
 
 def run_tradeoff(trials: Trials, wish: Wish | None, progress: Progress | None = None) -> Tradeoff:
-    """Scan and score all of it. progress: called with frames taken and all, those on columns.
+    """Scan and score all trials. progress: called with frames done and to do, counting those on columns.
 
     An interrupt ends it after the last whole row; before there is one it is raised.
     """
@@ -141,7 +144,7 @@ def run_tradeoff(trials: Trials, wish: Wish | None, progress: Progress | None = 
 
 
 def require_methods(estimators: Sequence[str], filters: Sequence[str]) -> list[str]:
-    """What is wrong with names of estimators and filters."""
+    """Problems with names of estimators and filters."""
     return [
         f"{what} {name!r} is unknown; choose of {', '.join(known)}"
         for what, names, known in (("estimator", estimators, ESTIMATORS), ("filter", filters, FILTERS))
@@ -151,7 +154,7 @@ def require_methods(estimators: Sequence[str], filters: Sequence[str]) -> list[s
 
 
 def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRow]]:
-    """The rows of one trial after the other."""
+    """Give the rows of one trial after the other."""
     configs = trials.configs()
     bar = _Bar(progress, trials.repeat * sum(map(_frames_of, configs.values())))
     limits = SceneLimits(trials.exposures)
@@ -177,7 +180,7 @@ def _rows(trials: Trials, progress: Progress | None) -> Iterator[list[TradeoffRo
 
 
 def _frames_of(config: RigConfig) -> int:
-    """Frames on columns of one scan."""
+    """Number of frames on columns of one scan."""
     return MAPS * config.scan.columns * config.scan.exposures // len(config.line_offsets)
 
 
@@ -190,13 +193,13 @@ class _Bar:
         self._done = 0
 
     def within(self, frames: int) -> Callable[[int, int], None] | None:
-        """What a scan of so many is to tell how far it is."""
+        """A callback for a scan of so many frames to tell its progress with; None where nobody listens."""
         if self._progress is None:
             return None
         return lambda done, planned: self._tell(self._done + frames * min(1.0, done / max(planned, 1)))
 
     def add(self, frames: int) -> None:
-        """A scan of so many is done."""
+        """Note that a scan of so many frames is done."""
         self._done += frames
         self._tell(self._done)
 
