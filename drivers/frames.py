@@ -22,7 +22,7 @@ SUBFRAME_MASK = 0xFF
 
 
 class Mark(IntFlag):
-    """What happened during a frame's period (bits of `marks`)."""
+    """Events of a frame's period (bits of `marks`)."""
 
     GATE_HIGH = 1
     """The gate was high during the whole exposure: the frame is lit."""
@@ -52,7 +52,7 @@ class BlockFlag(IntFlag):
 
 
 class BlockStatus(IntEnum):
-    """How a block ended (SPB1 1.0 trailer, offset 4)."""
+    """Ways in which a block can end (SPB1 1.0 trailer, offset 4)."""
 
     OK = 0
     TRUNCATED = 1
@@ -72,7 +72,7 @@ def frame_bytes(width: int, height: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class BlockHeader:
-    """What holds for every frame of a block. Fields as in the SPB1 1.0 wire layout (docs/spb1.md)."""
+    """Everything that holds for all frames of a block. Fields as in the SPB1 1.0 wire layout (docs/spb1.md)."""
 
     flags: BlockFlag
     run_id: int

@@ -116,7 +116,9 @@ def parse_quantity(text: object, dimension: str) -> float:
 
 
 def parse_exact(text: object, dimension: str) -> Fraction:
-    """As `parse_quantity`, with nothing rounded; takes a fraction too ("100000/3 Hz")."""
+    """Parse a quantity as `parse_quantity` does, but exactly, with nothing rounded; takes a fraction too ("100000/3
+    Hz").
+    """
     known = DIMENSIONS[dimension]
     like = f'write the {known.name} with a unit, like "{known.example}"'
     if not isinstance(text, str):
@@ -234,5 +236,5 @@ MetresPerHour = Annotated[float, _Text("rain rate")]
 CountsPerSecond = Annotated[float, _Text("count rate")]
 PerSecond = Annotated[float, _Text("rate")]
 PerSecondSquared = Annotated[float, _Text("acceleration")]
-"""Of a normalised drive: full ranges of -1 to 1 are 2."""
+"""Acceleration of the normalised drive, whose full range, -1 to 1, is 2."""
 BytesPerSecond = Annotated[float, _Text("data rate")]

@@ -1,10 +1,10 @@
-"""Messages between application and guard: one JSON object a line over a socket pair, and errors on their way.
+"""Messages and heartbeat between the application and the guard.
 
-The end of the stream is a message too: the kernel sends it the moment the other process is gone.
+Messages are one JSON object a line over a socket pair, errors included. The end of the stream is a message too: the
+kernel sends it the moment the other process is gone.
 
-The heartbeat: a page of memory that application and guard share, in which the source thread writes.
-
-To beat is one store: no lock, no system call, nothing that a full pipe, a stopped guard or a slow disk could hold up.
+The heartbeat is a page of memory that both share, in which the source thread writes. To beat is one store: no lock, no
+system call, nothing that a full pipe, a stopped guard or a slow disk could hold up.
 """
 
 import json

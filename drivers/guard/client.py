@@ -1,6 +1,7 @@
-"""The application's side of the guard: starts it, speaks with it, beats for it, and steps in where it is gone.
+"""The application's side of the guard: starts it, talks to it, sends its heartbeats, and makes the light safe itself
+where the guard is lost.
 
-Laser and sync source as the application sees them: the usual interfaces, done by the guard.
+`GuardedLaser` and `GuardedSync` are the usual device interfaces; each verb is carried out by the guard.
 """
 
 import itertools
@@ -30,7 +31,7 @@ from drivers.transports.tap import TapFile
 
 
 class Asks(Protocol):
-    """What a proxy needs of the guard."""
+    """The part of the guard that a proxy device uses."""
 
     def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
         """Have the guard do a verb; returns its result, raises its error, or `GuardLost`."""
@@ -53,12 +54,12 @@ class GuardedLaser(LineLaser):
 
     @property
     def identity(self) -> str:
-        """As the guard found it."""
+        """The identity that the guard read when it opened the device."""
         return self._identity
 
     @property
     def limits(self) -> LaserLimits:
-        """As the guard found them when it opened the laser."""
+        """The limits that the guard read when it opened the laser."""
         return self._limits
 
     def _do_status(self) -> LaserStatus:
@@ -92,16 +93,16 @@ class GuardedSync(SyncSource):
 
     @property
     def identity(self) -> str:
-        """As the guard found it."""
+        """The identity that the guard read when it opened the device."""
         return self._identity
 
     @property
     def resolution_s(self) -> float:
-        """As the guard found it when it opened the device."""
+        """The resolution that the guard read when it opened the device."""
         return self._resolution_s
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int | None:
-        """As the device behind it."""
+        """The limit of the device behind the guard; None where it has none."""
         most: int | None = self._guard.ask("sync", "most_repeats", _plain(pulses))
         return most
 
@@ -145,7 +146,8 @@ BUSY_SILENCE_S = 5.0
 _TICK_S = 0.01
 _MAX_STEP_S = 0.1
 _RESCUE_SWITCH_S = 5e-4
-"""How long other threads may keep the interpreter while laser and gate are rescued, each time: usually 5 ms."""
+"""Longest time for which other threads keep the interpreter while laser and gate are rescued; Python's default is 5
+ms."""
 _LOWERING = ("pause", "disarm", "gate_low", "abort")
 _ENABLING = ("arm", "program", "run")
 
@@ -220,7 +222,7 @@ class Guard:
 
     @property
     def failure(self) -> DeviceError | None:
-        """Why the guard took the light, or `GuardLost`; None while all is well."""
+        """The reason why the guard took the light, or `GuardLost`; None while all is well."""
         return self._failure
 
     @property
@@ -230,7 +232,7 @@ class Guard:
 
     @property
     def pid(self) -> int:
-        """Of the guard's process."""
+        """Process id of the guard."""
         return self._process.pid
 
     def beat(self, frame: int) -> None:

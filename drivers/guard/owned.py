@@ -1,6 +1,6 @@
 """A device that the guard owns: opened from its config, asked by the application's messages, made safe at the end.
 
-A thread that does one job after the other for one device, urgent ones first.
+Its `Lane` is a thread that does one job after the other for it, urgent ones first.
 """
 
 import itertools

@@ -7,7 +7,8 @@ After it: an application that cannot help itself is killed, the laser disarmed, 
 because the gate's program has come to its end, the laser is paused and nothing else happens: it has nothing to shine
 for, and an application that waits for a silent SPAD may take seconds to say so.
 
-The guard itself is gone: the application opens the ports, which are free now, and lowers what it can.
+`Rescue` is for the opposite case, a guard that is gone: the application opens the ports, which are free now, and lowers
+what it can.
 """
 
 import logging

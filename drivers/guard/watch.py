@@ -1,4 +1,4 @@
-"""Decides whether an application that should be taking frames still does. Pure: fed with what was seen, and when.
+"""Decides whether an application that should be taking frames still does, and looks at its process from outside.
 
 A deadline on frames alone would either be too long for the laser or trip on a busy machine. So there are two: a short
 one for an application that does nothing at all (all its threads asleep, or the process stopped), and a longer one for
@@ -6,13 +6,11 @@ one that is at work or waits for a processor or a disk, as its threads' states t
 thread itself says that it has asked the SPAD in vain: then it is the SPAD that is silent.
 
 The guard's own time counts in short steps only: what stops the guard as well (a suspended or overloaded machine) is no
-silence of the application's.
+silence of the application's. The decision (`FrameWatch`) is pure: fed with what was seen, and when.
 
-Another process, seen from outside: has it ended, is it stopped, is any of its threads at work, and its end by force.
-
-From /proc (proc(5), the fields of `stat`; Documentation/scheduler/sched-stats.rst of Linux, the first two numbers of
-`schedstat`: nanoseconds on a processor and waiting for one) and a pidfd, which names the process for good and tells its
-end at once, also where a child that it forked still holds its sockets open.
+A process's state comes from /proc (proc(5), the fields of `stat`; Documentation/scheduler/sched-stats.rst of Linux, the
+first two numbers of `schedstat`: nanoseconds on a processor and waiting for one) and from a pidfd, which names the
+process for good and tells its end at once, also where a child that it forked still holds its sockets open.
 """
 
 import os
@@ -47,7 +45,7 @@ class GuardLimits:
     waits_within_s: float = 0.04
     """By one at work whose source thread says that it has asked the SPAD for so long in vain."""
     first_wait_s: float = 0.3
-    """The same before its first frame."""
+    """Limit of the wait for the first frame."""
     first_frame_s: float = 1.0
     """From `run` to the first one: SPAD, scanner and the scan marker come in between. An application at work gets
     `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""
@@ -89,10 +87,10 @@ class FrameWatch:
     def look(
         self, elapsed_s: float, frame: int, stopped: bool, busy: Callable[[], bool], waited_s: float = 0.0
     ) -> str | None:
-        """What is wrong with the application, `elapsed_s` after the last look; None: nothing that is known.
+        """Look at the application, `elapsed_s` after the last look; returns a fault it shows, or None.
 
-        stopped: it is, while the laser may shine. busy: asked only in doubt, since it costs a look at every thread.
-        waited_s: for how long the SPAD has been asked in vain, as the source thread says.
+        stopped: whether the process is stopped while the laser may shine. busy: asked only in doubt, since it costs a
+        look at every thread. waited_s: for how long the source thread says that it has asked the SPAD in vain.
         """
         if stopped:
             return "is stopped"

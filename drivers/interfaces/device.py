@@ -1,4 +1,4 @@
-"""What all devices share: a name, a state, verbs that check the state, and a close that leaves things safe."""
+"""The base of all devices: a name, a state, verbs that check the state, and a close that leaves things safe."""
 
 import logging
 from abc import ABC, abstractmethod
@@ -12,7 +12,7 @@ _log = logging.getLogger(__name__)
 
 
 class DeviceState(Enum):
-    """Where a device stands.
+    """The states of a device.
 
     ::
 
@@ -48,7 +48,7 @@ class Device(ABC):
 
     @property
     def name(self) -> str:
-        """What messages call this device."""
+        """The name of this device in messages."""
         return self._name
 
     @property
@@ -63,7 +63,7 @@ class Device(ABC):
 
     @property
     def state(self) -> DeviceState:
-        """Where the device stands, as far as its verbs tell."""
+        """The state as far as the verbs called so far tell; a run that ended by itself may not be noticed yet."""
         return self._state
 
     def close(self) -> None:

@@ -20,7 +20,7 @@ class LaserLimits:
 
 @dataclass(frozen=True, slots=True)
 class LaserStatus:
-    """What the laser says of itself, asked afresh each time."""
+    """The laser's own report, asked afresh each time."""
 
     emission: bool
     """The laser emits whenever the gate is high (light = emission AND gate). False while paused or warming up."""
@@ -32,9 +32,9 @@ class LaserStatus:
     """None: the laser has no key, or does not say."""
     warming_up: bool
     input_mode: str
-    """How the gate input acts, e.g. "digital"."""
+    """The way in which the gate input acts, e.g. "digital"."""
     temperature_c: float | None = None
-    """Of the laser's base plate. None: the laser does not say."""
+    """Temperature of the laser's base plate. None: the laser does not say."""
     power_w: float | None = None
     """Measured mean, gated light and all. None: the laser does not say."""
 

@@ -28,7 +28,9 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class ScannerLimits:
-    """What the mirror can follow. Commands are the normalised drive, -1 to 1 being the full range of the DAC."""
+    """Limits of what the mirror can follow. Commands are the normalised drive, -1 to 1 being the full range of the
+    DAC.
+    """
 
     command_range: tuple[float, float]
     velocity_per_s: float
@@ -57,7 +59,7 @@ class ScanWaveform:
 
 @dataclass(frozen=True, slots=True)
 class ScannerStatus:
-    """What the scanner says of itself, asked afresh each time."""
+    """The scanner's own report, asked afresh each time."""
 
     moving: bool
     fault: str | None
@@ -76,7 +78,7 @@ class BeamScanner(Device):
     @property
     @abstractmethod
     def limits(self) -> ScannerLimits:
-        """What the mirror can follow: the stricter of the device's limits and the config's."""
+        """Limits of what the mirror can follow: the stricter of the device's own and the config's."""
 
     @property
     def status(self) -> ScannerStatus:

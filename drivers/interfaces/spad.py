@@ -1,8 +1,7 @@
 """The SPAD array: takes binary frames and fills the ring with blocks of them.
 
-Windows that move with the laser line: the table a SPAD array holds while it streams parts of its rows.
-
-The device steps through the table by the markers of the scanner and never by counting frames: a scan marker takes it to
+It may stream parts of its rows only, windows that move with the laser line and stand in a table on the device. The
+device steps through the table by the markers of the scanner and never by counting frames: a scan marker takes it to
 entry 0 of the next sweep, line marker j to entry j. A frame has one window, taken at its start: a marker that arrives
 during a frame moves the window of the next one.
 """
@@ -116,14 +115,14 @@ class StreamMode:
 
 @dataclass(frozen=True, slots=True)
 class SpadInfo:
-    """What a SPAD array is and can do; constant while it is open."""
+    """Properties and abilities of a SPAD array; constant while it is open."""
 
     model: str
     serial: str
     width: int
     height: int
     rotation_deg: int
-    """How the sensor is mounted; the frames it delivers are upright already."""
+    """Angle at which the sensor is mounted; the frames that it delivers are upright already."""
     max_frame_rate_hz: Fraction
     burst: BurstMode | None
     stream: StreamMode | None
@@ -138,7 +137,7 @@ class SpadInfo:
 
 @dataclass(frozen=True, slots=True)
 class SpadRequest:
-    """What the plan wants of a SPAD array."""
+    """The frames that a plan asks of a SPAD array."""
 
     frame_rate_hz: Fraction
     exposure_s: float
@@ -152,7 +151,7 @@ class SpadRequest:
 
 @dataclass(frozen=True, slots=True)
 class SpadTiming:
-    """What a configured SPAD array will do, exactly."""
+    """The exact timing that a SPAD array was configured to."""
 
     tick_hz: Fraction
     frame_period_ticks: int
@@ -175,7 +174,9 @@ class SpadCounters:
 
 @dataclass(frozen=True, slots=True)
 class SpadHealth:
-    """What a SPAD array measures of itself. Empty and None: it does not say."""
+    """The sensor's own measurements of itself. A value that it does not measure is None, or missing from the
+    mapping.
+    """
 
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
     """By the place where each is measured."""
@@ -209,7 +210,7 @@ class SpadArray(Device):
 
     @property
     def serial(self) -> str | None:
-        """As in `info`."""
+        """The serial number that `info` gives; None where it is empty."""
         return self.info.serial or None
 
     @property

@@ -56,7 +56,7 @@ def sliced(pulses: Sequence[Pulse]) -> list[Pulse]:
 
 @dataclass(frozen=True, slots=True)
 class SyncStatus:
-    """What the device says of itself, asked afresh each time."""
+    """The device's own report, asked afresh each time."""
 
     state: Literal["stopped", "waiting", "running", "aborted"]
     """A device that cannot tell whether its program waits for the scan marker says "running" then, too."""
@@ -73,7 +73,7 @@ class SyncSource(Device):
         """Durations are rounded to multiples of this."""
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int | None:
-        """How often `pulses` can be repeated in one program; None: as often as anybody likes."""
+        """Largest number of times that one program can repeat `pulses`; None: there is no limit."""
         return None
 
     @property

@@ -1,24 +1,19 @@
 """The Cobolt (Huebner) 06-01 line laser, gated by its digital modulation input.
 
-hardware.md section 4.1; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope `lights/cobolt.py`.
-115 200 baud, 8N1. Two languages: 06-MLD and the newer SCPI-like one; 06-DPL is refused, since its regulated power
-follows a gate up to about 1 kHz only. Never sent: whatever changes autostart, key switch or direct control (`@cobas x`,
-`@cobasky`, `@cobasdr`). The laser has no watchdog: where its port is lost it stays as it was, so treat it as on. Its
-temperatures it judges itself: fault 1.
+hardware.md section 4.1; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope `lights/cobolt.py`. The
+laser has no watchdog: where its port is lost it stays as it was, so treat it as on. It judges its temperatures itself:
+fault 1.
 
+Modes. 06-MLD speaks one language, newer lasers an SCPI-like one; a `Dialect` is written for each. 06-DPL is refused:
+its regulated power follows a gate up to about 1 kHz only. Both languages keep the laser dark by a power of 0 and not by
+`l0`: after `l0` its key must be turned (pycobolt issue 6), and a power of 0 can be read back, by the next program too.
 Pause = power 0 (and `las:paus 1`): no key is needed to resume. Disarm = the same, then `l0`: with autostart enabled the
-key must be turned off and on before the laser starts again.
+key must be turned off and on before the laser starts again. Never sent: commands that change autostart, key switch or
+direct control (`@cobas x`, `@cobasky`, `@cobasdr`).
 
-The two languages of Cobolt 06-01 lasers for the same few things: gate mode, power, dark, bright.
-
-hardware.md section 4.1 (cobolt-lasers/pycobolt 1333e53). Both keep the laser dark by a power of 0 and not by `l0`:
-after `l0` its key must be turned (pycobolt issue 6), and a power of 0 can be read back, by the next program too.
-
-Commands and replies of a Cobolt laser as bytes.
-
-hardware.md section 4.1 (cobolt-lasers/pycobolt 1333e53): a command ends with CR, its reply is one line that ends with
-CRLF: a value, `OK` or `Syntax error: illegal command`. Old firmware may put junk before a reply. Commands follow one
-another at 100 ms or more; a reply may take a second (0.1 s was too little: python-microscope issue 234).
+Bytes. 115 200 baud, 8N1. A command ends with CR; its reply is one line that ends with CRLF: a value, `OK` or `Syntax
+error: illegal command`. Old firmware may put junk before a reply. Commands follow one another at 100 ms or more; a
+reply may take a second (0.1 s is too little: python-microscope issue 234).
 """
 
 import logging
@@ -77,7 +72,7 @@ _POWER_STEP_W = 1e-4
 
 
 class Dialect(Protocol):
-    """What the driver needs said. All methods raise the errors of `Dialogue`."""
+    """The commands of one language of the laser that the driver uses. All methods raise the errors of `Dialogue`."""
 
     family: str
 
@@ -86,7 +81,9 @@ class Dialect(Protocol):
         ...
 
     def input_mode(self, mode: str) -> str:
-        """What governs the light in it: "digital" under the gate; everything else shines without asking the gate."""
+        """The control of the light in this mode: "digital" under the gate; in every other mode light shines without the
+        gate.
+        """
         ...
 
     def gate(self) -> None:
@@ -366,7 +363,7 @@ def create(config: CoboltConfig, surroundings: Surroundings, timing: LineTiming 
 
 
 def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
-    """As few questions as can be: each costs a tenth of a second, and a guard waits for them."""
+    """Find out which laser answers, with as few questions as possible: each takes 0.1 s, and a guard waits for them."""
     try:
         model = line.ask_surely("glm?", NAME)
     except CommandRefused:

@@ -1,23 +1,20 @@
 """The Coherent OBIS LX/LS line laser, gated by its digital modulation input (`SOUR:AM:EXT DIG`).
 
 hardware.md section 4.2; from python-microscope `lights/obis.py` (69625e0), the bit tables of `obis.h`, the operator's
-manual (appendix C) and mmCoreAndDevices PRs 645 and 531. 115 200 baud, 8N1 (over USB the rate is ignored). Limits of
-the base plate's temperature are read by `SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not in hardware.md but in
-`obis.cpp` beside `obis.h` and in Micro-Manager's `CoherentOBIS.cpp`.
+manual (appendix C) and mmCoreAndDevices PRs 645 and 531. Limits of the base plate's temperature are read by
+`SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not in hardware.md but in `obis.cpp` beside `obis.h` and in
+Micro-Manager's `CoherentOBIS.cpp`. The laser has no watchdog: where its port is lost it stays as it was, so treat it as
+on.
 
-Traps: `AM:STAT ON` during warm-up is deferred, light may come minutes later. So `arm` waits until the laser is ready
-and only then says ON; whatever ends the wait says OFF. With CDRH the emission follows ON by 5 s. Modes cannot be
-changed while it is on. Never sent: CDRH OFF. The laser has no watchdog: where its port is lost it stays as it was, so
-treat it as on.
+Arming. `AM:STAT ON` during warm-up is deferred, light may come minutes later. So `arm` waits until the laser is ready
+and only then says ON; where the wait ends in any other way it says OFF. With CDRH the emission follows ON by 5 s. Modes
+cannot be changed while it is on. Pause = `AM:STAT OFF`, confirmed by the emission bit; no key is needed to resume.
+Disarm = the same, and least power. Never sent: CDRH OFF.
 
-Pause = `AM:STAT OFF`, confirmed by the emission bit; no key is needed to resume. Disarm = the same, and least power.
-
-Commands and replies of a Coherent OBIS laser as bytes, with its handshake on or off.
-
-hardware.md section 4.2 (OBIS operator's manual, appendix C; mmCoreAndDevices PR 645): commands end with CRLF. Handshake
-on: a set answers `OK`, a query its value and then `OK`, an error `ERR-nnn` in their place. Handshake off: a set answers
-nothing at all, a query its value. So the handshake is asked for first and never changed, and whatever is set is read
-back. Behind an OBIS Remote a number on SYST and SOUR addresses the laser; bare commands go to the Remote.
+Bytes. 115 200 baud, 8N1 (over USB the rate is ignored); commands end with CRLF. With the handshake on, a set answers
+`OK`, a query its value and then `OK`, an error `ERR-nnn` in their place; with it off, a set answers nothing at all, a
+query its value. So the handshake is asked for first and never changed, and every setting is read back. Behind an OBIS
+Remote a number on SYST and SOUR addresses the laser; bare commands go to the Remote.
 """
 
 import re
@@ -85,7 +82,7 @@ class ObisFraming:
         return _HANDSHAKE if self._handshake is None else "*IDN?"
 
     def greets(self, reply: str) -> bool:
-        """As `Framing`; learns about the handshake."""
+        """Whether `reply` answers the ping; the first one tells whether the handshake is on."""
         if self._handshake is not None:
             return reply == self.identity or (not self.identity and TEXT.fullmatch(reply) is not None)
         if SWITCH.fullmatch(reply) is None:
@@ -165,7 +162,7 @@ class ObisConfig(SerialLaserConfig):
 
 
 class TemperatureRange(NamedTuple):
-    """What the base plate may have, in degrees Celsius."""
+    """Temperatures at which the base plate may be, in degrees Celsius."""
 
     low_c: float
     high_c: float
@@ -285,7 +282,7 @@ class ObisLaser(SerialLaser):
         return int(self._line.ask_surely("SYST:STAT?", BITS), 16)
 
     def _fault(self, bits: int, base_c: float | None = None) -> str | None:
-        """What the laser calls a fault, and a base plate outside its range."""
+        """The faults that the laser reports, and a base plate outside its range; None where all is well."""
         said = []
         word = int(self._line.ask_surely("SYST:FAUL?", BITS), 16)
         if word:

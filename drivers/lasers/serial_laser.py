@@ -1,6 +1,8 @@
-"""What every laser on a serial line has: a config with limits, a port that may get lost, a serial number to check.
+"""The common part of all lasers on a serial line: a config with limits, a port that may get lost, a serial number to
+check.
 
-A line laser without key or warm-up, whose emission follows `arm` and `pause` at once: simulated, or recorded.
+Also `PlainLaser`, a line laser without key or warm-up, whose emission follows `arm` and `pause` at once: simulated, or
+recorded.
 """
 
 from collections.abc import Callable
@@ -18,14 +20,14 @@ from drivers.units import Watts
 
 
 class SerialLaserConfig(KindConfig):
-    """What the config of each kind of them says."""
+    """Config fields that every kind of serial laser has."""
 
     port: str
     """Serial port: a path or COM port, "serial=..." or "usb=VVVV:PPPP" of its USB device, or "emulated:NAME"."""
     max_power: Annotated[Watts, Field(gt=0)]
     """The most this rig may ever send out; the laser's own maximum holds where it is smaller."""
     serial_number: str | None = None
-    """Of the laser itself; another one is refused. None: any."""
+    """Serial number of the laser; any other laser is refused. None: any laser will do."""
 
 
 class SerialLaser(LineLaser):

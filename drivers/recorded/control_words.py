@@ -1,4 +1,4 @@
-"""What a recording of control traffic says: the commands that do something, apart from the questions between them.
+"""The commands in a recording of control traffic that do something, apart from the questions between them.
 
 How often a driver asks depends on the host's moment, and so do the tokens that number its questions: neither is
 compared. Commands of the drivers may be sent again where a reply was lost, so that repeats count once. Questions are
@@ -23,7 +23,7 @@ _USB_QUESTIONS = {
 FRAME_PORTS = ("02", "03")
 """Bulk endpoints that points go to: each transfer is a buffer of the device, sent when it has room."""
 BEGIN, END = (b"run", b"swr"), b"abt"
-"""Of the sync source: between them a scan runs, behind the end the mirror is parked from wherever it is."""
+"""Commands of the sync source: between them a scan runs, behind the end the mirror is parked from wherever it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Spoken:
 
     @classmethod
     def of(cls, passed: Iterable[Passed]) -> "Spoken":
-        """Of what passed the taps, in order of time."""
+        """Sort out the pieces that passed the taps, given in order of time."""
         sent: dict[tuple[str, str], list[Word]] = defaultdict(list)
         for one in passed:
             if one.direction == OUT:

@@ -18,9 +18,10 @@ _NEIGHBOURS: Final = 2
 """So many blocks on either side are asked whether a block's numbers go with theirs."""
 _OF_BLOCK: Final = 16
 _OF_INDEX: Final = 8
-"""What a block and its record in the index weigh, beside 1 for each neighbour: fewer blocks never outweigh more."""
+"""Weight of a block and its record in the index, beside 1 for each neighbour: fewer blocks never outweigh more."""
 _OUTLIERS: Final = 4
-"""Where more than one in so many has the wrong ticks or sweep, they are as the device has them: none is left out."""
+"""If more than one block in so many has the wrong ticks or sweep, the device counts in this way, and none is left
+out."""
 
 
 def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bool) -> tuple[Entries, bool]:
@@ -48,9 +49,10 @@ def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bo
 
 
 def _foreign(by_place: Entries, told: Entries) -> NDArray[np.bool_]:
-    """Which blocks are of another run than their segment, (n,): than most of it, or, alone there, than the index says.
+    """Whether each block is of another run than its segment, (n,): than most of the segment, or, where the block is
+    alone there, than the index says.
 
-    The index is believed where it tells of a run that has other segments, and the block of one that has not.
+    The index is believed where it names a run that has other segments while the block's own run has none.
     """
     run, segment = by_place["run_id"].astype(np.uint64), by_place["segment"].astype(np.uint64)
     runs, of_run = np.unique(run, return_counts=True)

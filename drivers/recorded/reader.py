@@ -180,7 +180,9 @@ class RunRecording:
         return runs
 
     def _header(self, entries: Entries) -> BlockHeader | None:
-        """Of the first sound block, of several asked, that is of the size and clock of most of them; None: none is."""
+        """A header that agrees in size and clock with most of several sound blocks' headers; None where no block is
+        sound.
+        """
         headers: list[BlockHeader] = []
         for at in _spread(len(entries)):
             with suppress(ProtocolError):
@@ -226,7 +228,7 @@ def is_of_run(header: BlockHeader, other: BlockHeader) -> bool:
 
 
 def run_kind(header: BlockHeader) -> tuple[Any, ...]:
-    """What all blocks of a run have in common: its id, size and clock."""
+    """The values that all blocks of a run share: its id, size and clock."""
     return tuple(getattr(header, name) for name in _OF_A_RUN)
 
 

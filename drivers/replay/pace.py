@@ -24,7 +24,10 @@ _TIMES = re.compile(r"x(\d+(?:\.\d*)?|\.\d+)")
 
 @dataclass(frozen=True, slots=True)
 class ReplayClock:
-    """What `--clock` says. speed: recorded seconds per second; None: as fast as they are taken, or step by step."""
+    """The replay clock that `--clock` asks for.
+
+    speed: recorded seconds per second. None: frames are due as fast as they are taken, or step by step.
+    """
 
     speed: float | None = None
     steps: bool = False
@@ -47,7 +50,7 @@ class ReplayClock:
 
 @dataclass(frozen=True, slots=True)
 class PaceReport:
-    """How the pace was held: lateness of `blocks` against their own times. held_s: how long a full ring held it up."""
+    """Lateness of `blocks` against their own times. held_s: for how long a full ring held up the replay."""
 
     blocks: int = 0
     late_mean_s: float = 0.0
@@ -74,7 +77,7 @@ class Pace:
 
     @property
     def report(self) -> PaceReport:
-        """Of all runs so far."""
+        """Lateness over all runs so far."""
         late = self._late_s
         sd_s = math.sqrt(late.squares / late.blocks) if late.blocks else 0.0
         return PaceReport(late.blocks, late.mean, sd_s, late.most, self._held_ns / NS_PER_S)

@@ -1,12 +1,9 @@
 """A SPAD array that plays a recording: every recorded frame with its record, in the same starts, gaps as gaps.
 
-Blocks need not be those of the recording: consecutive frames are cut or joined to the length that is asked for, so that
-what is made of them can be shown not to depend on it. Frames are copied into the ring, their checksums tested before; a
-damaged block is left out, a gap like any other.
-
-What the devices of a recording said of themselves: from its manifest, or as far as the frames themselves tell.
-
-The place in a recorded start of a SPAD: the next frames, cut and joined as they are asked for.
+The blocks played need not be those of the recording: consecutive frames are cut or joined to the length that is asked
+for, so that results can be shown not to depend on it. Frames are copied into the ring, their checksums tested before; a
+damaged block is left out, a gap like any other. The properties of the sensor come from the recording's manifest, or as
+far as possible from the frames.
 """
 
 import threading
@@ -37,7 +34,7 @@ MANIFEST = "manifest.json"
 
 
 def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
-    """What the manifest of a recording notes of a device; None where there is no manifest or nothing in it.
+    """The manifest's entry on a device of a recording; None where there is no manifest or nothing in it.
 
     `ProtocolError` where the manifest cannot be read.
     """
@@ -54,7 +51,7 @@ def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
 
 
 def recorded_info(recording: RunRecording) -> SpadInfo:
-    """Of the SPAD that took the frames; only that a recording can always wait."""
+    """The SPAD that took the frames; only that a recording can always wait."""
     noted = recorded_device(recording.path, "spad")
     told = _told_by(recording)
     if noted is None:
@@ -75,7 +72,7 @@ def recorded_info(recording: RunRecording) -> SpadInfo:
 
 
 def _read(noted: dict[str, Any]) -> SpadInfo:
-    """As the manifest has it."""
+    """The SPAD's properties from the manifest's entry."""
     return SpadInfo(
         model=str(noted["model"]),
         serial=str(noted["serial"]),
@@ -93,7 +90,7 @@ def _read(noted: dict[str, Any]) -> SpadInfo:
 
 
 def _told_by(recording: RunRecording) -> SpadInfo:
-    """What the blocks alone say."""
+    """The SPAD's properties as far as the blocks alone tell them."""
     first = recording.runs[0].header
     rate = first.tick_hz / (first.frame_period_ticks or max(1, first.exposure_ticks))
     most = max(run.end_frame for run in recording.runs)
@@ -246,12 +243,12 @@ class ReplaySpad(SpadArray):
 
     @property
     def info(self) -> SpadInfo:
-        """Of the SPAD that took the frames; only that a recording can wait."""
+        """The SPAD that took the frames; only that a recording can wait."""
         return self._info
 
     @property
     def recording(self) -> RunRecording:
-        """What it plays."""
+        """The recording that is played."""
         return self._recording
 
     @property
@@ -371,7 +368,7 @@ class ReplaySpad(SpadArray):
         return not reading.over
 
     def _due_s(self, block: FrameBlock, _: int, end: int) -> float:
-        """When the last of these frames had been exposed, from the first one of the run."""
+        """Time at which the last of these frames had been exposed, from the first one of the run."""
         header = block.header
         ticks = header.t0_ticks - self._t0_ticks + int(block.records["ticks"][end - 1]) + header.frame_period_ticks
         return float(ticks / header.tick_hz)

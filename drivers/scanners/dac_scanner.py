@@ -1,13 +1,11 @@
-"""A beam scanner that is a galvo behind a DAC on USB: all that is the same whatever the DAC.
+"""A beam scanner that is a galvo behind a DAC on USB: everything that is the same whatever the DAC.
 
 A `Dac` is one board with its link: it says at what rates it runs, and plays points. The mirror moves only when it is
 started or parked, always along ramps; opening a scanner asks the board who it is, no more.
 
-The points of one run of a scanner, taken slice by slice: the way to the first point, the waveform, the way to rest.
-
-Nothing is laid out beforehand: a waveform of a million points repeated for hours takes the memory of the waveform.
-
-Plays runs of points on a DAC that must be fed: in a thread while a scan runs, and knows where the mirror rests.
+A run is the way to the first point, the waveform, and the way to rest. A thread feeds its points to the DAC slice by
+slice, and knows where the mirror rests. Nothing is laid out beforehand: a waveform of a million points repeated for
+hours takes the memory of the waveform.
 """
 
 import logging
@@ -148,11 +146,11 @@ class RunPlayer:
         self._name = name
         self._halt = halt
         self.position: float | None = position
-        """Where the mirror rests; None: moving, or unknown after a fault."""
+        """Command at which the mirror rests; None: it is moving, or its place is unknown after a fault."""
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self.error: DeviceError | None = None
-        """What ended the last run early."""
+        """The error that ended the last run early; None: it ended by itself or was stopped."""
 
     def status(self, ask: Callable[[], None]) -> ScannerStatus:
         """The status; `ask` raises where the device at rest does not answer."""
@@ -265,12 +263,12 @@ class DacScanner(BeamScanner):
 
     @property
     def identity(self) -> str:
-        """What the board says of itself."""
+        """The board's own description of itself."""
         return self._dac.identity
 
     @property
     def serial(self) -> str | None:
-        """Of the board: which mirror hangs on it nobody can ask."""
+        """Serial number of the board; the mirror behind it has none that could be asked for."""
         return self._dac.serial
 
     @property

@@ -1,6 +1,5 @@
-"""The config of a galvo behind a DAC: what the mirror can follow, where it may go, where the beam is dumped.
-
-Ways of a mirror between two commands within a scanner's limits: to the first point, to a stop, to the dump angle.
+"""A galvo behind a DAC: its config (what the mirror can follow, where it may go, where the beam is dumped) and its ways
+between two commands within these limits: to the first point, to a stop, to the dump angle.
 
     ramp   x(t) = a + (b - a) (1 - cos(pi t / T)) / 2      peaks: v = |b - a| pi / 2T, a = |b - a| pi^2 / 2T^2
     brake  constant deceleration from the speed that the mirror has
@@ -36,7 +35,7 @@ class GalvoConfig(KindConfig):
     """usb; where several are attached usb:serial=ABC, or usb:path=1-2 for a Helios, which has none; emulated:NAME."""
     axis: Literal["x", "y"] = "x"
     max_velocity: Annotated[PerSecond, Field(gt=0, le=1e6)]
-    """Of the normalised drive: the full range is 2."""
+    """Speed of the normalised drive, whose full range is 2."""
     max_acceleration: Annotated[PerSecondSquared, Field(gt=0, le=1e10)]
     max_step: Annotated[float, Field(gt=0, le=2)] = 0.1
     """Largest change of the drive from one point to the next."""

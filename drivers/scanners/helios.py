@@ -7,28 +7,22 @@ The device plays frames of up to 4095 points from two buffers, one playing and o
 nor a clock output: synchronisation comes from the markers in the SPAD's stream. A thread keeps the pending buffer full.
 Every frame is SINGLE: a dead host leaves a mirror that stands after two frames, not one that scans for ever. STOP
 centres the mirror in one jump, so that it is for emergencies and for the end; scans end with a brake ramp. The shutter
-pin is never raised and flash is never written; opcode DE (bootloader) does not exist here.
+pin is never raised.
 
-Frames of the Helios laser DAC and its point clock, as bytes and exact numbers (hardware.md 3.1).
+Whether the buffers ever ran dry is judged from the device's status, which tells only when the pending buffer falls
+free. Between the last status 'full' and the first 'free' the pending frame began to play; that bounds when it ends. A
+frame that arrives after the earliest such end may have left the mirror standing: the run ends with a fault. A buffer
+that falls free before the playing frame can have ended means that the device dropped a frame in silence. Only the
+markers in the SPAD's stream tell what was really played.
 
-Sources there: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
-sdk/cpp/HeliosDac.cpp (read for facts; no code taken).
+Bytes. Sources: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
+sdk/cpp/HeliosDac.cpp (read for facts; no code taken). Endpoints of alternate setting 1: interrupt OUT 0x06 commands,
+interrupt IN 0x83 replies, bulk OUT 0x02 frames. Only the opcodes below exist here: DE would jump to the bootloader, 06
+wears the flash, and 02 is sent with 0 only.
 
     point (7 B)     x[11:4], x[3:0] << 4 | y[11:8], y[7:0], R, G, B, I       12 bit, centre 0x800
     trailer (5 B)   u16 LE points per second, u16 LE points, u8 flags        1 start now, 2 single
     clock           SysTick of 112 MHz, floor(112e6 / pps) + 1 cycles a point
-
-Commands of a Helios laser DAC over its USB link (hardware.md 3.1; firmware v6, `Grix/helios_dac` 0952a2a).
-
-Endpoints of alternate setting 1: interrupt OUT 0x06 commands, interrupt IN 0x83 replies, bulk OUT 0x02 frames.
-Only the opcodes below exist here: DE would jump to the bootloader, 06 wears the flash, and 02 is sent with 0 only.
-
-One run of a Helios: frames into its two buffers, and a judgement whether they ever ran dry (hardware.md 3.1).
-
-The host sees when the pending buffer falls free, no more. Between the last status 'full' and the first 'free' the
-pending frame began to play; that bounds when it ends. A frame that arrives after the earliest such end may have left
-the mirror standing: the run ends with a fault. A buffer that falls free before the playing frame can have ended means
-that the device dropped a frame in silence. What was really played only the markers in the SPAD's stream tell.
 """
 
 import logging
@@ -55,7 +49,7 @@ SYSTICK_HZ = 112_000_000
 LEAST_PPS, MOST_PPS = 7, 65535
 """Beyond these the firmware clamps and the vendor's library drops points, both in silence: refused here."""
 MOST_POINTS = 4095
-"""Of a frame, by the vendor's library; the firmware's buffer holds one more."""
+"""Most points of a frame in the vendor's library; the firmware's buffer holds one more."""
 
 FLAG_START, FLAG_SINGLE = 1, 2
 _CENTRE = 0x800
@@ -69,7 +63,7 @@ def rate_of(pps: int) -> Fraction:
 
 
 def pps_of(rate_hz: Fraction) -> int:
-    """What to ask for so that the device runs at a rate that `rate_of` gave: 25 001 for 25 000 Hz."""
+    """The integer to ask for so that the device runs at a rate that `rate_of` gave: 25 001 for 25 000 Hz."""
     return math.floor(rate_hz) + 1
 
 
@@ -133,7 +127,7 @@ _COMMANDS, _REPLIES, _FRAMES = 0x06, 0x83, 0x02
 _REPLY_BYTES = 32
 _STOP, _SHUTTER, _STATUS, _VERSION, _NAME, _SDK_VERSION = 0x01, 0x02, 0x03, 0x04, 0x05, 0x07
 _OUR_SDK_VERSION = 11
-"""Of the vendor's library whose frames these are."""
+"""Version of the vendor's library whose frames these are."""
 
 _STATUSES = {b"\x83\x01": True, b"\x83\x00": False}
 
@@ -203,7 +197,7 @@ class HeliosLink:
             self._link.write(_COMMANDS, bytes((opcode, data)), _COMMAND_S)
 
     def _ask(self, opcode: int, answer: int, least: int) -> bytes:
-        """What follows the answer's first byte. Two questions with three reads each, as in the vendor's library."""
+        """The bytes behind the answer's first one. Asks twice with three reads each, as the vendor's library does."""
         heard = b""
         with self._lock:
             for _ in range(2):
@@ -251,7 +245,7 @@ class HeliosRun:
         self._playing_s = self._pending_s = 0.0
         """Durations of the frames in the two buffers; 0: none."""
         self._earliest_end_s = self._latest_end_s = 0.0
-        """When the playing frame ends, on the host's clock."""
+        """Bounds on when the playing frame ends, on the host's clock."""
         self._next: tuple[bytes, float] | None = None
         """The frame to be sent next and its duration: made while another plays, not when the time for it has come."""
         if self._unsendable():
@@ -404,7 +398,7 @@ class HeliosDac:
         self._clock = clock
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-        """What the divider of its timer makes of it."""
+        """The rate nearest to the requested one that the divider of the board's timer can make."""
         return nearest_rate(requested_hz, low_hz, high_hz)
 
     def run(self, source: PointSource, clock_hz: Fraction) -> HeliosRun:

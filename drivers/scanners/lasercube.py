@@ -8,23 +8,19 @@ The board has a ring of samples that is topped up by a thread: no frames, no sea
 its own unless these are unplugged, so that they stay off until the config says where they lead. Clear and disable are
 its only stop; nothing at all happens when the host dies, so that the gate must not depend on it.
 
-Commands and samples of a LaserCube / LaserDock over its USB link (hardware.md 3.2).
+Whether each sample was played once is judged from the answers to 'how many are queued'. Each answer bounds the moment
+at which the first sample was played, if none was lost, played twice or waited for: the moments that all answers allow
+must have one in common. Samples go out in whole transfers, so that a lost one stands out. A run begins with copies of
+its first point, so that a sample lost before the first answer is one of them. It ends with copies of its last: what the
+device does when its ring runs empty is not documented (hold or repeat), so that the ring is cleared while they are
+played.
 
-Source there: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp (read for facts; no code taken).
+Bytes. Source: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp (read for facts; no code taken). The
+USB ids are shared with Lasershark boards, so that the product string decides.
 
     command   interface 0, bulk OUT 0x01: opcode and 0 to 4 bytes; reply on bulk IN 0x81, 64 B: [1] = 0 is 'done', data
               little-endian from [2]. [0] is not to be relied on
     samples   interface 1 alternate 1, bulk OUT 0x03: 64 samples a transfer, each 4 x u16 LE: R | G << 8, B, X, Y
-
-The numbers are shared with Lasershark boards, so that the product string decides.
-
-One run of a LaserCube: samples into its ring, and a judgement whether each was played once (hardware.md 3.2).
-
-Every question 'how many are queued' says when the first sample must have been played, if none was lost, played twice
-or waited for: the moments that all answers allow must have one in common. Samples go out in whole transfers, so that a
-lost one stands out. A run begins with copies of its first point: what is lost before the first answer is one of them.
-It ends with copies of its last: what the device does when its ring runs empty is not documented (hold or repeat), so
-that the ring is cleared while they are played.
 """
 
 import math
@@ -174,7 +170,8 @@ def _level(markers: NDArray[np.uint8], bit: int) -> NDArray[np.uint16]:
 _POLL_S = 0.002
 _PATIENCE_S = 1.0
 _HOLD_S = 0.03
-"""Of the first and the last point, at least: the host may be late by this when it asks first and clears last."""
+"""Shortest time for which the first and the last point are held: the host may be late by this when it asks first and
+clears last."""
 _DRIFT = 1e-3
 """Most that the device's crystal and the host's clock differ."""
 _TOLERANCE_POINTS = 48
@@ -202,7 +199,7 @@ class LaserCubeRun:
         """Samples short of a transfer."""
         self._sent = 0
         self._start_s = (-np.inf, np.inf)
-        """When the first sample was played, at the earliest and at the latest."""
+        """Earliest and latest time at which the first sample was played."""
         self._asked_s = 0.0
 
     def begin(self) -> None:

@@ -1,24 +1,21 @@
 """Pi Imaging SPAD512S (SPAD512^2) through its vendor's program, which serves commands and pixels on a local TCP port.
 
-Facts and their sources: hardware.md section 2.1; `spad512s_line` and `drivers.spads.spad512s` speak with the program.
-In short:
+Facts and their sources: hardware.md section 2.1; `spad512s_line` speaks with the program. In short:
 
 - The vendor's program must run, on this computer or behind a bridge; it serves one client.
 - `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit: tInt is in
   microseconds at 1 and 4 bits, in milliseconds from 6 bits on, so this driver sends microseconds and 1 bit only.
-- The answer is 32 768 bytes a frame (65 536 of a 1M sensor), most significant bit first.
+- The answer is 32 768 bytes a frame (65 536 of a 1M sensor), most significant bit first; then `DONE`, or text that ends
+  with `ERROR`, anywhere.
 - Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
 
 The sensor takes a run into its own memory (BURST). Its frames carry neither ticks nor markers: they say nothing of the
 scanner, the records' ticks are nominal. `STOP` is known from other people's code only; a run that does not end soon
 after it is left by closing the connection.
 
-One run of a SPAD512S as it comes over the vendor's line: pixels that may read like its ending (hardware.md 2.1).
-
-The answer to `I` is the pixels, then `DONE`; or text that ends with `ERROR`, anywhere. Pixels may well read `DONE` or
-`ERROR`: what counts is the exact length and what stands behind it. A block is given out once so much has come behind it
-that no error text can be part of it. Frames have neither number nor checksum: pixels handed over twice in place of
-others have the right length, so that no frame may be the very same as one before.
+Pixels may well read `DONE` or `ERROR`: the exact length decides, and the text behind it. A block is given out once so
+much has come behind it that no error text can be part of it. Frames have neither number nor checksum: pixels handed
+over twice in place of others have the right length, so that no frame may be the very same as one before.
 """
 
 import threading
@@ -167,7 +164,7 @@ TICKS_PER_FRAME = 1024
 LISTENS_AGAIN_S = 1.0
 """A program that serves one client may take so long to listen again once that one has left."""
 _TEMPERATURES = ("master FPGA", "slave FPGA", "board", "chip")
-"""What `R` measures first."""
+"""Names of the temperatures that `R` reports first, in its order."""
 _US_SLACK = 1e-6
 """Microseconds by which a whole number of them may miss as a float in seconds."""
 

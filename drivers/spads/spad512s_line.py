@@ -20,7 +20,7 @@ from drivers.transports.tcp_stream import TcpStream
 _log = logging.getLogger(__name__)
 
 DONE, ERROR = b"DONE", b"ERROR"
-"""What ends a run; `DONE` may be glued to an answer in text as well."""
+"""Words that end a run; `DONE` may be glued to an answer in text as well."""
 QUIET_S = 0.05
 """A text answer has no stated end: it is whole when the line was quiet for so long, or when it ends with DONE."""
 _MOST_TEXT_BYTES = 65_536
@@ -42,7 +42,7 @@ class Deadlines:
 
 @dataclass(frozen=True, slots=True)
 class Spad512sIdentity:
-    """What the device says about itself (`D`)."""
+    """The device's description of itself (`D`)."""
 
     detector: str
     master_serial: str
@@ -227,7 +227,7 @@ class Spad512sLine:
             self._tap.note("tcp", direction, data)
 
     def _read_text(self, stream: TcpStream, deadline_s: float) -> str:
-        """What comes until the line is quiet or says DONE, at most for `deadline_s`; empty where nothing came."""
+        """The text until the line is quiet or says DONE, at most for `deadline_s`; empty where nothing came."""
         ends_at = time.monotonic() + deadline_s
         data = stream.receive(deadline_s)
         while data and not data.endswith(DONE) and time.monotonic() < ends_at:

@@ -1,12 +1,10 @@
-"""What an SPB1 device is told before START, and its test pattern, run when it is opened (hardware.md section 8).
+"""Opening an SPB1 device (hardware.md sections 2.4, 2.5 and 8): its USB chip, its identity registers, its test pattern,
+and the registers written before START.
 
-Who answers at the other end of an SPB1 control plane, and what it can do (hardware.md section 8.3).
-
-The USB chips of SPB1 boards: ids, endpoints, and the session that an FT601 wants (hardware.md sections 2.4 and 2.5).
-
-Sources there: `VicidominiLab` BrightEyes-TTM 8f8d8d8 (FX3 with the AN65974 firmware, 04B4:00F1, bulk IN 0x81);
-`apertus-open-source-cinema/ft60x-rs` and `lambdaconcept/ft60x_driver` (0403:601F, session commands on 0x01, stream on
-0x82). Both ids are shared by unrelated gear, so the product string must fit too.
+The USB chips differ in ids and endpoints, and an FT601 wants a session. Sources: `VicidominiLab` BrightEyes-TTM 8f8d8d8
+(FX3 with the AN65974 firmware, 04B4:00F1, bulk IN 0x81); `apertus-open-source-cinema/ft60x-rs` and
+`lambdaconcept/ft60x_driver` (0403:601F, session commands on 0x01, stream on 0x82). Both ids are shared by unrelated
+gear, so the product string must fit too.
 """
 
 import struct
@@ -38,14 +36,14 @@ from drivers.transports.usb_device import UsbId
 
 @dataclass(frozen=True, slots=True)
 class SensorIdentity:
-    """What the identity registers say."""
+    """Contents of the identity registers."""
 
     info: SpadInfo
     features: Feature
     tick_hz: Fraction
     min_period_ticks: int
     window_entries: int
-    """Of all window tables together."""
+    """Entries of all window tables together."""
     max_stride: int
 
 
@@ -208,7 +206,7 @@ _CONFIG_REQUEST, _CONFIG_BYTES = 0xCF, 152
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """Which endpoint is what on a chip. ack_in: not on every board."""
+    """The endpoints of a USB chip and what each is for. ack_in: 0 where the board has none."""
 
     usb: UsbId
     interfaces: tuple[int, ...]
@@ -245,4 +243,4 @@ WIRINGS: dict[Chip, Wiring] = {
     "ft601": Wiring(UsbId(LABEL, 0x0403, 0x601F, "SPB1"), (0, 1), 0x02, 0x82, 0x83, has_session=True),
 }
 USB_IDS = tuple(wiring.usb for wiring in WIRINGS.values())
-"""What such boards say they are on the bus."""
+"""USB ids and product strings by which such boards are found."""

@@ -2,8 +2,6 @@
 
 A command is 16 bytes on a bulk OUT endpoint (hardware.md section 8.3), several may share a transfer. Every one is
 acknowledged with 16 bytes, in order: on an IN endpoint of their own, or as payload of control blocks in the stream.
-
-Commands to an SPB1 device and what it answers, over an endpoint of its own or inside the stream.
 """
 
 import struct
@@ -38,7 +36,7 @@ TEXT_BYTES: Final = 64
 
 
 class Op(IntEnum):
-    """What a command asks for."""
+    """Operations that a command can ask for."""
 
     READ = 1
     WRITE = 2
@@ -53,7 +51,7 @@ class Op(IntEnum):
 
 
 class AckStatus(IntEnum):
-    """How a command went."""
+    """Outcomes of a command."""
 
     OK = 0
     UNKNOWN_OP = 1
@@ -63,7 +61,7 @@ class AckStatus(IntEnum):
 
 
 class SensorState(IntEnum):
-    """Where the device stands (register STATE)."""
+    """States of the device (register STATE)."""
 
     IDLE = 0
     ARMED = 1
@@ -72,7 +70,7 @@ class SensorState(IntEnum):
 
 
 class Feature(IntFlag):
-    """What a device can do (register FEATURES)."""
+    """Abilities of a device (register FEATURES)."""
 
     BURST = 1 << 0
     STREAM = 1 << 1
@@ -208,7 +206,7 @@ _QUIET_S = 0.003
 _DRAIN_S = 1.0
 _TRIES = 3
 TAP_PORT = "control"
-"""What a tap calls it, whatever endpoints it goes over."""
+"""Name of the control plane in a tap's file, whatever endpoints it goes over."""
 
 
 class ControlChannel:

@@ -63,7 +63,7 @@ class Reads(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Armed:
-    """What the blocks of a run must look like."""
+    """Properties that the blocks of a run must have."""
 
     run_id: int
     stride: int
@@ -76,7 +76,7 @@ class Armed:
 
 
 class Took(Enum):
-    """What a read turned out to be."""
+    """Outcomes of a read."""
 
     NOTHING = "nothing came in time"
     CONTROL = "a control block, or what is left over from another run"

@@ -6,11 +6,9 @@ Outputs as in hardware.md section 6: GPIO0 triggers the SPAD, GPIO1 is the laser
 The firmware has no loops and no watchdog. So programs are written out in full and end on two words that hold everything
 low, whatever happens to the host. It cannot read its pins while a program runs, nor tell a wait from play.
 
-Turns pulses into the words of a PrawnDO program, and refuses what the board would play otherwise than written.
-
-A word is 16 outputs and a number of cycles (hardware.md section 5.1): 0 cycles wait for the trigger, two such words in
-a row are the end, with the first one's outputs left on the pins. The trigger is a level, so that a wait passes at once
-while it is high: that is how a held pulse looks at the scan marker.
+A word is 16 outputs and a number of cycles: 0 cycles wait for the trigger, two such words in a row are the end, with
+the first one's outputs left on the pins. The trigger is a level, so that a wait passes at once while it is high: that
+is how a held pulse looks at the scan marker. Pulses that the board would play otherwise than written are refused.
 """
 
 import logging
@@ -52,7 +50,7 @@ WORD = np.dtype([("outputs", "<u2"), ("cycles", "<u4")])
 
 @dataclass(frozen=True, slots=True)
 class ProgramLimits:
-    """What bounds a program. trigger_pulse_s: the longest scan marker of a program without held pulses."""
+    """Limits of a program. trigger_pulse_s: the longest scan marker of a program without held pulses."""
 
     name: str
     clock_hz: float
@@ -76,7 +74,7 @@ def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits)
 
 
 def most_repeats(pulses: Sequence[Pulse], board: ProgramLimits) -> int:
-    """How often a period fits into the board beside the end."""
+    """Number of times a period fits into the board's memory beside the words at the end."""
     return (board.max_words - 3) // len(sliced(pulses))
 
 
@@ -199,7 +197,7 @@ class PrawnDo(SyncSource):
         return self._line.port_lost
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
-        """As often as they fit into the board's memory: there are no loops."""
+        """The number of times `pulses` fit into the board's memory: there are no loops."""
         return most_repeats(pulses, self._board)
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:

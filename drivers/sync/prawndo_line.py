@@ -32,12 +32,12 @@ _RESUSCITATED = "System Clock Resus'd"
 _CHUNK_BYTES = 4032
 """Bytes per write while a program is loaded: sixteen of the firmware's own pieces of 42 words."""
 _SLICE_S = 0.02
-"""How soon a command under way gives way to the gate."""
+"""Longest time until a command under way gives way to the gate."""
 
 
 @dataclass(frozen=True, slots=True)
 class PrawnDoTiming:
-    """How long the line waits. Over USB a reply takes 1 ms; the rest is for a loaded host."""
+    """Deadlines of the line. Over USB a reply takes 1 ms; the rest is for a loaded host."""
 
     reply_s: float = 0.5
     """For a reply."""

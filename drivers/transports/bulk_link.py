@@ -1,13 +1,11 @@
 """A USB device that streams: commands and answers, and reads that are queued so that its FIFO never starves.
 
-Two implementations: `drivers.transports.bulk_link` reads one piece after the other through pyusb, with a gap between
-two; `queued_link` keeps many transfers in flight through asynchronous libusb, which write straight into the caller's
-memory. tests/benchmarks/spb_usb.py compares them. Both have a deadline on every call and our errors.
+Two implementations: `PlainLink`, here, reads one piece after the other through pyusb, with a gap between two;
+`queued_link` keeps many transfers in flight through asynchronous libusb, which write straight into the caller's memory.
+tests/benchmarks/spb_usb.py compares them. Both have a deadline on every call and our errors.
 
 A queue belongs to one thread at a time. Buffers are whole packets long and stay the caller's until `reap` or `cancel`
 gives them back.
-
-A streaming USB device read by pyusb, one piece after the other: nothing is queued between two reads.
 """
 
 import array
@@ -24,7 +22,7 @@ Buffer = NDArray[np.uint8]
 
 
 class BulkLink(Protocol):
-    """What a streaming driver needs of its device."""
+    """The abilities that a streaming driver needs of its device."""
 
     label: str
     endpoints: frozenset[int]

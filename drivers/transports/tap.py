@@ -29,7 +29,9 @@ _Lines = SimpleQueue[bytes | threading.Event | None]
 
 @dataclass(frozen=True, slots=True)
 class TapFile:
-    """Where taps write, and the time that counts as 0 (`time.monotonic_ns`). Crosses processes as its two fields."""
+    """The file to which taps write, and the time that counts as 0 (`time.monotonic_ns`). Its two fields can be handed
+    to another process.
+    """
 
     path: str
     start_ns: int

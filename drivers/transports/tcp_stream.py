@@ -39,7 +39,7 @@ class TcpStream:
 
     @property
     def address(self) -> str:
-        """Where it is connected to."""
+        """The address that it is connected to."""
         return self._address
 
     def send(self, data: bytes, deadline_s: float) -> None:
@@ -54,12 +54,14 @@ class TcpStream:
                     rest = rest[self._socket.send(rest) :]
 
     def receive(self, deadline_s: float, limit: int = _CHUNK_BYTES) -> bytes:
-        """What there is, at least one byte; b"" where nothing came within the deadline. `DeviceDisconnected`."""
+        """The bytes that have come, at least one; b"" where nothing came within the deadline. `DeviceDisconnected`."""
         buffer = bytearray(limit)
         return bytes(buffer[: self.receive_into(memoryview(buffer), deadline_s)])
 
     def receive_into(self, view: memoryview, deadline_s: float) -> int:
-        """As `receive`, into `view` (bytes, not empty); returns how many, 0 past the deadline."""
+        """Receive into `view` (bytes, not empty); returns the number of bytes, 0 past the deadline.
+        `DeviceDisconnected`.
+        """
         ends_at = time.monotonic() + deadline_s
         while True:
             with self._translated():
