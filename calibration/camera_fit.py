@@ -1,16 +1,13 @@
 """The camera from corners of a board at several poses: OpenCV's calibration, made robust and told how well it knows.
 
 Three kinds of corners are left out and named: a view that does not fit the others (the board moved, its corners in
-another order), single corners that do not fit their view, and a view whose board is seen from behind, which is a
-mirror image. The fit is that of cv2.calibrateCamera on what is left. The covariance is s^2 (J^T J)^-1 with the poses
-free and s^2 the residuals' variance, so it counts what the lens model misses as noise.
+another order), single corners that do not fit their view, and a view whose board is seen from behind, which is a mirror
+image. The fit is that of cv2.calibrateCamera on what is left. The covariance is s^2 (J^T J)^-1 with the poses free and
+s^2 the residuals' variance, so it counts what the lens model misses as noise.
 
-OpenCV's calibration of a camera from corners, and whether they determine it.
-
-What decides is the normal matrix: its condition number and the sd it gives the focal length. How far the boards are
-turned against each other only chooses the word for the refusal.
-
-The normal equations of a camera and its boards' poses: how well corners determine the camera, poses left free.
+Whether the corners determine a camera is decided by the normal equations, poses left free: their condition number and
+the sd they give the focal length. How far the boards are turned against each other only chooses the word for the
+refusal.
 """
 
 from collections.abc import Sequence
@@ -42,7 +39,9 @@ class Normal:
 
     @property
     def condition(self) -> float:
-        """Of the matrix scaled to a unit diagonal: what it would be in the parameters' best units; inf if singular."""
+        """Condition number of the matrix scaled to a unit diagonal, as in the parameters' best units; inf if
+        singular.
+        """
         scale = np.sqrt(np.diag(self.matrix))
         if not np.all(np.isfinite(scale)) or not np.all(scale > 0):
             return float("inf")
@@ -50,7 +49,7 @@ class Normal:
         return float(eigen[-1] / eigen[0]) if eigen[0] > 0 else float("inf")
 
     def first(self, count: int) -> "Normal":
-        """Of the first parameters alone, the others taken as known."""
+        """The normal equations of the first parameters alone, the others taken as known."""
         return Normal(self.names[:count], self.matrix[:count, :count])
 
     def covariance(self, variance_px2: float) -> Covariance:
@@ -63,7 +62,9 @@ class Normal:
 def camera_normal(
     points_m: Sequence[Array], poses: Sequence[BoardPose], matrix: Array, distortion: Array, terms: int
 ) -> Normal:
-    """Of points (n, 3) of the board seen at each of the poses, by a camera with `terms` free terms of distortion."""
+    """The normal equations of a camera with `terms` free terms of distortion that saw points (n, 3) of the board at
+    each of the poses.
+    """
     total = np.zeros((4 + terms, 4 + terms))
     given = np.zeros(max(len(distortion), 5)) if terms <= 5 else np.zeros(14 if terms > 8 else 8)
     given[: len(distortion)] = distortion
@@ -82,12 +83,12 @@ Mask = NDArray[np.bool_]
 LEAST_SD_PX = 0.01
 """Corners are never better than this, however well they fit."""
 _MOST_FOCAL_SD = 0.05
-"""Of the focal length, relative: above, depth would be wrong by as much."""
+"""Largest relative sd of the focal length: above, depth would be wrong by as much."""
 _MOST_CONDITION = 1e11
-"""Of the normal matrix at unit diagonal: beyond, doubles lose its smallest eigenvalue."""
+"""Largest condition number of the normal matrix at unit diagonal: beyond, doubles lose its smallest eigenvalue."""
 _PARALLEL_RAD = float(np.radians(3.0))
 _SAME_PLACE = 0.02
-"""Of the distance: boards nearer to each other than that, and parallel, are one pose."""
+"""Share of their distance within which two parallel boards count as one pose."""
 _GUESSED_FOCAL = (1.2, 0.7, 2.5)
 """Focal lengths, in widths of the picture, to start from where OpenCV's own start fails."""
 _FLAGS = {
@@ -244,12 +245,12 @@ class CameraProblem:
 
 
 def rms(residual_px: Array) -> float:
-    """Of the distance, as OpenCV has it: root of the mean of dx^2 + dy^2."""
+    """Root of the mean of dx^2 + dy^2, the rms distance as OpenCV counts it."""
     return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=-1)))) if len(residual_px) else float("nan")
 
 
 _FEWEST_CORNERS = 8
-"""Of a view: four give the pose, the rest say whether it fits."""
+"""Fewest corners of a view: four give the pose, the rest say whether it fits."""
 _VIEW_LIMIT = 2.5
 """A view is an outlier where its residuals, in sds of its corners, are so many times those of the usual view."""
 _CORNER_LIMIT = 6.0
@@ -295,7 +296,7 @@ class CameraFit:
 
     @property
     def sd(self) -> dict[str, float]:
-        """Of every parameter, by name: fx fy cx cy in pixels, the distortion's in its own units."""
+        """Standard deviation of every parameter, by name: fx fy cx cy in pixels, the distortion's in its own units."""
         spread = np.sqrt(np.diag(self.covariance.matrix))
         return dict(zip(self.covariance.names, spread.tolist(), strict=True))
 

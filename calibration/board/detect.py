@@ -1,10 +1,9 @@
 """Finds a board's corners in a picture: from counts summed to flux, noisy as they are, or from an image file.
 
-OpenCV finds the markers, or the chessboard, in the picture as it is, enlarged and smoothed, whichever shows most; a
-smooth map through them says where all corners are, and each is then fitted on its own (corner_registration.py). What
-cannot be used is refused with the reason: no board, another one, half of one, its mirror image, two of them.
-
-Pixels that cannot be used, filled in from their neighbours so that a picture can be searched.
+Pixels that cannot be used are filled in from their neighbours first. OpenCV finds the markers, or the chessboard, in
+the picture as it is, enlarged and smoothed, whichever shows most; a smooth map through them says where all corners are,
+and each is then fitted on its own (registration.py). A picture that cannot be used is refused with the reason: no
+board, another one, half of one, its mirror image, two of them.
 """
 
 from dataclasses import replace
@@ -47,11 +46,11 @@ def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = N
 Array = NDArray[np.float64]
 
 LEAST_SHARE = 0.5
-"""Of the board's corners; a view with no more is refused."""
+"""Share of the board's corners that a view must show more than; others are refused."""
 _SECOND_BOARD_MARKERS = 4
-"""As many that lie on a board of their own are no misreadings."""
+"""Markers that lie on a board of their own and are too many for misreadings."""
 _MAP_OUTLIER_SQUARES = 0.4
-"""How far a lens may bend a board off its homography, and how far a misread marker never lies."""
+"""Distance from the homography, in squares, that no lens bends a board by and every misread marker exceeds."""
 _GROWTH_SQUARES = 1.6
 """From what is known of a far board to the next corners; beyond, a map through a few noisy markers leads astray."""
 _OUTLIER_SDS = 6.0

@@ -1,9 +1,7 @@
-"""What views and a fit tell about a calibration, as numbers that a verdict is made of.
+"""The evidence on a calibration: numbers that tell what its views and its fit lack, and the reasons that follow.
 
 Each number speaks for one way to go wrong: how many poses there were, how far they were tilted, how large the board was
-seen, how much of the picture it reached, how bright the room was, what the baseline came out as.
-
-What views of a board lack to make a calibration: light of the line only, poses, tilts, size, coverage.
+seen, how much of the picture it reached, how bright the room was, how long the baseline came out.
 """
 
 import math
@@ -30,12 +28,12 @@ _WHITE_PERCENT = 75
 
 @dataclass(frozen=True, slots=True)
 class ViewEvidence:
-    """What is seen before anything is fitted; NaN where nothing tells.
+    """Evidence of the views before anything is fitted; NaN where nothing tells.
 
-    shown: poses. used: those of them that a fit can be checked by: with corners, and where a line is asked for with
-    the line on the board too. coverage: share of the picture within the outline of all corners. room_flux: photons per
-    pixel and exposure of white on the board (of the bright parts of the picture where there is no board), median over
-    the views. odd: names of those that do not fit the others and had no say.
+    shown: number of poses. used: those of them that a fit can be checked by: with corners, and where a line is asked
+    for with the line on the board too. coverage: share of the picture within the outline of all corners. room_flux:
+    photons per pixel and exposure of white on the board (of the bright parts of the picture where there is no board),
+    median over the views. odd: names of those that do not fit the others and had no say.
     """
 
     shown: int
@@ -47,7 +45,7 @@ class ViewEvidence:
 
 @dataclass(frozen=True, slots=True)
 class PoseEvidence:
-    """How the boards stood. tilt_rad: largest angle between two of them. distance_m: median of their centres.
+    """Evidence of the boards' poses. tilt_rad: largest angle between two of them. distance_m: median of their centres.
 
     board_rad: angle under which the camera sees a board's longer side, median.
     """
@@ -90,7 +88,7 @@ def pose_evidence(poses: Sequence[BoardPose], board: Board) -> PoseEvidence:
 
 
 def rough_poses(views: Sequence[View], board: Board, camera: Camera) -> list[BoardPose]:
-    """Where the boards stood, as a camera sees it that is known only roughly."""
+    """Poses of the boards by a camera that is known only roughly; views that give none are left out."""
     found = []
     for view in views:
         if view.corners is None or len(view.corners.ids) < FEWEST_CORNERS:
@@ -132,7 +130,7 @@ def _within(corners: Corners, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 _FEWEST_TO_JUDGE = 3
-"""Of fewer poses neither tilt nor coverage can be asked."""
+"""Fewest poses from which tilt and coverage can be judged."""
 _MEND_VIEWS = "mend what is said of the other views, then show more"
 _SHOW_ANEW = "show the board again for each of these, at rest until its sweeps are over"
 FEWEST_POSES: Final = 6
@@ -142,7 +140,11 @@ FEWEST_WHY: Final = "are the fewest that can be checked against each other"
 
 @dataclass(frozen=True, slots=True)
 class EvidenceLimit:
-    """Of a number: what is never enough, and what is no likely cause of an error that is too large."""
+    """Limits of a number.
+
+    always: beyond it the number is never enough. imprecise: within it the number is no likely cause of an error that is
+    too large.
+    """
 
     always: float
     imprecise: float
@@ -167,7 +169,7 @@ on room light costs more than half of what a frame can tell of the line."""
 def data_lack(
     views: ViewEvidence, poses: PoseEvidence | None, *, imprecise: bool, photons: bool = True
 ) -> list[Reason]:
-    """What the data lack, but for what is `hiding` the rest: more counts where the result is not precise enough.
+    """Reasons why the data are too few, those of `hiding` left aside; stricter where the result is not precise enough.
 
     poses: None where nothing tells. photons: whether pictures count photons; those from files do not.
     """
@@ -190,8 +192,8 @@ def data_lack(
 
 
 def hiding(views: ViewEvidence, poses: PoseEvidence | None, *, photons: bool = True) -> list[Reason]:
-    """What makes up other faults: room light in which frames hold little else, and boards so far away that their
-    corners do not say where they are. As for `data_lack`.
+    """Reasons that make other faults appear: room light in which frames hold little else, and boards so far away that
+    their corners do not say where they are. Arguments as for `data_lack`.
     """
     found = []
     if photons and views.room_flux > MOST_ROOM_FLUX.always:

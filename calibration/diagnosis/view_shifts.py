@@ -1,4 +1,4 @@
-"""Which views contradict the others: their passages as seen from the pose that their corners alone give.
+"""Shifts of views against each other: their passages as seen from the pose that their corners alone give.
 
 A fit of everything may move a board by a millimetre to please the light. With every pose from the corners alone, and
 camera and mirror as fitted, passages lie off the light by what the views disagree: nothing but the noise of the poses
@@ -22,7 +22,7 @@ from calibration.views import FEWEST_CORNERS, BoardPose, View
 Array = NDArray[np.float64]
 
 _STEP = 1e-6
-"""Of the command range, and of a pose in rad and m, for differences."""
+"""Change for differences: of the command as a share of its range, of a pose in rad and m."""
 _ROUNDS = 8
 """In which a pose settles with the weights of its corners."""
 _FEWEST_TO_SPLIT = 4
@@ -34,7 +34,9 @@ MOST_UNEXPLAINED = 0.35
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewShift:
-    """Of one view, in command units: median of its passages off the light, and the sd that the pose's noise gives."""
+    """Shift of one view in command units: median of its passages off the light, and the sd that the pose's noise
+    gives.
+    """
 
     name: str
     shift: float
@@ -42,7 +44,7 @@ class ViewShift:
 
 
 def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
-    """Of all views of a fit that have passages; views by name."""
+    """The shifts of all views of a fit that have passages; `views` by name."""
     model = fit.model
     posed = []
     for name, pose, sweeps in zip(fit.views, fit.poses, fit.sweeps, strict=True):
@@ -71,7 +73,7 @@ def shift_noise(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> floa
 
 
 def _variances(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> Array:
-    """Of the views' shifts (views,), as far as noise of poses and waves makes them."""
+    """Variances of the views' shifts (views,) from the noise of the poses and from waves."""
     return np.array([one.sd**2 for one in shifts]) + (wave**2 / max(sweeps, 1) if np.isfinite(wave) else 0.0)
 
 

@@ -67,7 +67,7 @@ def load_camera(path: Path) -> KnownCamera:
 
 
 def camera_file_text(camera: Camera, covariance: Covariance, views: list[str], verdict: Verdict) -> str:
-    """What such a file says."""
+    """The text of a camera file."""
     content: dict[str, Any] = {
         "format": CAMERA_FORMAT,
         "version": CAMERA_VERSION,
