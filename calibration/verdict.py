@@ -1,4 +1,4 @@
-"""What a calibration is found to be: good enough for what was asked, or not, and for which reasons."""
+"""The verdict on a calibration: good enough for what was asked, or not, and for which reasons."""
 
 import math
 from collections.abc import Callable
@@ -16,12 +16,12 @@ WORST_TIMES: Final = 4.0
 
 
 AT_M: Final = 5.0
-"""Where depth is judged unless another distance is asked for."""
+"""Distance at which depth is judged unless another is asked for."""
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """How good a calibration is to be: sd of depth at a distance; the baseline where somebody has measured it."""
+    """The quality asked of a calibration: sd of depth at a distance; the baseline where somebody has measured it."""
 
     accuracy_m: float
     at_m: float = AT_M
@@ -30,7 +30,9 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why a calibration is not good enough: code for machines, text for people, value and limit in the same unit."""
+    """A reason why a calibration is not good enough: code for machines, text for people, value and limit in the same
+    unit.
+    """
 
     code: str
     text: str

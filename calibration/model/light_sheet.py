@@ -1,4 +1,5 @@
-"""The sheet of light at one mirror command: a plane, or a sheet that bows out of it.
+"""The sheet of light at one mirror command, a plane or a sheet that bows out of it, and the depth at which a pixel's
+ray meets it.
 
 A line lens spreads the beam into a fan of directions. Seen from the fan's origin O, with f the fan's middle, t across
 it (along the mirror's axis) and n the plane's normal, light leaves at the angle phi within the plane and, where the
@@ -9,12 +10,9 @@ sheet is bowed, at the angle bow phi^2 out of it towards n. A point X with p = (
 whether O itself lies in the plane or a little beside it. O is the model's `source_m`; where that is unknown, the point
 of the mirror's axis that is nearest to the camera.
 
-Depth where a pixel's ray meets a light plane, and how it changes along an image row.
-
 Ray r = (u, v, 1), plane n.X = d:  z = d / (n.r). Along an image row dz/dx = -(z^2 / d) (n . dr/dx), whose sign says on
-which side of the stripe the near points lie. Everything broadcasts; NaN is 'no depth', never inf, never a warning.
-n.r cancels where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps 1e-9 of z at the least.
-Light that bows out of its plane is in `light_sheet`.
+which side of the stripe the near points lie. Everything broadcasts; NaN is 'no depth', never inf, never a warning. n.r
+cancels where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps 1e-9 of z at the least.
 """
 
 from dataclasses import dataclass
@@ -109,7 +107,7 @@ class LightSheets:
     bow_per_rad: float
 
     def distance_m(self, points_m: ArrayLike) -> Array:
-        """How far points (..., 3) lie off their sheets along n, metres: 0 on the sheet."""
+        """Distance of points (..., 3) from their sheets along n, metres: 0 on the sheet."""
         points = np.asarray(points_m, np.float64)
         off: Array = np.sum(self.planes[..., :3] * points, axis=-1) - self.planes[..., 3]
         if self.bow_per_rad:
@@ -179,7 +177,9 @@ def light_sheets(scanner: Scanner, source_m: ArrayLike | None, commands: ArrayLi
 
 
 def fan_origin(scanner: Scanner, source_m: ArrayLike | None) -> Array:
-    """Where the fan of light starts (3,): the source, or the point of the mirror's axis nearest to the camera."""
+    """The point (3,) from which the fan of light spreads: the source, or the point of the mirror's axis nearest to the
+    camera.
+    """
     if source_m is not None:
         return np.asarray(source_m, np.float64)
     if not isinstance(scanner, PivotScanner):

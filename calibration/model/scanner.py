@@ -27,7 +27,7 @@ _MOST_BOW_PER_RAD = 0.5
 
 
 class Scanner(Protocol):
-    """What the rest of the project needs of a scanner model."""
+    """The part of a scanner model that the rest of the project uses."""
 
     @property
     def command_range(self) -> tuple[float, float]:
@@ -160,7 +160,7 @@ class PivotScanner:
         return result
 
     def turned(self, commands: ArrayLike) -> Array:
-        """The same planes with the sign of n(a), along which offset_m, cone_rad and bow_per_rad count."""
+        """The planes with the sign of n(a), along which offset_m, cone_rad and bow_per_rad count."""
         at = _inside(commands, self.command_range)
         angle = np.polynomial.polynomial.polyval(at, self.angle_rad)[..., None]
         normal = self.zero_normal * np.cos(angle) + np.cross(self.axis_direction, self.zero_normal) * np.sin(angle)

@@ -1,4 +1,4 @@
-"""Where the line's centre crosses each pixel, by maximum likelihood of the pixel's counts over the columns.
+"""Maximum likelihood of a pixel's counts over the columns: the command at which the line's centre crosses each pixel.
 
 The light is that of `calibration.passages.light`. Its width is common to the pixels of a group (a part of the picture),
 the four other parameters are the pixel's own. Fisher scoring on all pixels at once, steps damped where they would make
@@ -35,13 +35,13 @@ UNKNOWN_SD = 1e3
 ITERATIONS, WIDTH_ITERATIONS = 12, 7
 """In the first ones the common widths are found too."""
 MOST_WORSE = 2.0
-"""Of the logarithm of a pixel's likelihood, while the width is being found."""
+"""Most that the logarithm of a pixel's likelihood may fall while the width is being found."""
 MOST_STEP = 0.6
-"""Of the centre in one iteration, in sigmas, and of the logarithm of sigma."""
+"""Largest change in one iteration: of the centre in sigmas, and of the logarithm of sigma."""
 DAMPING = 0.01
 """To begin with: share by which the information's diagonal is raised, so that steps fall short."""
 LEAST_STEP = 1e-3
-"""Of the centre, in columns: where it is less for all but one pixel in a hundred, that is it."""
+"""Change of the centre, in columns, at which the fit ends: less for all but one pixel in a hundred."""
 SPAN, SPACING = 4, 0.8
 """At how many places the likelihood of a centre is looked at on either side of its best, so many deviations apart."""
 MOST_AT_END = 0.03
@@ -228,7 +228,9 @@ def _width_step(log_sigma: Array, score: Array, information: Array, group: NDArr
 
 
 def _significance(ones: Array, frames: Array, at: Array, centre: Array, flux: Array) -> Array:
-    """Of the line (pixels,), against a level before the centre and one behind it with all the light."""
+    """Significance of the line (pixels,) in sds, against a level before the centre and one behind it with all the
+    light.
+    """
     level = np.zeros_like(flux)
     for side in (at < centre[:, None], at >= centre[:, None]):
         share = ((ones * side).sum(axis=1) + LEVEL_COUNTS) / ((frames * side).sum(axis=1) + 2 * LEVEL_COUNTS)

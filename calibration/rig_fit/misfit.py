@@ -1,12 +1,11 @@
-"""What a fitted rig does not describe: views that do not belong, slow misfit, terms that are neither there nor not.
+"""The misfit of a fitted rig: views that do not belong, slow misfit, and terms of the mirror that the data call for.
 
-Which terms of the mirror the data call for, decided one at a time, each decision kept.
-
-A term that is not in the model is tried to first order: the equations say what value it would take and how sure that
-would be. It comes in where it would be SIGNIFICANT_SD of its own standard deviations and can be told from the others.
-The angle's polynomial grows by one order or two, since a symmetric mirror has no even terms. Of several that would come
-in the first is the one that leaves least unexplained: what is not there can stand for a part of what is, as light that
-passes the axis for an angle that bends, and be surer of its value than what it stands for.
+Terms are decided one at a time, each decision kept. A term that is not in the model is tried to first order: the
+equations say what value it would take and how sure that would be. It comes in where it would be SIGNIFICANT_SD of its
+own standard deviations and can be told from the others. The angle's polynomial grows by one order or two, since a
+symmetric mirror has no even terms. Of several that would come in the first is the one that leaves least unexplained: a
+term that is not there can stand for a part of one that is (light that passes beside the axis for an angle that bends),
+and may be surer of its value than the one it stands for.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +24,7 @@ Array = NDArray[np.float64]
 
 SIGNIFICANT_SD = 5.0
 LEAST_OWN_SHARE = 1e-7
-"""Of a term's weight in the equations, what is its own when all others are free; less is rounding."""
+"""Share of a term's weight in the equations that must be its own when all others are free; less is rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +50,7 @@ def with_free(problem: RigProblem, groups: Sequence[Sequence[str]]) -> RigProble
 
 
 def candidates(free: Sequence[Sequence[str]], row_delay: bool) -> list[tuple[str, ...]]:
-    """What could come in next: (new terms), of which the last is the one that is judged."""
+    """Sets of terms that could come in next; of each set the last term is the one that is judged."""
     names = {name for group in free for name in group}
     order = max(k for k in range(ANGLE_TERMS) if f"angle_{k}" in names)
     tried = [tuple(f"angle_{k}" for k in range(order + 1, top + 1)) for top in range(order + 1, order + 3)]
@@ -67,9 +66,9 @@ def candidates(free: Sequence[Sequence[str]], row_delay: bool) -> list[tuple[str
 def tried(
     problem: RigProblem, solution: RigSolution, new: Sequence[str], left_over: Callable[[float], float]
 ) -> TermDecision:
-    """What the last of the new terms would be with all of them free.
+    """The decision on the last of the new terms, with all of them free.
 
-    left_over: by which factor variances would still be too large, were chi2 less by so much.
+    left_over: gives the factor by which variances would still be too large, were chi2 less by so much.
     """
     at = problem.terms.at(new)
     matrix, right = solution.matrix, solution.right
@@ -93,7 +92,7 @@ def tried(
 
 
 def best(decisions: Sequence[TermDecision]) -> int | None:
-    """Of those that would be kept the one that leaves least unexplained."""
+    """Index of the decision that leaves least unexplained, of those that would be kept; None where there is none."""
     kept = [at for at, decision in enumerate(decisions) if decision.kept]
     return max(kept, key=lambda at: decisions[at].gain) if kept else None
 
@@ -101,7 +100,7 @@ def best(decisions: Sequence[TermDecision]) -> int | None:
 def lag_decisions(
     solution: RigSolution, problem: RigProblem, free: Sequence[Sequence[str]], timing: Array
 ) -> list[TermDecision]:
-    """What the directions and speeds told of the lags."""
+    """The decisions on the lags, by what the directions and speeds told of them."""
     spread = np.sqrt(np.diag(solution.covariance(problem.tie)))
     told = {group[0]: group for group in free if group[0].startswith("lag")}
     decisions = []
@@ -152,7 +151,7 @@ def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> fl
 
 
 SCANNER_MOVES = ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2", "angle_0")
-"""What a scanner that was knocked changes: five of six, since a shift along the axis changes nothing."""
+"""Parameters that change when a scanner is knocked: five of six, since a shift along the axis changes nothing."""
 ODD_CHI2 = 60.0
 """By which chi2 must fall when a view has its own place of the scanner: 20 is one in a thousand."""
 ODD_TIMES = 8.0
@@ -251,7 +250,7 @@ class Misfit(NamedTuple):
 
 
 def misfit(problem: RigProblem, solution: RigSolution) -> Misfit:
-    """What corners and passages have against each other, and passages among themselves."""
+    """The contradictions of corners and passages with each other, and of passages among themselves."""
     return Misfit(_of_corners(problem, solution), _of_sweeps(problem, solution))
 
 
@@ -267,7 +266,7 @@ def _of_corners(problem: RigProblem, solution: RigSolution) -> tuple[float, floa
 
 
 def _of_sweeps(problem: RigProblem, solution: RigSolution) -> tuple[float, float]:
-    """Of the smooth part of what is left of each sweep."""
+    """chi2 and number of degrees of freedom of the smooth part of each sweep's residuals."""
     chi2, count = 0.0, 0
     jitter = solution.weight.jitter
     for view, seen in enumerate(problem.sightings):
@@ -290,7 +289,7 @@ def _of_sweeps(problem: RigProblem, solution: RigSolution) -> tuple[float, float
 
 
 def _taken(problem: RigProblem, solution: RigSolution) -> float:
-    """How many parameters the passages, rather than the corners, determine."""
+    """Number of parameters that the passages, rather than the corners, determine."""
     covariance = solution.covariance(problem.tie)
     return float(
         sum(

@@ -1,4 +1,4 @@
-"""How noisy corners and passages are, from what is left of them.
+"""The noise of corners and passages, told from their residuals.
 
 Passages have three kinds of error: that of their own photons (their sd, times one factor), that of the mirror, which
 all pixels crossed in the same instant share (jitter), and what the model does not describe, which varies slowly over a
@@ -23,10 +23,10 @@ from calibration.views import MAD_TO_SD, robust_sd
 Array = NDArray[np.float64]
 
 BINS = 1024
-"""Of all commands there are: some to a column, within which jitter hardly changes."""
+"""Bins of the whole command range: some to a column, within which jitter hardly changes."""
 MOST_REACH_BINS = 96
 LEAST_FACTOR = 0.3
-"""Of the passages' own sd; an sd that is stated more than three times too large is not believed to be."""
+"""Least factor of the passages' own sd; an sd that is stated more than three times too large is not believed to be."""
 TAIL_SD = 3.0
 """From here on an error counts as unlikely, and pulls no more than it would here."""
 OUTLIER_SD = 6.0
@@ -34,9 +34,9 @@ OUTLIER_SD = 6.0
 CUT_SD = 4.0
 """Errors beyond it are left out where the noise is told: the square of one outlier would be that of hundreds."""
 FEWEST_PAIRS = 200
-"""Of neighbouring passages, that tell how errors go with their sd."""
+"""Fewest pairs of neighbouring passages that tell how errors go with their sd."""
 LEAST_SPREAD = 0.05
-"""Of the logarithm of the sd, that tells it too."""
+"""Least spread of the logarithm of the sd that tells it."""
 SIGNIFICANT_SD = 3.0
 """For a jitter to be there; one overlooked makes a model look better than it is."""
 

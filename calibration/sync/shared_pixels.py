@@ -16,7 +16,7 @@ from calibration.views import Passages, robust_sd
 Array = NDArray[np.float64]
 
 SWEEP_ERROR_S = 3e-7
-"""What every sweep may be off as a whole besides noise: a thirtieth of a frame of 10 us."""
+"""Error of every sweep as a whole besides noise: a thirtieth of a frame of 10 us."""
 LEAST_PIXELS = 50
 CLUSTERS = 64
 """Parts of the command range in which the mirror's own trembling is taken to be common to all pixels."""

@@ -206,7 +206,7 @@ _CONFIG_REQUEST, _CONFIG_BYTES = 0xCF, 152
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """The endpoints of a USB chip and what each is for. ack_in: 0 where the board has none."""
+    """The endpoints of a USB chip. ack_in: a board without this one acknowledges in its stream."""
 
     usb: UsbId
     interfaces: tuple[int, ...]
