@@ -1,4 +1,4 @@
-"""Which pose of the board to show next, and why: the one after which the expected depth error is the least.
+"""Advice on the board's next pose, and why: the one after which the expected depth error is the least.
 
 Candidates stand on a grid of distance, place in the picture and tilt. The gain of each is forecast by the fit of the
 views so far (`Forecast`); before there is a fit, three poses begin that tell most about any camera. The same grid gives

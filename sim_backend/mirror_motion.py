@@ -1,8 +1,8 @@
-"""Where the simulated mirror points and what the scanner's marker outputs do, at any time.
+"""The motion of the simulated mirror and the levels of the scanner's marker outputs, at any time.
 
-The command passes the value of point i at the start of point i and runs straight to the next one; the mirror follows
-it by the lag of the direction it runs in. Marker outputs have no lag. A real mirror also shakes. Times are seconds of
-the bench.
+The command passes the value of point i at the start of point i and runs straight to the next one; the mirror follows it
+by the lag of the direction it runs in. Marker outputs have no lag. A real mirror also shakes. Times are seconds of the
+bench.
 """
 
 import math
@@ -47,7 +47,7 @@ class Jitter:
 
 
 class ScannerMotion(Protocol):
-    """What the bench asks of the scanner."""
+    """The part of the scanner that the bench uses."""
 
     def mirror(self, time_s: Array) -> Array:
         """Mirror position as the command it stands at, float64, same shape as the times."""
@@ -112,7 +112,7 @@ class Playing:
 
     @property
     def end_s(self) -> float:
-        """When the last point of the last repetition ends."""
+        """Time at which the last point of the last repetition ends."""
         return self.start_s + self.repeats * len(self.waveform.command) / self.rate_hz
 
     def mirror(self, time_s: Array) -> Array:

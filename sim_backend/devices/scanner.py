@@ -41,7 +41,7 @@ class SimulatedScannerConfig(KindConfig):
     jitter: float = Field(default=0.0, ge=0, le=0.1)
     """Standard deviation of the mirror's random error, in units of the drive; a column of the bundled rig is 3.5e-3."""
     serial: str = Field(default="SIM-MIRROR-0001", min_length=1)
-    """What it says of itself; another one is another scanner, which needs a calibration of its own."""
+    """Serial number. A scanner with another one needs a calibration of its own."""
 
 
 class SimulatedScanner(BeamScanner):

@@ -1,1 +1,3 @@
-"""What light does between laser and sensor, one file per effect; what a scene does not call for is not imported."""
+"""Effects on the light between laser and sensor, one file each; an effect that a scene does not call for is not
+imported.
+"""

@@ -100,7 +100,7 @@ def _clear(now: NDArray[np.uint64], earlier: NDArray[np.uint64], width: int, key
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _set(now: NDArray[np.uint64], earlier: NDArray[np.uint64], width: int, key: np.uint64, log_miss: float) -> None:
-    """As `_clear`, the other way."""
+    """Set each bit (rows, words) that is 1 in the earlier frame, with the probability that log_miss says."""
     draw = 0
     place = next_hit(-1.0, key, draw, log_miss)
     while place < len(now) * width:

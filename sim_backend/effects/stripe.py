@@ -33,7 +33,7 @@ Lit = tuple[Array, Array, Array, Array, Array, Array, Array]
 
 
 def lit_surface(view: CameraView) -> Lit:
-    """What `row_light` takes of a view."""
+    """The arrays of a view that `row_light` takes."""
     return view.u, view.v, view.u_x, view.v_x, view.facet, view.albedo, view.source_m
 
 

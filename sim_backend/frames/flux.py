@@ -3,14 +3,12 @@
     lambda = exposure (steady + share power sheet),     p = 1 - exp(-lambda)
 
 share is the part of the exposure during which the gate let light out. `steady` is made once, `sheet` once per command
-(what that costs: `sim_backend.frames.photons`).
+(for the cost see `sim_backend.frames.photons`).
 
-Mirror positions at which the flux is computed: frames of one column share one.
-
-Tracing the light costs more than drawing a frame, so the frames that the mirror spends in one cell of a grid all get
-their mean position. A mean over a column's frames, which is what is counted and bound, is then that of a mirror that
-moves on, wherever in their column the frames happen to lie. Told the columns' commands the cells are the columns; not
-told, the command range is divided finely, four cells per pixel of width.
+Tracing the light costs more than drawing a frame, so the frames that the mirror spends in one cell of a grid
+(`CommandGrid`) all get their mean position. A mean over a column's frames, which is what is counted and bound, is then
+that of a mirror that moves on, wherever in their column the frames happen to lie. Told the columns' commands the cells
+are the columns; not told, the command range is divided finely, four cells per pixel of width.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -41,7 +39,7 @@ class FluxModel:
         self.steady: Mapping[str, Array] = {e.name: effect.rate() for e, effect in loaded.items() if e.kind == "steady"}
         """Detections per second (rows, width) by name."""
         self.bits: Mapping[str, BitEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "bits"}
-        """What the sensor does to the bits, by name, in the order in which it does."""
+        """The sensor's effects on the bits, by name, in the order in which they act."""
         self.steady_per_s: Array = sum(self.steady.values(), np.zeros(setting.view.u.shape))
         """Detections per second without the laser, float64 (rows, width)."""
 
@@ -52,7 +50,7 @@ class FluxModel:
 
     @property
     def bit_effects(self) -> tuple[BitEffect, ...]:
-        """What the sensor does to the bits, in the order in which it does."""
+        """The sensor's effects on the bits, in the order in which they act."""
         return tuple(self.bits.values())
 
     @property
@@ -92,7 +90,7 @@ FINE_POSITIONS_PER_PX = 4
 ROUNDING = 1e-9
 """Positions are rounded to this, far below what a frame can tell: frames then have the very same mean."""
 _SLACK = 1e-6
-"""Of a step: where frames lie on the very border of cells."""
+"""Slack, as a share of a step, for frames that lie on the very border of cells."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,7 +26,7 @@ from sim_backend.random_numbers import WORD_PX
 
 Array = NDArray[np.float64]
 _SLACK = 1e-6
-"""Of a time step: times that are meant to be a multiple of it are."""
+"""Slack, as a share of a time step, by which times may miss a multiple of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

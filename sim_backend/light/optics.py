@@ -42,7 +42,7 @@ class Sensor(_Part):
     dark_rate: Annotated[CountsPerSecond, Field(ge=0)] = 20.0
     """Median over the pixels; the distribution has a heavy tail of hot ones."""
     pixel_seed: int = Field(default=1, ge=0)
-    """Which pixels are hot or dead: a property of the one sensor, the same in every run."""
+    """Seed of the hot and dead pixels: they belong to the one sensor and are the same in every run."""
     dead_share: Annotated[Ppm, Field(ge=0, le=1)] = 0.0
     """Pixels that read 0 in every frame."""
     hot_share: Annotated[Ppm, Field(ge=0, le=1)] = 0.0
@@ -54,7 +54,7 @@ class Sensor(_Part):
     trap_lifetime: Annotated[Seconds, Field(gt=0, le=1)] = 100e-9
     """Mean time until an afterpulse."""
     dead_time: Annotated[Seconds, Field(ge=0, le=1e-6)] = 0.0
-    """How long a pixel is blind after a detection."""
+    """Time for which a pixel is blind after a detection."""
     bit_error_rate: Annotated[Ppm, Field(ge=0, le=0.5)] = 0.0
     """Chance of every pixel of a frame to be read wrongly."""
 

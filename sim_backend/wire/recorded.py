@@ -37,7 +37,7 @@ _SCANNERS = {"helios": HeliosModel, "lasercube": LaserCubeModel}
 
 @dataclass(slots=True)
 class Exchange:
-    """What a driver sent in one piece, when, and all that came back before it sent the next."""
+    """A piece of bytes that a driver sent, when, and all that came back before it sent the next."""
 
     t_s: float
     sent: bytes
@@ -126,7 +126,9 @@ class RecordedModel:
         return found + [i for i in range(self._at, max(0, self._at - _SAID_AGAIN), -1)]
 
     def _answered(self, form: bytes, now_s: float) -> Exchange:
-        """What came back for a question: at this time after the last command, else next or last before."""
+        """The recorded answer to a question: the one at this time after the last command, else the next or last one
+        before.
+        """
         command = self._commands[self._at]
         elapsed_s = now_s - self._since_s
         mine = [one for one in command.questions if one.form == form]
@@ -176,7 +178,7 @@ class RecordedWorldConfig(KindConfig):
     recording: Path
     """Folder of a run that was taken with --record, with control.jsonl in it."""
     scanner: Literal["helios", "lasercube"] = "helios"
-    """Which scanner is emulated at emulated:scanner."""
+    """The scanner that is emulated at emulated:scanner."""
 
 
 class RecordedWorld:

@@ -1,6 +1,5 @@
-"""What emulated scanner boards have in common: commands and replies, points, a record of what the outputs did.
-
-What a scanner DAC put out over time: the record that an emulated world and tests look at.
+"""The common part of emulated scanner boards: commands and replies, points, and a record of the outputs over time,
+which an emulated world and tests look at.
 """
 
 import threading
@@ -100,7 +99,7 @@ class DacHistory:
         return np.concatenate(edges) if edges else np.empty(0)
 
     def _between(self, from_s: float, until_s: float) -> list[Played]:
-        """What was played in [from_s, until_s], ascending."""
+        """The points that were played in [from_s, until_s], ascending."""
         return [one for one in self._played if one.end_s > from_s and one.start_s <= until_s]
 
     def playing(self, time_s: float) -> bool:

@@ -17,7 +17,7 @@ SYSTICK_HZ = 112_000_000
 BUFFER_POINTS = 4096
 STOP_DEAD_S = 0.1
 BUS_BYTES_PER_S = 1.0e6
-"""What full speed carries, about: 4095 points take 28 ms."""
+"""Bytes a second at full speed, about: 4095 points take 28 ms."""
 
 COMMANDS, REPLIES, FRAMES = 0x06, 0x83, 0x02
 RED, GREEN, BLUE, INTENSITY = 0, 1, 2, 3

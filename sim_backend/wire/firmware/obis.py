@@ -52,7 +52,7 @@ class ObisModel:
         self.tec = True
         self.base_c = 24.6
         self.base_range_c: tuple[float, float] | None = (10.0, 50.0)
-        """What it states; None: this unit does not."""
+        """Range of the base plate's temperature that this unit states; None: it states none."""
         self.forbidden: list[str] = []
         self.commands: list[str] = []
         self._warm_up_s = warm_up_s

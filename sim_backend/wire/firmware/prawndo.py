@@ -46,7 +46,7 @@ class TriggerLine:
         self.set(False, at_s + width_s)
 
     def __call__(self, from_s: float, until_s: float) -> float | None:
-        """As `Trigger`."""
+        """First time in [from_s, until_s) at which the line is high; None: it is low until then."""
         index = bisect_right(self._edges, from_s, key=lambda edge: edge[0]) - 1
         if index >= 0 and self._edges[index][1]:
             return from_s

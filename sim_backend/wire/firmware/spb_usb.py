@@ -107,12 +107,12 @@ class SpbUsbModel(UsbModel):
 
     @property
     def state(self) -> SensorState:
-        """Where the device stands."""
+        """State of the device."""
         return self._state
 
     @property
     def heartbeat_ms(self) -> int:
-        """What the host set for the watchdog."""
+        """Time that the host set for the watchdog."""
         return self._registers[Register.HEARTBEAT_MS]
 
     # The bus

@@ -1,6 +1,5 @@
-"""One run of an emulated SPB1 device: frames exposed, frames its memory loses, the blocks in which the others come.
-
-What an emulated SPB1 device is: its USB descriptors and its registers (docs/spb1-usb.md).
+"""An emulated SPB1 device's descriptors, its registers (docs/spb1-usb.md), and one run of it: frames exposed, frames
+that its memory loses, the blocks in which the others come.
 """
 
 from collections.abc import Mapping
@@ -38,7 +37,7 @@ class Span:
 
 
 class FrameSource(Protocol):
-    """What the sensor sees and which markers reach it. Asked for every frame of a run, once and in order."""
+    """The scene before the sensor and the markers that reach it. Asked for every frame of a run, once and in order."""
 
     def started(self) -> None:
         """A run begins: counters of markers are 0."""
@@ -54,7 +53,7 @@ class FrameSource(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RunSettings:
-    """What holds for all runs. Options as of `SpbUsbModel`."""
+    """Settings that hold for all runs. Options as of `SpbUsbModel`."""
 
     width: int
     height: int

@@ -52,12 +52,12 @@ class TcpServer(WireServer[TcpModel]):
 
     @property
     def address(self) -> str:
-        """Where a client finds it."""
+        """Address at which a client finds the device."""
         return f"{HOST}:{self._port}"
 
     @property
     def endpoint(self) -> Endpoint:
-        """The same for `Surroundings.ports`."""
+        """The endpoint of that address for `Surroundings.ports`."""
         return Endpoint(self.address, emulated=True)
 
     def plug(self) -> None:

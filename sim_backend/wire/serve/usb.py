@@ -23,7 +23,8 @@ from drivers.clock import NS_PER_S, Clock
 from sim_backend.wire.serve.usb_model import AlternateSpec, AttachedDevice, Setup, UsbFailure, UsbModel
 
 FIRST_POLL_S, LONGEST_POLL_S = 250e-6, 1e-3
-"""When a transfer that the device is not ready for asks again; each time twice as late, up to the second."""
+"""Waits until a transfer that the device is not ready for asks again: each twice as long, from the first up to the
+second."""
 
 _LIBUSB = {
     errno.EIO: (-1, "Input/Output Error"),
@@ -167,7 +168,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         return _Handle(dev)
 
     def close_device(self, dev_handle: _Handle) -> None:
-        """What was claimed falls free."""
+        """Close the device; the interfaces that were claimed fall free."""
         dev_handle.device.close(dev_handle)
 
     def set_configuration(self, dev_handle: _Handle, config_value: int) -> None:
@@ -180,7 +181,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         return dev_handle.device.configuration
 
     def set_interface_altsetting(self, dev_handle: _Handle, intf: int, altsetting: int) -> None:
-        """Of a claimed interface."""
+        """Choose an alternate setting of a claimed interface."""
         with _pyusb_errors():
             dev_handle.device.set_alternate(intf, altsetting, dev_handle)
 
@@ -203,11 +204,11 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         return self._read(dev_handle, ep, buff, timeout)
 
     def intr_write(self, dev_handle: _Handle, ep: int, intf: int, data: Any, timeout: int) -> int:
-        """As bulk."""
+        """Write to an interrupt endpoint, as to a bulk one."""
         return self._write(dev_handle, ep, bytes(data), timeout)
 
     def intr_read(self, dev_handle: _Handle, ep: int, intf: int, buff: Any, timeout: int) -> int:
-        """As bulk."""
+        """Read from an interrupt endpoint, as from a bulk one."""
         return self._read(dev_handle, ep, buff, timeout)
 
     def ctrl_transfer(

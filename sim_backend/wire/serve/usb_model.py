@@ -1,9 +1,8 @@
-"""What an emulated USB device is, whatever transport serves it: descriptors, answers, and the rules of the bus.
+"""An emulated USB device, whatever transport serves it: descriptors, answers, and the rules of the bus.
 
-A device model is a pure state machine: the transport tells it what the host did and the time, and it answers. It has
-no thread and never waits. `AttachedDevice` puts the bus around it: claims, settings, packets, stalls, unplugging.
-
-What a USB device says of itself: endpoints, alternate settings, strings, as bytes (USB 2.0 chapter 9.6).
+A device model is a pure state machine: the transport tells it what the host did and the time, and it answers. It has no
+thread and never waits. `AttachedDevice` puts the bus around it: claims, settings, packets, stalls, unplugging.
+`DeviceSpec` gives its descriptors (endpoints, alternate settings, strings) as bytes (USB 2.0 chapter 9.6).
 """
 
 import errno
@@ -17,7 +16,7 @@ from typing import Final, Literal
 Speed = Literal["full", "high", "super"]
 
 SPEED_MBIT: Final = {"full": 12, "high": 480, "super": 5000}
-"""As the file `speed` of /sys/bus/usb/devices says it."""
+"""Speeds in Mbit/s, as in the file `speed` of /sys/bus/usb/devices."""
 
 DEVICE, CONFIGURATION, STRING = 1, 2, 3
 """Types of descriptors that a host asks for."""
@@ -46,7 +45,7 @@ class AlternateSpec:
 
 @dataclass(frozen=True, slots=True)
 class DeviceSpec:
-    """What the descriptors say: one configuration, numbered 1."""
+    """Contents of the descriptors: one configuration, numbered 1."""
 
     vendor: int
     product: int
