@@ -53,7 +53,7 @@ class Normal:
         return Normal(self.names[:count], self.matrix[:count, :count])
 
     def covariance(self, variance_px2: float) -> Covariance:
-        """For corners of this variance. CalibrationError or LinAlgError where the matrix is singular."""
+        """The covariance for corners of this variance. CalibrationError or LinAlgError where the matrix is singular."""
         scale = np.sqrt(np.diag(self.matrix))
         inverse = np.linalg.inv(self.matrix / np.outer(scale, scale)) / np.outer(scale, scale)
         return Covariance(self.names, variance_px2 * (inverse + inverse.T) / 2)
@@ -260,7 +260,7 @@ _FEW_CORNERS = 1
 _LEAST_CLOSE = 0.7
 """Share of a view's corners; with fewer that fit, none is used."""
 _FEWEST_VIEWS = 3
-"""That stay when outliers leave."""
+"""Fewest views that must stay when outliers leave."""
 _MAX_ROUNDS = 20
 
 

@@ -262,7 +262,7 @@ def sensitivity(model: RigModel, at_m: float) -> Sensitivity:
 
 
 def _said_reach(model: RigModel, x: Array, y: Array) -> str:
-    """From where to where the line reaches."""
+    """Words for the range of distances that the line reaches."""
     share = np.array([np.isfinite(command_at(model, x, y, at)).mean() for at in _DISTANCES_M])
     lit = _DISTANCES_M[share >= LEAST_LIT_SHARE]
     return f"it reaches {lit[0]:.2g} to {lit[-1]:.2g} m" if lit.size else "nor anything else within 100 m"
@@ -273,8 +273,8 @@ _TRUTH_GRID = 32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthErrors:
-    """Over a grid of pixels that the true rig lights at one depth. error_m: (n,) signed; sd_m: (n,) as the model's
-    covariance predicts, NaN for a model without one.
+    """Errors over a grid of pixels that the true rig lights at one depth. error_m: (n,) signed; sd_m: (n,) as the
+    model's covariance predicts, NaN for a model without one.
     """
 
     depth_m: float

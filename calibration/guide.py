@@ -135,7 +135,8 @@ def next_pose(
 
 
 def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[Candidate, ...]:
-    """So many poses that differ from one another as much as they can: near and far, all places, all tilts.
+    """Poses, as many as asked for, that differ from one another as much as they can: near and far, all places, all
+    tilts.
 
     Each is the one farthest from those before it; the first is a tilted one, near. seed: which of equals comes first.
     """
@@ -196,7 +197,7 @@ def _traits(candidate: Candidate) -> Array:
 
 
 BOARD_POINTS = 14
-"""Along either side of the board, where passages are looked at; each stands for as many as there will be."""
+"""Points along either side of the board where passages are looked at; each stands for as many as there will be."""
 _CELLS = (9, 7)
 """Cells of the picture, across and down, in whose middles the depth error is looked at."""
 BORDER_PX = 2.0
@@ -277,7 +278,9 @@ class Forecast:
 
 
 def _next_velocities(fit: RigFit) -> tuple[float, ...]:
-    """At which the next pose will be swept: poses take turns at the speeds, so as the one that had its turn first."""
+    """The velocities at which the next pose will be swept: poses take turns at the speeds, so those of the pose whose
+    turn is the longest ago.
+    """
     shown = [tuple(sweep.direction * sweep.speed_per_s for sweep in view) for view in fit.sweeps if view]
     last = {velocities: turn for turn, velocities in enumerate(shown)}
     return min(last, key=lambda velocities: last[velocities])

@@ -10,7 +10,7 @@ from calibration.errors import digits
 VerdictWord = Literal["passed", "failed"]
 """A verdict as files have it."""
 SIGMAS: Final = 4.0
-"""By how many standard deviations a baseline must differ from the stated one."""
+"""Standard deviations by which a baseline must differ from the stated one."""
 WORST_TIMES: Final = 4.0
 """The picture's worst places (95 %) may have this many times the error asked for."""
 
@@ -54,7 +54,7 @@ class Verdict:
 
     @property
     def word(self) -> VerdictWord:
-        """It, in a word."""
+        """The verdict in a word."""
         return "passed" if self.passed else "failed"
 
     @property
@@ -63,12 +63,12 @@ class Verdict:
         return tuple(reason.code for reason in self.reasons)
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """The verdict as JSON content, for programs."""
         return {"passed": self.passed, "reasons": [asdict(reason) for reason in self.reasons]}
 
 
 MOST_POSES: Final = 50
-"""That anybody shows: four times those of a usual session."""
+"""Most poses that anybody shows: four times those of a usual session."""
 
 _GUIDED = " ('--guided' says which)"
 _TELL_MORE = f"make each pose tell more, with more light, the board nearer and tilted more{_GUIDED}"

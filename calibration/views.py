@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 NO_POSE = "corners of a view are no picture of a board; take the view out, or name the board that it shows"
 USUAL_CORNER_SD_PX = 0.03
 FEWEST_CORNERS = 6
-"""That give a board's pose, with some to spare."""
+"""Fewest corners that give a board's pose, with some to spare."""
 LEAST_ACROSS_PX = 1.0
 """Least extent of corners across their line, in pixels, for a pose; they are found to some 0.01 px."""
 

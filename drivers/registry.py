@@ -40,7 +40,7 @@ class Surroundings:
     ports: Mapping[str, Endpoint] = field(default_factory=dict)
     """Ports that an emulating world created, by name; a device's `port: emulated:NAME` means one of them."""
     tap: Tap | None = None
-    """Told of all that passes the device's port, where its traffic is recorded."""
+    """Tap on everything that passes the device's port, where its traffic is recorded."""
 
 
 @dataclass(frozen=True, slots=True)

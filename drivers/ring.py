@@ -169,7 +169,7 @@ class BlockRing:
             )
 
     def end_waits(self) -> None:
-        """From now on `claim` gives its answer at once: the source is to end, and readers may never come again."""
+        """Let `claim` give its answer at once from now on: the source is to end, and readers may never come again."""
         with self._changed:
             self._patient = False
             self._changed.notify_all()

@@ -22,7 +22,7 @@ _MAX_TEXT = 1000
 """Longest text taken, in characters: exact arithmetic on an endless number would take endless time."""
 
 MANY_ZEROS = 5
-"""From so many zeros on a whole number is written with an exponent."""
+"""Number of zeros from which on a whole number is written with an exponent."""
 _FAITHFUL = Context(prec=20)
 """Decimal digits that pin a 64-bit float (17) with enough to spare for one multiplication by a unit."""
 
@@ -221,7 +221,7 @@ class _Text:
 
 Seconds = Annotated[float, _Text("time")]
 Age = Annotated[float, _Text("age")]
-"""In seconds in code: "90 d" is 7776000."""
+"""An age, in seconds in code: "90 d" is 7776000."""
 Hertz = Annotated[float, _Text("frequency")]
 ExactHertz = Annotated[Fraction, _Text("frequency", exact=True)]
 Metres = Annotated[float, _Text("length")]

@@ -104,7 +104,7 @@ class Bench:
                 self._program.lower_gate(self.now_s())
 
     def abort_program(self) -> None:
-        """All outputs low from now on."""
+        """Take all outputs low from now on."""
         with self._lock:
             self._aborted = True
             if self._program is not None:

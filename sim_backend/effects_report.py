@@ -33,7 +33,7 @@ SPARSITY = 6
 
 
 def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
-    """For columns of `exposures` frames at a power.
+    """The report for columns of `exposures` frames at a power.
 
     planned_for: power_w, exposure_s (of a column's frames together) and exposures that the plan holds for.
     changed_decisions_bound: of all that was left out together. effects: one mapping for each of the catalogue, with

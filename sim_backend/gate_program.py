@@ -71,7 +71,7 @@ class GateProgram:
         self._cut(at_s, lambda level: level & ~OUT_GATE)
 
     def abort(self, at_s: float) -> None:
-        """All outputs low from `at_s`."""
+        """Take all outputs low at `at_s`."""
         self._words_left = 0
         self._cut(at_s, lambda level: 0)
 

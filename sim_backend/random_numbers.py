@@ -285,7 +285,7 @@ def frame_key(seed: np.uint64, frame: np.uint64) -> np.uint64:
 
 
 LARGEST: Final = 700.0
-"""Above it 1 - exp(-t) is taken as 1."""
+"""Largest t; above it 1 - exp(-t) is taken as 1."""
 LOG2_E: Final = 1.4426950408889634
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 """ln 2 in two parts, the high one with 20 zeros at its end: its product with k is exact (Cody and Waite)."""

@@ -220,7 +220,7 @@ class SimulatedWorld:
 
     @property
     def _frame_delay_s(self) -> float:
-        """From the exposure of the first row to that of the last."""
+        """Time from the exposure of the first row to that of the last."""
         return self.model.row_delay_s * (self.size[0] - 1)
 
     def true_model(self) -> RigModel:

@@ -63,9 +63,9 @@ BUNDLED_BOARD = Path(__file__).parents[2] / "config" / "board.yaml"
 """The board that the commands take when none is named."""
 
 _FEWEST_SQUARES = 3
-"""Along a side; fewer leave less than 2 x 2 inner corners."""
+"""Fewest squares along a side; fewer leave less than 2 x 2 inner corners."""
 _MOST_SQUARES = 100
-"""Along a side; no dictionary of markers goes further."""
+"""Most squares along a side; no dictionary of markers goes further."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +214,7 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 CELLS = 8
-"""Along each side of the picture."""
+"""Cells along each side of the picture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -52,9 +52,11 @@ _SECOND_BOARD_MARKERS = 4
 _MAP_OUTLIER_SQUARES = 0.4
 """Distance from the homography, in squares, that no lens bends a board by and every misread marker exceeds."""
 _GROWTH_SQUARES = 1.6
-"""From what is known of a far board to the next corners; beyond, a map through a few noisy markers leads astray."""
+"""Distance from the known part of a far board to the next corners; beyond, a map through a few noisy markers leads
+astray."""
 _OUTLIER_SDS = 6.0
-"""Off the map through all corners, or as many pixels and squares as follow: a lens bends more than the map does."""
+"""Sds that a corner may lie off the map through all corners, or as many pixels and squares as follow: a lens bends more
+than the map does."""
 _LEAST_OUTLIER_PX = 0.3
 _MOST_USUAL_SDS = 4.0
 """A corner whose sd is more than that of its neighbours was not laid over what it should be."""
@@ -118,8 +120,8 @@ def _another(sighting: Sighting, board: Board) -> bool:
 def _refined(
     values: NDArray[np.float32], board: Board, rough: BoardMap, sighting: Sighting
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """All corners the picture shows: sought around the rough map first, then, growing, around the map through those;
-    last, each on pixels of its own.
+    """Find all corners that the picture shows: around the rough map first, then, growing, around the map through those
+    found; last, each on pixels of its own.
     """
     corners_m = board.corners_m[:, :2]
     side = sides_px(board, rough, np.array([board.size_m]) / 2)[0]

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.board.board import MARGIN_SQUARES, Board
 
 _PX_PER_SQUARE = (32, 256)
-"""At least and at most."""
+"""Least and most pixels of the drawing per square."""
 _MOST_PX = 1 << 25
 """Most pixels of a drawing, 128 MB. Boards of more than 21 x 21 squares reach it; the largest there are get 57 pixels a
 square. Fewer pixels cost precision: 30 x 29 squares, each 17 to 24 pixels in the picture, have corners off by 0.0018 px

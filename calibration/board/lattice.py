@@ -25,7 +25,8 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
 _OFFSETS = np.array([0.1, 0.2, 0.3, 0.4])
-"""In squares from the corner: clear of its edges, and within the outer squares where half of them was cut off."""
+"""Places where the change is looked at, in squares from the corner: clear of its edges, and within the outer squares
+where half of them was cut off."""
 _THERE = 0.3
 _GOES_ON = 0.5
 """Least change across a line outside the grid, as a share of that in the grid, for another row to follow there. In
@@ -95,7 +96,7 @@ class _Seen:
 
 
 def _cut_down(picture: Picture, px: Array) -> Array | None:
-    """Without outer rows that are not there."""
+    """The grid without outer rows that are not there."""
     while min(px.shape[:2]) >= _FEWEST:
         sides = [_seen(picture, np.rot90(px, turn)) for turn in range(4)]
         own = [np.inf if side is None or not np.isfinite(side.own) else side.own for side in sides]
@@ -107,7 +108,7 @@ def _cut_down(picture: Picture, px: Array) -> Array | None:
 
 
 def _grown(picture: Picture, px: Array) -> Array:
-    """With the rows that follow outside."""
+    """The grid with the rows that follow outside."""
     turn = kept = 0
     while kept < 4 and max(px.shape[:2]) < _MOST:
         turned = np.rot90(px, turn)
@@ -186,7 +187,7 @@ def _row_above(picture: Picture, px: Array) -> Array | None:
 
 
 def _map(px: Array) -> BoardMap | None:
-    """From squares, counted from the outer corner of the grid's top left one, to pixels."""
+    """The map to pixels from squares, counted from the outer corner of the grid's top left one."""
     board = _board(px.shape[1], px.shape[0])
     points = px.reshape(-1, 2)
     side = np.median(np.linalg.norm(np.diff(px, axis=1), axis=-1))

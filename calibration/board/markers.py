@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 
 _NEXT_SQUARES = 2.5
-"""From a placed marker to the next while they are few, twice that then; markers are 1.4 squares apart."""
+"""Distance from a placed marker to the next while they are few, twice that then; markers are 1.4 squares apart."""
 _OFF_SQUARES = 0.3
 """Farther from the middle of a square, a marker is none of this lattice."""
 _MOST_TURN_RAD = 0.6

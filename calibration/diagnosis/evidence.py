@@ -150,15 +150,16 @@ class EvidenceLimit:
     imprecise: float
 
     def at(self, imprecise: bool) -> float:
-        """The one that counts."""
+        """The limit that counts."""
         return self.imprecise if imprecise else self.always
 
 
 LEAST_TILT_RAD: Final = EvidenceLimit(math.radians(12), math.radians(20))
-"""Between two boards. Of boards parallel to each other focal length and distance cannot be told apart: they hang on the
-mirror's model alone, which nothing checks then."""
+"""Tilt between two boards. Of boards parallel to each other focal length and distance cannot be told apart: they hang
+on the mirror's model alone, which nothing checks then."""
 LEAST_BOARD_RAD: Final = EvidenceLimit(0.11, 0.15)
-"""Seen under smaller angles, a board's perspective (by which focal length is told) goes with the angle's square."""
+"""Angle under which a board is seen. Under smaller ones its perspective (by which focal length is told) goes with the
+angle's square."""
 LEAST_COVERAGE: Final = EvidenceLimit(0.3, 0.5)
 """Share of the picture within the outline of all corners; the lens is extrapolated outside, which nothing checks."""
 MOST_ROOM_FLUX: Final = EvidenceLimit(3.0, 1.0)

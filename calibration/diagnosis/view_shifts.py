@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 _STEP = 1e-6
 """Change for differences: of the command as a share of its range, of a pose in rad and m."""
 _ROUNDS = 8
-"""In which a pose settles with the weights of its corners."""
+"""Rounds in which a pose settles with the weights of its corners."""
 _FEWEST_TO_SPLIT = 4
 MOST_MISFIT = 3.0
 """Factor on the variances up to which the views are taken to agree."""
@@ -65,7 +65,7 @@ def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> flo
 
 
 def shift_noise(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> float:
-    """Up to where a `common_shift` of these may be noise of poses and waves; NaN for fewer than two views."""
+    """Value up to which a `common_shift` of these may be noise of poses and waves; NaN for fewer than two views."""
     if len(shifts) < 2:
         return np.nan
     chance = float(np.sqrt(2 * np.sum(_variances(shifts, wave, sweeps) ** 2))) / len(shifts)
@@ -78,9 +78,10 @@ def _variances(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> Array
 
 
 def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...], misfit: float = 1.0) -> tuple[ViewShift, ...]:
-    """Those that have to agree: all, but for a single outlier, which had no say in the fit.
+    """The shifts that have to agree: all, but for a single outlier, which had no say in the fit.
 
-    Unless it is the last one, since the rig may be another since then, or the others do not fit either.
+    An outlier that is the last view counts, since the rig may be another since then; it also counts where the others do
+    not fit either.
     """
     if len(outliers) != 1 or not shifts or shifts[-1].name in outliers or misfit > MOST_MISFIT:
         return shifts

@@ -26,7 +26,7 @@ from calibration.views import View
 CAMERA_FORMAT = "spadrig-camera"
 CAMERA_VERSION = 1
 CORNERS = "corners"
-"""In the provenance of a rig's calibration: digests of the views it was made of, those of its camera too."""
+"""Key in the provenance of a rig's calibration: digests of the views it was made of, those of its camera too."""
 
 
 class _CovarianceRows(FileSection):

@@ -47,7 +47,7 @@ _WORDS = {True: "true", False: "false", None: "null"}
 
 
 def _no_kinds(name: str, content: Any) -> None:
-    """Every section has one model."""
+    """No other model: every section has one."""
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ class ScannerSection(FileSection):
 
 
 class LagSection(FileSection):
-    """By how much the mirror follows a rising and a falling command."""
+    """The lags of the mirror behind a rising and a falling command."""
 
     forward: Number = 0.0
     backward: Number = 0.0

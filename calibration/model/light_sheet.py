@@ -150,7 +150,9 @@ class LightSheets:
         return z
 
     def _bowed(self, seen: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """For X - O, or that over z: off the plane, its slope by w, and whether it lies ahead of the fan."""
+        """The bow for X - O, or for that over z: the distance off the plane, its slope by w, and whether it lies ahead
+        of the fan.
+        """
         p, q = np.sum(seen * self.middle, axis=-1), np.sum(seen * self.across, axis=-1)
         dp, dq = -(self.middle @ self.origin_m), -(self.across @ self.origin_m)
         reach = np.hypot(p, q)

@@ -143,11 +143,11 @@ def _rotation(vector: Array) -> Array:
 
 
 SWEPT: Final = "velocities_per_s"
-"""In a model's provenance: the signed velocities of the sweeps that its planes were found from."""
+"""Key in a model's provenance: the signed velocities of the sweeps that its planes were found from."""
 ALIKE_SPEEDS: Final = 0.02
 """Relative difference up to which two speeds are one: they would tell a lag 50 times worse than their own places."""
 SPEED_MARGIN: Final = 0.05
-"""So far beyond the speeds at which it was measured a lag is taken to hold."""
+"""Share beyond the speeds at which it was measured for which a lag is taken to hold."""
 
 
 def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:

@@ -19,7 +19,8 @@ from calibration.verdict import VerdictWord
 Array = NDArray[np.float64]
 
 _ASYMMETRY = 1e-6
-"""By which two correlations that are the same may differ, and a smallest eigenvalue lie below 0, from rounding."""
+"""Amount by which two correlations that are the same may differ, and a smallest eigenvalue lie below 0, from
+rounding."""
 
 
 @dataclass(frozen=True, eq=False)

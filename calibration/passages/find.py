@@ -46,11 +46,11 @@ class ColumnSums:
 
     @property
     def columns(self) -> int:
-        """So many there are."""
+        """Number of columns."""
         return len(self.ones) - 1
 
     def some(self, which: "NDArray[np.bool_] | slice") -> "ColumnSums":
-        """Those of some pixels."""
+        """The sums of some pixels."""
         return ColumnSums(self.ones[:, which], self.frames if self.frames.shape[1] == 1 else self.frames[:, which])
 
     def between(self, begin: int, end: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -118,7 +118,7 @@ Counts = NDArray[np.unsignedinteger[Any]]
 MOST_PASSAGES = 2000
 """Most passages of a sweep; more say little more about a dozen parameters."""
 TRIES = 6
-"""So many times more pixels are looked at where few of them see the line."""
+"""Factor on the number of pixels that are looked at where few of them see the line."""
 CHUNK = 3000
 """Pixels at a time."""
 NEAR_SIGMAS = 4.5
@@ -127,8 +127,8 @@ REACH = 14
 """Columns on either side of the line that tell of the levels, and at least twice as many as it has itself."""
 FAR = 1e4
 SHAPES = (*(LineShape(box) for box in (0.0, 1.5, 2.5, 4.0)), LineShape(1.5, travels=True))
-"""That are tried: lines whose light is the same in all frames of a column, as on a DAC's stairs, and one that moves, of
-which the pixel's width hardly matters."""
+"""Shapes that are tried: lines whose light is the same in all frames of a column, as on a DAC's stairs, and one that
+moves, for which the pixel's width hardly matters."""
 MOST_LOSS = 2.0
 """Most that a pixel's log-likelihood may lose against its best shape: otherwise a single one whose fit went astray
 would choose for all."""
@@ -139,7 +139,7 @@ LEAST_SIGNIFICANCE = 5.0
 MOST_MISFIT = 5.0
 """Largest misfit, in standard deviations of chi squared: beyond, there was another line, or something moved."""
 MOST_SD = 1.0
-"""In columns."""
+"""Largest sd of a passage, in columns."""
 GROUPS = 4
 """Parts of the picture, in each direction, that have a line width of their own."""
 

@@ -33,27 +33,28 @@ FITTED_BESIDES = 3
 UNKNOWN_SD = 1e3
 """Columns; of a passage that the photons do not tell."""
 ITERATIONS, WIDTH_ITERATIONS = 12, 7
-"""In the first ones the common widths are found too."""
+"""Iterations; in the first ones the common widths are found too."""
 MOST_WORSE = 2.0
 """Most that the logarithm of a pixel's likelihood may fall while the width is being found."""
 MOST_STEP = 0.6
 """Largest change in one iteration: of the centre in sigmas, and of the logarithm of sigma."""
 DAMPING = 0.01
-"""To begin with: share by which the information's diagonal is raised, so that steps fall short."""
+"""Damping to begin with: share by which the information's diagonal is raised, so that steps fall short."""
 LEAST_STEP = 1e-3
 """Change of the centre, in columns, at which the fit ends: less for all but one pixel in a hundred."""
 SPAN, SPACING = 4, 0.8
-"""At how many places the likelihood of a centre is looked at on either side of its best, so many deviations apart."""
+"""Number of places at which the likelihood of a centre is looked at on either side of its best, and their distance in
+deviations."""
 MOST_AT_END = 0.03
 """Most chance at an end of that: where there is more, the centre is not known."""
 ALIKE = 1.25
 """Factor by which what was found may differ from what was looked for."""
 LEAST_LOOK, MOST_LOOK = 0.01, 0.7
-"""Within these, in columns."""
+"""Bounds of the deviation that is looked for, in columns."""
 LEAST_SIGMA, MOST_SIGMA = 0.25, 12.0
-"""In columns. A narrower line lies in one column or two, which do not say where."""
+"""Bounds of sigma, in columns. A narrower line lies in one column or two, which do not say where."""
 SIGMA_SPREAD = 0.15
-"""By how much (standard deviation of the logarithm) sigma may differ from one part of the picture to another."""
+"""Standard deviation of the logarithm of sigma from one part of the picture to another."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

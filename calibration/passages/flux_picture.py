@@ -78,7 +78,7 @@ def _everything(sweep: SweepCounts) -> tuple[Array, Array]:
 
 
 def _brightest_column(sweep: SweepCounts) -> NDArray[np.int32]:
-    """In which column (rows, width) a pixel and its neighbours' columns had most 1s."""
+    """Column (rows, width) in which a pixel and its neighbours' columns had most 1s."""
     columns, rows, window = sweep.counts.shape
     size = (rows, int(sweep.x0.max(initial=0)) + window)
     most, at = np.zeros(size, np.uint32), np.zeros(size, np.int32)

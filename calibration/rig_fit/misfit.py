@@ -153,11 +153,11 @@ def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> fl
 SCANNER_MOVES = ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2", "angle_0")
 """Parameters that change when a scanner is knocked: five of six, since a shift along the axis changes nothing."""
 ODD_CHI2 = 60.0
-"""By which chi2 must fall when a view has its own place of the scanner: 20 is one in a thousand."""
+"""Least fall of chi2 when an odd view has its own place of the scanner: 20 is one in a thousand."""
 ODD_TIMES = 8.0
-"""And more than so many times what it falls by for most views, should the model fit none of them well."""
+"""Least such fall as a multiple of that for most views, should the model fit none of them well."""
 EXPLAINED_SHARE = 0.05
-"""Or at most this of the misfit is left when the view has its own place of the scanner,"""
+"""Alternatively: at most this share of the misfit is left when the view has its own place of the scanner,"""
 OTHERS_SHARE = 0.3
 """and at least this whichever other view had one,"""
 LEAST_EXPLAINED = 2.0
@@ -165,9 +165,9 @@ LEAST_EXPLAINED = 2.0
 FEWEST_TO_TELL = 4
 """Views with passages: of fewer none is the usual one."""
 UNDECIDED_SD = 2.5
-"""From here on a term that was not taken in widens the covariance by what it would change."""
+"""Significance from which on a term that was not taken in widens the covariance by what it would change."""
 MISFIT_SD = 3.0
-"""By which chi2 of the slow misfit must exceed its mean before it is believed."""
+"""Sds by which chi2 of the slow misfit must exceed its mean before it is believed."""
 
 
 def odd_view(problem: RigProblem, solution: RigSolution, left: "Misfit") -> int | None:
@@ -236,7 +236,7 @@ class Misfit(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """By which variances are larger than the noise makes them; 1 where that may be chance."""
+        """Factor by which variances are larger than the noise makes them; 1 where that may be chance."""
         found = [1.0]
         for chi2, free in self:
             if free >= 1 and chi2 > free + MISFIT_SD * np.sqrt(2 * free):
@@ -255,7 +255,7 @@ def misfit(problem: RigProblem, solution: RigSolution) -> Misfit:
 
 
 def _of_corners(problem: RigProblem, solution: RigSolution) -> tuple[float, float]:
-    """With the noise that the corners alone speak for."""
+    """chi2 and degrees of freedom of the corners, with the noise that they alone speak for."""
     covariance = solution.covariance(problem.tie)
     chi2 = free = 0.0
     for view, (rows, _), counts in zip(solution.views, solution.rows, problem.counted, strict=True):

@@ -173,6 +173,6 @@ def _swept(problem: RigProblem) -> list[float]:
 
 
 def _trimmed(terms: Array, least: int) -> Array:
-    """Without the zeros at the end."""
+    """The terms without the zeros at the end."""
     used = np.flatnonzero(terms)
     return terms[: max(least, int(used[-1]) + 1 if used.size else 0)]

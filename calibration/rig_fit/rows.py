@@ -27,7 +27,7 @@ from calibration.views import BoardPose
 Array = NDArray[np.float64]
 
 LENS_TERMS = DISTORTION[:12]
-"""All but a tilted sensor's."""
+"""Names of the distortion's terms, without those of a tilted sensor."""
 ANGLE_TERMS = 6
 OFFSET_TERMS = 2
 

@@ -135,9 +135,10 @@ def _products(rows: Rows, weight: Array) -> tuple[Array, Array, float]:
 
 MOST_STEPS = 12
 WEIGHED_STEPS = 6
-"""After these, who is an outlier stays one: weights that follow every step never come to rest."""
+"""Steps after which an outlier stays one: weights that follow every step never come to rest."""
 CONVERGED_CHI2 = 1e-3
-"""Promised by the next step: 0.03 of a standard deviation along any parameter."""
+"""Gain in chi2 promised by the next step at which a fit is at rest: 0.03 of a standard deviation along any
+parameter."""
 ROUGH_SHARE = 1e-4
 """Share of chi2 that the next step may still promise where a term is only looked for."""
 WORSE_CHI2 = 0.1

@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 _ORDERS = (3, 1, 3)
 """Orders of d, b and e in the command: tangents of an angle that turns a quarter of a right angle either way."""
 POSES_FOR_PLANES = 5
-"""On fewer boards a command's light leaves too few lines to lay a plane through, all errors considered."""
+"""Fewest boards; on fewer a command's light leaves too few lines to lay a plane through, all errors considered."""
 MOST_FIRST_LAG_S = 1e-3
 """Ten times that of a small galvo."""
 _STEP = 0.7
@@ -164,7 +164,7 @@ def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[flo
 
 
 LEAST_TILT_RAD = np.radians(5.0)
-"""Between two boards at least."""
+"""Least tilt between two boards."""
 LEAST_THICKNESS = 0.01
 """Least thickness of the points about the plane that fits them best, as a share of their distance: less is one
 plane."""
@@ -231,7 +231,7 @@ def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:
 
 
 def unfit(names: Sequence[str]) -> str:
-    """That these views had no say, in words."""
+    """Words for the views that had no say."""
     return f"view{'s' if len(names) > 1 else ''} {', '.join(names)} left out: unlike the others"
 
 

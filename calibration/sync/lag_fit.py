@@ -63,7 +63,7 @@ class SweepTiming:
 
     @property
     def velocity_per_s(self) -> float:
-        """Signed."""
+        """Velocity of the command, signed."""
         return self.direction * self.speed_per_s
 
 
@@ -98,7 +98,7 @@ class SyncFit:
 
     @property
     def velocities_per_s(self) -> tuple[float, ...]:
-        """Signed, of the sweeps."""
+        """Velocities of the sweeps, signed."""
         return tuple(sweep.velocity_per_s for sweep in self.sweeps)
 
     @property

@@ -39,7 +39,7 @@ class SharedPixels:
 
     @property
     def velocity(self) -> Array:
-        """Signed (sweeps,)."""
+        """Velocities of the command, signed (sweeps,)."""
         result: Array = self.direction * self.speed
         return result
 

@@ -36,7 +36,7 @@ class Channel:
         self._received = bytearray()
 
     def fileno(self) -> int:
-        """For select."""
+        """The socket's file descriptor, for select."""
         return self._end.fileno()
 
     def send(self, message: Message, within_s: float = 0.0) -> None:
@@ -140,7 +140,9 @@ class Heartbeat:
 
     @property
     def waited_s(self) -> float:
-        """For how long the source thread has asked the SPAD in vain since its last frames, as it said last."""
+        """Seconds for which the source thread has asked the SPAD in vain since its last frames, by its own last
+        word.
+        """
         return float(_WAITED.unpack_from(self._page, _FRAME.size)[0])
 
     @waited_s.setter

@@ -254,7 +254,7 @@ class Guard:
         self._channel.send({"limits": asdict(limits)}, within_s=1.0)
 
     def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
-        """For the proxies: have the guard do a verb; returns its result or raises its error.
+        """Have the guard do a verb for a proxy; returns its result or raises its error.
 
         `GuardLost` where there is no guard: at once, but for verbs that lower, which wait for the application's own
         attempt at it.
@@ -399,7 +399,7 @@ class Guard:
         self._release()
 
     def _release(self) -> None:
-        """Whoever waits for an answer learns that none will come."""
+        """Tell everybody who waits for an answer that none will come."""
         with self._lock:
             waiting = list(self._answers.values())
         for inbox in waiting:
@@ -409,7 +409,7 @@ class Guard:
 
 
 def _start(theirs: socket.socket, heartbeat: Heartbeat) -> "subprocess.Popen[bytes]":
-    """In a session of its own: no Ctrl-C, no closed terminal reaches it."""
+    """Start the guard's process in a session of its own: no Ctrl-C, no closed terminal reaches it."""
     package_root = str(Path(__file__).parents[2])
     paths = [package_root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     return subprocess.Popen(

@@ -57,7 +57,7 @@ class Lane:
 _log = logging.getLogger(__name__)
 
 RETRY_S = 0.1
-"""Between attempts to make a device safe that does not answer or is not there."""
+"""Pause between attempts to make a device safe that does not answer or is not there."""
 
 
 class Owned:
@@ -137,7 +137,7 @@ class Owned:
         return None
 
     def want_safe(self) -> None:
-        """From now on `try_safe` is to be called until `finished`."""
+        """Ask for `try_safe` to be called from now on until `finished`."""
         self.unsafe = True
 
     @property
@@ -162,7 +162,7 @@ class Owned:
             self.trying = False
 
     def calm(self) -> None:
-        """Beside a verb that may end in light: dark now, `try_safe` follows it."""
+        """Make the device dark now, beside a verb that may end in light; `try_safe` follows it."""
         try:
             if isinstance(self.device, SyncSource):
                 self.device.abort()

@@ -35,19 +35,19 @@ from drivers.transports.serial_port import SerialPort
 _log = logging.getLogger(__name__)
 
 SIGN_OF_LIFE_S = 0.05
-"""Between the guard's own signs of life."""
+"""Time between the guard's own signs of life."""
 POLL_S = 1.0
-"""Between questions to an armed laser about interlock and faults (hardware.md section 4: at 1 Hz or more)."""
+"""Time between questions to an armed laser about interlock and faults (hardware.md section 4: at 1 Hz or more)."""
 CHECK_S = 0.05
 """Time for the gate to say whether its program has ended, before it is taken for still running."""
 END_CHECK_S = 0.2
-"""Between questions for that to the gate of an application at work, which may be late with its frames for longer."""
+"""Time between questions whether the gate's program has ended, while an application at work is late with its frames."""
 HELP_ITSELF_S = 0.5
 """Time for an application that lives but takes no frames to make its rig safe, before it is killed."""
 GATE_FIRST_S = 0.1
-"""Most that a kill waits for the low gate: a mirror whose program dies must not be lit."""
+"""Longest time that a kill waits for the low gate: a mirror whose program dies must not be lit."""
 GIVE_UP_S = 10.0
-"""Attempts to make a device safe that does not answer end here."""
+"""Time after which attempts to make a device safe that does not answer end."""
 
 _URGENT = ("gate_low", "abort", "pause", "disarm")
 _ENABLING = ("arm", "program", "run")
@@ -75,7 +75,7 @@ class GuardProcess:
         self._terminated = False
 
     def run(self) -> int:
-        """Until the application says goodbye or is gone."""
+        """Serve the application until it says goodbye or is gone."""
         signal.signal(signal.SIGTERM, self._on_terminate)
         before = seen = time.monotonic()
         while not self._ending:
@@ -153,7 +153,7 @@ class GuardProcess:
             owned.lane.do(owned.calm)  # what the overtaken verb still does is undone behind it
 
     def _answer(self, owned: Owned, message: Message) -> None:
-        """On the device's lane."""
+        """Do a verb and answer with its result or error. Runs on the device's lane."""
         verb = message["verb"]
         answer: Message = {"id": message["id"]}
         with self._trip_lock:
@@ -221,7 +221,7 @@ class GuardProcess:
             sync.urgent.do(lambda: self._check_end(sync, trouble), first=True)
 
     def _check_end(self, sync: Owned, trouble: str) -> None:
-        """On a lane of the gate's."""
+        """Trip the application unless the gate's program has ended by itself. Runs on a lane of the gate's."""
         if not self._note_end(sync):
             self._trip_application(f"{trouble}; check the SPAD's cable and trigger, or unload the computer", False)
         self._check_until = None
@@ -241,7 +241,7 @@ class GuardProcess:
         return True
 
     def _rest(self, laser: Owned) -> None:
-        """On the laser's lane."""
+        """Pause the laser after the end of the gate's program. Runs on the laser's lane."""
         try:
             laser.call("pause", [])
         except DeviceError as error:
@@ -261,7 +261,9 @@ class GuardProcess:
         laser.lane.do(lambda: self._ask_laser(laser))
 
     def _ask_laser(self, laser: Owned) -> None:
-        """On the laser's lane. A single answer that is missing or garbled is asked for again."""
+        """Ask the laser about interlock and faults. A single answer that is missing or garbled is asked for again. Runs
+        on the laser's lane.
+        """
         device: LineLaser = laser.device
         for attempt in range(2):
             try:
@@ -393,7 +395,9 @@ class Rescue:
             _log.error("%s: %s", slot, error)
 
     def _switch_off(self, slot: str) -> None:
-        """Off, before anything is asked: to open a laser that takes ten commands a second takes more than one."""
+        """Switch the emission off before anything is asked: opening a laser that takes ten commands a second takes more
+        than one.
+        """
         place, off = self._off[slot]
         address = place().address
         port = _once_free(lambda: SerialPort(slot, address))

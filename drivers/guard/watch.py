@@ -24,7 +24,7 @@ from dataclasses import dataclass
 TICK_S = 0.01
 """Time from one look to the next."""
 MAX_STEP_S = 0.03
-"""Most that one look adds to a silence, however late it comes."""
+"""Longest time that one look adds to a silence, however late it comes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,19 +36,19 @@ class GuardLimits:
     """
 
     frames_within_s: float = 0.05
-    """By an application that sleeps, as two looks say: with their 20 ms and the gate's 30 ms, 100 ms in all."""
+    """Limit for an application that sleeps, as two looks say: with their 20 ms and the gate's 30 ms, 100 ms in all."""
     busy_within_s: float = 1.5
-    """By one that computes or waits for a processor or a disk. With four times more work than processors a thread that
-    only sleeps 1 ms was seen to wake 0.2 s late, one that shares its interpreter 0.35 s, and disks stall for a second:
-    none of that may end a scan. The light meanwhile is that of a moving mirror, since each sweep waits, with its gate
-    low, for a scan marker. An application that is killed or stopped never gets this long."""
+    """Limit for one that computes or waits for a processor or a disk. With four times more work than processors a
+    thread that only sleeps 1 ms was seen to wake 0.2 s late, one that shares its interpreter 0.35 s, and disks stall
+    for a second: none of that may end a scan. The light meanwhile is that of a moving mirror, since each sweep waits,
+    with its gate low, for a scan marker. An application that is killed or stopped never gets this long."""
     waits_within_s: float = 0.04
-    """By one at work whose source thread says that it has asked the SPAD for so long in vain."""
+    """Limit for one at work whose source thread says that it has asked the SPAD for so long in vain."""
     first_wait_s: float = 0.3
     """Limit of the wait for the first frame."""
     first_frame_s: float = 1.0
-    """From `run` to the first one: SPAD, scanner and the scan marker come in between. An application at work gets
-    `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""
+    """Time from `run` to the first frame: SPAD, scanner and the scan marker come in between. An application at work
+    gets `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""
 
 
 class FrameWatch:

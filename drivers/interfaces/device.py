@@ -53,12 +53,12 @@ class Device(ABC):
 
     @property
     def identity(self) -> str:
-        """Its name, and what else tells it from others of its kind: model, serial number, firmware."""
+        """The device's name, and what else tells it from others of its kind: model, serial number, firmware."""
         return self._name
 
     @property
     def serial(self) -> str | None:
-        """Its serial number, or the lasting name of one that has none; None: it tells neither."""
+        """The device's serial number, or the lasting name of one that has none; None: it tells neither."""
         return None
 
     @property

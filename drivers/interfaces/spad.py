@@ -141,7 +141,7 @@ class SpadRequest:
 
     frame_rate_hz: Fraction
     exposure_s: float
-    """At most one frame period."""
+    """Exposure of a frame, at most one frame period."""
     mode: SpadMode
     block_frames: int
     """Frames wanted per block; a device may send shorter blocks, never longer ones."""
@@ -179,12 +179,12 @@ class SpadHealth:
     """
 
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
-    """By the place where each is measured."""
+    """Temperatures by the place where each is measured."""
     excess_bias_v: float | None = None
     """Bright light at a high one ages the chip."""
     frame_clock_hz: float | None = None
     memory_high_water_bytes: int | None = None
-    """Most that waited in its memory in the last run."""
+    """Largest amount of data that waited in the sensor's memory in the last run."""
 
 
 class SpadArray(Device):
@@ -195,8 +195,8 @@ class SpadArray(Device):
         self._mode: SpadMode | None = None
         self._run_opened = False
         self.on_wait: Callable[[float], None] | None = None
-        """Told within `fill` for how many seconds it has asked the device in vain since its last frames; a device that
-        cannot tell leaves it alone."""
+        """Called within `fill` with the number of seconds for which the device has been asked in vain since its last
+        frames. A device that cannot tell leaves it alone."""
 
     @property
     @abstractmethod

@@ -51,7 +51,7 @@ class CoboltFraming:
         return reply == DONE
 
     def encode(self, command: str) -> bytes:
-        """With CR."""
+        """The command's bytes, ended by CR."""
         return command.encode("ascii") + b"\r"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
@@ -63,7 +63,7 @@ class CoboltFraming:
         return ""
 
     def refusal(self, reply: str) -> str | None:
-        """Its own words."""
+        """The laser's own words where it refuses the command; None: it does not."""
         return reply if _REFUSED.fullmatch(reply) else None
 
 
@@ -107,7 +107,7 @@ class Dialect(Protocol):
         ...
 
     def waits_for_key(self) -> bool:
-        """It starts once its key is turned off and on."""
+        """Whether the laser starts only once its key is turned off and on."""
         ...
 
 
@@ -136,7 +136,7 @@ class MldDialect:
         return self._line.ask("gam?", re.compile("[012]"))
 
     def input_mode(self, mode: str) -> str:
-        """From `gdmes?` and `games?`."""
+        """The input by which the light is modulated, from `gdmes?` and `games?`."""
         if mode != "2":
             return self._MODES[int(mode)]
         return _inputs(self._line.ask_flag("gdmes?"), self._line.ask_flag("games?"))
@@ -163,7 +163,7 @@ class MldDialect:
         self._line.tell("p 0")
 
     def brighten(self) -> None:
-        """Nothing besides the power."""
+        """Nothing more to do: the power alone makes this laser bright."""
 
     def waits_for_key(self) -> bool:
         """`gom?` 1."""
@@ -187,7 +187,7 @@ class ScpiDialect:
         return self._line.ask("laser:runmode?", WORD).lower()
 
     def input_mode(self, mode: str) -> str:
-        """From the inputs that are on."""
+        """The input by which the light is modulated, from the inputs that are on."""
         if mode != "powermodulation":
             return mode
         return _inputs(self._line.ask_flag("las:pm:dig:ena?"), self._line.ask_flag("las:pm:ana:ena?"))

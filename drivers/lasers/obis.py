@@ -229,7 +229,9 @@ class ObisLaser(SerialLaser):
         self._armed = True
 
     def _prepare(self) -> None:
-        """Off, and set up so that nothing but the gate governs the light, at no later power-up either."""
+        """Switch off, and set up the laser so that nothing but the gate governs the light, at no later power-up
+        either.
+        """
         line = self._line
         self._switch_off()
         line.tell_and_check("SYST:CDRH ON", "SYST:CDRH?", SWITCH, "ON".__eq__)
@@ -245,7 +247,7 @@ class ObisLaser(SerialLaser):
         self._line.tell_and_check(f"SOUR:POW:LEV:IMM:AMPL {power_w:.5f}", query, NUMBER, is_power)
 
     def _await_ready(self) -> None:
-        """Until an ON acts at once: said earlier it would be deferred, and light come when nobody expects it."""
+        """Wait until an ON acts at once: said earlier it would be deferred, and light come when nobody expects it."""
         give_up_ns = self._clock.now_ns() + round(self._warm_up_s * NS_PER_S)
         while not (bits := self._bits()) & READY or bits & WARM_UP:
             fault = self._fault(bits)
@@ -272,7 +274,7 @@ class ObisLaser(SerialLaser):
         self._set_power(self._limits.min_power_w)
 
     def _switch_off(self) -> None:
-        """Off, a deferred ON too. `DeviceFault` where it still emits."""
+        """Switch off, a deferred ON too. `DeviceFault` where the laser still emits."""
         self._line.tell_and_check("SOUR:AM:STAT OFF", "SOUR:AM:STAT?", SWITCH, "OFF".__eq__)
         self._told_on = False
         if self._bits() & EMISSION:
@@ -336,7 +338,7 @@ def _identify(config: ObisConfig, clock: Clock, framing: ObisFraming, line: Dial
 
 
 def _base_range(line: Dialogue) -> TemperatureRange | None:
-    """None: this unit does not say, or states no range; its own fault word judges then."""
+    """The range that the base plate may be in. None: this unit states none; its own fault word judges then."""
     try:
         low, high = (line.ask_surely(f"SOUR:TEMP:PROT:BAS:{end}?", CELSIUS) for end in ("LOW", "HIGH"))
     except CommandRefused:

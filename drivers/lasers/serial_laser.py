@@ -116,7 +116,10 @@ def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> N
 
 
 class PlainLaser(LineLaser):
-    """Any power up to `max_power_w`. emit: told how much it emits under the gate, in W, whenever that changes."""
+    """A laser that takes any power up to `max_power_w`.
+
+    emit: called with the power that it emits under the gate, in W, whenever that changes.
+    """
 
     def __init__(self, name: str, max_power_w: float, emit: Callable[[float], None] | None = None) -> None:
         super().__init__(name)
@@ -126,7 +129,7 @@ class PlainLaser(LineLaser):
 
     @property
     def limits(self) -> LaserLimits:
-        """From 0 W on."""
+        """Powers from 0 W on."""
         return self._limits
 
     def _do_status(self) -> LaserStatus:

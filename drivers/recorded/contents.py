@@ -71,7 +71,7 @@ def index_header() -> bytes:
 def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = None) -> bytes:
     """The record, 64 bytes, of a block that begins at byte `offset` of `segment`.
 
-    length: its bytes, where it was not written by `drivers.spb1.block_parts`.
+    length: its bytes, where it was not written by `drivers.spb1.writer.block_parts`.
     """
     header = block.header
     bare = _RECORD.pack(
@@ -197,7 +197,7 @@ def _told(folder: Path, problems: list[str]) -> Entries | None:
 
 
 def _inside(records: Entries, segments: dict[int, SegmentReader], problems: list[str]) -> Entries:
-    """Those records that tell of blocks which can be there; where two tell of the same bytes, neither."""
+    """The records that tell of blocks which can be there; where two tell of the same bytes, neither."""
     sizes = np.zeros(max(segments) + 2)
     sizes[list(segments)] = [segment.size for segment in segments.values()]
     room = sizes[np.minimum(records["segment"], len(sizes) - 1)]

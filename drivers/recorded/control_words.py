@@ -36,7 +36,9 @@ class Word:
 
 @dataclass(frozen=True, slots=True)
 class Spoken:
-    """All that went to the devices of a rig. commands: by device. scans: the buffers of each scan that was run."""
+    """The commands that went to the devices of a rig. commands: by device. scans: the buffers of each scan that was
+    run.
+    """
 
     commands: dict[str, list[Word]]
     scans: list[list[Word]]
@@ -85,7 +87,7 @@ def _lines(pieces: list[Word]) -> list[Word]:
 
 
 def _once(words: list[Word]) -> list[Word]:
-    """Without repeats of what was just said, a command or two of them: both are how drivers make sure."""
+    """The commands without repeats of the last one or two: drivers repeat both to make sure."""
     kept: list[Word] = []
     for word in words:
         kept.append(word)

@@ -15,7 +15,7 @@ Entries = NDArray[Any]
 Ints = NDArray[np.int64]
 
 _NEIGHBOURS: Final = 2
-"""So many blocks on either side are asked whether a block's numbers go with theirs."""
+"""Number of blocks on either side that are asked whether a block's numbers go with theirs."""
 _OF_BLOCK: Final = 16
 _OF_INDEX: Final = 8
 """Weight of a block and its record in the index, beside 1 for each neighbour: fewer blocks never outweigh more."""
@@ -104,7 +104,9 @@ def _rising(run: Entries, told: Entries) -> Ints:
 
 
 def _agreeing(seq: Ints, first: Ints, t0: Ints, n_frames: Ints) -> Ints:
-    """With how many neighbours each block agrees, int64 (n,): the least of its number, frames and ticks."""
+    """Number of neighbours with which each block agrees, int64 (n,): the least of those by its number, frames and
+    ticks.
+    """
     place = np.arange(len(seq))
     steps = np.diff(first)
     per_frame = float(np.median(np.diff(t0)[steps > 0] / steps[steps > 0])) if (steps > 0).any() else 0.0

@@ -119,7 +119,7 @@ Piece = tuple[FrameBlock, int, int]
 
 
 class Cursor:
-    """From the first frame of a start to its end, or to frame number `n_frames`. For one thread.
+    """A reading of one start from its first frame to its end, or to frame number `n_frames`. For one thread.
 
     by_block: steps are blocks, since there are no markers.
     """
@@ -354,7 +354,7 @@ class ReplaySpad(SpadArray):
         return self._counters
 
     def _not_yet(self, why: str) -> bool:
-        """Nothing was published; False where the run was stopped meanwhile."""
+        """Raise DeviceTimeout with the reason why nothing was published; False where the run was stopped meanwhile."""
         if self.pace.halted:
             return False
         raise DeviceTimeout(f"{self.name}: {why}")

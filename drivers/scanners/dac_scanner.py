@@ -70,7 +70,7 @@ class PointSource:
         return self._end - self._at
 
     def pad_start(self, points: int = 1) -> None:
-        """More points at the very beginning, where the mirror rests. Before the first `take`."""
+        """Add points at the very beginning, where the mirror rests. Before the first `take`."""
         self._way = np.concatenate([np.full(points, self.last), self._way])
         self._end += points
 
@@ -111,13 +111,13 @@ class PointSource:
 def scan_from(
     position: float, waveform: ScanWaveform, repeats: int, limits: ScannerLimits, rate_hz: float
 ) -> PointSource:
-    """From rest at `position` to the waveform's first point, and the waveform."""
+    """Points from rest at `position` to the waveform's first point, and the waveform."""
     way = ramp(position, float(waveform.command[0]), limits, rate_hz)
     return PointSource(way, waveform, repeats, position=position, limits=limits, rate_hz=rate_hz)
 
 
 def park_from(position: float, end: float, limits: ScannerLimits, rate_hz: float) -> PointSource:
-    """From rest at `position` to rest at `end`; no points where that is the same."""
+    """Points from rest at `position` to rest at `end`; none where that is the same."""
     way = ramp(position, end, limits, rate_hz)
     return PointSource(way, None, 0, position=position, limits=limits, rate_hz=rate_hz)
 
@@ -189,7 +189,7 @@ class RunPlayer:
         self.rest()
 
     def end(self) -> None:
-        """Before the device is closed: no thread talks to it afterwards."""
+        """End the thread before the device is closed: nothing talks to it afterwards."""
         self._stopping.set()
         self.join()
 
@@ -308,7 +308,7 @@ class DacScanner(BeamScanner):
             self._dac.close()
 
     def _go(self, command: float) -> None:
-        """To rest at `command`, as fast as the board plays."""
+        """Bring the mirror to rest at `command`, as fast as the board plays."""
         clock_hz = self._do_point_clock(self._limits.point_rate_hz[1])
         source = park_from(self._player.rest(), command, self._limits, float(clock_hz))
         self._player.play(self._dac.run(source, clock_hz))

@@ -135,7 +135,7 @@ _COMMAND_S = 0.1
 """The vendor's 16 ms are too short for slow hosts (pull request 10)."""
 _FRAME_S = 0.5
 _SETTLE_S = 0.1
-"""From entering alternate setting 1 to the first command."""
+"""Pause between entering alternate setting 1 and the first command."""
 _DRAIN_S = 0.005
 _AFTER_STOP_S = 0.15
 """Frames within 100 ms of STOP are refused."""
@@ -218,13 +218,13 @@ class HeliosLink:
 
 _POLL_S = 0.002
 _SILENT_S = 0.5
-"""So long no proper status: the device hangs."""
+"""Time without a proper status after which the device counts as hung."""
 _PATIENCE_S = 1.0
 """Beyond the time its frames take, for the buffer to fall free."""
 _WIRE_BYTES_PER_S = 1.216e6
-"""Most that a full-speed bulk endpoint carries: 19 packets of 64 bytes a millisecond (USB 2.0, table 5-9)."""
+"""Bytes a second that a full-speed bulk endpoint carries: 19 packets of 64 bytes a millisecond (USB 2.0, table 5-9)."""
 _DRIFT = 1e-3
-"""Most that the device's crystal and the host's clock differ."""
+"""Largest relative difference between the device's crystal and the host's clock."""
 
 
 class HeliosRun:

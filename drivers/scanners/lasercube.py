@@ -173,7 +173,7 @@ _HOLD_S = 0.03
 """Shortest time for which the first and the last point are held: the host may be late by this when it asks first and
 clears last."""
 _DRIFT = 1e-3
-"""Most that the device's crystal and the host's clock differ."""
+"""Largest relative difference between the device's crystal and the host's clock."""
 _TOLERANCE_POINTS = 48
 """Less than a transfer, which is what gets lost as a whole; more than the device's own steps in counting."""
 
@@ -321,7 +321,7 @@ class LaserCubeDac:
         )
 
     def check(self) -> None:
-        """Any question will do."""
+        """Check that the board answers; any question will do."""
         self._link.queued()
 
     def halt(self) -> float:

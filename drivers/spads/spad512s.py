@@ -42,11 +42,11 @@ from drivers.transports.tap import Tap
 from drivers.units import BytesPerSecond, ExactHertz
 
 GUARD_BYTES = 512
-"""So much must come behind a block before it counts. The longest error text of the samples has 160 characters."""
+"""Bytes that must come behind a block before it counts. The longest error text of the samples has 160 characters."""
 SLICE_S = 0.05
 """One wait: how late a `stop` from another thread comes at most."""
 _ERROR_CHECK_S = 0.5
-"""After a silence of so long within a run the last bytes are looked at: they may be an error text."""
+"""Silence within a run after which the last bytes are looked at: they may be an error text."""
 _UNIFORM = (0x00, 0xFF)
 
 

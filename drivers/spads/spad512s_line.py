@@ -33,7 +33,7 @@ class Deadlines:
     """Longest waits in seconds."""
 
     open_s: float = 30.0
-    """For the banner."""
+    """Deadline for the banner."""
     calibration_s: float = 90.0
     answer_s: float = 5.0
     stop_s: float = 1.0
@@ -54,7 +54,7 @@ class Spad512sIdentity:
     intensity: bool
 
     def __str__(self) -> str:
-        """For people."""
+        """The identity as a text for people."""
         return (
             f"{self.detector} {self.flavour}, FPGAs {self.master_serial} and {self.slave_serial}, software "
             f"{self.software}, firmware {self.firmware}, hardware {self.hardware}"
@@ -190,7 +190,7 @@ class Spad512sLine:
         return self._identity_of(detector, answer)
 
     def _await_calibration(self, stream: TcpStream) -> None:
-        """Nothing may be sent before the end of it."""
+        """Wait for the end of the calibration; nothing may be sent before it."""
         _log.info("%s: calibrates its breakdown voltage; waiting", self._name)
         ends_at = time.monotonic() + self._deadlines.calibration_s
         text = ""

@@ -226,13 +226,15 @@ class Wiring:
             self._tell(link, command)
 
     def close_session(self, link: BulkLink) -> None:
-        """Without it the FT601 answers nobody until it is plugged in anew."""
+        """End the session: without it the FT601 answers nobody until it is plugged in anew."""
         if self.has_session:
             for command in (_ABORT, _CLEAR):
                 self._tell(link, command)
 
     def _tell(self, link: BulkLink, command: int) -> None:
-        """To each pipe in use: touching others disturbs the session (LeechCore pull requests 80 and 81)."""
+        """Send a session command to each pipe in use: touching others disturbs the session (LeechCore pull requests 80
+        and 81).
+        """
         for pipe in sorted({self.stream_in, self.ack_in} & link.endpoints):
             length = _STREAM_BYTES if command == _STREAM else 0
             link.write(_SESSION_OUT, _COMMAND.pack(0, pipe, command, 0, length, 0, 0), 1.0)

@@ -102,7 +102,7 @@ class Register(IntEnum):
     """Most entries of all window tables together."""
 
     HEARTBEAT_MS = 0x0100
-    """Without a PING for so long a run ends with the gate low; 0: never."""
+    """Time without a PING after which a run ends with the gate low; 0: never."""
     STATE = 0x0104
     PERIOD_TICKS = 0x0110
     EXPOSURE_TICKS = 0x0114
@@ -138,7 +138,7 @@ class Command:
     value: int = 0
 
     def packed(self) -> bytes:
-        """Its 16 bytes."""
+        """The command's 16 bytes."""
         return COMMAND.pack(COMMAND_MAGIC, self.op, self.request_id, self.address, self.value)
 
 
@@ -152,7 +152,7 @@ class Ack:
     value: int
 
     def packed(self) -> bytes:
-        """Its 16 bytes."""
+        """The acknowledgement's 16 bytes."""
         return ACK.pack(ACK_MAGIC, self.op, self.request_id, self.status, self.value)
 
 
@@ -226,7 +226,7 @@ class ControlChannel:
         self._request_id = 0
         self._received: list[Ack] = []
         self.on_wait: Callable[[float], None] | None = None
-        """Told of each piece of a wait in vain, in seconds."""
+        """Called for each piece of a wait in vain, with its seconds."""
 
     @property
     def has_acks(self) -> bool:

@@ -65,7 +65,7 @@ class BlockLayout:
 
     @property
     def pixels_offset(self) -> int:
-        """From the block's start; a multiple of `PIXELS_ALIGN`."""
+        """Offset of the pixels from the block's start; a multiple of `PIXELS_ALIGN`."""
         return round_up(HEADER_BYTES + FRAME_RECORD.itemsize * self.n_frames, PIXELS_ALIGN)
 
     @property

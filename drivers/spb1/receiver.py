@@ -37,7 +37,7 @@ _LAST, _LOST_BEFORE, _FORCED_LOW = (
 )
 """Plain numbers: arithmetic with flags takes microseconds, ten times a block."""
 _ROOMY_RING = 8
-"""From so many slots on, two reads are kept in flight even where the ring is full."""
+"""Number of slots from which on two reads are kept in flight even where the ring is full."""
 
 
 class Reads(Protocol):
@@ -99,7 +99,7 @@ class BlockReceiver:
     def __init__(self, reads: Reads, endpoint: int, armed: Armed, label: str) -> None:
         self.delivered = 0
         self.next_frame = 0
-        """Behind the last frame that is known to have been exposed."""
+        """Number of the frame behind the last one that is known to have been exposed."""
         self.crc_errors = 0
         """Blocks refused: damaged, out of order or of another geometry."""
         self.resyncs = 0

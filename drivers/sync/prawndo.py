@@ -98,7 +98,9 @@ def _cycles(index: int, pulse: Pulse, board: ProgramLimits) -> int:
 
 
 def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -> None:
-    """Between two waits the program plays longer than a scan marker, or one marker would end both (pitfall 1)."""
+    """Check that between two waits the program plays longer than a scan marker: else one marker would end both (pitfall
+    1).
+    """
     waits = np.flatnonzero(period["cycles"] == 0)
     if len(waits) == 0:
         return
@@ -278,7 +280,7 @@ class PrawnDo(SyncSource):
             raise DeviceFault(f"{self.name}: {lines} after a program of {n_words} words; load it again")
 
     def _forget_program(self) -> None:
-        """Nothing of a program that did not arrive whole may ever be run."""
+        """Clear a program that did not arrive whole: nothing of it may ever be run."""
         try:
             self._line.command("cls")
         except DeviceError as error:

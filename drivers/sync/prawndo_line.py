@@ -40,13 +40,13 @@ class PrawnDoTiming:
     """Deadlines of the line. Over USB a reply takes 1 ms; the rest is for a loaded host."""
 
     reply_s: float = 0.5
-    """For a reply."""
+    """Deadline for a reply."""
     hasty_s: float = 0.06
-    """The same on the way to low outputs, where asking again is better than waiting."""
+    """Deadline for a reply on the way to low outputs, where asking again is better than waiting."""
     lower_s: float = 0.5
-    """For outputs to be confirmed low."""
+    """Deadline for outputs to be confirmed low."""
     load_s: float = 5.0
-    """For the answer to a program: 360 kB at USB full speed, with much to spare."""
+    """Deadline for the answer to a program: 360 kB at USB full speed, with much to spare."""
 
 
 USUAL_TIMING = PrawnDoTiming()
@@ -82,7 +82,7 @@ class PrawnDoLine:
         self._port.close()
 
     def connect(self, most_words: int) -> None:
-        """All outputs low, before anything else is asked, whatever state a former host left the board in.
+        """Take all outputs low, before anything else is asked, whatever state a former host left the board in.
 
         most_words: of any board. `ProtocolError` where something else answers, `DeviceTimeout` where nothing does.
         """

@@ -22,7 +22,9 @@ from drivers.transports.serial_port import SerialPort
 
 
 class FairLock:
-    """To be used by `with`; not re-entrant."""
+    """A lock for `with` that serves threads in turn: whoever waits gets it before the thread that had it last; not
+    re-entrant.
+    """
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
@@ -53,13 +55,13 @@ class LineTiming:
     """Times of the line. The defaults suit a laser; tests with emulators run the same code faster."""
 
     gap_s: float = 0.0
-    """Between a reply and the next command, at least."""
+    """Shortest time between a reply and the next command."""
     reply_s: float = 1.0
-    """For each line of a reply."""
+    """Deadline for each line of a reply."""
     quiet_s: float = 0.3
-    """A line is drained once nothing came for so long..."""
+    """Silence after which a line counts as drained."""
     drain_s: float = 1.0
-    """...or after this long at most."""
+    """Longest time for which a line is drained."""
 
 
 class CommandRefused(ProtocolError):  # noqa: N818 - named after what happened, as all device errors

@@ -184,7 +184,7 @@ class SerialPort:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Whatever pyserial raises about an open port means that it is gone."""
+        """Raise our error for everything that pyserial raises about an open port: it means that the port is gone."""
         try:
             yield
         except (*_FOREIGN, TypeError) as error:

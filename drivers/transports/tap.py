@@ -38,7 +38,7 @@ class TapFile:
 
     @classmethod
     def begin(cls, path: Path) -> "TapFile":
-        """From now on."""
+        """Begin now: the present time counts as 0."""
         return cls(str(path.absolute()), time.monotonic_ns())
 
     def tap(self, device: str) -> "Tap":
@@ -125,7 +125,9 @@ class Passed:
 
 
 def read_taps(file: Path) -> list[Passed]:
-    """All that passed, in order of time; a torn last line is left out. `ProtocolError` for one that is none."""
+    """Everything that passed, in order of time; a torn last line is left out. `ProtocolError` for a file that is no
+    tap's.
+    """
     *lines, _ = file.read_bytes().split(b"\n")
     found = []
     for number, line in enumerate(lines, 1):

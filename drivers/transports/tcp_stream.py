@@ -15,7 +15,7 @@ from drivers.errors import DeviceDisconnected, DeviceError, DeviceNotFound, Devi
 
 _FORBIDDEN = (errno.EACCES, errno.EPERM)
 _CHUNK_BYTES = 65_536
-"""Most that `receive` takes at a time."""
+"""Largest number of bytes that `receive` takes at a time."""
 
 
 class TcpStream:
@@ -76,7 +76,7 @@ class TcpStream:
             return n
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
-        """All that comes until the line is quiet for `quiet_s`, at most for `deadline_s`; to be dropped."""
+        """Take, to be dropped, all that comes until the line is quiet for `quiet_s`, at most for `deadline_s`."""
         ends_at = time.monotonic() + deadline_s
         dropped = bytearray()
         while (left_s := ends_at - time.monotonic()) > 0 and (data := self.receive(min(quiet_s, left_s))):
@@ -104,7 +104,9 @@ class TcpStream:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Whatever a socket raises about an open connection means that it is gone."""
+        """Raise our error for everything that a socket raises about an open connection: it means that the connection is
+        gone.
+        """
         try:
             yield
         except (OSError, ValueError) as error:

@@ -44,7 +44,7 @@ _LOST = (errno.ENODEV, errno.EIO, errno.ESHUTDOWN, errno.ENOTCONN)
 
 
 def no_permission(label: str) -> str:
-    """For a device that is there and may not be opened."""
+    """The error for a device that is there and may not be opened."""
     return f"{label}: no permission to open it; install {UDEV_RULES} (its first lines say how) and plug it in again"
 
 

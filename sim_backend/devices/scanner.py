@@ -37,7 +37,7 @@ class SimulatedScannerConfig(KindConfig):
     clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 20e-6
     """Relative error of the scanner's crystal."""
     start_latency: Annotated[Seconds, Field(ge=0)] = 1.3373e-3
-    """From `start` to the first point; no whole number of frames."""
+    """Time from `start` to the first point; no whole number of frames."""
     jitter: float = Field(default=0.0, ge=0, le=0.1)
     """Standard deviation of the mirror's random error, in units of the drive; a column of the bundled rig is 3.5e-3."""
     serial: str = Field(default="SIM-MIRROR-0001", min_length=1)

@@ -168,7 +168,7 @@ TICK_HZ = 100_000_000
 """
 TICKS_PER_FRAME = 1024
 LINK_BYTES_PER_S = 8e9
-"""More than any frame rate needs: unless the config names a `link`, it is no bottleneck."""
+"""Bytes a second, more than any frame rate needs: unless the config names a `link`, it is no bottleneck."""
 MAX_THREADS = 4
 START_BITS = 48
 MOST_STARTS = 0x3FFF

@@ -50,7 +50,7 @@ class FrameTimes:
 
     @property
     def gap_s(self) -> float:
-        """From the end of an exposure to the start of the next."""
+        """Time from the end of an exposure to the start of the next."""
         return max(0.0, self.period_s - self.exposure_s)
 
 

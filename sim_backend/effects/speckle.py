@@ -47,7 +47,7 @@ class Speckle:
 
 @numba.njit(cache=True, nogil=True)
 def _uniform(key: np.uint64, number: int) -> float:
-    """In (0, 1)."""
+    """A uniform number in (0, 1)."""
     return (float(frame_key(key, np.uint64(number)) >> np.uint64(11)) + 0.5) * 2.0**-53
 
 

@@ -35,7 +35,8 @@ class FluxModel:
         self.setting = setting
         loaded = {entry: entry.load()(setting) for entry in entries if entry.kind != "within"}
         self.laser: Mapping[str, LaserEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "laser"}
-        """By name, in the order in which they add: a later one may act on what the earlier ones brought."""
+        """The laser's effects by name, in the order in which they add: a later one may act on what the earlier ones
+        brought."""
         self.steady: Mapping[str, Array] = {e.name: effect.rate() for e, effect in loaded.items() if e.kind == "steady"}
         """Detections per second (rows, width) by name."""
         self.bits: Mapping[str, BitEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "bits"}
@@ -55,7 +56,7 @@ class FluxModel:
 
     @property
     def hold_s(self) -> float:
-        """For how long the sheet's light may be taken as constant; 0: nothing moves, it is constant for ever."""
+        """Time for which the sheet's light may be taken as constant; 0: nothing moves, it is constant for ever."""
         return min((held for effect in self.laser.values() if (held := hold_s(effect)) > 0), default=0.0)
 
     def without(self, names: Collection[str]) -> "FluxModel":
@@ -82,7 +83,7 @@ class FluxModel:
 
 
 def hold_s(effect: LaserEffect) -> float:
-    """For how long an effect's light stands still; 0: it does not move."""
+    """Time for which an effect's light stands still; 0: it does not move."""
     return float(getattr(effect, "hold_s", 0.0))
 
 

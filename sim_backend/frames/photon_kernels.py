@@ -7,10 +7,9 @@ where
     p = (1 - c) level / 2^16 + c s,     0 <= s <= 1 for every level within [2^16 (p - c) / (1 - c), 2^16 p / (1 - c)]
 
 That interval is three levels wide, so that levels may be computed in float32 while every p is exact to the last bit of
-a float64; 0 never fires and 1 always. The highest level that
-16 bits hold stands for 2^16 itself: its pixels are 1 whatever the random number, so they are set afterwards.
-Random numbers are functions of seed, frame, row and place
-alone (`sim_backend.random_numbers`): windows, threads and blocks do not matter.
+a float64; 0 never fires and 1 always. The highest level that 16 bits hold stands for 2^16 itself: its pixels are 1
+whatever the random number, so they are set afterwards. Random numbers are functions of seed, frame, row and place alone
+(`sim_backend.random_numbers`): windows, threads and blocks do not matter.
 
 Measured, 512 x 512 on one core: 12 us a frame, 0.12 ms for new levels where half of the words are lit. Skipping from
 hit to hit where p is small would not pay: at 0.004 (5 lux behind the stripe) that is a hit in every fourth word, which
@@ -58,7 +57,7 @@ _PER_SKIP = 1.0 / math.log1p(-CHANCE)
 
 _S11 = np.uint64(11)
 _ANEW = np.uint64(2**32)
-"""In the place of the row: the streams of what is drawn anew."""
+"""Number in the place of the row for the streams of pixels that are drawn anew."""
 _STRIP_ROWS = 64
 _UNIT = 2.0**-53
 _PLACE = np.array(PLACE, np.uint8)

@@ -86,7 +86,7 @@ ONE_LINE = LineFan()
 
 
 def _of_rows(sheets: LightSheets, index: int, rows: int) -> LightSheets:
-    """Those of one position and line, one for each row."""
+    """The sheets of one position and line, one for each row."""
     parts = sheets.planes[index], sheets.middle[index], sheets.across[index]
     planes, middle, across = (np.broadcast_to(part, (rows, part.shape[-1])) for part in parts)
     return replace(sheets, planes=planes, middle=middle, across=across)

@@ -1,4 +1,4 @@
-"""From light to detections: lens, sensor and laser line of the simulated rig.
+"""Lens, sensor and laser line of the simulated rig, and the detections that they make of light.
 
 Detections per second of a pixel that sees radiance L:  FF PDP T (pi/4)/N^2 pitch^2 L / (h c / wavelength).
 """

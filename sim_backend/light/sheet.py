@@ -22,7 +22,7 @@ from calibration.model.light_sheet import LightSheets
 Array = NDArray[np.float64]
 
 _TANGENT_STEP_M = 1e-4
-"""To either side of a point: sheets bend over metres."""
+"""Step to either side of a point for the tangent: sheets bend over metres."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -183,7 +183,7 @@ def _surface_slope(surface: Array, axis: int) -> Array:
 
 
 def _inner_joined(joined: NDArray[np.bool_], offset: int) -> NDArray[np.bool_]:
-    """For the outer step at `offset` (1 or -2), whether the inner step between it and the pixel is joined."""
+    """Whether the inner step between the pixel and the outer step at `offset` (1 or -2) is joined."""
     inner = np.zeros_like(joined)
     if offset == 1:
         inner[1:] = joined[:-1]

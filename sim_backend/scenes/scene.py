@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 SCENE_FOLDER = Path(__file__).parents[2] / "config" / "scenes"
 """Folder in which the bundled scenes are found by name."""
 CLEAR = "clear"
-"""In place of a visibility: no fog."""
+"""Word in place of a visibility: no fog."""
 
 
 class AmbientLight(SceneSection):
@@ -45,7 +45,7 @@ class SceneMotion(SceneSection):
     """Motion of the surfaces, all of them together and straight on, from the bench's time 0 on."""
 
     velocity: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] = Field(examples=["[0 m/s, 0 m/s, -2 m/s]"])
-    """Along x (right), y (down), z (away from the camera)."""
+    """Velocity along x (right), y (down), z (away from the camera)."""
 
 
 class BoardPlace(SceneSection):

@@ -73,7 +73,7 @@ class EmulatedWorldConfig(WorldConfig):
     spad: Literal["spb-usb", "spad512s"] = "spb-usb"
     """The SPAD that answers at emulated:spad."""
     scanner_clock_error: float = Field(default=20e-6, ge=-1e-3, le=1e-3)
-    """By how much the scanner's crystal runs fast."""
+    """Relative amount by which the scanner's crystal runs fast."""
 
 
 class EmulatedWorld(SimulatedWorld):

@@ -31,7 +31,7 @@ _TOKEN = re.compile(rb"#[0-9a-f]{8}")
 """A PrawnDO driver numbers its questions so that their answers are known."""
 _BAUD = 10_000_000
 _SAID_AGAIN = 3
-"""So many of the last commands may come again."""
+"""Number of the last commands that may come again."""
 _SCANNERS = {"helios": HeliosModel, "lasercube": LaserCubeModel}
 
 
@@ -45,7 +45,7 @@ class Exchange:
 
     @property
     def form(self) -> bytes:
-        """Without the tokens' numbers."""
+        """The bytes sent without the tokens' numbers."""
         return _TOKEN.sub(b"#00000000", self.sent)
 
     def answer_to(self, sent: bytes) -> bytes:
@@ -95,7 +95,7 @@ class RecordedModel:
         return b"".join(answers)
 
     def tick(self, now_s: float) -> bytes:
-        """It says nothing unasked."""
+        """Do nothing: the device says nothing unasked."""
         return b""
 
     def _match(self, now_s: float) -> bytes | None:
@@ -141,7 +141,7 @@ class RecordedModel:
 
 
 def _uncut(form: bytes) -> bytes:
-    """Without a token that has not come whole."""
+    """The bytes without a token that has not come whole."""
     cut = form.rfind(b"#", max(0, len(form) - 8))
     return form if cut < 0 or _TOKEN.match(form[cut:]) else form[:cut]
 
@@ -204,7 +204,7 @@ class RecordedWorld:
                 self.ports[device] = server.endpoint
 
     def truth(self, commands: NDArray[np.float64], velocity_per_s: float = 0.0) -> SweepTruth:
-        """Nobody asks: the recording keeps its own."""
+        """Raise DeviceError: this world knows no truth."""
         raise DeviceError("a world of recorded devices knows no truth")
 
     def close(self) -> None:

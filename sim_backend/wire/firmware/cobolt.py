@@ -114,7 +114,7 @@ class CoboltModel:
 
     @property
     def emitting(self) -> bool:
-        """It would shine through an open gate."""
+        """Whether the laser would shine through an open gate."""
         return self.power_w > 0
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:

@@ -177,5 +177,5 @@ class DacModel(UsbModel):
         raise NotImplementedError
 
     def _halt(self, now_s: float) -> None:
-        """Nothing is left to play."""
+        """End playing: nothing is left to play."""
         raise NotImplementedError

@@ -69,12 +69,12 @@ class ObisModel:
 
     @property
     def able(self) -> bool:
-        """Nothing forbids emission."""
+        """Whether nothing forbids emission."""
         return self.key_on and not self.interlock_open and not self.fault
 
     @property
     def emitting(self) -> bool:
-        """It would shine through an open gate."""
+        """Whether the laser would shine through an open gate."""
         return self.able and self.state_on and self._lit_at_s is not None and self._now_s >= self._lit_at_s
 
     @property

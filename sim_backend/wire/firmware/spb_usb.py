@@ -122,7 +122,7 @@ class SpbUsbModel(UsbModel):
         self._reset()
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Nothing happens: hosts choose the setting that is there."""
+        """Do nothing: hosts choose the setting that is there."""
 
     def control(self, setup: Setup, data: bytes, now_s: float) -> Answer:
         """FT601: its configuration (0xCF) and its own firmware version (0xF1)."""

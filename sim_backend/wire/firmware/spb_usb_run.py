@@ -71,7 +71,7 @@ class BlockMemory:
         self._next = 0
 
     def take(self, size: int) -> NDArray[np.uint8]:
-        """The one that was given out longest ago."""
+        """The buffer that was given out longest ago."""
         if self._next == len(self._buffers):
             self._buffers.append(np.zeros(0, np.uint8))
         if len(self._buffers[self._next]) != size:
@@ -88,7 +88,7 @@ class BlockMemory:
 
 
 class EmulatedRun:
-    """From START to its last block."""
+    """A run from START to its last block."""
 
     def __init__(
         self,
@@ -103,9 +103,9 @@ class EmulatedRun:
         self.next_frame = 0
         self.pinged_s = now_s
         self.over = False
-        """Its last block was made."""
+        """Whether the last block was made."""
         self.high_water_bytes = 0
-        """Most that waited for the host."""
+        """Largest number of bytes that waited for the host."""
         self._board, self._source, self._memory, self._run_id = board, source, memory, run_id
         self._period, self._exposure = registers[Register.PERIOD_TICKS], registers[Register.EXPOSURE_TICKS]
         self._burst = registers[Register.MODE] == 1
@@ -287,7 +287,7 @@ def registers_at_power_up(
     protocol: int,
     features: Feature,
 ) -> dict[int, int]:
-    """All of them by address, those that nobody wrote yet 0."""
+    """The registers by address; those that nobody wrote yet are 0."""
     registers = dict.fromkeys(WRITABLE, 0)
     registers |= {
         Register.MAGIC: IDENTITY_MAGIC,

@@ -83,7 +83,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
             return iter(list(self._devices))
 
     def get_parent(self, dev: AttachedDevice) -> None:
-        """All devices hang on the root."""
+        """None: all devices hang on the root."""
         return None
 
     def get_device_descriptor(self, dev: AttachedDevice) -> SimpleNamespace:
@@ -129,7 +129,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         )
 
     def get_interface_descriptor(self, dev: AttachedDevice, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """By index, IndexError past the end."""
+        """The interface descriptor by index; IndexError past the end."""
         one = _alternate(dev, intf, alt)
         return SimpleNamespace(
             bLength=9,
@@ -147,7 +147,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
     def get_endpoint_descriptor(
         self, dev: AttachedDevice, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """By index, IndexError past the end."""
+        """The endpoint descriptor by index; IndexError past the end."""
         end = _alternate(dev, intf, alt).endpoints[ep]
         return SimpleNamespace(
             bLength=7,
@@ -186,7 +186,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
             dev_handle.device.set_alternate(intf, altsetting, dev_handle)
 
     def claim_interface(self, dev_handle: _Handle, intf: int) -> None:
-        """For this handle."""
+        """Claim an interface for this handle."""
         with _pyusb_errors():
             dev_handle.device.claim(intf, dev_handle)
 
