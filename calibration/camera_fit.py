@@ -81,7 +81,7 @@ def camera_normal(
 Mask = NDArray[np.bool_]
 
 LEAST_SD_PX = 0.01
-"""Corners are never better than this, however well they fit."""
+"""Least sd of corners: they are never better than this, however well they fit."""
 _MOST_FOCAL_SD = 0.05
 """Largest relative sd of the focal length: above, depth would be wrong by as much."""
 _MOST_CONDITION = 1e11
@@ -256,9 +256,9 @@ _VIEW_LIMIT = 2.5
 _CORNER_LIMIT = 6.0
 """Sds of either coordinate beyond which a corner is left out."""
 _FEW_CORNERS = 1
-"""Left out of a view without naming it."""
+"""Number of corners that may be left out of a view without naming it."""
 _LEAST_CLOSE = 0.7
-"""Share of a view's corners; with fewer that fit, none is used."""
+"""Least share of a view's corners; with fewer that fit, none is used."""
 _FEWEST_VIEWS = 3
 """Fewest views that must stay when outliers leave."""
 _MAX_ROUNDS = 20

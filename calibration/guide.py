@@ -46,7 +46,7 @@ PLACES = {
     (1, 1): "in the lower right corner",
 }
 TILT_RAD = math.radians(35)
-"""Enough for a strong perspective, little enough for corners to be found."""
+"""Tilt of a tilted board: enough for a strong perspective, little enough for corners to be found."""
 TILTS = {
     (0, 0): "facing the camera",
     (0, 1): "its left side turned away",
@@ -201,7 +201,7 @@ BOARD_POINTS = 14
 _CELLS = (9, 7)
 """Cells of the picture, across and down, in whose middles the depth error is looked at."""
 BORDER_PX = 2.0
-"""Corners nearer to the picture's border are not found."""
+"""Distance from the picture's border within which corners are not found."""
 
 
 class Forecast:

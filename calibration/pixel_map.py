@@ -299,10 +299,10 @@ _LEAST_HOT = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelDrift:
-    """From an older map to a newer one.
+    """The change from an older map to a newer one.
 
-    became_hot, became_dead, recovered: (n, 2) row and column; hot ones where the change is more than chance. ratio:
-    of the ordinary pixels' rates, newer to older, with ratio_sigma, its distance from 1 in sd. changed: share of the
+    became_hot, became_dead, recovered: (n, 2) row and column; hot ones where the change is more than chance. ratio: of
+    the ordinary pixels' rates, newer to older, with ratio_sigma, its distance from 1 in sd. changed: share of the
     pixels whose rates differ by more than chance once that factor is taken out. correlation: of the logarithms of the
     rates, NaN where either has none. alike: share of the old hot pixels that are hot still, None for too few.
     new_defects: share of all pixels that became hot or dead.

@@ -68,7 +68,7 @@ class Verdict:
 
 
 MOST_POSES: Final = 50
-"""Most poses that anybody shows: four times those of a usual session."""
+"""Most poses that anybody shows: four times those of a usual calibration."""
 
 _GUIDED = " ('--guided' says which)"
 _TELL_MORE = f"make each pose tell more, with more light, the board nearer and tilted more{_GUIDED}"
@@ -97,13 +97,13 @@ def reason_for(code: str, text: str, value: float = math.nan, limit: float = mat
 
 
 def unguided(verdict: Verdict) -> Verdict:
-    """The same for a command that has no guided mode."""
+    """The verdict for a command that has no guided mode: no next step names one."""
     reasons = tuple(replace(reason, next_step=reason.next_step.replace(_GUIDED, "")) for reason in verdict.reasons)
     return replace(verdict, reasons=reasons)
 
 
 def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, said: Callable[[float], str]) -> Reason:
-    """Nothing is wrong with the data but their number: errors fall with the root of it.
+    """The reason where nothing is wrong with the data but their number: errors fall with the root of it.
 
     what: the words before an error; found: its median and 95 % over the picture, of which the one that is farther from
     what is asked for is named; said: an error in words.

@@ -34,7 +34,7 @@ class Mark(IntFlag):
     BACKWARD = 32
     """Level, not edge: the scanner runs backward."""
     WINDOW_LOST = 64
-    """The device lost the line its window table is at; `x0` is not to be trusted."""
+    """The device lost the line that its window table is at; `x0` is not to be trusted."""
 
 
 class BlockFlag(IntFlag):
@@ -76,9 +76,9 @@ class BlockHeader:
 
     flags: BlockFlag
     run_id: int
-    """Changes at each START, so that stale data after a re-arm is recognised; 16 bit."""
+    """Number of the run, 16 bit; changes at each START, so that stale data after a re-arm is recognised."""
     block_seq: int
-    """Counts blocks of the run from 0."""
+    """Number of the block in its run, from 0."""
     first_frame: int
     """Number of the first frame; counts *exposed* frames since START, lost ones included."""
     t0_ticks: int

@@ -43,7 +43,7 @@ Length = Annotated[float, BeforeValidator(_metres)]
 
 
 class BoardFile(FileSection):
-    """One board."""
+    """The keys of a board's file."""
 
     kind: Literal["charuco", "chessboard"] = Field(description="with markers in the white squares, or without")
     squares: tuple[int, int] = Field(description="squares along x and y, those at the border included")

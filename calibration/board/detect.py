@@ -59,7 +59,7 @@ _OUTLIER_SDS = 6.0
 than the map does."""
 _LEAST_OUTLIER_PX = 0.3
 _MOST_USUAL_SDS = 4.0
-"""A corner whose sd is more than that of its neighbours was not laid over what it should be."""
+"""Largest ratio of a corner's sd to that of its neighbours: beyond, the drawing was laid over something else."""
 _LEAST_OUTLIER_SQUARES = 0.02
 
 

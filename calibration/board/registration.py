@@ -35,7 +35,7 @@ no two corners share pixels and their errors, which a fit takes to be independen
 _MOST_REACH_PX = 16
 _LEAST_REACH_PX = 4
 _SEARCH_SQUARES = 0.25
-"""Beyond that a shift could mistake one module of a marker for the next."""
+"""Farthest search for a corner: beyond, a shift could mistake one module of a marker for the next."""
 _POWERS = [(i, j) for i in range(4) for j in range(4 - i)]
 """Powers of x and y in pixels that place the drawing around a corner: a tilt and a lens bend no more over two
 squares."""

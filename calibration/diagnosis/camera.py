@@ -28,7 +28,7 @@ from calibration.views import View
 Array = NDArray[np.float64]
 
 ACCURACY_PX = 0.1
-"""Good enough: no estimator finds the stripe better in fog."""
+"""Error of a pixel's place that is good enough: no estimator finds the stripe better in fog."""
 _GRID = 16
 _STEP = 1e-6
 

@@ -23,7 +23,7 @@ from calibration.views import FEWEST_CORNERS, BoardPose, Corners, View
 Array = NDArray[np.float64]
 
 _WHITE_PERCENT = 75
-"""Half of a board is white: this percentile of its pixels is."""
+"""Percentile of the board's pixels that is white: half of a board is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ def _room_flux(view: View) -> float:
 
 
 def _within(corners: Corners, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """True in the outline of the corners; everywhere where there is none."""
+    """Mask of the pixels within the outline of the corners; all of them where there is none."""
     if len(corners.ids) < 3:
         return np.ones(shape, bool)
     mask = np.zeros(shape, np.uint8)
@@ -134,7 +134,8 @@ _FEWEST_TO_JUDGE = 3
 _MEND_VIEWS = "mend what is said of the other views, then show more"
 _SHOW_ANEW = "show the board again for each of these, at rest until its sweeps are over"
 FEWEST_POSES: Final = 6
-"""With fewer, a single bad view bends the fit to it, so that nothing shows that it was bad."""
+"""Fewest poses that can be checked: with fewer, a single bad view bends the fit to it, and nothing shows that it was
+bad."""
 FEWEST_WHY: Final = "are the fewest that can be checked against each other"
 
 

@@ -53,7 +53,8 @@ MOST_SHIFT = 0.25
 depth is off by several times what is left: 2 to 5 times over 30 simulated knocks."""
 
 WAVES_MOVE = 2.0
-"""Waves move whole views too, of few sweeps by as much as sweeps differ: up to 1.35 times it was in 23 sessions."""
+"""Multiple of the waves that a view's shift must exceed to count as a move: waves move whole views too, of few sweeps
+by as much as sweeps differ, up to 1.35 times in 23 simulated calibrations."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,7 +61,7 @@ class PivotSection(FileSection):
 
 
 class ScannerSection(FileSection):
-    """One of the two forms."""
+    """The scanner, in one of its two forms."""
 
     table: TableSection | None = None
     pivot: PivotSection | None = None
@@ -109,7 +109,7 @@ class ProvenanceSection(BaseModel):
 
 
 class CalibrationFile(FileSection):
-    """The whole file."""
+    """The whole calibration file."""
 
     format: Literal["spadrig-calibration"]
     version: Literal[1]

@@ -46,7 +46,7 @@ _RING = 1e-3
 """Step, in tangents, at which a fold is looked for."""
 
 _MAX_TANGENT = 20.0
-"""Rays steeper than 87 degrees are beyond any lens this model describes."""
+"""Largest tangent: rays steeper than 87 degrees are beyond any lens this model describes."""
 
 
 class Forward(NamedTuple):

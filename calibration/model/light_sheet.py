@@ -29,7 +29,8 @@ Array = NDArray[np.float64]
 NEARLY_PARALLEL: Final = 1e-6
 """Sine of the angle between ray and plane below which there is no depth: 1e-3 px, finer than any calibration."""
 LEAST_OFFSET_M: Final = 1e-6
-"""A plane that passes the camera closer than this gives no depth: all its points are seen on one line."""
+"""Least distance of a plane from the camera; one that passes closer gives no depth: all its points are seen on one
+line."""
 
 
 def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
@@ -115,7 +116,7 @@ class LightSheets:
         return off
 
     def inverse_depth(self, u: ArrayLike, v: ArrayLike) -> Array:
-        """1/z (1/m) of rays (u, v), by the same rules as `triangulation.inverse_depth`, which it is for planes.
+        """1/z (1/m) of rays (u, v), by the same rules as the module's `inverse_depth`, which it is for planes.
 
         With w = 1/z and the ray r it is n.r - d w = tan(bow phi^2) hypot(p, q) of r - w O: nearly linear in w, and
         regular for rays that never meet the sheet. Newton's method begins at the plane.
@@ -139,7 +140,7 @@ class LightSheets:
         return np.where(found, w, np.nan)
 
     def depth(self, u: ArrayLike, v: ArrayLike) -> Array:
-        """Depth z (m) of rays (u, v), by the same rules as `triangulation.depth`, which it is for planes."""
+        """Depth z (m) of rays (u, v), by the same rules as the module's `depth`, which it is for planes."""
         if not self.bow_per_rad:
             return depth(u, v, self.planes)
         w = self.inverse_depth(u, v)

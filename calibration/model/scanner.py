@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 _ROUNDING = 1e-15
 """A few units in the last place of 1.0."""
 _MOST_ANGLE_RAD = 1e3
-"""Sines of larger angles lose digits; no mirror turns that far."""
+"""Largest angle: sines of larger ones lose digits, and no mirror turns that far."""
 _MOST_OFFSET_M = 10.0
 """Metres by which light could pass the axis of any mirror."""
 _MOST_CONE_RAD = 0.5

@@ -159,9 +159,9 @@ ODD_TIMES = 8.0
 EXPLAINED_SHARE = 0.05
 """Alternatively: at most this share of the misfit is left when the view has its own place of the scanner,"""
 OTHERS_SHARE = 0.3
-"""and at least this whichever other view had one,"""
+"""and at least this share is left whichever other view has one,"""
 LEAST_EXPLAINED = 2.0
-"""where there is as much of a misfit as this factor on the variances."""
+"""where the misfit is at least this factor on the variances."""
 FEWEST_TO_TELL = 4
 """Views with passages: of fewer none is the usual one."""
 UNDECIDED_SD = 2.5
@@ -203,7 +203,7 @@ def with_passages(problem: RigProblem) -> NDArray[np.bool_]:
 
 
 def _own_place(problem: RigProblem, solution: RigSolution, view: int) -> float:
-    """Fall of chi2 to first order."""
+    """Fall of chi2, to first order, when the view has its own place of the scanner."""
     at = problem.terms.at(SCANNER_MOVES)
     tie, own = problem.tie, solution.views[view]
     inverse, _ = scaled_inverse(tie.T @ solution.matrix @ tie)

@@ -142,7 +142,7 @@ parameter."""
 ROUGH_SHARE = 1e-4
 """Share of chi2 that the next step may still promise where a term is only looked for."""
 WORSE_CHI2 = 0.1
-"""A step may do harm by this: derivatives are exact but for how a bow changes along the line."""
+"""Amount by which a step may raise chi2: derivatives are exact but for how a bow changes along the line."""
 MOST_DAMPING = 1e8
 MOST_CONDITION = 1e12
 """Largest condition number of the scaled equations; beyond it float64 leaves no digits of the worst direction."""
@@ -268,7 +268,7 @@ def scaled_inverse(matrix: Array) -> tuple[Array, float]:
 
 
 def _damped(matrix: Array, right: Array, damping: float) -> Array:
-    """Step of the free parameters."""
+    """The damped step of the free parameters."""
     scale = 1 / np.sqrt(np.diag(matrix))
     scaled = matrix * scale[:, None] * scale + damping * np.eye(len(scale))
     result: Array = scale * np.linalg.solve(scaled, scale * right)
@@ -319,7 +319,7 @@ def _off(prior: Prior, terms: Terms, state: RigState) -> Array:
 
 
 def _camera_values(camera: Camera, terms: Terms) -> Array:
-    """(p,), 0 for what is not the camera's."""
+    """The camera's values (p,), 0 for the other parameters."""
     values: Array = np.zeros(len(terms.names))
     (fx, _, cx), (_, fy, cy) = camera.matrix[:2]
     values[: 4 + terms.lens] = [fx, fy, cx, cy, *camera.distortion[: terms.lens]]

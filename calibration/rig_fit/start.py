@@ -35,7 +35,7 @@ _ORDERS = (3, 1, 3)
 POSES_FOR_PLANES = 5
 """Fewest boards; on fewer a command's light leaves too few lines to lay a plane through, all errors considered."""
 MOST_FIRST_LAG_S = 1e-3
-"""Ten times that of a small galvo."""
+"""Largest first value of a lag: ten times that of a small galvo."""
 _STEP = 0.7
 """Share of its range by which a sweep's planes are sampled; the ends are worst known."""
 

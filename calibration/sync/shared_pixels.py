@@ -45,7 +45,7 @@ class SharedPixels:
 
     @classmethod
     def of(cls, sweeps: Sequence[Passages]) -> "SharedPixels":
-        """Degenerate where too few pixels are shared."""
+        """Collect the pixels that sweeps share. Degenerate where they are too few."""
         places = [np.stack([sweep.y_px, sweep.x_px], axis=1) for sweep in sweeps]
         every = np.concatenate([*places, np.empty((0, 2))])
         pixels, index = np.unique(every, axis=0, return_inverse=True)

@@ -26,7 +26,7 @@ _READ_BYTES = 65_536
 
 
 class Channel:
-    """One end. Sending is safe from any thread, receiving belongs to one."""
+    """One end of the connection. Sending is safe from any thread, receiving belongs to one."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
@@ -111,7 +111,7 @@ _NO_FRAME = -1
 
 
 class Heartbeat:
-    """The page, in either process."""
+    """The shared page, in either process."""
 
     def __init__(self, handle: int) -> None:
         """handle: of an anonymous file of at least a page."""

@@ -66,7 +66,7 @@ class GuardedLaser(LineLaser):
         return LaserStatus(**self._guard.ask("laser", "status"))
 
     def _check_health(self) -> None:
-        """The guard's own `arm` does it: a slow laser is not asked twice."""
+        """Do nothing: the guard's own `arm` checks, and a slow laser is not asked twice."""
 
     def _do_arm(self, power_w: float) -> None:
         self._guard.ask("laser", "arm", power_w)
@@ -250,7 +250,7 @@ class Guard:
         self._heartbeat.waited_s = waited_s
 
     def expect(self, limits: GuardLimits) -> None:
-        """Other limits from now on, as for a burst, which is silent until it is read out."""
+        """Set other limits from now on, as for a burst, which is silent until it is read out."""
         self._channel.send({"limits": asdict(limits)}, within_s=1.0)
 
     def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
@@ -383,7 +383,7 @@ class Guard:
             self._parted = True
 
     def _end(self) -> None:
-        """The guard has ended: as asked, after it made all safe, or by force."""
+        """Deal with the end of the guard: as asked, after it made all safe, or by force."""
         if self._parted:
             self._lost.set()
         else:

@@ -54,7 +54,7 @@ _ENABLING = ("arm", "program", "run")
 
 
 class GuardProcess:
-    """One session. `run` returns the exit code: 0 after a normal end, 1 where the guard had to act."""
+    """The guard of one application. `run` returns the exit code: 0 after a normal end, 1 where the guard had to act."""
 
     def __init__(self, channel: Channel, heartbeat: Heartbeat) -> None:
         self._channel = channel
@@ -96,7 +96,7 @@ class GuardProcess:
     # Messages
 
     def _receive(self) -> list[Message]:
-        """Messages that come within a tick."""
+        """Deal with the messages that come within a tick."""
         sources = [self._channel.fileno()]
         if self._application is not None and self._application.handle is not None:
             sources.append(self._application.handle)
@@ -175,7 +175,7 @@ class GuardProcess:
     # Watching
 
     def _look(self, elapsed_s: float) -> None:
-        """One tick."""
+        """Look at the application and the devices once, at every tick."""
         if self._terminated:
             self._trip(DeviceFault("the guard was told to end"))
             self._ending = True
@@ -212,7 +212,7 @@ class GuardProcess:
                 application.kill()
 
     def _suspect(self, trouble: str, stopped: bool, now: float) -> None:
-        """No frames: unless the program has come to its end by itself, which its gate can tell."""
+        """Act on missing frames, unless the program has come to its end by itself, which its gate can tell."""
         sync = self._owned.get("sync")
         if stopped or sync is None or (self._check_until is not None and now > self._check_until):
             self._trip_application(trouble, stopped)
@@ -283,7 +283,7 @@ class GuardProcess:
     # Ending the light
 
     def _trip(self, cause: DeviceError) -> bool:
-        """Gate low and laser paused, at once and whatever else is under way. False: it was done before."""
+        """Take the gate low and pause the laser, at once and whatever else is under way. False: it was done before."""
         with self._trip_lock:
             if self._tripped is not None:
                 return False
@@ -298,7 +298,7 @@ class GuardProcess:
         return True
 
     def _make_safe(self) -> None:
-        """Give the lanes what is due."""
+        """Give the lanes the jobs that are due."""
         with self._trip_lock:
             due = [owned for owned in self._owned.values() if owned.due]
             for owned in due:
@@ -308,7 +308,7 @@ class GuardProcess:
             lane.do(owned.try_safe, first=True)
 
     def _end(self) -> int:
-        """Everything safe and closed."""
+        """Make everything safe and close it."""
         ends_at = time.monotonic() + GIVE_UP_S
         while any(owned.unsafe for owned in self._owned.values()) and time.monotonic() < ends_at:
             self._make_safe()
@@ -327,7 +327,9 @@ class GuardProcess:
 
 
 def _told(error: Exception) -> list[str]:
-    """The error for the application; one that is none of a device's is a fault of ours, with all there is to know."""
+    """The error as the application is told it; one that is no device's is a fault of the guard, with all there is to
+    know.
+    """
     if not isinstance(error, DeviceError):
         _log.exception("guard")
     return error_message(error)
@@ -347,15 +349,15 @@ FREE_S = 1.0
 """Time for the kernel to free the ports of a process that ended."""
 _RETRY_S = 0.005
 OFF_TIMES, OFF_GAP_S = 2, 0.11
-"""`Kind.off` is sent so often, so far apart: a Cobolt heeds no command within 0.1 s of another (hardware.md 4.1), and
-the guard may just have asked something."""
+"""Number of times that `Kind.off` is sent, and their distance: a Cobolt heeds no command within 0.1 s of another
+(hardware.md 4.1), and the guard may just have asked something."""
 
 
 class Rescue:
     """Lowers gate and laser at the same time, each on a thread of its own."""
 
     def __init__(self, configs: Mapping[str, Any], ports: Mapping[str, Endpoint]) -> None:
-        """Finds the drivers now: there will be no time to import them."""
+        """Find the drivers now: there will be no time to import them."""
         surroundings = Surroundings(SystemClock(), None, 0, ports)
         self._create: dict[str, Callable[[], Any]] = {}
         self._off: dict[str, tuple[Callable[[], Endpoint], bytes]] = {}

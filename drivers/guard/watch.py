@@ -52,7 +52,7 @@ class GuardLimits:
 
 
 class FrameWatch:
-    """Watches between `start` and `stop`."""
+    """The decision whether frames come as they should, from `start` to `stop`."""
 
     def __init__(self, limits: GuardLimits) -> None:
         self.limits = limits
@@ -77,11 +77,11 @@ class FrameWatch:
         return self._watching and self._begun and self._silent_s > self.limits.frames_within_s
 
     def start(self, frame: int) -> None:
-        """The gate may open from now on; `frame` is the last number told before."""
+        """Note that the gate may open from now on; `frame` is the last number told before."""
         self._last, self._begun, self._silent_s, self._watching = frame, False, 0.0, True
 
     def stop(self) -> None:
-        """The gate is low."""
+        """Note that the gate is low."""
         self._watching = False
 
     def look(
@@ -115,7 +115,7 @@ class FrameWatch:
 
 _STOPPED = ("T", "t")
 _AT_WORK = ("R", "D")
-"""Running or waiting for a processor; waiting for a disk."""
+"""States of a thread at work: running or waiting for a processor; waiting for a disk."""
 _BUSY_SHARE = 0.15
 """Share of a time that all threads together have run, or waited to, in a process at work. One that hangs wakes some
 service thread for microseconds now and then."""
@@ -136,7 +136,7 @@ class WatchedProcess:
         self._since = 0.0
         self._found_asleep = False
         self.handle: int | None = None
-        """Readable once the process has ended; None where the kernel has no pidfd (before Linux 5.3)."""
+        """Handle that is readable once the process has ended; None where the kernel has no pidfd (before Linux 5.3)."""
         if hasattr(os, "pidfd_open"):
             try:
                 self.handle = os.pidfd_open(pid)
@@ -160,7 +160,7 @@ class WatchedProcess:
         return _state(f"/proc/{self._pid}/stat") in _STOPPED
 
     def note_progress(self) -> None:
-        """Work is counted from now on."""
+        """Count work from now on."""
         self._worked_ns = {task: _work_ns(task) for task in self._tasks()}
         self._since = time.monotonic()
         self._found_asleep = False
@@ -192,7 +192,7 @@ class WatchedProcess:
             return []
 
     def kill(self) -> None:
-        """End it; nothing happens where it has ended."""
+        """End the process; nothing happens where it has ended."""
         if self.ended:
             return
         with suppress(ProcessLookupError):

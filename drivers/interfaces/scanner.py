@@ -64,7 +64,7 @@ class ScannerStatus:
     moving: bool
     fault: str | None
     position: float | None
-    """Normalised drive; None where the device does not say."""
+    """Position of the mirror, normalised drive; None where the device does not say."""
 
 
 class BeamScanner(Device):
@@ -141,7 +141,7 @@ class BeamScanner(Device):
         self._do_park()
 
     def _note_end(self) -> None:
-        """A waveform ends by itself: learn of it where the state matters."""
+        """Learn, where the state matters, that a waveform has ended by itself."""
         if self._state is DeviceState.RUNNING and not self._do_status().moving:
             self._state = DeviceState.CONFIGURED
 

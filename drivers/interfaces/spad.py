@@ -181,7 +181,7 @@ class SpadHealth:
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
     """Temperatures by the place where each is measured."""
     excess_bias_v: float | None = None
-    """Bright light at a high one ages the chip."""
+    """Excess bias of the diodes; bright light at a high one ages the chip."""
     frame_clock_hz: float | None = None
     memory_high_water_bytes: int | None = None
     """Largest amount of data that waited in the sensor's memory in the last run."""
@@ -201,7 +201,7 @@ class SpadArray(Device):
     @property
     @abstractmethod
     def info(self) -> SpadInfo:
-        """Geometry and abilities."""
+        """Geometry and abilities of the sensor."""
 
     @property
     def identity(self) -> str:

@@ -42,12 +42,12 @@ _MOST_LINES = 3
 
 
 class CoboltFraming:
-    """A `Framing`."""
+    """The form of a Cobolt's commands and replies."""
 
     ping = "?"
 
     def greets(self, reply: str) -> bool:
-        """`OK`."""
+        """Whether the reply is `OK`."""
         return reply == DONE
 
     def encode(self, command: str) -> bytes:
@@ -55,7 +55,7 @@ class CoboltFraming:
         return command.encode("ascii") + b"\r"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The line that follows it, without junk, and without the echo, should it be on."""
+        """The line that follows the command, without junk, and without the echo, should it be on."""
         for _ in range(_MOST_LINES):
             reply = _JUNK.sub("", read_line().rpartition(command)[2].strip())
             if reply:
@@ -91,7 +91,7 @@ class Dialect(Protocol):
         ...
 
     def set_power(self, power_w: float) -> None:
-        """Power while the gate is high. Read back."""
+        """Set the power while the gate is high. Read back."""
         ...
 
     def power_w(self, mode: str) -> float | None:
@@ -99,7 +99,7 @@ class Dialect(Protocol):
         ...
 
     def darken(self) -> None:
-        """No light in any mode that knows a power, at once and without the key."""
+        """Leave no light in any mode that knows a power, at once and without the key."""
         ...
 
     def brighten(self) -> None:
@@ -123,7 +123,7 @@ def classify(model: str) -> str:
 
 
 class MldDialect:
-    """06-MLD: `slmp`, `sdmes`, `em`."""
+    """The language of 06-MLD: `slmp`, `sdmes`, `em`."""
 
     family = "06-MLD"
     _MODES = ("constant current", "constant power")
@@ -132,7 +132,7 @@ class MldDialect:
         self._line = line
 
     def mode(self) -> str:
-        """`gam?`: 0 constant current, 1 constant power, 2 modulation."""
+        """The answer to `gam?`: 0 constant current, 1 constant power, 2 modulation."""
         return self._line.ask("gam?", re.compile("[012]"))
 
     def input_mode(self, mode: str) -> str:
@@ -142,23 +142,23 @@ class MldDialect:
         return _inputs(self._line.ask_flag("gdmes?"), self._line.ask_flag("games?"))
 
     def gate(self) -> None:
-        """Digital modulation on, analog off, modulation mode."""
+        """Set digital modulation on, analog off, and modulation mode."""
         self._line.tell_and_check("sdmes 1", "gdmes?", FLAG, "1".__eq__)
         self._line.tell_and_check("sames 0", "games?", FLAG, "0".__eq__)
         self._line.tell_and_check("em", "gam?", COUNT, "2".__eq__)
 
     def set_power(self, power_w: float) -> None:
-        """`slmp` takes milliwatts."""
+        """Set the power; `slmp` takes milliwatts."""
         self._power_mw(power_w * 1e3)
 
     def power_w(self, mode: str) -> float | None:
-        """`glmp?` in milliwatts, `p?` in watts."""
+        """The power set, in W: `glmp?` answers in milliwatts, `p?` in watts."""
         if mode == "0":
             return None
         return self._line.ask_number("glmp?") * 1e-3 if mode == "2" else self._line.ask_number("p?")
 
     def darken(self) -> None:
-        """The power of the present mode first: this may be an emergency."""
+        """Set powers to 0, that of the present mode first: this may be an emergency."""
         self._power_mw(0.0)
         self._line.tell("p 0")
 
@@ -166,7 +166,7 @@ class MldDialect:
         """Nothing more to do: the power alone makes this laser bright."""
 
     def waits_for_key(self) -> bool:
-        """`gom?` 1."""
+        """Whether `gom?` is 1."""
         return self._line.ask("gom?", COUNT) == "1"
 
     def _power_mw(self, power_mw: float) -> None:
@@ -193,24 +193,24 @@ class ScpiDialect:
         return _inputs(self._line.ask_flag("las:pm:dig:ena?"), self._line.ask_flag("las:pm:ana:ena?"))
 
     def gate(self) -> None:
-        """The modulator must be the external one: as "command" it follows `!e` and `!d` without ever replying."""
+        """Set the external modulator and nothing else: as "command" it follows `!e` and `!d` without ever replying."""
         self._line.tell_and_check("las:pm:dig:ena 1", "las:pm:dig:ena?", FLAG, "1".__eq__)
         self._line.tell_and_check("las:pm:ana:ena 0", "las:pm:ana:ena?", FLAG, "0".__eq__)
         self._line.tell("laser:pm:dig:modulator external")
         self._line.tell_and_check("laser:runmode PowerModulation", "laser:runmode?", WORD, _is_modulation)
 
     def set_power(self, power_w: float) -> None:
-        """Milliwatts."""
+        """Set the power, in milliwatts on the wire."""
         self._power_mw(power_w * 1e3)
 
     def power_w(self, mode: str) -> float | None:
-        """Milliwatts in both modes that know a power."""
+        """The power set, in W; milliwatts on the wire, in both modes that know a power."""
         if mode == "powermodulation":
             return self._line.ask_number(f"{self._POWER}?") * 1e-3
         return self._line.ask_number("laser:cp:power:setpoint?") * 1e-3 if mode == "constantpower" else None
 
     def darken(self) -> None:
-        """`las:paus 1` blanks it at once; the powers of 0 tell the next program so."""
+        """Blank at once by `las:paus 1`; the powers of 0 tell the next program so."""
         self._line.tell("las:paus 1")
         self._power_mw(0.0)
         self._line.tell("laser:cp:power:setpoint 0")
@@ -220,7 +220,7 @@ class ScpiDialect:
         self._line.tell("las:paus 0")
 
     def waits_for_key(self) -> bool:
-        """`state?` AutostartWaitingForKeyOn."""
+        """Whether `state?` is AutostartWaitingForKeyOn."""
         return "waitingforkey" in self._line.ask("state?", WORD).lower()
 
     def _power_mw(self, power_mw: float) -> None:
@@ -306,7 +306,7 @@ class CoboltLaser(SerialLaser):
         self._armed = True
 
     def _enable(self, power_w: float) -> None:
-        """Dark until the gate is known to govern the light; only then the power."""
+        """Keep the laser dark until the gate is known to govern the light; only then set the power."""
         dialect = self._dialect
         gated = all(dialect.input_mode(dialect.mode()) == "digital" for _ in range(2))  # a flipped bit must not shine
         on = self._line.ask_flag("l?")
@@ -394,7 +394,9 @@ def _dialect(line: Dialogue, model: str) -> Dialect:
 
 
 def _off(config: CoboltConfig) -> bytes:
-    """No line end before it: an empty command may count as one, and what follows within 0.1 s is not heeded."""
+    """Bytes that switch off. No line end before them: an empty command may count as one, and what follows within 0.1 s
+    is not heeded.
+    """
     return b"l0\r"
 
 

@@ -68,7 +68,9 @@ ERRORS = {
 
 
 class ObisFraming:
-    """A `Framing`. channel: slot of the laser in a Remote; None: it is on the port itself."""
+    """The form of an OBIS's commands and replies. channel: slot of the laser in a Remote; None: it is on the port
+    itself.
+    """
 
     def __init__(self, channel: int | None) -> None:
         self._suffix = "" if channel is None else str(channel)
@@ -78,7 +80,7 @@ class ObisFraming:
 
     @property
     def ping(self) -> str:
-        """Who it is; before all else, whether the handshake is on."""
+        """The question who the laser is; before all else, whether the handshake is on."""
         return _HANDSHAKE if self._handshake is None else "*IDN?"
 
     def greets(self, reply: str) -> bool:
@@ -91,12 +93,12 @@ class ObisFraming:
         return True
 
     def encode(self, command: str) -> bytes:
-        """Addressed, with CRLF."""
+        """The bytes of a command, addressed, with CRLF."""
         addressed = command if command == _HANDSHAKE else _ADDRESSED.sub(rf"\g<1>{self._suffix}", command)
         return addressed.encode("ascii") + b"\r\n"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """A set that answers nothing is done: how it reads back will tell."""
+        """The reply to a command. A set that answers nothing counts as done: how it reads back will tell."""
         if not command.endswith("?"):
             return read_line() if self._handshake else DONE
         reply = read_line()
@@ -106,7 +108,7 @@ class ObisFraming:
         return reply
 
     def refusal(self, reply: str) -> str | None:
-        """Number and meaning."""
+        """Number and meaning of the error; None: the reply is none."""
         error = _ERROR.fullmatch(reply)
         return f"{reply} ({ERRORS.get(int(error[1]), 'no known number')})" if error is not None else None
 
@@ -299,7 +301,7 @@ class ObisLaser(SerialLaser):
         return "; ".join(said) or None
 
     def _out_of_range(self, base_c: float) -> TemperatureRange | None:
-        """The range that it is outside of."""
+        """The range that the base plate is outside of; None where it is inside."""
         allowed = self._base_range
         return None if allowed is None or allowed.low_c <= base_c <= allowed.high_c else allowed
 
@@ -354,7 +356,7 @@ def _celsius(reply: str) -> float:
 
 
 def _off(config: ObisConfig) -> bytes:
-    """The line end before it ends what a program that died had begun to say."""
+    """Bytes that switch off. The line end before them ends what a program that died had begun to say."""
     return b"\r\n" + ObisFraming(config.channel).encode("SOUR:AM:STAT OFF")
 
 

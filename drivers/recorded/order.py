@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Entries = NDArray[Any]
-"""(n,) of INDEX_RECORD."""
+"""Entries (n,) of INDEX_RECORD."""
 Ints = NDArray[np.int64]
 
 _NEIGHBOURS: Final = 2

@@ -24,11 +24,11 @@ from drivers.recorded.order import Entries
 from drivers.recorded.segments import open_segments
 
 READERS: Final = 2
-"""One thread checks 4 GB/s."""
+"""Threads that read ahead; one checks 4 GB/s."""
 BLOCKS_AHEAD: Final = 6
 READ_AHEAD_BYTES: Final = 32 * 2**20
 _ROUNDING_TICKS: Final = 1e-6
-"""Seconds are no whole number of ticks in binary: so much less than one still is that one."""
+"""Ticks by which a number of seconds may miss a whole tick, since binary numbers do."""
 _MOST_TICKS: Final = 2.0**62
 _WITNESSES: Final = 3
 """Blocks of a run that are asked for its size and clock."""

@@ -176,7 +176,7 @@ class SegmentReader(Protocol):
         ...
 
     def expect(self, offset: int, length: int) -> None:
-        """Say that so much will be read soon."""
+        """Announce that so many bytes will be read soon."""
         ...
 
 
@@ -210,7 +210,7 @@ class PlainSegment:
 
 
 class PackedSegment:
-    """A segment that was compressed after the run, block by block (`drivers.recorded.segments`)."""
+    """A segment that was compressed after the run, block by block."""
 
     def __init__(self, path: Path, number: int) -> None:
         self.path = path

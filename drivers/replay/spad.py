@@ -167,7 +167,7 @@ class Cursor:
         return pieces
 
     def move_on(self, pieces: list[Piece]) -> None:
-        """Past frames that were gathered."""
+        """Move past frames that were gathered."""
         block, _, end = pieces[-1]
         self.step_due = self._by_block or bool(block.records["marks"][end - 1] & _SCAN)
         self.next_frame = block.header.first_frame + end
@@ -219,11 +219,11 @@ class ReplaySpadConfig(KindConfig):
     recording: Path | None = None
     """Folder of a run taken with --record, relative to this file; `rig replay RUN` fills it in."""
     clock: Annotated[str, AfterValidator(_a_clock)] = "realtime"
-    """realtime, max, step, or a multiple of real time: x4, x0.1."""
+    """Speed: realtime, max, step, or a multiple of real time: x4, x0.1."""
     loop: bool = False
-    """Begin again behind the last frame."""
+    """Whether to begin again behind the last frame."""
     block_frames: int | None = Field(default=None, ge=1)
-    """Most frames of a block; what the scan asks for where not given."""
+    """Most frames of a block; by default as many as the scan asks for."""
 
 
 class ReplaySpad(SpadArray):

@@ -30,7 +30,9 @@ _NO_WAVE = ScanWaveform(np.zeros(1), np.zeros(1, np.uint8), Fraction(1))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointSlice:
-    """A slice. command: float64 (n,). markers: uint8 (n,). lit: bool (n,), part of the waveform, not of a ramp."""
+    """A slice of points. command: float64 (n,). markers: uint8 (n,). lit: bool (n,), part of the waveform, not of a
+    ramp.
+    """
 
     command: NDArray[np.float64]
     markers: NDArray[np.uint8]
@@ -75,7 +77,7 @@ class PointSource:
         self._end += points
 
     def pad_end(self) -> None:
-        """One more point at the end of a way to rest, where the mirror rests then. After `stop`, before `take`."""
+        """Add one more point at the end of a way to rest, where the mirror rests then. After `stop`, before `take`."""
         self._way = np.append(self._way, self._way[-1])
         self._end += 1
 
@@ -163,7 +165,9 @@ class RunPlayer:
         return ScannerStatus(moving=moving, fault=fault, position=None if moving else self.position)
 
     def rest(self) -> float:
-        """Wait for a run that is ending; where the mirror rests. After a fault nobody knows, so that it is halted."""
+        """Wait for a run that is ending; returns where the mirror rests. After a fault nobody knows that, so the device
+        is halted.
+        """
         self.join()
         if self.position is None:
             self.position = self._halt()
@@ -207,7 +211,7 @@ class RunPlayer:
         run.begin()
 
     def _feed(self, run: DacRun) -> None:
-        """The thread. What fails here is told by `status` and ends the run."""
+        """Feed the device, in the thread. `status` tells of what fails here, which ends the run."""
         try:
             run.feed(self._stopping)
             self.position = run.source.last
@@ -226,26 +230,26 @@ class Dac(Protocol):
     """See `Device.serial`."""
     highest_rate_hz: float
     closes_at: float | None
-    """Drive that giving the board back jumps to; None: it holds."""
+    """Drive that the mirror jumps to when the board is given back; None: it stays."""
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
         """The exact rate nearest to the requested one, within low to high."""
         ...
 
     def run(self, source: PointSource, clock_hz: Fraction) -> DacRun:
-        """These points at a rate that `point_clock` returned."""
+        """A run of these points at a rate that `point_clock` returned."""
         ...
 
     def check(self) -> None:
-        """Raise where it does not answer. Any thread."""
+        """Raise where the board does not answer. Any thread."""
         ...
 
     def halt(self) -> float:
-        """End whatever it plays, in an emergency; where the mirror rests then."""
+        """End what the board plays, in an emergency; returns where the mirror rests then."""
         ...
 
     def close(self) -> None:
-        """Outputs safe, and the board given back."""
+        """Make the outputs safe and give the board back."""
         ...
 
 
@@ -273,7 +277,7 @@ class DacScanner(BeamScanner):
 
     @property
     def limits(self) -> ScannerLimits:
-        """The config's, on the rates that the device allows."""
+        """The config's limits, at the rates that the device allows."""
         return self._limits
 
     def _do_status(self) -> ScannerStatus:

@@ -20,19 +20,20 @@ from drivers.registry import KindConfig
 from drivers.units import PerSecond, PerSecondSquared
 
 LOWEST_RATE_HZ = 1000.0
-"""Slower than that a mirror shows every point as a step."""
+"""Lowest point rate: slower than that a mirror shows every point as a step."""
 MOST_WAVEFORM_POINTS = 1_000_000
-"""A waveform stays in the host's memory, 9 bytes a point."""
+"""Most points of a waveform, which stays in the host's memory, 9 bytes a point."""
 
 Drive = Annotated[float, Field(ge=-1, le=1)]
-"""Normalised: -1 to 1 is the DAC's range."""
+"""Normalised drive: -1 to 1 is the DAC's range."""
 
 
 class GalvoConfig(KindConfig):
     """Limits of the galvo; they are in its data sheet. The DAC itself would follow anything."""
 
     port: str = "usb"
-    """usb; where several are attached usb:serial=ABC, or usb:path=1-2 for a Helios, which has none; emulated:NAME."""
+    """Port: usb; where several are attached usb:serial=ABC, or usb:path=1-2 for a Helios, which has none;
+    emulated:NAME."""
     axis: Literal["x", "y"] = "x"
     max_velocity: Annotated[PerSecond, Field(gt=0, le=1e6)]
     """Speed of the normalised drive, whose full range is 2."""

@@ -132,17 +132,17 @@ _OUR_SDK_VERSION = 11
 _STATUSES = {b"\x83\x01": True, b"\x83\x00": False}
 
 _COMMAND_S = 0.1
-"""The vendor's 16 ms are too short for slow hosts (pull request 10)."""
+"""Deadline for a command; the vendor's 16 ms are too short for slow hosts (pull request 10)."""
 _FRAME_S = 0.5
 _SETTLE_S = 0.1
 """Pause between entering alternate setting 1 and the first command."""
 _DRAIN_S = 0.005
 _AFTER_STOP_S = 0.15
-"""Frames within 100 ms of STOP are refused."""
+"""Wait after STOP: frames within 100 ms of it are refused."""
 
 
 class HeliosLink:
-    """Commands, one at a time. Any thread."""
+    """The commands of a Helios, one at a time. Any thread."""
 
     def __init__(self, link: UsbDevice, clock: Clock) -> None:
         """Wait until the firmware is enabled, drop old replies, learn version and name."""
@@ -174,7 +174,7 @@ class HeliosLink:
         return answer
 
     def send_frame(self, frame: bytes) -> None:
-        """One frame, after `free` said True."""
+        """Send one frame, after `free` said True."""
         with self._lock:
             self._link.write(_FRAMES, frame, _FRAME_S)
 
@@ -184,7 +184,9 @@ class HeliosLink:
         self._clock.sleep(_AFTER_STOP_S)
 
     def close(self) -> None:
-        """Stop, shutter pin low (the firmware never lowers it), back to 'disabled', and the USB device given back."""
+        """Stop, take the shutter pin low (the firmware never lowers it), go back to 'disabled', and give the USB device
+        back.
+        """
         try:
             self.stop()
             self._send(_SHUTTER, 0)
@@ -220,7 +222,7 @@ _POLL_S = 0.002
 _SILENT_S = 0.5
 """Time without a proper status after which the device counts as hung."""
 _PATIENCE_S = 1.0
-"""Beyond the time its frames take, for the buffer to fall free."""
+"""Wait for the buffer to fall free, beyond the time that its frames take."""
 _WIRE_BYTES_PER_S = 1.216e6
 """Bytes a second that a full-speed bulk endpoint carries: 19 packets of 64 bytes a millisecond (USB 2.0, table 5-9)."""
 _DRIFT = 1e-3
@@ -228,7 +230,7 @@ _DRIFT = 1e-3
 
 
 class HeliosRun:
-    """Begin, then feed. Every wait has an end: at most two frames and two seconds."""
+    """One run: `begin`, then `feed`. Every wait has an end: at most two frames and two seconds."""
 
     def __init__(
         self, link: HeliosLink, clock: Clock, source: PointSource, clock_hz: Fraction, *, frame_s: float, axis: str
@@ -277,7 +279,7 @@ class HeliosRun:
         self._clock.sleep(latest_s - self._now_s())
 
     def _append(self, frame: bytes, duration_s: float) -> None:
-        """One more frame, behind the playing one."""
+        """Send one more frame, behind the playing one."""
         _, arrived_s = self._send(frame)
         late_s = arrived_s - self._earliest_end_s
         if late_s > 0:
@@ -289,7 +291,7 @@ class HeliosRun:
         self._check_kept()
 
     def _check_kept(self) -> None:
-        """A frame that was taken and kept means 'full' until the playing one ends."""
+        """Check that a frame that was taken was kept: the status must then be 'full' until the playing one ends."""
         free = None
         while free is None and self._now_s() < self._earliest_end_s:
             free = self._link.free()
@@ -311,7 +313,7 @@ class HeliosRun:
         return encode(points, self._axis, self._pps, flags), len(points) / self._rate_hz
 
     def _send(self, frame: bytes) -> tuple[float, float]:
-        """The host's times between which the frame arrived."""
+        """Send a frame; returns the host's times between which it arrived."""
         began_s = self._now_s()
         self._link.send_frame(frame)
         self._sent += 1
@@ -353,7 +355,7 @@ class HeliosRun:
         return False
 
     def _note_swap(self, earliest_s: float, latest_s: float) -> None:
-        """The pending frame, if any, began to play between these times."""
+        """Note that the pending frame, if any, began to play between these times."""
         if not self._pending_s:
             return
         if latest_s < self._earliest_end_s - _POLL_S:
@@ -378,13 +380,13 @@ class HeliosConfig(GalvoConfig):
     name: str | None = None
     """Name stored in the device; another one is refused."""
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=MOST_PPS)] = 65535.0
-    """Lower it where the host's USB is busy: 40 kHz leaves a margin."""
+    """Most points per second. Lower it where the host's USB is busy: 40 kHz leaves a margin."""
     frame: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
-    """Length of one frame: what the host may be late by, and half of what a stop takes."""
+    """Length of one frame: the host may be late by as much, and a stop takes twice as long."""
 
 
 class HeliosDac:
-    """A `Dac`. Where STOP and the alternate setting without endpoints leave the mirror is the centre."""
+    """A Helios as a `Dac`. STOP and the alternate setting without endpoints leave the mirror at the centre."""
 
     closes_at: float | None = 0.0
 
@@ -407,12 +409,12 @@ class HeliosDac:
         return HeliosRun(self._link, self._clock, source, clock_hz, frame_s=config.frame, axis=config.axis)
 
     def check(self) -> None:
-        """DeviceTimeout where it is asked twice in vain."""
+        """Check that the board answers; DeviceTimeout where it is asked twice in vain."""
         if self._link.free() is None and self._link.free() is None:
             raise DeviceTimeout(f"{self.name}: gives no status; unplug it and plug it in again")
 
     def halt(self) -> float:
-        """STOP: at the centre, in one jump."""
+        """Send STOP: the mirror is at the centre then, in one jump."""
         self._link.stop()
         return 0.0
 

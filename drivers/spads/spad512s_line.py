@@ -83,7 +83,7 @@ class Spad512sLine:
         return self._stream is not None
 
     def connect(self) -> Spad512sIdentity:
-        """Banner, D, the calibration where one runs, D again."""
+        """Connect: banner, D, the calibration where one runs, D again."""
         self._stream = TcpStream(self._name, self.address)
         try:
             return self._greet(self._stream)
@@ -119,7 +119,7 @@ class Spad512sLine:
 
     @contextmanager
     def _given_up_on_silence(self) -> Iterator[None]:
-        """A connection that is gone or silent is closed: a late answer could not be told from the next one's."""
+        """Close a connection that is gone or silent: a late answer could not be told from the next one's."""
         try:
             yield
         except (DeviceTimeout, DeviceDisconnected):

@@ -45,7 +45,7 @@ _SLICE_S = 0.05
 """One wait inside `fill`: how late a `stop` from another thread comes at most."""
 _PINGS_PER_HEARTBEAT = 4
 _SILENCE_S = 0.5
-"""A run sends a heartbeat block every 100 ms: after a silence of so long the device is asked whether it still runs."""
+"""Silence after which the device is asked whether it still runs; a run sends a heartbeat block every 100 ms."""
 _STOP_S = 1.0
 """Longest wait for the last block after ABORT."""
 
@@ -237,7 +237,7 @@ class SpbUsb(SpadArray):
         )
 
     def _finish(self, receiver: BlockReceiver) -> None:
-        """The run is over: what the device exposed is asked for, since its last blocks may be lost."""
+        """End the run: the device is asked how much it exposed, since its last blocks may be lost."""
         self._receiver = None
         receiver.close()
         try:

@@ -48,7 +48,9 @@ class SensorIdentity:
 
 
 def identify(control: ControlChannel, name: str) -> SensorIdentity:
-    """Ask. `DeviceNotFound` where it does not speak SPB1, `DeviceFault` where it speaks another version."""
+    """Read the identity registers. `DeviceNotFound` where the device does not speak SPB1, `DeviceFault` where it speaks
+    another version.
+    """
     # A program that died may have left a run behind, which would drown the answers.
     control.forget_run()
     try:
@@ -108,7 +110,7 @@ class RunSetup:
     window: WindowTable | None = None
 
     def write(self, control: ControlChannel) -> None:
-        """Tell the device."""
+        """Write the registers."""
         control.write_all(
             (
                 (Register.HEARTBEAT_MS, round(self.heartbeat_s * 1000)),
@@ -132,13 +134,13 @@ class RunSetup:
 
 
 def write_length(control: ControlChannel, n_frames: int | None) -> None:
-    """The run ends behind so many frames; None: at STOP."""
+    """Have the run end behind so many frames; None: at STOP."""
     n = n_frames or 0
     control.write_all(((Register.N_FRAMES, n & 0xFFFFFFFF), (Register.N_FRAMES + 4, n >> 32)))
 
 
 def block_size(identity: SensorIdentity, width: int, block_frames: int, name: str) -> tuple[int, int]:
-    """Stride and frames of a block: as many as were asked for, or as fit. `LimitExceeded` where none does."""
+    """Stride and frames of a block: as many as were asked for, or as many as fit. `LimitExceeded` where none does."""
     height = identity.info.height
     try:
         n = min(block_frames, frames_per_block(identity.max_stride, width, height))
@@ -162,7 +164,7 @@ def require_windows(identity: SensorIdentity, window: WindowTable, name: str) ->
 def require_order(
     control: ControlChannel, link: BulkLink, stream_in: int, identity: SensorIdentity, heartbeat_s: float
 ) -> None:
-    """A few frames of the test pattern: bits or rows in another order than SPB1's would go unnoticed (8.4, 6)."""
+    """Check a few frames of the test pattern: bits or rows in another order than SPB1's would go unnoticed (8.4, 6)."""
     if Feature.TEST_PATTERN not in identity.features:
         return
     info, name, period = identity.info, link.label, identity.min_period_ticks
@@ -216,7 +218,9 @@ class Wiring:
     has_session: bool = False
 
     def open_session(self, link: BulkLink) -> None:
-        """The FT601 streams only after it was told to; data of a session that was not closed is cleared first."""
+        """Tell the FT601 to stream, which it does not before; data of a session that was not closed is cleared
+        first.
+        """
         if not self.has_session:
             return
         found = len(link.control_in(0xC0, _CONFIG_REQUEST, 1, 0, _CONFIG_BYTES, 1.0))

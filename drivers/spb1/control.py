@@ -234,11 +234,12 @@ class ControlChannel:
         return self._ack_in is not None
 
     def read(self, register: int) -> int:
-        """A register."""
+        """The value of a register."""
         return self.read_all((register,))[0]
 
     def read_all(self, registers: Sequence[int]) -> list[int]:
-        """Several registers, each asked for twice: acknowledgements carry no checksum, and a value may just change.
+        """The values of several registers, each asked for twice: acknowledgements carry no checksum, and a value may
+        just change.
 
         `ProtocolError` where the answers never agree.
         """
@@ -260,11 +261,11 @@ class ControlChannel:
         return raw.split(b"\0")[0].decode("utf-8", "replace").strip()
 
     def write_all(self, values: Iterable[tuple[int, int]]) -> None:
-        """Several registers. `DeviceFault` where the device refuses one."""
+        """Write several registers. `DeviceFault` where the device refuses one."""
         self._ask([(Op.WRITE, register, value) for register, value in values])
 
     def send(self, op: Op, value: int = 0) -> Ack:
-        """One command. `DeviceFault` where the device refuses it."""
+        """Send one command. `DeviceFault` where the device refuses it."""
         return self._ask([(op, 0, value)])[0]
 
     def ping(self, value: int) -> None:
@@ -272,7 +273,9 @@ class ControlChannel:
         self.send_in_run(Op.PING, value)
 
     def send_in_run(self, op: Op, value: int = 0) -> None:
-        """One command while the stream runs: the answer is waited for only where it does not come in the stream."""
+        """Send one command while the stream runs: the answer is waited for only where it does not come in the
+        stream.
+        """
         if self._ack_in is not None:
             self.send(op, value)
         else:

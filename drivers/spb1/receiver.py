@@ -104,9 +104,9 @@ class BlockReceiver:
         """Blocks refused: damaged, out of order or of another geometry."""
         self.resyncs = 0
         self.ended = False
-        """The run's last block came."""
+        """Whether the run's last block came."""
         self.gate_forced_low = False
-        """The device's watchdog ended the run."""
+        """Whether the device's watchdog ended the run."""
         self._reads = reads
         self._endpoint = endpoint
         self._armed = armed
@@ -253,7 +253,7 @@ class BlockReceiver:
             raise CorruptBlock(f"block {block.header.block_seq}: a window lies beyond the row or off its words")
 
     def _note(self, fields: HeaderFields, n_frames: int) -> None:
-        """Count what the header says was exposed."""
+        """Count the frames that the header says were exposed."""
         block = fields.block
         self._last_seq = max(self._last_seq, block.block_seq)
         self.next_frame = max(self.next_frame, block.first_frame + n_frames)
@@ -262,7 +262,7 @@ class BlockReceiver:
         self.gate_forced_low = self.gate_forced_low or bool(flags & _FORCED_LOW)
 
     def _hand_over(self, item: _Item, block: FrameBlock) -> None:
-        """Publish; what came into spare memory is copied or dropped."""
+        """Publish; a block that came into spare memory is copied or dropped."""
         assert self._ring is not None, "set by take"
         block = self._as_received(block)
         if not item.slot:

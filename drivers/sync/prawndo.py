@@ -123,7 +123,7 @@ INTERNAL_HZ = 100_000_000
 """The board's own clock (5.1)."""
 MAX_WORDS = {"board: pico1": 30_000, "board: pico2": 60_000}
 OLDEST_FIRMWARE = (1, 3)
-"""`adm` takes a start address, and `brd` exists, from here on."""
+"""Oldest firmware: from here on `adm` takes a start address, and `brd` exists."""
 _CLOCK_CHANGE_S = 0.02
 """Time for the board to find out that there is no clock on GPIO20."""
 _CLOCK_TOLERANCE = 0.01

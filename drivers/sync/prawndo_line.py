@@ -164,7 +164,8 @@ class PrawnDoLine:
         return self._pins(hasty_s, urgent=True) == 0 and self._run_status(hasty_s, urgent=True)[0] in IDLE
 
     def _free_wedged(self, most_words: int) -> None:
-        """A program that another host never finished sending swallows all commands: give it what it waits for.
+        """Free a board that a program which another host never finished sending keeps from hearing commands: give it
+        the rest.
 
         Zeros are words that wait with all outputs low (5.1, pitfall 4).
         """
@@ -209,7 +210,7 @@ class PrawnDoLine:
         return self._ask_twice("gto", lambda line: int(line, 16), deadline_s, urgent)
 
     def _ask_twice(self, command: str, parse: Callable[[str], _T], deadline_s: float, urgent: bool) -> _T:
-        """A flipped bit makes a low gate of a high one: only two answers that agree are an answer."""
+        """Ask until two answers in a row agree: a flipped bit makes a low gate of a high one."""
         lines = self._transact(f"{command}\n{command}", deadline_s, urgent)
         try:
             first, second = (parse(line) for line in lines)

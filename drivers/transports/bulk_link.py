@@ -65,7 +65,7 @@ class BulkLink(Protocol):
 
 
 class PlainLink:
-    """A `BulkLink`."""
+    """A streaming USB device read through pyusb, one piece after the other."""
 
     def __init__(self, device: UsbDevice) -> None:
         self.label = device.label
@@ -95,12 +95,12 @@ class PlainLink:
         return self._device.control_in(request_type, request, value, index, length, timeout_s)
 
     def submit(self, endpoint: int, buffer: Buffer) -> bool:
-        """Remember it for `reap`."""
+        """Remember the buffer for `reap`."""
         self._queue.append((endpoint, buffer))
         return True
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
-        """Read the oldest now. What a time-out interrupts goes on with the next call."""
+        """Read the oldest queued buffer now. What a time-out interrupts goes on with the next call."""
         if not self._queue:
             return None
         endpoint, buffer = self._queue[0]

@@ -53,7 +53,7 @@ class SerialPort:
     """
 
     def __init__(self, name: str, address: str, baud: int = 115_200, tap: Tap | None = None) -> None:
-        """Open it. name: what messages call the device. tap: told of all that passes.
+        """Open the port. name: the device's name in messages. tap: told of all that passes.
 
         address: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
         vendor and product, the only one attached). Raises `DeviceNotFound`, `DevicePermission` or `DeviceBusy`.

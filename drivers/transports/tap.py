@@ -68,7 +68,7 @@ class Tap:
         self._starting = threading.Lock()
 
     def note(self, port: str, direction: str, data: bytes) -> None:
-        """A piece of bytes; of none nothing is noted. Returns at once."""
+        """Note a piece of bytes; an empty one is not noted. Returns at once."""
         if not data:
             return
         t_ns = time.monotonic_ns() - self._file.start_ns

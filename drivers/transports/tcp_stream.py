@@ -22,7 +22,7 @@ class TcpStream:
     """An open connection. `close` is idempotent. For one thread, but for `close`."""
 
     def __init__(self, name: str, address: str, *, connect_s: float = 5.0) -> None:
-        """Connect. name: what messages call the device; address: "host:port".
+        """Connect. name: the device's name in messages; address: "host:port".
 
         Raises `DeviceNotFound` (refused, unreachable, silent or no such host) or `DevicePermission`.
         """

@@ -331,5 +331,5 @@ def _libusb() -> Any:
 
 
 def milliseconds(timeout_s: float) -> int:
-    """libusb takes 0 as 'for ever', which no call here may ask for."""
+    """The time in milliseconds, at least 1: libusb takes 0 as 'for ever', which no call here may ask for."""
     return max(1, round(timeout_s * 1000))
