@@ -71,7 +71,7 @@ class Bench:
             self._motion = Playing(waveform, repeats, start_s, rate_hz, self.lag.forward, self.lag.backward)
 
     def rest(self, command: float) -> None:
-        """Stop the mirror at a command, now."""
+        """Stop the mirror now, at a command."""
         with self._lock:
             self._motion = Resting(command)
 
@@ -97,7 +97,7 @@ class Bench:
             self._program = GateProgram(pulses, repeats, self.now_s())
 
     def lower_gate(self) -> None:
-        """Gate low from now on, until the next program."""
+        """Take the gate low from now on, until the next program."""
         with self._lock:
             if self._program is not None:
                 self._catch_up()

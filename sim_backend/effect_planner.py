@@ -38,7 +38,7 @@ MOST = PlannedFor(power_w=1.0, exposure_s=1e-3, exposures=100)
 """The most that a plan holds for where nobody says what is to be scanned: more than a line laser and an ordinary scan
 have."""
 SAFETY = 2.0
-"""Times the mean over sampled rows: their spread over rows and columns is less."""
+"""Safety factor on the mean over sampled rows: their spread over rows and columns is less."""
 SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8
 
 

@@ -29,7 +29,7 @@ MOTION = "motion"
 TIMED_FRAMES = 50
 TIMED_ROUNDS = 5
 SPARSITY = 6
-"""Bits are timed on frames with 1 pixel in 2^6 lit, as in fog."""
+"""Halvings of the lit share on which bits are timed: 1 pixel in 2^6, as in fog."""
 
 
 def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:

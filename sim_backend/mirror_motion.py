@@ -93,7 +93,7 @@ class Resting:
         return None
 
     def moving(self, time_s: float) -> bool:
-        """No."""
+        """Whether a waveform is being played: never."""
         return False
 
 

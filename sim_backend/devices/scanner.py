@@ -14,7 +14,7 @@ from sim_backend.devices.place import bench_of, note_effect
 from sim_backend.mirror_motion import Jitter
 
 MASTER_HZ = 48_000_000
-"""The point clock is this divided by a whole number, as in a timer of a microcontroller."""
+"""Master clock: the point clock is this divided by a whole number, as in a timer of a microcontroller."""
 
 LIMITS = ScannerLimits(
     command_range=(-1.0, 1.0),
@@ -25,7 +25,7 @@ LIMITS = ScannerLimits(
     max_points=1_000_000,
     point_rate_hz=(1e3, 200e3),
 )
-"""A fast small galvo: full sweep in half a millisecond."""
+"""Limits of a fast small galvo: full sweep in half a millisecond."""
 
 
 class SimulatedScannerConfig(KindConfig):
@@ -60,7 +60,7 @@ class SimulatedScanner(BeamScanner):
 
     @property
     def serial(self) -> str:
-        """The config's."""
+        """The serial number in the config."""
         return self._config.serial
 
     def _do_status(self) -> ScannerStatus:

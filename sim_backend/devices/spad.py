@@ -42,7 +42,7 @@ from sim_backend.frames.photons import PhotonSource
 from sim_backend.world import SimulatedWorld
 
 _TWICE = np.uint64(0xE7037ED1A0B428DB)
-"""Keeps the draws of frames that come twice apart from those that get lost."""
+"""Stream that keeps the draws of frames that come twice apart from those of frames that get lost."""
 
 
 class FrameLink:
@@ -172,7 +172,8 @@ LINK_BYTES_PER_S = 8e9
 MAX_THREADS = 4
 START_BITS = 48
 MOST_STARTS = 0x3FFF
-"""Photons are drawn by the number of a frame: those of the second start are numbered from 2^48 on, and so on."""
+"""Mask of the number of a start. Photons are drawn by the number of a frame: those of the second start are numbered
+from 2^48 on, and so on."""
 
 
 class SimulatedSpadConfig(KindConfig):

@@ -32,7 +32,7 @@ from sim_backend.effects.setting import FrameTimes, Setting, Words
 from sim_backend.random_numbers import WORD_PX, frame_key
 
 _AFTER, _BLIND = np.uint64(0x9FB21C651E98DF25), np.uint64(0xD6E8FEB86659FD93)
-"""Keep these draws apart from those of photons and other effects."""
+"""Streams that keep these draws apart from those of photons and other effects."""
 
 
 class Afterpulsing:

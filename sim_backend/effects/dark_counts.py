@@ -21,7 +21,7 @@ _BODY_SD = 0.12
 _TAIL_SHARE, _TAIL_AT = 0.01, 10.0
 _TAIL_START = 2.0
 _TAIL_POWER = math.log10(5)
-"""A fifth of the pixels above 10 times the median are above 100 times."""
+"""Power of the tail: a fifth of the pixels above 10 times the median are above 100 times."""
 _MAX_RATIO = 1e5
 
 

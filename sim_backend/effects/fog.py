@@ -30,7 +30,7 @@ from sim_backend.light.sheet import LightSheet
 from sim_backend.random_numbers import HALVING, LOG2_E, power_of_half
 
 REACH_SIGMAS = 5.0
-"""The blurred end is cut here."""
+"""Sds at which the blurred end is cut."""
 LEAST_INVERSE_DEPTH = 1e-12
 """Least inverse depth, in 1/m: what lies farther or behind the camera is taken as there."""
 Rays = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]

@@ -28,12 +28,12 @@ from sim_backend.scenes.medium import Sizes
 Array = NDArray[np.float64]
 
 REACH_SIGMAS = 4.0
-"""Sheet and picture of a particle are cut here."""
+"""Sds at which sheet and picture of a particle are cut."""
 FARTHEST_RANGE_M = 30.0
-"""No particle is farther than this from the mirror."""
+"""Largest distance of a particle from the mirror."""
 NEWTON_STEPS = 8
 SHORT_PX = 0.05
-"""A streak shorter than this is a point."""
+"""Length in pixels below which a streak is a point."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -143,7 +143,7 @@ def add_particles(
 MOST = 100_000
 """Particles that are kept, on average."""
 HOLD_S = 2e-4
-"""A particle stands still for so long: less than 2 mm of fall."""
+"""Time for which a particle stands still: less than 2 mm of fall."""
 NEAREST_M, FARTHEST_M = 0.1, 10.0
 """Depths between which particles are made."""
 FAINTEST_MM, FAINTEST_AT_M = 0.5, 8.0
@@ -209,7 +209,7 @@ def make_particles(what: Precipitation, cone: Array, farthest_m: float, rng: np.
 
 
 class ParticleLight:
-    """Adds what particles in a sheet send back."""
+    """The light that particles in a sheet send back."""
 
     def __init__(self, setting: Setting, what: Precipitation, rng: np.random.Generator) -> None:
         view = setting.view

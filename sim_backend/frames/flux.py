@@ -60,7 +60,7 @@ class FluxModel:
         return min((held for effect in self.laser.values() if (held := hold_s(effect)) > 0), default=0.0)
 
     def without(self, names: Collection[str]) -> "FluxModel":
-        """The same with fewer effects, which are not made anew."""
+        """The model with fewer effects; those that stay are not made anew."""
         fewer = copy(self)
         fewer.laser = {name: effect for name, effect in self.laser.items() if name not in names}
         fewer.steady = {name: rate for name, rate in self.steady.items() if name not in names}
@@ -89,7 +89,7 @@ def hold_s(effect: LaserEffect) -> float:
 
 FINE_POSITIONS_PER_PX = 4
 ROUNDING = 1e-9
-"""Positions are rounded to this, far below what a frame can tell: frames then have the very same mean."""
+"""Step to which positions are rounded, far below what a frame can tell: frames then have the very same mean."""
 _SLACK = 1e-6
 """Slack, as a share of a step, for frames that lie on the very border of cells."""
 

@@ -240,7 +240,7 @@ def _draw_anew(
 
 
 _DROP_STREAM = np.uint64(0xA0761D6478BD642F)
-"""Keeps the draws of lost frames apart from those of photons."""
+"""Stream that keeps the draws of lost frames apart from those of photons."""
 
 
 @numba.njit(cache=True, nogil=True)

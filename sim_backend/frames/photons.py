@@ -201,7 +201,7 @@ class PhotonSource:
         self._each(partial(work, a, b) for a, b in self._bands)
 
     def _each(self, jobs: Iterable[Callable[[], None]]) -> None:
-        """Do all of them at once; errors are raised when all have ended."""
+        """Do all jobs at once; errors are raised when all have ended."""
         first, *others = jobs
         running = [self._pool.submit(job) for job in others]
         try:

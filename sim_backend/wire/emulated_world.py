@@ -46,12 +46,12 @@ Array = NDArray[np.float64]
 
 MAX_THREADS = 8
 USB_BAUD = 10_000_000
-"""A virtual COM port is as fast as USB lets it be."""
+"""Baud of a virtual COM port, which is as fast as USB lets it be."""
 PICO_2 = 2
 KEPT_S = 20.0
 """Time after which the past of gate and mirror is forgotten."""
 KEPT_FRAMES = 1_000_000_000
-"""Frames that wait for the host: as many as there may be."""
+"""Most frames that wait for the host."""
 
 
 class TakesDevices(Protocol):
@@ -232,7 +232,7 @@ class WorldFrames:
         self._made_for: tuple[FrameTimes, FluxModel] | None = None
 
     def started(self) -> None:
-        """A run begins: counters of markers are 0."""
+        """Set the counters of markers to 0 at the start of a run."""
         self._markers = MarkerInputs()
 
     def expose(self, span: Span, records: NDArray[np.void], bits: NDArray[np.uint8] | None) -> int:

@@ -14,7 +14,7 @@ from sim_backend.wire.serve.usb_model import STALL, Answer, DeviceSpec, Stall, U
 Array = NDArray[np.float64]
 
 KEEP_S = 20.0
-"""Older output is forgotten."""
+"""Age at which output is forgotten."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,13 +130,13 @@ class DacModel(UsbModel):
         self.spec = spec
         self.history = DacHistory(normal(CENTRE), lines=4)
         self.deaf = False
-        """Test knob: the firmware hangs, its outputs play on."""
+        """Test knob: whether the firmware hangs, while its outputs play on."""
         self.points_endpoint = points
         self._commands_endpoint, self._replies_endpoint = commands, replies
         self._replies: deque[bytes] = deque()
 
     def leave_reply(self, reply: bytes) -> None:
-        """A reply that an earlier program never read."""
+        """Leave a reply that an earlier program never read."""
         self._replies.append(reply)
 
     def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
@@ -156,7 +156,7 @@ class DacModel(UsbModel):
         return self._replies.popleft() if ready else None
 
     def unplugged(self, now_s: float) -> None:
-        """No power: the outputs fall to 0 V, which is the centre."""
+        """Let the outputs fall to 0 V without power, which is the centre."""
         self.advance(now_s)
         self._halt(now_s)
         self.history.cut(now_s, normal(CENTRE))

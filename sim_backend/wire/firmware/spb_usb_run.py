@@ -19,7 +19,7 @@ from drivers.spb1.writer import seal_control
 from sim_backend.wire.serve.usb_model import AlternateSpec, DeviceSpec, EndpointSpec
 
 IDLE_S: Final = 0.1
-"""A run without frames for so long sends a heartbeat block."""
+"""Time without frames after which a run sends a heartbeat block."""
 BUFFERS: Final = 80
 """Blocks that transports may hold at a time; memory is taken as it is needed."""
 
@@ -122,7 +122,7 @@ class EmulatedRun:
         self._just_lost = False
 
     def stop(self) -> None:
-        """No frame more."""
+        """End the run: no frame more."""
         self._n_frames = self.next_frame
 
     def end(self, status: BlockStatus, flag: BlockFlag) -> memoryview:

@@ -162,7 +162,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         )
 
     def open_device(self, dev: AttachedDevice) -> _Handle:
-        """A handle."""
+        """A handle of the device."""
         with _pyusb_errors():
             dev.open()
         return _Handle(dev)
@@ -172,12 +172,12 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         dev_handle.device.close(dev_handle)
 
     def set_configuration(self, dev_handle: _Handle, config_value: int) -> None:
-        """0 or 1."""
+        """Set configuration 0 or 1."""
         with _pyusb_errors():
             dev_handle.device.set_configuration(config_value)
 
     def get_configuration(self, dev_handle: _Handle) -> int:
-        """The present one."""
+        """Number of the present configuration."""
         return dev_handle.device.configuration
 
     def set_interface_altsetting(self, dev_handle: _Handle, intf: int, altsetting: int) -> None:
@@ -191,16 +191,16 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
             dev_handle.device.claim(intf, dev_handle)
 
     def release_interface(self, dev_handle: _Handle, intf: int) -> None:
-        """Claimed by this handle."""
+        """Release an interface that this handle claimed."""
         with _pyusb_errors():
             dev_handle.device.release(intf, dev_handle)
 
     def bulk_write(self, dev_handle: _Handle, ep: int, intf: int, data: Any, timeout: int) -> int:
-        """Bytes sent; partial on a timeout."""
+        """Send to a bulk endpoint; returns the number of bytes sent, fewer on a timeout."""
         return self._write(dev_handle, ep, bytes(data), timeout)
 
     def bulk_read(self, dev_handle: _Handle, ep: int, intf: int, buff: Any, timeout: int) -> int:
-        """Bytes read; partial on a timeout."""
+        """Read from a bulk endpoint; returns the number of bytes read, fewer on a timeout."""
         return self._read(dev_handle, ep, buff, timeout)
 
     def intr_write(self, dev_handle: _Handle, ep: int, intf: int, data: Any, timeout: int) -> int:
@@ -221,7 +221,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         data: Any,
         timeout: int,
     ) -> int:
-        """Bytes of the data stage."""
+        """Make a control transfer; returns the number of bytes of the data stage."""
         view = memoryview(data).cast("B")
         setup = Setup(bmRequestType, bRequest, wValue, wIndex, len(view))
         host_to_device = not bmRequestType & 0x80
@@ -241,7 +241,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
             dev_handle.device.clear_halt(ep)
 
     def is_kernel_driver_active(self, dev_handle: _Handle, intf: int) -> bool:
-        """Never: vendor-specific interfaces have none."""
+        """False: vendor-specific interfaces have no kernel driver."""
         return False
 
     def _write(self, handle: _Handle, endpoint: int, data: bytes, timeout_ms: int) -> int:

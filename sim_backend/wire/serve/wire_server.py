@@ -26,23 +26,23 @@ class Fault(Enum):
     device and are the transport's to act out."""
 
     LATE = "late"
-    """Comes whole, after `late_s`."""
+    """The reply comes whole, after `late_s`."""
     SPLIT = "split"
-    """Comes in two parts with a pause between them."""
+    """The reply comes in two parts with a pause between them."""
     MERGED = "merged"
-    """Comes together with the next reply."""
+    """The reply comes together with the next one."""
     TRUNCATED = "truncated"
     """The reply's end never comes."""
     CORRUPTED = "corrupted"
-    """One of its bits is flipped."""
+    """One of the reply's bits is flipped."""
     REPEATED = "repeated"
-    """Comes twice."""
+    """The reply comes twice."""
     LOST = "lost"
-    """Never comes."""
+    """The reply never comes."""
     STALL = "stall"
     """The reply and all that follow come after `stall_s`."""
     UNPLUG = "unplug"
-    """The cable is pulled before it comes."""
+    """The cable is pulled before the reply comes."""
     HANG = "hang"
     """The firmware hangs: it takes and says nothing from now on; its outputs stay as they are."""
 
@@ -56,7 +56,7 @@ class Delivery:
 
 
 class FaultSchedule:
-    """Decides on each reply. Seeded, so that a sequence that failed can be run again.
+    """The decision on each reply. Seeded, so that a sequence that failed can be run again.
 
     probability: that a reply meets a fault at all. kinds: which ones, equally often. skip: so many replies come
     unharmed first (the opening of a device, say). most: faults in all; None: no end.
@@ -204,7 +204,7 @@ class WireServer(ABC, Generic[Model]):
         """Pull the cable: the open port is lost, bytes on their way with it."""
 
     def hang(self) -> None:
-        """The firmware hangs: nothing is taken and nothing said, outputs stay as they are."""
+        """Let the firmware hang: nothing is taken and nothing said, outputs stay as they are."""
         with self.lock:
             self._hung = True
             self._outbox.clear()
