@@ -106,7 +106,9 @@ class CameraSolution:
     """A camera, and of every view the pose and the residuals (n, 2), projected less seen."""
 
     matrix: Array
+    """(3, 3) camera matrix, pixels."""
     distortion: Array
+    """Terms of the distortion in OpenCV's order."""
     poses: tuple[BoardPose, ...]
     residual_px: tuple[Array, ...]
 

@@ -75,6 +75,7 @@ class BlockHeader:
     """Everything that holds for all frames of a block. Fields as in the SPB1 1.0 wire layout (docs/spb1.md)."""
 
     flags: BlockFlag
+    """Flags of the block."""
     run_id: int
     """Number of the run, 16 bit; changes at each START, so that stale data after a re-arm is recognised."""
     block_seq: int
@@ -86,9 +87,11 @@ class BlockHeader:
     lost_before: int
     """Frames exposed since START that are not in the stream before this block."""
     tick_hz: Fraction
+    """Rate of the tick counter."""
     frame_period_ticks: int
     """Nominal period; 0 = triggered from outside."""
     exposure_ticks: int
+    """Exposure of every frame."""
     sweep: int
     """Scan markers since START at the first frame."""
     frame_step: int
@@ -96,10 +99,15 @@ class BlockHeader:
     width: int
     """Pixels of each frame's window; constant within a block."""
     height: int
+    """Rows of each frame."""
     sensor_width: int
+    """Pixels of a row of the whole sensor."""
     sensor_height: int
+    """Rows of the whole sensor."""
     bits_per_px: int = 1
+    """Always 1 for blocks of frames that this program reads."""
     payload_type: int = 0
+    """Type of the payload; 0: packed frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +123,7 @@ class FrameBlock:
     records: NDArray[np.void]
     bits: NDArray[np.uint8]
     status: int = BlockStatus.OK
+    """How the block ended, a `BlockStatus`."""
 
     @property
     def n_frames(self) -> int:

@@ -79,9 +79,13 @@ class BoardMap:
     homography: Array
     bend_px: Array
     degree: int
+    """Degree of the polynomial; 0: the homography alone."""
     half_m: Array
+    """Half of the board's size (2,)."""
     centre_px: Array
+    """Middle of the points that were fitted (2,)."""
     half_px: float
+    """Largest distance of these points from the middle, along x or y."""
 
     def to_px(self, points_m: ArrayLike) -> Array:
         """Raw pixels (..., 2) of board positions (..., 2)."""

@@ -29,14 +29,19 @@ LEAST_OWN_SHARE = 1e-7
 
 @dataclass(frozen=True, slots=True)
 class TermDecision:
-    """One about a term. value, sd: what it is or would be, in its own unit; NaN where nothing tells. along: name and
-    value of the terms that would come in with it. gain: by which chi2 would fall with all of them."""
+    """A decision about a term.
+
+    value, sd: what it is or would be, in its own unit; NaN where nothing tells. along: name and value of the terms that
+    would come in with it. gain: fall of chi2 with all of them.
+    """
 
     name: str
     kept: bool
+    """Whether the term is in the model."""
     value: float
     sd: float
     reason: str
+    """Why, in words."""
     along: tuple[tuple[str, float], ...] = ()
     gain: float = 0.0
 

@@ -33,14 +33,19 @@ class ScannerLimits:
     """
 
     command_range: tuple[float, float]
+    """Smallest and largest command."""
     velocity_per_s: float
+    """Largest speed of the command, drive units per second."""
     acceleration_per_s2: float
+    """Largest acceleration of the command, drive units per second squared."""
     step: float
     """Largest change of command from one point to the next."""
     rms_duty: float
     """Largest root-mean-square acceleration of a waveform as a share of `acceleration_per_s2`: the mirror's heat."""
     max_points: int
+    """Most points of a waveform."""
     point_rate_hz: tuple[float, float]
+    """Lowest and highest point rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +67,9 @@ class ScannerStatus:
     """The scanner's own report, asked afresh each time."""
 
     moving: bool
+    """A waveform is being played, or the mirror is on its way to rest."""
     fault: str | None
+    """The fault in one line; None: there is none."""
     position: float | None
     """Position of the mirror, normalised drive; None where the device does not say."""
 

@@ -103,7 +103,9 @@ class BurstMode:
     """The device stores a run in its own memory and is read out afterwards."""
 
     capacity_frames: int
+    """Most frames of a run: what the memory holds."""
     readout_bytes_per_s: float
+    """Rate at which a run is read out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +113,7 @@ class StreamMode:
     """The device sends frames while it takes them, as fast as its link carries them."""
 
     bytes_per_s: float
+    """Rate that the link carries."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,18 +122,23 @@ class SpadInfo:
 
     model: str
     serial: str
+    """Serial number, as far as the sensor has one."""
     width: int
+    """Pixels per row of the frames delivered, after the turn."""
     height: int
     rotation_deg: int
     """Angle at which the sensor is mounted; the frames that it delivers are upright already."""
     max_frame_rate_hz: Fraction
     burst: BurstMode | None
+    """None: the sensor cannot store a run."""
     stream: StreamMode | None
+    """None: the sensor cannot stream."""
     roi_step_px: int
     """Windows start and end at multiples of this."""
     markers: bool
     """Whether frame records carry the markers of scanner and gate."""
     trigger_modes: tuple[str, ...]
+    """What may start an exposure: "free" (one follows the other), "external" (a pulse on the trigger input)."""
     can_wait: bool = False
     """Whether it can stand still while the ring is full, as a simulation on virtual time does; a sensor cannot."""
 
@@ -143,6 +151,7 @@ class SpadRequest:
     exposure_s: float
     """Exposure of a frame, at most one frame period."""
     mode: SpadMode
+    """Whether frames are streamed or stored and read out."""
     block_frames: int
     """Frames wanted per block; a device may send shorter blocks, never longer ones."""
     window: WindowTable | None = None
@@ -154,7 +163,9 @@ class SpadTiming:
     """The exact timing that a SPAD array was configured to."""
 
     tick_hz: Fraction
+    """Rate of the tick counter that time-stamps the frames."""
     frame_period_ticks: int
+    """From the start of an exposure to that of the next."""
     exposure_ticks: int
     stride: int
     """Bytes of a ring slot that holds one block."""
@@ -165,11 +176,15 @@ class SpadCounters:
     """Counts since `start`. None: the device does not say."""
 
     exposed: int | None
+    """Frames exposed."""
     delivered: int
+    """Frames published in the ring."""
     lost: int | None
     """exposed = delivered + lost once the run has ended; while it runs, frames on their way are in `exposed` only."""
     crc_errors: int | None
+    """Blocks refused: damaged, out of order or of another geometry."""
     resyncs: int | None
+    """Times that the beginning of blocks had to be found anew after damage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +198,7 @@ class SpadHealth:
     excess_bias_v: float | None = None
     """Excess bias of the diodes; bright light at a high one ages the chip."""
     frame_clock_hz: float | None = None
+    """Measured rate of the clock that starts the frames."""
     memory_high_water_bytes: int | None = None
     """Largest amount of data that waited in the sensor's memory in the last run."""
 

@@ -31,6 +31,7 @@ class ReplayClock:
 
     speed: float | None = None
     steps: bool = False
+    """Frames wait for somebody's word, step by step."""
 
     @classmethod
     def parse(cls, text: str) -> "ReplayClock":

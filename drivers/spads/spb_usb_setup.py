@@ -42,9 +42,11 @@ class SensorIdentity:
     features: Feature
     tick_hz: Fraction
     min_period_ticks: int
+    """Shortest frame period."""
     window_entries: int
     """Entries of all window tables together."""
     max_stride: int
+    """Largest stride of a block."""
 
 
 def identify(control: ControlChannel, name: str) -> SensorIdentity:
@@ -107,6 +109,7 @@ class RunSetup:
     stride: int
     block_frames: int
     heartbeat_s: float
+    """Time without a PING after which the device ends the run."""
     window: WindowTable | None = None
 
     def write(self, control: ControlChannel) -> None:
@@ -216,6 +219,7 @@ class Wiring:
     stream_in: int
     ack_in: int
     has_session: bool = False
+    """Whether the chip streams only within a session that is opened by commands."""
 
     def open_session(self, link: BulkLink) -> None:
         """Tell the FT601 to stream, which it does not before; data of a session that was not closed is cleared
