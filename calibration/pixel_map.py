@@ -1,20 +1,20 @@
 """Pixels of a SPAD array in the dark and in light: how fast each fires by itself, which are hot, dead or noisy, and how
 they have changed since they were last looked at.
 
-Flux per exposure is -ln(1 - p), p the share of frames in which a pixel fired. Its sd from N frames is sqrt((e^flux - 1)
-/ N); a pixel that never fired is given the sd of half a count.
+Flux per exposure is -ln(1 - p), p the share of frames in which a pixel fired. Its sd from N frames is
+sqrt((e^flux - 1) / N); a pixel that never fired is given the sd of half a count.
 
-Hot is a matter of cost. A frame tells of a stripe's s photons with the Fisher information 1 / (e^(s + b) - 1) of a bit
-(b: all else that the pixel detects). The limit is the dark flux at which that falls to half of what the pixels around
-it tell: b = ln(2 e^(s + b0) - 1) - s, b0 theirs. A hot pixel must lie above it, and above what its neighbours' scatter
-explains. Fewer frames than `frames_for` cannot place pixels near the limit.
+Hot pixels are told by what they cost. A frame tells of a stripe's s photons with the Fisher information
+1 / (e^(s + b) - 1) of a bit (b: all else that the pixel detects). The limit is the dark flux at which that falls to
+half of what the pixels around it tell: b = ln(2 e^(s + b0) - 1) - s, b0 theirs. A hot pixel must lie above it, and above what its
+neighbours' scatter explains. Fewer frames than `frames_for` cannot place pixels near the limit.
 
-Noisy is a pixel whose counts scatter over blocks of frames more than counting does, as they do where its rate jumps
+A noisy pixel is one whose counts scatter over blocks of frames more than counting does, as they do where its rate jumps
 (random telegraph noise). Index of dispersion: sum (n - e)^2 / e over the blocks, e in proportion to what ordinary
 pixels count in them, so that a lamp or a warming sensor makes nobody noisy; chi-square with blocks - 1 degrees of
 freedom but for the 1 - p of bits. `FALSE_ALARM` is the probability by which a pixel without fault is called noisy.
 
-Dead is a pixel that hardly fires in light although its neighbours do. Without light nobody can tell.
+A dead pixel is one that hardly fires in light although its neighbours do. Without light nobody can tell.
 
 Changes (`pixel_drift`) are told from frames of the same exposure in the same dark; dark rates double every 8 to 10 K,
 so a warmer sensor shows as a common factor and a faulty one pixel by pixel.

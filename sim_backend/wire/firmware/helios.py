@@ -69,7 +69,7 @@ class HeliosModel(DacModel):
         self.played = 0
         """Frames whose playing began."""
         self.drop_next = 0
-        """Test knob: so many sound frames are dropped in silence."""
+        """Test knob: number of sound frames that are dropped in silence."""
         self._name, self._version, self._axis = name, version, axis
         self._clock_error = clock_error
         self._playing: _Frame | None = None
