@@ -6,8 +6,8 @@ sqrt((e^flux - 1) / N); a pixel that never fired is given the sd of half a count
 
 Hot pixels are told by what they cost. A frame tells of a stripe's s photons with the Fisher information
 1 / (e^(s + b) - 1) of a bit (b: all else that the pixel detects). The limit is the dark flux at which that falls to
-half of what the pixels around it tell: b = ln(2 e^(s + b0) - 1) - s, b0 theirs. A hot pixel must lie above it, and above what its
-neighbours' scatter explains. Fewer frames than `frames_for` cannot place pixels near the limit.
+half of what the pixels around it tell: b = ln(2 e^(s + b0) - 1) - s, b0 theirs. A hot pixel must lie above it, and
+above what its neighbours' scatter explains. Fewer frames than `frames_for` cannot place pixels near the limit.
 
 A noisy pixel is one whose counts scatter over blocks of frames more than counting does, as they do where its rate jumps
 (random telegraph noise). Index of dispersion: sum (n - e)^2 / e over the blocks, e in proportion to what ordinary
