@@ -2,9 +2,9 @@
 
     var z = J C J',    J = dz / d(parameters) of the pixel's ray on the light sheet of its mirror command.
 
-A group's part of it is the variance that would go if the parameters of that group were known exactly, J C_.g C_gg^-1
-C_g. J': 0 at the least, all at the most, and the group's own variance where it is correlated with no other. Groups that
-are correlated share what they have in common, so parts may add up to more than the whole.
+A group's part of it is the variance that would go if the parameters of that group were known exactly,
+J C_.g C_gg^-1 C_g. J': 0 at the least, all at the most, and the group's own variance where it is correlated with no
+other. Groups that are correlated share what they have in common, so parts may add up to more than the whole.
 
 Further: the covariance of any other number that follows from a model (`propagated`); what an error of the mirror's
 command or of the stripe's place is worth in depth (`sensitivity`); and, where a simulation knows the true model, by how

@@ -1,5 +1,4 @@
-"""Pixels of a SPAD array in the dark and in light: how fast each fires by itself, which are hot, dead or noisy, and how
-they have changed since they were last looked at.
+"""Pixels of a SPAD array in the dark and in light: rates, hot, dead and noisy ones, and how they have changed.
 
 Flux per exposure is -ln(1 - p), p the share of frames in which a pixel fired. Its sd from N frames is
 sqrt((e^flux - 1) / N); a pixel that never fired is given the sd of half a count.

@@ -1,5 +1,6 @@
-"""The calibration board, a ChArUco board or a plain chessboard; its file; and how much of the picture, of the angles
-and of the distances a set of views has shown the camera.
+"""The calibration board, a ChArUco board or a plain chessboard, its file, and how much of it views have shown.
+
+A set of views covers a part of the picture, of the angles and of the distances (`Coverage`).
 
 Board coordinates in metres: x right, y down, z into the board, origin at the top left corner of the top left square,
 which is black. The inner corners are numbered row by row, as cv2.aruco.CharucoBoard does. The board's file holds what

@@ -1,5 +1,4 @@
-"""Finds a plain chessboard in a picture: OpenCV finds a grid of corners, the squares around it say whether it is the
-board.
+"""Finds a plain chessboard in a picture: OpenCV finds a grid, the squares around it say whether it is the board.
 
 OpenCV finds the grid that it is asked for in any larger print, and now and then in a smaller one, with corners that are
 none. So a grid counts as the board only where its print has as many corners as the board, no fewer and no more, as far

@@ -1,5 +1,4 @@
-"""A board drawn so that a picture of it can be compared with the drawing, and a smooth map from the board to the
-picture.
+"""A board drawn for comparison with a picture of it, and a smooth map from the board to the picture.
 
 The map is a homography and, with points enough, a polynomial on top of it for what a lens bends. It needs no camera: it
 is fitted to points whose board positions are known, and says where corners should be and how the board is drawn around

@@ -1,5 +1,4 @@
-"""The extent of a chessboard in a picture (which corners of a grid are there, and whether there are more), and the
-first search for a board's markers.
+"""The extent of a chessboard in a picture: which corners of a grid are there; and the first search for markers.
 
 Where four squares meet, the light changes across the line between them above the corner and, the other way round, below
 it; along a row of corners the change turns about from one to the next. A row that was only guessed, or that lies on the

@@ -1,5 +1,4 @@
-"""The sheet of light at one mirror command, a plane or a sheet that bows out of it, and the depth at which a pixel's
-ray meets it.
+"""The sheet of light at one mirror command, flat or bowed, and the depth at which a pixel's ray meets it.
 
 A line lens spreads the beam into a fan of directions. Seen from the fan's origin O, with f the fan's middle, t across
 it (along the mirror's axis) and n the plane's normal, light leaves at the angle phi within the plane and, where the

@@ -1,5 +1,4 @@
-"""A model's numbers as a list of parameters, local and minimal, for fits and covariances; and which lags sweeps can
-tell.
+"""A model's numbers as a list of parameters, local and minimal, for fits and covariances; the lags that sweeps tell.
 
 Directions and points have fewer degrees of freedom than numbers, so those of the axis are changes: 0 for the model at
 hand, counted about and along two fixed directions across the axis, e1 = zero_normal and e2 = axis x zero_normal.

@@ -1,6 +1,4 @@
-"""The rig model: the calibrated camera and scanner together, with what else the calibration knows of the rig, and the
-covariance of its parameters by name.
-"""
+"""The rig model: the calibrated camera and scanner, what else is known of the rig, and the parameters' covariance."""
 
 import hashlib
 from collections.abc import Mapping, Sequence

@@ -1,3 +1,1 @@
-"""A sweep's picture and its passages (when the line's centre crossed each pixel), both from the counts of its
-columns.
-"""
+"""A sweep's picture and its passages (when the line's centre crossed each pixel), from the counts of its columns."""

@@ -1,10 +1,14 @@
-"""The least squares of a rig's fit: Gauss-Newton steps, damped where they do not help, in scaled parameters, from
-normal equations that take one view at a time and eliminate its pose.
+"""The least squares of a rig's fit: Gauss-Newton steps, damped where they do not help, in scaled parameters.
 
-Passages of one instant share the mirror's jitter s: V = D + s^2 11' for each bin. Its inverse is D^-1 - k (D^-1 1)(D^-1
-1)', k = s^2 / (1 + s^2 1'D^-1 1), so a bin adds the sum over its passages less k times a product of sums. A view's pose
-only touches that view: with N = [[A, B'], [B, C]] (A shared, C the pose's own) the view adds A - B'C^-1 B to the shared
-equations, and its pose follows from theirs.
+The normal equations take one view at a time and eliminate its pose.
+
+Passages of one instant share the mirror's jitter s. For each bin
+
+    V = D + s^2 11',    V^-1 = D^-1 - k (D^-1 1)(D^-1 1)',    k = s^2 / (1 + s^2 1'D^-1 1)
+
+so a bin adds the sum over its passages less k times a product of sums. A view's pose only touches that view: with
+N = [[A, B'], [B, C]] (A shared, C the pose's own) the view adds A - B'C^-1 B to the shared equations, and its pose
+follows from theirs.
 """
 
 from collections.abc import Sequence

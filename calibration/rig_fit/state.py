@@ -1,5 +1,6 @@
-"""The state of a rig's fit: the model, its timing, the poses and all residuals at that point; and the sightings that it
-is fitted to, each pose's corners and passages, cleaned and in the order that the fit needs.
+"""The state of a rig's fit (model, timing, poses, residuals), and the sightings that it is fitted to.
+
+A sighting is a pose's corners and passages, cleaned and in the order that the fit needs.
 """
 
 from collections.abc import Sequence

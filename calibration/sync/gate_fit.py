@@ -3,9 +3,12 @@
     ones of frame i = level + slope i + brightness r(share of the exposure that was lit),     r(0) = 0, r(1) = 1
 
 One frame at most is lit in part. All others give level, slope and brightness by least squares, and so how bright that
-one is, r, with its standard deviation. A pixel that fires with probability p when lit whole has 1 - (1 - p)^s = s p + s
-(1 - s) / 2 p^2 + ..., whose coefficients are all positive and sum to 1. With m the mean of p over the ones (sum of p^2
-over sum of p) the response of a share s is therefore known within
+one is, r, with its standard deviation. A pixel that fires with probability p when lit whole has
+
+    1 - (1 - p)^s = s p + s (1 - s) / 2 p^2 + ...
+
+whose coefficients are all positive and sum to 1. With m the mean of p over the ones (sum of p^2 over sum of p) the
+response of a share s is therefore known within
 
     s + s (1 - s) m / 2 <= r(s) <= s + (1 - s) m
 

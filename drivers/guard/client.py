@@ -1,5 +1,4 @@
-"""The application's side of the guard: starts it, talks to it, sends its heartbeats, and makes the light safe itself
-where the guard is lost.
+"""The application's side of the guard: starts it, talks to it, beats for it, and steps in where it is lost.
 
 `GuardedLaser` and `GuardedSync` are the usual device interfaces; each verb is carried out by the guard.
 """

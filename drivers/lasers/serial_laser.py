@@ -1,5 +1,4 @@
-"""The common part of all lasers on a serial line: a config with limits, a port that may get lost, a serial number to
-check.
+"""The common part of all lasers on a serial line: config with limits, a port that may get lost, serial number.
 
 Also `PlainLaser`, a line laser without key or warm-up, whose emission follows `arm` and `pause` at once: simulated, or
 recorded.

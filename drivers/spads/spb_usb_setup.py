@@ -1,5 +1,6 @@
-"""Opening an SPB1 device (hardware.md sections 2.4, 2.5 and 8): its USB chip, its identity registers, its test pattern,
-and the registers written before START.
+"""Opening an SPB1 device: USB chip, identity registers, test pattern, and the registers written before START.
+
+Facts: hardware.md sections 2.4, 2.5 and 8.
 
 The USB chips differ in ids and endpoints, and an FT601 wants a session. Sources: `VicidominiLab` BrightEyes-TTM 8f8d8d8
 (FX3 with the AN65974 firmware, 04B4:00F1, bulk IN 0x81); `apertus-open-source-cinema/ft60x-rs` and

@@ -1,3 +1,1 @@
-"""Effects on the light between laser and sensor, one file each; an effect that a scene does not call for is not
-imported.
-"""
+"""Effects on the light between laser and sensor, one file each; one that no scene calls for is not imported."""

@@ -1,8 +1,8 @@
 """Drops and flakes as single bright points where they cross the sheet: the common part of rain and snow.
 
-A particle at X in a sheet of Gaussian thickness, s = n.X - d off its middle, gets J/r N(s; thickness/4) W/m^2 with J =
-P/fan, sends back that times its `back_m2_per_sr`, and is seen as a point of this intensity: a pixel of solid angle w
-sees the radiance I/(|X|^2 w). It is blurred like the line, and drawn out to a streak by what it falls in `HOLD_S`.
+A particle at X in a sheet of Gaussian thickness, s = n.X - d off its middle, gets J/r N(s; thickness/4) W/m^2 with
+J = P/fan, sends back that times its `back_m2_per_sr`, and is seen as a point of this intensity: a pixel of solid angle
+w sees the radiance I/(|X|^2 w). It is blurred like the line, and drawn out to a streak by what it falls in `HOLD_S`.
 
 The particles are a fixed set in the cone that the camera sees: each has its depth, and its direction runs on with its
 speed and comes in again at the other side, so that they are spread evenly at any time and a time says where all of them

@@ -1,5 +1,4 @@
-"""The medium and the weather of a scene: fog or smoke, rain or snow, their density and into which directions they
-scatter.
+"""The medium and the weather of a scene: fog or smoke, rain or snow, how dense, and where they scatter light to.
 
     medium: {fog: {visibility: 40 m}}                           # 2 % contrast; or {extinction: 0.1 /m}
     medium: {smoke: {extinction: 0.5 /m}}                       # or its visibility

@@ -1,5 +1,6 @@
-"""The common part of emulated scanner boards: commands and replies, points, and a record of the outputs over time,
-which an emulated world and tests look at.
+"""The common part of emulated scanner boards: commands and replies, points, and a record of the outputs.
+
+An emulated world and tests look at that record.
 """
 
 import threading

@@ -1,5 +1,6 @@
-"""An emulated SPB1 device's descriptors, its registers (docs/spb1-usb.md), and one run of it: frames exposed, frames
-that its memory loses, the blocks in which the others come.
+"""One run of an emulated SPB1 device, its USB descriptors and its registers (docs/spb1-usb.md).
+
+In a run frames are exposed, the memory may lose some, and the others come in blocks.
 """
 
 from collections.abc import Mapping
