@@ -1,16 +1,13 @@
 """The camera from corners of a board at several poses: OpenCV's calibration, made robust and told how well it knows.
 
 Three kinds of corners are left out and named: a view that does not fit the others (the board moved, its corners in
-another order), single corners that do not fit their view, and a view whose board is seen from behind, which is a
-mirror image. The fit is that of cv2.calibrateCamera on what is left. The covariance is s^2 (J^T J)^-1 with the poses
-free and s^2 the residuals' variance, so it counts what the lens model misses as noise.
+another order), single corners that do not fit their view, and a view whose board is seen from behind, which is a mirror
+image. The fit is that of cv2.calibrateCamera on what is left. The covariance is s^2 (J^T J)^-1 with the poses free and
+s^2 the residuals' variance, so it counts what the lens model misses as noise.
 
-OpenCV's calibration of a camera from corners, and whether they determine it.
-
-What decides is the normal matrix: its condition number and the sd it gives the focal length. How far the boards are
-turned against each other only chooses the word for the refusal.
-
-The normal equations of a camera and its boards' poses: how well corners determine the camera, poses left free.
+Whether the corners determine a camera is decided by the normal equations, poses left free: their condition number and
+the sd they give the focal length. How far the boards are turned against each other only chooses the word for the
+refusal.
 """
 
 from collections.abc import Sequence
@@ -42,7 +39,9 @@ class Normal:
 
     @property
     def condition(self) -> float:
-        """Of the matrix scaled to a unit diagonal: what it would be in the parameters' best units; inf if singular."""
+        """Condition number of the matrix scaled to a unit diagonal, as in the parameters' best units; inf if
+        singular.
+        """
         scale = np.sqrt(np.diag(self.matrix))
         if not np.all(np.isfinite(scale)) or not np.all(scale > 0):
             return float("inf")
@@ -50,11 +49,11 @@ class Normal:
         return float(eigen[-1] / eigen[0]) if eigen[0] > 0 else float("inf")
 
     def first(self, count: int) -> "Normal":
-        """Of the first parameters alone, the others taken as known."""
+        """The normal equations of the first parameters alone, the others taken as known."""
         return Normal(self.names[:count], self.matrix[:count, :count])
 
     def covariance(self, variance_px2: float) -> Covariance:
-        """For corners of this variance. CalibrationError or LinAlgError where the matrix is singular."""
+        """The covariance for corners of this variance. CalibrationError or LinAlgError where the matrix is singular."""
         scale = np.sqrt(np.diag(self.matrix))
         inverse = np.linalg.inv(self.matrix / np.outer(scale, scale)) / np.outer(scale, scale)
         return Covariance(self.names, variance_px2 * (inverse + inverse.T) / 2)
@@ -63,7 +62,9 @@ class Normal:
 def camera_normal(
     points_m: Sequence[Array], poses: Sequence[BoardPose], matrix: Array, distortion: Array, terms: int
 ) -> Normal:
-    """Of points (n, 3) of the board seen at each of the poses, by a camera with `terms` free terms of distortion."""
+    """The normal equations of a camera with `terms` free terms of distortion that saw points (n, 3) of the board at
+    each of the poses.
+    """
     total = np.zeros((4 + terms, 4 + terms))
     given = np.zeros(max(len(distortion), 5)) if terms <= 5 else np.zeros(14 if terms > 8 else 8)
     given[: len(distortion)] = distortion
@@ -80,14 +81,14 @@ def camera_normal(
 Mask = NDArray[np.bool_]
 
 LEAST_SD_PX = 0.01
-"""Corners are never better than this, however well they fit."""
+"""Least sd of corners: they are never better than this, however well they fit."""
 _MOST_FOCAL_SD = 0.05
-"""Of the focal length, relative: above, depth would be wrong by as much."""
+"""Largest relative sd of the focal length: above, depth would be wrong by as much."""
 _MOST_CONDITION = 1e11
-"""Of the normal matrix at unit diagonal: beyond, doubles lose its smallest eigenvalue."""
+"""Largest condition number of the normal matrix at unit diagonal: beyond, doubles lose its smallest eigenvalue."""
 _PARALLEL_RAD = float(np.radians(3.0))
 _SAME_PLACE = 0.02
-"""Of the distance: boards nearer to each other than that, and parallel, are one pose."""
+"""Share of their distance within which two parallel boards count as one pose."""
 _GUESSED_FOCAL = (1.2, 0.7, 2.5)
 """Focal lengths, in widths of the picture, to start from where OpenCV's own start fails."""
 _FLAGS = {
@@ -105,7 +106,9 @@ class CameraSolution:
     """A camera, and of every view the pose and the residuals (n, 2), projected less seen."""
 
     matrix: Array
+    """(3, 3) camera matrix, pixels."""
     distortion: Array
+    """Terms of the distortion in OpenCV's order."""
     poses: tuple[BoardPose, ...]
     residual_px: tuple[Array, ...]
 
@@ -244,22 +247,22 @@ class CameraProblem:
 
 
 def rms(residual_px: Array) -> float:
-    """Of the distance, as OpenCV has it: root of the mean of dx^2 + dy^2."""
+    """Root of the mean of dx^2 + dy^2, the rms distance as OpenCV counts it."""
     return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=-1)))) if len(residual_px) else float("nan")
 
 
 _FEWEST_CORNERS = 8
-"""Of a view: four give the pose, the rest say whether it fits."""
+"""Fewest corners of a view: four give the pose, the rest say whether it fits."""
 _VIEW_LIMIT = 2.5
 """A view is an outlier where its residuals, in sds of its corners, are so many times those of the usual view."""
 _CORNER_LIMIT = 6.0
 """Sds of either coordinate beyond which a corner is left out."""
 _FEW_CORNERS = 1
-"""Left out of a view without naming it."""
+"""Number of corners that may be left out of a view without naming it."""
 _LEAST_CLOSE = 0.7
-"""Share of a view's corners; with fewer that fit, none is used."""
+"""Least share of a view's corners; with fewer that fit, none is used."""
 _FEWEST_VIEWS = 3
-"""That stay when outliers leave."""
+"""Fewest views that must stay when outliers leave."""
 _MAX_ROUNDS = 20
 
 
@@ -295,7 +298,7 @@ class CameraFit:
 
     @property
     def sd(self) -> dict[str, float]:
-        """Of every parameter, by name: fx fy cx cy in pixels, the distortion's in its own units."""
+        """Standard deviation of every parameter, by name: fx fy cx cy in pixels, the distortion's in its own units."""
         spread = np.sqrt(np.diag(self.covariance.matrix))
         return dict(zip(self.covariance.names, spread.tolist(), strict=True))
 

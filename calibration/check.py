@@ -7,8 +7,6 @@ model's covariance and the scan's noise let expect of each stands beside it. Wit
 expected covariance and P what takes a plane off,
 
     chi2 = (P m)' (P C P)^+ (P m)    with cells - 3 degrees of freedom.
-
-A flat board as the line scanned it: mean pixel and mean command of each of its squares, and the points they give.
 """
 
 import math
@@ -158,11 +156,11 @@ _PARALLEL = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedBoard:
-    """What the scan of one board gives; lengths in metres.
+    """The result of the scan of one board; lengths in metres.
 
     distance_m: depth of its middle. flatness_rms_m, flatness_peak_m: of its squares' means off their plane; expected_m:
     the rms that covariance and noise let expect. chi2, freedom: of the deviations. scale: size scanned over size
-    stated; scale_sd: as expected. cells_m: (squares down, across) deviations, NaN where a square was not scanned.
+    stated; scale_sd: its expected sd. cells_m: (squares down, across) deviations, NaN where a square was not scanned.
     point_rms_m: of single passages off the plane. normal: (3,) unit, towards the camera.
     """
 

@@ -1,4 +1,4 @@
-"""How well a depth is known, from the covariance of the calibration: first order, by pixel, and what it comes from.
+"""The error of depth that a calibration leaves: by pixel, from its covariance to first order, and by which parameters.
 
     var z = J C J',    J = dz / d(parameters) of the pixel's ray on the light sheet of its mirror command.
 
@@ -6,11 +6,9 @@ A group's part of it is the variance that would go if the parameters of that gro
 J C_.g C_gg^-1 C_g. J': 0 at the least, all at the most, and the group's own variance where it is correlated with no
 other. Groups that are correlated share what they have in common, so parts may add up to more than the whole.
 
-What an error of the mirror's command or of the stripe's place is worth in depth, and where there is any depth.
-
-How well a number is known that follows from a model: its covariance, from that of the model's parameters.
-
-A model beside the true one, where a simulation knows it: by how much it gets depths wrong.
+Further: the covariance of any other number that follows from a model (`propagated`); what an error of the mirror's
+command or of the stripe's place is worth in depth (`sensitivity`); and, where a simulation knows the true model, by how
+much another one gets depths wrong (`depth_errors`).
 """
 
 from collections.abc import Callable, Mapping
@@ -29,7 +27,7 @@ Array = NDArray[np.float64]
 
 _STEPS = dict.fromkeys(MATRIX, 1e-3) | dict.fromkeys(TIMES, 1e-9) | {ROW_DELAY: 1e-12}
 _STEP = 1e-6
-"""Of each parameter, in its own unit: small against what bends, large against rounding."""
+"""Change of each parameter, in its own unit, for differences: small against what bends, large against rounding."""
 
 
 def propagated(model: RigModel, measure: Callable[[RigModel], Array]) -> tuple[Array, Array]:
@@ -68,7 +66,7 @@ _SEARCH_STEPS = 60
 _FOUND_M = 1e-9
 """A mirror command is found when its sheet passes the point within this: a thousandth of any calibration's error."""
 _INSIDE = 1e-6
-"""Of the command range: by so much differences stay within it."""
+"""Share of the command range by which differences stay within it."""
 _INDEPENDENT = 1e-12
 """Eigenvalues of a correlation matrix below this are rounding."""
 
@@ -142,7 +140,7 @@ def depth_sd_m(
 
 
 def command_at(model: RigModel, x_px: ArrayLike, y_px: ArrayLike, depth_m: ArrayLike) -> Array:
-    """Where the mirror stands when its light meets raw pixels at a depth; NaN where it does not within its range."""
+    """Mirror command at which the light meets raw pixels at a depth; NaN where it does not within the range."""
     z = np.asarray(depth_m, np.float64)
     u, v = model.camera.tangents_at(x_px, y_px)
     points = np.stack(np.broadcast_arrays(u * z, v * z, z), axis=-1)
@@ -227,7 +225,7 @@ def _covariance(model: RigModel) -> Covariance:
 _SENSITIVITY_GRID: Final = 24
 """Pixels looked at along each side."""
 LEAST_LIT_SHARE: Final = 0.05
-"""Of the picture, for a distance to be judged at: more than a border column or row."""
+"""Share of the picture that must be lit for a distance to be judged at: more than a border column or row."""
 _DISTANCES_M: Final = np.geomspace(0.05, 100.0, 60)
 
 
@@ -264,7 +262,7 @@ def sensitivity(model: RigModel, at_m: float) -> Sensitivity:
 
 
 def _said_reach(model: RigModel, x: Array, y: Array) -> str:
-    """From where to where the line reaches."""
+    """Words for the range of distances that the line reaches."""
     share = np.array([np.isfinite(command_at(model, x, y, at)).mean() for at in _DISTANCES_M])
     lit = _DISTANCES_M[share >= LEAST_LIT_SHARE]
     return f"it reaches {lit[0]:.2g} to {lit[-1]:.2g} m" if lit.size else "nor anything else within 100 m"
@@ -275,8 +273,8 @@ _TRUTH_GRID = 32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthErrors:
-    """Over a grid of pixels that the true rig lights at one depth. error_m: (n,) signed; sd_m: (n,) as the model's
-    covariance predicts, NaN for a model without one.
+    """Errors over a grid of pixels that the true rig lights at one depth. error_m: (n,) signed; sd_m: (n,) as the
+    model's covariance predicts, NaN for a model without one.
     """
 
     depth_m: float
@@ -301,7 +299,7 @@ class DepthErrors:
 
 
 def depth_errors(model: RigModel, truth: RigModel, depth_m: float, velocity_per_s: float) -> DepthErrors:
-    """What `model` makes of pixels that see the light at `depth_m`. velocity_per_s: of the command, signed."""
+    """The errors of `model` at pixels that see the light at `depth_m`. velocity_per_s: of the command, signed."""
     camera = truth.camera
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, _TRUTH_GRID), np.linspace(0, camera.height - 1, _TRUTH_GRID))
     mirror = command_at(truth, x, y, depth_m)

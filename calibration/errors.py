@@ -1,7 +1,4 @@
-"""The errors of this package.
-
-Numbers in messages and tables: as many digits as are known, never as a power of ten.
-"""
+"""The errors of this package, and numbers in messages and tables: as many digits as are known, never a power of ten."""
 
 import numpy as np
 

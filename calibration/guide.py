@@ -1,10 +1,8 @@
-"""Which pose of the board to show next, and why: the one after which the expected depth error is the least.
+"""Advice on the board's next pose, and why: the one after which the expected depth error is the least.
 
-Candidates stand on a grid of distance, place in the picture and tilt. What each would bring is forecast by the fit of
-the views so far (`calibration.guide`); before there is a fit, three poses begin that tell most about any
-camera. The same grid gives the sequence of poses that a simulated rig shows when nobody guides it.
-
-What one more pose of the board would bring: the depth error expected once it has been shown.
+Candidates stand on a grid of distance, place in the picture and tilt. The gain of each is forecast by the fit of the
+views so far (`Forecast`); before there is a fit, three poses begin that tell most about any camera. The same grid gives
+the sequence of poses that a simulated rig shows when nobody guides it.
 
 A pose that nobody has shown yet has no data, but its equations need none: where its corners and passages would lie, and
 how they change with the parameters, follows from the fit so far; how noisy they would be, from the noise of the others.
@@ -35,7 +33,7 @@ from calibration.views import FEWEST_CORNERS, BoardPose
 Array = NDArray[np.float64]
 
 FILLS = (0.6, 0.45, 0.32, 0.22)
-"""How much of the picture's width or height, whichever it meets first, the board fills: its distance, by name."""
+"""Share of the picture's width or height, whichever it meets first, that the board fills: its distance, by name."""
 PLACES = {
     (0, 0): "in the middle of the picture",
     (-1, 0): "at the left border",
@@ -48,7 +46,7 @@ PLACES = {
     (1, 1): "in the lower right corner",
 }
 TILT_RAD = math.radians(35)
-"""Enough for a strong perspective, little enough for corners to be found."""
+"""Tilt of a tilted board: enough for a strong perspective, little enough for corners to be found."""
 TILTS = {
     (0, 0): "facing the camera",
     (0, 1): "its left side turned away",
@@ -60,7 +58,7 @@ TILTS = {
 LEAST_MODULE_PX = 2.0
 """Side of a marker's module in the picture; smaller ones are not read when tilted and noisy."""
 _BORDER_SHARE = 0.03
-"""Of the picture, left free around the board."""
+"""Share of the picture left free around the board."""
 
 ExpectedError = Callable[[BoardPose], float]
 """The expected depth error (m) once this pose has been shown too."""
@@ -77,7 +75,7 @@ class Candidate:
     pose: BoardPose
 
     def __str__(self) -> str:
-        """What to do with the board."""
+        """Instruction to the person who holds the board."""
         if self.tilt == (0, 0):
             what = "hold the board facing the camera"
         else:
@@ -96,7 +94,7 @@ class Advice:
     after_m: float = math.nan
 
     def __str__(self) -> str:
-        """What to do and why."""
+        """Instruction to the person who holds the board, and the reason for it."""
         if not math.isfinite(self.after_m):
             return str(self.candidate)
         before = f"from {mm(self.before_m)} " if math.isfinite(self.before_m) else ""
@@ -124,7 +122,9 @@ def next_pose(
     now_m: float = math.nan,
     forecast: ExpectedError | None = None,
 ) -> Advice:
-    """What to show after `shown` poses: by the forecast, without one from the sequence that begins well."""
+    """The pose to show after `shown` poses: the best by the forecast; without one, the next of the sequence that begins
+    well.
+    """
     if not choices:
         raise ValueError("no pose of the board fits into the picture")
     if forecast is None:
@@ -135,7 +135,8 @@ def next_pose(
 
 
 def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[Candidate, ...]:
-    """So many poses that differ from one another as much as they can: near and far, all places, all tilts.
+    """Poses, as many as asked for, that differ from one another as much as they can: near and far, all places, all
+    tilts.
 
     Each is the one farthest from those before it; the first is a tilted one, near. seed: which of equals comes first.
     """
@@ -191,23 +192,23 @@ def _candidate(
 
 
 def _traits(candidate: Candidate) -> Array:
-    """Where a pose stands among others: distance, place, tilt, in steps that matter about as much."""
+    """Coordinates of a pose among others: distance, place, tilt, in steps that matter about as much."""
     return np.array([1.5 * math.log(candidate.distance_m), *(0.7 * np.array(candidate.place)), *candidate.tilt])
 
 
 BOARD_POINTS = 14
-"""Along either side of the board, where passages are looked at; each stands for as many as there will be."""
+"""Points along either side of the board where passages are looked at; each stands for as many as there will be."""
 _CELLS = (9, 7)
-"""Of the picture, across and down, in whose middles the depth error is looked at."""
+"""Cells of the picture, across and down, in whose middles the depth error is looked at."""
 BORDER_PX = 2.0
-"""Corners nearer to the picture's border are not found."""
+"""Distance from the picture's border within which corners are not found."""
 
 
 class Forecast:
     """The depth error to expect after one more pose: call it with the pose. now_m: without it."""
 
     def __init__(self, fit: RigFit, at_m: float) -> None:
-        """Of a fit, for a depth."""
+        """Prepare forecasts from a fit, for the depth error at `at_m`."""
         self._fit = fit
         self._terms = Terms(fit.model.camera.distortion.size)
         self._tie = np.zeros((len(self._terms.names), len(fit.free)))
@@ -244,7 +245,7 @@ class Forecast:
         return float(np.sqrt(np.median(variance))) if variance.size else math.nan
 
     def _seen(self, pose: BoardPose) -> Sighting | None:
-        """What would be seen of the board there, without errors; None for too little."""
+        """The corners and passages that a board there would give, without errors; None where they are too few."""
         model, board = self._fit.model, self._fit.board
         corners_m = board.corners_m
         x, y, found = _inside(model, pose.to_camera(corners_m))
@@ -277,7 +278,9 @@ class Forecast:
 
 
 def _next_velocities(fit: RigFit) -> tuple[float, ...]:
-    """At which the next pose will be swept: poses take turns at the speeds, so as the one that had its turn first."""
+    """The velocities at which the next pose will be swept: poses take turns at the speeds, so those of the pose whose
+    turn is the longest ago.
+    """
     shown = [tuple(sweep.direction * sweep.speed_per_s for sweep in view) for view in fit.sweeps if view]
     last = {velocities: turn for turn, velocities in enumerate(shown)}
     return min(last, key=lambda velocities: last[velocities])

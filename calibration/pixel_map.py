@@ -1,35 +1,25 @@
-"""Pixels of a SPAD array in the dark and in light: how fast each fires by itself, and which are hot, dead or noisy.
+"""Pixels of a SPAD array in the dark and in light: rates, hot, dead and noisy ones, and how they have changed.
 
 Flux per exposure is -ln(1 - p), p the share of frames in which a pixel fired. Its sd from N frames is
 sqrt((e^flux - 1) / N); a pixel that never fired is given the sd of half a count.
 
-Hot is a matter of cost. A frame tells of a stripe's s photons with the Fisher information 1 / (e^(s + b) - 1) of a bit
-(b: all else that the pixel detects). The limit is the dark flux at which that falls to half of what the pixels around
-it tell: b = ln(2 e^(s + b0) - 1) - s, b0 theirs. A hot pixel must lie above it, and above what its neighbours' scatter
-explains. Fewer frames than `frames_for` cannot place pixels near the limit.
+Hot pixels are told by what they cost. A frame tells of a stripe's s photons with the Fisher information
+1 / (e^(s + b) - 1) of a bit (b: all else that the pixel detects). The limit is the dark flux at which that falls to
+half of what the pixels around it tell: b = ln(2 e^(s + b0) - 1) - s, b0 theirs. A hot pixel must lie above it, and
+above what its neighbours' scatter explains. Fewer frames than `frames_for` cannot place pixels near the limit.
 
-Noisy is a pixel whose counts scatter more than counting does (`calibration.pixel_map`); `FALSE_ALARM` is the
-probability by which one without fault is called so.
+A noisy pixel is one whose counts scatter over blocks of frames more than counting does, as they do where its rate jumps
+(random telegraph noise). Index of dispersion: sum (n - e)^2 / e over the blocks, e in proportion to what ordinary
+pixels count in them, so that a lamp or a warming sensor makes nobody noisy; chi-square with blocks - 1 degrees of
+freedom but for the 1 - p of bits. `FALSE_ALARM` is the probability by which a pixel without fault is called noisy.
 
-Dead is a pixel that hardly fires in light although its neighbours do. Without light nobody can tell.
+A dead pixel is one that hardly fires in light although its neighbours do. Without light nobody can tell.
 
-Dark frames of a SPAD array, added up, and by how much each pixel's counts scatter from block to block.
+Changes (`pixel_drift`) are told from frames of the same exposure in the same dark; dark rates double every 8 to 10 K,
+so a warmer sensor shows as a common factor and a faulty one pixel by pixel.
 
-The counts of a pixel whose rate jumps (random telegraph noise) scatter over the blocks of frames more than counting
-does. Index of dispersion: sum (n - e)^2 / e over the blocks, e in proportion to what ordinary pixels count in them, so
-that a lamp or a warming sensor makes nobody noisy; chi-square with blocks - 1 degrees of freedom but for the 1 - p of
-bits.
-
-What has become of a sensor's pixels since they were last looked at, and whether that is still the same sensor.
-
-Compared are frames of the same exposure in the same dark; dark rates double every 8 to 10 K, so a warmer sensor shows
-as a common factor and a faulty one pixel by pixel.
-
-`pixels.npz`: what is known of a sensor's pixels, with the number of its version, its date and its predecessor.
-
-Arrays as in `PixelMap`, by their names (`dead` is left out where nobody could tell), and `about`, JSON text: format,
-version, created, parent, sensor, exposure_s, frames, judged, lit_judged,
-ordinary_per_s.
+`pixels.npz` holds the arrays of a `PixelMap` by their names (`dead` is left out where nobody could tell), and `about`,
+JSON text: format, version, created, parent, sensor, exposure_s, frames, judged, lit_judged, ordinary_per_s.
 """
 
 import hashlib
@@ -130,7 +120,7 @@ PRECISION = 0.02
 FALSE_ALARM = 1e-6
 """Probability that a pixel without fault is called noisy, or dead: a quarter of one in 512 x 512."""
 DEAD_SHARE = 0.1
-"""Of its neighbours' light."""
+"""Share of its neighbours' light below which a pixel is dead."""
 _HOT_SIGMA = 6.0
 _JUMP_SIGMA = 3.0
 """A noisy pixel is a defect where its rate goes beyond the limit by so many sd."""
@@ -138,14 +128,14 @@ _JUMP_SIGMA = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelMap:
-    """What was found; arrays are (rows, width).
+    """The result for each pixel; arrays are (rows, width).
 
     rate_per_s, rate_sd_per_s: float32, dark counts a second; NaN where no frame had the pixel. jump_per_s: float32, sd
     of the rate from block to block beyond that of counting, 0 where there is none or nobody can tell. hot, noisy: bool.
     dead: None where there was no light. judged, lit_judged: share of the pixels that fired often enough to tell whether
     they are noisy, and that were lit well enough to tell whether they are dead. defects: hot, dead, or noisy and at
-    times as fast as hot ones. limit_per_s: float32, where hot begins. frames: most that a pixel had.
-    ordinary_per_s: mean dark rate of the pixels that nothing sets apart.
+    times as fast as hot ones. limit_per_s: float32, where hot begins. frames: most that a pixel had. ordinary_per_s:
+    mean dark rate of the pixels that nothing sets apart.
     """
 
     rate_per_s: NDArray[np.float32]
@@ -171,9 +161,9 @@ def judge_pixels(
     signal: float = SIGNAL,
     false_alarm: float = FALSE_ALARM,
 ) -> PixelMap:
-    """What the dark frames say of each pixel. lit: (ones, frames) with light on the sensor, else nobody is dead.
+    """Judge each pixel by the dark frames. lit: (ones, frames) with light on the sensor; without it nobody is dead.
 
-    signal: photons per pixel and exposure of the weakest stripe. false_alarm: as `FALSE_ALARM`.
+    signal: photons per pixel and exposure of the weakest stripe. false_alarm: see `FALSE_ALARM`.
     """
     ones, frames = tally.ones, tally.frames
     flux, sd = flux_of(ones, frames)
@@ -288,7 +278,7 @@ def _share(ones: NDArray[np.integer], frames: NDArray[np.integer]) -> Array:
 
 
 def _chi_square_limit(dof: NDArray[np.int64], probability: float) -> Array:
-    """What chi-square exceeds with that probability (Wilson and Hilferty, 1931)."""
+    """The value that chi-square exceeds with that probability (Wilson and Hilferty, 1931)."""
     spread = 2 / (9 * dof)
     result: Array = dof * (1 - spread + NormalDist().inv_cdf(1 - probability) * np.sqrt(spread)) ** 3
     return result
@@ -308,10 +298,10 @@ _LEAST_HOT = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelDrift:
-    """From an older map to a newer one.
+    """The change from an older map to a newer one.
 
-    became_hot, became_dead, recovered: (n, 2) row and column; hot ones where the change is more than chance. ratio:
-    of the ordinary pixels' rates, newer to older, with ratio_sigma, its distance from 1 in sd. changed: share of the
+    became_hot, became_dead, recovered: (n, 2) row and column; hot ones where the change is more than chance. ratio: of
+    the ordinary pixels' rates, newer to older, with ratio_sigma, its distance from 1 in sd. changed: share of the
     pixels whose rates differ by more than chance once that factor is taken out. correlation: of the logarithms of the
     rates, NaN where either has none. alike: share of the old hot pixels that are hot still, None for too few.
     new_defects: share of all pixels that became hot or dead.
@@ -379,7 +369,9 @@ def _ratio(
     sd_before: NDArray[np.float64],
     sd_after: NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Of the sums of two sets of rates, and its distance from 1 in sd; (1, 0) where there is nothing to compare."""
+    """Ratio of the sums of two sets of rates, and its distance from 1 in sd; (1, 0) where there is nothing to
+    compare.
+    """
     old, new = float(before.sum()), float(after.sum())
     if old <= 0 or new <= 0:
         return 1.0, 0.0
@@ -450,7 +442,7 @@ def save_pixels(version: PixelVersion, path: str | os.PathLike[str]) -> None:
 _DAMAGE = (
     ArithmeticError, AttributeError, EOFError, KeyError, RecursionError, TypeError, ValueError, zipfile.BadZipFile,
 )  # fmt: skip
-"""What reading a file raises that is not as it was written."""
+"""Errors that reading raises for a file that is not as it was written."""
 
 
 def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:

@@ -1,4 +1,4 @@
-"""What a calibration is found to be: good enough for what was asked, or not, and for which reasons."""
+"""The verdict on a calibration: good enough for what was asked, or not, and for which reasons."""
 
 import math
 from collections.abc import Callable
@@ -10,18 +10,18 @@ from calibration.errors import digits
 VerdictWord = Literal["passed", "failed"]
 """A verdict as files have it."""
 SIGMAS: Final = 4.0
-"""By how many standard deviations a baseline must differ from the stated one."""
+"""Standard deviations by which a baseline must differ from the stated one."""
 WORST_TIMES: Final = 4.0
 """The picture's worst places (95 %) may have this many times the error asked for."""
 
 
 AT_M: Final = 5.0
-"""Where depth is judged unless another distance is asked for."""
+"""Distance at which depth is judged unless another is asked for."""
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """How good a calibration is to be: sd of depth at a distance; the baseline where somebody has measured it."""
+    """The quality asked of a calibration: sd of depth at a distance; the baseline where somebody has measured it."""
 
     accuracy_m: float
     at_m: float = AT_M
@@ -30,7 +30,9 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why a calibration is not good enough: code for machines, text for people, value and limit in the same unit."""
+    """A reason why a calibration is not good enough: code for machines, text for people, value and limit in the same
+    unit.
+    """
 
     code: str
     text: str
@@ -52,7 +54,7 @@ class Verdict:
 
     @property
     def word(self) -> VerdictWord:
-        """It, in a word."""
+        """The verdict in a word."""
         return "passed" if self.passed else "failed"
 
     @property
@@ -61,12 +63,12 @@ class Verdict:
         return tuple(reason.code for reason in self.reasons)
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """The verdict as JSON content, for programs."""
         return {"passed": self.passed, "reasons": [asdict(reason) for reason in self.reasons]}
 
 
 MOST_POSES: Final = 50
-"""That anybody shows: four times those of a usual session."""
+"""Most poses that anybody shows: four times those of a usual calibration."""
 
 _GUIDED = " ('--guided' says which)"
 _TELL_MORE = f"make each pose tell more, with more light, the board nearer and tilted more{_GUIDED}"
@@ -95,13 +97,13 @@ def reason_for(code: str, text: str, value: float = math.nan, limit: float = mat
 
 
 def unguided(verdict: Verdict) -> Verdict:
-    """The same for a command that has no guided mode."""
+    """The verdict for a command that has no guided mode: no next step names one."""
     reasons = tuple(replace(reason, next_step=reason.next_step.replace(_GUIDED, "")) for reason in verdict.reasons)
     return replace(verdict, reasons=reasons)
 
 
 def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, said: Callable[[float], str]) -> Reason:
-    """Nothing is wrong with the data but their number: errors fall with the root of it.
+    """The reason where nothing is wrong with the data but their number: errors fall with the root of it.
 
     what: the words before an error; found: its median and 95 % over the picture, of which the one that is farther from
     what is asked for is named; said: an error in words.

@@ -1,9 +1,8 @@
 """One view of a calibration board held still: where its corners lie, and when the line passed over each pixel.
 
 A pixel's passage is the mirror command at which the line's centre crosses it. Its albedo is the same in every column,
-so the board's print does not pull at the passage, as it would at a stripe sought along a row.
-
-Scatter that a few wrong values do not move.
+so the board's print does not pull at the passage, as it would at a stripe sought along a row. Scatter is estimated by
+`robust_sd`, which a few wrong values do not move.
 """
 
 from dataclasses import dataclass
@@ -18,9 +17,9 @@ Array = NDArray[np.float64]
 NO_POSE = "corners of a view are no picture of a board; take the view out, or name the board that it shows"
 USUAL_CORNER_SD_PX = 0.03
 FEWEST_CORNERS = 6
-"""That give a board's pose, with some to spare."""
+"""Fewest corners that give a board's pose, with some to spare."""
 LEAST_ACROSS_PX = 1.0
-"""Of corners that give a pose; they are found to some 0.01 px."""
+"""Least extent of corners across their line, in pixels, for a pose; they are found to some 0.01 px."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +53,7 @@ class Corners:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Passages:
-    """When the line's centre crossed the pixels of one sweep.
+    """Mirror commands at which the line's centre crossed the pixels of one sweep.
 
     x_px, y_px: (m,) float64. command: (m,) float64, as commanded at that instant, without any lag. sd: (m,) float64 in
     command units. direction: +1 while the command rises, else -1. speed_per_s: how fast it does, above 0.
@@ -69,13 +68,13 @@ class Passages:
 
     @property
     def velocity_per_s(self) -> float:
-        """Of the command, signed."""
+        """Velocity of the command, signed."""
         return float(np.sign(self.direction)) * self.speed_per_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What is known of one pose of the board. picture: (height, width) float32, photons per pixel and exposure."""
+    """One pose of the board as seen and scanned. picture: (height, width) float32, photons per pixel and exposure."""
 
     name: str
     corners: Corners | None

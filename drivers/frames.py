@@ -22,7 +22,7 @@ SUBFRAME_MASK = 0xFF
 
 
 class Mark(IntFlag):
-    """What happened during a frame's period (bits of `marks`)."""
+    """Events of a frame's period (bits of `marks`)."""
 
     GATE_HIGH = 1
     """The gate was high during the whole exposure: the frame is lit."""
@@ -34,7 +34,7 @@ class Mark(IntFlag):
     BACKWARD = 32
     """Level, not edge: the scanner runs backward."""
     WINDOW_LOST = 64
-    """The device lost the line its window table is at; `x0` is not to be trusted."""
+    """The device lost the line that its window table is at; `x0` is not to be trusted."""
 
 
 class BlockFlag(IntFlag):
@@ -52,7 +52,7 @@ class BlockFlag(IntFlag):
 
 
 class BlockStatus(IntEnum):
-    """How a block ended (SPB1 1.0 trailer, offset 4)."""
+    """Ways in which a block can end (SPB1 1.0 trailer, offset 4)."""
 
     OK = 0
     TRUNCATED = 1
@@ -72,13 +72,14 @@ def frame_bytes(width: int, height: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class BlockHeader:
-    """What holds for every frame of a block. Fields as in the SPB1 1.0 wire layout (docs/spb1.md)."""
+    """Everything that holds for all frames of a block. Fields as in the SPB1 1.0 wire layout (docs/spb1.md)."""
 
     flags: BlockFlag
+    """Flags of the block."""
     run_id: int
-    """Changes at each START, so that stale data after a re-arm is recognised; 16 bit."""
+    """Number of the run, 16 bit; changes at each START, so that stale data after a re-arm is recognised."""
     block_seq: int
-    """Counts blocks of the run from 0."""
+    """Number of the block in its run, from 0."""
     first_frame: int
     """Number of the first frame; counts *exposed* frames since START, lost ones included."""
     t0_ticks: int
@@ -86,9 +87,11 @@ class BlockHeader:
     lost_before: int
     """Frames exposed since START that are not in the stream before this block."""
     tick_hz: Fraction
+    """Rate of the tick counter."""
     frame_period_ticks: int
     """Nominal period; 0 = triggered from outside."""
     exposure_ticks: int
+    """Exposure of every frame."""
     sweep: int
     """Scan markers since START at the first frame."""
     frame_step: int
@@ -96,10 +99,15 @@ class BlockHeader:
     width: int
     """Pixels of each frame's window; constant within a block."""
     height: int
+    """Rows of each frame."""
     sensor_width: int
+    """Pixels of a row of the whole sensor."""
     sensor_height: int
+    """Rows of the whole sensor."""
     bits_per_px: int = 1
+    """Always 1 for blocks of frames that this program reads."""
     payload_type: int = 0
+    """Type of the payload; 0: packed frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +123,7 @@ class FrameBlock:
     records: NDArray[np.void]
     bits: NDArray[np.uint8]
     status: int = BlockStatus.OK
+    """How the block ended, a `BlockStatus`."""
 
     @property
     def n_frames(self) -> int:

@@ -6,11 +6,13 @@ from typing import Any, Final
 MAX_DEPTH: Final = 64
 """Most lists and mappings within one another."""
 _MOST_DIGITS: Final = 20
-"""Of a whole number of 64 bits."""
+"""Digits of the longest whole number of 64 bits."""
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What a text of JSON says. Raises ValueError, one line, where it is none or more than this program takes."""
+    """The content of a JSON text. ValueError, one line, where the text is no JSON or goes beyond what this program
+    takes.
+    """
     try:
         content = json.loads(text, parse_int=_whole)
     except RecursionError:

@@ -30,7 +30,9 @@ class KindConfig(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What a device is created in. Real devices take clock and ports; simulated ones share the world and the seed."""
+    """The things a device is created with. Real devices take clock and ports; simulated ones share the world and the
+    seed.
+    """
 
     clock: Clock
     world: World | None
@@ -38,12 +40,12 @@ class Surroundings:
     ports: Mapping[str, Endpoint] = field(default_factory=dict)
     """Ports that an emulating world created, by name; a device's `port: emulated:NAME` means one of them."""
     tap: Tap | None = None
-    """Told of all that passes the device's port, where its traffic is recorded."""
+    """Tap on everything that passes the device's port, where its traffic is recorded."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What an entry point loads: the config model of a kind and the function that creates the opened device.
+    """The object an entry point loads: the config model of a kind and the function that creates the opened device.
 
     `create(config, surroundings)` gets an instance of `config` and returns a device of the slot's interface (or a
     `World`); it raises a `DeviceError` when the device cannot be opened.
@@ -55,8 +57,8 @@ class Kind:
     """Opens the files that its config names, as `create` does, without the device; `DeviceError` where one cannot be
     used. None: it names none. A world needs none, it is created."""
     off: Callable[[Any], bytes] | None = None
-    """What a laser on a serial port is sent, by its config, where there is no time to open it first: emission off,
-    whatever it answers."""
+    """The bytes that switch off the emission of a laser on a serial port, by its config, whatever it answers: sent
+    where there is no time to open it first."""
 
 
 def kinds(slot: str) -> tuple[str, ...]:

@@ -27,7 +27,7 @@ _PAGE_BYTES = 4096
 
 
 class OnFull(Enum):
-    """What becomes of a block for which there is no free slot."""
+    """Fate of a block for which there is no free slot."""
 
     WAIT = "wait"
     """The source waits until one comes free. A source that cannot drops the block all the same."""
@@ -169,7 +169,7 @@ class BlockRing:
             )
 
     def end_waits(self) -> None:
-        """From now on `claim` gives its answer at once: the source is to end, and readers may never come again."""
+        """Let `claim` give its answer at once from now on: the source is to end, and readers may never come again."""
         with self._changed:
             self._patient = False
             self._changed.notify_all()

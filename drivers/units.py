@@ -22,7 +22,7 @@ _MAX_TEXT = 1000
 """Longest text taken, in characters: exact arithmetic on an endless number would take endless time."""
 
 MANY_ZEROS = 5
-"""From so many zeros on a whole number is written with an exponent."""
+"""Number of zeros from which on a whole number is written with an exponent."""
 _FAITHFUL = Context(prec=20)
 """Decimal digits that pin a 64-bit float (17) with enough to spare for one multiplication by a unit."""
 
@@ -116,7 +116,9 @@ def parse_quantity(text: object, dimension: str) -> float:
 
 
 def parse_exact(text: object, dimension: str) -> Fraction:
-    """As `parse_quantity`, with nothing rounded; takes a fraction too ("100000/3 Hz")."""
+    """Parse a quantity as `parse_quantity` does, but exactly, with nothing rounded; takes a fraction too ("100000/3
+    Hz").
+    """
     known = DIMENSIONS[dimension]
     like = f'write the {known.name} with a unit, like "{known.example}"'
     if not isinstance(text, str):
@@ -219,7 +221,7 @@ class _Text:
 
 Seconds = Annotated[float, _Text("time")]
 Age = Annotated[float, _Text("age")]
-"""In seconds in code: "90 d" is 7776000."""
+"""An age, in seconds in code: "90 d" is 7776000."""
 Hertz = Annotated[float, _Text("frequency")]
 ExactHertz = Annotated[Fraction, _Text("frequency", exact=True)]
 Metres = Annotated[float, _Text("length")]
@@ -234,5 +236,5 @@ MetresPerHour = Annotated[float, _Text("rain rate")]
 CountsPerSecond = Annotated[float, _Text("count rate")]
 PerSecond = Annotated[float, _Text("rate")]
 PerSecondSquared = Annotated[float, _Text("acceleration")]
-"""Of a normalised drive: full ranges of -1 to 1 are 2."""
+"""Acceleration of the normalised drive, whose full range, -1 to 1, is 2."""
 BytesPerSecond = Annotated[float, _Text("data rate")]

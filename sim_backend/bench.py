@@ -22,12 +22,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Happening:
-    """What happened during n frames.
+    """Events during n frames.
 
     mirror: (n,) mirror position, as a command, in the middle of each exposure. velocity_per_s: (n,) of it, NaN = not
     known. share: (n,) part of the exposure with the gate high. edge: (n,) bool, the gate changed during the exposure.
     backward: (n,) bool, direction level at the start. line_s, scan_s: times of marker edges. power_w: emitted power, 0
-    while paused. jitter: (n,) or 0, by how much the mirror is off that position."""
+    while paused. jitter: (n,) or 0, by how much the mirror is off that position.
+    """
 
     mirror: Array
     velocity_per_s: Array
@@ -53,7 +54,7 @@ class Bench:
         self._aborted = False
         self._power_w = 0.0
         self.jitter = Jitter(0.0, 0)
-        """How the mirror shakes."""
+        """Shaking of the mirror."""
 
     def now_s(self) -> float:
         """Present time of the bench."""
@@ -70,7 +71,7 @@ class Bench:
             self._motion = Playing(waveform, repeats, start_s, rate_hz, self.lag.forward, self.lag.backward)
 
     def rest(self, command: float) -> None:
-        """Stop the mirror at a command, now."""
+        """Stop the mirror now, at a command."""
         with self._lock:
             self._motion = Resting(command)
 
@@ -80,7 +81,7 @@ class Bench:
             return self._motion.moving(self.now_s())
 
     def mirror(self) -> float:
-        """Where the mirror stands now, as a command."""
+        """Present position of the mirror, as a command."""
         with self._lock:
             return float(self._motion.mirror(np.array([self.now_s()]))[0])
 
@@ -96,14 +97,14 @@ class Bench:
             self._program = GateProgram(pulses, repeats, self.now_s())
 
     def lower_gate(self) -> None:
-        """Gate low from now on, until the next program."""
+        """Take the gate low from now on, until the next program."""
         with self._lock:
             if self._program is not None:
                 self._catch_up()
                 self._program.lower_gate(self.now_s())
 
     def abort_program(self) -> None:
-        """All outputs low from now on."""
+        """Take all outputs low from now on."""
         with self._lock:
             self._aborted = True
             if self._program is not None:
@@ -122,7 +123,7 @@ class Bench:
             return ("waiting" if self._program.waiting else "running"), word
 
     def during(self, start_s: Array, exposure_s: float, period_s: float) -> Happening:
-        """What happens during frames that start at start_s (n,), ascending, one period apart."""
+        """Events during frames that start at start_s (n,), ascending, one period apart."""
         until_s = float(start_s[-1]) + period_s
         with self._lock:
             motion = self._motion

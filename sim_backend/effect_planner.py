@@ -30,14 +30,15 @@ from sim_backend.light.sheet import LightSheet, empty_sheet
 
 Array = NDArray[np.float64]
 Wanted = Literal["planned", "all"] | tuple[str, ...]
-"""Which of the effects that a scene calls for are run: without the negligible ones, all, or these."""
+"""The effects to run of those that a scene calls for: all but the negligible ones, all, or these."""
 
 MOST_CHANGED = 0.01
 """Share of decisions that may change by all that is left out: eps = 2e-4."""
 MOST = PlannedFor(power_w=1.0, exposure_s=1e-3, exposures=100)
-"""What a plan holds for where nobody says what is to be scanned: more than a line laser and an ordinary scan have."""
+"""The most that a plan holds for where nobody says what is to be scanned: more than a line laser and an ordinary scan
+have."""
 SAFETY = 2.0
-"""Times the mean over sampled rows: their spread over rows and columns is less."""
+"""Safety factor on the mean over sampled rows: their spread over rows and columns is less."""
 SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8
 
 
@@ -103,7 +104,7 @@ def _decision(
 
 
 def _smallest(changes: dict[str, float]) -> tuple[set[str], float]:
-    """As many of the effects as stay within `MOST_CHANGED` together, the smallest first, and their sum."""
+    """The effects, smallest first, that stay within `MOST_CHANGED` together, and their sum."""
     taken, total = set(), 0.0
     for name in sorted(changes, key=changes.__getitem__):
         if total + changes[name] > MOST_CHANGED:
@@ -121,7 +122,7 @@ class _Bounds:
         self._seconds, self._joules = planned_for.exposure_s, planned_for.exposure_s * planned_for.power_w
         light = [name for name, effect in model.laser.items() if name != MEASURED and hold_s(effect) == 0]
         self.names = (*light, *model.steady)
-        """What can be bounded: light that stands still, and dark counts."""
+        """Names of the effects that can be bounded: light that stands still, and dark counts."""
         self._bands = _bands(model.setting.view.rows)
         self._sheets = _sheets(model, planes, self._bands) if light else []
         self._whole = self._sampled(()) if light else np.zeros(0)

@@ -1,9 +1,8 @@
-"""What every effect of a world is worth: on or off, why, its share of the photons, what it costs; and a row's flux.
+"""A report on the effects of a world: on or off, why, each one's share of the photons, its cost; and a row's flux.
 
-An effect's light is what the flux is more (or less) once it has acted on that of the effects before it, so that the
-effects' lights add up to the flux. Costs are medians of one thread's time, measured when asked for: light per column,
-divided among the frames that share it, what happens to bits per whole frame; light that does not depend on the laser is
-made once for all.
+An effect's light is the flux with it less the flux of the effects before it, so that the effects' lights add up to the
+flux. Costs are medians of one thread's time, measured when asked for: light per column, divided among the frames that
+share it, effects on the bits per whole frame; light that does not depend on the laser is made once for all.
 """
 
 import time
@@ -30,11 +29,11 @@ MOTION = "motion"
 TIMED_FRAMES = 50
 TIMED_ROUNDS = 5
 SPARSITY = 6
-"""Bits are timed on frames with 1 pixel in 2^6 lit, as in fog."""
+"""Halvings of the lit share on which bits are timed: 1 pixel in 2^6, as in fog."""
 
 
 def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
-    """For columns of `exposures` frames at a power.
+    """The report for columns of `exposures` frames at a power.
 
     planned_for: power_w, exposure_s (of a column's frames together) and exposures that the plan holds for.
     changed_decisions_bound: of all that was left out together. effects: one mapping for each of the catalogue, with
@@ -100,7 +99,7 @@ def _line(decision: EffectDecision, share: float, costs: Mapping[str, float | No
 def _light(
     world: "SimulatedWorld", model: FluxModel, joules: float, exposure_s: float, exposures: int
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Of every effect of the laser: mean photons per frame over the mirror positions, and us per frame."""
+    """Mean photons per frame over the mirror positions, and us per frame, of every effect of the laser."""
     sheets = [world.setting.view.sheet(plane) for plane in world.sampled_planes]
     _parts(model, sheets[0], 0, 1, np.float32)  # compiled, and in the cache; in the precision that frames are drawn in
     parts = [_parts(model, sheet, 0, world.size[0], np.float32) for sheet in sheets]
@@ -127,7 +126,9 @@ def _view_s(world: "SimulatedWorld", time_s: float) -> float:
 def _parts(
     model: FluxModel, sheet: LightSheet, first_row: int, last_row: int, kind: type[np.floating[Any]] = np.float64
 ) -> dict[str, tuple[Array, float]]:
-    """What each effect of the laser adds, detections per second and watt (rows, width), and the seconds it took."""
+    """The light that each effect of the laser adds, detections per second and watt (rows, width), and the seconds it
+    took.
+    """
     rate: Any = np.zeros(model.steady_per_s.shape, kind)
     parts = {}
     for name, effect in model.laser.items():
@@ -140,7 +141,7 @@ def _parts(
 
 
 def _bits_us(world: "SimulatedWorld", model: FluxModel, times: FrameTimes) -> dict[str, float]:
-    """Of every effect on the bits: microseconds per whole frame."""
+    """Microseconds per whole frame of every effect on the bits."""
     rows, width = world.size
     rng = np.random.default_rng(0)
     shape = (TIMED_FRAMES + 1, rows, -(-width // WORD_PX))

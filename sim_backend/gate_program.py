@@ -66,12 +66,12 @@ class GateProgram:
             self._levels.append(level)
 
     def lower_gate(self, at_s: float) -> None:
-        """Gate low from `at_s` for the rest of this run; the program plays on."""
+        """Take the gate low from `at_s` for the rest of this run; the program plays on."""
         self._mask = ~OUT_GATE
         self._cut(at_s, lambda level: level & ~OUT_GATE)
 
     def abort(self, at_s: float) -> None:
-        """All outputs low from `at_s`."""
+        """Take all outputs low at `at_s`."""
         self._words_left = 0
         self._cut(at_s, lambda level: 0)
 

@@ -1,8 +1,8 @@
-"""Where the simulated mirror points and what the scanner's marker outputs do, at any time.
+"""The motion of the simulated mirror and the levels of the scanner's marker outputs, at any time.
 
-The command passes the value of point i at the start of point i and runs straight to the next one; the mirror follows
-it by the lag of the direction it runs in. Marker outputs have no lag. A real mirror also shakes. Times are seconds of
-the bench.
+The command passes the value of point i at the start of point i and runs straight to the next one; the mirror follows it
+by the lag of the direction it runs in. Marker outputs have no lag. A real mirror also shakes. Times are seconds of the
+bench.
 """
 
 import math
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 JITTER_HOLD_S = 1e-4
-"""For how long the mirror's error stays the same: a small galvo answers within 100 us."""
+"""Time for which the mirror's error stays the same: a small galvo answers within 100 us."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Jitter:
 
 
 class ScannerMotion(Protocol):
-    """What the bench asks of the scanner."""
+    """The part of the scanner that the bench uses."""
 
     def mirror(self, time_s: Array) -> Array:
         """Mirror position as the command it stands at, float64, same shape as the times."""
@@ -77,23 +77,23 @@ class Resting:
     command: float
 
     def mirror(self, time_s: Array) -> Array:
-        """The one position."""
+        """The one position at all times."""
         return np.full(time_s.shape, self.command)
 
     def backward(self, time_s: Array) -> NDArray[np.bool_]:
-        """Low."""
+        """The direction output, always low."""
         return np.zeros(time_s.shape, bool)
 
     def edges(self, bit: int, from_s: float, until_s: float) -> Array:
-        """None."""
+        """No edges."""
         return np.empty(0)
 
     def first_high(self, bit: int, from_s: float, until_s: float) -> float | None:
-        """None."""
+        """None: no output is ever high."""
         return None
 
     def moving(self, time_s: float) -> bool:
-        """No."""
+        """Whether a waveform is being played: never."""
         return False
 
 
@@ -112,7 +112,7 @@ class Playing:
 
     @property
     def end_s(self) -> float:
-        """When the last point of the last repetition ends."""
+        """Time at which the last point of the last repetition ends."""
         return self.start_s + self.repeats * len(self.waveform.command) / self.rate_hz
 
     def mirror(self, time_s: Array) -> Array:
@@ -128,7 +128,7 @@ class Playing:
         return self._high(LEVEL_BACKWARD, time_s)
 
     def first_high(self, bit: int, from_s: float, until_s: float) -> float | None:
-        """At once where the output is high then, else at its next rising edge."""
+        """Time from which on the output is high: at once where it is high then, else at its next rising edge."""
         if from_s < until_s and self._high(bit, np.array([from_s]))[0]:
             return from_s
         edges = self.edges(bit, from_s, until_s)
@@ -156,7 +156,7 @@ class Playing:
         return times[(times >= from_s) & (times < until_s)]
 
     def moving(self, time_s: float) -> bool:
-        """From the start until the last point has been played; before the start the waveform is under way already."""
+        """Whether the last point has still to be played; before the start the waveform counts as under way already."""
         return time_s < self.end_s
 
     def _command(self, time_s: Array) -> Array:

@@ -1,25 +1,22 @@
-"""Random bits for kernels: counters enciphered by rounds of AES, which processors have instructions for.
+"""Random bits and exponentials for compiled kernels.
 
-Counter-based numbers need no state and no order (Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2,
-3", SC 2011). `enciphered` is their ARS-5, which passes BigCrush there: five rounds whose keys step by a Weyl sequence
-(the last one mixes columns like the others, a bijection). Its 128 bits are the key of a few rows of a frame, under
-which `drawn_word` enciphers the numbers of blocks of 8 pixels with three rounds more. Block numbers of one key differ
-in a few bytes, which two rounds spread over all 16; after the third, bytes of two blocks agree as often as chance would
-have it, within 1e-7.
+Random bits are counters enciphered by rounds of AES, which processors have instructions for. Counter-based numbers need
+no state and no order (Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011). `enciphered`
+is their ARS-5, which passes BigCrush there: five rounds whose keys step by a Weyl sequence (the last one mixes columns
+like the others, a bijection). Its 128 bits are the key of a few rows of a frame, under which `drawn_word` enciphers the
+numbers of blocks of 8 pixels with three rounds more. Block numbers of one key differ in a few bytes, which two rounds
+spread over all 16; after the third, bytes of two blocks agree as often as chance would have it, within 1e-7. For single
+numbers that follow from a seed and a place there is SplitMix64 (Steele, Lea, Flood 2014).
 
 One AES round of 256 bits takes one cycle on x86 with VAES, two with AES-NI or on 64-bit ARM. Elsewhere it is table
 look-ups: the same bits, many times as slow. Everything here is for code compiled with `numba.njit`.
 
-SplitMix64 (Steele, Lea, Flood 2014): random numbers that a seed and a place tell, and nothing else.
-
-Exponentials for kernels, straight-line, so that loops over them become vector instructions; libm's are calls.
-
-With k = round(t) and f = k - t, |f| <= 1/2:  2^-t = 2^-k 2^f, the latter by its Taylor series. Relative error against
-50 digits: `power_of_half` 3e-13 (series to f^10) and what rounding t brings, `one_minus_exp_minus` 4e-16 (to r^13, with
-r = f ln 2 in two parts). `roughly_one_minus_exp_minus` is for where six digits will do, in float32.
-
-What loops need of numbers comes as a tuple that the kernel's caller hands it (`HALVING`, `ROUGHLY`): of numbers that it
-knows, LLVM fetches each anew for every vector, 24 of 59 instructions of a loop over `power_of_half`.
+Exponentials are straight-line, so that loops over them become vector instructions; libm's are calls. With k = round(t)
+and f = k - t, |f| <= 1/2:  2^-t = 2^-k 2^f, the latter by its Taylor series. Relative error against 50 digits:
+`power_of_half` 3e-13 (series to f^10) and what rounding t brings, `one_minus_exp_minus` 4e-16 (to r^13, with r = f ln 2
+in two parts). `roughly_one_minus_exp_minus` is for where six digits will do, in float32. The numbers that loops need
+come as a tuple that the kernel's caller hands over (`HALVING`, `ROUGHLY`): constants that it knows LLVM fetches anew
+for every vector, 24 of 59 instructions of a loop over `power_of_half`.
 """
 
 import math
@@ -48,9 +45,9 @@ _BYTES, _BLOCK, _PAIR = ir.VectorType(_I8, 16), ir.VectorType(_I64, 2), ir.Vecto
 _COLUMNS = ir.VectorType(_I32, 4)
 _PIXELS = ir.VectorType(_I16, _VECTOR_PX)
 _PACKED: Final = (*range(8), *range(16, 24), *range(8, 16), *range(24, 32))
-"""Which of two vectors' pixels stands where in 32 bits: what x86 packs in one instruction."""
+"""Order in which x86 packs the pixels of two vectors into 32 bits by one instruction."""
 PLACE: Final = tuple(8 * (0, 2, 1, 3, 4, 6, 5, 7)[x // 8] + 7 - x % 8 for x in range(WORD_PX))
-"""Where the level of pixel x of a word is to stand, so that bits come out as `packbits` has them."""
+"""Place of the level of pixel x of a word, so that bits come out as `packbits` has them."""
 
 _intrinsic: Any = intrinsic
 _Code = tuple[Any, Callable[[Any, Any, Any, Any], Any]]
@@ -100,7 +97,7 @@ def substitution() -> NDArray[np.uint8]:
 
 
 def _table(builder: Any) -> Any:
-    """What one byte of a column becomes: its S-box value times 2, 1, 1 and 3, lowest byte first."""
+    """A table of what each byte of a column becomes: its S-box value times 2, 1, 1 and 3, lowest byte first."""
     name = "spadrig.aes"
     known = builder.module.globals.get(name)
     if known is None:
@@ -201,7 +198,9 @@ def _levels_at(builder: Any, address: Any) -> list[Any]:
 
 @numba.njit(cache=True)
 def block_numbers(words: int) -> NDArray[np.uint64]:
-    """What `drawn_word` takes of each word of a row, uint64 (words, 16): the number of each of its blocks, twice."""
+    """The block numbers that `drawn_word` takes for each word of a row, uint64 (words, 16): that of each block,
+    twice.
+    """
     numbers = np.empty((words, 2 * WORD_PX // BLOCK_PX), np.uint64)
     for k in range(words):
         for i in range(2 * WORD_PX // BLOCK_PX):
@@ -286,7 +285,7 @@ def frame_key(seed: np.uint64, frame: np.uint64) -> np.uint64:
 
 
 LARGEST: Final = 700.0
-"""Above it 1 - exp(-t) is taken as 1."""
+"""Largest t; above it 1 - exp(-t) is taken as 1."""
 LOG2_E: Final = 1.4426950408889634
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 """ln 2 in two parts, the high one with 20 zeros at its end: its product with k is exact (Cody and Waite)."""
@@ -300,10 +299,12 @@ HALVING: Final[dict[Any, tuple[Any, ...]]] = {
     np.float64: (1010.0, _ROUNDER, *_SERIES),
     np.float32: tuple(map(np.float32, (120.0, _ROUNDER_32, *_SERIES))),
 }
-"""Of `power_of_half`, by precision: the most halvings, above which it stays what it is there; rounder; series."""
+"""Constants of `power_of_half`, by precision: the most halvings, above which it stays what it is there; rounder;
+series."""
 _SERIES_32 = (1 / math.factorial(n) for n in (0, 2, 3, 4, 5, 6))
 ROUGHLY: Final = tuple(map(np.float32, (80.0, LOG2_E, _ROUNDER_32, math.log(2), *_SERIES_32)))
-"""Of `roughly_one_minus_exp_minus`: largest t, scale, rounder, ln 2, series without its linear term; float32."""
+"""Constants of `roughly_one_minus_exp_minus`: largest t, scale, rounder, ln 2, series without its linear term;
+float32."""
 
 
 @_intrinsic

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 DARK_EFFECTS = ("dark counts",)
 """Steady detections that need no light."""
 LEAST_PIXELS = 2
-"""Of the camera each way: light is computed with the slopes of the rays from pixel to pixel."""
+"""Least size of the camera each way: light is computed with the slopes of the rays from pixel to pixel."""
 DEFAULT_GEOMETRY = Path(__file__).parent.parent / "config" / "simulated-rig.yaml"
 
 
@@ -82,16 +82,15 @@ class WorldConfig(KindConfig):
     scene: str = "street"
     """A bundled scene's name, a scene file, or a folder of surfaces."""
     fog: Annotated[str | None, BeforeValidator(_known_fog)] = None
-    """How far one sees in the scene's air, in place of what the scene says: a visibility such as `20 m`, or `clear`."""
+    """Visibility in the scene's air, in place of the scene's own: a distance such as `20 m`, or `clear`."""
     board_pose: BoardPlace | None = None
-    """Where the scene's calibration board is held, in place of where the scene has it."""
+    """Pose of the scene's calibration board, in place of the scene's own."""
     optics: Optics = Field(default_factory=Optics)
     sensor: Sensor = Field(default_factory=Sensor)
     line: Line = Field(default_factory=Line)
     effects: Annotated[Wanted, AfterValidator(_known)] = "planned"
-    """Which of the effects that the scene calls for are simulated: without those that provably change next to nothing,
-    `all`, or a list of names (for ablations).
-    """
+    """Effects that are simulated, of those that the scene calls for: all but those that provably change next to nothing
+    (`planned`), `all`, or a list of names (for ablations)."""
     command_grid: CommandGridConfig | None = None
     """Columns in which the flux is held, for use without an application that says `hold_columns`."""
 
@@ -160,7 +159,7 @@ class SimulatedWorld:
 
     @property
     def effect_plan(self) -> EffectPlan:
-        """Which effects are simulated and why, decided when first asked for: the devices are there by then."""
+        """The effects that are simulated and why, decided when first asked for: the devices are there by then."""
         return self._plan()[0]
 
     @property
@@ -221,7 +220,7 @@ class SimulatedWorld:
 
     @property
     def _frame_delay_s(self) -> float:
-        """From the exposure of the first row to that of the last."""
+        """Time from the exposure of the first row to that of the last."""
         return self.model.row_delay_s * (self.size[0] - 1)
 
     def true_model(self) -> RigModel:
@@ -229,7 +228,7 @@ class SimulatedWorld:
         return self.model
 
     def truth(self, commands: Array, velocity_per_s: float = 0.0, time_s: float = 0.0) -> SweepTruth:
-        """Where the stripe of each column (commands (columns,)) truly is, and the depth of every pixel.
+        """The true place of the stripe for each column (commands (columns,)), and the depth of every pixel.
 
         velocity_per_s: of the command. time_s: of the bench, where surfaces move; a scan asks for time 0, that is for
         the scene before it moved.
@@ -267,11 +266,11 @@ class SimulatedWorld:
         return flux_row(self, row, sheets, power_w=power_w * self.fan.share, exposure_s=exposure_s)
 
     def frame_source(self, exposure_s: float, seed: int, threads: int) -> PhotonSource:
-        """What draws frames that follow one another without a gap."""
+        """A source of frames that follow one another without a gap."""
         return self.photons(FrameTimes(exposure_s, exposure_s), seed, threads)
 
     def photons(self, times: FrameTimes, seed: int, threads: int) -> PhotonSource:
-        """What draws frames that follow one another like that."""
+        """A source of frames that follow one another at these times."""
         model = self.model
         return PhotonSource(self.flux_model, model.sheets, times, seed, threads, self.fan, model.scanner.command_range)
 
@@ -283,7 +282,7 @@ class SimulatedWorld:
 
 
 def _own(model: RigModel) -> dict[str, str]:
-    """What the rig does that not every rig does, by effect, and how much of it."""
+    """The rig's own peculiarities, by effect, and how much of each."""
     found = {}
     if bow := getattr(model.scanner, "bow_per_rad", 0.0):
         found["sheet bow"] = f"the sheet leaves its plane by {bow:g} rad times the square of the angle within its fan"

@@ -1,1 +1,1 @@
-"""The calibration board: its print, its corners in a picture, what of the picture it covers."""
+"""The calibration board: its print, its corners in a picture, and how much of the picture they cover."""

@@ -1,14 +1,13 @@
-"""The calibration board, a ChArUco board or a plain chessboard, and its file.
+"""The calibration board, a ChArUco board or a plain chessboard, its file, and how much of it views have shown.
+
+A set of views covers a part of the picture, of the angles and of the distances (`Coverage`).
 
 Board coordinates in metres: x right, y down, z into the board, origin at the top left corner of the top left square,
-which is black. The inner corners are numbered row by row, as cv2.aruco.CharucoBoard does.
+which is black. The inner corners are numbered row by row, as cv2.aruco.CharucoBoard does. The board's file holds what
+was printed, lengths as text with a unit.
 
 A chessboard looks the same from more than one side. Only with an even number of squares along both sides, and not the
 same number, does its mirror image differ; only with one of the two even can it be told from itself upside down.
-
-The schema of a board's file: what was printed, lengths as text with a unit.
-
-How much of the picture, of the angles and of the distances a set of views has shown the camera.
 """
 
 import os
@@ -45,7 +44,7 @@ Length = Annotated[float, BeforeValidator(_metres)]
 
 
 class BoardFile(FileSection):
-    """One board."""
+    """The keys of a board's file."""
 
     kind: Literal["charuco", "chessboard"] = Field(description="with markers in the white squares, or without")
     squares: tuple[int, int] = Field(description="squares along x and y, those at the border included")
@@ -65,9 +64,9 @@ BUNDLED_BOARD = Path(__file__).parents[2] / "config" / "board.yaml"
 """The board that the commands take when none is named."""
 
 _FEWEST_SQUARES = 3
-"""Along a side; fewer leave less than 2 x 2 inner corners."""
+"""Fewest squares along a side; fewer leave less than 2 x 2 inner corners."""
 _MOST_SQUARES = 100
-"""Along a side; no dictionary of markers goes further."""
+"""Most squares along a side; no dictionary of markers goes further."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +146,7 @@ class Board:
         return np.where(self.albedo_at(x, y[:, None]) > BLACK, np.uint8(255), np.uint8(0))
 
     def charuco(self) -> cv2.aruco.CharucoBoard:
-        """The same board as OpenCV knows it. CalibrationError for a chessboard."""
+        """OpenCV's object for this board. CalibrationError for a chessboard."""
         if self.dictionary is None or self.marker_m is None:
             raise CalibrationError("a chessboard has no markers to look for; set kind: charuco")
         return cv2.aruco.CharucoBoard(self.squares, self.square_m, self.marker_m, _dictionary(self.dictionary))
@@ -216,7 +215,7 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 CELLS = 8
-"""Along each side of the picture."""
+"""Cells along each side of the picture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -234,12 +233,12 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """Of the cells, those that hold a corner."""
+        """Share of the cells that hold a corner."""
         return float(np.count_nonzero(self.cells) / self.cells.size)
 
 
 def coverage_of(views: Sequence[View], poses: Sequence[BoardPose], board: Board, size: tuple[int, int]) -> Coverage:
-    """What the corners of `views`, whose boards stand at `poses`, cover of a picture of size (width, height)."""
+    """The coverage of a picture of size (width, height) by the corners of `views`, whose boards stand at `poses`."""
     px = np.concatenate([view.corners.px for view in views if view.corners is not None])
     edges = [np.linspace(-0.5, length - 0.5, CELLS + 1) for length in (size[1], size[0])]
     cells = np.histogram2d(px[:, 1], px[:, 0], bins=edges)[0].astype(np.int64)

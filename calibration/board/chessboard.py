@@ -1,8 +1,8 @@
-"""A plain chessboard in a picture: OpenCV finds a grid of corners, the squares around it say whether it is the board.
+"""Finds a plain chessboard in a picture: OpenCV finds a grid, the squares around it say whether it is the board.
 
-OpenCV finds the grid that it is asked for in any larger print, and now and then in a smaller one, with corners that
-are none. So a grid counts as the board only where its print has as many corners as the board, no fewer and no more, as
-far as the picture shows (lattice.py). Measured by tests/reference/chessboard_extent.py.
+OpenCV finds the grid that it is asked for in any larger print, and now and then in a smaller one, with corners that are
+none. So a grid counts as the board only where its print has as many corners as the board, no fewer and no more, as far
+as the picture shows (lattice.py). Measured by tests/reference/chessboard_extent.py.
 """
 
 import itertools
@@ -143,7 +143,9 @@ def _from_top_left(px: Array, shown: Gray, board: Board) -> tuple[Array, bool]:
 
 
 def _top_left_is_black(px: Array, shown: Gray) -> bool:
-    """Of the squares between the corners: those of the top left one's colour are the darker ones."""
+    """Whether the squares of the top left one's colour are the darker ones, as seen in the squares between the
+    corners.
+    """
     middles = (px[:-1, :-1] + px[:-1, 1:] + px[1:, :-1] + px[1:, 1:]) / 4
     height, width = shown.shape
     x = np.clip(np.round(middles[..., 0]).astype(int), 0, width - 1)

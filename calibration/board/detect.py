@@ -1,10 +1,9 @@
 """Finds a board's corners in a picture: from counts summed to flux, noisy as they are, or from an image file.
 
-OpenCV finds the markers, or the chessboard, in the picture as it is, enlarged and smoothed, whichever shows most; a
-smooth map through them says where all corners are, and each is then fitted on its own (corner_registration.py). What
-cannot be used is refused with the reason: no board, another one, half of one, its mirror image, two of them.
-
-Pixels that cannot be used, filled in from their neighbours so that a picture can be searched.
+Pixels that cannot be used are filled in from their neighbours first. OpenCV finds the markers, or the chessboard, in
+the picture as it is, enlarged and smoothed, whichever shows most; a smooth map through them says where all corners are,
+and each is then fitted on its own (registration.py). A picture that cannot be used is refused with the reason: no
+board, another one, half of one, its mirror image, two of them.
 """
 
 from dataclasses import replace
@@ -47,18 +46,20 @@ def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = N
 Array = NDArray[np.float64]
 
 LEAST_SHARE = 0.5
-"""Of the board's corners; a view with no more is refused."""
+"""Share of the board's corners that a view must show more than; others are refused."""
 _SECOND_BOARD_MARKERS = 4
-"""As many that lie on a board of their own are no misreadings."""
+"""Markers that lie on a board of their own and are too many for misreadings."""
 _MAP_OUTLIER_SQUARES = 0.4
-"""How far a lens may bend a board off its homography, and how far a misread marker never lies."""
+"""Distance from the homography, in squares, that no lens bends a board by and every misread marker exceeds."""
 _GROWTH_SQUARES = 1.6
-"""From what is known of a far board to the next corners; beyond, a map through a few noisy markers leads astray."""
+"""Distance from the known part of a far board to the next corners; beyond, a map through a few noisy markers leads
+astray."""
 _OUTLIER_SDS = 6.0
-"""Off the map through all corners, or as many pixels and squares as follow: a lens bends more than the map does."""
+"""Sds that a corner may lie off the map through all corners, or as many pixels and squares as follow: a lens bends more
+than the map does."""
 _LEAST_OUTLIER_PX = 0.3
 _MOST_USUAL_SDS = 4.0
-"""A corner whose sd is more than that of its neighbours was not laid over what it should be."""
+"""Largest ratio of a corner's sd to that of its neighbours: beyond, the drawing was laid over something else."""
 _LEAST_OUTLIER_SQUARES = 0.02
 
 
@@ -119,8 +120,8 @@ def _another(sighting: Sighting, board: Board) -> bool:
 def _refined(
     values: NDArray[np.float32], board: Board, rough: BoardMap, sighting: Sighting
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """All corners the picture shows: sought around the rough map first, then, growing, around the map through those;
-    last, each on pixels of its own.
+    """Find all corners that the picture shows: around the rough map first, then, growing, around the map through those
+    found; last, each on pixels of its own.
     """
     corners_m = board.corners_m[:, :2]
     side = sides_px(board, rough, np.array([board.size_m]) / 2)[0]

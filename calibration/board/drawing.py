@@ -1,11 +1,10 @@
-"""A board drawn so that a picture of it can be compared with the drawing.
+"""A board drawn for comparison with a picture of it, and a smooth map from the board to the picture.
 
-A smooth map from board to picture: a homography and, with points enough, what a lens bends on top of it.
-
-It needs no camera: the bend is a polynomial over the picture, fitted to points whose board positions are known. It says
-where corners should be and how the board is drawn around one. Not over the board: a lens bends the picture, by terms
-that are a polynomial there, whatever the board's tilt; over tilted boards they are none, and what was left of them drew
-corners off by less than 0.002 px, but alike in all pictures, which made focal lengths wrong by 0.025 % at k1 = 0.2.
+The map is a homography and, with points enough, a polynomial on top of it for what a lens bends. It needs no camera: it
+is fitted to points whose board positions are known, and says where corners should be and how the board is drawn around
+one. The polynomial is one over the picture and not over the board: a lens bends the picture, by terms that are a
+polynomial there, whatever the board's tilt. Over a tilted board they are none, and fitting one there moves corners by
+less than 0.002 px, but alike in all pictures, which makes focal lengths wrong by 0.025 % at k1 = 0.2.
 """
 
 from dataclasses import dataclass
@@ -17,11 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.board.board import MARGIN_SQUARES, Board
 
 _PX_PER_SQUARE = (32, 256)
-"""At least and at most."""
+"""Least and most pixels of the drawing per square."""
 _MOST_PX = 1 << 25
-"""Of a drawing, 128 MB: reached by boards of more than 21 x 21 squares; 57 a square on the largest there are. 30 x 29
-squares, each 17 to 24 pixels in the picture, drawn 134 to a square in the place of 256, had corners off by 0.0018 px
-for 0.0009."""
+"""Most pixels of a drawing, 128 MB. Boards of more than 21 x 21 squares reach it; the largest there are get 57 pixels a
+square. Fewer pixels cost precision: 30 x 29 squares, each 17 to 24 pixels in the picture, have corners off by 0.0018 px
+when drawn 134 to a square, and by 0.0009 px at 256."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +63,8 @@ _BENDS = ((30, 3), (12, 2))
 """(least number of points, degree of the polynomial): three points to a term at least."""
 _FEWEST_POINTS = 4
 _KEPT_SHARES = (0.8, 0.8, 1.0)
-"""Of the points, the closest ones, on which the polynomial is fitted again: a point far off must not bend it."""
+"""Shares of the points, the closest ones, to which the polynomial is fitted in turn: a point far off must not bend
+it."""
 _OUTLIER_MEDIANS = 5.0
 _LEAST_OUTLIER_PX = 0.3
 
@@ -78,9 +78,13 @@ class BoardMap:
     homography: Array
     bend_px: Array
     degree: int
+    """Degree of the polynomial; 0: the homography alone."""
     half_m: Array
+    """Half of the board's size (2,)."""
     centre_px: Array
+    """Middle of the points that were fitted (2,)."""
     half_px: float
+    """Largest distance of these points from the middle, along x or y."""
 
     def to_px(self, points_m: ArrayLike) -> Array:
         """Raw pixels (..., 2) of board positions (..., 2)."""

@@ -1,15 +1,12 @@
-"""How far the squares of a chessboard go: which corners of a grid are there, and whether there are more.
+"""The extent of a chessboard in a picture: which corners of a grid are there; and the first search for markers.
 
-Where four squares meet, the light changes across the line between them above the corner and, the other way round,
-below it; along a row of corners the change turns about from one to the next. A row that was only guessed, or that lies
-on the edge of the print, shows no such change on its outer side, and one that follows outside the grid does. So a
-grid is cut down to the corners that are there, and grows while more of them follow. What lies outside the picture is
-not known.
+Where four squares meet, the light changes across the line between them above the corner and, the other way round, below
+it; along a row of corners the change turns about from one to the next. A row that was only guessed, or that lies on the
+edge of the print, shows no such change on its outer side, and one that follows outside the grid does. So a grid is cut
+down to the corners that are there, and grows while more of them follow. What lies outside the picture is not known.
 
-Where a board is, roughly: OpenCV's markers, on every form of the picture that may show them.
-
-Under few photons the picture is tried enlarged (small markers are read when their modules have a few pixels) and
-smoothed (shot noise breaks their outline).
+OpenCV looks for markers on every form of the picture that may show them. Under few photons the picture is tried
+enlarged (small markers are read when their modules have a few pixels) and smoothed (shot noise breaks their outline).
 """
 
 from dataclasses import dataclass
@@ -27,11 +24,12 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
 _OFFSETS = np.array([0.1, 0.2, 0.3, 0.4])
-"""In squares from the corner: clear of its edges, and within the outer squares where half of them was cut off."""
+"""Places where the change is looked at, in squares from the corner: clear of its edges, and within the outer squares
+where half of them was cut off."""
 _THERE = 0.3
 _GOES_ON = 0.5
-"""Of the usual change across a line: in a row of the grid, and in the one outside it. On OpenCV's 26 chessboard
-pictures a row that is there has 0.75 to 1.15 of it, one that is not 0.09 at most."""
+"""Least change across a line outside the grid, as a share of that in the grid, for another row to follow there. In
+OpenCV's 26 chessboard pictures a row that is there has 0.75 to 1.15 of it, one that is not 0.09 at most."""
 _LEAST_ALIKE = 0.8
 """Share of the corners that are there; in noise it is half of them."""
 _FEWEST = 2
@@ -97,7 +95,7 @@ class _Seen:
 
 
 def _cut_down(picture: Picture, px: Array) -> Array | None:
-    """Without outer rows that are not there."""
+    """The grid without outer rows that are not there."""
     while min(px.shape[:2]) >= _FEWEST:
         sides = [_seen(picture, np.rot90(px, turn)) for turn in range(4)]
         own = [np.inf if side is None or not np.isfinite(side.own) else side.own for side in sides]
@@ -109,7 +107,7 @@ def _cut_down(picture: Picture, px: Array) -> Array | None:
 
 
 def _grown(picture: Picture, px: Array) -> Array:
-    """With the rows that follow outside."""
+    """The grid with the rows that follow outside."""
     turn = kept = 0
     while kept < 4 and max(px.shape[:2]) < _MOST:
         turned = np.rot90(px, turn)
@@ -188,7 +186,7 @@ def _row_above(picture: Picture, px: Array) -> Array | None:
 
 
 def _map(px: Array) -> BoardMap | None:
-    """From squares, counted from the outer corner of the grid's top left one, to pixels."""
+    """The map to pixels from squares, counted from the outer corner of the grid's top left one."""
     board = _board(px.shape[1], px.shape[0])
     points = px.reshape(-1, 2)
     side = np.median(np.linalg.norm(np.diff(px, axis=1), axis=-1))

@@ -1,4 +1,4 @@
-"""Whether markers stand as a board's file says: their places on the lattice of squares, told without their ids.
+"""Checks that markers stand as a board's file says: their places on the lattice of squares, told without their ids.
 
 A marker's own outline says where the next squares are; from one to the next, all markers of a print get whole numbers
 (column, row). A layout gives each id its place; where another layout than the stated one puts clearly more of the
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 
 _NEXT_SQUARES = 2.5
-"""From a placed marker to the next while they are few, twice that then; markers are 1.4 squares apart."""
+"""Distance from a placed marker to the next while they are few, twice that then; markers are 1.4 squares apart."""
 _OFF_SQUARES = 0.3
 """Farther from the middle of a square, a marker is none of this lattice."""
 _MOST_TURN_RAD = 0.6
@@ -28,19 +28,19 @@ _MOST_ACROSS = 40
 _CLEARLY_MORE = 2
 """Markers that are where another layout has them: single ones are misread."""
 _LEAST_SHARE = 0.6
-"""Of the markers of a lattice, that a layout must put where they are."""
+"""Share of a lattice's markers that a layout must put where they are."""
 _EDGE_SQUARES = 0.2
-"""How far beyond a row the next one is looked for: within the white paper around a print."""
+"""Distance beyond a row at which the next one is looked for: within the white paper around a print."""
 _WHITE_PERCENT = 90
-"""Of the pixels among markers; half of them are white."""
+"""Percentile of the pixels among markers that counts as white; half of these pixels are white."""
 _FEWEST = 6
 """Markers of which a share can be asked."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Markers:
-    """What was read, whether the board has it or not. ids: (n,) int64; px: (n, 4, 2) corners, clockwise from its own
-    top left.
+    """The markers that were read, whether the board has them or not. ids: (n,) int64; px: (n, 4, 2) corners, clockwise
+    from the marker's own top left.
     """
 
     ids: Places
@@ -69,7 +69,9 @@ class _Layout:
 
 
 def contradiction(read: Markers, board: Board, shown: NDArray[np.uint8]) -> str | None:
-    """What of the markers read in the picture `shown` does not fit the board; None where nothing speaks against it."""
+    """A text on how the markers read in the picture `shown` do not fit the board; None where nothing speaks against
+    it.
+    """
     assert board.marker_m is not None, "asked of boards with markers"
     placed, lattice = _lattice(read.px, board.marker_m / board.square_m)
     ids, lattice = read.ids[placed], lattice[placed]
@@ -89,7 +91,7 @@ def contradiction(read: Markers, board: Board, shown: NDArray[np.uint8]) -> str 
 
 
 def _others(board: Board, least_id: int) -> Iterator[_Layout]:
-    """What else may have been printed, the likeliest first; that of the board too, with rows without end.
+    """The layouts that may have been printed, the likeliest first; among them the board's own, with rows without end.
 
     Ids repeat their pattern every two rows, which hold as many as a row has squares: first ids farther below the least
     one that was read put markers where one of these does.
@@ -122,7 +124,7 @@ def _named(layout: _Layout, ids: Places, board: Board) -> str:
 
 
 def _support(layout: _Layout, ids: Places, lattice: Places) -> tuple[int, Places]:
-    """How many markers are where a layout has them, and where its top left square is on the lattice."""
+    """The number of markers that stand where a layout has them, and the place of its top left square on the lattice."""
     if len(ids) == 0:
         return 0, np.zeros(2, np.int64)
     origins, counts = np.unique(lattice - layout.places(ids), axis=0, return_counts=True)
@@ -131,7 +133,9 @@ def _support(layout: _Layout, ids: Places, lattice: Places) -> tuple[int, Places
 
 
 def _lattice(px: Array, marker_squares: float) -> tuple[NDArray[np.bool_], Places]:
-    """Which markers (n, 4, 2) stand on one lattice, most of them if possible, and their (n, 2) columns and rows."""
+    """The markers (n, 4, 2) that stand on one lattice, as a mask (n,) of most of them if possible, and their (n, 2)
+    columns and rows.
+    """
     best, places = np.zeros(len(px), np.bool_), np.zeros((len(px), 2), np.int64)
     tried = np.zeros(len(px), np.bool_)
     for start in np.argsort([-cv2.contourArea(corners.astype(np.float32)) for corners in px]):
@@ -181,7 +185,9 @@ def _map_to_lattice(places: Places, px: Array, marker_squares: float) -> Array |
 
 
 def _ends_early(board: Board, shown: NDArray[np.uint8], px: Array, places: Places) -> str | None:
-    """Where a print has fewer rows, there is white paper below its last markers, at black squares of the board too."""
+    """The fault of a print that ends before the board does, or None. Such a print shows white paper below its last
+    markers where the board has black squares.
+    """
     across, down = board.squares
     assert board.marker_m is not None, "asked of boards with markers"
     to_lattice = _map_to_lattice(places, px, board.marker_m / board.square_m)

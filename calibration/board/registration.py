@@ -30,14 +30,15 @@ With 6 corners are off by 0.0020 px without noise, alike enough in all pictures 
 by 0.0012 px, most of it the pictures' own drawing, and 30 ppm.
 """
 WIDE, OWN = 0.9, 0.5
-"""How far around a corner is looked, in squares: short of the next ones, to find it; halfway to them, so that no two
-corners share pixels and their errors, which a fit takes to be independent, are."""
+"""Distance, in squares, around a corner that is looked at: short of the next ones, to find it; halfway to them, so that
+no two corners share pixels and their errors, which a fit takes to be independent, are."""
 _MOST_REACH_PX = 16
 _LEAST_REACH_PX = 4
 _SEARCH_SQUARES = 0.25
-"""Beyond that a shift could mistake one module of a marker for the next."""
+"""Farthest search for a corner: beyond, a shift could mistake one module of a marker for the next."""
 _POWERS = [(i, j) for i in range(4) for j in range(4 - i)]
-"""Of x and y in pixels, for where the board is drawn around a corner: what a tilt and a lens bend over two squares."""
+"""Powers of x and y in pixels that place the drawing around a corner: a tilt and a lens bend no more over two
+squares."""
 _AROUND = np.stack(np.meshgrid(*2 * [np.linspace(-1.25, 1.25, 7)]), axis=-1).reshape(-1, 2)
 """Points, in reaches, through which that polynomial goes; the patch and what a pixel more on every side needs."""
 _STEPS = 4
@@ -45,12 +46,12 @@ _SETTLED_SDS = 0.1
 """A step this small ends the iteration: what is left is a tenth of it."""
 _OUTLIER_SDS = 5.0
 _DARK_SHARE = 0.05
-"""Of the picture's white: noise that is there without light."""
+"""Noise that is there without light, as a share of the picture's white."""
 _LEAST_MATCH = 0.4
 """Correlation of picture and drawing; a board under few photons gives 0.5, anything else 0.2."""
 _MOST_SD_PX = 0.5
 _DRAWING_SD_PX = 0.003
-"""What the drawing itself is off by, with room: 0.0012 px without noise, but in part alike in many pictures."""
+"""Error of the drawing itself, with room: 0.0012 px without noise, but in part alike in many pictures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,8 +65,10 @@ class _Patch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
-    """Where a corner should be: its pixel, a square's side, half width of the patch. to_drawing: (4, 4, 2) what powers
-    of x and y, in reaches from the corner, add to the place in the drawing.
+    """A corner's expected place: its pixel, a square's side, half the width of the patch around it.
+
+    to_drawing: (4, 4, 2), the amounts that powers of x and y, in reaches from the corner, add to the place in the
+    drawing.
     """
 
     expected_px: Array
@@ -102,7 +105,7 @@ def sides_px(board: Board, board_map: BoardMap, corners_m: Array) -> Array:
 
 
 def _places(drawing: Drawing, board_map: BoardMap, ids: NDArray[np.int32], reach_squares: float) -> list[_Place]:
-    """Where the map has the corners, and how the drawing lies there."""
+    """The places where the map has the corners, each with how the drawing lies there."""
     board = drawing.board
     corners_m = board.corners_m[ids, :2]
     sides = sides_px(board, board_map, corners_m)

@@ -1,9 +1,9 @@
-"""From a fit of the camera alone to its verdict: how well it knows where rays go, in pixels.
+"""The verdict on a fit of the camera alone, by how well it knows where rays go, in pixels; and the verdict of a check.
 
 A camera whose rays are all turned by one angle is as good as before, since the mirror is calibrated with it. So the
 error of a pixel is what is left of J C J' when the best common rotation of all rays is taken off J.
 
-The verdict of a check: errors that are larger than the covariance lets expect and than depth can bear.
+A check fails where its errors are larger than the covariance lets expect and than depth can bear.
 """
 
 import math
@@ -28,7 +28,7 @@ from calibration.views import View
 Array = NDArray[np.float64]
 
 ACCURACY_PX = 0.1
-"""Good enough: no estimator finds the stripe better in fog."""
+"""Error of a pixel's place that is good enough: no estimator finds the stripe better in fog."""
 _GRID = 16
 _STEP = 1e-6
 
@@ -103,7 +103,7 @@ def ray_sd_px(camera: Camera, covariance: Covariance) -> Array:
 
 
 UNLIKELY_SDS: Final = 4.0
-"""Of chi2 about its number of degrees of freedom, by which deviations are no longer chance."""
+"""Distance of chi2 from its number of degrees of freedom, in its sds, beyond which deviations are no longer chance."""
 
 _AGAIN = "calibrate again"
 

@@ -1,9 +1,7 @@
-"""What views and a fit tell about a calibration, as numbers that a verdict is made of.
+"""The evidence on a calibration: numbers that tell what its views and its fit lack, and the reasons that follow.
 
 Each number speaks for one way to go wrong: how many poses there were, how far they were tilted, how large the board was
-seen, how much of the picture it reached, how bright the room was, what the baseline came out as.
-
-What views of a board lack to make a calibration: light of the line only, poses, tilts, size, coverage.
+seen, how much of the picture it reached, how bright the room was, how long the baseline came out.
 """
 
 import math
@@ -25,17 +23,17 @@ from calibration.views import FEWEST_CORNERS, BoardPose, Corners, View
 Array = NDArray[np.float64]
 
 _WHITE_PERCENT = 75
-"""Half of a board is white: this percentile of its pixels is."""
+"""Percentile of the board's pixels that is white: half of a board is."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewEvidence:
-    """What is seen before anything is fitted; NaN where nothing tells.
+    """Evidence of the views before anything is fitted; NaN where nothing tells.
 
-    shown: poses. used: those of them that a fit can be checked by: with corners, and where a line is asked for with
-    the line on the board too. coverage: share of the picture within the outline of all corners. room_flux: photons per
-    pixel and exposure of white on the board (of the bright parts of the picture where there is no board), median over
-    the views. odd: names of those that do not fit the others and had no say.
+    shown: number of poses. used: those of them that a fit can be checked by: with corners, and where a line is asked
+    for with the line on the board too. coverage: share of the picture within the outline of all corners. room_flux:
+    photons per pixel and exposure of white on the board (of the bright parts of the picture where there is no board),
+    median over the views. odd: names of those that do not fit the others and had no say.
     """
 
     shown: int
@@ -47,7 +45,7 @@ class ViewEvidence:
 
 @dataclass(frozen=True, slots=True)
 class PoseEvidence:
-    """How the boards stood. tilt_rad: largest angle between two of them. distance_m: median of their centres.
+    """Evidence of the boards' poses. tilt_rad: largest angle between two of them. distance_m: median of their centres.
 
     board_rad: angle under which the camera sees a board's longer side, median.
     """
@@ -90,7 +88,7 @@ def pose_evidence(poses: Sequence[BoardPose], board: Board) -> PoseEvidence:
 
 
 def rough_poses(views: Sequence[View], board: Board, camera: Camera) -> list[BoardPose]:
-    """Where the boards stood, as a camera sees it that is known only roughly."""
+    """Poses of the boards by a camera that is known only roughly; views that give none are left out."""
     found = []
     for view in views:
         if view.corners is None or len(view.corners.ids) < FEWEST_CORNERS:
@@ -123,7 +121,7 @@ def _room_flux(view: View) -> float:
 
 
 def _within(corners: Corners, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """True in the outline of the corners; everywhere where there is none."""
+    """Mask of the pixels within the outline of the corners; all of them where there is none."""
     if len(corners.ids) < 3:
         return np.ones(shape, bool)
     mask = np.zeros(shape, np.uint8)
@@ -132,31 +130,37 @@ def _within(corners: Corners, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 _FEWEST_TO_JUDGE = 3
-"""Of fewer poses neither tilt nor coverage can be asked."""
+"""Fewest poses from which tilt and coverage can be judged."""
 _MEND_VIEWS = "mend what is said of the other views, then show more"
 _SHOW_ANEW = "show the board again for each of these, at rest until its sweeps are over"
 FEWEST_POSES: Final = 6
-"""With fewer, a single bad view bends the fit to it, so that nothing shows that it was bad."""
+"""Fewest poses that can be checked: with fewer, a single bad view bends the fit to it, and nothing shows that it was
+bad."""
 FEWEST_WHY: Final = "are the fewest that can be checked against each other"
 
 
 @dataclass(frozen=True, slots=True)
 class EvidenceLimit:
-    """Of a number: what is never enough, and what is no likely cause of an error that is too large."""
+    """Limits of a number.
+
+    always: beyond it the number is never enough. imprecise: within it the number is no likely cause of an error that is
+    too large.
+    """
 
     always: float
     imprecise: float
 
     def at(self, imprecise: bool) -> float:
-        """The one that counts."""
+        """The limit that counts."""
         return self.imprecise if imprecise else self.always
 
 
 LEAST_TILT_RAD: Final = EvidenceLimit(math.radians(12), math.radians(20))
-"""Between two boards. Of boards parallel to each other focal length and distance cannot be told apart: they hang on the
-mirror's model alone, which nothing checks then."""
+"""Tilt between two boards. Of boards parallel to each other focal length and distance cannot be told apart: they hang
+on the mirror's model alone, which nothing checks then."""
 LEAST_BOARD_RAD: Final = EvidenceLimit(0.11, 0.15)
-"""Seen under smaller angles, a board's perspective (by which focal length is told) goes with the angle's square."""
+"""Angle under which a board is seen. Under smaller ones its perspective (by which focal length is told) goes with the
+angle's square."""
 LEAST_COVERAGE: Final = EvidenceLimit(0.3, 0.5)
 """Share of the picture within the outline of all corners; the lens is extrapolated outside, which nothing checks."""
 MOST_ROOM_FLUX: Final = EvidenceLimit(3.0, 1.0)
@@ -167,7 +171,7 @@ on room light costs more than half of what a frame can tell of the line."""
 def data_lack(
     views: ViewEvidence, poses: PoseEvidence | None, *, imprecise: bool, photons: bool = True
 ) -> list[Reason]:
-    """What the data lack, but for what is `hiding` the rest: more counts where the result is not precise enough.
+    """Reasons why the data are too few, those of `hiding` left aside; stricter where the result is not precise enough.
 
     poses: None where nothing tells. photons: whether pictures count photons; those from files do not.
     """
@@ -190,8 +194,8 @@ def data_lack(
 
 
 def hiding(views: ViewEvidence, poses: PoseEvidence | None, *, photons: bool = True) -> list[Reason]:
-    """What makes up other faults: room light in which frames hold little else, and boards so far away that their
-    corners do not say where they are. As for `data_lack`.
+    """Reasons that make other faults appear: room light in which frames hold little else, and boards so far away that
+    their corners do not say where they are. Arguments as for `data_lack`.
     """
     found = []
     if photons and views.room_flux > MOST_ROOM_FLUX.always:

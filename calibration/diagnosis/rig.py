@@ -1,6 +1,6 @@
-"""From a fit to its verdict: what was asked, what the fit tells, and the words of `calibration.verdict` for it.
+"""The verdict on a fit of the rig: what was asked, what the fit tells, and the words of `calibration.verdict` for it.
 
-The verdict on lag and row delay, by the depth error that their uncertainty makes.
+Lag and row delay are judged by the depth error that their uncertainty makes.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,8 @@ from calibration.verdict import AT_M, Asked, Reason, Verdict, unguided
 from calibration.views import View
 
 ACCURACY_PX: Final = 0.1
-"""Where no accuracy is asked for: what a stripe that is off by this costs. No estimator does better in fog."""
+"""Error of the stripe, in pixels, whose depth error is asked for where nobody states an accuracy. No estimator does
+better in fog."""
 _WORST_PERCENT = 95
 
 
@@ -54,7 +55,9 @@ class Judged:
 def goal(
     worth: Sensitivity, accuracy_m: float | None, at_m: float = AT_M, stated_baseline_m: float | None = None
 ) -> Asked:
-    """What a calibration is held to. accuracy_m: sd of depth at `at_m`, for which `worth` is; None: ACCURACY_PX."""
+    """The accuracy that a calibration is held to. accuracy_m: sd of depth at `at_m`, for which `worth` is; None: that
+    of ACCURACY_PX.
+    """
     return Asked(ACCURACY_PX * worth.per_pixel_m if accuracy_m is None else accuracy_m, at_m, stated_baseline_m)
 
 

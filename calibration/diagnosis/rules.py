@@ -3,7 +3,7 @@
 A calibration passes where the depth error that its covariance predicts is at most what was asked for, and where its
 data agree with each other and with what is known of the rig. The first reason is the root cause. Their order:
 
-1. What makes up faults that are not there: room light that drowns the line, boards too far away to be placed.
+1. Causes of faults that are not there: room light that drowns the line, boards too far away to be placed.
 2. Data that no one rig can have made (planes that wave, a rig that moved): nothing else can be believed then.
 3. A baseline other than the stated one: everything is in proportion, only too large or too small.
 4. Data that say too little (room light, too few poses, no tilt, boards too far, corners in a part of the picture only):
@@ -11,9 +11,8 @@ data agree with each other and with what is known of the rig. The first reason i
    alone, with next to nothing left to check the model by.
 
 Where the error is too large and the data have none of these faults, there are simply too few of them. Last comes what
-the predicted error does not show: sweeps that told no lag for one of the ways that a scan may go.
-
-What directions and speeds are short of for lags that hold wherever the calibration is used.
+the predicted error does not show: sweeps whose directions and speeds told no lag for one of the ways that a scan may
+go.
 """
 
 import math
@@ -30,7 +29,7 @@ _SPEEDS = "scan both ways (scan.bidirectional), at two speeds or more (scan.expo
 
 
 def lag_lack(velocities_per_s: Sequence[float], *, mean_will_do: bool) -> list[Reason]:
-    """Why sweeps at these signed velocities do not tell both lags.
+    """Reasons why sweeps at these signed velocities do not tell both lags.
 
     mean_will_do: planes found with the mean of both lags at one speed are right at that speed, both ways.
     """
@@ -48,25 +47,26 @@ def lag_lack(velocities_per_s: Sequence[float], *, mean_will_do: bool) -> list[R
 
 
 LEAST_BASELINE_CHANGE: Final = 0.01
-"""What a tape measure may be wrong: 3 mm in 300 mm."""
+"""Error of a tape measure: 3 mm in 300 mm."""
 MOST_SHIFT = 0.25
-"""Of the accuracy asked: what views may contradict each other by. A fit has gone between them already, and its depth is
-off by several times what is left: 2 to 5 times over 30 knocks of the second simulator."""
+"""Share of the accuracy asked by which views may contradict each other. A fit has gone between them already, and its
+depth is off by several times what is left: 2 to 5 times over 30 simulated knocks."""
 
 WAVES_MOVE = 2.0
-"""Waves move whole views too, of few sweeps by as much as sweeps differ: up to 1.35 times it was in 23 sessions."""
+"""Multiple of the waves that a view's shift must exceed to count as a move: waves move whole views too, of few sweeps
+by as much as sweeps differ, up to 1.35 times in 23 simulated calibrations."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitEvidence:
-    """What a fit tells, besides where the boards stood; NaN where it cannot.
+    """Evidence of a fit and of where its boards stood; NaN where it cannot tell.
 
     expected_m, worst_m: predicted sd of the depth at the distance asked, median and 95 % of the picture. wave_m: error
     of one sweep against another of the same view there; wave_noise_m: up to here that may be noise. shift_m,
     shift_noise_m: of a view against the others, and up to where that may be; moved_after: the view after which they
-    changed, where one move explains them. misfit: by which the expected variances grew because the data contradict each
-    other. baseline_m, baseline_sd_m: distance of camera and mirror axis. velocities_per_s: of the sweeps, signed; none:
-    not known.
+    changed, where one move explains them. misfit: factor by which the expected variances grew because the data
+    contradict each other. baseline_m, baseline_sd_m: distance of camera and mirror axis. velocities_per_s: of the
+    sweeps, signed; empty: not known.
     """
 
     poses: PoseEvidence
@@ -119,13 +119,14 @@ def judge_refusal(
 
 
 _REFUSED_FOR = {"one-pose": "too-few-poses", "coplanar": "no-tilt"}
-"""What a fit that is impossible was short of."""
+"""Reason for which a fit was impossible, and the lack of data behind it."""
 _SEEN_AT_ONCE = ("no-board", "wrong-board", "board-half-out", "mirrored", "two-boards", "no-line")
-"""What is wrong with single views, so that too few of them can be used."""
+"""Faults of single views that leave too few to be used."""
 
 
 def _contradictions(fit: FitEvidence, asked: Asked, imprecise: bool) -> list[Reason]:
-    """What no one rig can have made. Sweeps of one view that differ tell waves from a rig that moved in between.
+    """Reasons that no one rig can have made. Sweeps of one view that differ tell waves from a rig that moved in
+    between.
 
     Where the result would be precise but for the misfit, less than the accuracy asked is the cause already.
     """

@@ -1,4 +1,4 @@
-"""By how much the planes of one sweep wave against those of another: exposures that are not locked to the mirror.
+"""The waves of one sweep's planes against those of another: the sign of exposures that are not locked to the mirror.
 
 While the sweeps of a view were taken nothing moved, so their residuals, binned over the mirror's command, may differ by
 noise and by one constant for each direction (what is left of the lag). The rest are waves that each sweep has on its
@@ -17,15 +17,16 @@ from calibration.views import robust_sd
 Array = NDArray[np.float64]
 
 BINS = 24
-"""Of the command range: wide enough for tens of passages each, narrow enough for a wave of several turns."""
+"""Bins of the command range: wide enough for tens of passages each, narrow enough for a wave of several turns."""
 _FEWEST_IN_BIN = 5
 _LEAST_SHARE_IN_BIN = 0.25
-"""Of what a sweep's bins hold: where it only reaches into a bin, those are there whose noise led them to it."""
+"""Share of a sweep's usual bin contents that a bin must hold: where a sweep only reaches into a bin, noise has chosen
+the passages that are in it."""
 _FEWEST_BINS = 4
 _MEDIAN_VARIANCE = np.pi / 2
-"""Of a median in units of the mean's variance, normal distribution."""
+"""Variance of a median in units of the mean's, normal distribution."""
 _MEDIAN_TAKES = 0.8
-"""Of n values: their robust scatter around their own median is (n - 0.8) / n of the true (Croux, Rousseeuw, 1992)."""
+"""The robust scatter of n values around their own median is (n - 0.8) / n of the true (Croux, Rousseeuw, 1992)."""
 NOISE_SIGMAS = 4.0
 """Standard deviations of a mean square up to which it may be noise."""
 

@@ -1,4 +1,4 @@
-"""Which views contradict the others: their passages as seen from the pose that their corners alone give.
+"""Shifts of views against each other: their passages as seen from the pose that their corners alone give.
 
 A fit of everything may move a board by a millimetre to please the light. With every pose from the corners alone, and
 camera and mirror as fitted, passages lie off the light by what the views disagree: nothing but the noise of the poses
@@ -22,9 +22,9 @@ from calibration.views import FEWEST_CORNERS, BoardPose, View
 Array = NDArray[np.float64]
 
 _STEP = 1e-6
-"""Of the command range, and of a pose in rad and m, for differences."""
+"""Change for differences: of the command as a share of its range, of a pose in rad and m."""
 _ROUNDS = 8
-"""In which a pose settles with the weights of its corners."""
+"""Rounds in which a pose settles with the weights of its corners."""
 _FEWEST_TO_SPLIT = 4
 MOST_MISFIT = 3.0
 """Factor on the variances up to which the views are taken to agree."""
@@ -34,7 +34,9 @@ MOST_UNEXPLAINED = 0.35
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewShift:
-    """Of one view, in command units: median of its passages off the light, and the sd that the pose's noise gives."""
+    """Shift of one view in command units: median of its passages off the light, and the sd that the pose's noise
+    gives.
+    """
 
     name: str
     shift: float
@@ -42,7 +44,7 @@ class ViewShift:
 
 
 def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
-    """Of all views of a fit that have passages; views by name."""
+    """The shifts of all views of a fit that have passages; `views` by name."""
     model = fit.model
     posed = []
     for name, pose, sweeps in zip(fit.views, fit.poses, fit.sweeps, strict=True):
@@ -63,7 +65,7 @@ def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> flo
 
 
 def shift_noise(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> float:
-    """Up to where a `common_shift` of these may be noise of poses and waves; NaN for fewer than two views."""
+    """Value up to which a `common_shift` of these may be noise of poses and waves; NaN for fewer than two views."""
     if len(shifts) < 2:
         return np.nan
     chance = float(np.sqrt(2 * np.sum(_variances(shifts, wave, sweeps) ** 2))) / len(shifts)
@@ -71,14 +73,15 @@ def shift_noise(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> floa
 
 
 def _variances(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> Array:
-    """Of the views' shifts (views,), as far as noise of poses and waves makes them."""
+    """Variances of the views' shifts (views,) from the noise of the poses and from waves."""
     return np.array([one.sd**2 for one in shifts]) + (wave**2 / max(sweeps, 1) if np.isfinite(wave) else 0.0)
 
 
 def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...], misfit: float = 1.0) -> tuple[ViewShift, ...]:
-    """Those that have to agree: all, but for a single outlier, which had no say in the fit.
+    """The shifts that have to agree: all, but for a single outlier, which had no say in the fit.
 
-    Unless it is the last one, since the rig may be another since then, or the others do not fit either.
+    An outlier that is the last view counts, since the rig may be another since then; it also counts where the others do
+    not fit either.
     """
     if len(outliers) != 1 or not shifts or shifts[-1].name in outliers or misfit > MOST_MISFIT:
         return shifts

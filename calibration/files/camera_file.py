@@ -26,7 +26,7 @@ from calibration.views import View
 CAMERA_FORMAT = "spadrig-camera"
 CAMERA_VERSION = 1
 CORNERS = "corners"
-"""In the provenance of a rig's calibration: digests of the views it was made of, those of its camera too."""
+"""Key in the provenance of a rig's calibration: digests of the views it was made of, those of its camera too."""
 
 
 class _CovarianceRows(FileSection):
@@ -67,7 +67,7 @@ def load_camera(path: Path) -> KnownCamera:
 
 
 def camera_file_text(camera: Camera, covariance: Covariance, views: list[str], verdict: Verdict) -> str:
-    """What such a file says."""
+    """The text of a camera file."""
     content: dict[str, Any] = {
         "format": CAMERA_FORMAT,
         "version": CAMERA_VERSION,

@@ -14,7 +14,7 @@ import numpy as np
 
 _MAGIC_BYTES: Final = 8
 _LENGTH_BYTES: Final = {1: 2, 2: 4, 3: 4}
-"""Of the length of the header, by version of the format."""
+"""Bytes that hold the length of the header, by version of the format."""
 _MOST_HEADER_BYTES: Final = 10_000
 """numpy's own limit, which it looks at only once it has read so much."""
 _DEFLATE_RATIO: Final = 1032

@@ -34,7 +34,7 @@ _TYPES = {
     "tuple": "a list",
     "path": "a path",
 }
-"""What pydantic's error types ask for, by their first word."""
+"""Values that pydantic's error types ask for, by the first word of the type."""
 _BOUNDS = {
     "greater_than": ("more than", "gt"),
     "greater_than_equal": ("at least", "ge"),
@@ -47,14 +47,14 @@ _WORDS = {True: "true", False: "false", None: "null"}
 
 
 def _no_kinds(name: str, content: Any) -> None:
-    """Every section has one model."""
+    """No other model: every section has one."""
 
 
 @dataclass(frozen=True)
 class ValueSources:
-    """Where values came from: a file with the line of each key, and the keys that were given as options.
+    """The origin of values: a file with the line of each key, and the keys that were given as options.
 
-    lines_of: called where there is something wrong. flags: what the command line calls some keys.
+    lines_of: called only once there is something wrong. flags: the command line's names of some keys.
     """
 
     file: str
@@ -76,7 +76,7 @@ class ValueSources:
         return self.flags.get(key) if self._is_option(key) else None
 
     def place(self, key: Key) -> str:
-        """What a message begins with: the option, or the file with the line."""
+        """The beginning of a message: the option, or the file with the line."""
         if self._is_option(key):
             return "option:"
         line = self.line(key)
@@ -118,7 +118,7 @@ class _Schema:
         return section.model_fields.get(named[-1]) if section is not None and named else None
 
     def keys_called(self, name: str) -> Iterator[Key]:
-        """Where a key of that name would be known, the outermost first."""
+        """Keys of that name that the model knows, the outermost first."""
         level: list[tuple[Key, type[BaseModel], Any]] = [((), self.model, self.content)]
         while level:
             yield from ((*path, name) for path, model, _ in level if name in model.model_fields)
@@ -204,7 +204,7 @@ def _leaves(value: Any, key: Key) -> Iterator[tuple[Key, Any]]:
 
 
 def _number_words(annotation: Any) -> str | None:
-    """What a field asks for that takes numbers and no truth values."""
+    """Words for the number that a field asks for; None where it takes truth values or no numbers."""
     kinds = set(plain_types(annotation))
     if bool in kinds or not kinds & {int, float}:
         return None
@@ -220,7 +220,7 @@ def plain_types(annotation: Any) -> Iterator[type]:
 
 
 def _key(problem: ErrorDetails, content: Any) -> Key:
-    """Where a problem is: pydantic's own names for validators and members of unions left out."""
+    """The key of a problem, without pydantic's own names for validators and members of unions."""
     key: list[str] = []
     for i, part in enumerate(problem["loc"]):
         last = i == len(problem["loc"]) - 1

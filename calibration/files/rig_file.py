@@ -36,7 +36,7 @@ from calibration.model.rig_model import Covariance, Identity, Lag, RigModel
 from calibration.model.scanner import PivotScanner, PlaneTable, Scanner
 
 CALIBRATION_FILE: Final = "calibration.yaml"
-"""Its name wherever the project writes one."""
+"""Name of a calibration file wherever the project writes one."""
 _PLAIN = {"row_delay_s": 0.0, "gate_delay_s": 0.0, "colour_skew_s": 0.0, "marker_rising": True}
 """Values of a model that its file has under the same name, and what they are where it does not."""
 

@@ -1,6 +1,6 @@
-"""What a calibration file may say, section by section.
+"""The sections of a calibration file and their limits, and the one reader of YAML files.
 
-The one reader of YAML files: bounded in size, depth and repetition, keys given once, errors in a line.
+The reader is bounded in size, depth and repetition; keys are given once; errors are one line.
 """
 
 from collections.abc import Iterator
@@ -61,7 +61,7 @@ class PivotSection(FileSection):
 
 
 class ScannerSection(FileSection):
-    """One of the two forms."""
+    """The scanner, in one of its two forms."""
 
     table: TableSection | None = None
     pivot: PivotSection | None = None
@@ -74,7 +74,7 @@ class ScannerSection(FileSection):
 
 
 class LagSection(FileSection):
-    """By how much the mirror follows a rising and a falling command."""
+    """The lags of the mirror behind a rising and a falling command."""
 
     forward: Number = 0.0
     backward: Number = 0.0
@@ -88,7 +88,7 @@ class CovarianceSection(FileSection):
 
 
 class IdentitySection(FileSection):
-    """Of which rig, as `Identity` has it."""
+    """The identity of the rig, with the fields of `Identity`."""
 
     rig: str
     created: str
@@ -100,7 +100,7 @@ class IdentitySection(FileSection):
 
 
 class ProvenanceSection(BaseModel):
-    """Where it is from: what anybody likes to note, and the two notes that programs go by."""
+    """The origin of a calibration: free notes, and the two that programs go by."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -109,7 +109,7 @@ class ProvenanceSection(BaseModel):
 
 
 class CalibrationFile(FileSection):
-    """The whole file."""
+    """The whole calibration file."""
 
     format: Literal["spadrig-calibration"]
     version: Literal[1]

@@ -3,14 +3,14 @@
 A ray is (u, v, 1) in the camera frame (x right, y down, z forward). Pixel centres lie at integers. The lens model and
 the order of its terms are OpenCV's, so a calibration made with OpenCV is used as it is.
 
-The OpenCV lens model on tangents (u, v) = (x/z, y/z), its Jacobian, and its inverse.
+Forward model (OpenCV 'calib3d', projectPoints) on tangents (u, v) = (x/z, y/z), r2 = u^2 + v^2:
 
-Forward model (OpenCV 'calib3d', projectPoints), r2 = u^2 + v^2:
-  g  = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)
-  u' = u g + 2 p1 u v + p2 (r2 + 2 u^2) + s1 r2 + s2 r2^2
-  v' = v g + p1 (r2 + 2 v^2) + 2 p2 u v + s3 r2 + s4 r2^2
-followed, with 14 terms, by the homography of a sensor tilted by (tau_x, tau_y).
-Order of the terms: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]].
+    g  = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)
+    u' = u g + 2 p1 u v + p2 (r2 + 2 u^2) + s1 r2 + s2 r2^2
+    v' = v g + p1 (r2 + 2 v^2) + 2 p2 u v + s3 r2 + s4 r2^2
+
+followed, with 14 terms, by the homography of a sensor tilted by (tau_x, tau_y). Order of the terms: k1 k2 p1 p2 [k3 [k4
+k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]].
 
 The model folds back on itself past some radius. A tangent counts as valid when the Jacobian determinant stays positive
 on the whole segment from the optical axis to it; only there is the inverse unique, and everything else is NaN. Where
@@ -34,19 +34,19 @@ TERM_COUNTS = (4, 5, 8, 12, 14)
 """Numbers of distortion terms OpenCV defines."""
 
 _SEGMENT_SAMPLES = np.linspace(0.0, 1.0, 17)[1:]
-"""Where the segment from the axis to a tangent is tested for a fold."""
+"""Places on the segment from the axis to a tangent that are tested for a fold, as shares of it."""
 
 _RESIDUAL_LIMIT = 1e-10
 """Largest accepted |forward(inverse) - target|, in tangents: 1e-7 px at f = 1000 px; relative to targets above 1."""
 
 _HALVINGS = 60
-"""Of a radius of up to _MAX_TANGENT: down to its last bits."""
+"""Halvings that bring a radius of up to _MAX_TANGENT down to its last bits."""
 
 _RING = 1e-3
 """Step, in tangents, at which a fold is looked for."""
 
 _MAX_TANGENT = 20.0
-"""Rays steeper than 87 degrees are beyond any lens this model describes."""
+"""Largest tangent: rays steeper than 87 degrees are beyond any lens this model describes."""
 
 
 class Forward(NamedTuple):
@@ -196,7 +196,7 @@ class LensModel:
 
 
 def _folds(terms: Array) -> tuple[float, list[float]]:
-    """Of k1 to k6 alone: r2 of the first fold, inf where there is none, and an r2 within each ring that is folded.
+    """r2 of the first fold of k1 to k6 alone, inf where there is none, and an r2 within each ring that is folded.
 
     With g = n / d a ring is folded where n, d or the slope of r g, n d + 2 r2 (n' d - n d'), is not positive. Rings
     narrower than _RING are no lens's.

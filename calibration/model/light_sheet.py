@@ -1,4 +1,4 @@
-"""The sheet of light at one mirror command: a plane, or a sheet that bows out of it.
+"""The sheet of light at one mirror command, flat or bowed, and the depth at which a pixel's ray meets it.
 
 A line lens spreads the beam into a fan of directions. Seen from the fan's origin O, with f the fan's middle, t across
 it (along the mirror's axis) and n the plane's normal, light leaves at the angle phi within the plane and, where the
@@ -9,12 +9,9 @@ sheet is bowed, at the angle bow phi^2 out of it towards n. A point X with p = (
 whether O itself lies in the plane or a little beside it. O is the model's `source_m`; where that is unknown, the point
 of the mirror's axis that is nearest to the camera.
 
-Depth where a pixel's ray meets a light plane, and how it changes along an image row.
-
 Ray r = (u, v, 1), plane n.X = d:  z = d / (n.r). Along an image row dz/dx = -(z^2 / d) (n . dr/dx), whose sign says on
-which side of the stripe the near points lie. Everything broadcasts; NaN is 'no depth', never inf, never a warning.
-n.r cancels where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps 1e-9 of z at the least.
-Light that bows out of its plane is in `light_sheet`.
+which side of the stripe the near points lie. Everything broadcasts; NaN is 'no depth', never inf, never a warning. n.r
+cancels where ray and plane are nearly parallel: `NEARLY_PARALLEL` keeps 1e-9 of z at the least.
 """
 
 from dataclasses import dataclass
@@ -31,7 +28,8 @@ Array = NDArray[np.float64]
 NEARLY_PARALLEL: Final = 1e-6
 """Sine of the angle between ray and plane below which there is no depth: 1e-3 px, finer than any calibration."""
 LEAST_OFFSET_M: Final = 1e-6
-"""A plane that passes the camera closer than this gives no depth: all its points are seen on one line."""
+"""Least distance of a plane from the camera; one that passes closer gives no depth: all its points are seen on one
+line."""
 
 
 def inverse_depth(u: ArrayLike, v: ArrayLike, planes: ArrayLike) -> Array:
@@ -109,7 +107,7 @@ class LightSheets:
     bow_per_rad: float
 
     def distance_m(self, points_m: ArrayLike) -> Array:
-        """How far points (..., 3) lie off their sheets along n, metres: 0 on the sheet."""
+        """Distance of points (..., 3) from their sheets along n, metres: 0 on the sheet."""
         points = np.asarray(points_m, np.float64)
         off: Array = np.sum(self.planes[..., :3] * points, axis=-1) - self.planes[..., 3]
         if self.bow_per_rad:
@@ -117,7 +115,7 @@ class LightSheets:
         return off
 
     def inverse_depth(self, u: ArrayLike, v: ArrayLike) -> Array:
-        """1/z (1/m) of rays (u, v), by the same rules as `triangulation.inverse_depth`, which it is for planes.
+        """1/z (1/m) of rays (u, v), by the same rules as the module's `inverse_depth`, which it is for planes.
 
         With w = 1/z and the ray r it is n.r - d w = tan(bow phi^2) hypot(p, q) of r - w O: nearly linear in w, and
         regular for rays that never meet the sheet. Newton's method begins at the plane.
@@ -141,7 +139,7 @@ class LightSheets:
         return np.where(found, w, np.nan)
 
     def depth(self, u: ArrayLike, v: ArrayLike) -> Array:
-        """Depth z (m) of rays (u, v), by the same rules as `triangulation.depth`, which it is for planes."""
+        """Depth z (m) of rays (u, v), by the same rules as the module's `depth`, which it is for planes."""
         if not self.bow_per_rad:
             return depth(u, v, self.planes)
         w = self.inverse_depth(u, v)
@@ -152,7 +150,9 @@ class LightSheets:
         return z
 
     def _bowed(self, seen: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """For X - O, or that over z: off the plane, its slope by w, and whether it lies ahead of the fan."""
+        """The bow for X - O, or for that over z: the distance off the plane, its slope by w, and whether it lies ahead
+        of the fan.
+        """
         p, q = np.sum(seen * self.middle, axis=-1), np.sum(seen * self.across, axis=-1)
         dp, dq = -(self.middle @ self.origin_m), -(self.across @ self.origin_m)
         reach = np.hypot(p, q)
@@ -179,7 +179,9 @@ def light_sheets(scanner: Scanner, source_m: ArrayLike | None, commands: ArrayLi
 
 
 def fan_origin(scanner: Scanner, source_m: ArrayLike | None) -> Array:
-    """Where the fan of light starts (3,): the source, or the point of the mirror's axis nearest to the camera."""
+    """The point (3,) from which the fan of light spreads: the source, or the point of the mirror's axis nearest to the
+    camera.
+    """
     if source_m is not None:
         return np.asarray(source_m, np.float64)
     if not isinstance(scanner, PivotScanner):

@@ -1,4 +1,4 @@
-"""A model's numbers as a list of parameters, local and minimal, for fits and covariances.
+"""A model's numbers as a list of parameters, local and minimal, for fits and covariances; the lags that sweeps tell.
 
 Directions and points have fewer degrees of freedom than numbers, so those of the axis are changes: 0 for the model at
 hand, counted about and along two fixed directions across the axis, e1 = zero_normal and e2 = axis x zero_normal.
@@ -13,9 +13,8 @@ hand, counted about and along two fixed directions across the axis, e1 = zero_no
 
 A table of planes has no parameters of its own: only the camera's and the lags' are given.
 
-Which lags sweeps tell, by the directions and speeds at which they ran: one rule for planes and for `sync`.
-
-Where the line stands is not known beforehand. A sweep of signed velocity v sees it at
+One rule says, for planes and for `calibration.sync`, which lags sweeps tell by the directions and speeds at which they
+ran. Where the line stands is not known beforehand. A sweep of signed velocity v sees it at
 
     command = position + v lag_of_its_direction
 
@@ -42,7 +41,7 @@ MATRIX = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 AXIS = ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2")
 MOST_TERMS = 32
-"""Of a polynomial; a galvo's law has two to five."""
+"""Most terms of a polynomial; a galvo's law has two to five."""
 TIMES = FORWARD, BACKWARD, ROW_DELAY = "lag_forward", "lag_backward", "row_delay"
 
 
@@ -143,11 +142,11 @@ def _rotation(vector: Array) -> Array:
 
 
 SWEPT: Final = "velocities_per_s"
-"""In a model's provenance: the signed velocities of the sweeps that its planes were found from."""
+"""Key in a model's provenance: the signed velocities of the sweeps that its planes were found from."""
 ALIKE_SPEEDS: Final = 0.02
 """Relative difference up to which two speeds are one: they would tell a lag 50 times worse than their own places."""
 SPEED_MARGIN: Final = 0.05
-"""So far beyond the speeds at which it was measured a lag is taken to hold."""
+"""Share beyond the speeds at which it was measured for which a lag is taken to hold."""
 
 
 def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:

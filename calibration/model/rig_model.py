@@ -1,7 +1,4 @@
-"""The rig model: the calibrated camera and scanner together, with what else the calibration knows of the rig.
-
-What is known of how well the parameters of a model are known: their covariance, by name.
-"""
+"""The rig model: the calibrated camera and scanner, what else is known of the rig, and the parameters' covariance."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -20,7 +17,8 @@ from calibration.verdict import VerdictWord
 Array = NDArray[np.float64]
 
 _ASYMMETRY = 1e-6
-"""By which two correlations that are the same may differ, and a smallest eigenvalue lie below 0, from rounding."""
+"""Amount by which two correlations that are the same may differ, and a smallest eigenvalue lie below 0, from
+rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +73,7 @@ class Lag(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Of which rig this is the calibration, from when, and what became of it; compared before a model is used.
+    """The rig that a calibration is of, its date, and its verdict; compared before a model is used.
 
     rig: hash over what matters of the rig's config. name: the rig's name. created: date and time, ISO 8601. kinds,
     serials: of the devices by slot (spad, scanner, ...), those that were known. verdict, reasons: of the calibration
@@ -153,10 +151,10 @@ class RigModel:
         return light_sheets(self.scanner, self.source_m, commands)
 
     def mirror_command(self, commands: ArrayLike, y_px: ArrayLike, velocity_per_s: ArrayLike) -> Array:
-        """Where the mirror stands when row y sees the light, on the command's scale, for what is commanded then.
+        """Position of the mirror, on the command's scale, when row y sees the light, for what is commanded then.
 
-        'Then' is when the first row is exposed; a later row sees the mirror farther on. velocity_per_s: of the
-        command, positive where it rises; the lag is that of its direction. All broadcast.
+        'Then' is when the first row is exposed; a later row sees the mirror farther on. velocity_per_s: of the command,
+        positive where it rises; the lag is that of its direction. All broadcast.
         """
         velocity = np.asarray(velocity_per_s, np.float64)
         lag_s = np.where(velocity < 0, self.lag_s.backward, self.lag_s.forward)

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 _ROUNDING = 1e-15
 """A few units in the last place of 1.0."""
 _MOST_ANGLE_RAD = 1e3
-"""Sines of larger angles lose digits; no mirror turns that far."""
+"""Largest angle: sines of larger ones lose digits, and no mirror turns that far."""
 _MOST_OFFSET_M = 10.0
 """Metres by which light could pass the axis of any mirror."""
 _MOST_CONE_RAD = 0.5
@@ -27,7 +27,7 @@ _MOST_BOW_PER_RAD = 0.5
 
 
 class Scanner(Protocol):
-    """What the rest of the project needs of a scanner model."""
+    """The part of a scanner model that the rest of the project uses."""
 
     @property
     def command_range(self) -> tuple[float, float]:
@@ -160,7 +160,7 @@ class PivotScanner:
         return result
 
     def turned(self, commands: ArrayLike) -> Array:
-        """The same planes with the sign of n(a), along which offset_m, cone_rad and bow_per_rad count."""
+        """The planes with the sign of n(a), along which offset_m, cone_rad and bow_per_rad count."""
         at = _inside(commands, self.command_range)
         angle = np.polynomial.polynomial.polyval(at, self.angle_rad)[..., None]
         normal = self.zero_normal * np.cos(angle) + np.cross(self.axis_direction, self.zero_normal) * np.sin(angle)

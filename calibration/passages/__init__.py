@@ -1,1 +1,1 @@
-"""From the counts of a sweep to its picture, and to when the line's centre crossed each pixel."""
+"""A sweep's picture and its passages (when the line's centre crossed each pixel), from the counts of its columns."""

@@ -1,16 +1,13 @@
-"""When the laser line passed over each pixel of a sweep, from the counts of its columns.
+"""The passages of a sweep: when the laser line passed over each pixel, from the counts of the columns.
 
-For each of many pixels, spread evenly over the picture: where the line stands out most from what is on both sides, then
-the maximum likelihood of the columns around it (`calibration.passages.fit`). A pixel that tells nothing is left
-out, and what is given says how far it is to be trusted: the standard deviation of a passage within a flat top, where
-all frames are lit, is a long one. The line has to be seen in two columns or more: at columns wider than 2 pixels most
-pixels tell nothing, so calibrate with many columns of few exposures rather than few columns of many.
+For each of many pixels, spread evenly over the picture: first the column at which the line stands out most from what is
+on both sides (sums over columns, and their peak), then the maximum likelihood of the columns around it
+(`calibration.passages.fit`). A pixel that tells nothing is left out. The sd of a passage says how far it is to be
+trusted: within a flat top, where all frames are lit, it is large. The line has to be seen in two columns or more: at
+columns wider than 2 pixels most pixels tell nothing, so calibrate with many columns of few exposures rather than few
+columns of many.
 
 10 000 pixels of 500 columns take about 0.5 s.
-
-Where in a pixel's columns the line stands out most, before anything is fitted: sums over columns, and their peak.
-
-Pixels of a picture in an order whose every beginning is spread evenly over it.
 """
 
 from dataclasses import dataclass
@@ -32,7 +29,7 @@ RING = 8
 TOP = 0.95
 """Columns that stand out by this much of the best are as good."""
 LEAST_SEEN = 3.0
-"""How far it stands out before it is fitted: as much as chance makes it along a few dozen columns."""
+"""Score above which a line is fitted: chance makes as much along a few dozen columns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,16 +41,16 @@ class ColumnSums:
 
     @classmethod
     def of(cls, ones: NDArray[np.int32], frames: NDArray[np.int32]) -> "ColumnSums":
-        """Of counts (columns, pixels)."""
+        """Sum up counts (columns, pixels) of 1s and of frames."""
         return cls(*(np.concatenate([np.zeros_like(a[:1]), a.cumsum(axis=0, dtype=np.int32)]) for a in (ones, frames)))
 
     @property
     def columns(self) -> int:
-        """So many there are."""
+        """Number of columns."""
         return len(self.ones) - 1
 
     def some(self, which: "NDArray[np.bool_] | slice") -> "ColumnSums":
-        """Those of some pixels."""
+        """The sums of some pixels."""
         return ColumnSums(self.ones[:, which], self.frames if self.frames.shape[1] == 1 else self.frames[:, which])
 
     def between(self, begin: int, end: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -77,7 +74,7 @@ class ColumnSums:
 
 
 def brightest(sums: ColumnSums) -> tuple[Array, NDArray[np.bool_]]:
-    """Where the line stands out most (pixels,), and whether that is enough.
+    """Column at which the line stands out most (pixels,), and whether that is enough.
 
     Flux within the core is compared with the brighter of two rings beside it: the haze has an edge there, but no peak.
     """
@@ -119,36 +116,37 @@ def evenly(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
 Counts = NDArray[np.unsignedinteger[Any]]
 
 MOST_PASSAGES = 2000
-"""Of a sweep; more say little more about a dozen parameters."""
+"""Most passages of a sweep; more say little more about a dozen parameters."""
 TRIES = 6
-"""So many times more pixels are looked at where few of them see the line."""
+"""Factor on the number of pixels that are looked at where few of them see the line."""
 CHUNK = 3000
 """Pixels at a time."""
 NEAR_SIGMAS = 4.5
-"""How far from its centre the line still is, and a column: what is farther away tells of the levels only."""
+"""Reach of the line around its centre, plus one column: what is farther away tells of the levels only."""
 REACH = 14
 """Columns on either side of the line that tell of the levels, and at least twice as many as it has itself."""
 FAR = 1e4
 SHAPES = (*(LineShape(box) for box in (0.0, 1.5, 2.5, 4.0)), LineShape(1.5, travels=True))
-"""That are tried: lines whose light is the same in all frames of a column, as on a DAC's stairs, and one that moves, of
-which the pixel's width hardly matters."""
+"""Shapes that are tried: lines whose light is the same in all frames of a column, as on a DAC's stairs, and one that
+moves, for which the pixel's width hardly matters."""
 MOST_LOSS = 2.0
-"""Of a pixel's log-likelihood against its best shape: a single one whose fit went astray would choose for all."""
+"""Most that a pixel's log-likelihood may lose against its best shape: otherwise a single one whose fit went astray
+would choose for all."""
 LEAST_SAMPLE, SAMPLE = 50, 300
 """Pixels that tell of the passage's shape: fewer than the first find one for themselves alone, more are not asked."""
 LEAST_SIGNIFICANCE = 5.0
-"""Of the line, in standard deviations."""
+"""Least significance of the line, in standard deviations."""
 MOST_MISFIT = 5.0
-"""Of what was fitted, in standard deviations of chi squared: another line, or something that moved."""
+"""Largest misfit, in standard deviations of chi squared: beyond, there was another line, or something moved."""
 MOST_SD = 1.0
-"""In columns."""
+"""Largest sd of a passage, in columns."""
 GROUPS = 4
 """Parts of the picture, in each direction, that have a line width of their own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepCounts:
-    """What a sweep counted.
+    """The counts of a sweep.
 
     counts: (columns, rows, window), 1s of each pixel over the frames of a column. n_frames: (columns,), frames of each.
     command: (columns,), mean mirror command of them, without any lag; NaN where there are none. x0: (columns,), first
@@ -171,7 +169,7 @@ class SweepCounts:
 
     @property
     def position(self) -> Array:
-        """Of each column (columns,), in columns: its own number, as far as its frames lay evenly in it."""
+        """Position of each column (columns,), in columns: its number, moved to where its frames really lay."""
         number = np.arange(len(self.command), dtype=np.float64)
         there = np.flatnonzero(np.isfinite(self.command))
         if len(there) < 2:
@@ -230,7 +228,7 @@ def find_passages(
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """Of the passages of a sweep. near: columns on either side of a line that it reaches."""
+    """Shape of a sweep's passages. near: columns on either side that the line reaches."""
 
     near: int
     line: LineShape

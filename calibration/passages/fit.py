@@ -1,4 +1,4 @@
-"""Where the line's centre crosses each pixel, by maximum likelihood of the pixel's counts over the columns.
+"""Maximum likelihood of a pixel's counts over the columns: the command at which the line's centre crosses each pixel.
 
 The light is that of `calibration.passages.light`. Its width is common to the pixels of a group (a part of the picture),
 the four other parameters are the pixel's own. Fisher scoring on all pixels at once, steps damped where they would make
@@ -33,27 +33,28 @@ FITTED_BESIDES = 3
 UNKNOWN_SD = 1e3
 """Columns; of a passage that the photons do not tell."""
 ITERATIONS, WIDTH_ITERATIONS = 12, 7
-"""In the first ones the common widths are found too."""
+"""Iterations; in the first ones the common widths are found too."""
 MOST_WORSE = 2.0
-"""Of the logarithm of a pixel's likelihood, while the width is being found."""
+"""Most that the logarithm of a pixel's likelihood may fall while the width is being found."""
 MOST_STEP = 0.6
-"""Of the centre in one iteration, in sigmas, and of the logarithm of sigma."""
+"""Largest change in one iteration: of the centre in sigmas, and of the logarithm of sigma."""
 DAMPING = 0.01
-"""To begin with: share by which the information's diagonal is raised, so that steps fall short."""
+"""Damping to begin with: share by which the information's diagonal is raised, so that steps fall short."""
 LEAST_STEP = 1e-3
-"""Of the centre, in columns: where it is less for all but one pixel in a hundred, that is it."""
+"""Change of the centre, in columns, at which the fit ends: less for all but one pixel in a hundred."""
 SPAN, SPACING = 4, 0.8
-"""At how many places the likelihood of a centre is looked at on either side of its best, so many deviations apart."""
+"""Number of places at which the likelihood of a centre is looked at on either side of its best, and their distance in
+deviations."""
 MOST_AT_END = 0.03
 """Most chance at an end of that: where there is more, the centre is not known."""
 ALIKE = 1.25
 """Factor by which what was found may differ from what was looked for."""
 LEAST_LOOK, MOST_LOOK = 0.01, 0.7
-"""Within these, in columns."""
+"""Bounds of the deviation that is looked for, in columns."""
 LEAST_SIGMA, MOST_SIGMA = 0.25, 12.0
-"""In columns. A narrower line lies in one column or two, which do not say where."""
+"""Bounds of sigma, in columns. A narrower line lies in one column or two, which do not say where."""
 SIGMA_SPREAD = 0.15
-"""By how much (standard deviation of the logarithm) sigma may differ from one part of the picture to another."""
+"""Standard deviation of the logarithm of sigma from one part of the picture to another."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,7 +229,9 @@ def _width_step(log_sigma: Array, score: Array, information: Array, group: NDArr
 
 
 def _significance(ones: Array, frames: Array, at: Array, centre: Array, flux: Array) -> Array:
-    """Of the line (pixels,), against a level before the centre and one behind it with all the light."""
+    """Significance of the line (pixels,) in sds, against a level before the centre and one behind it with all the
+    light.
+    """
     level = np.zeros_like(flux)
     for side in (at < centre[:, None], at >= centre[:, None]):
         share = ((ones * side).sum(axis=1) + LEVEL_COUNTS) / ((frames * side).sum(axis=1) + 2 * LEVEL_COUNTS)

@@ -5,11 +5,10 @@ of half a frame without. Where room light alone gives a picture, the columns tha
 the line saturates on near boards, white and black alike, and leaves stripes where columns are wide. In the dark its own
 light is the picture, summed column by column. 512 x 512 pixels of 500 columns take about 0.4 s.
 
-Where a picture is even along its rows: away from edges of print that the line crosses.
-
-A pixel's passage is that of the light it gets. Where a lens or the pixel itself mixes white from one side with black
-from the other, that is the white's: up to a quarter of a pixel off. Edges along the row do no harm: the line runs
-across them, and lights both sides at once.
+`even_pixels` finds where a picture is even along its rows, away from edges of print that the line crosses. A pixel's
+passage is that of the light it gets. Where a lens or the pixel itself mixes white from one side with black from the
+other, that is the white's: up to a quarter of a pixel off. Edges along the row do no harm: the line runs across them,
+and lights both sides at once.
 """
 
 import cv2
@@ -79,7 +78,7 @@ def _everything(sweep: SweepCounts) -> tuple[Array, Array]:
 
 
 def _brightest_column(sweep: SweepCounts) -> NDArray[np.int32]:
-    """In which column (rows, width) a pixel and its neighbours' columns had most 1s."""
+    """Column (rows, width) in which a pixel and its neighbours' columns had most 1s."""
     columns, rows, window = sweep.counts.shape
     size = (rows, int(sweep.x0.max(initial=0)) + window)
     most, at = np.zeros(size, np.uint32), np.zeros(size, np.int32)

@@ -27,14 +27,15 @@ _NODES = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(3
 _TRAVEL = tuple((x / 2, w / 2) for x, w in zip(*np.polynomial.legendre.leggauss(4), strict=True))
 LEAST_FLUX = 1e-7
 LEVEL_COUNTS = 0.5
-"""What a level is held up by, in counts: one without a single 1 is then half a count over all its frames, not 0."""
+"""Least number of 1s a level is taken to have, in counts: one without a single 1 is then half a count over all its
+frames, not 0."""
 BEFORE, AFTER, AREA, CENTRE, SIGMA = range(5)
 
 
 @dataclass(frozen=True, slots=True)
 class LineShape:
-    """Of the line's light over the columns. box: width of what is no Gaussian in it, in the Gaussian's sigmas. travels:
-    whether the line moves while a column's frames are taken.
+    """Shape of the line's light over the columns. box: width of the part that is no Gaussian, in the Gaussian's sigmas.
+    travels: whether the line moves while a column's frames are taken.
     """
 
     box: float = 0.0
@@ -88,7 +89,7 @@ def _travelled(area: Array, sigma: Array, away: Array, box: float) -> tuple[Arra
 
 
 def _normal_integral(z: Array) -> Array:
-    """Of the normal density up to z, to 2e-4 (E. Page, Applied Statistics 26, 1977)."""
+    """Integral of the normal density up to z, to 2e-4 (E. Page, Applied Statistics 26, 1977)."""
     result: Array = 0.5 * (1 + np.tanh(np.sqrt(2 / np.pi) * (z + 0.044715 * z**3)))
     return result
 
@@ -119,6 +120,6 @@ def regular(information: Array) -> Array:
 
 
 def log_likelihood(ones: Array, frames: Array, flux: Array) -> Array:
-    """Of each pixel's counts (pixels,), without the part that no flux changes."""
+    """Log-likelihood of each pixel's counts (pixels,), without the part that no flux changes."""
     result: Array = (ones * np.log(-np.expm1(-flux)) - (frames - ones) * flux).sum(axis=1)
     return result

@@ -1,8 +1,9 @@
 """Bundle adjustment of a whole rig: camera, poses of the board, mirror and lag, from corners and passages together.
 
-Start values come from linear fits (`rig_start`), the best values from robust least squares (`rig_solve`) whose noise is
-told from the residuals themselves (`rig_noise`). Terms of the mirror that the data call for are added one at a time
-(`rig_select`); what speeds and directions cannot tell is not fitted. The covariance is that of all parameters jointly.
+Start values come from linear fits (`start`), the best values from robust least squares (`solve`) whose noise is told
+from the residuals themselves (`noise`). Terms of the mirror that the data call for are added one at a time (`rounds`,
+`misfit`); a lag that the sweeps' speeds and directions cannot tell is not fitted. The covariance is that of all
+parameters jointly.
 """
 
 from collections.abc import Sequence

@@ -1,12 +1,11 @@
-"""What a fitted rig does not describe: views that do not belong, slow misfit, terms that are neither there nor not.
+"""The misfit of a fitted rig: views that do not belong, slow misfit, and terms of the mirror that the data call for.
 
-Which terms of the mirror the data call for, decided one at a time, each decision kept.
-
-A term that is not in the model is tried to first order: the equations say what value it would take and how sure that
-would be. It comes in where it would be SIGNIFICANT_SD of its own standard deviations and can be told from the others.
-The angle's polynomial grows by one order or two, since a symmetric mirror has no even terms. Of several that would come
-in the first is the one that leaves least unexplained: what is not there can stand for a part of what is, as light that
-passes the axis for an angle that bends, and be surer of its value than what it stands for.
+Terms are decided one at a time, each decision kept. A term that is not in the model is tried to first order: the
+equations say what value it would take and how sure that would be. It comes in where it would be SIGNIFICANT_SD of its
+own standard deviations and can be told from the others. The angle's polynomial grows by one order or two, since a
+symmetric mirror has no even terms. Of several that would come in the first is the one that leaves least unexplained: a
+term that is not there can stand for a part of one that is (light that passes beside the axis for an angle that bends),
+and may be surer of its value than the one it stands for.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,19 +24,24 @@ Array = NDArray[np.float64]
 
 SIGNIFICANT_SD = 5.0
 LEAST_OWN_SHARE = 1e-7
-"""Of a term's weight in the equations, what is its own when all others are free; less is rounding."""
+"""Share of a term's weight in the equations that must be its own when all others are free; less is rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class TermDecision:
-    """One about a term. value, sd: what it is or would be, in its own unit; NaN where nothing tells. along: name and
-    value of the terms that would come in with it. gain: by which chi2 would fall with all of them."""
+    """A decision about a term.
+
+    value, sd: what it is or would be, in its own unit; NaN where nothing tells. along: name and value of the terms that
+    would come in with it. gain: fall of chi2 with all of them.
+    """
 
     name: str
     kept: bool
+    """Whether the term is in the model."""
     value: float
     sd: float
     reason: str
+    """Why, in words."""
     along: tuple[tuple[str, float], ...] = ()
     gain: float = 0.0
 
@@ -51,7 +55,7 @@ def with_free(problem: RigProblem, groups: Sequence[Sequence[str]]) -> RigProble
 
 
 def candidates(free: Sequence[Sequence[str]], row_delay: bool) -> list[tuple[str, ...]]:
-    """What could come in next: (new terms), of which the last is the one that is judged."""
+    """Sets of terms that could come in next; of each set the last term is the one that is judged."""
     names = {name for group in free for name in group}
     order = max(k for k in range(ANGLE_TERMS) if f"angle_{k}" in names)
     tried = [tuple(f"angle_{k}" for k in range(order + 1, top + 1)) for top in range(order + 1, order + 3)]
@@ -67,9 +71,9 @@ def candidates(free: Sequence[Sequence[str]], row_delay: bool) -> list[tuple[str
 def tried(
     problem: RigProblem, solution: RigSolution, new: Sequence[str], left_over: Callable[[float], float]
 ) -> TermDecision:
-    """What the last of the new terms would be with all of them free.
+    """The decision on the last of the new terms, with all of them free.
 
-    left_over: by which factor variances would still be too large, were chi2 less by so much.
+    left_over: gives the factor by which variances would still be too large, were chi2 less by so much.
     """
     at = problem.terms.at(new)
     matrix, right = solution.matrix, solution.right
@@ -93,7 +97,7 @@ def tried(
 
 
 def best(decisions: Sequence[TermDecision]) -> int | None:
-    """Of those that would be kept the one that leaves least unexplained."""
+    """Index of the decision that leaves least unexplained, of those that would be kept; None where there is none."""
     kept = [at for at, decision in enumerate(decisions) if decision.kept]
     return max(kept, key=lambda at: decisions[at].gain) if kept else None
 
@@ -101,7 +105,7 @@ def best(decisions: Sequence[TermDecision]) -> int | None:
 def lag_decisions(
     solution: RigSolution, problem: RigProblem, free: Sequence[Sequence[str]], timing: Array
 ) -> list[TermDecision]:
-    """What the directions and speeds told of the lags."""
+    """The decisions on the lags, by what the directions and speeds told of them."""
     spread = np.sqrt(np.diag(solution.covariance(problem.tie)))
     told = {group[0]: group for group in free if group[0].startswith("lag")}
     decisions = []
@@ -152,23 +156,23 @@ def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> fl
 
 
 SCANNER_MOVES = ("axis_turn_1", "axis_turn_2", "axis_shift_1", "axis_shift_2", "angle_0")
-"""What a scanner that was knocked changes: five of six, since a shift along the axis changes nothing."""
+"""Parameters that change when a scanner is knocked: five of six, since a shift along the axis changes nothing."""
 ODD_CHI2 = 60.0
-"""By which chi2 must fall when a view has its own place of the scanner: 20 is one in a thousand."""
+"""Least fall of chi2 when an odd view has its own place of the scanner: 20 is one in a thousand."""
 ODD_TIMES = 8.0
-"""And more than so many times what it falls by for most views, should the model fit none of them well."""
+"""Least such fall as a multiple of that for most views, should the model fit none of them well."""
 EXPLAINED_SHARE = 0.05
-"""Or at most this of the misfit is left when the view has its own place of the scanner,"""
+"""Alternatively: at most this share of the misfit is left when the view has its own place of the scanner,"""
 OTHERS_SHARE = 0.3
-"""and at least this whichever other view had one,"""
+"""and at least this share is left whichever other view has one,"""
 LEAST_EXPLAINED = 2.0
-"""where there is as much of a misfit as this factor on the variances."""
+"""where the misfit is at least this factor on the variances."""
 FEWEST_TO_TELL = 4
 """Views with passages: of fewer none is the usual one."""
 UNDECIDED_SD = 2.5
-"""From here on a term that was not taken in widens the covariance by what it would change."""
+"""Significance from which on a term that was not taken in widens the covariance by what it would change."""
 MISFIT_SD = 3.0
-"""By which chi2 of the slow misfit must exceed its mean before it is believed."""
+"""Sds by which chi2 of the slow misfit must exceed its mean before it is believed."""
 
 
 def odd_view(problem: RigProblem, solution: RigSolution, left: "Misfit") -> int | None:
@@ -204,7 +208,7 @@ def with_passages(problem: RigProblem) -> NDArray[np.bool_]:
 
 
 def _own_place(problem: RigProblem, solution: RigSolution, view: int) -> float:
-    """Fall of chi2 to first order."""
+    """Fall of chi2, to first order, when the view has its own place of the scanner."""
     at = problem.terms.at(SCANNER_MOVES)
     tie, own = problem.tie, solution.views[view]
     inverse, _ = scaled_inverse(tie.T @ solution.matrix @ tie)
@@ -237,7 +241,7 @@ class Misfit(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """By which variances are larger than the noise makes them; 1 where that may be chance."""
+        """Factor by which variances are larger than the noise makes them; 1 where that may be chance."""
         found = [1.0]
         for chi2, free in self:
             if free >= 1 and chi2 > free + MISFIT_SD * np.sqrt(2 * free):
@@ -251,12 +255,12 @@ class Misfit(NamedTuple):
 
 
 def misfit(problem: RigProblem, solution: RigSolution) -> Misfit:
-    """What corners and passages have against each other, and passages among themselves."""
+    """The contradictions of corners and passages with each other, and of passages among themselves."""
     return Misfit(_of_corners(problem, solution), _of_sweeps(problem, solution))
 
 
 def _of_corners(problem: RigProblem, solution: RigSolution) -> tuple[float, float]:
-    """With the noise that the corners alone speak for."""
+    """chi2 and degrees of freedom of the corners, with the noise that they alone speak for."""
     covariance = solution.covariance(problem.tie)
     chi2 = free = 0.0
     for view, (rows, _), counts in zip(solution.views, solution.rows, problem.counted, strict=True):
@@ -267,7 +271,7 @@ def _of_corners(problem: RigProblem, solution: RigSolution) -> tuple[float, floa
 
 
 def _of_sweeps(problem: RigProblem, solution: RigSolution) -> tuple[float, float]:
-    """Of the smooth part of what is left of each sweep."""
+    """chi2 and number of degrees of freedom of the smooth part of each sweep's residuals."""
     chi2, count = 0.0, 0
     jitter = solution.weight.jitter
     for view, seen in enumerate(problem.sightings):
@@ -290,7 +294,7 @@ def _of_sweeps(problem: RigProblem, solution: RigSolution) -> tuple[float, float
 
 
 def _taken(problem: RigProblem, solution: RigSolution) -> float:
-    """How many parameters the passages, rather than the corners, determine."""
+    """Number of parameters that the passages, rather than the corners, determine."""
     covariance = solution.covariance(problem.tie)
     return float(
         sum(

@@ -1,4 +1,4 @@
-"""How noisy corners and passages are, from what is left of them.
+"""The noise of corners and passages, told from their residuals.
 
 Passages have three kinds of error: that of their own photons (their sd, times one factor), that of the mirror, which
 all pixels crossed in the same instant share (jitter), and what the model does not describe, which varies slowly over a
@@ -23,22 +23,22 @@ from calibration.views import MAD_TO_SD, robust_sd
 Array = NDArray[np.float64]
 
 BINS = 1024
-"""Of all commands there are: some to a column, within which jitter hardly changes."""
+"""Bins of the whole command range: some to a column, within which jitter hardly changes."""
 MOST_REACH_BINS = 96
 LEAST_FACTOR = 0.3
-"""Of the passages' own sd; an sd that is stated more than three times too large is not believed to be."""
+"""Least factor of the passages' own sd; an sd that is stated more than three times too large is not believed to be."""
 TAIL_SD = 3.0
-"""From here on an error counts as unlikely, and pulls no more than it would here."""
+"""Sds from which on an error counts as unlikely, and pulls no more than it would here."""
 OUTLIER_SD = 6.0
-"""From here on it is no error of this kind, and does not count."""
+"""Sds from which on a deviation is no error of this kind, and does not count."""
 CUT_SD = 4.0
 """Errors beyond it are left out where the noise is told: the square of one outlier would be that of hundreds."""
 FEWEST_PAIRS = 200
-"""Of neighbouring passages, that tell how errors go with their sd."""
+"""Fewest pairs of neighbouring passages that tell how errors go with their sd."""
 LEAST_SPREAD = 0.05
-"""Of the logarithm of the sd, that tells it too."""
+"""Least spread of the logarithm of the sd that tells it."""
 SIGNIFICANT_SD = 3.0
-"""For a jitter to be there; one overlooked makes a model look better than it is."""
+"""Significance for a jitter to be there; one overlooked makes a model look better than it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,9 @@ def restated(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> tuple
 
 
 def _kinds(sightings: Sequence[Sighting]) -> list[list[int]]:
-    """For every sweep of every view a number that those of speeds alike share: their frames in a column are, too."""
+    """A number for every sweep of every view, the same for sweeps of like speed: their frames in a column are alike,
+    too.
+    """
     speeds = [[float(seen.velocity_per_s[sweep.start]) for sweep in seen.sweeps] for seen in sightings]
     kinds = iter(alike_speeds([speed for of_view in speeds for speed in of_view]).tolist())
     return [[next(kinds) for _ in of_view] for of_view in speeds]

@@ -1,7 +1,4 @@
-"""What a fit of a whole rig comes to: model with covariance, residuals, and what had a say.
-
-What a fit leaves of each sweep's passages.
-"""
+"""The result of a fit of a whole rig: model with covariance, residuals of each sweep's passages, and what had a say."""
 
 from dataclasses import dataclass, replace
 
@@ -25,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepFit:
-    """What is left of the passages of one sweep of a view; all float64 (m,), sorted by command.
+    """The residuals of the passages of one sweep of a view; all float64 (m,), sorted by command.
 
     command: the mirror's, as the model has it. residual, sd: in command units. distance_m: how far the point on the
     board lies off the light.
@@ -42,7 +39,7 @@ class SweepFit:
 
 
 def sweep_fits(seen: Sighting, residual: Array, state: RigState, view: int) -> tuple[SweepFit, ...]:
-    """Of a view's sweeps, from the residuals of its passages."""
+    """The fits of a view's sweeps, from the residuals of its passages."""
     command = mirror_command(state.timing, seen.command, seen.y_px, seen.velocity_per_s)
     points = board_points(state.model.camera, [seen], [state.poses[view]]).points_m
     per_command_m = sheet_rows(
@@ -176,6 +173,6 @@ def _swept(problem: RigProblem) -> list[float]:
 
 
 def _trimmed(terms: Array, least: int) -> Array:
-    """Without the zeros at the end."""
+    """The terms without the zeros at the end."""
     used = np.flatnonzero(terms)
     return terms[: max(least, int(used[-1]) + 1 if used.size else 0)]

@@ -25,19 +25,21 @@ from calibration.rig_fit.solve import RigProblem, RigSolution, solved
 from calibration.rig_fit.state import RigState, with_terms_of
 
 MOST_ROUNDS = 16
-"""Of fitting and deciding; every round but the last adds a term, drops a view or settles the noise."""
+"""Most rounds of fitting and deciding; every round but the last adds a term, drops a view or settles the noise."""
 MOST_IDLE_ROUNDS = 4
-"""Without a decision: data that contradict each other may keep a fit from coming to rest for ever."""
+"""Most rounds without a decision: data that contradict each other may keep a fit from coming to rest for ever."""
 SETTLED_SHARE = 0.02
-"""By which the noise may still change in the last round."""
+"""Relative change of the noise that is still allowed in the last round."""
 MOST_ODD_SHARE = 1 / 3
-"""Of the views with passages may be dropped as outliers; more, and it is not they who are wrong."""
+"""Largest share of the views with passages that may be dropped as outliers; beyond it, it is not they who are wrong."""
 
 
 @dataclass
 class Rounds:
-    """Where the fitting and deciding stands. base: what is free to begin with; free: now. decisions: the last about
-    terms; kept: those that changed the model.
+    """The state of fitting and deciding.
+
+    base: parameters that are free to begin with; free: now. decisions: the last ones about terms; kept: those that
+    changed the model.
     """
 
     problem: RigProblem
@@ -54,7 +56,7 @@ class Rounds:
         self.free = list(self.base)
 
     def run(self) -> None:
-        """Until nothing changes."""
+        """Fit and decide until nothing changes."""
         idle = 0
         for _ in range(MOST_ROUNDS):
             self.solution = solved(self.problem, self.state, self.noise, roughly=idle == 0)

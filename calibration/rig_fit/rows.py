@@ -27,7 +27,7 @@ from calibration.views import BoardPose
 Array = NDArray[np.float64]
 
 LENS_TERMS = DISTORTION[:12]
-"""All but a tilted sensor's."""
+"""Names of the distortion's terms, without those of a tilted sensor."""
 ANGLE_TERMS = 6
 OFFSET_TERMS = 2
 
@@ -40,12 +40,12 @@ class Terms:
 
     @property
     def camera(self) -> tuple[str, ...]:
-        """Of the camera."""
+        """Names of the camera's parameters."""
         return (*MATRIX, *LENS_TERMS[: self.lens])
 
     @property
     def scanner(self) -> tuple[str, ...]:
-        """Of the mirror."""
+        """Names of the mirror's parameters."""
         return (
             *AXIS,
             *(f"angle_{k}" for k in range(ANGLE_TERMS)), *(f"offset_{k}" for k in range(OFFSET_TERMS)), "cone", "bow",
@@ -53,7 +53,7 @@ class Terms:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all columns."""
+        """Names of all columns."""
         return (*self.camera, *self.scanner, *TIMES)
 
     def at(self, names: Sequence[str]) -> list[int]:
@@ -122,7 +122,9 @@ def sheet_rows(
 
 
 def mirror_command(timing: Array, command: Array, y_px: Array, velocity_per_s: Array) -> Array:
-    """Where the mirror stood, on the command's scale; see `RigModel.mirror_command`, whose lags have no sign."""
+    """Position of the mirror, on the command's scale; as `RigModel.mirror_command`, with `timing` (3,) in place of a
+    model.
+    """
     delay_s: Array = np.where(velocity_per_s > 0, timing[0], timing[1]) - timing[2] * y_px
     return command - velocity_per_s * delay_s
 
@@ -168,7 +170,7 @@ def passage_rows(
     camera: Camera, terms: Terms, scanner: PivotScanner, source_m: Array | None, timing: Array, pose: BoardPose,
     rays: Array, command: Array, y_px: Array, velocity_per_s: Array,
 ) -> Rows:  # fmt: skip
-    """Of passages with the rays (2, m) of their pixels; residuals in units of the command."""
+    """Rows of passages with the rays (2, m) of their pixels; residuals in units of the command."""
     u, v = rays
     ray = np.stack([u, v, np.ones_like(u)], axis=-1)
     board = pose.matrix[:, 2]
@@ -187,7 +189,7 @@ def passage_rows(
 
 
 def corner_rows(camera: Camera, terms: Terms, pose: BoardPose, corners_m: Array, corner_px: Array) -> Rows:
-    """Of corners (n, 3) seen at (n, 2): predicted less seen, in pixels, (2 n,) with all x first."""
+    """Rows of corners (n, 3) seen at (n, 2): predicted less seen, in pixels, (2 n,) with all x first."""
     moved = corners_m @ pose.matrix.T
     points = moved + pose.position_m
     z = points[:, 2]

@@ -1,11 +1,14 @@
 """The least squares of a rig's fit: Gauss-Newton steps, damped where they do not help, in scaled parameters.
 
-Normal equations of a rig's fit: one view at a time, its pose eliminated.
+The normal equations take one view at a time and eliminate its pose.
 
-Passages of one instant share the mirror's jitter s: V = D + s^2 11' for each bin. Its inverse is
-D^-1 - k (D^-1 1)(D^-1 1)', k = s^2 / (1 + s^2 1'D^-1 1), so what a bin adds is the sum over its passages less k times a
-product of sums. A view's pose only touches that view: with N = [[A, B'], [B, C]] (A shared, C the pose's own) the view
-adds A - B'C^-1 B to the shared equations, and its pose follows from theirs.
+Passages of one instant share the mirror's jitter s. For each bin
+
+    V = D + s^2 11',    V^-1 = D^-1 - k (D^-1 1)(D^-1 1)',    k = s^2 / (1 + s^2 1'D^-1 1)
+
+so a bin adds the sum over its passages less k times a product of sums. A view's pose only touches that view: with
+N = [[A, B'], [B, C]] (A shared, C the pose's own) the view adds A - B'C^-1 B to the shared equations, and its pose
+follows from theirs.
 """
 
 from collections.abc import Sequence
@@ -29,9 +32,11 @@ _USUAL_MISS = float(np.sqrt(np.log(2.0)))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewNormal:
-    """What a view adds, its pose eliminated. matrix (p, p), right (p,); pose_by_shared (6, p), pose_alone (6,) and
-    pose_inverse (6, 6): the pose's change is pose_alone - pose_by_shared @ shared. chi2 of (corners, passages).
-    corner_part, passage_part: (p + 6, p + 6) what each adds before the elimination; corner_right: (p + 6,).
+    """The normal equations of a view, its pose eliminated.
+
+    matrix (p, p), right (p,); pose_by_shared (6, p), pose_alone (6,) and pose_inverse (6, 6): the pose's change is
+    pose_alone - pose_by_shared @ shared. chi2 of (corners, passages). corner_part, passage_part: (p + 6, p + 6) what
+    each adds before the elimination; corner_right: (p + 6,).
     """
 
     matrix: Array
@@ -134,21 +139,24 @@ def _products(rows: Rows, weight: Array) -> tuple[Array, Array, float]:
 
 MOST_STEPS = 12
 WEIGHED_STEPS = 6
-"""After these, who is an outlier stays one: weights that follow every step never come to rest."""
+"""Steps after which an outlier stays one: weights that follow every step never come to rest."""
 CONVERGED_CHI2 = 1e-3
-"""Promised by the next step: 0.03 of a standard deviation along any parameter."""
+"""Gain in chi2 promised by the next step at which a fit is at rest: 0.03 of a standard deviation along any
+parameter."""
 ROUGH_SHARE = 1e-4
-"""Of chi2, that the next step may promise where a term is only looked for."""
+"""Share of chi2 that the next step may still promise where a term is only looked for."""
 WORSE_CHI2 = 0.1
-"""A step may do harm by this: derivatives are exact but for how a bow changes along the line."""
+"""Amount by which a step may raise chi2: derivatives are exact but for how a bow changes along the line."""
 MOST_DAMPING = 1e8
 MOST_CONDITION = 1e12
-"""Of the scaled equations; beyond it float64 leaves no digits of the worst direction."""
+"""Largest condition number of the scaled equations; beyond it float64 leaves no digits of the worst direction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """What is known of the camera from elsewhere. matrix: (p, p) information, 0 for the rest, at the values (p,)."""
+    """Knowledge of the camera from elsewhere. matrix: (p, p) information, 0 for the other parameters, at the values
+    (p,).
+    """
 
     matrix: Array
     values: Array
@@ -156,8 +164,10 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigProblem:
-    """What is fitted to what. tie: (p, q), shared parameters by free ones. counted: (views,), False where a view has
-    a pose of its own but no say in what all share. prior: on the camera's terms, or None.
+    """The data and the parameters of a fit.
+
+    tie: (p, q), shared parameters by free ones. counted: (views,), False where a view has a pose of its own but no say
+    in what all share. prior: on the camera's terms, or None.
     """
 
     sightings: tuple[Sighting, ...]
@@ -262,7 +272,7 @@ def scaled_inverse(matrix: Array) -> tuple[Array, float]:
 
 
 def _damped(matrix: Array, right: Array, damping: float) -> Array:
-    """Step of the free parameters."""
+    """The damped step of the free parameters."""
     scale = 1 / np.sqrt(np.diag(matrix))
     scaled = matrix * scale[:, None] * scale + damping * np.eye(len(scale))
     result: Array = scale * np.linalg.solve(scaled, scale * right)
@@ -297,7 +307,7 @@ def _counted(views: Sequence[ViewNormal], problem: RigProblem) -> list[ViewNorma
 
 
 def camera_prior(known: Covariance, camera: Camera, terms: Terms) -> Prior:
-    """What other pictures told of the camera."""
+    """The prior from a camera that other pictures told of, with their covariance."""
     variance = dict(zip(known.names, np.diag(known.matrix), strict=True))
     names = [name for name in known.names if name in terms.camera and variance[name] > 0]
     at = terms.at(names)
@@ -307,13 +317,13 @@ def camera_prior(known: Covariance, camera: Camera, terms: Terms) -> Prior:
 
 
 def _off(prior: Prior, terms: Terms, state: RigState) -> Array:
-    """What the prior's values are more than those of the state."""
+    """The prior's values less those of the state."""
     off: Array = prior.values - _camera_values(state.model.camera, terms)
     return off
 
 
 def _camera_values(camera: Camera, terms: Terms) -> Array:
-    """(p,), 0 for what is not the camera's."""
+    """The camera's values (p,), 0 for the other parameters."""
     values: Array = np.zeros(len(terms.names))
     (fx, _, cx), (_, fy, cy) = camera.matrix[:2]
     values[: 4 + terms.lens] = [fx, fy, cx, cy, *camera.distortion[: terms.lens]]

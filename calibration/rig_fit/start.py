@@ -5,7 +5,7 @@ x = d(c) - b(c) y - e(c) z with d, b, e smooth in c: polynomials, found by one l
 a direction and speed of sweep gave. Their planes' normals lie across the axis, and the commands at which two sweeps
 reach the same angle differ by what the mirror lags.
 
-Views that make no model of a rig: refused with the reason, what was measured, its limit and what to do.
+Views that make no model of a rig are refused with the reason, what was measured, its limit and what to do.
 """
 
 import math
@@ -31,18 +31,20 @@ from calibration.views import NO_POSE, BoardPose, View
 Array = NDArray[np.float64]
 
 _ORDERS = (3, 1, 3)
-"""Of d, b and e in the command: tangents of an angle that turns a quarter of a right angle either way."""
+"""Orders of d, b and e in the command: tangents of an angle that turns a quarter of a right angle either way."""
 POSES_FOR_PLANES = 5
-"""On fewer boards a command's light leaves too few lines to lay a plane through, all errors considered."""
+"""Fewest boards; on fewer a command's light leaves too few lines to lay a plane through, all errors considered."""
 MOST_FIRST_LAG_S = 1e-3
-"""Ten times that of a small galvo."""
+"""Largest first value of a lag: ten times that of a small galvo."""
 _STEP = 0.7
 """Share of its range by which a sweep's planes are sampled; the ends are worst known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LitPoints:
-    """Where light met the board: points_m (m, 3), command (m,), velocity_per_s (m,), and in which view (m,)."""
+    """Points at which light met the board: points_m (m, 3), command (m,), velocity_per_s (m,), and the view of each
+    (m,).
+    """
 
     points_m: Array
     command: Array
@@ -162,15 +164,16 @@ def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[flo
 
 
 LEAST_TILT_RAD = np.radians(5.0)
-"""Between two boards at least."""
+"""Least tilt between two boards."""
 LEAST_THICKNESS = 0.01
-"""Of the points about the plane that fits them best, as a share of their distance: less is one plane."""
+"""Least thickness of the points about the plane that fits them best, as a share of their distance: less is one
+plane."""
 LEAST_SPAN = 0.02
-"""Of the mirror's command range: a line that hardly moved tells nothing of how it turns."""
+"""Least share of the mirror's command range: a line that hardly moved tells nothing of how it turns."""
 LEAST_LIT_SHARE = 0.1
-"""Of the picture, for a distance to be judged at."""
+"""Least share of the picture that must be lit for a distance to be judged at."""
 MOST_DEPTH_SD_SHARE = 0.2
-"""Of the distance it is judged at; a model that knows depth no better knows nothing."""
+"""Largest sd of depth, as a share of the distance; a model that knows depth no better knows nothing."""
 
 
 def check_views(views: Sequence[View], sightings: Sequence[Sighting]) -> None:
@@ -219,7 +222,7 @@ def reason_of(poses: Sequence[BoardPose]) -> str:
 
 
 def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:
-    """What is raised where not even a first guess makes a rig."""
+    """The error for views from which not even a first guess makes a rig."""
     return Degenerate(
         reason_of(poses),
         f"light on {len(poses)} boards fits no mirror: {error}; show the board at 8 or more poses, at several "
@@ -228,7 +231,7 @@ def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:
 
 
 def unfit(names: Sequence[str]) -> str:
-    """That these views had no say, in words."""
+    """Words for the views that had no say."""
     return f"view{'s' if len(names) > 1 else ''} {', '.join(names)} left out: unlike the others"
 
 

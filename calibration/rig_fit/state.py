@@ -1,6 +1,6 @@
-"""Where a fit of a rig stands: the model, its timing, the poses, and all residuals at that point.
+"""The state of a rig's fit (model, timing, poses, residuals), and the sightings that it is fitted to.
 
-What the fit of a rig sees of each pose of the board: corners and passages, cleaned, in the order it needs them.
+A sighting is a pose's corners and passages, cleaned and in the order that the fit needs.
 """
 
 from collections.abc import Sequence
@@ -22,11 +22,11 @@ Array = NDArray[np.float64]
 EDGE_PX = 1.5
 """Passages this close to the board's outline are left out: such pixels see what stands behind it too."""
 LEAST_SD_SHARE = 0.05
-"""Of the median sd of a sweep: none counts as better known, or a few too sure of themselves would decide."""
+"""Least sd of a passage, as a share of its sweep's median: a few that are too sure of themselves must not decide."""
 LEAST_CORNER_SD_PX = 0.02
-"""What the print, the lens model and the finding of corners leave, however bright the picture."""
+"""Error that the print, the lens model and the finding of corners leave, however bright the picture."""
 FEWEST_PASSAGES = 30
-"""Of a sweep; fewer say nothing that the noise can be told from."""
+"""Fewest passages of a sweep; fewer say nothing that the noise can be told from."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +80,7 @@ def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sight
 
 
 def corner_scale(corners: Corners) -> Array:
-    """Of each corner, 1 where the picture did not tell."""
+    """Relative sd of each corner, 1 where the picture did not tell."""
     if corners.sd_px is None:
         return np.ones(len(corners.ids))
     scale: Array = np.hypot(corners.likely_sd_px, LEAST_CORNER_SD_PX) / USUAL_CORNER_SD_PX
@@ -158,7 +158,9 @@ class RigState:
         return corners, passages
 
     def stepped(self, terms: Terms, shared: Array, poses: Sequence[Array], sightings: Sequence[Sighting]) -> "RigState":
-        """Moved by changes of the shared parameters (p,) and of each pose (6,). CalibrationError: no such model."""
+        """The state moved by changes of the shared parameters (p,) and of each pose (6,). CalibrationError: no such
+        model.
+        """
         untimed = len(terms.names) - len(TIMES)
         moved = [name for name, change in zip(terms.names[:untimed], shared, strict=False) if change != 0]
         model = with_parameters(self.model, moved, [shared[terms.names.index(name)] for name in moved])

@@ -1,15 +1,18 @@
-"""When the laser's light begins or ends, from the ones of the frames around that moment.
+"""The moment at which the laser's light begins or ends, from the ones of the frames around it.
 
     ones of frame i = level + slope i + brightness r(share of the exposure that was lit),     r(0) = 0, r(1) = 1
 
 One frame at most is lit in part. All others give level, slope and brightness by least squares, and so how bright that
 one is, r, with its standard deviation. A pixel that fires with probability p when lit whole has
-1 - (1 - p)^s = s p + s (1 - s) / 2 p^2 + ..., whose coefficients are all positive and sum to 1. With m the mean of p
-over the ones (sum of p^2 over sum of p) the response of a share s is therefore known within
+
+    1 - (1 - p)^s = s p + s (1 - s) / 2 p^2 + ...
+
+whose coefficients are all positive and sum to 1. With m the mean of p over the ones (sum of p^2 over sum of p) the
+response of a share s is therefore known within
 
     s + s (1 - s) m / 2 <= r(s) <= s + (1 - s) m
 
-Of a weak line that is s; of one that saturates next to nothing is known within a frame, and edges that lie elsewhere
+For a weak line that is s; for one that saturates next to nothing is known within a frame, and edges that lie elsewhere
 within theirs have to tell. Ones scatter like photons, or more where the fit says so.
 """
 
@@ -41,7 +44,7 @@ class Edge:
 def fit_edge(
     ones: Array, start_s: Array, exposure_s: float, times_s: Array, *, rises: bool, saturation: float = 0.0
 ) -> Edge:
-    """How well light that begins (rises) or ends at each of the moments (times,), ascending, explains some frames.
+    """Tell how well light that begins (rises) or ends at each of the moments (times,), ascending, explains some frames.
 
     ones, start_s: (frames,), 1s of each and when its exposure began, at least 8 frames. saturation: m above. Moments
     within two frames of either end are taken to be impossible.

@@ -1,4 +1,4 @@
-"""When light, mirror and frames happen, from sweeps over one unmoved scene at several speeds, both ways.
+"""The lags of light, mirror and frames, from sweeps over one unmoved scene at several speeds, both ways.
 
 A pixel sees the line at one mirror position, whatever the speed. In a sweep with direction s = +1 or -1 and speed v it
 sees it at (calibration/views.py)
@@ -11,12 +11,13 @@ needed and no geometry, only pixels that tell of a passage in several of the swe
 What the sweeps can tell depends on them (`calibration.model.parameters`). One speed each way: a mean of the lags alone,
 both are taken to be it. Two speeds in one direction at least: the lag of each way that was scanned. Whether a lag is
 the same at all speeds shows with two speeds both ways, or three. The row delay needs rows, not speeds. One that is
-known from elsewhere counts with what the sweeps tell of it, unless they contradict it significantly; nothing known is
-0.
-What no sweep tells: a delay of the markers behind the mirror's command that is always the same (the scanner's colour
-outputs trail its mirror outputs by some microseconds, docs/hardware.md, Helios): it shortens both lags, which are then
-as they have to be for binding with these very markers. It takes an oscilloscope. A marker of the wrong polarity shows
-in the binding, whose residual it breaks; the gate's delay in the frames at its edges (`gate_delay`).
+known from elsewhere counts with what the sweeps tell of it, unless they contradict it significantly; where nothing is
+known it is 0.
+
+No sweep tells of a delay of the markers behind the mirror's command that is always the same (the scanner's colour
+outputs trail its mirror outputs by some microseconds, docs/hardware.md): it shortens both lags, which are then as they
+have to be for binding with these very markers; measuring it takes an oscilloscope. A marker of the wrong polarity shows
+in the binding, whose residual it breaks; the gate's delay shows in the frames at its edges (`gate_fit`).
 """
 
 from collections.abc import Sequence
@@ -45,12 +46,14 @@ Array = NDArray[np.float64]
 SIGNIFICANT = 5.0
 """Standard deviations of a row delay that is believed against the known one, and of a lag below 0 that is refused."""
 MOST_CHI2_SDS = 4.0
-"""How far, in its standard deviations, chi squared of the speeds may lie above its mean."""
+"""Most standard deviations by which chi squared of the speeds may lie above its mean."""
 
 
 @dataclass(frozen=True, slots=True)
 class SweepTiming:
-    """What one sweep says beside the others. lag_s: as if it were the only one of its kind; sd_s: of that."""
+    """The timing that one sweep tells beside the others. lag_s: as if it were the only one of its kind; sd_s: of
+    that.
+    """
 
     direction: int
     speed_per_s: float
@@ -60,7 +63,7 @@ class SweepTiming:
 
     @property
     def velocity_per_s(self) -> float:
-        """Signed."""
+        """Velocity of the command, signed."""
         return self.direction * self.speed_per_s
 
 
@@ -95,7 +98,7 @@ class SyncFit:
 
     @property
     def velocities_per_s(self) -> tuple[float, ...]:
-        """Signed, of the sweeps."""
+        """Velocities of the sweeps, signed."""
         return tuple(sweep.velocity_per_s for sweep in self.sweeps)
 
     @property

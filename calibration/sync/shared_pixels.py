@@ -16,7 +16,7 @@ from calibration.views import Passages, robust_sd
 Array = NDArray[np.float64]
 
 SWEEP_ERROR_S = 3e-7
-"""What every sweep may be off as a whole besides noise: a thirtieth of a frame of 10 us."""
+"""Error of every sweep as a whole besides noise: a thirtieth of a frame of 10 us."""
 LEAST_PIXELS = 50
 CLUSTERS = 64
 """Parts of the command range in which the mirror's own trembling is taken to be common to all pixels."""
@@ -39,13 +39,13 @@ class SharedPixels:
 
     @property
     def velocity(self) -> Array:
-        """Signed (sweeps,)."""
+        """Velocities of the command, signed (sweeps,)."""
         result: Array = self.direction * self.speed
         return result
 
     @classmethod
     def of(cls, sweeps: Sequence[Passages]) -> "SharedPixels":
-        """Degenerate where too few pixels are shared."""
+        """Collect the pixels that sweeps share. Degenerate where they are too few."""
         places = [np.stack([sweep.y_px, sweep.x_px], axis=1) for sweep in sweeps]
         every = np.concatenate([*places, np.empty((0, 2))])
         pixels, index = np.unique(every, axis=0, return_inverse=True)

@@ -9,8 +9,8 @@ with an angle of its own: C is wide open then. With x the lags, y all else, S th
 It takes a mirror whose lags were then what they are now. Where both contradict each other, the lags have changed: the
 angle stays as it was, if it is known without them.
 
-The row delay goes with the lags where the sweeps told of it; `sync_fit` was given what the model knows of it, and has
-both in its value.
+The row delay goes with the lags where the sweeps told of it; the fit of the lags (`lag_fit`) was given what the model
+knows of it, and has both in its value.
 """
 
 from dataclasses import replace
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 _OPEN_S = 1e-4, 1e-2
 """Standard deviation of a lag that nothing tells: enough to follow it, and to be surprised by none."""
 _LEAST_SHARE = 1e-9
-"""Of the scaled covariance of lags; below it they were taken for one."""
+"""Least own share of the scaled covariance of lags; below it they were taken for one."""
 _AGAIN = "calibrate the planes again, both ways and at two speeds or more (--exposures)"
 
 
@@ -71,7 +71,7 @@ def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
 
 
 def _told(fit: SyncFit) -> tuple[dict[str, float], Array]:
-    """What the sweeps tell, by name, and its covariance: a lag that was not scanned is the other."""
+    """The values that the sweeps tell, by name, and their covariance: a lag that was not scanned is the other."""
     ways = [at if np.isfinite(fit.covariance[at, at]) else 1 - at for at in (0, 1)]
     at = [*ways, 2] if fit.row_told else ways
     values = dict(zip(TIMES, (*fit.lag_s, fit.row_delay_s), strict=True))
@@ -81,7 +81,9 @@ def _told(fit: SyncFit) -> tuple[dict[str, float], Array]:
 def _slopes(
     base: RigModel, known: Array, names: tuple[str, ...], lags: int, change: Array, spread: Array
 ) -> tuple[Array, Reason | None]:
-    """How all else goes with the lags (the last of the names), (others, lags): A; and why that is not to be told."""
+    """The slopes A (others, lags) of all else by the lags (the last of the names), and the reason where they cannot be
+    told.
+    """
     n = len(names) - lags
     slopes = np.zeros((n, lags))
     velocities = base.provenance.get(SWEPT) or ()

@@ -1,10 +1,10 @@
-"""Messages between application and guard: one JSON object a line over a socket pair, and errors on their way.
+"""Messages and heartbeat between the application and the guard.
 
-The end of the stream is a message too: the kernel sends it the moment the other process is gone.
+Messages are one JSON object a line over a socket pair, errors included. The end of the stream is a message too: the
+kernel sends it the moment the other process is gone.
 
-The heartbeat: a page of memory that application and guard share, in which the source thread writes.
-
-To beat is one store: no lock, no system call, nothing that a full pipe, a stopped guard or a slow disk could hold up.
+The heartbeat is a page of memory that both share, in which the source thread writes. To beat is one store: no lock, no
+system call, nothing that a full pipe, a stopped guard or a slow disk could hold up.
 """
 
 import json
@@ -26,7 +26,7 @@ _READ_BYTES = 65_536
 
 
 class Channel:
-    """One end. Sending is safe from any thread, receiving belongs to one."""
+    """One end of the connection. Sending is safe from any thread, receiving belongs to one."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
@@ -36,7 +36,7 @@ class Channel:
         self._received = bytearray()
 
     def fileno(self) -> int:
-        """For select."""
+        """The socket's file descriptor, for select."""
         return self._end.fileno()
 
     def send(self, message: Message, within_s: float = 0.0) -> None:
@@ -111,7 +111,7 @@ _NO_FRAME = -1
 
 
 class Heartbeat:
-    """The page, in either process."""
+    """The shared page, in either process."""
 
     def __init__(self, handle: int) -> None:
         """handle: of an anonymous file of at least a page."""
@@ -140,7 +140,9 @@ class Heartbeat:
 
     @property
     def waited_s(self) -> float:
-        """For how long the source thread has asked the SPAD in vain since its last frames, as it said last."""
+        """Seconds for which the source thread has asked the SPAD in vain since its last frames, by its own last
+        word.
+        """
         return float(_WAITED.unpack_from(self._page, _FRAME.size)[0])
 
     @waited_s.setter

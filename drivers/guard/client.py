@@ -1,6 +1,6 @@
-"""The application's side of the guard: starts it, speaks with it, beats for it, and steps in where it is gone.
+"""The application's side of the guard: starts it, talks to it, beats for it, and steps in where it is lost.
 
-Laser and sync source as the application sees them: the usual interfaces, done by the guard.
+`GuardedLaser` and `GuardedSync` are the usual device interfaces; each verb is carried out by the guard.
 """
 
 import itertools
@@ -30,7 +30,7 @@ from drivers.transports.tap import TapFile
 
 
 class Asks(Protocol):
-    """What a proxy needs of the guard."""
+    """The part of the guard that a proxy device uses."""
 
     def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
         """Have the guard do a verb; returns its result, raises its error, or `GuardLost`."""
@@ -53,19 +53,19 @@ class GuardedLaser(LineLaser):
 
     @property
     def identity(self) -> str:
-        """As the guard found it."""
+        """The identity that the guard read when it opened the device."""
         return self._identity
 
     @property
     def limits(self) -> LaserLimits:
-        """As the guard found them when it opened the laser."""
+        """The limits that the guard read when it opened the laser."""
         return self._limits
 
     def _do_status(self) -> LaserStatus:
         return LaserStatus(**self._guard.ask("laser", "status"))
 
     def _check_health(self) -> None:
-        """The guard's own `arm` does it: a slow laser is not asked twice."""
+        """Do nothing: the guard's own `arm` checks, and a slow laser is not asked twice."""
 
     def _do_arm(self, power_w: float) -> None:
         self._guard.ask("laser", "arm", power_w)
@@ -92,16 +92,16 @@ class GuardedSync(SyncSource):
 
     @property
     def identity(self) -> str:
-        """As the guard found it."""
+        """The identity that the guard read when it opened the device."""
         return self._identity
 
     @property
     def resolution_s(self) -> float:
-        """As the guard found it when it opened the device."""
+        """The resolution that the guard read when it opened the device."""
         return self._resolution_s
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int | None:
-        """As the device behind it."""
+        """The limit of the device behind the guard; None where it has none."""
         most: int | None = self._guard.ask("sync", "most_repeats", _plain(pulses))
         return most
 
@@ -145,7 +145,8 @@ BUSY_SILENCE_S = 5.0
 _TICK_S = 0.01
 _MAX_STEP_S = 0.1
 _RESCUE_SWITCH_S = 5e-4
-"""How long other threads may keep the interpreter while laser and gate are rescued, each time: usually 5 ms."""
+"""Longest time for which other threads keep the interpreter while laser and gate are rescued; Python's default is 5
+ms."""
 _LOWERING = ("pause", "disarm", "gate_low", "abort")
 _ENABLING = ("arm", "program", "run")
 
@@ -220,7 +221,7 @@ class Guard:
 
     @property
     def failure(self) -> DeviceError | None:
-        """Why the guard took the light, or `GuardLost`; None while all is well."""
+        """The reason why the guard took the light, or `GuardLost`; None while all is well."""
         return self._failure
 
     @property
@@ -230,7 +231,7 @@ class Guard:
 
     @property
     def pid(self) -> int:
-        """Of the guard's process."""
+        """Process id of the guard."""
         return self._process.pid
 
     def beat(self, frame: int) -> None:
@@ -248,11 +249,11 @@ class Guard:
         self._heartbeat.waited_s = waited_s
 
     def expect(self, limits: GuardLimits) -> None:
-        """Other limits from now on, as for a burst, which is silent until it is read out."""
+        """Set other limits from now on, as for a burst, which is silent until it is read out."""
         self._channel.send({"limits": asdict(limits)}, within_s=1.0)
 
     def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
-        """For the proxies: have the guard do a verb; returns its result or raises its error.
+        """Have the guard do a verb for a proxy; returns its result or raises its error.
 
         `GuardLost` where there is no guard: at once, but for verbs that lower, which wait for the application's own
         attempt at it.
@@ -381,7 +382,7 @@ class Guard:
             self._parted = True
 
     def _end(self) -> None:
-        """The guard has ended: as asked, after it made all safe, or by force."""
+        """Deal with the end of the guard: as asked, after it made all safe, or by force."""
         if self._parted:
             self._lost.set()
         else:
@@ -397,7 +398,7 @@ class Guard:
         self._release()
 
     def _release(self) -> None:
-        """Whoever waits for an answer learns that none will come."""
+        """Tell everybody who waits for an answer that none will come."""
         with self._lock:
             waiting = list(self._answers.values())
         for inbox in waiting:
@@ -407,7 +408,7 @@ class Guard:
 
 
 def _start(theirs: socket.socket, heartbeat: Heartbeat) -> "subprocess.Popen[bytes]":
-    """In a session of its own: no Ctrl-C, no closed terminal reaches it."""
+    """Start the guard's process in a session of its own: no Ctrl-C, no closed terminal reaches it."""
     package_root = str(Path(__file__).parents[2])
     paths = [package_root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     return subprocess.Popen(

@@ -1,6 +1,6 @@
 """A device that the guard owns: opened from its config, asked by the application's messages, made safe at the end.
 
-A thread that does one job after the other for one device, urgent ones first.
+Its `Lane` is a thread that does one job after the other for it, urgent ones first.
 """
 
 import itertools
@@ -23,7 +23,9 @@ Job = Callable[[], object]
 
 
 class Lane:
-    """Jobs must not raise. The thread is a daemon: a job that hangs in a driver does not keep the process alive."""
+    """A thread that does jobs one after the other. Jobs must not raise. The thread is a daemon: a job that hangs in a
+    driver does not keep the process alive.
+    """
 
     def __init__(self, name: str) -> None:
         self._jobs: queue.PriorityQueue[tuple[int, int, Job]] = queue.PriorityQueue()
@@ -57,7 +59,7 @@ class Lane:
 _log = logging.getLogger(__name__)
 
 RETRY_S = 0.1
-"""Between attempts to make a device safe that does not answer or is not there."""
+"""Pause between attempts to make a device safe that does not answer or is not there."""
 
 
 class Owned:
@@ -70,13 +72,13 @@ class Owned:
         self.slot = slot
         self.device: Any = None
         self.armed = False
-        """A laser that is to be disarmed where the application cannot go on."""
+        """Whether this is a laser that is to be disarmed where the application cannot go on."""
         self.emits = False
-        """A laser that shines through an open gate, as far as it was told to."""
+        """Whether this is a laser that shines through an open gate, as far as it was told to."""
         self.lane = Lane(slot)
         self.urgent = Lane(f"{slot}, urgent")
         self.enabling = False
-        """A verb that may end in light is under way on `lane`."""
+        """Whether a verb that may end in light is under way on `lane`."""
         self.unsafe = False
         self.trying = False
         self.finished = threading.Event()
@@ -137,7 +139,7 @@ class Owned:
         return None
 
     def want_safe(self) -> None:
-        """From now on `try_safe` is to be called until `finished`."""
+        """Ask for `try_safe` to be called from now on until `finished`."""
         self.unsafe = True
 
     @property
@@ -146,7 +148,9 @@ class Owned:
         return self.unsafe and not self.trying and time.monotonic() >= self._next_try
 
     def try_safe(self) -> None:
-        """Gate: all outputs low. Laser: paused, then disarmed if it was armed. One attempt, on a lane."""
+        """Try once to make the device safe. Gate: all outputs low. Laser: paused, then disarmed if it was armed. On a
+        lane.
+        """
         try:
             if self.port_lost:
                 self._reopen()
@@ -162,7 +166,7 @@ class Owned:
             self.trying = False
 
     def calm(self) -> None:
-        """Beside a verb that may end in light: dark now, `try_safe` follows it."""
+        """Make the device dark now, beside a verb that may end in light; `try_safe` follows it."""
         try:
             if isinstance(self.device, SyncSource):
                 self.device.abort()
@@ -183,5 +187,7 @@ class Owned:
             self.armed = False
 
     def _reopen(self) -> None:
-        """The port is gone: the device may have been plugged in again. DeviceError while it is not."""
+        """Open the device again after its port was lost: it may have been plugged in anew. DeviceError while it is
+        not.
+        """
         self.device = self._create()

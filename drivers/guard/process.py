@@ -7,7 +7,8 @@ After it: an application that cannot help itself is killed, the laser disarmed, 
 because the gate's program has come to its end, the laser is paused and nothing else happens: it has nothing to shine
 for, and an application that waits for a silent SPAD may take seconds to say so.
 
-The guard itself is gone: the application opens the ports, which are free now, and lowers what it can.
+`Rescue` is for the opposite case, a guard that is gone: the application opens the ports, which are free now, and lowers
+what it can.
 """
 
 import logging
@@ -34,26 +35,26 @@ from drivers.transports.serial_port import SerialPort
 _log = logging.getLogger(__name__)
 
 SIGN_OF_LIFE_S = 0.05
-"""Between the guard's own signs of life."""
+"""Time between the guard's own signs of life."""
 POLL_S = 1.0
-"""Between questions to an armed laser about interlock and faults: at 1 Hz or more (docs/hardware.md)."""
+"""Time between questions to an armed laser about interlock and faults (docs/hardware.md: at 1 Hz or more)."""
 CHECK_S = 0.05
 """Time for the gate to say whether its program has ended, before it is taken for still running."""
 END_CHECK_S = 0.2
-"""Between questions for that to the gate of an application at work, which may be late with its frames for longer."""
+"""Time between questions whether the gate's program has ended, while an application at work is late with its frames."""
 HELP_ITSELF_S = 0.5
 """Time for an application that lives but takes no frames to make its rig safe, before it is killed."""
 GATE_FIRST_S = 0.1
-"""Most that a kill waits for the low gate: a mirror whose program dies must not be lit."""
+"""Longest time that a kill waits for the low gate: a mirror whose program dies must not be lit."""
 GIVE_UP_S = 10.0
-"""Attempts to make a device safe that does not answer end here."""
+"""Time after which attempts to make a device safe that does not answer end."""
 
 _URGENT = ("gate_low", "abort", "pause", "disarm")
 _ENABLING = ("arm", "program", "run")
 
 
 class GuardProcess:
-    """One session. `run` returns the exit code: 0 after a normal end, 1 where the guard had to act."""
+    """The guard of one application. `run` returns the exit code: 0 after a normal end, 1 where the guard had to act."""
 
     def __init__(self, channel: Channel, heartbeat: Heartbeat) -> None:
         self._channel = channel
@@ -74,7 +75,7 @@ class GuardProcess:
         self._terminated = False
 
     def run(self) -> int:
-        """Until the application says goodbye or is gone."""
+        """Serve the application until it says goodbye or is gone."""
         signal.signal(signal.SIGTERM, self._on_terminate)
         before = seen = time.monotonic()
         while not self._ending:
@@ -95,7 +96,7 @@ class GuardProcess:
     # Messages
 
     def _receive(self) -> list[Message]:
-        """Messages that come within a tick."""
+        """Deal with the messages that come within a tick."""
         sources = [self._channel.fileno()]
         if self._application is not None and self._application.handle is not None:
             sources.append(self._application.handle)
@@ -152,7 +153,7 @@ class GuardProcess:
             owned.lane.do(owned.calm)  # what the overtaken verb still does is undone behind it
 
     def _answer(self, owned: Owned, message: Message) -> None:
-        """On the device's lane."""
+        """Do a verb and answer with its result or error. Runs on the device's lane."""
         verb = message["verb"]
         answer: Message = {"id": message["id"]}
         with self._trip_lock:
@@ -174,7 +175,7 @@ class GuardProcess:
     # Watching
 
     def _look(self, elapsed_s: float) -> None:
-        """One tick."""
+        """Look at the application and the devices once, at every tick."""
         if self._terminated:
             self._trip(DeviceFault("the guard was told to end"))
             self._ending = True
@@ -211,7 +212,7 @@ class GuardProcess:
                 application.kill()
 
     def _suspect(self, trouble: str, stopped: bool, now: float) -> None:
-        """No frames: unless the program has come to its end by itself, which its gate can tell."""
+        """Act on missing frames, unless the program has come to its end by itself, which its gate can tell."""
         sync = self._owned.get("sync")
         if stopped or sync is None or (self._check_until is not None and now > self._check_until):
             self._trip_application(trouble, stopped)
@@ -220,7 +221,7 @@ class GuardProcess:
             sync.urgent.do(lambda: self._check_end(sync, trouble), first=True)
 
     def _check_end(self, sync: Owned, trouble: str) -> None:
-        """On a lane of the gate's."""
+        """Trip the application unless the gate's program has ended by itself. Runs on a lane of the gate's."""
         if not self._note_end(sync):
             self._trip_application(f"{trouble}; check the SPAD's cable and trigger, or unload the computer", False)
         self._check_until = None
@@ -240,7 +241,7 @@ class GuardProcess:
         return True
 
     def _rest(self, laser: Owned) -> None:
-        """On the laser's lane."""
+        """Pause the laser after the end of the gate's program. Runs on the laser's lane."""
         try:
             laser.call("pause", [])
         except DeviceError as error:
@@ -260,7 +261,9 @@ class GuardProcess:
         laser.lane.do(lambda: self._ask_laser(laser))
 
     def _ask_laser(self, laser: Owned) -> None:
-        """On the laser's lane. A single answer that is missing or garbled is asked for again."""
+        """Ask the laser about interlock and faults. A single answer that is missing or garbled is asked for again. Runs
+        on the laser's lane.
+        """
         device: LineLaser = laser.device
         for attempt in range(2):
             try:
@@ -280,7 +283,7 @@ class GuardProcess:
     # Ending the light
 
     def _trip(self, cause: DeviceError) -> bool:
-        """Gate low and laser paused, at once and whatever else is under way. False: it was done before."""
+        """Take the gate low and pause the laser, at once and whatever else is under way. False: it was done before."""
         with self._trip_lock:
             if self._tripped is not None:
                 return False
@@ -295,7 +298,7 @@ class GuardProcess:
         return True
 
     def _make_safe(self) -> None:
-        """Give the lanes what is due."""
+        """Give the lanes the jobs that are due."""
         with self._trip_lock:
             due = [owned for owned in self._owned.values() if owned.due]
             for owned in due:
@@ -305,7 +308,7 @@ class GuardProcess:
             lane.do(owned.try_safe, first=True)
 
     def _end(self) -> int:
-        """Everything safe and closed."""
+        """Make everything safe and close it."""
         ends_at = time.monotonic() + GIVE_UP_S
         while any(owned.unsafe for owned in self._owned.values()) and time.monotonic() < ends_at:
             self._make_safe()
@@ -324,7 +327,9 @@ class GuardProcess:
 
 
 def _told(error: Exception) -> list[str]:
-    """The error for the application; one that is none of a device's is a fault of ours, with all there is to know."""
+    """The error as the application is told it; one that is no device's is a fault of the guard, with all there is to
+    know.
+    """
     if not isinstance(error, DeviceError):
         _log.exception("guard")
     return error_message(error)
@@ -344,15 +349,15 @@ FREE_S = 1.0
 """Time for the kernel to free the ports of a process that ended."""
 _RETRY_S = 0.005
 OFF_TIMES, OFF_GAP_S = 2, 0.11
-"""`Kind.off` is sent so often, so far apart: a Cobolt heeds no command within 0.1 s of another (docs/hardware.md), and
-the guard may just have asked something."""
+"""Number of times that `Kind.off` is sent, and their distance: a Cobolt heeds no command within 0.1 s of another
+(docs/hardware.md), and the guard may just have asked something."""
 
 
 class Rescue:
     """Lowers gate and laser at the same time, each on a thread of its own."""
 
     def __init__(self, configs: Mapping[str, Any], ports: Mapping[str, Endpoint]) -> None:
-        """Finds the drivers now: there will be no time to import them."""
+        """Find the drivers now: there will be no time to import them."""
         surroundings = Surroundings(SystemClock(), None, 0, ports)
         self._create: dict[str, Callable[[], Any]] = {}
         self._off: dict[str, tuple[Callable[[], Endpoint], bytes]] = {}
@@ -392,7 +397,9 @@ class Rescue:
             _log.error("%s: %s", slot, error)
 
     def _switch_off(self, slot: str) -> None:
-        """Off, before anything is asked: to open a laser that takes ten commands a second takes more than one."""
+        """Switch the emission off before anything is asked: opening a laser that takes ten commands a second takes more
+        than one.
+        """
         place, off = self._off[slot]
         address = place().address
         port = _once_free(lambda: SerialPort(slot, address))

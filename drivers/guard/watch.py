@@ -1,4 +1,4 @@
-"""Decides whether an application that should be taking frames still does. Pure: fed with what was seen, and when.
+"""Decides whether an application that should be taking frames still does, and looks at its process from outside.
 
 A deadline on frames alone would either be too long for the laser or trip on a busy machine. So there are two: a short
 one for an application that does nothing at all (all its threads asleep, or the process stopped), and a longer one for
@@ -6,13 +6,11 @@ one that is at work or waits for a processor or a disk, as its threads' states t
 thread itself says that it has asked the SPAD in vain: then it is the SPAD that is silent.
 
 The guard's own time counts in short steps only: what stops the guard as well (a suspended or overloaded machine) is no
-silence of the application's.
+silence of the application's. The decision (`FrameWatch`) is pure: fed with what was seen, and when.
 
-Another process, seen from outside: has it ended, is it stopped, is any of its threads at work, and its end by force.
-
-From /proc (proc(5), the fields of `stat`; Documentation/scheduler/sched-stats.rst of Linux, the first two numbers of
-`schedstat`: nanoseconds on a processor and waiting for one) and a pidfd, which names the process for good and tells its
-end at once, also where a child that it forked still holds its sockets open.
+A process's state comes from /proc (proc(5), the fields of `stat`; Documentation/scheduler/sched-stats.rst of Linux, the
+first two numbers of `schedstat`: nanoseconds on a processor and waiting for one) and from a pidfd, which names the
+process for good and tells its end at once, also where a child that it forked still holds its sockets open.
 """
 
 import os
@@ -26,7 +24,7 @@ from dataclasses import dataclass
 TICK_S = 0.01
 """Time from one look to the next."""
 MAX_STEP_S = 0.03
-"""Most that one look adds to a silence, however late it comes."""
+"""Longest time that one look adds to a silence, however late it comes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,23 +36,23 @@ class GuardLimits:
     """
 
     frames_within_s: float = 0.05
-    """By an application that sleeps, as two looks say: with their 20 ms and the gate's 30 ms, 100 ms in all."""
+    """Limit for an application that sleeps, as two looks say: with their 20 ms and the gate's 30 ms, 100 ms in all."""
     busy_within_s: float = 1.5
-    """By one that computes or waits for a processor or a disk. With four times more work than processors a thread that
-    only sleeps 1 ms was seen to wake 0.2 s late, one that shares its interpreter 0.35 s, and disks stall for a second:
-    none of that may end a scan. The light meanwhile is that of a moving mirror, since each sweep waits, with its gate
-    low, for a scan marker. An application that is killed or stopped never gets this long."""
+    """Limit for one that computes or waits for a processor or a disk. With four times more work than processors a
+    thread that only sleeps 1 ms was seen to wake 0.2 s late, one that shares its interpreter 0.35 s, and disks stall
+    for a second: none of that may end a scan. The light meanwhile is that of a moving mirror, since each sweep waits,
+    with its gate low, for a scan marker. An application that is killed or stopped never gets this long."""
     waits_within_s: float = 0.04
-    """By one at work whose source thread says that it has asked the SPAD for so long in vain."""
+    """Limit for one at work whose source thread says that it has asked the SPAD for so long in vain."""
     first_wait_s: float = 0.3
-    """The same before its first frame."""
+    """Limit of the wait for the first frame."""
     first_frame_s: float = 1.0
-    """From `run` to the first one: SPAD, scanner and the scan marker come in between. An application at work gets
-    `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""
+    """Time from `run` to the first frame: SPAD, scanner and the scan marker come in between. An application at work
+    gets `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""
 
 
 class FrameWatch:
-    """Watches between `start` and `stop`."""
+    """The decision whether frames come as they should, from `start` to `stop`."""
 
     def __init__(self, limits: GuardLimits) -> None:
         self.limits = limits
@@ -79,20 +77,20 @@ class FrameWatch:
         return self._watching and self._begun and self._silent_s > self.limits.frames_within_s
 
     def start(self, frame: int) -> None:
-        """The gate may open from now on; `frame` is the last number told before."""
+        """Note that the gate may open from now on; `frame` is the last number told before."""
         self._last, self._begun, self._silent_s, self._watching = frame, False, 0.0, True
 
     def stop(self) -> None:
-        """The gate is low."""
+        """Note that the gate is low."""
         self._watching = False
 
     def look(
         self, elapsed_s: float, frame: int, stopped: bool, busy: Callable[[], bool], waited_s: float = 0.0
     ) -> str | None:
-        """What is wrong with the application, `elapsed_s` after the last look; None: nothing that is known.
+        """Look at the application, `elapsed_s` after the last look; returns a fault it shows, or None.
 
-        stopped: it is, while the laser may shine. busy: asked only in doubt, since it costs a look at every thread.
-        waited_s: for how long the SPAD has been asked in vain, as the source thread says.
+        stopped: whether the process is stopped while the laser may shine. busy: asked only in doubt, since it costs a
+        look at every thread. waited_s: for how long the source thread says that it has asked the SPAD in vain.
         """
         if stopped:
             return "is stopped"
@@ -117,7 +115,7 @@ class FrameWatch:
 
 _STOPPED = ("T", "t")
 _AT_WORK = ("R", "D")
-"""Running or waiting for a processor; waiting for a disk."""
+"""States of a thread at work: running or waiting for a processor; waiting for a disk."""
 _BUSY_SHARE = 0.15
 """Share of a time that all threads together have run, or waited to, in a process at work. One that hangs wakes some
 service thread for microseconds now and then."""
@@ -138,7 +136,7 @@ class WatchedProcess:
         self._since = 0.0
         self._found_asleep = False
         self.handle: int | None = None
-        """Readable once the process has ended; None where the kernel has no pidfd (before Linux 5.3)."""
+        """Handle that is readable once the process has ended; None where the kernel has no pidfd (before Linux 5.3)."""
         if hasattr(os, "pidfd_open"):
             try:
                 self.handle = os.pidfd_open(pid)
@@ -162,7 +160,7 @@ class WatchedProcess:
         return _state(f"/proc/{self._pid}/stat") in _STOPPED
 
     def note_progress(self) -> None:
-        """Work is counted from now on."""
+        """Count work from now on."""
         self._worked_ns = {task: _work_ns(task) for task in self._tasks()}
         self._since = time.monotonic()
         self._found_asleep = False
@@ -194,7 +192,7 @@ class WatchedProcess:
             return []
 
     def kill(self) -> None:
-        """End it; nothing happens where it has ended."""
+        """End the process; nothing happens where it has ended."""
         if self.ended:
             return
         with suppress(ProcessLookupError):

@@ -1,4 +1,4 @@
-"""What all devices share: a name, a state, verbs that check the state, and a close that leaves things safe."""
+"""The base of all devices: a name, a state, verbs that check the state, and a close that leaves things safe."""
 
 import logging
 from abc import ABC, abstractmethod
@@ -12,7 +12,7 @@ _log = logging.getLogger(__name__)
 
 
 class DeviceState(Enum):
-    """Where a device stands.
+    """The states of a device.
 
     ::
 
@@ -48,22 +48,22 @@ class Device(ABC):
 
     @property
     def name(self) -> str:
-        """What messages call this device."""
+        """The name of this device in messages."""
         return self._name
 
     @property
     def identity(self) -> str:
-        """Its name, and what else tells it from others of its kind: model, serial number, firmware."""
+        """The device's name, and what else tells it from others of its kind: model, serial number, firmware."""
         return self._name
 
     @property
     def serial(self) -> str | None:
-        """Its serial number, or the lasting name of one that has none; None: it tells neither."""
+        """The device's serial number, or the lasting name of one that has none; None: it tells neither."""
         return None
 
     @property
     def state(self) -> DeviceState:
-        """Where the device stands, as far as its verbs tell."""
+        """The state as far as the verbs called so far tell; a run that ended by itself may not be noticed yet."""
         return self._state
 
     def close(self) -> None:

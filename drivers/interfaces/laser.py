@@ -20,23 +20,25 @@ class LaserLimits:
 
 @dataclass(frozen=True, slots=True)
 class LaserStatus:
-    """What the laser says of itself, asked afresh each time."""
+    """The laser's own report, asked afresh each time."""
 
     emission: bool
     """The laser emits whenever the gate is high (light = emission AND gate). False while paused or warming up."""
     armed: bool
-    """Between `arm` and `disarm`, pauses included."""
+    """True from `arm` to `disarm`, pauses included."""
     interlock_closed: bool
     fault: str | None
+    """The laser's faults in one line; None: it has none."""
     key_on: bool | None
-    """None: the laser has no key, or does not say."""
+    """True where the laser's key is on. None: the laser has no key, or does not say."""
     warming_up: bool
+    """The laser is not ready yet; its light may begin later by itself."""
     input_mode: str
-    """How the gate input acts, e.g. "digital"."""
+    """The way in which the gate input acts, e.g. "digital"."""
     temperature_c: float | None = None
-    """Of the laser's base plate. None: the laser does not say."""
+    """Temperature of the laser's base plate. None: the laser does not say."""
     power_w: float | None = None
-    """Measured mean, gated light and all. None: the laser does not say."""
+    """Measured mean power, the gate's dark times included. None: the laser does not say."""
 
 
 class LineLaser(Device):
@@ -96,7 +98,7 @@ class LineLaser(Device):
         self.pause()
 
     def _check_health(self) -> None:
-        """Before anything is enabled. `InterlockOpen`, `DeviceFault`."""
+        """Refuse a laser that must not be enabled. `InterlockOpen`, `DeviceFault`."""
         status = self._do_status()
         if not status.interlock_closed:
             raise InterlockOpen(f"{self._name}: the interlock is open; close it and arm again")

@@ -28,17 +28,24 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class ScannerLimits:
-    """What the mirror can follow. Commands are the normalised drive, -1 to 1 being the full range of the DAC."""
+    """Limits of what the mirror can follow. Commands are the normalised drive, -1 to 1 being the full range of the
+    DAC.
+    """
 
     command_range: tuple[float, float]
+    """Smallest and largest command."""
     velocity_per_s: float
+    """Largest speed of the command, drive units per second."""
     acceleration_per_s2: float
+    """Largest acceleration of the command, drive units per second squared."""
     step: float
     """Largest change of command from one point to the next."""
     rms_duty: float
     """Largest root-mean-square acceleration of a waveform as a share of `acceleration_per_s2`: the mirror's heat."""
     max_points: int
+    """Most points of a waveform."""
     point_rate_hz: tuple[float, float]
+    """Lowest and highest point rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,12 +64,14 @@ class ScanWaveform:
 
 @dataclass(frozen=True, slots=True)
 class ScannerStatus:
-    """What the scanner says of itself, asked afresh each time."""
+    """The scanner's own report, asked afresh each time."""
 
     moving: bool
+    """A waveform is being played, or the mirror is on its way to rest."""
     fault: str | None
+    """The fault in one line; None: there is none."""
     position: float | None
-    """Normalised drive; None where the device does not say."""
+    """Position of the mirror, normalised drive; None where the device does not say."""
 
 
 class BeamScanner(Device):
@@ -76,7 +85,7 @@ class BeamScanner(Device):
     @property
     @abstractmethod
     def limits(self) -> ScannerLimits:
-        """What the mirror can follow: the stricter of the device's limits and the config's."""
+        """Limits of what the mirror can follow: the stricter of the device's own and the config's."""
 
     @property
     def status(self) -> ScannerStatus:
@@ -139,7 +148,7 @@ class BeamScanner(Device):
         self._do_park()
 
     def _note_end(self) -> None:
-        """A waveform ends by itself: learn of it where the state matters."""
+        """Learn, where the state matters, that a waveform has ended by itself."""
         if self._state is DeviceState.RUNNING and not self._do_status().moving:
             self._state = DeviceState.CONFIGURED
 

@@ -1,8 +1,7 @@
 """The SPAD array: takes binary frames and fills the ring with blocks of them.
 
-Windows that move with the laser line: the table a SPAD array holds while it streams parts of its rows.
-
-The device steps through the table by the markers of the scanner and never by counting frames: a scan marker takes it to
+It may stream parts of its rows only, windows that move with the laser line and stand in a table on the device. The
+device steps through the table by the markers of the scanner and never by counting frames: a scan marker takes it to
 entry 0 of the next sweep, line marker j to entry j. A frame has one window, taken at its start: a marker that arrives
 during a frame moves the window of the next one.
 """
@@ -104,7 +103,9 @@ class BurstMode:
     """The device stores a run in its own memory and is read out afterwards."""
 
     capacity_frames: int
+    """Most frames of a run: what the memory holds."""
     readout_bytes_per_s: float
+    """Rate at which a run is read out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,38 +113,45 @@ class StreamMode:
     """The device sends frames while it takes them, as fast as its link carries them."""
 
     bytes_per_s: float
+    """Rate that the link carries."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpadInfo:
-    """What a SPAD array is and can do; constant while it is open."""
+    """Properties and abilities of a SPAD array; constant while it is open."""
 
     model: str
     serial: str
+    """Serial number, as far as the sensor has one."""
     width: int
+    """Pixels per row of the frames delivered, after the turn."""
     height: int
     rotation_deg: int
-    """How the sensor is mounted; the frames it delivers are upright already."""
+    """Angle at which the sensor is mounted; the frames that it delivers are upright already."""
     max_frame_rate_hz: Fraction
     burst: BurstMode | None
+    """None: the sensor cannot store a run."""
     stream: StreamMode | None
+    """None: the sensor cannot stream."""
     roi_step_px: int
     """Windows start and end at multiples of this."""
     markers: bool
     """Whether frame records carry the markers of scanner and gate."""
     trigger_modes: tuple[str, ...]
+    """What may start an exposure: "free" (one follows the other), "external" (a pulse on the trigger input)."""
     can_wait: bool = False
     """Whether it can stand still while the ring is full, as a simulation on virtual time does; a sensor cannot."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpadRequest:
-    """What the plan wants of a SPAD array."""
+    """The frames that a plan asks of a SPAD array."""
 
     frame_rate_hz: Fraction
     exposure_s: float
-    """At most one frame period."""
+    """Exposure of a frame, at most one frame period."""
     mode: SpadMode
+    """Whether frames are streamed or stored and read out."""
     block_frames: int
     """Frames wanted per block; a device may send shorter blocks, never longer ones."""
     window: WindowTable | None = None
@@ -152,10 +160,12 @@ class SpadRequest:
 
 @dataclass(frozen=True, slots=True)
 class SpadTiming:
-    """What a configured SPAD array will do, exactly."""
+    """The exact timing that a SPAD array was configured to."""
 
     tick_hz: Fraction
+    """Rate of the tick counter that time-stamps the frames."""
     frame_period_ticks: int
+    """From the start of an exposure to that of the next."""
     exposure_ticks: int
     stride: int
     """Bytes of a ring slot that holds one block."""
@@ -166,24 +176,31 @@ class SpadCounters:
     """Counts since `start`. None: the device does not say."""
 
     exposed: int | None
+    """Frames exposed."""
     delivered: int
+    """Frames published in the ring."""
     lost: int | None
     """exposed = delivered + lost once the run has ended; while it runs, frames on their way are in `exposed` only."""
     crc_errors: int | None
+    """Blocks refused: damaged, out of order or of another geometry."""
     resyncs: int | None
+    """Times that the beginning of blocks had to be found anew after damage."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpadHealth:
-    """What a SPAD array measures of itself. Empty and None: it does not say."""
+    """The sensor's own measurements of itself. A value that it does not measure is None, or missing from the
+    mapping.
+    """
 
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
-    """By the place where each is measured."""
+    """Temperatures by the place where each is measured."""
     excess_bias_v: float | None = None
-    """Bright light at a high one ages the chip."""
+    """Excess bias of the diodes; bright light at a high one ages the chip."""
     frame_clock_hz: float | None = None
+    """Measured rate of the clock that starts the frames."""
     memory_high_water_bytes: int | None = None
-    """Most that waited in its memory in the last run."""
+    """Largest amount of data that waited in the sensor's memory in the last run."""
 
 
 class SpadArray(Device):
@@ -194,13 +211,13 @@ class SpadArray(Device):
         self._mode: SpadMode | None = None
         self._run_opened = False
         self.on_wait: Callable[[float], None] | None = None
-        """Told within `fill` for how many seconds it has asked the device in vain since its last frames; a device that
-        cannot tell leaves it alone."""
+        """Called within `fill` with the number of seconds for which the device has been asked in vain since its last
+        frames. A device that cannot tell leaves it alone."""
 
     @property
     @abstractmethod
     def info(self) -> SpadInfo:
-        """Geometry and abilities."""
+        """Geometry and abilities of the sensor."""
 
     @property
     def identity(self) -> str:
@@ -209,7 +226,7 @@ class SpadArray(Device):
 
     @property
     def serial(self) -> str | None:
-        """As in `info`."""
+        """The serial number that `info` gives; None where it is empty."""
         return self.info.serial or None
 
     @property

@@ -36,7 +36,7 @@ class Pulse:
 
 
 def slices(duration_s: float) -> int:
-    """Equal parts of a held pulse, each of which begins only while the scan marker is high."""
+    """Number of equal parts of a held pulse, each of which begins only while the scan marker is high."""
     return max(1, math.ceil(duration_s / HOLD_S - 1e-9))
 
 
@@ -56,10 +56,11 @@ def sliced(pulses: Sequence[Pulse]) -> list[Pulse]:
 
 @dataclass(frozen=True, slots=True)
 class SyncStatus:
-    """What the device says of itself, asked afresh each time."""
+    """The device's own report, asked afresh each time."""
 
     state: Literal["stopped", "waiting", "running", "aborted"]
-    """A device that cannot tell whether its program waits for the scan marker says "running" then, too."""
+    """State of the program. A device that cannot tell whether its program waits for the scan marker says "running"
+    then, too."""
     outputs: int | None
     """Levels read back from the pins; None: this device cannot read them while a program runs."""
 
@@ -70,10 +71,10 @@ class SyncSource(Device):
     @property
     @abstractmethod
     def resolution_s(self) -> float:
-        """Durations are rounded to multiples of this."""
+        """Step of durations: they are rounded to multiples of it."""
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int | None:
-        """How often `pulses` can be repeated in one program; None: as often as anybody likes."""
+        """Largest number of times that one program can repeat `pulses`; None: there is no limit."""
         return None
 
     @property
@@ -126,7 +127,7 @@ class SyncSource(Device):
         self._check_low(~0, "abort")
 
     def _note_end(self) -> None:
-        """A program ends by itself: learn of it where the state matters."""
+        """Learn, where the state matters, that a program has ended by itself."""
         if self._state is DeviceState.RUNNING and self._do_status().state in ("stopped", "aborted"):
             self._state = DeviceState.CONFIGURED
 

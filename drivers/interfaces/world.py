@@ -1,4 +1,4 @@
-"""What only a simulated rig has: a world that knows the truth of a sweep."""
+"""The interface to a simulated world, which knows the truth of a sweep."""
 
 from dataclasses import dataclass
 from typing import Protocol

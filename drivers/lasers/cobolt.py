@@ -1,24 +1,19 @@
 """The Cobolt (Huebner) 06-01 line laser, gated by its digital modulation input.
 
-docs/hardware.md; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope `lights/cobolt.py`.
-115 200 baud, 8N1. Two languages: 06-MLD and the newer SCPI-like one; 06-DPL is refused, since its regulated power
-follows a gate up to about 1 kHz only. Never sent: whatever changes autostart, key switch or direct control (`@cobas x`,
-`@cobasky`, `@cobasdr`). The laser has no watchdog: where its port is lost it stays as it was, so treat it as on. Its
-temperatures it judges itself: fault 1.
+docs/hardware.md; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope `lights/cobolt.py`. The
+laser has no watchdog: where its port is lost it stays as it was, so treat it as on. It judges its temperatures itself:
+fault 1.
 
+Modes. 06-MLD speaks one language, newer lasers an SCPI-like one; a `Dialect` is written for each. 06-DPL is refused:
+its regulated power follows a gate up to about 1 kHz only. Both languages keep the laser dark by a power of 0 and not by
+`l0`: after `l0` its key must be turned (pycobolt issue 6), and a power of 0 can be read back, by the next program too.
 Pause = power 0 (and `las:paus 1`): no key is needed to resume. Disarm = the same, then `l0`: with autostart enabled the
-key must be turned off and on before the laser starts again.
+key must be turned off and on before the laser starts again. Never sent: commands that change autostart, key switch or
+direct control (`@cobas x`, `@cobasky`, `@cobasdr`).
 
-The two languages of Cobolt 06-01 lasers for the same few things: gate mode, power, dark, bright.
-
-docs/hardware.md (cobolt-lasers/pycobolt 1333e53). Both keep the laser dark by a power of 0 and not by `l0`:
-after `l0` its key must be turned (pycobolt issue 6), and a power of 0 can be read back, by the next program too.
-
-Commands and replies of a Cobolt laser as bytes.
-
-docs/hardware.md (cobolt-lasers/pycobolt 1333e53): a command ends with CR, its reply is one line that ends with
-CRLF: a value, `OK` or `Syntax error: illegal command`. Old firmware may put junk before a reply. Commands follow one
-another at 100 ms or more; a reply may take a second (0.1 s was too little: python-microscope issue 234).
+Bytes. 115 200 baud, 8N1. A command ends with CR; its reply is one line that ends with CRLF: a value, `OK` or `Syntax
+error: illegal command`. Old firmware may put junk before a reply. Commands follow one another at 100 ms or more; a
+reply may take a second (0.1 s is too little: python-microscope issue 234).
 """
 
 import logging
@@ -47,20 +42,20 @@ _MOST_LINES = 3
 
 
 class CoboltFraming:
-    """A `Framing`."""
+    """The form of a Cobolt's commands and replies."""
 
     ping = "?"
 
     def greets(self, reply: str) -> bool:
-        """`OK`."""
+        """Whether the reply is `OK`."""
         return reply == DONE
 
     def encode(self, command: str) -> bytes:
-        """With CR."""
+        """The command's bytes, ended by CR."""
         return command.encode("ascii") + b"\r"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The line that follows it, without junk, and without the echo, should it be on."""
+        """The line that follows the command, without junk, and without the echo, should it be on."""
         for _ in range(_MOST_LINES):
             reply = _JUNK.sub("", read_line().rpartition(command)[2].strip())
             if reply:
@@ -68,7 +63,7 @@ class CoboltFraming:
         return ""
 
     def refusal(self, reply: str) -> str | None:
-        """Its own words."""
+        """The laser's own words where it refuses the command; None: it does not."""
         return reply if _REFUSED.fullmatch(reply) else None
 
 
@@ -77,7 +72,7 @@ _POWER_STEP_W = 1e-4
 
 
 class Dialect(Protocol):
-    """What the driver needs said. All methods raise the errors of `Dialogue`."""
+    """The commands of one language of the laser that the driver uses. All methods raise the errors of `Dialogue`."""
 
     family: str
 
@@ -86,7 +81,9 @@ class Dialect(Protocol):
         ...
 
     def input_mode(self, mode: str) -> str:
-        """What governs the light in it: "digital" under the gate; everything else shines without asking the gate."""
+        """The control of the light in this mode: "digital" under the gate; in every other mode light shines without the
+        gate.
+        """
         ...
 
     def gate(self) -> None:
@@ -94,7 +91,7 @@ class Dialect(Protocol):
         ...
 
     def set_power(self, power_w: float) -> None:
-        """Power while the gate is high. Read back."""
+        """Set the power while the gate is high. Read back."""
         ...
 
     def power_w(self, mode: str) -> float | None:
@@ -102,7 +99,7 @@ class Dialect(Protocol):
         ...
 
     def darken(self) -> None:
-        """No light in any mode that knows a power, at once and without the key."""
+        """Leave no light in any mode that knows a power, at once and without the key."""
         ...
 
     def brighten(self) -> None:
@@ -110,7 +107,7 @@ class Dialect(Protocol):
         ...
 
     def waits_for_key(self) -> bool:
-        """It starts once its key is turned off and on."""
+        """Whether the laser starts only once its key is turned off and on."""
         ...
 
 
@@ -126,7 +123,7 @@ def classify(model: str) -> str:
 
 
 class MldDialect:
-    """06-MLD: `slmp`, `sdmes`, `em`."""
+    """The language of 06-MLD: `slmp`, `sdmes`, `em`."""
 
     family = "06-MLD"
     _MODES = ("constant current", "constant power")
@@ -135,41 +132,41 @@ class MldDialect:
         self._line = line
 
     def mode(self) -> str:
-        """`gam?`: 0 constant current, 1 constant power, 2 modulation."""
+        """The answer to `gam?`: 0 constant current, 1 constant power, 2 modulation."""
         return self._line.ask("gam?", re.compile("[012]"))
 
     def input_mode(self, mode: str) -> str:
-        """From `gdmes?` and `games?`."""
+        """The input by which the light is modulated, from `gdmes?` and `games?`."""
         if mode != "2":
             return self._MODES[int(mode)]
         return _inputs(self._line.ask_flag("gdmes?"), self._line.ask_flag("games?"))
 
     def gate(self) -> None:
-        """Digital modulation on, analog off, modulation mode."""
+        """Set digital modulation on, analog off, and modulation mode."""
         self._line.tell_and_check("sdmes 1", "gdmes?", FLAG, "1".__eq__)
         self._line.tell_and_check("sames 0", "games?", FLAG, "0".__eq__)
         self._line.tell_and_check("em", "gam?", COUNT, "2".__eq__)
 
     def set_power(self, power_w: float) -> None:
-        """`slmp` takes milliwatts."""
+        """Set the power; `slmp` takes milliwatts."""
         self._power_mw(power_w * 1e3)
 
     def power_w(self, mode: str) -> float | None:
-        """`glmp?` in milliwatts, `p?` in watts."""
+        """The power set, in W: `glmp?` answers in milliwatts, `p?` in watts."""
         if mode == "0":
             return None
         return self._line.ask_number("glmp?") * 1e-3 if mode == "2" else self._line.ask_number("p?")
 
     def darken(self) -> None:
-        """The power of the present mode first: this may be an emergency."""
+        """Set powers to 0, that of the present mode first: this may be an emergency."""
         self._power_mw(0.0)
         self._line.tell("p 0")
 
     def brighten(self) -> None:
-        """Nothing besides the power."""
+        """Nothing more to do: the power alone makes this laser bright."""
 
     def waits_for_key(self) -> bool:
-        """`gom?` 1."""
+        """Whether `gom?` is 1."""
         return self._line.ask("gom?", COUNT) == "1"
 
     def _power_mw(self, power_mw: float) -> None:
@@ -190,30 +187,30 @@ class ScpiDialect:
         return self._line.ask("laser:runmode?", WORD).lower()
 
     def input_mode(self, mode: str) -> str:
-        """From the inputs that are on."""
+        """The input by which the light is modulated, from the inputs that are on."""
         if mode != "powermodulation":
             return mode
         return _inputs(self._line.ask_flag("las:pm:dig:ena?"), self._line.ask_flag("las:pm:ana:ena?"))
 
     def gate(self) -> None:
-        """The modulator must be the external one: as "command" it follows `!e` and `!d` without ever replying."""
+        """Set the external modulator and nothing else: as "command" it follows `!e` and `!d` without ever replying."""
         self._line.tell_and_check("las:pm:dig:ena 1", "las:pm:dig:ena?", FLAG, "1".__eq__)
         self._line.tell_and_check("las:pm:ana:ena 0", "las:pm:ana:ena?", FLAG, "0".__eq__)
         self._line.tell("laser:pm:dig:modulator external")
         self._line.tell_and_check("laser:runmode PowerModulation", "laser:runmode?", WORD, _is_modulation)
 
     def set_power(self, power_w: float) -> None:
-        """Milliwatts."""
+        """Set the power, in milliwatts on the wire."""
         self._power_mw(power_w * 1e3)
 
     def power_w(self, mode: str) -> float | None:
-        """Milliwatts in both modes that know a power."""
+        """The power set, in W; milliwatts on the wire, in both modes that know a power."""
         if mode == "powermodulation":
             return self._line.ask_number(f"{self._POWER}?") * 1e-3
         return self._line.ask_number("laser:cp:power:setpoint?") * 1e-3 if mode == "constantpower" else None
 
     def darken(self) -> None:
-        """`las:paus 1` blanks it at once; the powers of 0 tell the next program so."""
+        """Blank at once by `las:paus 1`; the powers of 0 tell the next program so."""
         self._line.tell("las:paus 1")
         self._power_mw(0.0)
         self._line.tell("laser:cp:power:setpoint 0")
@@ -223,7 +220,7 @@ class ScpiDialect:
         self._line.tell("las:paus 0")
 
     def waits_for_key(self) -> bool:
-        """`state?` AutostartWaitingForKeyOn."""
+        """Whether `state?` is AutostartWaitingForKeyOn."""
         return "waitingforkey" in self._line.ask("state?", WORD).lower()
 
     def _power_mw(self, power_mw: float) -> None:
@@ -309,7 +306,7 @@ class CoboltLaser(SerialLaser):
         self._armed = True
 
     def _enable(self, power_w: float) -> None:
-        """Dark until the gate is known to govern the light; only then the power."""
+        """Keep the laser dark until the gate is known to govern the light; only then set the power."""
         dialect = self._dialect
         gated = all(dialect.input_mode(dialect.mode()) == "digital" for _ in range(2))  # a flipped bit must not shine
         on = self._line.ask_flag("l?")
@@ -366,7 +363,7 @@ def create(config: CoboltConfig, surroundings: Surroundings, timing: LineTiming 
 
 
 def _identify(config: CoboltConfig, line: Dialogue) -> CoboltLaser:
-    """As few questions as can be: each costs a tenth of a second, and a guard waits for them."""
+    """Find out which laser answers, with as few questions as possible: each takes 0.1 s, and a guard waits for them."""
     try:
         model = line.ask_surely("glm?", NAME)
     except CommandRefused:
@@ -397,7 +394,9 @@ def _dialect(line: Dialogue, model: str) -> Dialect:
 
 
 def _off(config: CoboltConfig) -> bytes:
-    """No line end before it: an empty command may count as one, and what follows within 0.1 s is not heeded."""
+    """Bytes that switch off. No line end before them: an empty command may count as one, and what follows within 0.1 s
+    is not heeded.
+    """
     return b"l0\r"
 
 

@@ -1,23 +1,20 @@
 """The Coherent OBIS LX/LS line laser, gated by its digital modulation input (`SOUR:AM:EXT DIG`).
 
 docs/hardware.md; from python-microscope `lights/obis.py` (69625e0), the bit tables of `obis.h`, the operator's
-manual (appendix C) and mmCoreAndDevices PRs 645 and 531. 115 200 baud, 8N1 (over USB the rate is ignored). Limits of
-the base plate's temperature are read by `SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not there but in
-`obis.cpp` beside `obis.h` and in Micro-Manager's `CoherentOBIS.cpp`.
+manual (appendix C) and mmCoreAndDevices PRs 645 and 531. Limits of the base plate's temperature are read by
+`SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not in docs/hardware.mdbut in `obis.cpp` beside `obis.h` and in
+Micro-Manager's `CoherentOBIS.cpp`. The laser has no watchdog: where its port is lost it stays as it was, so treat it as
+on.
 
-Traps: `AM:STAT ON` during warm-up is deferred, light may come minutes later. So `arm` waits until the laser is ready
-and only then says ON; whatever ends the wait says OFF. With CDRH the emission follows ON by 5 s. Modes cannot be
-changed while it is on. Never sent: CDRH OFF. The laser has no watchdog: where its port is lost it stays as it was, so
-treat it as on.
+Arming. `AM:STAT ON` during warm-up is deferred, light may come minutes later. So `arm` waits until the laser is ready
+and only then says ON; where the wait ends in any other way it says OFF. With CDRH the emission follows ON by 5 s. Modes
+cannot be changed while it is on. Pause = `AM:STAT OFF`, confirmed by the emission bit; no key is needed to resume.
+Disarm = the same, and least power. Never sent: CDRH OFF.
 
-Pause = `AM:STAT OFF`, confirmed by the emission bit; no key is needed to resume. Disarm = the same, and least power.
-
-Commands and replies of a Coherent OBIS laser as bytes, with its handshake on or off.
-
-docs/hardware.md (OBIS operator's manual, appendix C; mmCoreAndDevices PR 645): commands end with CRLF. Handshake
-on: a set answers `OK`, a query its value and then `OK`, an error `ERR-nnn` in their place. Handshake off: a set answers
-nothing at all, a query its value. So the handshake is asked for first and never changed, and whatever is set is read
-back. Behind an OBIS Remote a number on SYST and SOUR addresses the laser; bare commands go to the Remote.
+Bytes. 115 200 baud, 8N1 (over USB the rate is ignored); commands end with CRLF. With the handshake on, a set answers
+`OK`, a query its value and then `OK`, an error `ERR-nnn` in their place; with it off, a set answers nothing at all, a
+query its value. So the handshake is asked for first and never changed, and every setting is read back. Behind an OBIS
+Remote a number on SYST and SOUR addresses the laser; bare commands go to the Remote.
 """
 
 import re
@@ -71,7 +68,9 @@ ERRORS = {
 
 
 class ObisFraming:
-    """A `Framing`. channel: slot of the laser in a Remote; None: it is on the port itself."""
+    """The form of an OBIS's commands and replies. channel: slot of the laser in a Remote; None: it is on the port
+    itself.
+    """
 
     def __init__(self, channel: int | None) -> None:
         self._suffix = "" if channel is None else str(channel)
@@ -81,11 +80,11 @@ class ObisFraming:
 
     @property
     def ping(self) -> str:
-        """Who it is; before all else, whether the handshake is on."""
+        """The question who the laser is; before all else, whether the handshake is on."""
         return _HANDSHAKE if self._handshake is None else "*IDN?"
 
     def greets(self, reply: str) -> bool:
-        """As `Framing`; learns about the handshake."""
+        """Whether `reply` answers the ping; the first one tells whether the handshake is on."""
         if self._handshake is not None:
             return reply == self.identity or (not self.identity and TEXT.fullmatch(reply) is not None)
         if SWITCH.fullmatch(reply) is None:
@@ -94,12 +93,12 @@ class ObisFraming:
         return True
 
     def encode(self, command: str) -> bytes:
-        """Addressed, with CRLF."""
+        """The bytes of a command, addressed, with CRLF."""
         addressed = command if command == _HANDSHAKE else _ADDRESSED.sub(rf"\g<1>{self._suffix}", command)
         return addressed.encode("ascii") + b"\r\n"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """A set that answers nothing is done: how it reads back will tell."""
+        """The reply to a command. A set that answers nothing counts as done: how it reads back will tell."""
         if not command.endswith("?"):
             return read_line() if self._handshake else DONE
         reply = read_line()
@@ -109,7 +108,7 @@ class ObisFraming:
         return reply
 
     def refusal(self, reply: str) -> str | None:
-        """Number and meaning."""
+        """Number and meaning of the error; None: the reply is none."""
         error = _ERROR.fullmatch(reply)
         return f"{reply} ({ERRORS.get(int(error[1]), 'no known number')})" if error is not None else None
 
@@ -165,7 +164,7 @@ class ObisConfig(SerialLaserConfig):
 
 
 class TemperatureRange(NamedTuple):
-    """What the base plate may have, in degrees Celsius."""
+    """Temperatures at which the base plate may be, in degrees Celsius."""
 
     low_c: float
     high_c: float
@@ -232,7 +231,9 @@ class ObisLaser(SerialLaser):
         self._armed = True
 
     def _prepare(self) -> None:
-        """Off, and set up so that nothing but the gate governs the light, at no later power-up either."""
+        """Switch off, and set up the laser so that nothing but the gate governs the light, at no later power-up
+        either.
+        """
         line = self._line
         self._switch_off()
         line.tell_and_check("SYST:CDRH ON", "SYST:CDRH?", SWITCH, "ON".__eq__)
@@ -248,7 +249,7 @@ class ObisLaser(SerialLaser):
         self._line.tell_and_check(f"SOUR:POW:LEV:IMM:AMPL {power_w:.5f}", query, NUMBER, is_power)
 
     def _await_ready(self) -> None:
-        """Until an ON acts at once: said earlier it would be deferred, and light come when nobody expects it."""
+        """Wait until an ON acts at once: said earlier it would be deferred, and light come when nobody expects it."""
         give_up_ns = self._clock.now_ns() + round(self._warm_up_s * NS_PER_S)
         while not (bits := self._bits()) & READY or bits & WARM_UP:
             fault = self._fault(bits)
@@ -275,7 +276,7 @@ class ObisLaser(SerialLaser):
         self._set_power(self._limits.min_power_w)
 
     def _switch_off(self) -> None:
-        """Off, a deferred ON too. `DeviceFault` where it still emits."""
+        """Switch off, a deferred ON too. `DeviceFault` where the laser still emits."""
         self._line.tell_and_check("SOUR:AM:STAT OFF", "SOUR:AM:STAT?", SWITCH, "OFF".__eq__)
         self._told_on = False
         if self._bits() & EMISSION:
@@ -285,7 +286,7 @@ class ObisLaser(SerialLaser):
         return int(self._line.ask_surely("SYST:STAT?", BITS), 16)
 
     def _fault(self, bits: int, base_c: float | None = None) -> str | None:
-        """What the laser calls a fault, and a base plate outside its range."""
+        """The faults that the laser reports, and a base plate outside its range; None where all is well."""
         said = []
         word = int(self._line.ask_surely("SYST:FAUL?", BITS), 16)
         if word:
@@ -300,7 +301,7 @@ class ObisLaser(SerialLaser):
         return "; ".join(said) or None
 
     def _out_of_range(self, base_c: float) -> TemperatureRange | None:
-        """The range that it is outside of."""
+        """The range that the base plate is outside of; None where it is inside."""
         allowed = self._base_range
         return None if allowed is None or allowed.low_c <= base_c <= allowed.high_c else allowed
 
@@ -339,7 +340,7 @@ def _identify(config: ObisConfig, clock: Clock, framing: ObisFraming, line: Dial
 
 
 def _base_range(line: Dialogue) -> TemperatureRange | None:
-    """None: this unit does not say, or states no range; its own fault word judges then."""
+    """The range that the base plate may be in. None: this unit states none; its own fault word judges then."""
     try:
         low, high = (line.ask_surely(f"SOUR:TEMP:PROT:BAS:{end}?", CELSIUS) for end in ("LOW", "HIGH"))
     except CommandRefused:
@@ -355,7 +356,7 @@ def _celsius(reply: str) -> float:
 
 
 def _off(config: ObisConfig) -> bytes:
-    """The line end before it ends what a program that died had begun to say."""
+    """Bytes that switch off. The line end before them ends what a program that died had begun to say."""
     return b"\r\n" + ObisFraming(config.channel).encode("SOUR:AM:STAT OFF")
 
 

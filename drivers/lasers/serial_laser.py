@@ -1,6 +1,7 @@
-"""What every laser on a serial line has: a config with limits, a port that may get lost, a serial number to check.
+"""The common part of all lasers on a serial line: config with limits, a port that may get lost, serial number.
 
-A line laser without key or warm-up, whose emission follows `arm` and `pause` at once: simulated, or recorded.
+Also `PlainLaser`, a line laser without key or warm-up, whose emission follows `arm` and `pause` at once: simulated, or
+recorded.
 """
 
 from collections.abc import Callable
@@ -18,14 +19,14 @@ from drivers.units import Watts
 
 
 class SerialLaserConfig(KindConfig):
-    """What the config of each kind of them says."""
+    """Config fields that every kind of serial laser has."""
 
     port: str
     """Serial port: a path or COM port, "serial=..." or "usb=VVVV:PPPP" of its USB device, or "emulated:NAME"."""
     max_power: Annotated[Watts, Field(gt=0)]
     """The most this rig may ever send out; the laser's own maximum holds where it is smaller."""
     serial_number: str | None = None
-    """Of the laser itself; another one is refused. None: any."""
+    """Serial number of the laser; any other laser is refused. None: any laser will do."""
 
 
 class SerialLaser(LineLaser):
@@ -114,7 +115,10 @@ def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> N
 
 
 class PlainLaser(LineLaser):
-    """Any power up to `max_power_w`. emit: told how much it emits under the gate, in W, whenever that changes."""
+    """A laser that takes any power up to `max_power_w`.
+
+    emit: called with the power that it emits under the gate, in W, whenever that changes.
+    """
 
     def __init__(self, name: str, max_power_w: float, emit: Callable[[float], None] | None = None) -> None:
         super().__init__(name)
@@ -124,7 +128,7 @@ class PlainLaser(LineLaser):
 
     @property
     def limits(self) -> LaserLimits:
-        """From 0 W on."""
+        """Powers from 0 W on."""
         return self._limits
 
     def _do_status(self) -> LaserStatus:

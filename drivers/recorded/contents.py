@@ -1,13 +1,12 @@
-"""Which blocks a recording holds, and where: from its index as far as that fits, else from the blocks themselves.
+"""The contents of a recording: which blocks it holds, and where.
 
-Index records count where their CRC is right, their place exists and the first and last block of their segment are what
-they say. What they leave out is searched for blocks; where they do not fit, everything is. Payloads are not read here.
+The index `frames.idx` has 64 bytes of header, then a record of 64 bytes for each block, in the order of writing, each
+with a CRC of its own: a torn or damaged record is known as such and costs no other. A record counts where its CRC is
+right, its place exists and the first and last block of its segment are what they say. Stretches that the records leave
+out are searched for blocks; where the records do not fit, the whole segment is. Payloads are not read here.
 
-The index of a recording, `frames.idx`: one record of fixed size for each block, in the order of writing.
-
-64 bytes of header, then records of 64 bytes, each with a CRC of its own: a torn or damaged record is known as such
-and costs no other. The index tells where to look; what is there only the block itself can tell, so that a lost index is
-no loss (`rig repair` writes it anew from the blocks).
+The index only tells where to look; the blocks themselves hold everything, so that a lost index is no loss (`rig repair`
+writes it anew from them).
 """
 
 import struct
@@ -49,9 +48,9 @@ INDEX_RECORD: Final = np.dtype(
         ("crc", "<u4"),
     ]
 )
-"""Where a block is: number of its segment, offset and length in bytes (header to trailer, without the zeros behind it);
-and what it holds, as its header says: flags, run_id, block_seq (low 32 bits), first_frame, n_frames, sweep and t0_ticks
-of the first frame. reserved: 0. crc: CRC-32 (zlib) of the 60 bytes before."""
+"""The place of a block: number of its segment, offset and length in bytes (header to trailer, without the zeros behind
+it); and its contents, as its header has them: flags, run_id, block_seq (low 32 bits), first_frame, n_frames, sweep and
+t0_ticks of the first frame. reserved: 0. crc: CRC-32 (zlib) of the 60 bytes before."""
 
 _HEADER: Final = struct.Struct("<4sHHI48xI")
 _RECORD: Final = struct.Struct("<IIQQIIQIIQII")
@@ -72,7 +71,7 @@ def index_header() -> bytes:
 def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = None) -> bytes:
     """The record, 64 bytes, of a block that begins at byte `offset` of `segment`.
 
-    length: its bytes, where it was not written by `drivers.spb1.block_parts`.
+    length: its bytes, where it was not written by `drivers.spb1.writer.block_parts`.
     """
     header = block.header
     bare = _RECORD.pack(
@@ -116,9 +115,9 @@ def decode_index(buffer: NDArray[np.uint8]) -> tuple[NDArray[np.void], NDArray[n
 PAGE_BYTES: Final = 4096
 """Blocks of a recording begin on multiples of this."""
 MOST_FRAMES: Final = 0xFFFF
-"""Of a block."""
+"""Most frames of a block."""
 MOST_COUNTED: Final = 2**63 - 2**32
-"""Of frames and ticks, as of a block's header."""
+"""Largest count of frames or ticks, as in a block's header."""
 
 
 @dataclass(slots=True)
@@ -198,7 +197,7 @@ def _told(folder: Path, problems: list[str]) -> Entries | None:
 
 
 def _inside(records: Entries, segments: dict[int, SegmentReader], problems: list[str]) -> Entries:
-    """Those records that tell of blocks which can be there; where two tell of the same bytes, neither."""
+    """The records that tell of blocks which can be there; where two tell of the same bytes, neither."""
     sizes = np.zeros(max(segments) + 2)
     sizes[list(segments)] = [segment.size for segment in segments.values()]
     room = sizes[np.minimum(records["segment"], len(sizes) - 1)]
@@ -256,5 +255,5 @@ def round_up_to_page(size: Any) -> Any:
 
 
 def damage_line(segment: SegmentReader, damage: Damage) -> str:
-    """What people are told of a damage."""
+    """The line that tells people of a damage."""
     return f"{segment.path.name}, bytes {damage.offset} to {damage.offset + damage.length}: {damage.reason}"

@@ -1,4 +1,4 @@
-"""What a recording of control traffic says: the commands that do something, apart from the questions between them.
+"""The commands in a recording of control traffic that do something, apart from the questions between them.
 
 How often a driver asks depends on the host's moment, and so do the tokens that number its questions: neither is
 compared. Commands of the drivers may be sent again where a reply was lost, so that repeats count once. Questions are
@@ -23,7 +23,7 @@ _USB_QUESTIONS = {
 FRAME_PORTS = ("02", "03")
 """Bulk endpoints that points go to: each transfer is a buffer of the device, sent when it has room."""
 BEGIN, END = (b"run", b"swr"), b"abt"
-"""Of the sync source: between them a scan runs, behind the end the mirror is parked from wherever it is."""
+"""Commands of the sync source: between them a scan runs, behind the end the mirror is parked from wherever it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,14 +36,16 @@ class Word:
 
 @dataclass(frozen=True, slots=True)
 class Spoken:
-    """All that went to the devices of a rig. commands: by device. scans: the buffers of each scan that was run."""
+    """The commands that went to the devices of a rig. commands: by device. scans: the buffers of each scan that was
+    run.
+    """
 
     commands: dict[str, list[Word]]
     scans: list[list[Word]]
 
     @classmethod
     def of(cls, passed: Iterable[Passed]) -> "Spoken":
-        """Of what passed the taps, in order of time."""
+        """Sort out the pieces that passed the taps, given in order of time."""
         sent: dict[tuple[str, str], list[Word]] = defaultdict(list)
         for one in passed:
             if one.direction == OUT:
@@ -85,7 +87,7 @@ def _lines(pieces: list[Word]) -> list[Word]:
 
 
 def _once(words: list[Word]) -> list[Word]:
-    """Without repeats of what was just said, a command or two of them: both are how drivers make sure."""
+    """The commands without repeats of the last one or two: drivers repeat both to make sure."""
     kept: list[Word] = []
     for word in words:
         kept.append(word)

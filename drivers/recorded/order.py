@@ -11,16 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 Entries = NDArray[Any]
-"""(n,) of INDEX_RECORD."""
+"""Entries (n,) of INDEX_RECORD."""
 Ints = NDArray[np.int64]
 
 _NEIGHBOURS: Final = 2
-"""So many blocks on either side are asked whether a block's numbers go with theirs."""
+"""Number of blocks on either side that are asked whether a block's numbers go with theirs."""
 _OF_BLOCK: Final = 16
 _OF_INDEX: Final = 8
-"""What a block and its record in the index weigh, beside 1 for each neighbour: fewer blocks never outweigh more."""
+"""Weight of a block and its record in the index, beside 1 for each neighbour: fewer blocks never outweigh more."""
 _OUTLIERS: Final = 4
-"""Where more than one in so many has the wrong ticks or sweep, they are as the device has them: none is left out."""
+"""If more than one block in so many has the wrong ticks or sweep, the device counts in this way, and none is left
+out."""
 
 
 def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bool) -> tuple[Entries, bool]:
@@ -48,9 +49,10 @@ def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bo
 
 
 def _foreign(by_place: Entries, told: Entries) -> NDArray[np.bool_]:
-    """Which blocks are of another run than their segment, (n,): than most of it, or, alone there, than the index says.
+    """Whether each block is of another run than its segment, (n,): than most of the segment, or, where the block is
+    alone there, than the index says.
 
-    The index is believed where it tells of a run that has other segments, and the block of one that has not.
+    The index is believed where it names a run that has other segments while the block's own run has none.
     """
     run, segment = by_place["run_id"].astype(np.uint64), by_place["segment"].astype(np.uint64)
     runs, of_run = np.unique(run, return_counts=True)
@@ -102,7 +104,9 @@ def _rising(run: Entries, told: Entries) -> Ints:
 
 
 def _agreeing(seq: Ints, first: Ints, t0: Ints, n_frames: Ints) -> Ints:
-    """With how many neighbours each block agrees, int64 (n,): the least of its number, frames and ticks."""
+    """Number of neighbours with which each block agrees, int64 (n,): the least of those by its number, frames and
+    ticks.
+    """
     place = np.arange(len(seq))
     steps = np.diff(first)
     per_frame = float(np.median(np.diff(t0)[steps > 0] / steps[steps > 0])) if (steps > 0).any() else 0.0

@@ -24,11 +24,11 @@ from drivers.recorded.order import Entries
 from drivers.recorded.segments import open_segments
 
 READERS: Final = 2
-"""One thread checks 4 GB/s."""
+"""Threads that read ahead; one checks 4 GB/s."""
 BLOCKS_AHEAD: Final = 6
 READ_AHEAD_BYTES: Final = 32 * 2**20
 _ROUNDING_TICKS: Final = 1e-6
-"""Seconds are no whole number of ticks in binary: so much less than one still is that one."""
+"""Ticks by which a number of seconds may miss a whole tick, since binary numbers do."""
 _MOST_TICKS: Final = 2.0**62
 _WITNESSES: Final = 3
 """Blocks of a run that are asked for its size and clock."""
@@ -180,7 +180,9 @@ class RunRecording:
         return runs
 
     def _header(self, entries: Entries) -> BlockHeader | None:
-        """Of the first sound block, of several asked, that is of the size and clock of most of them; None: none is."""
+        """A header that agrees in size and clock with most of several sound blocks' headers; None where no block is
+        sound.
+        """
         headers: list[BlockHeader] = []
         for at in _spread(len(entries)):
             with suppress(ProtocolError):
@@ -226,7 +228,7 @@ def is_of_run(header: BlockHeader, other: BlockHeader) -> bool:
 
 
 def run_kind(header: BlockHeader) -> tuple[Any, ...]:
-    """What all blocks of a run have in common: its id, size and clock."""
+    """The values that all blocks of a run share: its id, size and clock."""
     return tuple(getattr(header, name) for name in _OF_A_RUN)
 
 

@@ -3,13 +3,11 @@
 Offsets are those of the plain segment in both, so that one index holds for both. A plain segment is mapped into memory
 and its blocks are used where they lie.
 
-Compressed segments that can be read at any place: the seekable format of zstd, one frame for each block.
-
-A `.zst` file like any other (`zstd -d` gives the plain segment back), with a skippable frame at its end that says how
-long the frames are, packed and unpacked. Source of its layout: zstd_seekable_compression_format.md, version 0.1.0, in
-contrib/seekable_format of facebook/zstd. Where that table is damaged the frames are found one after the other.
-
-The package zstandard is optional: the extra `compress`.
+A compressed segment is in the seekable format of zstd, one zstd frame for each block, so that it can be read at any
+place. It is a `.zst` file like any other (`zstd -d` gives the plain segment back), with a skippable frame at its end
+that lists the lengths of the frames, packed and unpacked. Where that table is damaged the frames are found one after
+the other. Source of the layout: zstd_seekable_compression_format.md, version 0.1.0, in contrib/seekable_format of
+facebook/zstd. The package zstandard is optional: the extra `compress`.
 """
 
 import mmap
@@ -35,7 +33,7 @@ MAX_FRAME_BYTES: Final = 1 << 31
 MOST_RATIO: Final = 1 << 15
 """Plain bytes that a packed one can stand for: a block of zstd takes 4 bytes and holds 128 KiB at most (RFC 8878)."""
 _PIECE_BYTES: Final = 1 << 12
-"""Of a frame of unknown size, fed to the unpacker at a time: 128 MiB at most come of it."""
+"""Bytes of a frame of unknown size that are fed to the unpacker at a time: they unpack to 128 MiB at most."""
 
 _HEAD: Final = struct.Struct("<II")
 _FOOT: Final = struct.Struct("<IBI")
@@ -46,14 +44,14 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class FrameTable:
-    """Where each frame begins, packed and unpacked: int64 (frames + 1,)."""
+    """Offsets at which each frame begins, packed and unpacked: int64 (frames + 1,), the last ones being the end."""
 
     packed: NDArray[np.int64]
     plain: NDArray[np.int64]
 
     @classmethod
     def read(cls, data: Bytes) -> "FrameTable":
-        """Of a whole file (uint8 (bytes,)): its table, or where that is damaged what the frames themselves say."""
+        """Read the table of a whole file (uint8 (bytes,)); where it is damaged, make it from the frames themselves."""
         sizes = _stated_sizes(data)
         if sizes is None:
             sizes = np.array(list(_found_sizes(data)), np.int64).reshape(-1, 2)
@@ -178,7 +176,7 @@ class SegmentReader(Protocol):
         ...
 
     def expect(self, offset: int, length: int) -> None:
-        """Say that so much will be read soon."""
+        """Announce that so many bytes will be read soon."""
         ...
 
 
@@ -212,7 +210,7 @@ class PlainSegment:
 
 
 class PackedSegment:
-    """A segment that was compressed after the run, block by block (`drivers.recorded.segments`)."""
+    """A segment that was compressed after the run, block by block."""
 
     def __init__(self, path: Path, number: int) -> None:
         self.path = path

@@ -24,14 +24,18 @@ _TIMES = re.compile(r"x(\d+(?:\.\d*)?|\.\d+)")
 
 @dataclass(frozen=True, slots=True)
 class ReplayClock:
-    """What `--clock` says. speed: recorded seconds per second; None: as fast as they are taken, or step by step."""
+    """The replay clock that `--clock` asks for.
+
+    speed: recorded seconds per second. None: frames are due as fast as they are taken, or step by step.
+    """
 
     speed: float | None = None
     steps: bool = False
+    """Frames wait for somebody's word, step by step."""
 
     @classmethod
     def parse(cls, text: str) -> "ReplayClock":
-        """realtime, max, step or xN. ValueError for anything else."""
+        """The clock that a text means: realtime, max, step or xN. ValueError for anything else."""
         named = {"realtime": cls(1.0), "max": cls(), "step": cls(steps=True)}
         if text in named:
             return named[text]
@@ -47,7 +51,7 @@ class ReplayClock:
 
 @dataclass(frozen=True, slots=True)
 class PaceReport:
-    """How the pace was held: lateness of `blocks` against their own times. held_s: how long a full ring held it up."""
+    """Lateness of `blocks` against their own times. held_s: for how long a full ring held up the replay."""
 
     blocks: int = 0
     late_mean_s: float = 0.0
@@ -74,7 +78,7 @@ class Pace:
 
     @property
     def report(self) -> PaceReport:
-        """Of all runs so far."""
+        """Lateness over all runs so far."""
         late = self._late_s
         sd_s = math.sqrt(late.squares / late.blocks) if late.blocks else 0.0
         return PaceReport(late.blocks, late.mean, sd_s, late.most, self._held_ns / NS_PER_S)
@@ -99,18 +103,18 @@ class Pace:
         return math.inf if self._what.speed is None else max(1.0, _PIECE_S * self._what.speed / float(period_s))
 
     def start(self) -> None:
-        """A run begins now."""
+        """Begin a run now."""
         self._halted = False
         self._origin_ns = self._clock.now_ns()
 
     def step(self) -> None:
-        """One step more."""
+        """Allow one step more."""
         with self._changed:
             self._steps += 1
             self._changed.notify_all()
 
     def run_on(self) -> None:
-        """No more steps: as fast as frames are taken."""
+        """End stepping: from now on frames come as fast as they are taken."""
         with self._changed:
             self._run_on = True
             self._changed.notify_all()
@@ -131,7 +135,7 @@ class Pace:
             return True
 
     def hold(self, due_s: float, waited_s: float) -> None:
-        """A full ring held a block up for `waited_s`, which was due `due_s` after the run's start."""
+        """Note that a full ring held up for `waited_s` a block that was due `due_s` after the run's start."""
         if self._what.speed is None:
             return
         late_ns = self._clock.now_ns() - self._due_ns(due_s, self._what.speed)
@@ -169,7 +173,7 @@ class _Lateness:
     most: float = 0.0
 
     def note(self, late_s: float) -> None:
-        """Take up one more."""
+        """Take up one more value."""
         self.blocks += 1
         off = late_s - self.mean
         self.mean += off / self.blocks

@@ -1,12 +1,9 @@
 """A SPAD array that plays a recording: every recorded frame with its record, in the same starts, gaps as gaps.
 
-Blocks need not be those of the recording: consecutive frames are cut or joined to the length that is asked for, so that
-what is made of them can be shown not to depend on it. Frames are copied into the ring, their checksums tested before; a
-damaged block is left out, a gap like any other.
-
-What the devices of a recording said of themselves: from its manifest, or as far as the frames themselves tell.
-
-The place in a recorded start of a SPAD: the next frames, cut and joined as they are asked for.
+The blocks played need not be those of the recording: consecutive frames are cut or joined to the length that is asked
+for, so that results can be shown not to depend on it. Frames are copied into the ring, their checksums tested before; a
+damaged block is left out, a gap like any other. The properties of the sensor come from the recording's manifest, or as
+far as possible from the frames.
 """
 
 import threading
@@ -37,7 +34,7 @@ MANIFEST = "manifest.json"
 
 
 def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
-    """What the manifest of a recording notes of a device; None where there is no manifest or nothing in it.
+    """The manifest's entry on a device of a recording; None where there is no manifest or nothing in it.
 
     `ProtocolError` where the manifest cannot be read.
     """
@@ -54,7 +51,7 @@ def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
 
 
 def recorded_info(recording: RunRecording) -> SpadInfo:
-    """Of the SPAD that took the frames; only that a recording can always wait."""
+    """The SPAD that took the frames; only that a recording can always wait."""
     noted = recorded_device(recording.path, "spad")
     told = _told_by(recording)
     if noted is None:
@@ -75,7 +72,7 @@ def recorded_info(recording: RunRecording) -> SpadInfo:
 
 
 def _read(noted: dict[str, Any]) -> SpadInfo:
-    """As the manifest has it."""
+    """The SPAD's properties from the manifest's entry."""
     return SpadInfo(
         model=str(noted["model"]),
         serial=str(noted["serial"]),
@@ -93,7 +90,7 @@ def _read(noted: dict[str, Any]) -> SpadInfo:
 
 
 def _told_by(recording: RunRecording) -> SpadInfo:
-    """What the blocks alone say."""
+    """The SPAD's properties as far as the blocks alone tell them."""
     first = recording.runs[0].header
     rate = first.tick_hz / (first.frame_period_ticks or max(1, first.exposure_ticks))
     most = max(run.end_frame for run in recording.runs)
@@ -122,7 +119,7 @@ Piece = tuple[FrameBlock, int, int]
 
 
 class Cursor:
-    """From the first frame of a start to its end, or to frame number `n_frames`. For one thread.
+    """A reading of one start from its first frame to its end, or to frame number `n_frames`. For one thread.
 
     by_block: steps are blocks, since there are no markers.
     """
@@ -170,7 +167,7 @@ class Cursor:
         return pieces
 
     def move_on(self, pieces: list[Piece]) -> None:
-        """Past frames that were gathered."""
+        """Move past frames that were gathered."""
         block, _, end = pieces[-1]
         self.step_due = self._by_block or bool(block.records["marks"][end - 1] & _SCAN)
         self.next_frame = block.header.first_frame + end
@@ -222,11 +219,11 @@ class ReplaySpadConfig(KindConfig):
     recording: Path | None = None
     """Folder of a run taken with --record, relative to this file; `rig replay RUN` fills it in."""
     clock: Annotated[str, AfterValidator(_a_clock)] = "realtime"
-    """realtime, max, step, or a multiple of real time: x4, x0.1."""
+    """Speed: realtime, max, step, or a multiple of real time: x4, x0.1."""
     loop: bool = False
-    """Begin again behind the last frame."""
+    """Whether to begin again behind the last frame."""
     block_frames: int | None = Field(default=None, ge=1)
-    """Most frames of a block; what the scan asks for where not given."""
+    """Most frames of a block; by default as many as the scan asks for."""
 
 
 class ReplaySpad(SpadArray):
@@ -246,12 +243,12 @@ class ReplaySpad(SpadArray):
 
     @property
     def info(self) -> SpadInfo:
-        """Of the SPAD that took the frames; only that a recording can wait."""
+        """The SPAD that took the frames; only that a recording can wait."""
         return self._info
 
     @property
     def recording(self) -> RunRecording:
-        """What it plays."""
+        """The recording that is played."""
         return self._recording
 
     @property
@@ -357,7 +354,7 @@ class ReplaySpad(SpadArray):
         return self._counters
 
     def _not_yet(self, why: str) -> bool:
-        """Nothing was published; False where the run was stopped meanwhile."""
+        """Raise DeviceTimeout with the reason why nothing was published; False where the run was stopped meanwhile."""
         if self.pace.halted:
             return False
         raise DeviceTimeout(f"{self.name}: {why}")
@@ -371,7 +368,7 @@ class ReplaySpad(SpadArray):
         return not reading.over
 
     def _due_s(self, block: FrameBlock, _: int, end: int) -> float:
-        """When the last of these frames had been exposed, from the first one of the run."""
+        """Time at which the last of these frames had been exposed, from the first one of the run."""
         header = block.header
         ticks = header.t0_ticks - self._t0_ticks + int(block.records["ticks"][end - 1]) + header.frame_period_ticks
         return float(ticks / header.tick_hz)

@@ -21,7 +21,7 @@ LIMITS = ScannerLimits(
     max_points=1 << 24,
     point_rate_hz=(1e-3, 1e9),
 )
-"""Of a mirror that has followed already."""
+"""Limits that every recorded waveform is within: the mirror has followed it already."""
 MAX_POWER_W = 1e3
 RESOLUTION_S = 1e-9
 _LARGEST_DIVISOR = 100_000

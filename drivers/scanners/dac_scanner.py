@@ -1,13 +1,11 @@
-"""A beam scanner that is a galvo behind a DAC on USB: all that is the same whatever the DAC.
+"""A beam scanner that is a galvo behind a DAC on USB: everything that is the same whatever the DAC.
 
 A `Dac` is one board with its link: it says at what rates it runs, and plays points. The mirror moves only when it is
 started or parked, always along ramps; opening a scanner asks the board who it is, no more.
 
-The points of one run of a scanner, taken slice by slice: the way to the first point, the waveform, the way to rest.
-
-Nothing is laid out beforehand: a waveform of a million points repeated for hours takes the memory of the waveform.
-
-Plays runs of points on a DAC that must be fed: in a thread while a scan runs, and knows where the mirror rests.
+A run is the way to the first point, the waveform, and the way to rest. A thread feeds its points to the DAC slice by
+slice, and knows where the mirror rests. Nothing is laid out beforehand: a waveform of a million points repeated for
+hours takes the memory of the waveform.
 """
 
 import logging
@@ -32,7 +30,9 @@ _NO_WAVE = ScanWaveform(np.zeros(1), np.zeros(1, np.uint8), Fraction(1))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointSlice:
-    """A slice. command: float64 (n,). markers: uint8 (n,). lit: bool (n,), part of the waveform, not of a ramp."""
+    """A slice of points. command: float64 (n,). markers: uint8 (n,). lit: bool (n,), part of the waveform, not of a
+    ramp.
+    """
 
     command: NDArray[np.float64]
     markers: NDArray[np.uint8]
@@ -72,12 +72,12 @@ class PointSource:
         return self._end - self._at
 
     def pad_start(self, points: int = 1) -> None:
-        """More points at the very beginning, where the mirror rests. Before the first `take`."""
+        """Add points at the very beginning, where the mirror rests. Before the first `take`."""
         self._way = np.concatenate([np.full(points, self.last), self._way])
         self._end += points
 
     def pad_end(self) -> None:
-        """One more point at the end of a way to rest, where the mirror rests then. After `stop`, before `take`."""
+        """Add one more point at the end of a way to rest, where the mirror rests then. After `stop`, before `take`."""
         self._way = np.append(self._way, self._way[-1])
         self._end += 1
 
@@ -113,13 +113,13 @@ class PointSource:
 def scan_from(
     position: float, waveform: ScanWaveform, repeats: int, limits: ScannerLimits, rate_hz: float
 ) -> PointSource:
-    """From rest at `position` to the waveform's first point, and the waveform."""
+    """Points from rest at `position` to the waveform's first point, and the waveform."""
     way = ramp(position, float(waveform.command[0]), limits, rate_hz)
     return PointSource(way, waveform, repeats, position=position, limits=limits, rate_hz=rate_hz)
 
 
 def park_from(position: float, end: float, limits: ScannerLimits, rate_hz: float) -> PointSource:
-    """From rest at `position` to rest at `end`; no points where that is the same."""
+    """Points from rest at `position` to rest at `end`; none where that is the same."""
     way = ramp(position, end, limits, rate_hz)
     return PointSource(way, None, 0, position=position, limits=limits, rate_hz=rate_hz)
 
@@ -148,11 +148,11 @@ class RunPlayer:
         self._name = name
         self._halt = halt
         self.position: float | None = position
-        """Where the mirror rests; None: moving, or unknown after a fault."""
+        """Command at which the mirror rests; None: it is moving, or its place is unknown after a fault."""
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self.error: DeviceError | None = None
-        """What ended the last run early."""
+        """The error that ended the last run early; None: it ended by itself or was stopped."""
 
     def status(self, ask: Callable[[], None]) -> ScannerStatus:
         """The status; `ask` raises where the device at rest does not answer."""
@@ -165,7 +165,9 @@ class RunPlayer:
         return ScannerStatus(moving=moving, fault=fault, position=None if moving else self.position)
 
     def rest(self) -> float:
-        """Wait for a run that is ending; where the mirror rests. After a fault nobody knows, so that it is halted."""
+        """Wait for a run that is ending; returns where the mirror rests. After a fault nobody knows that, so the device
+        is halted.
+        """
         self.join()
         if self.position is None:
             self.position = self._halt()
@@ -191,7 +193,7 @@ class RunPlayer:
         self.rest()
 
     def end(self) -> None:
-        """Before the device is closed: no thread talks to it afterwards."""
+        """End the thread before the device is closed: nothing talks to it afterwards."""
         self._stopping.set()
         self.join()
 
@@ -209,7 +211,7 @@ class RunPlayer:
         run.begin()
 
     def _feed(self, run: DacRun) -> None:
-        """The thread. What fails here is told by `status` and ends the run."""
+        """Feed the device, in the thread. `status` tells of what fails here, which ends the run."""
         try:
             run.feed(self._stopping)
             self.position = run.source.last
@@ -228,26 +230,26 @@ class Dac(Protocol):
     """See `Device.serial`."""
     highest_rate_hz: float
     closes_at: float | None
-    """Drive that giving the board back jumps to; None: it holds."""
+    """Drive that the mirror jumps to when the board is given back; None: it stays."""
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
         """The exact rate nearest to the requested one, within low to high."""
         ...
 
     def run(self, source: PointSource, clock_hz: Fraction) -> DacRun:
-        """These points at a rate that `point_clock` returned."""
+        """A run of these points at a rate that `point_clock` returned."""
         ...
 
     def check(self) -> None:
-        """Raise where it does not answer. Any thread."""
+        """Raise where the board does not answer. Any thread."""
         ...
 
     def halt(self) -> float:
-        """End whatever it plays, in an emergency; where the mirror rests then."""
+        """End what the board plays, in an emergency; returns where the mirror rests then."""
         ...
 
     def close(self) -> None:
-        """Outputs safe, and the board given back."""
+        """Make the outputs safe and give the board back."""
         ...
 
 
@@ -265,17 +267,17 @@ class DacScanner(BeamScanner):
 
     @property
     def identity(self) -> str:
-        """What the board says of itself."""
+        """The board's own description of itself."""
         return self._dac.identity
 
     @property
     def serial(self) -> str | None:
-        """Of the board: which mirror hangs on it nobody can ask."""
+        """Serial number of the board; the mirror behind it has none that could be asked for."""
         return self._dac.serial
 
     @property
     def limits(self) -> ScannerLimits:
-        """The config's, on the rates that the device allows."""
+        """The config's limits, at the rates that the device allows."""
         return self._limits
 
     def _do_status(self) -> ScannerStatus:
@@ -310,7 +312,7 @@ class DacScanner(BeamScanner):
             self._dac.close()
 
     def _go(self, command: float) -> None:
-        """To rest at `command`, as fast as the board plays."""
+        """Bring the mirror to rest at `command`, as fast as the board plays."""
         clock_hz = self._do_point_clock(self._limits.point_rate_hz[1])
         source = park_from(self._player.rest(), command, self._limits, float(clock_hz))
         self._player.play(self._dac.run(source, clock_hz))

@@ -1,6 +1,7 @@
-"""The config of a galvo behind a DAC: what the mirror can follow, where it may go, where the beam is dumped.
+"""A galvo behind a DAC: its config and limits, and its ways between two commands within them.
 
-Ways of a mirror between two commands within a scanner's limits: to the first point, to a stop, to the dump angle.
+The config says what the mirror can follow, where it may go and where the beam is dumped. The ways are those to the
+first point, to a stop and to the dump angle:
 
     ramp   x(t) = a + (b - a) (1 - cos(pi t / T)) / 2      peaks: v = |b - a| pi / 2T, a = |b - a| pi^2 / 2T^2
     brake  constant deceleration from the speed that the mirror has
@@ -21,22 +22,23 @@ from drivers.registry import KindConfig
 from drivers.units import PerSecond, PerSecondSquared
 
 LOWEST_RATE_HZ = 1000.0
-"""Slower than that a mirror shows every point as a step."""
+"""Lowest point rate: slower than that a mirror shows every point as a step."""
 MOST_WAVEFORM_POINTS = 1_000_000
-"""A waveform stays in the host's memory, 9 bytes a point."""
+"""Most points of a waveform, which stays in the host's memory, 9 bytes a point."""
 
 Drive = Annotated[float, Field(ge=-1, le=1)]
-"""Normalised: -1 to 1 is the DAC's range."""
+"""Normalised drive: -1 to 1 is the DAC's range."""
 
 
 class GalvoConfig(KindConfig):
     """Limits of the galvo; they are in its data sheet. The DAC itself would follow anything."""
 
     port: str = "usb"
-    """usb; where several are attached usb:serial=ABC, or usb:path=1-2 for a Helios, which has none; emulated:NAME."""
+    """Port: usb; where several are attached usb:serial=ABC, or usb:path=1-2 for a Helios, which has none;
+    emulated:NAME."""
     axis: Literal["x", "y"] = "x"
     max_velocity: Annotated[PerSecond, Field(gt=0, le=1e6)]
-    """Of the normalised drive: the full range is 2."""
+    """Speed of the normalised drive, whose full range is 2."""
     max_acceleration: Annotated[PerSecondSquared, Field(gt=0, le=1e10)]
     max_step: Annotated[float, Field(gt=0, le=2)] = 0.1
     """Largest change of the drive from one point to the next."""

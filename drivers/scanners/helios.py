@@ -7,28 +7,22 @@ The device plays frames of up to 4095 points from two buffers, one playing and o
 nor a clock output: synchronisation comes from the markers in the SPAD's stream. A thread keeps the pending buffer full.
 Every frame is SINGLE: a dead host leaves a mirror that stands after two frames, not one that scans for ever. STOP
 centres the mirror in one jump, so that it is for emergencies and for the end; scans end with a brake ramp. The shutter
-pin is never raised and flash is never written; opcode DE (bootloader) does not exist here.
+pin is never raised.
 
-Frames of the Helios laser DAC and its point clock, as bytes and exact numbers (docs/hardware.md).
+Whether the buffers ever ran dry is judged from the device's status, which tells only when the pending buffer falls
+free. Between the last status 'full' and the first 'free' the pending frame began to play; that bounds when it ends. A
+frame that arrives after the earliest such end may have left the mirror standing: the run ends with a fault. A buffer
+that falls free before the playing frame can have ended means that the device dropped a frame in silence. Only the
+markers in the SPAD's stream tell what was really played.
 
-Sources there: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
-sdk/cpp/HeliosDac.cpp (read for facts; no code taken).
+Bytes. Sources: `Grix/helios_dac` 0952a2a, firmware/AtmelStudio_helios/lasdac_mainfirmware/src/main.c and
+sdk/cpp/HeliosDac.cpp (read for facts; no code taken). Endpoints of alternate setting 1: interrupt OUT 0x06 commands,
+interrupt IN 0x83 replies, bulk OUT 0x02 frames. Only the opcodes below exist here: DE would jump to the bootloader, 06
+wears the flash, and 02 is sent with 0 only.
 
     point (7 B)     x[11:4], x[3:0] << 4 | y[11:8], y[7:0], R, G, B, I       12 bit, centre 0x800
     trailer (5 B)   u16 LE points per second, u16 LE points, u8 flags        1 start now, 2 single
     clock           SysTick of 112 MHz, floor(112e6 / pps) + 1 cycles a point
-
-Commands of a Helios laser DAC over its USB link (docs/hardware.md; firmware v6, `Grix/helios_dac` 0952a2a).
-
-Endpoints of alternate setting 1: interrupt OUT 0x06 commands, interrupt IN 0x83 replies, bulk OUT 0x02 frames.
-Only the opcodes below exist here: DE would jump to the bootloader, 06 wears the flash, and 02 is sent with 0 only.
-
-One run of a Helios: frames into its two buffers, and a judgement whether they ever ran dry (docs/hardware.md).
-
-The host sees when the pending buffer falls free, no more. Between the last status 'full' and the first 'free' the
-pending frame began to play; that bounds when it ends. A frame that arrives after the earliest such end may have left
-the mirror standing: the run ends with a fault. A buffer that falls free before the playing frame can have ended means
-that the device dropped a frame in silence. What was really played only the markers in the SPAD's stream tell.
 """
 
 import logging
@@ -55,7 +49,7 @@ SYSTICK_HZ = 112_000_000
 LEAST_PPS, MOST_PPS = 7, 65535
 """Beyond these the firmware clamps and the vendor's library drops points, both in silence: refused here."""
 MOST_POINTS = 4095
-"""Of a frame, by the vendor's library; the firmware's buffer holds one more."""
+"""Most points of a frame in the vendor's library; the firmware's buffer holds one more."""
 
 FLAG_START, FLAG_SINGLE = 1, 2
 _CENTRE = 0x800
@@ -69,7 +63,7 @@ def rate_of(pps: int) -> Fraction:
 
 
 def pps_of(rate_hz: Fraction) -> int:
-    """What to ask for so that the device runs at a rate that `rate_of` gave: 25 001 for 25 000 Hz."""
+    """The integer to ask for so that the device runs at a rate that `rate_of` gave: 25 001 for 25 000 Hz."""
     return math.floor(rate_hz) + 1
 
 
@@ -133,22 +127,22 @@ _COMMANDS, _REPLIES, _FRAMES = 0x06, 0x83, 0x02
 _REPLY_BYTES = 32
 _STOP, _SHUTTER, _STATUS, _VERSION, _NAME, _SDK_VERSION = 0x01, 0x02, 0x03, 0x04, 0x05, 0x07
 _OUR_SDK_VERSION = 11
-"""Of the vendor's library whose frames these are."""
+"""Version of the vendor's library whose frames these are."""
 
 _STATUSES = {b"\x83\x01": True, b"\x83\x00": False}
 
 _COMMAND_S = 0.1
-"""The vendor's 16 ms are too short for slow hosts (pull request 10)."""
+"""Deadline for a command; the vendor's 16 ms are too short for slow hosts (pull request 10)."""
 _FRAME_S = 0.5
 _SETTLE_S = 0.1
-"""From entering alternate setting 1 to the first command."""
+"""Pause between entering alternate setting 1 and the first command."""
 _DRAIN_S = 0.005
 _AFTER_STOP_S = 0.15
-"""Frames within 100 ms of STOP are refused."""
+"""Wait after STOP: frames within 100 ms of it are refused."""
 
 
 class HeliosLink:
-    """Commands, one at a time. Any thread."""
+    """The commands of a Helios, one at a time. Any thread."""
 
     def __init__(self, link: UsbDevice, clock: Clock) -> None:
         """Wait until the firmware is enabled, drop old replies, learn version and name."""
@@ -180,7 +174,7 @@ class HeliosLink:
         return answer
 
     def send_frame(self, frame: bytes) -> None:
-        """One frame, after `free` said True."""
+        """Send one frame, after `free` said True."""
         with self._lock:
             self._link.write(_FRAMES, frame, _FRAME_S)
 
@@ -190,7 +184,9 @@ class HeliosLink:
         self._clock.sleep(_AFTER_STOP_S)
 
     def close(self) -> None:
-        """Stop, shutter pin low (the firmware never lowers it), back to 'disabled', and the USB device given back."""
+        """Stop, take the shutter pin low (the firmware never lowers it), go back to 'disabled', and give the USB device
+        back.
+        """
         try:
             self.stop()
             self._send(_SHUTTER, 0)
@@ -203,7 +199,7 @@ class HeliosLink:
             self._link.write(_COMMANDS, bytes((opcode, data)), _COMMAND_S)
 
     def _ask(self, opcode: int, answer: int, least: int) -> bytes:
-        """What follows the answer's first byte. Two questions with three reads each, as in the vendor's library."""
+        """The bytes behind the answer's first one. Asks twice with three reads each, as the vendor's library does."""
         heard = b""
         with self._lock:
             for _ in range(2):
@@ -224,17 +220,17 @@ class HeliosLink:
 
 _POLL_S = 0.002
 _SILENT_S = 0.5
-"""So long no proper status: the device hangs."""
+"""Time without a proper status after which the device counts as hung."""
 _PATIENCE_S = 1.0
-"""Beyond the time its frames take, for the buffer to fall free."""
+"""Wait for the buffer to fall free, beyond the time that its frames take."""
 _WIRE_BYTES_PER_S = 1.216e6
-"""Most that a full-speed bulk endpoint carries: 19 packets of 64 bytes a millisecond (USB 2.0, table 5-9)."""
+"""Bytes a second that a full-speed bulk endpoint carries: 19 packets of 64 bytes a millisecond (USB 2.0, table 5-9)."""
 _DRIFT = 1e-3
-"""Most that the device's crystal and the host's clock differ."""
+"""Largest relative difference between the device's crystal and the host's clock."""
 
 
 class HeliosRun:
-    """Begin, then feed. Every wait has an end: at most two frames and two seconds."""
+    """One run: `begin`, then `feed`. Every wait has an end: at most two frames and two seconds."""
 
     def __init__(
         self, link: HeliosLink, clock: Clock, source: PointSource, clock_hz: Fraction, *, frame_s: float, axis: str
@@ -251,7 +247,7 @@ class HeliosRun:
         self._playing_s = self._pending_s = 0.0
         """Durations of the frames in the two buffers; 0: none."""
         self._earliest_end_s = self._latest_end_s = 0.0
-        """When the playing frame ends, on the host's clock."""
+        """Bounds on when the playing frame ends, on the host's clock."""
         self._next: tuple[bytes, float] | None = None
         """The frame to be sent next and its duration: made while another plays, not when the time for it has come."""
         if self._unsendable():
@@ -283,7 +279,7 @@ class HeliosRun:
         self._clock.sleep(latest_s - self._now_s())
 
     def _append(self, frame: bytes, duration_s: float) -> None:
-        """One more frame, behind the playing one."""
+        """Send one more frame, behind the playing one."""
         _, arrived_s = self._send(frame)
         late_s = arrived_s - self._earliest_end_s
         if late_s > 0:
@@ -295,7 +291,7 @@ class HeliosRun:
         self._check_kept()
 
     def _check_kept(self) -> None:
-        """A frame that was taken and kept means 'full' until the playing one ends."""
+        """Check that a frame that was taken was kept: the status must then be 'full' until the playing one ends."""
         free = None
         while free is None and self._now_s() < self._earliest_end_s:
             free = self._link.free()
@@ -317,7 +313,7 @@ class HeliosRun:
         return encode(points, self._axis, self._pps, flags), len(points) / self._rate_hz
 
     def _send(self, frame: bytes) -> tuple[float, float]:
-        """The host's times between which the frame arrived."""
+        """Send a frame; returns the host's times between which it arrived."""
         began_s = self._now_s()
         self._link.send_frame(frame)
         self._sent += 1
@@ -359,7 +355,7 @@ class HeliosRun:
         return False
 
     def _note_swap(self, earliest_s: float, latest_s: float) -> None:
-        """The pending frame, if any, began to play between these times."""
+        """Note that the pending frame, if any, began to play between these times."""
         if not self._pending_s:
             return
         if latest_s < self._earliest_end_s - _POLL_S:
@@ -384,13 +380,13 @@ class HeliosConfig(GalvoConfig):
     name: str | None = None
     """Name stored in the device; another one is refused."""
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=MOST_PPS)] = 65535.0
-    """Lower it where the host's USB is busy: 40 kHz leaves a margin."""
+    """Most points per second. Lower it where the host's USB is busy: 40 kHz leaves a margin."""
     frame: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
-    """Length of one frame: what the host may be late by, and half of what a stop takes."""
+    """Length of one frame: the host may be late by as much, and a stop takes twice as long."""
 
 
 class HeliosDac:
-    """A `Dac`. Where STOP and the alternate setting without endpoints leave the mirror is the centre."""
+    """A Helios as a `Dac`. STOP and the alternate setting without endpoints leave the mirror at the centre."""
 
     closes_at: float | None = 0.0
 
@@ -404,7 +400,7 @@ class HeliosDac:
         self._clock = clock
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-        """What the divider of its timer makes of it."""
+        """The rate nearest to the requested one that the divider of the board's timer can make."""
         return nearest_rate(requested_hz, low_hz, high_hz)
 
     def run(self, source: PointSource, clock_hz: Fraction) -> HeliosRun:
@@ -413,12 +409,12 @@ class HeliosDac:
         return HeliosRun(self._link, self._clock, source, clock_hz, frame_s=config.frame, axis=config.axis)
 
     def check(self) -> None:
-        """DeviceTimeout where it is asked twice in vain."""
+        """Check that the board answers; DeviceTimeout where it is asked twice in vain."""
         if self._link.free() is None and self._link.free() is None:
             raise DeviceTimeout(f"{self.name}: gives no status; unplug it and plug it in again")
 
     def halt(self) -> float:
-        """STOP: at the centre, in one jump."""
+        """Send STOP: the mirror is at the centre then, in one jump."""
         self._link.stop()
         return 0.0
 

@@ -8,23 +8,19 @@ The board has a ring of samples that is topped up by a thread: no frames, no sea
 its own unless these are unplugged, so that they stay off until the config says where they lead. Clear and disable are
 its only stop; nothing at all happens when the host dies, so that the gate must not depend on it.
 
-Commands and samples of a LaserCube / LaserDock over its USB link (docs/hardware.md).
+Whether each sample was played once is judged from the answers to 'how many are queued'. Each answer bounds the moment
+at which the first sample was played, if none was lost, played twice or waited for: the moments that all answers allow
+must have one in common. Samples go out in whole transfers, so that a lost one stands out. A run begins with copies of
+its first point, so that a sample lost before the first answer is one of them. It ends with copies of its last: what the
+device does when its ring runs empty is not documented (hold or repeat), so that the ring is cleared while they are
+played.
 
-Source there: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp (read for facts; no code taken).
+Bytes. Source: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp (read for facts; no code taken). The
+USB ids are shared with Lasershark boards, so that the product string decides.
 
     command   interface 0, bulk OUT 0x01: opcode and 0 to 4 bytes; reply on bulk IN 0x81, 64 B: [1] = 0 is 'done', data
               little-endian from [2]. [0] is not to be relied on
     samples   interface 1 alternate 1, bulk OUT 0x03: 64 samples a transfer, each 4 x u16 LE: R | G << 8, B, X, Y
-
-The numbers are shared with Lasershark boards, so that the product string decides.
-
-One run of a LaserCube: samples into its ring, and a judgement whether each was played once (docs/hardware.md).
-
-Every question 'how many are queued' says when the first sample must have been played, if none was lost, played twice
-or waited for: the moments that all answers allow must have one in common. Samples go out in whole transfers, so that a
-lost one stands out. A run begins with copies of its first point: what is lost before the first answer is one of them.
-It ends with copies of its last: what the device does when its ring runs empty is not documented (hold or repeat), so
-that the ring is cleared while they are played.
 """
 
 import math
@@ -60,16 +56,16 @@ _FULL_SCALE = 4095
 _CENTRE = 0x800
 _HIGH = 255
 _COMMAND_S = 0.1
-"""The vendor's library waits for ever."""
+"""Deadline for a command; the vendor's library waits for ever."""
 _SAMPLES_S = 0.5
 _DRAIN_S = 0.005
 
 
 class LaserCubeLink:
-    """Commands, one at a time. Any thread."""
+    """The commands of a LaserCube, one at a time. Any thread."""
 
     def __init__(self, link: UsbDevice, clock: Clock) -> None:
-        """Output off, ring empty, and what the device says of itself."""
+        """Switch the output off, empty the ring, and ask the device about itself."""
         self.name = link.label
         self.serial = link.listing.serial
         self.clock = clock
@@ -89,12 +85,12 @@ class LaserCubeLink:
             )
 
     def safe(self) -> None:
-        """Colours off, then nothing left to play."""
+        """Switch the colours off, then leave nothing to play."""
         self.enable(False)
         self.clear()
 
     def enable(self, on: bool) -> None:
-        """The colour outputs."""
+        """Enable the colour outputs."""
         self._ask(bytes((_ENABLE, on)))
 
     def clear(self) -> None:
@@ -122,7 +118,7 @@ class LaserCubeLink:
             self._link.write(_SAMPLES, samples[at : at + step], _SAMPLES_S)
 
     def close(self) -> None:
-        """Safe, and the USB device given back."""
+        """Make the board safe and give the USB device back."""
         try:
             self.safe()
         finally:
@@ -154,7 +150,7 @@ class LaserCubeLink:
 
 
 def encode(points: PointSlice, axis: str, *, markers: bool) -> bytes:
-    """Samples. With markers: R backward, G line marker, B scan marker; else dark."""
+    """The bytes of samples. With markers: R backward, G line marker, B scan marker; else dark."""
     value = np.rint((points.command + 1) / 2 * _FULL_SCALE).astype("<u2")
     red, green, blue = (
         _level(points.markers, bit) if markers else np.zeros(len(points), "<u2")
@@ -174,15 +170,17 @@ def _level(markers: NDArray[np.uint8], bit: int) -> NDArray[np.uint16]:
 _POLL_S = 0.002
 _PATIENCE_S = 1.0
 _HOLD_S = 0.03
-"""Of the first and the last point, at least: the host may be late by this when it asks first and clears last."""
+"""Shortest time for which the first and the last point are held: the host may be late by this when it asks first and
+clears last."""
 _DRIFT = 1e-3
-"""Most that the device's crystal and the host's clock differ."""
+"""Largest relative difference between the device's crystal and the host's clock."""
 _TOLERANCE_POINTS = 48
-"""Less than a transfer, which is what gets lost as a whole; more than the device's own steps in counting."""
+"""Tolerance in points: less than a transfer, which gets lost as a whole; more than the device's own steps in
+counting."""
 
 
 class LaserCubeRun:
-    """Begin, then feed. Every wait has an end: what is queued and a second."""
+    """One run: `begin`, then `feed`. Every wait has an end: the queued samples and a second."""
 
     def __init__(
         self, link: LaserCubeLink, source: PointSource, rate_hz: int, *, buffer_s: float, axis: str, markers: bool
@@ -202,7 +200,7 @@ class LaserCubeRun:
         """Samples short of a transfer."""
         self._sent = 0
         self._start_s = (-np.inf, np.inf)
-        """When the first sample was played, at the earliest and at the latest."""
+        """Earliest and latest time at which the first sample was played."""
         self._asked_s = 0.0
 
     def begin(self) -> None:
@@ -229,7 +227,7 @@ class LaserCubeRun:
         self._finish()
 
     def _finish(self) -> None:
-        """Copies of the last point, and an end among them."""
+        """Send copies of the last point, and find an end among them."""
         hold = self._hold + -(len(self._waiting) // 8) % SAMPLES_PER_TRANSFER
         self._send(PointSlice(np.full(hold, self.source.last), np.zeros(hold, np.uint8), np.zeros(hold, bool)))
         end_s = self._now_s() + (self._most + hold) / self._rate_hz * (1 + _DRIFT) + _PATIENCE_S
@@ -249,7 +247,7 @@ class LaserCubeRun:
             raise DeviceFault(f"{self._link.name}: answered too late to tell how the run ended; unload the host")
 
     def _send(self, points: PointSlice) -> None:
-        """Whole transfers; what is short of one waits."""
+        """Send whole transfers; samples short of one wait."""
         self._waiting += encode(points, self._axis, markers=self._markers)
         whole = len(self._waiting) // (8 * SAMPLES_PER_TRANSFER) * 8 * SAMPLES_PER_TRANSFER
         self._link.send(self._waiting[:whole])
@@ -291,15 +289,18 @@ class LaserCubeConfig(GalvoConfig):
 
     kind: Literal["lasercube"] = "lasercube"
     colours: Literal["dark", "markers"] = "dark"
-    """markers: its lasers are unplugged and the colour outputs lead to the marker inputs. dark: never enabled."""
+    """Use of the colour outputs. markers: its lasers are unplugged and the outputs lead to the marker inputs. dark:
+    never enabled."""
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=100_000)] = 30_000.0
-    """The device may allow less."""
+    """Most points per second; the device may allow less."""
     buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
-    """Samples queued in the device: what the host may be late by, and what a stop takes."""
+    """Duration of the samples queued in the device: the host may be late by as much, and a stop takes as long."""
 
 
 class LaserCubeDac:
-    """A `Dac`. Where its mirror stands when it is opened nobody can ask: the first run begins at the centre."""
+    """A LaserCube as a `Dac`. Nobody can ask where its mirror stands when it is opened: the first run begins at the
+    centre.
+    """
 
     closes_at: float | None = None
 
@@ -312,7 +313,7 @@ class LaserCubeDac:
         self._link = link
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-        """Whole numbers of Hz are what the device can be told; a run reads them back."""
+        """The nearest whole number of Hz, which is all that the device can be told; a run reads it back."""
         return Fraction(min(max(round(requested_hz), int(low_hz)), int(high_hz)))
 
     def run(self, source: PointSource, clock_hz: Fraction) -> LaserCubeRun:
@@ -324,7 +325,7 @@ class LaserCubeDac:
         )
 
     def check(self) -> None:
-        """Any question will do."""
+        """Check that the board answers; any question will do."""
         self._link.queued()
 
     def halt(self) -> float:

@@ -1,24 +1,21 @@
 """Pi Imaging SPAD512S (SPAD512^2) through its vendor's program, which serves commands and pixels on a local TCP port.
 
-Facts and their sources: docs/hardware.md; `spad512s_line` and `drivers.spads.spad512s` speak with the program.
-In short:
+Facts and their sources: docs/hardware.md; `spad512s_line` speaks with the program. In short:
 
 - The vendor's program must run, on this computer or behind a bridge; it serves one client.
 - `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit: tInt is in
   microseconds at 1 and 4 bits, in milliseconds from 6 bits on, so this driver sends microseconds and 1 bit only.
-- The answer is 32 768 bytes a frame (65 536 of a 1M sensor), most significant bit first.
+- The answer is 32 768 bytes a frame (65 536 of a 1M sensor), most significant bit first; then `DONE`, or text that ends
+  with `ERROR`, anywhere.
 - Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
 
 The sensor takes a run into its own memory (BURST). Its frames carry neither ticks nor markers: they say nothing of the
 scanner, the records' ticks are nominal. `STOP` is known from other people's code only; a run that does not end soon
 after it is left by closing the connection.
 
-One run of a SPAD512S as it comes over the vendor's line: pixels that may read like its ending (docs/hardware.md).
-
-The answer to `I` is the pixels, then `DONE`; or text that ends with `ERROR`, anywhere. Pixels may well read `DONE` or
-`ERROR`: what counts is the exact length and what stands behind it. A block is given out once so much has come behind it
-that no error text can be part of it. Frames have neither number nor checksum: pixels handed over twice in place of
-others have the right length, so that no frame may be the very same as one before.
+Pixels may well read `DONE` or `ERROR`: the exact length decides, and the text behind it. A block is given out once so
+much has come behind it that no error text can be part of it. Frames have neither number nor checksum: pixels handed
+over twice in place of others have the right length, so that no frame may be the very same as one before.
 """
 
 import threading
@@ -45,11 +42,11 @@ from drivers.transports.tap import Tap
 from drivers.units import BytesPerSecond, ExactHertz
 
 GUARD_BYTES = 512
-"""So much must come behind a block before it counts. The longest error text of the samples has 160 characters."""
+"""Bytes that must come behind a block before it counts. The longest error text of the samples has 160 characters."""
 SLICE_S = 0.05
 """One wait: how late a `stop` from another thread comes at most."""
 _ERROR_CHECK_S = 0.5
-"""After a silence of so long within a run the last bytes are looked at: they may be an error text."""
+"""Silence within a run after which the last bytes are looked at: they may be an error text."""
 _UNIFORM = (0x00, 0xFF)
 
 
@@ -57,23 +54,23 @@ class Spad512sRun:
     """Takes a run block by block; the memory it gives out is good until the next one is asked for."""
 
     def __init__(self, name: str, line: Spad512sLine, n_frames: int, block_frames: int, frame_bytes: int) -> None:
-        """Allocates; the command that starts the run is the caller's."""
+        """Allocate the memory; the command that starts the run is the caller's."""
         self.n_frames = n_frames
         self.next_frame = 0
         """First frame of the block that comes next."""
         self.block_seq = 0
         """Blocks published."""
         self.just_lost = False
-        """The block before was dropped."""
+        """Whether the block before was dropped."""
         self._name = name
         self._line = line
         self._block_frames, self._frame_bytes = block_frames, frame_bytes
         self._memory = np.zeros(block_frames * frame_bytes + GUARD_BYTES, np.uint8)
         self._got = 0
-        """Bytes of the present block and of what guards it that are here."""
+        """Number of bytes of the present block, and of what guards it, that are here."""
         self._heard_at = time.monotonic()
         self._seen: dict[tuple[int, int], int] = {}
-        """Frames by the checksums of their halves: 64 bits, since 10 000 frames may well share one of 32."""
+        """Frames seen, by the checksums of their halves: 64 bits, since 10 000 frames may well share one of 32."""
 
     @property
     def next_n(self) -> int:
@@ -103,7 +100,7 @@ class Spad512sRun:
         return pixels
 
     def go_on(self) -> None:
-        """The block is dealt with: what guarded it begins the next one."""
+        """Drop the block, which was dealt with: the bytes that guarded it begin the next one."""
         used = self.next_n * self._frame_bytes
         self._memory[: self._got - used] = self._memory[used : self._got]
         self._got -= used
@@ -125,7 +122,7 @@ class Spad512sRun:
             )
 
     def _require_done(self, pixel_bytes: int) -> None:
-        """DONE must stand exactly behind the last pixel, and nothing behind it."""
+        """Check that DONE stands exactly behind the last pixel, and nothing behind it."""
         behind = self._memory[pixel_bytes : self._got].tobytes()
         if behind == DONE:
             return
@@ -165,9 +162,9 @@ TICK_HZ = 100_000_000
 """Nominal: the vendor's stream carries no time. Where it does not divide the period, a multiple of the frame rate."""
 TICKS_PER_FRAME = 1024
 LISTENS_AGAIN_S = 1.0
-"""A program that serves one client may take so long to listen again once that one has left."""
+"""Time that a program which serves one client may take to listen again once that one has left."""
 _TEMPERATURES = ("master FPGA", "slave FPGA", "board", "chip")
-"""What `R` measures first."""
+"""Names of the temperatures that `R` reports first, in its order."""
 _US_SLACK = 1e-6
 """Microseconds by which a whole number of them may miss as a float in seconds."""
 
@@ -233,7 +230,7 @@ class Spad512s(SpadArray):
         return f"{self.name}: {self._identity}"
 
     def _do_health(self) -> SpadHealth:
-        """`R`: four temperatures, the laser's clock and the frames'; `V`: quench and excess bias."""
+        """Temperatures and clocks by `R` (four temperatures, the laser's clock and the frames'), biases by `V`."""
         with self._busy:
             self._connect_where_lost()
             *celsius, _, frame_clock_hz = self._line.ask_numbers("R", 6)
@@ -262,7 +259,9 @@ class Spad512s(SpadArray):
         return self._timing
 
     def _check_period(self, request: SpadRequest, exposure_us: int) -> None:
-        """Running free, a frame follows the other as soon as it is exposed and the one before is read out."""
+        """Check the period: running free, a frame follows the other once it is exposed and the one before is read
+        out.
+        """
         if self._config.trigger == "external":
             return
         period_s = max(Fraction(exposure_us, 1_000_000), 1 / self._info.max_frame_rate_hz)
@@ -287,7 +286,9 @@ class Spad512s(SpadArray):
             self._line.tell(f"I,1,{self._exposure_us},{n_frames},{external},1,0,1\n")
 
     def _connect_where_lost(self) -> None:
-        """The program was restarted, or left by hanging up. DeviceFault where another device answers now."""
+        """Connect again after the program was restarted, or left by hanging up. DeviceFault where another device
+        answers now.
+        """
         if self._line.is_open:
             return
         again, before = self._connect_again().master_serial, self._identity.master_serial
@@ -299,7 +300,7 @@ class Spad512s(SpadArray):
             )
 
     def _connect_again(self) -> Spad512sIdentity:
-        """The program serves one client, and listens again a moment after that one has left."""
+        """Connect again: the program serves one client, and listens again a moment after that one has left."""
         ends_at = time.monotonic() + LISTENS_AGAIN_S
         while True:
             try:

@@ -20,7 +20,7 @@ from drivers.transports.tcp_stream import TcpStream
 _log = logging.getLogger(__name__)
 
 DONE, ERROR = b"DONE", b"ERROR"
-"""What ends a run; `DONE` may be glued to an answer in text as well."""
+"""Words that end a run; `DONE` may be glued to an answer in text as well."""
 QUIET_S = 0.05
 """A text answer has no stated end: it is whole when the line was quiet for so long, or when it ends with DONE."""
 _MOST_TEXT_BYTES = 65_536
@@ -33,7 +33,7 @@ class Deadlines:
     """Longest waits in seconds."""
 
     open_s: float = 30.0
-    """For the banner."""
+    """Deadline for the banner."""
     calibration_s: float = 90.0
     answer_s: float = 5.0
     stop_s: float = 1.0
@@ -42,7 +42,7 @@ class Deadlines:
 
 @dataclass(frozen=True, slots=True)
 class Spad512sIdentity:
-    """What the device says about itself (`D`)."""
+    """The device's description of itself (`D`)."""
 
     detector: str
     master_serial: str
@@ -54,7 +54,7 @@ class Spad512sIdentity:
     intensity: bool
 
     def __str__(self) -> str:
-        """For people."""
+        """The identity as a text for people."""
         return (
             f"{self.detector} {self.flavour}, FPGAs {self.master_serial} and {self.slave_serial}, software "
             f"{self.software}, firmware {self.firmware}, hardware {self.hardware}"
@@ -83,7 +83,7 @@ class Spad512sLine:
         return self._stream is not None
 
     def connect(self) -> Spad512sIdentity:
-        """Banner, D, the calibration where one runs, D again."""
+        """Connect: banner, D, the calibration where one runs, D again."""
         self._stream = TcpStream(self._name, self.address)
         try:
             return self._greet(self._stream)
@@ -119,7 +119,7 @@ class Spad512sLine:
 
     @contextmanager
     def _given_up_on_silence(self) -> Iterator[None]:
-        """A connection that is gone or silent is closed: a late answer could not be told from the next one's."""
+        """Close a connection that is gone or silent: a late answer could not be told from the next one's."""
         try:
             yield
         except (DeviceTimeout, DeviceDisconnected):
@@ -190,7 +190,7 @@ class Spad512sLine:
         return self._identity_of(detector, answer)
 
     def _await_calibration(self, stream: TcpStream) -> None:
-        """Nothing may be sent before the end of it."""
+        """Wait for the end of the calibration; nothing may be sent before it."""
         _log.info("%s: calibrates its breakdown voltage; waiting", self._name)
         ends_at = time.monotonic() + self._deadlines.calibration_s
         text = ""
@@ -227,7 +227,7 @@ class Spad512sLine:
             self._tap.note("tcp", direction, data)
 
     def _read_text(self, stream: TcpStream, deadline_s: float) -> str:
-        """What comes until the line is quiet or says DONE, at most for `deadline_s`; empty where nothing came."""
+        """The text until the line is quiet or says DONE, at most for `deadline_s`; empty where nothing came."""
         ends_at = time.monotonic() + deadline_s
         data = stream.receive(deadline_s)
         while data and not data.endswith(DONE) and time.monotonic() < ends_at:

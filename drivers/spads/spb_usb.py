@@ -40,12 +40,12 @@ from drivers.units import Seconds
 _log = logging.getLogger(__name__)
 
 _CHECKED_BYTES_PER_S = 0.5e9
-"""Up to so much, payload CRCs are checked live; above, the recorder and `verify` do (docs/spb1-usb.md)."""
+"""Rate up to which payload CRCs are checked live; above, the recorder and `verify` do (section 8.2)."""
 _SLICE_S = 0.05
 """One wait inside `fill`: how late a `stop` from another thread comes at most."""
 _PINGS_PER_HEARTBEAT = 4
 _SILENCE_S = 0.5
-"""A run sends a heartbeat block every 100 ms: after a silence of so long the device is asked whether it still runs."""
+"""Silence after which the device is asked whether it still runs; a run sends a heartbeat block every 100 ms."""
 _STOP_S = 1.0
 """Longest wait for the last block after ABORT."""
 
@@ -61,8 +61,8 @@ class SpbUsbConfig(KindConfig):
     reads: Literal["queued", "plain"] = "queued"
     """queued: many reads in flight (libusb1); plain: one after the other (pyusb), for slow streams."""
     silence: Annotated[Seconds, Field(ge=0.04, le=1.5)] = 0.04
-    """Asked in vain for so long while light may fall, it has failed: the guard takes the light. One that is emulated
-    shares this computer's processors and needs longer."""
+    """Time for which the device may be asked in vain while light may fall: then it has failed, and the guard takes the
+    light. An emulated one shares this computer's processors and needs longer."""
     heartbeat: Annotated[Seconds, Field(ge=0.02, le=60)] = 1.0
     """The device ends a run and drops its gate where it hears nothing of this program for so long."""
     test_pattern: bool = True
@@ -87,7 +87,7 @@ class SpbUsb(SpadArray):
         self._receiver: BlockReceiver | None = None
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._waited_s = 0.0
-        """Asked in vain since the last frames."""
+        """Seconds for which the device has been asked in vain since the last frames."""
         try:
             wiring.open_session(link)
             ack_in = wiring.ack_in if wiring.ack_in in link.endpoints else None
@@ -209,7 +209,9 @@ class SpbUsb(SpadArray):
         return False
 
     def _note_wait(self, seconds: float) -> None:
-        """Asked in vain for so long. A thread that comes late finds what is there: only waiting itself counts."""
+        """Note how long the device was asked in vain. A thread that comes late finds what is there: only waiting itself
+        counts.
+        """
         self._waited_s += seconds
         if self.on_wait is not None:
             self.on_wait(self._waited_s)
@@ -235,7 +237,7 @@ class SpbUsb(SpadArray):
         )
 
     def _finish(self, receiver: BlockReceiver) -> None:
-        """The run is over: what the device exposed is asked for, since its last blocks may be lost."""
+        """End the run: the device is asked how much it exposed, since its last blocks may be lost."""
         self._receiver = None
         receiver.close()
         try:

@@ -1,12 +1,11 @@
-"""What an SPB1 device is told before START, and its test pattern, run when it is opened (docs/spb1-usb.md).
+"""Opening an SPB1 device: USB chip, identity registers, test pattern, and the registers written before START.
 
-Who answers at the other end of an SPB1 control plane, and what it can do (docs/spb1-usb.md).
+Facts: docs/hardware.mds 2.4, 2.5 and 8.
 
-The USB chips of SPB1 boards: ids, endpoints, and the session that an FT601 wants (docs/hardware.md).
-
-Sources there: `VicidominiLab` BrightEyes-TTM 8f8d8d8 (FX3 with the AN65974 firmware, 04B4:00F1, bulk IN 0x81);
-`apertus-open-source-cinema/ft60x-rs` and `lambdaconcept/ft60x_driver` (0403:601F, session commands on 0x01, stream on
-0x82). Both ids are shared by unrelated gear, so the product string must fit too.
+The USB chips differ in ids and endpoints, and an FT601 wants a session. Sources: `VicidominiLab` BrightEyes-TTM 8f8d8d8
+(FX3 with the AN65974 firmware, 04B4:00F1, bulk IN 0x81); `apertus-open-source-cinema/ft60x-rs` and
+`lambdaconcept/ft60x_driver` (0403:601F, session commands on 0x01, stream on 0x82). Both ids are shared by unrelated
+gear, so the product string must fit too.
 """
 
 import struct
@@ -38,19 +37,23 @@ from drivers.transports.usb_device import UsbId
 
 @dataclass(frozen=True, slots=True)
 class SensorIdentity:
-    """What the identity registers say."""
+    """Contents of the identity registers."""
 
     info: SpadInfo
     features: Feature
     tick_hz: Fraction
     min_period_ticks: int
+    """Shortest frame period."""
     window_entries: int
-    """Of all window tables together."""
+    """Entries of all window tables together."""
     max_stride: int
+    """Largest stride of a block."""
 
 
 def identify(control: ControlChannel, name: str) -> SensorIdentity:
-    """Ask. `DeviceNotFound` where it does not speak SPB1, `DeviceFault` where it speaks another version."""
+    """Read the identity registers. `DeviceNotFound` where the device does not speak SPB1, `DeviceFault` where it speaks
+    another version.
+    """
     # A program that died may have left a run behind, which would drown the answers.
     control.forget_run()
     try:
@@ -107,10 +110,11 @@ class RunSetup:
     stride: int
     block_frames: int
     heartbeat_s: float
+    """Time without a PING after which the device ends the run."""
     window: WindowTable | None = None
 
     def write(self, control: ControlChannel) -> None:
-        """Tell the device."""
+        """Write the registers."""
         control.write_all(
             (
                 (Register.HEARTBEAT_MS, round(self.heartbeat_s * 1000)),
@@ -134,13 +138,13 @@ class RunSetup:
 
 
 def write_length(control: ControlChannel, n_frames: int | None) -> None:
-    """The run ends behind so many frames; None: at STOP."""
+    """Have the run end behind so many frames; None: at STOP."""
     n = n_frames or 0
     control.write_all(((Register.N_FRAMES, n & 0xFFFFFFFF), (Register.N_FRAMES + 4, n >> 32)))
 
 
 def block_size(identity: SensorIdentity, width: int, block_frames: int, name: str) -> tuple[int, int]:
-    """Stride and frames of a block: as many as were asked for, or as fit. `LimitExceeded` where none does."""
+    """Stride and frames of a block: as many as were asked for, or as many as fit. `LimitExceeded` where none does."""
     height = identity.info.height
     try:
         n = min(block_frames, frames_per_block(identity.max_stride, width, height))
@@ -164,7 +168,7 @@ def require_windows(identity: SensorIdentity, window: WindowTable, name: str) ->
 def require_order(
     control: ControlChannel, link: BulkLink, stream_in: int, identity: SensorIdentity, heartbeat_s: float
 ) -> None:
-    """A few frames of the test pattern: bits or rows in another order than SPB1's would go unnoticed (8.4, 6)."""
+    """Check a few frames of the test pattern: bits or rows in another order than SPB1's would go unnoticed (8.4, 6)."""
     if Feature.TEST_PATTERN not in identity.features:
         return
     info, name, period = identity.info, link.label, identity.min_period_ticks
@@ -208,7 +212,7 @@ _CONFIG_REQUEST, _CONFIG_BYTES = 0xCF, 152
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """Which endpoint is what on a chip. ack_in: not on every board."""
+    """The endpoints of a USB chip. ack_in: a board without this one acknowledges in its stream."""
 
     usb: UsbId
     interfaces: tuple[int, ...]
@@ -216,9 +220,12 @@ class Wiring:
     stream_in: int
     ack_in: int
     has_session: bool = False
+    """Whether the chip streams only within a session that is opened by commands."""
 
     def open_session(self, link: BulkLink) -> None:
-        """The FT601 streams only after it was told to; data of a session that was not closed is cleared first."""
+        """Tell the FT601 to stream, which it does not before; data of a session that was not closed is cleared
+        first.
+        """
         if not self.has_session:
             return
         found = len(link.control_in(0xC0, _CONFIG_REQUEST, 1, 0, _CONFIG_BYTES, 1.0))
@@ -228,13 +235,15 @@ class Wiring:
             self._tell(link, command)
 
     def close_session(self, link: BulkLink) -> None:
-        """Without it the FT601 answers nobody until it is plugged in anew."""
+        """End the session: without it the FT601 answers nobody until it is plugged in anew."""
         if self.has_session:
             for command in (_ABORT, _CLEAR):
                 self._tell(link, command)
 
     def _tell(self, link: BulkLink, command: int) -> None:
-        """To each pipe in use: touching others disturbs the session (LeechCore pull requests 80 and 81)."""
+        """Send a session command to each pipe in use: touching others disturbs the session (LeechCore pull requests 80
+        and 81).
+        """
         for pipe in sorted({self.stream_in, self.ack_in} & link.endpoints):
             length = _STREAM_BYTES if command == _STREAM else 0
             link.write(_SESSION_OUT, _COMMAND.pack(0, pipe, command, 0, length, 0, 0), 1.0)
@@ -245,4 +254,4 @@ WIRINGS: dict[Chip, Wiring] = {
     "ft601": Wiring(UsbId(LABEL, 0x0403, 0x601F, "SPB1"), (0, 1), 0x02, 0x82, 0x83, has_session=True),
 }
 USB_IDS = tuple(wiring.usb for wiring in WIRINGS.values())
-"""What such boards say they are on the bus."""
+"""USB ids and product strings by which such boards are found."""

@@ -2,8 +2,6 @@
 
 A command is 16 bytes on a bulk OUT endpoint (docs/spb1-usb.md), several may share a transfer. Every one is
 acknowledged with 16 bytes, in order: on an IN endpoint of their own, or as payload of control blocks in the stream.
-
-Commands to an SPB1 device and what it answers, over an endpoint of its own or inside the stream.
 """
 
 import struct
@@ -38,7 +36,7 @@ TEXT_BYTES: Final = 64
 
 
 class Op(IntEnum):
-    """What a command asks for."""
+    """Operations that a command can ask for."""
 
     READ = 1
     WRITE = 2
@@ -53,7 +51,7 @@ class Op(IntEnum):
 
 
 class AckStatus(IntEnum):
-    """How a command went."""
+    """Outcomes of a command."""
 
     OK = 0
     UNKNOWN_OP = 1
@@ -63,7 +61,7 @@ class AckStatus(IntEnum):
 
 
 class SensorState(IntEnum):
-    """Where the device stands (register STATE)."""
+    """States of the device (register STATE)."""
 
     IDLE = 0
     ARMED = 1
@@ -72,7 +70,7 @@ class SensorState(IntEnum):
 
 
 class Feature(IntFlag):
-    """What a device can do (register FEATURES)."""
+    """Abilities of a device (register FEATURES)."""
 
     BURST = 1 << 0
     STREAM = 1 << 1
@@ -104,7 +102,7 @@ class Register(IntEnum):
     """Most entries of all window tables together."""
 
     HEARTBEAT_MS = 0x0100
-    """Without a PING for so long a run ends with the gate low; 0: never."""
+    """Time without a PING after which a run ends with the gate low; 0: never."""
     STATE = 0x0104
     PERIOD_TICKS = 0x0110
     EXPOSURE_TICKS = 0x0114
@@ -140,7 +138,7 @@ class Command:
     value: int = 0
 
     def packed(self) -> bytes:
-        """Its 16 bytes."""
+        """The command's 16 bytes."""
         return COMMAND.pack(COMMAND_MAGIC, self.op, self.request_id, self.address, self.value)
 
 
@@ -154,7 +152,7 @@ class Ack:
     value: int
 
     def packed(self) -> bytes:
-        """Its 16 bytes."""
+        """The acknowledgement's 16 bytes."""
         return ACK.pack(ACK_MAGIC, self.op, self.request_id, self.status, self.value)
 
 
@@ -208,7 +206,7 @@ _QUIET_S = 0.003
 _DRAIN_S = 1.0
 _TRIES = 3
 TAP_PORT = "control"
-"""What a tap calls it, whatever endpoints it goes over."""
+"""Name of the control plane in a tap's file, whatever endpoints it goes over."""
 
 
 class ControlChannel:
@@ -228,7 +226,7 @@ class ControlChannel:
         self._request_id = 0
         self._received: list[Ack] = []
         self.on_wait: Callable[[float], None] | None = None
-        """Told of each piece of a wait in vain, in seconds."""
+        """Called for each piece of a wait in vain, with its seconds."""
 
     @property
     def has_acks(self) -> bool:
@@ -236,11 +234,12 @@ class ControlChannel:
         return self._ack_in is not None
 
     def read(self, register: int) -> int:
-        """A register."""
+        """The value of a register."""
         return self.read_all((register,))[0]
 
     def read_all(self, registers: Sequence[int]) -> list[int]:
-        """Several registers, each asked for twice: acknowledgements carry no checksum, and a value may just change.
+        """The values of several registers, each asked for twice: acknowledgements carry no checksum, and a value may
+        just change.
 
         `ProtocolError` where the answers never agree.
         """
@@ -262,11 +261,11 @@ class ControlChannel:
         return raw.split(b"\0")[0].decode("utf-8", "replace").strip()
 
     def write_all(self, values: Iterable[tuple[int, int]]) -> None:
-        """Several registers. `DeviceFault` where the device refuses one."""
+        """Write several registers. `DeviceFault` where the device refuses one."""
         self._ask([(Op.WRITE, register, value) for register, value in values])
 
     def send(self, op: Op, value: int = 0) -> Ack:
-        """One command. `DeviceFault` where the device refuses it."""
+        """Send one command. `DeviceFault` where the device refuses it."""
         return self._ask([(op, 0, value)])[0]
 
     def ping(self, value: int) -> None:
@@ -274,7 +273,9 @@ class ControlChannel:
         self.send_in_run(Op.PING, value)
 
     def send_in_run(self, op: Op, value: int = 0) -> None:
-        """One command while the stream runs: the answer is waited for only where it does not come in the stream."""
+        """Send one command while the stream runs: the answer is waited for only where it does not come in the
+        stream.
+        """
         if self._ack_in is not None:
             self.send(op, value)
         else:

@@ -1,11 +1,8 @@
-"""Where things lie in an SPB1 block (SPB1 1.0 wire layout, docs/spb1.md).
+"""The layout of an SPB1 block (SPB1 1.0 wire layout, docs/spb1.md) and its checksum.
 
 Little-endian: header 96 B, records 16 B per frame, zeros to a multiple of 64, packed pixels, trailer 32 B, zeros to the
-stride.
-
-CRC-32 as zlib defines it, from ISA-L where that is installed: 12 GB/s on a core, zlib's own 3.5.
-
-Both read large buffers without the interpreter's lock.
+stride. The checksum is CRC-32 as zlib defines it, from ISA-L where that is installed (12 GB/s on a core, zlib's own
+3.5). Both read large buffers without the interpreter's lock.
 """
 
 import struct
@@ -68,7 +65,7 @@ class BlockLayout:
 
     @property
     def pixels_offset(self) -> int:
-        """From the block's start; a multiple of `PIXELS_ALIGN`."""
+        """Offset of the pixels from the block's start; a multiple of `PIXELS_ALIGN`."""
         return round_up(HEADER_BYTES + FRAME_RECORD.itemsize * self.n_frames, PIXELS_ALIGN)
 
     @property
@@ -88,7 +85,9 @@ class BlockLayout:
 
 
 def frames_per_block(stride: int, width: int, height: int) -> int:
-    """How many frames of width x height fit into a stride. ValueError where the stride is bad or holds no frame."""
+    """Number of frames of width x height that fit into a stride. ValueError where the stride is bad or holds no
+    frame.
+    """
     check_stride(stride)
     one = BlockLayout(1, width, height)
     room = stride - HEADER_BYTES - TRAILER_BYTES

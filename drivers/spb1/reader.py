@@ -1,9 +1,7 @@
-"""Reading one SPB1 block over the memory it lies in.
+"""Reading SPB1 blocks: one over the memory it lies in, or a stream of them, damage and all.
 
 Header and trailer are always checked in full; the payload's CRC on request, since it reads every byte: at full rate
-that would cost a live path a good part of a core.
-
-Walking a stream of SPB1 blocks, damage and all: nothing damaged is passed on, nothing is passed over in silence.
+that would cost a live path a good part of a core. Nothing damaged is passed on, nothing is passed over in silence.
 """
 
 from collections.abc import Iterator
@@ -281,9 +279,9 @@ class Placed:
 
 
 def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[Placed | Damage]:
-    """As `walk_blocks`, with the places of the blocks and in whatever order they come, twice too.
+    """Walk the blocks as `walk_blocks` does, with their places, and in whatever order they come, even twice.
 
-    A block of another sort is damage here: it costs what is behind it nothing.
+    A block of another sort is damage here, but what is behind it is read all the same.
     """
     if stride is not None:
         check_stride(stride)

@@ -37,7 +37,7 @@ _LAST, _LOST_BEFORE, _FORCED_LOW = (
 )
 """Plain numbers: arithmetic with flags takes microseconds, ten times a block."""
 _ROOMY_RING = 8
-"""From so many slots on, two reads are kept in flight even where the ring is full."""
+"""Number of slots from which on two reads are kept in flight even where the ring is full."""
 
 
 class Reads(Protocol):
@@ -63,7 +63,7 @@ class Reads(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Armed:
-    """What the blocks of a run must look like."""
+    """Properties that the blocks of a run must have."""
 
     run_id: int
     stride: int
@@ -76,7 +76,7 @@ class Armed:
 
 
 class Took(Enum):
-    """What a read turned out to be."""
+    """Outcomes of a read."""
 
     NOTHING = "nothing came in time"
     CONTROL = "a control block, or what is left over from another run"
@@ -99,14 +99,14 @@ class BlockReceiver:
     def __init__(self, reads: Reads, endpoint: int, armed: Armed, label: str) -> None:
         self.delivered = 0
         self.next_frame = 0
-        """Behind the last frame that is known to have been exposed."""
+        """Number of the frame behind the last one that is known to have been exposed."""
         self.crc_errors = 0
         """Blocks refused: damaged, out of order or of another geometry."""
         self.resyncs = 0
         self.ended = False
-        """The run's last block came."""
+        """Whether the run's last block came."""
         self.gate_forced_low = False
-        """The device's watchdog ended the run."""
+        """Whether the device's watchdog ended the run."""
         self._reads = reads
         self._endpoint = endpoint
         self._armed = armed
@@ -253,7 +253,7 @@ class BlockReceiver:
             raise CorruptBlock(f"block {block.header.block_seq}: a window lies beyond the row or off its words")
 
     def _note(self, fields: HeaderFields, n_frames: int) -> None:
-        """Count what the header says was exposed."""
+        """Count the frames that the header says were exposed."""
         block = fields.block
         self._last_seq = max(self._last_seq, block.block_seq)
         self.next_frame = max(self.next_frame, block.first_frame + n_frames)
@@ -262,7 +262,7 @@ class BlockReceiver:
         self.gate_forced_low = self.gate_forced_low or bool(flags & _FORCED_LOW)
 
     def _hand_over(self, item: _Item, block: FrameBlock) -> None:
-        """Publish; what came into spare memory is copied or dropped."""
+        """Publish; a block that came into spare memory is copied or dropped."""
         assert self._ring is not None, "set by take"
         block = self._as_received(block)
         if not item.slot:

@@ -6,11 +6,9 @@ Outputs (docs/hardware.md, Wiring and timing): GPIO0 triggers the SPAD, GPIO1 is
 The firmware has no loops and no watchdog. So programs are written out in full and end on two words that hold everything
 low, whatever happens to the host. It cannot read its pins while a program runs, nor tell a wait from play.
 
-Turns pulses into the words of a PrawnDO program, and refuses what the board would play otherwise than written.
-
-A word is 16 outputs and a number of cycles (docs/hardware.md): 0 cycles wait for the trigger, two such words in
-a row are the end, with the first one's outputs left on the pins. The trigger is a level, so that a wait passes at once
-while it is high: that is how a held pulse looks at the scan marker.
+A word is 16 outputs and a number of cycles: 0 cycles wait for the trigger, two such words in a row are the end, with
+the first one's outputs left on the pins. The trigger is a level, so that a wait passes at once while it is high: that
+is how a held pulse looks at the scan marker. Pulses that the board would play otherwise than written are refused.
 """
 
 import logging
@@ -52,7 +50,7 @@ WORD = np.dtype([("outputs", "<u2"), ("cycles", "<u4")])
 
 @dataclass(frozen=True, slots=True)
 class ProgramLimits:
-    """What bounds a program. trigger_pulse_s: the longest scan marker of a program without held pulses."""
+    """Limits of a program. trigger_pulse_s: the longest scan marker of a program without held pulses."""
 
     name: str
     clock_hz: float
@@ -76,7 +74,7 @@ def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits)
 
 
 def most_repeats(pulses: Sequence[Pulse], board: ProgramLimits) -> int:
-    """How often a period fits into the board beside the end."""
+    """Number of times a period fits into the board's memory beside the words at the end."""
     return (board.max_words - 3) // len(sliced(pulses))
 
 
@@ -100,7 +98,9 @@ def _cycles(index: int, pulse: Pulse, board: ProgramLimits) -> int:
 
 
 def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -> None:
-    """Between two waits the program plays longer than a scan marker, or one marker would end both (pitfall 1)."""
+    """Check that between two waits the program plays longer than a scan marker: else one marker would end both (pitfall
+    1).
+    """
     waits = np.flatnonzero(period["cycles"] == 0)
     if len(waits) == 0:
         return
@@ -123,7 +123,7 @@ INTERNAL_HZ = 100_000_000
 """The board's own clock (docs/hardware.md)."""
 MAX_WORDS = {"board: pico1": 30_000, "board: pico2": 60_000}
 OLDEST_FIRMWARE = (1, 3)
-"""`adm` takes a start address, and `brd` exists, from here on."""
+"""Oldest firmware: from here on `adm` takes a start address, and `brd` exists."""
 _CLOCK_CHANGE_S = 0.02
 """Time for the board to find out that there is no clock on GPIO20."""
 _CLOCK_TOLERANCE = 0.01
@@ -199,7 +199,7 @@ class PrawnDo(SyncSource):
         return self._line.port_lost
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
-        """As often as they fit into the board's memory: there are no loops."""
+        """The number of times `pulses` fit into the board's memory: there are no loops."""
         return most_repeats(pulses, self._board)
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
@@ -280,7 +280,7 @@ class PrawnDo(SyncSource):
             raise DeviceFault(f"{self.name}: {lines} after a program of {n_words} words; load it again")
 
     def _forget_program(self) -> None:
-        """Nothing of a program that did not arrive whole may ever be run."""
+        """Clear a program that did not arrive whole: nothing of it may ever be run."""
         try:
             self._line.command("cls")
         except DeviceError as error:

@@ -32,21 +32,21 @@ _RESUSCITATED = "System Clock Resus'd"
 _CHUNK_BYTES = 4032
 """Bytes per write while a program is loaded: sixteen of the firmware's own pieces of 42 words."""
 _SLICE_S = 0.02
-"""How soon a command under way gives way to the gate."""
+"""Longest time until a command under way gives way to the gate."""
 
 
 @dataclass(frozen=True, slots=True)
 class PrawnDoTiming:
-    """How long the line waits. Over USB a reply takes 1 ms; the rest is for a loaded host."""
+    """Deadlines of the line. Over USB a reply takes 1 ms; the rest is for a loaded host."""
 
     reply_s: float = 0.5
-    """For a reply."""
+    """Deadline for a reply."""
     hasty_s: float = 0.06
-    """The same on the way to low outputs, where asking again is better than waiting."""
+    """Deadline for a reply on the way to low outputs, where asking again is better than waiting."""
     lower_s: float = 0.5
-    """For outputs to be confirmed low."""
+    """Deadline for outputs to be confirmed low."""
     load_s: float = 5.0
-    """For the answer to a program: 360 kB at USB full speed, with much to spare."""
+    """Deadline for the answer to a program: 360 kB at USB full speed, with much to spare."""
 
 
 USUAL_TIMING = PrawnDoTiming()
@@ -82,7 +82,7 @@ class PrawnDoLine:
         self._port.close()
 
     def connect(self, most_words: int) -> None:
-        """All outputs low, before anything else is asked, whatever state a former host left the board in.
+        """Take all outputs low, before anything else is asked, whatever state a former host left the board in.
 
         most_words: of any board. `ProtocolError` where something else answers, `DeviceTimeout` where nothing does.
         """
@@ -164,7 +164,8 @@ class PrawnDoLine:
         return self._pins(hasty_s, urgent=True) == 0 and self._run_status(hasty_s, urgent=True)[0] in IDLE
 
     def _free_wedged(self, most_words: int) -> None:
-        """A program that another host never finished sending swallows all commands: give it what it waits for.
+        """Free a board that a program which another host never finished sending keeps from hearing commands: give it
+        the rest.
 
         Zeros are words that wait with all outputs low (5.1, pitfall 4).
         """
@@ -209,7 +210,7 @@ class PrawnDoLine:
         return self._ask_twice("gto", lambda line: int(line, 16), deadline_s, urgent)
 
     def _ask_twice(self, command: str, parse: Callable[[str], _T], deadline_s: float, urgent: bool) -> _T:
-        """A flipped bit makes a low gate of a high one: only two answers that agree are an answer."""
+        """Ask until two answers in a row agree: a flipped bit makes a low gate of a high one."""
         lines = self._transact(f"{command}\n{command}", deadline_s, urgent)
         try:
             first, second = (parse(line) for line in lines)

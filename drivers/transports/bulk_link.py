@@ -1,13 +1,11 @@
 """A USB device that streams: commands and answers, and reads that are queued so that its FIFO never starves.
 
-Two implementations: `drivers.transports.bulk_link` reads one piece after the other through pyusb, with a gap between
-two; `queued_link` keeps many transfers in flight through asynchronous libusb, which write straight into the caller's
-memory. tests/benchmarks/spb_usb.py compares them. Both have a deadline on every call and our errors.
+Two implementations: `PlainLink`, here, reads one piece after the other through pyusb, with a gap between two;
+`queued_link` keeps many transfers in flight through asynchronous libusb, which write straight into the caller's memory.
+tests/benchmarks/spb_usb.py compares them. Both have a deadline on every call and our errors.
 
 A queue belongs to one thread at a time. Buffers are whole packets long and stay the caller's until `reap` or `cancel`
 gives them back.
-
-A streaming USB device read by pyusb, one piece after the other: nothing is queued between two reads.
 """
 
 import array
@@ -24,7 +22,7 @@ Buffer = NDArray[np.uint8]
 
 
 class BulkLink(Protocol):
-    """What a streaming driver needs of its device."""
+    """The abilities that a streaming driver needs of its device."""
 
     label: str
     endpoints: frozenset[int]
@@ -67,7 +65,7 @@ class BulkLink(Protocol):
 
 
 class PlainLink:
-    """A `BulkLink`."""
+    """A streaming USB device read through pyusb, one piece after the other."""
 
     def __init__(self, device: UsbDevice) -> None:
         self.label = device.label
@@ -97,12 +95,12 @@ class PlainLink:
         return self._device.control_in(request_type, request, value, index, length, timeout_s)
 
     def submit(self, endpoint: int, buffer: Buffer) -> bool:
-        """Remember it for `reap`."""
+        """Remember the buffer for `reap`."""
         self._queue.append((endpoint, buffer))
         return True
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
-        """Read the oldest now. What a time-out interrupts goes on with the next call."""
+        """Read the oldest queued buffer now. What a time-out interrupts goes on with the next call."""
         if not self._queue:
             return None
         endpoint, buffer = self._queue[0]

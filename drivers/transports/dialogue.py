@@ -1,14 +1,12 @@
 """A dialogue with a device that answers one command at a time: paced, checked, and back in step after a lost reply.
 
-Nothing on a laser's line checks or numbers a reply (docs/hardware.md): one that comes late is taken for
-the answer to the next command. So the input is dropped before each command, each reply must have the form that its
-command calls for, and after one that has not, or none at all, the line is drained and a question asked whose answer is
-known. What a make's commands and replies look like is its `Framing`.
+Nothing on a laser's line checks or numbers a reply (docs/hardware.mds 4.1 and 4.2): one that comes late is taken for
+the answer to the next command. So the input is dropped before each command, and each reply must have the form that its
+command calls for. After one that has not, or none at all, the line is drained and a question asked whose answer is
+known. The form of a make's commands and replies is its `Framing`.
 
-A lock that serves threads in turn: whoever waits gets it before the thread that had it last gets it again.
-
-A thread that polls a slow device takes its lock again as soon as it gave it back; with a plain lock the thread that
-wants to switch the laser off may wait for ever.
+Threads take turns by a `FairLock`: a thread that polls a slow device takes its lock again as soon as it gave it back,
+and with a plain lock the thread that wants to switch the laser off may wait for ever.
 """
 
 import re
@@ -24,7 +22,9 @@ from drivers.transports.serial_port import SerialPort
 
 
 class FairLock:
-    """To be used by `with`; not re-entrant."""
+    """A lock for `with` that serves threads in turn: whoever waits gets it before the thread that had it last; not
+    re-entrant.
+    """
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
@@ -52,16 +52,16 @@ _ATTEMPTS = 3
 
 @dataclass(frozen=True, slots=True)
 class LineTiming:
-    """How long the line waits. The defaults suit a laser; the emulators' campaigns run the same code faster."""
+    """Times of the line. The defaults suit a laser; tests with emulators run the same code faster."""
 
     gap_s: float = 0.0
-    """Between a reply and the next command, at least."""
+    """Shortest time between a reply and the next command."""
     reply_s: float = 1.0
-    """For each line of a reply."""
+    """Deadline for each line of a reply."""
     quiet_s: float = 0.3
-    """A line is drained once nothing came for so long..."""
+    """Silence after which a line counts as drained."""
     drain_s: float = 1.0
-    """...or after this long at most."""
+    """Longest time for which a line is drained."""
 
 
 class CommandRefused(ProtocolError):  # noqa: N818 - named after what happened, as all device errors
@@ -69,7 +69,7 @@ class CommandRefused(ProtocolError):  # noqa: N818 - named after what happened, 
 
 
 class Framing(Protocol):
-    """How one make writes commands and replies."""
+    """The form of one make's commands and replies."""
 
     @property
     def ping(self) -> str:
@@ -89,7 +89,7 @@ class Framing(Protocol):
         ...
 
     def refusal(self, reply: str) -> str | None:
-        """What a reply means that refuses its command; None: it does not."""
+        """The reason for which `reply` refuses its command; None: it does not."""
         ...
 
 
@@ -149,7 +149,9 @@ class Dialogue:
         return float(self.ask(command, NUMBER))
 
     def ask_surely(self, command: str, form: re.Pattern[str]) -> str:
-        """As `ask`, until two replies in a row agree: for what is kept, or ends a scan; nothing else guards a bit."""
+        """Ask until two replies in a row agree. For answers that are kept, or that end a scan: nothing else guards
+        against a flipped bit.
+        """
         last = self.ask(command, form)
         for _ in range(_ATTEMPTS):
             reply = self.ask(command, form)

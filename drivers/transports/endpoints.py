@@ -1,4 +1,4 @@
-"""Where a device is found: a real address, or one that an emulating world created in this process."""
+"""The address of a device: a real one, or one that an emulating world created in this process."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

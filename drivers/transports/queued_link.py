@@ -18,7 +18,7 @@ from drivers.transports.usb_device import USBFS_HINT, UsbListing, milliseconds, 
 _log = logging.getLogger(__name__)
 
 _CANCEL_S = 1.0
-"""Cancelled transfers are waited for at most so long."""
+"""Longest wait for cancelled transfers."""
 _ERRNO = {
     -1: errno.EIO,
     -3: errno.EACCES,
@@ -94,7 +94,7 @@ class QueuedLink:
             return bytes(self._handle.controlRead(request_type, request, value, index, length, milliseconds(timeout_s)))
 
     def submit(self, endpoint: int, buffer: Buffer) -> bool:
-        """Queue it; False where the kernel's memory for transfers is used up and at least one is in flight."""
+        """Queue a read; False where the kernel's memory for transfers is used up and at least one is in flight."""
         read = _Read(self._transfer(), buffer)
         with self._translated(endpoint):
             try:
@@ -109,7 +109,7 @@ class QueuedLink:
         return True
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
-        """Handle events until the oldest is over or the time is."""
+        """Handle events until the oldest read is over or the time is."""
         if not self._queue or not self._wait(self._queue[0], timeout_s):
             return None
         read = self._queue.popleft()
@@ -119,7 +119,7 @@ class QueuedLink:
         return read.buffer, read.got
 
     def cancel(self) -> None:
-        """End all; waits until the kernel has let go of their memory."""
+        """Cancel all reads; waits until the kernel has let go of their memory."""
         for read in reversed(self._queue):  # the newest first, so that none of them begins meanwhile
             with suppress(self._usb1.USBError):
                 read.transfer.cancel()
@@ -167,7 +167,7 @@ class QueuedLink:
         raise DeviceNotFound(f"{self.label}: gone since it was found; plug it in again")
 
     def _hint(self, size: int) -> None:
-        """Once: the kernel takes no more."""
+        """Tell once how the kernel can be made to take more transfers."""
         if not self._hinted:
             self._hinted = True
             _log.warning(
@@ -210,7 +210,7 @@ class _Read:
         self.status = -1
 
     def begin(self, endpoint: int, timeout_ms: int) -> None:
-        """Hand it to libusb."""
+        """Hand the read to libusb."""
         self.endpoint = endpoint
         self.transfer.setBulk(endpoint, self.buffer.data, callback=self._done, timeout=timeout_ms)
         self.transfer.submit()

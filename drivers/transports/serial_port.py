@@ -53,7 +53,7 @@ class SerialPort:
     """
 
     def __init__(self, name: str, address: str, baud: int = 115_200, tap: Tap | None = None) -> None:
-        """Open it. name: what messages call the device. tap: told of all that passes.
+        """Open the port. name: the device's name in messages. tap: told of all that passes.
 
         address: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
         vendor and product, the only one attached). Raises `DeviceNotFound`, `DevicePermission` or `DeviceBusy`.
@@ -184,7 +184,7 @@ class SerialPort:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Whatever pyserial raises about an open port means that it is gone."""
+        """Raise our error for everything that pyserial raises about an open port: it means that the port is gone."""
         try:
             yield
         except (*_FOREIGN, TypeError) as error:

@@ -29,14 +29,16 @@ _Lines = SimpleQueue[bytes | threading.Event | None]
 
 @dataclass(frozen=True, slots=True)
 class TapFile:
-    """Where taps write, and the time that counts as 0 (`time.monotonic_ns`). Crosses processes as its two fields."""
+    """The file to which taps write, and the time that counts as 0 (`time.monotonic_ns`). Its two fields can be handed
+    to another process.
+    """
 
     path: str
     start_ns: int
 
     @classmethod
     def begin(cls, path: Path) -> "TapFile":
-        """From now on."""
+        """Begin now: the present time counts as 0."""
         return cls(str(path.absolute()), time.monotonic_ns())
 
     def tap(self, device: str) -> "Tap":
@@ -66,7 +68,7 @@ class Tap:
         self._starting = threading.Lock()
 
     def note(self, port: str, direction: str, data: bytes) -> None:
-        """A piece of bytes; of none nothing is noted. Returns at once."""
+        """Note a piece of bytes; an empty one is not noted. Returns at once."""
         if not data:
             return
         t_ns = time.monotonic_ns() - self._file.start_ns
@@ -123,7 +125,9 @@ class Passed:
 
 
 def read_taps(file: Path) -> list[Passed]:
-    """All that passed, in order of time; a torn last line is left out. `ProtocolError` for one that is none."""
+    """Everything that passed, in order of time; a torn last line is left out. `ProtocolError` for a file that is no
+    tap's.
+    """
     *lines, _ = file.read_bytes().split(b"\n")
     found = []
     for number, line in enumerate(lines, 1):

@@ -15,14 +15,14 @@ from drivers.errors import DeviceDisconnected, DeviceError, DeviceNotFound, Devi
 
 _FORBIDDEN = (errno.EACCES, errno.EPERM)
 _CHUNK_BYTES = 65_536
-"""Most that `receive` takes at a time."""
+"""Largest number of bytes that `receive` takes at a time."""
 
 
 class TcpStream:
     """An open connection. `close` is idempotent. For one thread, but for `close`."""
 
     def __init__(self, name: str, address: str, *, connect_s: float = 5.0) -> None:
-        """Connect. name: what messages call the device; address: "host:port".
+        """Connect. name: the device's name in messages; address: "host:port".
 
         Raises `DeviceNotFound` (refused, unreachable, silent or no such host) or `DevicePermission`.
         """
@@ -39,7 +39,7 @@ class TcpStream:
 
     @property
     def address(self) -> str:
-        """Where it is connected to."""
+        """The address that it is connected to."""
         return self._address
 
     def send(self, data: bytes, deadline_s: float) -> None:
@@ -54,12 +54,14 @@ class TcpStream:
                     rest = rest[self._socket.send(rest) :]
 
     def receive(self, deadline_s: float, limit: int = _CHUNK_BYTES) -> bytes:
-        """What there is, at least one byte; b"" where nothing came within the deadline. `DeviceDisconnected`."""
+        """The bytes that have come, at least one; b"" where nothing came within the deadline. `DeviceDisconnected`."""
         buffer = bytearray(limit)
         return bytes(buffer[: self.receive_into(memoryview(buffer), deadline_s)])
 
     def receive_into(self, view: memoryview, deadline_s: float) -> int:
-        """As `receive`, into `view` (bytes, not empty); returns how many, 0 past the deadline."""
+        """Receive into `view` (bytes, not empty); returns the number of bytes, 0 past the deadline.
+        `DeviceDisconnected`.
+        """
         ends_at = time.monotonic() + deadline_s
         while True:
             with self._translated():
@@ -74,7 +76,7 @@ class TcpStream:
             return n
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
-        """All that comes until the line is quiet for `quiet_s`, at most for `deadline_s`; to be dropped."""
+        """Take, to be dropped, all that comes until the line is quiet for `quiet_s`, at most for `deadline_s`."""
         ends_at = time.monotonic() + deadline_s
         dropped = bytearray()
         while (left_s := ends_at - time.monotonic()) > 0 and (data := self.receive(min(quiet_s, left_s))):
@@ -102,7 +104,9 @@ class TcpStream:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Whatever a socket raises about an open connection means that it is gone."""
+        """Raise our error for everything that a socket raises about an open connection: it means that the connection is
+        gone.
+        """
         try:
             yield
         except (OSError, ValueError) as error:

@@ -7,10 +7,9 @@ addresses to choose from. `backend` is pyusb's: None for the real libusb, an emu
 pyusb is synchronous: between two reads nothing is queued, so the device's FIFO must hold that long. A stream that
 cannot wait needs several transfers in flight, which pyusb does not offer (package `libusb1` does).
 
-What goes wrong on USB, as one line and one class of `drivers.errors`.
-
-Errors as libusb 1.0 numbers them and as Linux means them: unplugging shows as ENODEV, EIO or ESHUTDOWN; a read shorter
-than a packet overflows and loses the packet; the sum of all queued transfers is limited by `usbfs_memory_mb` (16).
+Errors are numbered by libusb 1.0 and mean what Linux means by them: unplugging shows as ENODEV, EIO or ESHUTDOWN; a
+read shorter than a packet overflows and loses the packet; the sum of all queued transfers is limited by
+`usbfs_memory_mb` (16).
 """
 
 import array
@@ -45,7 +44,7 @@ _LOST = (errno.ENODEV, errno.EIO, errno.ESHUTDOWN, errno.ENOTCONN)
 
 
 def no_permission(label: str) -> str:
-    """For a device that is there and may not be opened."""
+    """The error for a device that is there and may not be opened."""
     return f"{label}: no permission to open it; install {UDEV_RULES} (its first lines say how) and plug it in again"
 
 
@@ -84,7 +83,9 @@ def usb_failure(
 
 @dataclass(frozen=True, slots=True)
 class UsbId:
-    """What to look for. Vendors share numbers: one of `product_names`, if any, must be part of the product string."""
+    """The ids by which a device is found. Vendors share numbers: one of `product_names`, if any, must be part of the
+    product string.
+    """
 
     label: str
     vendor: int
@@ -185,7 +186,7 @@ class UsbDevice:
         return data
 
     def read_into(self, endpoint: int, buffer: "array.array[int]", timeout_s: float) -> int:
-        """As `read`, into an existing array (its own size in whole packets); returns the bytes read."""
+        """Read into an existing array (its own size in whole packets); returns the number of bytes read."""
         with translated(self.label, endpoint, timeout_s):
             return int(self._device.read(endpoint, buffer, milliseconds(timeout_s)))
 
@@ -330,5 +331,5 @@ def _libusb() -> Any:
 
 
 def milliseconds(timeout_s: float) -> int:
-    """libusb takes 0 as 'for ever', which no call here may ask for."""
+    """The time in milliseconds, at least 1: libusb takes 0 as 'for ever', which no call here may ask for."""
     return max(1, round(timeout_s * 1000))

@@ -1,4 +1,4 @@
-"""Where a simulated device stands: on the bench of the world it was created in, or on one of its own."""
+"""The place of a simulated device: the bench of the world it was created in, or one of its own."""
 
 from calibration.model.rig_model import Lag
 from drivers.errors import DeviceError

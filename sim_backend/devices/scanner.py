@@ -14,7 +14,7 @@ from sim_backend.devices.place import bench_of, note_effect
 from sim_backend.mirror_motion import Jitter
 
 MASTER_HZ = 48_000_000
-"""The point clock is this divided by a whole number, as in a timer of a microcontroller."""
+"""Master clock: the point clock is this divided by a whole number, as in a timer of a microcontroller."""
 
 LIMITS = ScannerLimits(
     command_range=(-1.0, 1.0),
@@ -25,7 +25,7 @@ LIMITS = ScannerLimits(
     max_points=1_000_000,
     point_rate_hz=(1e3, 200e3),
 )
-"""A fast small galvo: full sweep in half a millisecond."""
+"""Limits of a fast small galvo: full sweep in half a millisecond."""
 
 
 class SimulatedScannerConfig(KindConfig):
@@ -37,11 +37,11 @@ class SimulatedScannerConfig(KindConfig):
     clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 20e-6
     """Relative error of the scanner's crystal."""
     start_latency: Annotated[Seconds, Field(ge=0)] = 1.3373e-3
-    """From `start` to the first point; no whole number of frames."""
+    """Time from `start` to the first point; no whole number of frames."""
     jitter: float = Field(default=0.0, ge=0, le=0.1)
     """Standard deviation of the mirror's random error, in units of the drive; a column of the bundled rig is 3.5e-3."""
     serial: str = Field(default="SIM-MIRROR-0001", min_length=1)
-    """What it says of itself; another one is another scanner, which needs a calibration of its own."""
+    """Serial number. A scanner with another one needs a calibration of its own."""
 
 
 class SimulatedScanner(BeamScanner):
@@ -60,7 +60,7 @@ class SimulatedScanner(BeamScanner):
 
     @property
     def serial(self) -> str:
-        """The config's."""
+        """The serial number in the config."""
         return self._config.serial
 
     def _do_status(self) -> ScannerStatus:

@@ -1,17 +1,15 @@
 """The simulated SPAD array: asks the bench what happened during its frames and draws them, block by block.
 
 On a `VirtualClock` time passes as frames are made; on any other clock a block comes when its last frame has been
-exposed. Its tick counter runs on a crystal of its own (`clock_error`, `clock_wander`).
+exposed.
 
-What becomes of frames between the simulated SPAD's pixels and the computer: some get lost, some come twice.
+On the way to the computer some frames get lost, some come twice. A frame comes twice where the memory before the link
+gives its last entry once more instead of the next one: pixels, markers, counters and ticks are all those of the frame
+before, and the frame itself is gone. Its number is the next one all the same, since blocks count what they hold; only
+its ticks tell. Which frames follows from seed and number.
 
-A frame comes twice where the memory before the link gives its last entry once more instead of the next one: pixels,
-markers, counters and ticks are all those of the frame before, and the frame itself is gone. Its number is the next one
-all the same, since blocks count what they hold; only its ticks tell. Which frames follows from seed and number.
-
-Frame records of the simulated SPAD: which edges and levels fell into which frame.
-
-The SPAD's crystal against the time of the bench: off by a constant, and wandering.
+The tick counter runs on a crystal of its own (`clock_error`, `clock_wander`), off from the time of the bench by a
+constant, and wandering:
 
     dt/dtick = 1 / (tick_hz (1 + y)),    y = error + W,    W a random walk: var W(t) = wander^2 t
 
@@ -44,7 +42,7 @@ from sim_backend.frames.photons import PhotonSource
 from sim_backend.world import SimulatedWorld
 
 _TWICE = np.uint64(0xE7037ED1A0B428DB)
-"""Keeps the draws of frames that come twice apart from those that get lost."""
+"""Stream that keeps the draws of frames that come twice apart from those of frames that get lost."""
 
 
 class FrameLink:
@@ -59,7 +57,7 @@ class FrameLink:
         self._seed = np.uint64(seed & 0xFFFFFFFFFFFFFFFF)
 
     def loses(self, first_frame: int, n: int) -> NDArray[np.bool_]:
-        """Which of n frames get lost, bool (n,)."""
+        """Mask of the frames that get lost, bool (n,)."""
         lost: NDArray[np.bool_] = dropped_frames(self._seed, first_frame, n, self._loss)
         named = self._lost_frames[np.searchsorted(self._lost_frames, first_frame) :]
         lost[named[named < first_frame + n] - first_frame] = True
@@ -143,12 +141,14 @@ class TickClock:
         self._sd = wander * np.sqrt(self._step_ticks * tick_s)
         self._random = np.random.default_rng(seed)
         self._step = 0
-        """Of the first one in the lists: steps that nobody will ask for any more are forgotten."""
+        """Number of the first step in the lists: steps that nobody will ask for any more are forgotten."""
         self._start_s = [start_s]
         self._error = [error]
 
     def times_s(self, first_tick: int, period_ticks: int, n: int) -> Array:
-        """When the counter is at n ticks, one period apart, float64 (n,). Not before the first of the last call."""
+        """Times at which the counter is at n ticks, one period apart, float64 (n,). Not before the first of the last
+        call.
+        """
         ticks = first_tick + period_ticks * np.arange(n)
         step = ticks // self._step_ticks
         while self._step + len(self._error) <= step[-1]:
@@ -168,11 +168,12 @@ TICK_HZ = 100_000_000
 """
 TICKS_PER_FRAME = 1024
 LINK_BYTES_PER_S = 8e9
-"""More than any frame rate needs: unless the config names a `link`, it is no bottleneck."""
+"""Bytes a second, more than any frame rate needs: unless the config names a `link`, it is no bottleneck."""
 MAX_THREADS = 4
 START_BITS = 48
 MOST_STARTS = 0x3FFF
-"""Photons are drawn by the number of a frame: those of the second start are numbered from 2^48 on, and so on."""
+"""Mask of the number of a start. Photons are drawn by the number of a frame: those of the second start are numbered
+from 2^48 on, and so on."""
 
 
 class SimulatedSpadConfig(KindConfig):
@@ -183,7 +184,7 @@ class SimulatedSpadConfig(KindConfig):
     kind: Literal["simulated"] = "simulated"
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000)
     link: Annotated[BytesPerSecond, Field(gt=0)] = LINK_BYTES_PER_S
-    """What the link to the computer carries; where full frames are too much for it, windows are sent."""
+    """Bytes a second that the link to the computer carries; where full frames are too much for it, windows are sent."""
     lost_frames: tuple[int, ...] = ()
     """Numbers of frames that get lost on the way, to try gaps with."""
     loss_probability: float = Field(default=0.0, ge=0, le=1)
@@ -193,9 +194,9 @@ class SimulatedSpadConfig(KindConfig):
     clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 0.0
     """Relative error of the crystal."""
     clock_wander: Annotated[Ppm, Field(ge=0, le=1e-3)] = 0.0
-    """What a second adds to that error at random, as a standard deviation; it grows with the root of time."""
+    """Random change of that error in a second, as a standard deviation; it grows with the root of time."""
     serial: str = Field(default="SIM-0001", min_length=1)
-    """What it says of itself; another one is another sensor, which needs a calibration of its own."""
+    """Serial number. A sensor with another one needs a calibration of its own."""
 
 
 class SimulatedSpad(SpadArray):
@@ -310,7 +311,9 @@ class SimulatedSpad(SpadArray):
         return self._info.width if self._window is None else self._window.width_px
 
     def _frames_ahead(self) -> tuple[int, bool]:
-        """How many frames the next block holds, or (n, True): how many of the next frames get lost."""
+        """The number of frames that the next block holds, and False; or the number of the next frames that get lost,
+        and True.
+        """
         first = self._next_frame
         n = self._block_frames if self._n_frames is None else min(self._block_frames, self._n_frames - first)
         lost = self._link.loses(first, n)

@@ -9,7 +9,7 @@ from sim_backend.bench import Bench
 from sim_backend.devices.place import bench_of
 
 RESOLUTION_S = 1e-8
-"""One cycle of a 100 MHz pattern generator."""
+"""Resolution: one cycle of a 100 MHz pattern generator."""
 
 State = Literal["stopped", "waiting", "running", "aborted"]
 
@@ -32,7 +32,7 @@ class SimulatedSync(SyncSource):
 
     @property
     def resolution_s(self) -> float:
-        """10 ns."""
+        """The resolution, 10 ns."""
         return RESOLUTION_S
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:

@@ -1,1 +1,1 @@
-"""What light does between laser and sensor, one file per effect; what a scene does not call for is not imported."""
+"""Effects on the light between laser and sensor, one file each; one that no scene calls for is not imported."""

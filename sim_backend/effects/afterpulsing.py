@@ -32,7 +32,7 @@ from sim_backend.effects.setting import FrameTimes, Setting, Words
 from sim_backend.random_numbers import WORD_PX, frame_key
 
 _AFTER, _BLIND = np.uint64(0x9FB21C651E98DF25), np.uint64(0xD6E8FEB86659FD93)
-"""Keep these draws apart from those of photons and other effects."""
+"""Streams that keep these draws apart from those of photons and other effects."""
 
 
 class Afterpulsing:
@@ -100,7 +100,7 @@ def _clear(now: NDArray[np.uint64], earlier: NDArray[np.uint64], width: int, key
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _set(now: NDArray[np.uint64], earlier: NDArray[np.uint64], width: int, key: np.uint64, log_miss: float) -> None:
-    """As `_clear`, the other way."""
+    """Set each bit (rows, words) that is 1 in the earlier frame, with the probability that log_miss says."""
     draw = 0
     place = next_hit(-1.0, key, draw, log_miss)
     while place < len(now) * width:

@@ -19,7 +19,7 @@ from sim_backend.effects.setting import FrameTimes, Setting, Words
 from sim_backend.random_numbers import WORD_PX, frame_key
 
 _STREAM = np.uint64(0x8EBC6AF09C88C6E3)
-"""Keeps these draws apart from those of photons and other effects."""
+"""Stream that keeps these draws apart from those of photons and other effects."""
 
 
 class BitErrors:

@@ -11,7 +11,7 @@ from sim_backend.light.optics import ambient_irradiance
 
 Call = tuple[bool, str]
 EffectKind = Literal["laser", "steady", "bits", "within"]
-"""What an effect acts on: the sheet's light (`LaserEffect`), light or counts that are there without it
+"""The target of an effect: the sheet's light (`LaserEffect`), light or counts that are there without it
 (`SteadyEffect`), the sensor's bits (`BitEffect`); `within`: it is worked into a simulated device, another effect or the
 gain, which hold its code."""
 

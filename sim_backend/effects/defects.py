@@ -14,7 +14,7 @@ from sim_backend.effects.rare_bits import packed
 from sim_backend.effects.setting import FrameTimes, Setting, Words
 
 _STREAM = 2
-"""Of the sensor's seed: which pixels are hot in the dark is not asked again."""
+"""Stream of the sensor's seed, apart from the one that says which pixels are hot in the dark."""
 
 
 class Defects:

@@ -11,9 +11,10 @@ and in the sheet's own shadow along the row. Called for by `medium`.
 
 Per row everything is straight-line over the lit pixels, in two loops, so that it becomes vector instructions, and only
 those under the blurred end are walked one by one: 0.36 ms a mirror position for 512 x 512 pixels, half of them lit, in
-float64 and 0.19 in float32, where a walk with its own square roots, exponential and tests in every pixel took 2.2 ms in
-the same run. Kernels run in the precision of what they add to. In float32 the haze is right to 1e-5 at an optical depth
-of 10: by the divergence of `sim_backend.effect_planner` that is 1e-8 for a row's pixels in a column, of 2e-4."""
+float64 and 0.19 in float32. Kernels run in the precision of what they add to. In float32 the haze is right to 1e-5 at
+an optical depth of 10: by the divergence of `sim_backend.effect_planner` that is 1e-8 for a row's pixels in a column,
+of 2e-4.
+"""
 
 import math
 from dataclasses import dataclass
@@ -29,16 +30,19 @@ from sim_backend.light.sheet import LightSheet
 from sim_backend.random_numbers import HALVING, LOG2_E, power_of_half
 
 REACH_SIGMAS = 5.0
-"""The blurred end is cut here."""
+"""Sds at which the blurred end is cut."""
 LEAST_INVERSE_DEPTH = 1e-12
-"""In 1/m: what lies farther or behind the camera is taken as there."""
+"""Least inverse depth, in 1/m: what lies farther or behind the camera is taken as there."""
 Rays = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Numbers:
-    """What the kernel takes, in one precision. rays: u, v, |q| (rows, width) and source (3,); terms: (n, 3) weight, |g|
-    and sign of each Henyey-Greenstein term; halving: see `power_of_half`; simple: 0, 1, 2 and least inverse depth."""
+    """The kernel's numbers, in one precision.
+
+    rays: u, v, |q| (rows, width) and source (3,); terms: (n, 3) weight, |g| and sign of each Henyey-Greenstein term;
+    halving: see `power_of_half`; simple: 0, 1, 2 and least inverse depth.
+    """
 
     rays: Rays
     terms: NDArray[Any]

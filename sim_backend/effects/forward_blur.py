@@ -21,7 +21,7 @@ from sim_backend.light.sheet import LightSheet
 from sim_backend.scenes.medium import FORWARD_ANGLE
 
 MOST_TURNS = 600.0
-"""Of light turned more often nothing comes back; keeps exponentials finite."""
+"""Mean number of turns beyond which no light comes back; keeps exponentials finite."""
 
 
 class ForwardBlur:

@@ -32,7 +32,7 @@ NARROW, WIDE = math.radians(1.7), math.radians(6.0)
 MOST_EVEN = 0.18
 """eta of isotropic scattering at an optical depth of 1 and more."""
 MOST_DEPTH = 600.0
-"""Of what is so far off nothing comes back; keeps exponentials finite."""
+"""Optical depth beyond which no light comes back; keeps exponentials finite."""
 PEDESTAL, PEDESTAL_RISE, BEFORE = 0.16, 1.5, 0.8
 """The haze's further scattering: size, rise with the optical depth, and how much more of it there is before its end."""
 

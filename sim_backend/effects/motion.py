@@ -25,7 +25,7 @@ from sim_backend.light.view import CameraView
 
 HOLD_S = 1e-3
 KEPT_VIEWS = 8
-"""More than a block of frames takes; 10 MB each for 512 x 512 pixels."""
+"""Views that are kept, more than a block of frames takes; 10 MB each for 512 x 512 pixels."""
 SEARCH_STEPS = 3
 
 
@@ -58,7 +58,7 @@ class Motion:
         assert setting.view.motion is not None, "the world lets its surfaces move"
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Nothing: `View.at` is asked by what makes the light."""
+        """Add nothing: the effects that make the light ask `View.at`."""
 
 
 def shifted(still: CameraView, shift_m: Array) -> CameraView:

@@ -1,4 +1,4 @@
-"""Drops and flakes as single bright points where they cross the sheet: what rain and snow have in common.
+"""Drops and flakes as single bright points where they cross the sheet: the common part of rain and snow.
 
 A particle at X in a sheet of Gaussian thickness, s = n.X - d off its middle, gets J/r N(s; thickness/4) W/m^2 with
 J = P/fan, sends back that times its `back_m2_per_sr`, and is seen as a point of this intensity: a pixel of solid angle
@@ -8,9 +8,8 @@ The particles are a fixed set in the cone that the camera sees: each has its dep
 speed and comes in again at the other side, so that they are spread evenly at any time and a time says where all of them
 are. Those too faint (diameter below k z^1.5, brightness goes with D^2/z^3) are left out: k is that of 0.5 mm at 8 m, or
 more where more than `MOST` were left. With 50 mW and the default optics that is 5 thousandths of a photon per exposure
-for the brightest left out. 0.6 to 0.8 ms per mirror position and thread for `MOST` of them.
-
-Compiled search for the particles in a sheet, and their pictures (`sim_backend.effects.particles`).
+for the brightest left out. The search for the particles in a sheet and their pictures are compiled: 0.6 to 0.8 ms per
+mirror position and thread for `MOST` of them.
 """
 
 import math
@@ -29,12 +28,12 @@ from sim_backend.scenes.medium import Sizes
 Array = NDArray[np.float64]
 
 REACH_SIGMAS = 4.0
-"""Sheet and picture of a particle are cut here."""
+"""Sds at which sheet and picture of a particle are cut."""
 FARTHEST_RANGE_M = 30.0
-"""No particle is farther than this from the mirror."""
+"""Largest distance of a particle from the mirror."""
 NEWTON_STEPS = 8
 SHORT_PX = 0.05
-"""A streak shorter than this is a point."""
+"""Length in pixels below which a streak is a point."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -144,7 +143,7 @@ def add_particles(
 MOST = 100_000
 """Particles that are kept, on average."""
 HOLD_S = 2e-4
-"""A particle stands still for so long: less than 2 mm of fall."""
+"""Time for which a particle stands still: less than 2 mm of fall."""
 NEAREST_M, FARTHEST_M = 0.1, 10.0
 """Depths between which particles are made."""
 FAINTEST_MM, FAINTEST_AT_M = 0.5, 8.0
@@ -160,11 +159,11 @@ class Precipitation(Protocol):
 
     @property
     def sizes(self) -> Sizes:
-        """How many particles of which diameter."""
+        """The number of particles by diameter."""
         ...
 
     def back_m2_per_sr(self, diameter_mm: Array) -> Array:
-        """What a particle sends back."""
+        """Light that a particle sends back, W/sr per W/m^2."""
         ...
 
     def fall_m_per_s(self, diameter_mm: Array) -> Array:
@@ -188,7 +187,7 @@ class Particles:
     per_s: Array
 
     def points(self, time_s: float) -> Array:
-        """Where they are, metres (n, 3)."""
+        """Positions of the particles, metres (n, 3)."""
         share = self.at + self.per_s * time_s
         tangent = self.cone[:, 0] + (share - np.floor(share)) * self.cone[:, 1]
         return np.column_stack([tangent[:, 0] * self.z_m, tangent[:, 1] * self.z_m, self.z_m])
@@ -210,7 +209,7 @@ def make_particles(what: Precipitation, cone: Array, farthest_m: float, rng: np.
 
 
 class ParticleLight:
-    """Adds what particles in a sheet send back."""
+    """The light that particles in a sheet send back."""
 
     def __init__(self, setting: Setting, what: Precipitation, rng: np.random.Generator) -> None:
         view = setting.view

@@ -12,7 +12,7 @@ from sim_backend.effects.setting import Array, Setting
 from sim_backend.light.sheet import LightSheet
 
 _STREAM = 1
-"""Keeps its random numbers apart from the snow's."""
+"""Stream that keeps its random numbers apart from the snow's."""
 
 
 class RainDrops:

@@ -1,4 +1,4 @@
-"""What every effect is made from, and what an effect is."""
+"""The inputs that every effect is made from, and the interfaces of the effects."""
 
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -43,14 +43,14 @@ class PlannedFor:
 
 @dataclass(frozen=True, slots=True)
 class FrameTimes:
-    """How a run's frames follow one another."""
+    """Timing of a run's frames."""
 
     exposure_s: float
     period_s: float
 
     @property
     def gap_s(self) -> float:
-        """From the end of an exposure to the start of the next."""
+        """Time from the end of an exposure to the start of the next."""
         return max(0.0, self.period_s - self.exposure_s)
 
 
@@ -74,7 +74,7 @@ class LaserEffect(Protocol):
 
 
 class BitEffect(Protocol):
-    """What the sensor makes of the photons' bits."""
+    """A change of the photons' bits by the sensor."""
 
     reads_before: bool
     """Whether `before` is read: what one frame does to the next costs the frame before each block's first."""

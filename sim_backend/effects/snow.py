@@ -12,7 +12,7 @@ from sim_backend.effects.setting import Array, Setting
 from sim_backend.light.sheet import LightSheet
 
 _STREAM = 2
-"""Keeps its random numbers apart from the rain's."""
+"""Stream that keeps its random numbers apart from the rain's."""
 
 
 class SnowFlakes:

@@ -24,7 +24,7 @@ POLARISATIONS = 2
 
 
 def grains(optics: Optics, sensor: Sensor, line: Line) -> float:
-    """Independent grains that a pixel's diode averages."""
+    """Number of independent grains that a pixel's diode averages."""
     grain_m2 = 4 / math.pi * (line.wavelength * optics.f_number) ** 2
     return POLARISATIONS * (1 + sensor.fill_factor * sensor.pitch**2 / grain_m2)
 
@@ -38,7 +38,7 @@ class Speckle:
         self._widths_per_tangent = setting.view.focal_px / setting.line.sigma_px
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Multiply what the stripe brought."""
+        """Multiply the light that the stripe brought."""
         by_u, _, ahead = sheet.inverse[0]
         with np.errstate(divide="ignore", invalid="ignore"):
             place = np.rint(ahead / by_u * self._widths_per_tangent) + 0.0  # no negative zero
@@ -47,7 +47,7 @@ class Speckle:
 
 @numba.njit(cache=True, nogil=True)
 def _uniform(key: np.uint64, number: int) -> float:
-    """In (0, 1)."""
+    """A uniform number in (0, 1)."""
     return (float(frame_key(key, np.uint64(number)) >> np.uint64(11)) + 0.5) * 2.0**-53
 
 

@@ -23,7 +23,7 @@ from sim_backend.light.sheet import LightSheet
 from sim_backend.light.view import CameraView
 
 REACH_SIGMAS = 5.0
-"""The Gaussian is cut here; 6e-7 of the stripe is left out."""
+"""Sds at which the Gaussian is cut; 6e-7 of the stripe is left out."""
 MIN_SLOPE = 0.02
 """Smallest slope of the sheet against the surface along a row, as a share of the sheet's own: keeps a stripe that runs
 along the row, which has no position in it, from being infinitely bright."""
@@ -33,7 +33,7 @@ Lit = tuple[Array, Array, Array, Array, Array, Array, Array]
 
 
 def lit_surface(view: CameraView) -> Lit:
-    """What `row_light` takes of a view."""
+    """The arrays of a view that `row_light` takes."""
     return view.u, view.v, view.u_x, view.v_x, view.facet, view.albedo, view.source_m
 
 

@@ -3,14 +3,12 @@
     lambda = exposure (steady + share power sheet),     p = 1 - exp(-lambda)
 
 share is the part of the exposure during which the gate let light out. `steady` is made once, `sheet` once per command
-(what that costs: `sim_backend.frames.photons`).
+(for the cost see `sim_backend.frames.photons`).
 
-Mirror positions at which the flux is computed: frames of one column share one.
-
-Tracing the light costs more than drawing a frame, so the frames that the mirror spends in one cell of a grid all get
-their mean position. A mean over a column's frames, which is what is counted and bound, is then that of a mirror that
-moves on, wherever in their column the frames happen to lie. Told the columns' commands the cells are the columns; not
-told, the command range is divided finely, four cells per pixel of width.
+Tracing the light costs more than drawing a frame, so the frames that the mirror spends in one cell of a grid
+(`CommandGrid`) all get their mean position. A mean over a column's frames, which is what is counted and bound, is then
+that of a mirror that moves on, wherever in their column the frames happen to lie. Told the columns' commands the cells
+are the columns; not told, the command range is divided finely, four cells per pixel of width.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -37,11 +35,12 @@ class FluxModel:
         self.setting = setting
         loaded = {entry: entry.load()(setting) for entry in entries if entry.kind != "within"}
         self.laser: Mapping[str, LaserEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "laser"}
-        """By name, in the order in which they add: a later one may act on what the earlier ones brought."""
+        """The laser's effects by name, in the order in which they add: a later one may act on what the earlier ones
+        brought."""
         self.steady: Mapping[str, Array] = {e.name: effect.rate() for e, effect in loaded.items() if e.kind == "steady"}
         """Detections per second (rows, width) by name."""
         self.bits: Mapping[str, BitEffect] = {e.name: effect for e, effect in loaded.items() if e.kind == "bits"}
-        """What the sensor does to the bits, by name, in the order in which it does."""
+        """The sensor's effects on the bits, by name, in the order in which they act."""
         self.steady_per_s: Array = sum(self.steady.values(), np.zeros(setting.view.u.shape))
         """Detections per second without the laser, float64 (rows, width)."""
 
@@ -52,16 +51,16 @@ class FluxModel:
 
     @property
     def bit_effects(self) -> tuple[BitEffect, ...]:
-        """What the sensor does to the bits, in the order in which it does."""
+        """The sensor's effects on the bits, in the order in which they act."""
         return tuple(self.bits.values())
 
     @property
     def hold_s(self) -> float:
-        """For how long the sheet's light may be taken as constant; 0: nothing moves, it is constant for ever."""
+        """Time for which the sheet's light may be taken as constant; 0: nothing moves, it is constant for ever."""
         return min((held for effect in self.laser.values() if (held := hold_s(effect)) > 0), default=0.0)
 
     def without(self, names: Collection[str]) -> "FluxModel":
-        """The same with fewer effects, which are not made anew."""
+        """The model with fewer effects; those that stay are not made anew."""
         fewer = copy(self)
         fewer.laser = {name: effect for name, effect in self.laser.items() if name not in names}
         fewer.steady = {name: rate for name, rate in self.steady.items() if name not in names}
@@ -84,15 +83,15 @@ class FluxModel:
 
 
 def hold_s(effect: LaserEffect) -> float:
-    """For how long an effect's light stands still; 0: it does not move."""
+    """Time for which an effect's light stands still; 0: it does not move."""
     return float(getattr(effect, "hold_s", 0.0))
 
 
 FINE_POSITIONS_PER_PX = 4
 ROUNDING = 1e-9
-"""Positions are rounded to this, far below what a frame can tell: frames then have the very same mean."""
+"""Step to which positions are rounded, far below what a frame can tell: frames then have the very same mean."""
 _SLACK = 1e-6
-"""Of a step: where frames lie on the very border of cells."""
+"""Slack, as a share of a step, for frames that lie on the very border of cells."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

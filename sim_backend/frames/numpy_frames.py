@@ -1,4 +1,4 @@
-"""The straightforward way to simulate frames, whole arrays in numpy: what the compiled one is measured against.
+"""The straightforward way to simulate frames, whole arrays in numpy: the reference for the compiled one.
 
 Stripe and haze by the formulas of `sim_backend.effects.stripe` and `fog` in every pixel, p = 1 - exp(-flux), and a
 uniform number for every pixel of every frame. No other light from the laser; surfaces stand still.

@@ -7,15 +7,14 @@ where
     p = (1 - c) level / 2^16 + c s,     0 <= s <= 1 for every level within [2^16 (p - c) / (1 - c), 2^16 p / (1 - c)]
 
 That interval is three levels wide, so that levels may be computed in float32 while every p is exact to the last bit of
-a float64; 0 never fires and 1 always. The highest level there is room for stands for 2^16 itself: what 16 bits cannot
-be below is set afterwards. Random numbers are functions of seed, frame, row and place alone
+a float64; 0 never fires and 1 always. The highest level that 16 bits hold stands for 2^16 itself: its pixels are 1
+whatever the random number, so they are set afterwards. Random numbers are functions of seed, frame, row and place alone
 (`sim_backend.random_numbers`): windows, threads and blocks do not matter.
 
-Measured, 512 x 512 on one core: 12 us a frame, 0.12 ms for new levels where half of the words are lit. What it
-replaced in the same run, bit planes of p compared with random words until all 64 pixels of a word are decided: 95 us,
-and 2.3 ms for the planes, which need a bit matrix transposed for every word. Skipping from hit to hit where p is small
-does not pay: at 0.004 (5 lux behind the stripe) that is a hit in every fourth word, which costs as much as drawing
-four."""
+Measured, 512 x 512 on one core: 12 us a frame, 0.12 ms for new levels where half of the words are lit. Skipping from
+hit to hit where p is small would not pay: at 0.004 (5 lux behind the stripe) that is a hit in every fourth word, which
+costs as much as drawing four.
+"""
 
 import math
 
@@ -44,7 +43,7 @@ LEVELS = 2**16
 NEVER = LEVELS // 2 - 1
 """Level 0 as it is stored: a level is stored as this minus itself, the highest one is -32768."""
 CHANCE = 3.0 / LEVELS
-"""Of a pixel to be drawn anew."""
+"""Chance of a pixel to be drawn anew."""
 _LEVELING = tuple(np.float32(x) for x in (NEVER + 1.5, LEVELS / (1.0 - CHANCE), NEVER - LEVELS + 1, NEVER))
 """Offset, slope, least and largest: what is stored is the offset minus the slope times p, within 16 bits, without its
 fraction. So the level is half of one at least inside its interval, on both sides. Where it is the highest of 16 bits,
@@ -53,19 +52,19 @@ _TOGETHER = 8
 _KEY_ROWS, _ROW_SHIFT = 8, 16
 """Rows that share a key, and where their number stands in that of a block."""
 _WORD_BYTES = WORD_PX * 2
-"""Of levels."""
+"""Bytes that the levels of a word of pixels take."""
 _PER_SKIP = 1.0 / math.log1p(-CHANCE)
 
 _S11 = np.uint64(11)
 _ANEW = np.uint64(2**32)
-"""In the place of the row: the streams of what is drawn anew."""
+"""Number in the place of the row for the streams of pixels that are drawn anew."""
 _STRIP_ROWS = 64
 _UNIT = 2.0**-53
 _PLACE = np.array(PLACE, np.uint8)
 
 
 Levels = tuple[NDArray[np.int16], NDArray[np.uint64]]
-"""What a frame is drawn from: levels (rows, words, 64), as they are stored, in the order `PLACE`; and bits (rows,
+"""The input for drawing a frame: levels (rows, words, 64), as they are stored, in the order `PLACE`; and bits (rows,
 words) of the pixels of the highest level."""
 
 
@@ -241,12 +240,12 @@ def _draw_anew(
 
 
 _DROP_STREAM = np.uint64(0xA0761D6478BD642F)
-"""Keeps the draws of lost frames apart from those of photons."""
+"""Stream that keeps the draws of lost frames apart from those of photons."""
 
 
 @numba.njit(cache=True, nogil=True)
 def dropped_frames(seed: np.uint64, first_frame: int, frames: int, probability: float) -> NDArray[np.bool_]:
-    """Which of the frames get lost, bool (frames,), each with the given probability."""
+    """Mask of the frames that get lost, bool (frames,), each with the given probability."""
     lost = np.zeros(frames, np.bool_)
     for f in range(frames):
         random = frame_key(seed ^ _DROP_STREAM, np.uint64(first_frame + f))

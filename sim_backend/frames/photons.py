@@ -26,7 +26,7 @@ from sim_backend.random_numbers import WORD_PX
 
 Array = NDArray[np.float64]
 _SLACK = 1e-6
-"""Of a time step: times that are meant to be a multiple of it are."""
+"""Slack, as a share of a time step, by which times may miss a multiple of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,7 +201,7 @@ class PhotonSource:
         self._each(partial(work, a, b) for a, b in self._bands)
 
     def _each(self, jobs: Iterable[Callable[[], None]]) -> None:
-        """Do all of them at once; errors are raised when all have ended."""
+        """Do all jobs at once; errors are raised when all have ended."""
         first, *others = jobs
         running = [self._pool.submit(job) for job in others]
         try:

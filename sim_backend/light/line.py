@@ -1,4 +1,4 @@
-"""The lines that leave the mirror together: their places beside one another and their part of the power.
+"""The laser lines in the picture: their places beside one another, their part of the power, their width at each depth.
 
 A diffractive element splits one laser's power among them; more lasers bring their own. All leave the same mirror, so
 line l is where a single one would be at the mirror's command plus its offset. Flux of a frame, each line's stripe and
@@ -6,7 +6,7 @@ haze ending at its own object:
 
     lambda = exposure (steady + power sum over lines of share sheet_l)
 
-How wide the laser line is in the picture at each depth: its own width, that of a sheet that spreads, and defocus.
+The width is the line's own, that of a sheet that spreads, and defocus:
 
     sigma^2 = sigma_px^2 + (f spread/4 r/z)^2 + (c/4)^2,      c = f^2 |1/z - 1/z0| / (N pitch (1 - f/z0))
 
@@ -15,7 +15,7 @@ diameter in pixels of the disc that a lens of f-number N focused at z0 makes of 
 variance of c^2/16 along the row. Called for by `optics: {focus: 3 m}` and `line: {spread: 1 mrad}`; without them the
 width is `sigma_px` at every depth. The haze's end is blurred by `sigma_px` alone.
 
-The blurred edge of a Gaussian and its integral, from a table: three times as fast as erf and exp.
+The blurred edge of a Gaussian and its integral come from a table, three times as fast as erf and exp:
 
     edge(a) = Phi(a),     edge_sum(a) = a Phi(a) + phi(a), whose slope is Phi
 
@@ -86,7 +86,7 @@ ONE_LINE = LineFan()
 
 
 def _of_rows(sheets: LightSheets, index: int, rows: int) -> LightSheets:
-    """Those of one position and line, one for each row."""
+    """The sheets of one position and line, one for each row."""
     parts = sheets.planes[index], sheets.middle[index], sheets.across[index]
     planes, middle, across = (np.broadcast_to(part, (rows, part.shape[-1])) for part in parts)
     return replace(sheets, planes=planes, middle=middle, across=across)
@@ -98,9 +98,10 @@ def line_fan(offsets: Sequence[float], *, shared: bool) -> LineFan:
 
 
 def line_width(view: CameraView, optics: Optics, sensor: Sensor, line: Line) -> Array:
-    """What `sigma_px` takes: (4,) variance in px^2, spread in px, defocus in px m, inverse focus in 1/m.
+    """The numbers that `sigma_px` takes: (4,) variance in px^2, spread in px, defocus in px m, inverse focus in 1/m.
 
-    DeviceError where the focus lies within the focal length: a lens makes no picture of what is there."""
+    DeviceError where the focus lies within the focal length: a lens makes no picture of what is there.
+    """
     focal_px = view.focal_px
     defocus = 0.0
     if optics.focus is not None:

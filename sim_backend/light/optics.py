@@ -1,4 +1,4 @@
-"""From light to detections: lens, sensor and laser line of the simulated rig.
+"""Lens, sensor and laser line of the simulated rig, and the detections that they make of light.
 
 Detections per second of a pixel that sees radiance L:  FF PDP T (pi/4)/N^2 pitch^2 L / (h c / wavelength).
 """
@@ -40,21 +40,21 @@ class Sensor(_Part):
     fill_factor: float = Field(default=0.105, gt=0, le=1)
     detection_probability: float = Field(default=0.5, gt=0, le=1)
     dark_rate: Annotated[CountsPerSecond, Field(ge=0)] = 20.0
-    """Median over the pixels; the distribution has a heavy tail of hot ones."""
+    """Median dark rate of the pixels; the distribution has a heavy tail of hot ones."""
     pixel_seed: int = Field(default=1, ge=0)
-    """Which pixels are hot or dead: a property of the one sensor, the same in every run."""
+    """Seed of the hot and dead pixels: they belong to the one sensor and are the same in every run."""
     dead_share: Annotated[Ppm, Field(ge=0, le=1)] = 0.0
-    """Pixels that read 0 in every frame."""
+    """Share of pixels that read 0 in every frame."""
     hot_share: Annotated[Ppm, Field(ge=0, le=1)] = 0.0
-    """Pixels that read 1 in every frame, beyond those in the tail of `dark_rate`."""
+    """Share of pixels that read 1 in every frame, beyond those in the tail of `dark_rate`."""
     crosstalk: Annotated[Ppm, Field(ge=0, le=0.5)] = 0.0
-    """Neighbours that a detection sets off, on average; 0.1 to 0.2 % in arrays of this class."""
+    """Number of neighbours that a detection sets off, on average; 0.1 to 0.2 % in arrays of this class."""
     afterpulsing: Annotated[Ppm, Field(ge=0, le=0.5)] = 0.0
-    """Detections that a detection is followed by, whenever; 0.1 to 1 %."""
+    """Number of detections that follow a detection, whenever; 0.1 to 1 %."""
     trap_lifetime: Annotated[Seconds, Field(gt=0, le=1)] = 100e-9
     """Mean time until an afterpulse."""
     dead_time: Annotated[Seconds, Field(ge=0, le=1e-6)] = 0.0
-    """How long a pixel is blind after a detection."""
+    """Time for which a pixel is blind after a detection."""
     bit_error_rate: Annotated[Ppm, Field(ge=0, le=0.5)] = 0.0
     """Chance of every pixel of a frame to be read wrongly."""
 
@@ -72,13 +72,14 @@ class Line(_Part):
 
     wavelength: Annotated[Metres, Field(gt=0)] = 520e-9
     fan: Annotated[Radians, Field(gt=0, lt=math.pi)] = math.radians(50)
-    """The power is spread evenly over this angle; it is taken to cover the picture."""
+    """Angle over which the power is spread evenly; it is taken to cover the picture."""
     sigma_px: float = Field(default=0.6, gt=0.05, le=20)
     """Gaussian width of the stripe in the picture, pixels: line width and blur of the lens together."""
     spread: Annotated[Radians, Field(ge=0, lt=0.1)] = 0.0
     """Full angle (1/e^2) by which the sheet gets thicker on its way, on top of `sigma_px`."""
     thickness: Annotated[Metres, Field(gt=0, le=0.1)] = 2e-3
-    """Full thickness (1/e^2) of the sheet where it leaves the mirror: which drops and flakes are in it."""
+    """Full thickness (1/e^2) of the sheet where it leaves the mirror: it decides which drops and flakes are in the
+    sheet."""
     speckle: bool = False
     """Whether the laser is coherent enough for its light to come back grainy."""
 

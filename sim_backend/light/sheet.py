@@ -4,12 +4,11 @@ A world is 2.5-D: one depth per pixel, shadows along rows. Light that has gone b
 sees its sheet as a plane: all rows the same one, or, where the sheet bows or rows are exposed one after the other, each
 its own: that of the mirror at its time, and the tangent of the bowed sheet where the row sees it.
 
-Compiled walk of the light along each image row: where the sheet ends, and whether it ends as a stripe.
-
-On a row the sheet's inverse depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The
-walk starts at the near edge of the picture and ends where w passes the surface's inverse depth. Spans of 32 pixels
-in which even the least w lies before the nearest surface are passed at once. Measured: about 0.05 ms for 512 x 512
-pixels on one core, half of them lit; pixel by pixel it took 0.2 ms.
+A compiled walk follows the light along each row and tells whether it ends as a stripe. On a row the sheet's inverse
+depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The walk starts at the near edge
+of the picture and ends where w passes the surface's inverse depth. Spans of 32 pixels in which even the least w lies
+before the nearest surface are passed at once. Measured: about 0.05 ms for 512 x 512 pixels on one core, half of them
+lit.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +22,7 @@ from calibration.model.light_sheet import LightSheets
 Array = NDArray[np.float64]
 
 _TANGENT_STEP_M = 1e-4
-"""To either side of a point: sheets bend over metres."""
+"""Step to either side of a point for the tangent: sheets bend over metres."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

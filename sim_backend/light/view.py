@@ -1,4 +1,4 @@
-"""What the camera sees of a scene, per pixel, as the light transport needs it: rays, inverse depth, facets, albedo."""
+"""The camera's view of a scene, per pixel, as the light transport needs it: rays, inverse depth, facets, albedo."""
 
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 class Moves(Protocol):
-    """What makes the surfaces move."""
+    """A motion of the surfaces."""
 
     def view(self, still: "CameraView", time_s: float) -> "CameraView":
         """The view at a time of the bench; `still` is that at time 0. Any thread may ask."""
@@ -39,7 +39,7 @@ class CameraView:
     source_m: Array
     motion: Moves | None = None
     bounds: Array = field(init=False)
-    """Of u, v and surface (`span_bounds`)."""
+    """Bounds of u, v and surface (`span_bounds`)."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "bounds", span_bounds(self.u, self.v, self.surface))
@@ -65,7 +65,7 @@ class CameraView:
 
     @property
     def median_depth_m(self) -> float:
-        """Of the surfaces in the picture; 0 where there is none."""
+        """Median depth of the surfaces in the picture; 0 where there is none."""
         lit = self.surface[self.surface > 0]
         return 1.0 / float(np.median(lit)) if len(lit) else 0.0
 
@@ -183,7 +183,7 @@ def _surface_slope(surface: Array, axis: int) -> Array:
 
 
 def _inner_joined(joined: NDArray[np.bool_], offset: int) -> NDArray[np.bool_]:
-    """For the outer step at `offset` (1 or -2), whether the inner step between it and the pixel is joined."""
+    """Whether the inner step between the pixel and the outer step at `offset` (1 or -2) is joined."""
     inner = np.zeros_like(joined)
     if offset == 1:
         inner[1:] = joined[:-1]

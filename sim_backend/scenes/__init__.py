@@ -1,1 +1,1 @@
-"""What stands in front of the simulated rig."""
+"""The scenes in front of the simulated rig."""

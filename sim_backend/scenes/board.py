@@ -32,7 +32,7 @@ corners of a picture off together by 0.0015 px, twice what the photons of a brig
 LOOK = 21
 """The first of them, and the pixel's four corners, tell whether it sees an edge."""
 WALL_ALBEDO = 0.5
-"""Of a wall that is painted, neither white nor dark."""
+"""Albedo of a painted wall, neither white nor dark."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

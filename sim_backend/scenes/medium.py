@@ -1,4 +1,4 @@
-"""The scattering medium of a scene: fog or smoke, how dense, and into which directions it scatters.
+"""The medium and the weather of a scene: fog or smoke, rain or snow, how dense, and where they scatter light to.
 
     medium: {fog: {visibility: 40 m}}                           # 2 % contrast; or {extinction: 0.1 /m}
     medium: {smoke: {extinction: 0.5 /m}}                       # or its visibility
@@ -6,18 +6,16 @@
     medium: {extinction: 0.1 /m, phase: isotropic}
     medium: {extinction: 0.1 /m, phase: {g: 0.85}}              # Henyey-Greenstein
     medium: {extinction: 0.1 /m, phase: {terms: [[0.9, 0.9], [0.1, -0.5]]}}     # weights and g of several
+    rain: {rate: 20 mm/h}
+    snow: {rate: 2 mm/h, wind: 1 m/s}
 
 Henyey and Greenstein (1941): p(theta) = (1 - g^2) / (4 pi (1 + g^2 - 2 g cos theta)^1.5), in 1/sr, of integral 1 over
 all directions and mean cosine g; at 180 degrees (1 - g) / (4 pi (1 + g)^2).
 
-Rain and snow of a scene: how many drops and flakes of which size, how fast they fall, what they scatter.
-
-    rain: {rate: 20 mm/h}
-    snow: {rate: 2 mm/h, wind: 1 m/s}
-
 Rain (Marshall and Palmer 1948): N(D) = 8000 exp(-L D) per m^3 and mm, L = 4.1 R^-0.21 /mm; twice the cross-section is
 taken out (diffraction included), so sigma = 2 (pi/4) 8000 2/L^3 mm^2/m^3 = 3.65e-4 R^0.63 /m; fall speed 9.65 - 10.3
 exp(-0.6 D) m/s (Atlas, Srivastava and Sekhon 1973).
+
 Snow (Gunn and Marshall 1958), by melted diameter: N(D) = 3800 R^-0.87 exp(-L D), L = 2.55 R^-0.48 /mm; a flake has 4.5
 times its melted cross-section and falls at 1.6 (D/10)^0.31 m/s (aggregates of dendrites, Langleben 1954). R in mm/h of
 water, D in mm.
@@ -193,7 +191,7 @@ class Medium(SceneSection):
 
     @property
     def mean_cosine(self) -> float:
-        """Of the scattering angle: 0 isotropic, near 1 forward-peaked."""
+        """Mean cosine of the scattering angle: 0 isotropic, near 1 forward-peaked."""
         if self.phase_terms is not None:
             return sum(weight * g for weight, g in self.phase_terms)
         return DROPLET_G if self.smoke is None else SMOKE_G
@@ -238,7 +236,7 @@ class Rain(SceneSection):
 
     @property
     def sizes(self) -> Sizes:
-        """How many drops of which diameter."""
+        """The number of drops by diameter."""
         return Sizes(8000.0, 4.1 * (1e3 * self.rate) ** -0.21)
 
     @property
@@ -247,7 +245,7 @@ class Rain(SceneSection):
         return DIFFRACTION * self.sizes.area_per_m
 
     def back_m2_per_sr(self, diameter_mm: Array) -> Array:
-        """What a drop sends back, W/sr per W/m^2."""
+        """Light that a drop sends back, W/sr per W/m^2."""
         return DIFFRACTION * _disc_m2(diameter_mm) * self.backscatter
 
     def fall_m_per_s(self, diameter_mm: Array) -> Array:
@@ -266,7 +264,7 @@ class Snow(SceneSection):
 
     @property
     def sizes(self) -> Sizes:
-        """How many flakes of which melted diameter."""
+        """The number of flakes by melted diameter."""
         rate = 1e3 * self.rate
         return Sizes(3800.0 * rate**-0.87, 2.55 * rate**-0.48)
 
@@ -276,7 +274,7 @@ class Snow(SceneSection):
         return DIFFRACTION * FLAKE_AREA * self.sizes.area_per_m
 
     def back_m2_per_sr(self, diameter_mm: Array) -> Array:
-        """What a flake, a diffuse sphere, sends back, W/sr per W/m^2."""
+        """Light that a flake, a diffuse sphere, sends back, W/sr per W/m^2."""
         return FLAKE_AREA * _disc_m2(diameter_mm) * self.albedo * LAMBERT_SPHERE_BACK
 
     def fall_m_per_s(self, diameter_mm: Array) -> Array:

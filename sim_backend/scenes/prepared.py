@@ -1,12 +1,10 @@
-"""Scenes from a folder: a prepared `world.npz`, or `disparity.npy` with `left.png` prepared here.
+"""Scenes from a folder: a prepared `world.npz`, or a stereo data set's `disparity.npy` with `left.png`, prepared here.
 
 `world.npz` holds `depth_m`, `albedo` and, if some depths were guessed, `trusted`, at the camera's size.
 
-A stereo data set's disparity and left picture made into surfaces.
-
-Centre crop to the camera's shape, unknown disparity painted in, clipped to its 0.5 to 99.5 percentiles, resized by
-nearest neighbour, quantisation steps smoothed away inside surfaces; inverse depth linear in disparity between 1/6 and
-1/1.5 per metre; albedo from the linearised grey picture.
+Disparity and left picture become surfaces: centre crop to the camera's shape, unknown disparity painted in, clipped to
+its 0.5 to 99.5 percentiles, resized by nearest neighbour, quantisation steps smoothed away inside surfaces; inverse
+depth linear in disparity between 1/6 and 1/1.5 per metre; albedo from the linearised grey picture.
 """
 
 import zipfile

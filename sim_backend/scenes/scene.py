@@ -1,13 +1,12 @@
-"""What a scene file says: surfaces, medium, weather, ambient light, motion. Unknown keys are refused, quantities carry
-units.
+"""The scene file: surfaces, medium, weather, ambient light, motion. Unknown keys are refused, quantities carry units.
 
 surfaces: street              # the built-in street, board, or a folder with world.npz or disparity.npy and left.png
 board: {rotation: [20 deg, 0 deg, 0 deg], position: [-30 cm, -20 cm, 1.5 m]}    # of `surfaces: board`; or a list
 wall: 4 m                                                     # behind the board
-medium: {fog: {visibility: 30 m}, backscatter: 0.05 /sr}      # or smoke, `sim_backend.scenes.medium`; none: clear air
-rain: {rate: 20 mm/h}                                         # or snow: {rate: 2 mm/h}, `sim_backend.scenes.medium`
+medium: {fog: {visibility: 30 m}, backscatter: 0.05 /sr}      # or smoke, see `scenes.medium`; none: clear air
+rain: {rate: 20 mm/h}                                         # or snow: {rate: 2 mm/h}, see `scenes.medium`
 ambient: {illuminance: 100 lux}                               # none: darkness
-motion: {velocity: [0 m/s, 0 m/s, -2 m/s]}                    # of all surfaces: x right, y down, z away from the camera
+motion: {velocity: [0 m/s, 0 m/s, -2 m/s]}                    # of all surfaces: x right, y down, z away from camera
 seed: 1                                                       # where the drops are
 """
 
@@ -31,9 +30,9 @@ from sim_backend.scenes.surfaces import Surfaces
 
 Array = NDArray[np.float64]
 SCENE_FOLDER = Path(__file__).parents[2] / "config" / "scenes"
-"""Where the bundled scenes are found by name."""
+"""Folder in which the bundled scenes are found by name."""
 CLEAR = "clear"
-"""In place of a visibility: no fog."""
+"""Word in place of a visibility: no fog."""
 
 
 class AmbientLight(SceneSection):
@@ -43,26 +42,26 @@ class AmbientLight(SceneSection):
 
 
 class SceneMotion(SceneSection):
-    """How the surfaces move, all of them together and straight on, from the bench's time 0 on."""
+    """Motion of the surfaces, all of them together and straight on, from the bench's time 0 on."""
 
     velocity: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] = Field(examples=["[0 m/s, 0 m/s, -2 m/s]"])
-    """Along x (right), y (down), z (away from the camera)."""
+    """Velocity along x (right), y (down), z (away from the camera)."""
 
 
 class BoardPlace(SceneSection):
-    """Where a calibration board is held, as `calibration.views.BoardPose` has it."""
+    """Pose of a calibration board, as `calibration.views.BoardPose` has it."""
 
     rotation: tuple[Radians, Radians, Radians] = Field(examples=["[20 deg, 0 deg, 0 deg]"])
     """Rotation vector; all 0: square to the camera's axis."""
     position: tuple[Metres, Metres, Metres] = Field(examples=["[-30 cm, -20 cm, 1.5 m]"])
-    """Of the top left corner of the board's squares: x right, y down, z away from the camera."""
+    """Position of the top left corner of the board's squares: x right, y down, z away from the camera."""
 
 
 class BoardShown(BoardPlace):
     """A calibration board in the scene."""
 
     file: str | None = None
-    """What is printed on it, a board file; the bundled one by default."""
+    """Board file of the print; the bundled one by default."""
     mirrored: bool = False
     """Printed the wrong way round."""
 
@@ -74,16 +73,16 @@ class SceneFile(SceneSection):
     board: BoardShown | tuple[BoardShown, ...] = Field(
         default=(), examples=["{rotation: [20 deg, 0 deg, 0 deg], position: [-30 cm, -20 cm, 1.5 m]}"]
     )
-    """What stands in front of the wall where `surfaces` is `board`."""
+    """Boards in front of the wall where `surfaces` is `board`."""
     wall: Annotated[Metres, Field(gt=0, examples=["4 m"])] = 4.0
-    """How far behind the camera's plane the wall is that boards stand in front of."""
+    """Distance from the camera's plane to the wall that boards stand in front of."""
     medium: Medium | None = Field(default=None, examples=["{fog: {visibility: 30 m}}"])
     rain: Rain | None = Field(default=None, examples=["{rate: 20 mm/h}"])
     snow: Snow | None = Field(default=None, examples=["{rate: 2 mm/h}"])
     ambient: AmbientLight | None = Field(default=None, examples=["{illuminance: 100 lux}"])
     motion: SceneMotion | None = Field(default=None, examples=["{velocity: [0 m/s, 0 m/s, -2 m/s]}"])
     seed: int = Field(default=1, ge=0, lt=2**63, examples=["1"])
-    """Which drops and flakes there are, where, and which speckle."""
+    """Seed of the drops and flakes, their places, and the speckle."""
 
     @model_validator(mode="after")
     def _boards_on_board_scenes(self) -> Self:

@@ -1,10 +1,8 @@
-"""Rays against simple bodies: convex solids, upright cylinders, ellipsoids. Depth z, inf where a ray misses.
+"""Bodies and surfaces: rays against simple bodies, depth and albedo on the camera's pixel grid, procedural texture.
 
-A ray is t (u, v, 1), so t is the depth z itself. Frame: x right, y down, z forward, metres.
-
-Depth and albedo on the camera's pixel grid: all that a 2.5-D world is made of.
-
-Procedural texture: smooth noise from hashed lattice points, the same on every machine.
+Bodies are convex solids, upright cylinders and ellipsoids; a ray gives the depth z, inf where it misses. A ray is t (u,
+v, 1), so t is the depth z itself. Frame: x right, y down, z forward, metres. Depth and albedo by pixel are all that a
+2.5-D world is made of. Texture is smooth noise from hashed lattice points, the same on every machine.
 """
 
 from collections.abc import Sequence

@@ -46,12 +46,12 @@ Array = NDArray[np.float64]
 
 MAX_THREADS = 8
 USB_BAUD = 10_000_000
-"""A virtual COM port is as fast as USB lets it be."""
+"""Baud of a virtual COM port, which is as fast as USB lets it be."""
 PICO_2 = 2
 KEPT_S = 20.0
-"""What gate and mirror did before is forgotten."""
+"""Time after which the past of gate and mirror is forgotten."""
 KEPT_FRAMES = 1_000_000_000
-"""Frames that wait for the host: as many as there may be."""
+"""Most frames that wait for the host."""
 
 
 class TakesDevices(Protocol):
@@ -69,11 +69,11 @@ class EmulatedWorldConfig(WorldConfig):
 
     kind: str = "emulated"
     laser: Literal["cobolt", "obis"] = "cobolt"
-    """Which laser answers at emulated:laser."""
+    """The laser that answers at emulated:laser."""
     spad: Literal["spb-usb", "spad512s"] = "spb-usb"
-    """Which SPAD answers at emulated:spad."""
+    """The SPAD that answers at emulated:spad."""
     scanner_clock_error: float = Field(default=20e-6, ge=-1e-3, le=1e-3)
-    """By how much the scanner's crystal runs fast."""
+    """Relative amount by which the scanner's crystal runs fast."""
 
 
 class EmulatedWorld(SimulatedWorld):
@@ -130,11 +130,11 @@ class EmulatedWorld(SimulatedWorld):
 
     @property
     def seed(self) -> int:
-        """Of all that is random here."""
+        """Seed of everything that is random here."""
         return self._seed
 
     def photon_source(self, times: FrameTimes) -> PhotonSource:
-        """What draws frames that follow one another like that."""
+        """A source of frames that follow one another at these times."""
         threads = min(MAX_THREADS, os.cpu_count() or 1)
         return self.photons(times, self._seed, threads)
 
@@ -147,7 +147,7 @@ class EmulatedWorld(SimulatedWorld):
             source.expose(0, held, power_w, x0, bits, np.zeros(1))
 
     def during(self, start_s: Array, exposure_s: float, period_s: float) -> tuple[Happening, Array]:
-        """What happened during frames that start at start_s (n,), ascending, one period apart, and the laser's power.
+        """Events during frames that start at start_s (n,), ascending, one period apart, and the laser's power.
 
         Times are the host's; power_w (n,) of each exposure's middle.
         """
@@ -195,7 +195,7 @@ class EmulatedWorld(SimulatedWorld):
             return list(self._emission)
 
     def mirror(self, time_s: Array) -> Array:
-        """Where the scanner's output drives the mirror, normalised, at times (n,)."""
+        """Command, normalised, to which the scanner's output drives the mirror at times (n,)."""
         with self.scanner_plug.lock:
             self.scanner.advance(float(time_s[-1]))
             return self.scanner.history.command(time_s)
@@ -223,7 +223,7 @@ class EmulatedWorld(SimulatedWorld):
 
 
 class WorldFrames:
-    """What the emulated SPAD sees: a `FrameSource`."""
+    """The `FrameSource` of the emulated SPAD: the simulated world in front of it."""
 
     def __init__(self, world: EmulatedWorld) -> None:
         self._world = world
@@ -232,7 +232,7 @@ class WorldFrames:
         self._made_for: tuple[FrameTimes, FluxModel] | None = None
 
     def started(self) -> None:
-        """A run begins: counters of markers are 0."""
+        """Set the counters of markers to 0 at the start of a run."""
         self._markers = MarkerInputs()
 
     def expose(self, span: Span, records: NDArray[np.void], bits: NDArray[np.uint8] | None) -> int:

@@ -31,13 +31,13 @@ _TOKEN = re.compile(rb"#[0-9a-f]{8}")
 """A PrawnDO driver numbers its questions so that their answers are known."""
 _BAUD = 10_000_000
 _SAID_AGAIN = 3
-"""So many of the last commands may come again."""
+"""Number of the last commands that may come again."""
 _SCANNERS = {"helios": HeliosModel, "lasercube": LaserCubeModel}
 
 
 @dataclass(slots=True)
 class Exchange:
-    """What a driver sent in one piece, when, and all that came back before it sent the next."""
+    """A piece of bytes that a driver sent, when, and all that came back before it sent the next."""
 
     t_s: float
     sent: bytes
@@ -45,7 +45,7 @@ class Exchange:
 
     @property
     def form(self) -> bytes:
-        """Without the tokens' numbers."""
+        """The bytes sent without the tokens' numbers."""
         return _TOKEN.sub(b"#00000000", self.sent)
 
     def answer_to(self, sent: bytes) -> bytes:
@@ -95,7 +95,7 @@ class RecordedModel:
         return b"".join(answers)
 
     def tick(self, now_s: float) -> bytes:
-        """It says nothing unasked."""
+        """Do nothing: the device says nothing unasked."""
         return b""
 
     def _match(self, now_s: float) -> bytes | None:
@@ -126,7 +126,9 @@ class RecordedModel:
         return found + [i for i in range(self._at, max(0, self._at - _SAID_AGAIN), -1)]
 
     def _answered(self, form: bytes, now_s: float) -> Exchange:
-        """What came back for a question: at this time after the last command, else next or last before."""
+        """The recorded answer to a question: the one at this time after the last command, else the next or last one
+        before.
+        """
         command = self._commands[self._at]
         elapsed_s = now_s - self._since_s
         mine = [one for one in command.questions if one.form == form]
@@ -139,7 +141,7 @@ class RecordedModel:
 
 
 def _uncut(form: bytes) -> bytes:
-    """Without a token that has not come whole."""
+    """The bytes without a token that has not come whole."""
     cut = form.rfind(b"#", max(0, len(form) - 8))
     return form if cut < 0 or _TOKEN.match(form[cut:]) else form[:cut]
 
@@ -176,7 +178,7 @@ class RecordedWorldConfig(KindConfig):
     recording: Path
     """Folder of a run that was taken with --record, with control.jsonl in it."""
     scanner: Literal["helios", "lasercube"] = "helios"
-    """Which scanner is emulated at emulated:scanner."""
+    """The scanner that is emulated at emulated:scanner."""
 
 
 class RecordedWorld:
@@ -202,7 +204,7 @@ class RecordedWorld:
                 self.ports[device] = server.endpoint
 
     def truth(self, commands: NDArray[np.float64], velocity_per_s: float = 0.0) -> SweepTruth:
-        """Nobody asks: the recording keeps its own."""
+        """Raise DeviceError: this world knows no truth."""
         raise DeviceError("a world of recorded devices knows no truth")
 
     def close(self) -> None:

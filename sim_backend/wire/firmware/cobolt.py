@@ -16,7 +16,7 @@ MODELS: dict[Family, str] = {"06-MLD": "0488-06-01-0100-100", "06-01": "0488-06-
 """A model number of each family, as `glm?` gives it."""
 ILLEGAL = "Syntax error: illegal command"
 FORBIDDEN = re.compile(r"@cobas \S+|@cobasky.*|@cobasdr.*")
-"""Bypasses of key and autostart: a driver that sends one of them has failed its test."""
+"""Commands that bypass key and autostart: a driver that sends one of them has failed its test."""
 GAP_S = 0.09
 """Commands closer than this to the last reply get no answer (the manual's 100 ms with some tolerance)."""
 
@@ -96,7 +96,7 @@ class CoboltModel:
 
     @property
     def gated(self) -> bool:
-        """The TTL input governs the light."""
+        """Whether the TTL input governs the light."""
         return self.mode == "modulation" and self.digital and self.modulator == "external"
 
     @property
@@ -114,11 +114,11 @@ class CoboltModel:
 
     @property
     def emitting(self) -> bool:
-        """It would shine through an open gate."""
+        """Whether the laser would shine through an open gate."""
         return self.power_w > 0
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:
-        """Put it on, as somebody before us may have left it."""
+        """Put the laser on, as somebody before us may have left it."""
         self.on = True
         self.mode = "modulation" if gated else "constant power"
         self.digital = gated
@@ -138,7 +138,7 @@ class CoboltModel:
         self._tell(now_s)
 
     def open_interlock(self, now_s: float) -> None:
-        """A door opens: off, and fault 3 stays until it is cleared."""
+        """Open a door: the laser goes off, and fault 3 stays until it is cleared."""
         self.interlock_open = True
         self.fault = 3
         self._stop()

@@ -1,6 +1,6 @@
-"""What emulated scanner boards have in common: commands and replies, points, a record of what the outputs did.
+"""The common part of emulated scanner boards: commands and replies, points, and a record of the outputs.
 
-What a scanner DAC put out over time: the record that an emulated world and tests look at.
+An emulated world and tests look at that record.
 """
 
 import threading
@@ -15,7 +15,7 @@ from sim_backend.wire.serve.usb_model import STALL, Answer, DeviceSpec, Stall, U
 Array = NDArray[np.float64]
 
 KEEP_S = 20.0
-"""Older output is forgotten."""
+"""Age at which output is forgotten."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +100,7 @@ class DacHistory:
         return np.concatenate(edges) if edges else np.empty(0)
 
     def _between(self, from_s: float, until_s: float) -> list[Played]:
-        """What was played in [from_s, until_s], ascending."""
+        """The points that were played in [from_s, until_s], ascending."""
         return [one for one in self._played if one.end_s > from_s and one.start_s <= until_s]
 
     def playing(self, time_s: float) -> bool:
@@ -131,13 +131,13 @@ class DacModel(UsbModel):
         self.spec = spec
         self.history = DacHistory(normal(CENTRE), lines=4)
         self.deaf = False
-        """Test knob: the firmware hangs, its outputs play on."""
+        """Test knob: whether the firmware hangs, while its outputs play on."""
         self.points_endpoint = points
         self._commands_endpoint, self._replies_endpoint = commands, replies
         self._replies: deque[bytes] = deque()
 
     def leave_reply(self, reply: bytes) -> None:
-        """A reply that an earlier program never read."""
+        """Leave a reply that an earlier program never read."""
         self._replies.append(reply)
 
     def out(self, endpoint: int, data: bytes, now_s: float) -> int | Stall | None:
@@ -157,7 +157,7 @@ class DacModel(UsbModel):
         return self._replies.popleft() if ready else None
 
     def unplugged(self, now_s: float) -> None:
-        """No power: the outputs fall to 0 V, which is the centre."""
+        """Let the outputs fall to 0 V without power, which is the centre."""
         self.advance(now_s)
         self._halt(now_s)
         self.history.cut(now_s, normal(CENTRE))
@@ -178,5 +178,5 @@ class DacModel(UsbModel):
         raise NotImplementedError
 
     def _halt(self, now_s: float) -> None:
-        """Nothing is left to play."""
+        """End playing: nothing is left to play."""
         raise NotImplementedError

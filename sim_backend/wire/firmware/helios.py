@@ -17,7 +17,7 @@ SYSTICK_HZ = 112_000_000
 BUFFER_POINTS = 4096
 STOP_DEAD_S = 0.1
 BUS_BYTES_PER_S = 1.0e6
-"""What full speed carries, about: 4095 points take 28 ms."""
+"""Bytes a second at full speed, about: 4095 points take 28 ms."""
 
 COMMANDS, REPLIES, FRAMES = 0x06, 0x83, 0x02
 RED, GREEN, BLUE, INTENSITY = 0, 1, 2, 3
@@ -69,7 +69,7 @@ class HeliosModel(DacModel):
         self.played = 0
         """Frames whose playing began."""
         self.drop_next = 0
-        """Test knob: so many sound frames are dropped in silence."""
+        """Test knob: number of sound frames that are dropped in silence."""
         self._name, self._version, self._axis = name, version, axis
         self._clock_error = clock_error
         self._playing: _Frame | None = None

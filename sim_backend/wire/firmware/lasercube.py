@@ -51,7 +51,7 @@ class LaserCubeModel(DacModel):
         self.enabled = False
         self.rate_hz = 30_000
         self.rate_offset_hz = 0
-        """Test knob: the rate that is set is another one by this much."""
+        """Test knob: amount by which the rate that is set differs from the one that was asked for."""
         self._ring_points, self._highest_rate_hz = ring, highest_rate_hz
         self._when_empty, self._axis, self._clock_error = when_empty, axis, clock_error
         self._ring: deque[NDArray[np.uint16]] = deque()

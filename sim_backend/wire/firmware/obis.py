@@ -13,7 +13,7 @@ OFF_BITS = 0xC800_0000
 _COMMAND = re.compile(r"[^\r\n]+[\r\n]+")
 _ADDRESS = re.compile(r"^(SYST|SOUR)(\d*)(?=:)")
 FORBIDDEN = ("SYST:CDRH OFF",)
-"""Bypasses: a driver that sends one of them has failed its test."""
+"""Commands that bypass a safeguard: a driver that sends one of them has failed its test."""
 
 
 class ObisModel:
@@ -52,7 +52,7 @@ class ObisModel:
         self.tec = True
         self.base_c = 24.6
         self.base_range_c: tuple[float, float] | None = (10.0, 50.0)
-        """What it states; None: this unit does not."""
+        """Range of the base plate's temperature that this unit states; None: it states none."""
         self.forbidden: list[str] = []
         self.commands: list[str] = []
         self._warm_up_s = warm_up_s
@@ -64,22 +64,22 @@ class ObisModel:
 
     @property
     def warm(self) -> bool:
-        """The warm-up is over."""
+        """End the warm-up."""
         return self._warm_at_s is not None and self._now_s >= self._warm_at_s
 
     @property
     def able(self) -> bool:
-        """Nothing forbids emission."""
+        """Whether nothing forbids emission."""
         return self.key_on and not self.interlock_open and not self.fault
 
     @property
     def emitting(self) -> bool:
-        """It would shine through an open gate."""
+        """Whether the laser would shine through an open gate."""
         return self.able and self.state_on and self._lit_at_s is not None and self._now_s >= self._lit_at_s
 
     @property
     def gated(self) -> bool:
-        """The TTL input governs the light."""
+        """Whether the TTL input governs the light."""
         return self.mode == "DIGITAL"
 
     @property
@@ -88,14 +88,14 @@ class ObisModel:
         return self.set_power_w if self.emitting else 0.0
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:
-        """Put it on, as somebody before us may have left it."""
+        """Put the laser on, as somebody before us may have left it."""
         self.state_on = True
         self._warm_at_s = self._lit_at_s = float("-inf")
         self.mode = "DIGITAL" if gated else "CWP"
         self.set_power_w = power_w
 
     def open_interlock(self, now_s: float) -> None:
-        """A door opens: off until somebody says ON again."""
+        """Open a door: the laser is off until somebody says ON again."""
         self.tick(now_s)
         self.interlock_open = True
         self._switch(False)
@@ -113,7 +113,7 @@ class ObisModel:
         return out.encode("ascii")
 
     def tick(self, now_s: float) -> bytes:
-        """Warm-up and delay end; the laser never speaks unasked."""
+        """Let time pass: warm-up and delay end; the laser never speaks unasked."""
         self._now_s = now_s
         if self._warm_at_s is None:
             self._warm_at_s = now_s + self._warm_up_s

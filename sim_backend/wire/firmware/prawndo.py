@@ -37,16 +37,16 @@ class TriggerLine:
         self._edges: list[tuple[float, bool]] = []
 
     def set(self, high: bool, at_s: float) -> None:
-        """Switch it at a time not before the last one."""
+        """Switch the line at a time not before the last one."""
         self._edges.append((at_s, high))
 
     def pulse(self, at_s: float, width_s: float) -> None:
-        """High for `width_s` from `at_s` on."""
+        """Hold the line high for `width_s` from `at_s` on."""
         self.set(True, at_s)
         self.set(False, at_s + width_s)
 
     def __call__(self, from_s: float, until_s: float) -> float | None:
-        """As `Trigger`."""
+        """First time in [from_s, until_s) at which the line is high; None: it is low until then."""
         index = bisect_right(self._edges, from_s, key=lambda edge: edge[0]) - 1
         if index >= 0 and self._edges[index][1]:
             return from_s
@@ -154,14 +154,16 @@ class PrawnDoModel:
     # What happens to the device
 
     def power_cycle(self, at_s: float) -> None:
-        """Power lost and back: pull-downs hold the outputs low until the firmware drives them low again."""
+        """Take the power away and give it back: pull-downs hold the outputs low until the firmware drives them low
+        again.
+        """
         self.advance(at_s)
         self._restart()
         self._set_outputs(0, at_s)
         self._unasked = BANNER
 
     def lose_external_clock(self) -> None:
-        """The clock on GPIO20 dies: the firmware goes on with its own and says so, unasked."""
+        """Let the clock on GPIO20 die: the firmware goes on with its own and says so, unasked."""
         self.external_clock_hz = None
         if self.clock_external:
             self._resuscitate()

@@ -49,7 +49,7 @@ class Spad512sModel:
         self.commands: list[str] = []
         """Commands as they came, for tests to look at."""
         self.fail_at_byte: int | None = None
-        """The next run ends with `fail_text` behind so many bytes of pixels."""
+        """Test knob: number of bytes of pixels behind which the next run ends with `fail_text`."""
         self.fail_text = b"\nAuto-protect: too much light. Acquisition ERROR"
         self._frames = frames
         self._calibration_s = calibration_s
@@ -72,17 +72,17 @@ class Spad512sModel:
         return self._run is not None
 
     def connected(self, now_s: float) -> None:
-        """Greet."""
+        """Greet the client."""
         self._out = bytearray(BANNER.encode())
         self._run = None
 
     def disconnected(self, now_s: float) -> None:
-        """The run, if any, goes to nobody."""
+        """Give the run, if there is one, to nobody from now on."""
         self._run = None
         self._out.clear()
 
     def restarted(self) -> None:
-        """The program ended and was started anew."""
+        """End the program and start it anew."""
         self._calibrated = self._calibration_s == 0
 
     def receive(self, data: bytes, now_s: float) -> None:

@@ -73,10 +73,10 @@ class SpbUsbModel(UsbModel):
         """The FPGA's own gate line: low from the moment the watchdog strikes or a run is aborted until the next START.
         """
         self.deaf = False
-        """The firmware hangs: it takes commands and says nothing."""
+        """Test knob: whether the firmware hangs: it takes commands and says nothing."""
         self.pings: list[int] = []
         self.commands: list[tuple[int, int, int]] = []
-        """(op, address, value) of every command but PING."""
+        """Every command but PING: (op, address, value)."""
         self.spec = device_spec(chip, acks, serial, product_name)
         self._source = source
         self._board = RunSettings(width, height, tick_hz, paced, fifo_frames, payload_crc)
@@ -107,22 +107,22 @@ class SpbUsbModel(UsbModel):
 
     @property
     def state(self) -> SensorState:
-        """Where the device stands."""
+        """State of the device."""
         return self._state
 
     @property
     def heartbeat_ms(self) -> int:
-        """What the host set for the watchdog."""
+        """Time that the host set for the watchdog."""
         return self._registers[Register.HEARTBEAT_MS]
 
     # The bus
 
     def unplugged(self, now_s: float) -> None:
-        """Bus power is gone."""
+        """Take note that bus power is gone."""
         self._reset()
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Nothing happens: hosts choose the setting that is there."""
+        """Do nothing: hosts choose the setting that is there."""
 
     def control(self, setup: Setup, data: bytes, now_s: float) -> Answer:
         """FT601: its configuration (0xCF) and its own firmware version (0xF1)."""
@@ -258,7 +258,7 @@ class SpbUsbModel(UsbModel):
                 self._state = SensorState.DRAINING
 
     def _end(self, run: EmulatedRun, status: BlockStatus, flag: BlockFlag) -> None:
-        """Gate low, FIFO flushed, a last block without frames, idle."""
+        """End the run: gate low, FIFO flushed, a last block without frames, then idle."""
         self._queue.clear()
         self.gate_allowed = False
         self._send(run, run.end(status, flag))
@@ -272,7 +272,7 @@ class SpbUsbModel(UsbModel):
         self.gate_allowed = False
 
     def _watch(self, now_s: float) -> None:
-        """The watchdog: a run whose host sends no PING ends dark."""
+        """Act as the watchdog: a run whose host sends no PING ends dark."""
         limit_ms = self._registers[Register.HEARTBEAT_MS]
         run = self._run
         if run is not None and limit_ms and now_s - run.pinged_s > limit_ms / 1000:

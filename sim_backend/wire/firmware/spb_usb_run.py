@@ -1,6 +1,6 @@
-"""One run of an emulated SPB1 device: frames exposed, frames its memory loses, the blocks in which the others come.
+"""One run of an emulated SPB1 device, its USB descriptors and its registers (docs/spb1-usb.md).
 
-What an emulated SPB1 device is: its USB descriptors and its registers (docs/spb1-usb.md).
+In a run frames are exposed, the memory may lose some, and the others come in blocks.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from drivers.spb1.writer import seal_control
 from sim_backend.wire.serve.usb_model import AlternateSpec, DeviceSpec, EndpointSpec
 
 IDLE_S: Final = 0.1
-"""A run without frames for so long sends a heartbeat block."""
+"""Time without frames after which a run sends a heartbeat block."""
 BUFFERS: Final = 80
 """Blocks that transports may hold at a time; memory is taken as it is needed."""
 
@@ -38,7 +38,7 @@ class Span:
 
 
 class FrameSource(Protocol):
-    """What the sensor sees and which markers reach it. Asked for every frame of a run, once and in order."""
+    """The scene before the sensor and the markers that reach it. Asked for every frame of a run, once and in order."""
 
     def started(self) -> None:
         """A run begins: counters of markers are 0."""
@@ -54,7 +54,7 @@ class FrameSource(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RunSettings:
-    """What holds for all runs. Options as of `SpbUsbModel`."""
+    """Settings that hold for all runs. Options as of `SpbUsbModel`."""
 
     width: int
     height: int
@@ -72,7 +72,7 @@ class BlockMemory:
         self._next = 0
 
     def take(self, size: int) -> NDArray[np.uint8]:
-        """The one that was given out longest ago."""
+        """The buffer that was given out longest ago."""
         if self._next == len(self._buffers):
             self._buffers.append(np.zeros(0, np.uint8))
         if len(self._buffers[self._next]) != size:
@@ -89,7 +89,7 @@ class BlockMemory:
 
 
 class EmulatedRun:
-    """From START to its last block."""
+    """A run from START to its last block."""
 
     def __init__(
         self,
@@ -104,9 +104,9 @@ class EmulatedRun:
         self.next_frame = 0
         self.pinged_s = now_s
         self.over = False
-        """Its last block was made."""
+        """Whether the last block was made."""
         self.high_water_bytes = 0
-        """Most that waited for the host."""
+        """Largest number of bytes that waited for the host."""
         self._board, self._source, self._memory, self._run_id = board, source, memory, run_id
         self._period, self._exposure = registers[Register.PERIOD_TICKS], registers[Register.EXPOSURE_TICKS]
         self._burst = registers[Register.MODE] == 1
@@ -123,7 +123,7 @@ class EmulatedRun:
         self._just_lost = False
 
     def stop(self) -> None:
-        """No frame more."""
+        """End the run: no frame more."""
         self._n_frames = self.next_frame
 
     def end(self, status: BlockStatus, flag: BlockFlag) -> memoryview:
@@ -288,7 +288,7 @@ def registers_at_power_up(
     protocol: int,
     features: Feature,
 ) -> dict[int, int]:
-    """All of them by address, those that nobody wrote yet 0."""
+    """The registers by address; those that nobody wrote yet are 0."""
     registers = dict.fromkeys(WRITABLE, 0)
     registers |= {
         Register.MAGIC: IDENTITY_MAGIC,

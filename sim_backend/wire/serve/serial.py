@@ -59,12 +59,12 @@ class SerialServer(WireServer[SerialModel]):
 
     @property
     def path(self) -> str:
-        """Where pyserial finds the device while it is plugged in."""
+        """Path at which pyserial finds the device while it is plugged in."""
         return str(Path(self._folder.name) / "tty")
 
     @property
     def endpoint(self) -> Endpoint:
-        """The same for `Surroundings.ports`."""
+        """The endpoint of that path for `Surroundings.ports`."""
         return Endpoint(self.path, emulated=True)
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ from sim_backend.wire.serve.wire_server import FaultSchedule, WireServer
 
 HOST = "127.0.0.1"
 CHUNK_BYTES = 65_536
-"""Most that is asked of the model at a time: one piece of a stream, which a fault may strike."""
+"""Most bytes that are asked of the model at a time: one piece of a stream, which a fault may strike."""
 _TURN_S = 0.002
 """One turn of the serving thread while nothing moves."""
 
@@ -52,12 +52,12 @@ class TcpServer(WireServer[TcpModel]):
 
     @property
     def address(self) -> str:
-        """Where a client finds it."""
+        """Address at which a client finds the device."""
         return f"{HOST}:{self._port}"
 
     @property
     def endpoint(self) -> Endpoint:
-        """The same for `Surroundings.ports`."""
+        """The endpoint of that address for `Surroundings.ports`."""
         return Endpoint(self.address, emulated=True)
 
     def plug(self) -> None:

@@ -23,7 +23,8 @@ from drivers.clock import NS_PER_S, Clock
 from sim_backend.wire.serve.usb_model import AlternateSpec, AttachedDevice, Setup, UsbFailure, UsbModel
 
 FIRST_POLL_S, LONGEST_POLL_S = 250e-6, 1e-3
-"""When a transfer that the device is not ready for asks again; each time twice as late, up to the second."""
+"""Waits until a transfer that the device is not ready for asks again: each twice as long, from the first up to the
+second."""
 
 _LIBUSB = {
     errno.EIO: (-1, "Input/Output Error"),
@@ -82,7 +83,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
             return iter(list(self._devices))
 
     def get_parent(self, dev: AttachedDevice) -> None:
-        """All devices hang on the root."""
+        """None: all devices hang on the root."""
         return None
 
     def get_device_descriptor(self, dev: AttachedDevice) -> SimpleNamespace:
@@ -128,7 +129,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         )
 
     def get_interface_descriptor(self, dev: AttachedDevice, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """By index, IndexError past the end."""
+        """The interface descriptor by index; IndexError past the end."""
         one = _alternate(dev, intf, alt)
         return SimpleNamespace(
             bLength=9,
@@ -146,7 +147,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
     def get_endpoint_descriptor(
         self, dev: AttachedDevice, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """By index, IndexError past the end."""
+        """The endpoint descriptor by index; IndexError past the end."""
         end = _alternate(dev, intf, alt).endpoints[ep]
         return SimpleNamespace(
             bLength=7,
@@ -161,53 +162,53 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         )
 
     def open_device(self, dev: AttachedDevice) -> _Handle:
-        """A handle."""
+        """A handle of the device."""
         with _pyusb_errors():
             dev.open()
         return _Handle(dev)
 
     def close_device(self, dev_handle: _Handle) -> None:
-        """What was claimed falls free."""
+        """Close the device; the interfaces that were claimed fall free."""
         dev_handle.device.close(dev_handle)
 
     def set_configuration(self, dev_handle: _Handle, config_value: int) -> None:
-        """0 or 1."""
+        """Set configuration 0 or 1."""
         with _pyusb_errors():
             dev_handle.device.set_configuration(config_value)
 
     def get_configuration(self, dev_handle: _Handle) -> int:
-        """The present one."""
+        """Number of the present configuration."""
         return dev_handle.device.configuration
 
     def set_interface_altsetting(self, dev_handle: _Handle, intf: int, altsetting: int) -> None:
-        """Of a claimed interface."""
+        """Choose an alternate setting of a claimed interface."""
         with _pyusb_errors():
             dev_handle.device.set_alternate(intf, altsetting, dev_handle)
 
     def claim_interface(self, dev_handle: _Handle, intf: int) -> None:
-        """For this handle."""
+        """Claim an interface for this handle."""
         with _pyusb_errors():
             dev_handle.device.claim(intf, dev_handle)
 
     def release_interface(self, dev_handle: _Handle, intf: int) -> None:
-        """Claimed by this handle."""
+        """Release an interface that this handle claimed."""
         with _pyusb_errors():
             dev_handle.device.release(intf, dev_handle)
 
     def bulk_write(self, dev_handle: _Handle, ep: int, intf: int, data: Any, timeout: int) -> int:
-        """Bytes sent; partial on a timeout."""
+        """Send to a bulk endpoint; returns the number of bytes sent, fewer on a timeout."""
         return self._write(dev_handle, ep, bytes(data), timeout)
 
     def bulk_read(self, dev_handle: _Handle, ep: int, intf: int, buff: Any, timeout: int) -> int:
-        """Bytes read; partial on a timeout."""
+        """Read from a bulk endpoint; returns the number of bytes read, fewer on a timeout."""
         return self._read(dev_handle, ep, buff, timeout)
 
     def intr_write(self, dev_handle: _Handle, ep: int, intf: int, data: Any, timeout: int) -> int:
-        """As bulk."""
+        """Write to an interrupt endpoint, as to a bulk one."""
         return self._write(dev_handle, ep, bytes(data), timeout)
 
     def intr_read(self, dev_handle: _Handle, ep: int, intf: int, buff: Any, timeout: int) -> int:
-        """As bulk."""
+        """Read from an interrupt endpoint, as from a bulk one."""
         return self._read(dev_handle, ep, buff, timeout)
 
     def ctrl_transfer(
@@ -220,7 +221,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         data: Any,
         timeout: int,
     ) -> int:
-        """Bytes of the data stage."""
+        """Make a control transfer; returns the number of bytes of the data stage."""
         view = memoryview(data).cast("B")
         setup = Setup(bmRequestType, bRequest, wValue, wIndex, len(view))
         host_to_device = not bmRequestType & 0x80
@@ -240,7 +241,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
             dev_handle.device.clear_halt(ep)
 
     def is_kernel_driver_active(self, dev_handle: _Handle, intf: int) -> bool:
-        """Never: vendor-specific interfaces have none."""
+        """False: vendor-specific interfaces have no kernel driver."""
         return False
 
     def _write(self, handle: _Handle, endpoint: int, data: bytes, timeout_ms: int) -> int:

@@ -1,9 +1,8 @@
-"""What an emulated USB device is, whatever transport serves it: descriptors, answers, and the rules of the bus.
+"""An emulated USB device, whatever transport serves it: descriptors, answers, and the rules of the bus.
 
-A device model is a pure state machine: the transport tells it what the host did and the time, and it answers. It has
-no thread and never waits. `AttachedDevice` puts the bus around it: claims, settings, packets, stalls, unplugging.
-
-What a USB device says of itself: endpoints, alternate settings, strings, as bytes (USB 2.0 chapter 9.6).
+A device model is a pure state machine: the transport tells it what the host did and the time, and it answers. It has no
+thread and never waits. `AttachedDevice` puts the bus around it: claims, settings, packets, stalls, unplugging.
+`DeviceSpec` gives its descriptors (endpoints, alternate settings, strings) as bytes (USB 2.0 chapter 9.6).
 """
 
 import errno
@@ -17,7 +16,7 @@ from typing import Final, Literal
 Speed = Literal["full", "high", "super"]
 
 SPEED_MBIT: Final = {"full": 12, "high": 480, "super": 5000}
-"""As the file `speed` of /sys/bus/usb/devices says it."""
+"""Speeds in Mbit/s, as in the file `speed` of /sys/bus/usb/devices."""
 
 DEVICE, CONFIGURATION, STRING = 1, 2, 3
 """Types of descriptors that a host asks for."""
@@ -46,7 +45,7 @@ class AlternateSpec:
 
 @dataclass(frozen=True, slots=True)
 class DeviceSpec:
-    """What the descriptors say: one configuration, numbered 1."""
+    """Contents of the descriptors: one configuration, numbered 1."""
 
     vendor: int
     product: int
@@ -139,10 +138,10 @@ class UsbModel:
 
     spec: DeviceSpec
     gone: bool = False
-    """The device cut its own connection: the transport unplugs it at the next call."""
+    """Whether the device cut its own connection: the transport unplugs it at the next call."""
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """The host chose an alternate setting; 0 also when it released the interface or died."""
+        """Take note that the host chose an alternate setting; 0 also when it released the interface or died."""
 
     def control(self, setup: Setup, data: bytes, now_s: float) -> Answer:
         """A class or vendor request. IN: the reply; OUT: b"" is 'taken'. None: not ready."""
@@ -174,7 +173,7 @@ class AttachedDevice:
         self.address = port + 1
         self.present = True
         self.denied = False
-        """This user may not open it (EACCES)."""
+        """Whether this user may not open it (EACCES)."""
         self.configuration = 1
         self._now = now
         self._lock = threading.RLock()
@@ -196,20 +195,20 @@ class AttachedDevice:
                 self.model.unplugged(self._now())
 
     def open(self) -> None:
-        """EACCES where this user may not."""
+        """Open the device. EACCES where this user may not."""
         with self._lock:
             self._alive()
             if self.denied:
                 raise UsbFailure(errno.EACCES)
 
     def close(self, owner: object) -> None:
-        """The host closed its handle or died: interfaces fall free and back to alternate 0."""
+        """Deal with a host that closed its handle or died: interfaces fall free and back to alternate 0."""
         with self._lock:
             for interface in [number for number, holder in self._claims.items() if holder is owner]:
                 self._give_back(interface)
 
     def set_configuration(self, value: int) -> None:
-        """EBUSY while an interface is claimed, ENOENT for an unknown one."""
+        """Choose a configuration. EBUSY while an interface is claimed, ENOENT for an unknown one."""
         with self._lock:
             self._alive()
             if self._claims:
@@ -221,7 +220,7 @@ class AttachedDevice:
             self._halted.clear()
 
     def claim(self, interface: int, owner: object) -> None:
-        """EBUSY where another holds it."""
+        """Claim an interface. EBUSY where another holds it."""
         with self._lock:
             self._alive()
             if all(one.interface != interface for one in self.spec.alternates):
@@ -244,7 +243,7 @@ class AttachedDevice:
             self.model.set_interface(interface, 0, self._now())
 
     def set_alternate(self, interface: int, alternate: int, owner: object) -> None:
-        """ENOENT for an unknown one or an interface that is not claimed."""
+        """Choose an alternate setting. ENOENT for an unknown one or an interface that is not claimed."""
         with self._lock:
             self._alive()
             if self._claims.get(interface) is not owner or self._setting(interface, alternate) is None:

@@ -1,8 +1,8 @@
-"""What serves a model has a thread, a cable that can be pulled, firmware that can hang, and faults that strike.
+"""The base of servers of a model: a thread, a cable that can be pulled, firmware that can hang, and faults that strike.
 
-What can go wrong on a wire: late, split, merged, cut, corrupt, repeated or lost replies, stalls, unplugging, hangs.
-
-One seeded schedule decides, reply by reply, which fault strikes; the transports (serial, TCP, USB) act it out.
+Faults are the things that can go wrong on a wire: late, split, merged, cut, corrupt, repeated or lost replies, stalls,
+unplugging, hangs. One seeded schedule decides, reply by reply, which fault strikes; the transports (serial, TCP, USB)
+act it out.
 """
 
 import threading
@@ -26,23 +26,23 @@ class Fault(Enum):
     device and are the transport's to act out."""
 
     LATE = "late"
-    """Comes whole, after `late_s`."""
+    """The reply comes whole, after `late_s`."""
     SPLIT = "split"
-    """Comes in two parts with a pause between them."""
+    """The reply comes in two parts with a pause between them."""
     MERGED = "merged"
-    """Comes together with the next reply."""
+    """The reply comes together with the next one."""
     TRUNCATED = "truncated"
-    """Its end never comes."""
+    """The reply's end never comes."""
     CORRUPTED = "corrupted"
-    """One of its bits is flipped."""
+    """One of the reply's bits is flipped."""
     REPEATED = "repeated"
-    """Comes twice."""
+    """The reply comes twice."""
     LOST = "lost"
-    """Never comes."""
+    """The reply never comes."""
     STALL = "stall"
-    """It and all that follows come after `stall_s`."""
+    """The reply and all that follow come after `stall_s`."""
     UNPLUG = "unplug"
-    """The cable is pulled before it comes."""
+    """The cable is pulled before the reply comes."""
     HANG = "hang"
     """The firmware hangs: it takes and says nothing from now on; its outputs stay as they are."""
 
@@ -56,7 +56,7 @@ class Delivery:
 
 
 class FaultSchedule:
-    """Decides on each reply. Seeded, so that a sequence that failed can be run again.
+    """The decision on each reply. Seeded, so that a sequence that failed can be run again.
 
     probability: that a reply meets a fault at all. kinds: which ones, equally often. skip: so many replies come
     unharmed first (the opening of a device, say). most: faults in all; None: no end.
@@ -82,7 +82,7 @@ class FaultSchedule:
         self.stall_s = stall_s
         self._held = b""
         self.struck: list[Fault] = []
-        """What struck so far, in order."""
+        """Faults that struck so far, in order."""
 
     def next(self) -> Fault | None:
         """The fault that strikes the next reply."""
@@ -98,7 +98,7 @@ class FaultSchedule:
         return fault
 
     def shape(self, fault: Fault | None, reply: bytes) -> tuple[Delivery, ...]:
-        """What arrives instead of `reply`; a reply held back to be merged comes with the next one."""
+        """The deliveries in place of `reply`; a reply held back to be merged comes with the next one."""
         if fault is Fault.MERGED:
             self._held += reply
             return ()
@@ -162,7 +162,7 @@ class WireServer(ABC, Generic[Model]):
         self._clock = clock or SystemClock()
         self._outbox: deque[tuple[float, bytes]] = deque()
         self._free_at = 0.0
-        """When the next reply may leave: they leave in order."""
+        """Time at which the next reply may leave: they leave in order."""
         self._hung = False
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._serve, name=type(self).__name__, daemon=True)
@@ -170,7 +170,7 @@ class WireServer(ABC, Generic[Model]):
     @property
     @abstractmethod
     def endpoint(self) -> Endpoint:
-        """Where a host finds the device while it is plugged in, for `Surroundings.ports`."""
+        """The endpoint at which a host finds the device while it is plugged in, for `Surroundings.ports`."""
 
     def start(self) -> Self:
         """Plug it in and serve it on a thread of its own."""
@@ -204,7 +204,7 @@ class WireServer(ABC, Generic[Model]):
         """Pull the cable: the open port is lost, bytes on their way with it."""
 
     def hang(self) -> None:
-        """The firmware hangs: nothing is taken and nothing said, outputs stay as they are."""
+        """Let the firmware hang: nothing is taken and nothing said, outputs stay as they are."""
         with self.lock:
             self._hung = True
             self._outbox.clear()
