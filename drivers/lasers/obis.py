@@ -2,7 +2,7 @@
 
 docs/hardware.md; from python-microscope `lights/obis.py` (69625e0), the bit tables of `obis.h`, the operator's
 manual (appendix C) and mmCoreAndDevices PRs 645 and 531. Limits of the base plate's temperature are read by
-`SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not in docs/hardware.mdbut in `obis.cpp` beside `obis.h` and in
+`SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not in docs/hardware.md but in `obis.cpp` beside `obis.h` and in
 Micro-Manager's `CoherentOBIS.cpp`. The laser has no watchdog: where its port is lost it stays as it was, so treat it as
 on.
 

@@ -1,6 +1,6 @@
 """Opening an SPB1 device: USB chip, identity registers, test pattern, and the registers written before START.
 
-Facts: docs/hardware.mds 2.4, 2.5 and 8.
+Facts: docs/hardware.md and docs/spb1-usb.md.
 
 The USB chips differ in ids and endpoints, and an FT601 wants a session. Sources: `VicidominiLab` BrightEyes-TTM 8f8d8d8
 (FX3 with the AN65974 firmware, 04B4:00F1, bulk IN 0x81); `apertus-open-source-cinema/ft60x-rs` and
