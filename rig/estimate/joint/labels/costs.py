@@ -38,8 +38,7 @@ from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 
 SHARP: Final = 8.0
-"""Exposures at which a nat is worth half as many: with sharp rows the labels beside the best one must still count. In
-maps taken in passes that goes by each column's own."""
+"""Exposures at which a nat is worth half as many: with sharp rows the labels beside the best one must still count."""
 BAND_ROWS: Final = 64
 """Rows that share tables."""
 FINEST: Final = 64.0
