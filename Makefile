@@ -2,7 +2,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: demo help test lint types layers unit clean
+.PHONY: demo help test lint types layers house unit clean
 .PHONY: accuracy accuracy-rows accuracy-joint accuracy-calibration
 .PHONY: campaign campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration campaign-kernel
 .DELETE_ON_ERROR:
@@ -13,7 +13,7 @@ demo: .venv/.installed  ## scan the simulated rig in a foggy street
 help:  ## this list
 	@awk -F' *## ' '/^[a-z-]+:.*## / { sub(/:.*/, "", $$1); printf "%-21s %s\n", $$1, $$2 }' Makefile
 
-test: lint types layers unit  ## lint, types, import layers and all tests
+test: lint types layers house unit  ## lint, types, import layers, the tree's figures and all tests
 
 lint: .venv/.installed-tests
 	$(BIN)/ruff check .
@@ -22,6 +22,8 @@ types: .venv/.installed-tests
 	$(BIN)/mypy
 layers: .venv/.installed-tests
 	$(BIN)/lint-imports
+house: .venv/.installed-tests
+	$(BIN)/python -m tests.reference.house --limits
 # Files of tests go to the workers whole: what they prepare once is prepared once.
 WORKERS ?= 4
 unit: .venv/.installed-tests

@@ -2,7 +2,6 @@
 
 import threading
 import time
-from fractions import Fraction
 from typing import Protocol, runtime_checkable
 
 NS_PER_S = 1_000_000_000
@@ -56,8 +55,3 @@ class VirtualClock:
         """Advance to `t_ns`; a time already passed changes nothing, since the clock never runs backwards."""
         with self._lock:
             self._now_ns = max(self._now_ns, t_ns)
-
-
-def ticks_to_ns(ticks: int, tick_hz: Fraction) -> int:
-    """Nanoseconds (floor) of a device time in ticks. Exact at any length of run: 97.7 kHz is no whole number of ns."""
-    return ticks * NS_PER_S * tick_hz.denominator // tick_hz.numerator

@@ -68,7 +68,6 @@ class BlockRing:
         self._readers: list[RingReader] = []
         self._changed = threading.Condition()
         self._any_claimed = False
-        self._overflowed = False
         self._finished = False
         self._error: BaseException | None = None
 
@@ -81,11 +80,6 @@ class BlockRing:
     def full(self) -> bool:
         """Whether there is no free slot at this moment."""
         return not self._free
-
-    @property
-    def overflowed(self) -> bool:
-        """Whether the source had to drop blocks since the ring was made."""
-        return self._overflowed
 
     @property
     def finished(self) -> bool:
@@ -156,7 +150,6 @@ class BlockRing:
         Called once the source has counted them as lost. Raises RingOverflow where such a loss ends the run.
         """
         with self._changed:
-            self._overflowed = True
             self.last_frame += n_frames
             self.dropped_blocks += 1
             self.dropped_frames += n_frames

@@ -40,7 +40,7 @@ BLOCK_PX: Final = 8
 """Pixels of one counter, 16 bits each."""
 _VECTOR_PX = 16
 
-_I1, _I8, _I16, _I32, _I64 = (ir.IntType(bits) for bits in (1, 8, 16, 32, 64))
+_I8, _I16, _I32, _I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 _BYTES, _BLOCK, _PAIR = ir.VectorType(_I8, 16), ir.VectorType(_I64, 2), ir.VectorType(_I64, 4)
 _COLUMNS = ir.VectorType(_I32, 4)
 _PIXELS = ir.VectorType(_I16, _VECTOR_PX)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,6 @@ from sim_backend.light.line import ONE_LINE, LineFan, line_fan, line_width
 from sim_backend.light.optics import Line, Optics, Sensor, detections_per_radiance
 from sim_backend.light.view import make_view
 from sim_backend.scenes.scene import CLEAR, BoardPlace, load_scene, load_surfaces, with_board_at, with_fog
-
-if TYPE_CHECKING:
-    from sim_backend.frames.numpy_frames import NumpyFrames
 
 Array = NDArray[np.float64]
 
@@ -265,20 +262,10 @@ class SimulatedWorld:
             view.trace(sheet, row, row + 1)
         return flux_row(self, row, sheets, power_w=power_w * self.fan.share, exposure_s=exposure_s)
 
-    def frame_source(self, exposure_s: float, seed: int, threads: int) -> PhotonSource:
-        """A source of frames that follow one another without a gap."""
-        return self.photons(FrameTimes(exposure_s, exposure_s), seed, threads)
-
     def photons(self, times: FrameTimes, seed: int, threads: int) -> PhotonSource:
         """A source of frames that follow one another at these times."""
         model = self.model
         return PhotonSource(self.flux_model, model.sheets, times, seed, threads, self.fan, model.scanner.command_range)
-
-    def numpy_frames(self, exposure_s: float, seed: int) -> "NumpyFrames":
-        """The straightforward way to the same frames, to compare with."""
-        from sim_backend.frames.numpy_frames import NumpyFrames
-
-        return NumpyFrames(self.setting, self.flux_model.steady_per_s, exposure_s, seed)
 
 
 def _own(model: RigModel) -> dict[str, str]:

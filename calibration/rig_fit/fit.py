@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.board.board import Board
 from calibration.camera_fit import CameraFit, fit_camera
@@ -28,8 +27,6 @@ from calibration.rig_fit.solve import RigProblem, all_rows, camera_prior
 from calibration.rig_fit.start import board_points, check_poses, check_views, first_pose, first_scanner, no_start
 from calibration.rig_fit.state import RigState, Sighting, first_state, sighting, usable, with_terms_of
 from calibration.views import BoardPose, View, robust_sd
-
-Array = NDArray[np.float64]
 
 
 def fit_rig(

@@ -86,7 +86,7 @@ class Owned:
         self._next_try = 0.0
         self._trouble = ""
         kind = lookup(slot, config["kind"])
-        endpoints = {name: Endpoint(address, emulated=True) for name, address in ports.items()}
+        endpoints = {name: Endpoint(address) for name, address in ports.items()}
         self._tap = None if tap is None else TapFile(**tap).tap(slot)
         surroundings = Surroundings(SystemClock(), None, 0, endpoints, self._tap)
         model = kind.config.model_validate(config)

@@ -64,7 +64,6 @@ class GuardProcess:
         self._application: WatchedProcess | None = None
         self._tripped: DeviceError | None = None
         self._trip_lock = threading.Lock()
-        self._application_lives = True
         self._kill_at: float | None = None
         self._safe_asked = False
         self._ending = False
@@ -104,7 +103,6 @@ class GuardProcess:
         messages = self._channel.receive() if self._channel.fileno() in ready else []
         gone = self._application is not None and self._application.ended
         if messages is None or gone:
-            self._application_lives = False
             self._trip(DeviceDisconnected("the application is gone"))
             self._ending = True
             return []

@@ -43,11 +43,6 @@ _ROOMY_RING = 8
 class Reads(Protocol):
     """Queued reads of one endpoint, done in order; a `BulkLink` has them."""
 
-    @property
-    def in_flight(self) -> int:
-        """Reads that are queued."""
-        ...
-
     def submit(self, endpoint: int, buffer: Buffer) -> bool:
         """Queue a read of the whole buffer. False where the system takes no more of them."""
         ...

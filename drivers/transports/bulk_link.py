@@ -28,11 +28,6 @@ class BulkLink(Protocol):
     endpoints: frozenset[int]
     """Addresses of the claimed interfaces' endpoints; bit 7 set = IN."""
 
-    @property
-    def in_flight(self) -> int:
-        """Reads that are queued."""
-        ...
-
     def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
         """One OUT transfer. `DeviceTimeout` where not all of it went out."""
         ...
@@ -74,11 +69,6 @@ class PlainLink:
         self._queue: deque[tuple[int, Buffer]] = deque()
         self._scratch = array.array("B")
         self._got = 0
-
-    @property
-    def in_flight(self) -> int:
-        """Reads that are waiting."""
-        return len(self._queue)
 
     def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
         """See `BulkLink`."""

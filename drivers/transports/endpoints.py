@@ -15,10 +15,9 @@ EMULATED_PREFIX = "emulated:"
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """An address that a transport opens. Everything with `emulated` False is a real device and needs `--arm`."""
+    """An address that a transport opens."""
 
     address: str
-    emulated: bool
     usb_backend: object | None = None
     """The `usb.backend.IBackend` that serves an emulated USB device; None: libusb."""
 
@@ -29,7 +28,7 @@ def resolve(port: str, ports: Mapping[str, Endpoint]) -> Endpoint:
     `DeviceNotFound` for an emulated port that is not among them; a real address is not looked at before it is opened.
     """
     if not port.startswith(EMULATED_PREFIX):
-        return Endpoint(port, emulated=False)
+        return Endpoint(port)
     name = port.removeprefix(EMULATED_PREFIX)
     if name in ports:
         return ports[name]

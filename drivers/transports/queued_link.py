@@ -59,11 +59,6 @@ class QueuedLink:
             self.close()
             raise
 
-    @property
-    def in_flight(self) -> int:
-        """Reads that are queued."""
-        return len(self._queue)
-
     def write(self, endpoint: int, data: bytes, timeout_s: float) -> None:
         """See `BulkLink`."""
         with self._translated(endpoint, timeout_s):

@@ -38,6 +38,7 @@ _SLICE_S = 0.02
 """One wait inside pyserial: the granularity of deadlines, in seconds."""
 _WRITE_S = 1.0
 """Time for a write: a device that takes nothing for so long hangs. 1 s is 11 520 characters at 115 200 baud."""
+_BAUD = 115_200
 _MAX_LINE_BYTES = 65_536
 """Longer than any reply to a command: beyond it the line is noise without an end."""
 
@@ -52,7 +53,7 @@ class SerialPort:
     Not thread-safe: a driver that is polled from several threads locks around a whole command and reply.
     """
 
-    def __init__(self, name: str, address: str, baud: int = 115_200, tap: Tap | None = None) -> None:
+    def __init__(self, name: str, address: str, tap: Tap | None = None) -> None:
         """Open the port. name: the device's name in messages. tap: told of all that passes.
 
         address: a path or COM port, "serial=ABC" (serial number of the USB device) or "usb=VVVV:PPPP" (hexadecimal
@@ -62,7 +63,7 @@ class SerialPort:
         self._path = _find(name, address)
         self._received = bytearray()
         self._tap = tap
-        self._port = self._open(baud)
+        self._port = self._open()
 
     @property
     def path(self) -> str:
@@ -100,15 +101,8 @@ class SerialPort:
             if len(self._received) > _MAX_LINE_BYTES:
                 raise ProtocolError(f"{self._name} sent {len(self._received)} bytes without an end of line: noise")
             searched = max(0, len(self._received) - len(terminator) + 1)
-            self._receive(ends_at, deadline_s, "a whole line")
+            self._receive(ends_at, deadline_s)
         return self._take(end, len(terminator))
-
-    def read_exact(self, n: int, deadline_s: float) -> bytes:
-        """Exactly n bytes. `DeviceTimeout` after `deadline_s`: what came is kept for the next read."""
-        ends_at = time.monotonic() + deadline_s
-        while len(self._received) < n:
-            self._receive(ends_at, deadline_s, f"{n} bytes")
-        return self._take(n, 0)
 
     def reset_input(self) -> bytes:
         """Drop everything received so far and not read; returns what it was. More may be on its way: see `drain`."""
@@ -132,14 +126,14 @@ class SerialPort:
         with suppress(*_FOREIGN):  # the port is gone, and with it all that could be given back
             self._port.close()
 
-    def _open(self, baud: int) -> serial.Serial:
+    def _open(self) -> serial.Serial:
         if "://" in self._path:
             raise DeviceNotFound(
                 f"{self._name}: port {self._path} is on the network; make a local one of it (socat PTY,raw,link=PATH "
                 "TCP:HOST:PORT) and write its path"
             )
         try:
-            return serial.Serial(self._path, baud, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
+            return serial.Serial(self._path, _BAUD, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
         except _FOREIGN as error:
             raise self._refused(error) from None
 
@@ -156,13 +150,13 @@ class SerialPort:
             return DeviceBusy(f"{where} is held by another program; close that program and try again")
         return DeviceNotFound(f"{where} cannot be opened as a serial port ({_one_line(error)}); correct 'port'")
 
-    def _receive(self, ends_at: float, deadline_s: float, what: str) -> None:
+    def _receive(self, ends_at: float, deadline_s: float) -> None:
         """Wait for bytes; DeviceTimeout past the deadline."""
         if self._receive_some():
             return
         if time.monotonic() >= ends_at:
             raise DeviceTimeout(
-                f"{self._name} did not send {what} within {deadline_s:g} s on {self._path} "
+                f"{self._name} did not send a whole line within {deadline_s:g} s on {self._path} "
                 f"({len(self._received)} bytes came); check its power and cable"
             )
 

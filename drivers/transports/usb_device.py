@@ -210,13 +210,6 @@ class UsbDevice:
             reply = self._device.ctrl_transfer(request_type, request, value, index, length, milliseconds(timeout_s))
         return bytes(reply)
 
-    def control_out(
-        self, request_type: int, request: int, value: int, index: int, data: bytes, timeout_s: float
-    ) -> None:
-        """A control transfer that writes. `DeviceFault` where the device refuses it (stall)."""
-        with translated(self.label, 0, timeout_s):
-            self._device.ctrl_transfer(request_type, request, value, index, data, milliseconds(timeout_s))
-
     def endpoints(self) -> tuple[int, ...]:
         """Addresses of all endpoints in the active configuration; bit 7 set = IN."""
         with translated(self.label):

@@ -9,8 +9,6 @@ from rig.api.calibrate import calibrate_camera, calibrate_check, calibrate_pixel
 from rig.api.recordings import compress, cut, export_run, import_frames, recording_info, repair, verify
 from rig.api.rig import (
     bench,
-    bench_disk,
-    bench_simulator,
     check_config,
     devices,
     doctor,
@@ -34,8 +32,6 @@ __all__ = [
     "PathLike",
     "RunResult",
     "bench",
-    "bench_disk",
-    "bench_simulator",
     "bundled_rigs",
     "bundled_scenes",
     "calibrate_camera",

@@ -8,8 +8,6 @@ from rig.errors import UsageError
 from rig.progress import Progress
 
 if TYPE_CHECKING:
-    from rig.bench.disk import DiskReport
-    from rig.bench.simulator import SimulatorReport
     from rig.bench.soak import SoakReport
     from rig.bench.speed import SpeedReport
     from rig.config.models import RigConfig
@@ -92,26 +90,6 @@ def bench(*, threads: int | None = None, progress: Progress | None = None) -> "S
     if threads is not None and threads < 1:
         raise UsageError(f"threads is {threads}; it must be at least 1")
     return measure_speed(threads, progress=progress)
-
-
-def bench_disk(folder: PathLike, *, progress: Progress | None = None) -> "DiskReport":
-    """Measure how fast recordings are written to and read from the disk of `folder`, beside the best it does.
-
-    Some 2 GB are written there and removed again. progress: called with measurements done and to do.
-    """
-    from rig.bench.disk import measure_disk
-
-    return measure_disk(Path(folder), progress)
-
-
-def bench_simulator(config: Config = SIMULATED, *, progress: Progress | None = None) -> "SimulatorReport":
-    """Measure how fast the simulator draws frames of a clear, a foggy and a crowded scene, beside plain numpy.
-
-    progress: called with rows done and rows to do, over all rounds.
-    """
-    from rig.bench.simulator import measure_simulator
-
-    return measure_simulator(lambda scene: configure(config, scene=scene), progress=progress)
 
 
 def soak(

@@ -13,9 +13,7 @@ from rich.table import Table
 from calibration.errors import digits
 from calibration.verdict import Verdict
 from drivers.replay.pace import PaceReport
-from rig.bench.disk import DiskReport
 from rig.bench.frames import COLUMNS
-from rig.bench.simulator import SimulatorReport
 from rig.bench.soak import SoakReport
 from rig.bench.speed import REAL_TIME_HZ, SpeedReport, SpeedRow
 from rig.run_folder.summary import PipelineStats, RunVerdict, Summary, Synchronisation
@@ -314,7 +312,7 @@ def speed_table(report: SpeedReport) -> None:
     for point in report.working_points:
         console.print(str(point))
     console.print(f"(maps of {COLUMNS} columns at {REAL_TIME_HZ / 1e3:g} kHz, counting included)\n")
-    _print_machine(console, report.machine)
+    print_machine(console, report.machine)
     console.print(f"memory read, one thread: {report.memory_read_gb_per_s:.1f} GB/s")
     order = list(_TITLES)
     rows = sorted(report.rows, key=lambda row: (order.index(row.stage), row.window, row.exposures or 0, row.threads))
@@ -330,46 +328,6 @@ def speed_table(report: SpeedReport) -> None:
     if not latency.kept_up:
         console.print("the estimate did not keep up with 100 kHz: this is the latency of a full ring")
     console.print(f"measured in {report.seconds:.0f} s")
-
-
-def disk_table(report: DiskReport) -> None:
-    """Print the disk's rows to stdout."""
-    console = Console(highlight=False, width=BENCH_WIDTH)
-    _print_machine(console, report.machine)
-    past = "past the page cache" if report.direct else "through the page cache, which this disk cannot be had without"
-    console.print(f"{report.gigabytes:.1f} GB in {report.folder}; plain: two threads {past}")
-    table = Table(box=None, pad_edge=False)
-    for title in ("row", "MB/s", "CPU s/GB", "of plain"):
-        table.add_column(title, justify="left" if title == "row" else "right")
-    for row in report.rows:
-        of_plain = "" if row.of_plain is None else f"{row.of_plain:.2f}"
-        table.add_row(row.stage, f"{row.mb_per_s:.0f}", f"{row.cpu_s_per_gb:.2f}", of_plain)
-    console.print(table)
-
-
-def simulator_table(report: SimulatorReport) -> None:
-    """Print the simulator's rows to stdout."""
-    console = Console(highlight=False, width=BENCH_WIDTH)
-    _print_machine(console, report.machine)
-    console.print(f"memory read, one thread: {report.memory_read_gb_per_s:.1f} GB/s")
-    rows, width = report.size
-    console.print(f"frames of {rows} x {width}; ready: one column's light stands; fresh: computed for every column")
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("row", "scene", "threads", "K", "kframes/s", "us/frame", "real time", "x numpy"):
-        table.add_column(name, justify="left" if name in ("row", "scene") else "right", no_wrap=True)
-    for row in report.rows:
-        table.add_row(
-            row.stage.removeprefix("simulator-"),
-            row.scene,
-            str(row.threads),
-            str(row.exposures),
-            f"{row.frames_per_s / 1e3:.4g}",
-            f"{row.us_per_frame:.4g}",
-            f"{row.times_real_time:.2g}",
-            _figure(row.times_numpy),
-        )
-    console.print(table)
-    console.print(f"x numpy: of whole-array numpy in the foggy scene, one thread; measured in {report.seconds:.0f} s")
 
 
 def soak_table(report: SoakReport) -> None:
@@ -405,7 +363,8 @@ def soak_table(report: SoakReport) -> None:
     console.print(table)
 
 
-def _print_machine(console: Console, found: dict[str, object]) -> None:
+def print_machine(console: Console, found: dict[str, object]) -> None:
+    """Print the processor with its caches and the versions of what computes."""
     caches = found["caches"]
     assert isinstance(caches, dict)
     named = ", ".join(f"{level} {size}" for level, size in caches.items())

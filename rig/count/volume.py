@@ -99,13 +99,12 @@ class CountVolume(FrameTally):
     """Counts of one sweep.
 
     counts: (columns, rows, window) uint8, uint16 or uint32, 1s of each pixel over the frames of the column.
-    x0: (columns,) int32, first pixel of each column's window. exposures: frames nominally taken per column, None where
-    only the counts are known.
+    x0: (columns,) int32, first pixel of each column's window. exposures: frames nominally taken per column.
     """
 
     counts: Counts
     x0: NDArray[np.int32]
-    exposures: int | None = None
+    exposures: int
 
     def intensity(self) -> NDArray[np.uint32]:
         """Counts summed over the columns, (rows, width) uint32."""

@@ -79,7 +79,7 @@ class CalibrationUse:
         }
 
 
-def identity_of(rig: OpenRig, created: datetime | None = None) -> Identity:
+def identity_of(rig: OpenRig) -> Identity:
     """Identity of an open rig, for a calibration of it that is made now.
 
     A rig that plays a recording has the identity of the rig that was recorded.
@@ -99,7 +99,7 @@ def identity_of(rig: OpenRig, created: datetime | None = None) -> Identity:
     if isinstance(rig.world, KnowsRig):
         kinds[_GEOMETRY] = replace(rig.world.true_model(), defects=None).fingerprint()
     serials = {slot: serial for slot in _SLOTS if (serial := getattr(rig, slot).serial) and serial not in _NO_SERIAL}
-    return _identity(config.name, kinds, serials, (created or datetime.now(UTC)).isoformat(timespec="seconds"))
+    return _identity(config.name, kinds, serials, datetime.now(UTC).isoformat(timespec="seconds"))
 
 
 def recorded_identity(run: Path) -> Identity:

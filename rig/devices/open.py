@@ -5,7 +5,6 @@ needs the user's word, a simulated one none), and how a burst shares a SPAD's me
 has started and the maps.
 """
 
-import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -32,8 +31,6 @@ from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.cube import cube_columns
 from rig.recording.replay import PlaysRecording, replay_plan
-
-_log = logging.getLogger(__name__)
 
 GUARDED = ("laser", "sync")
 """Slots whose devices a process of its own owns, since they let light out."""
@@ -101,25 +98,23 @@ class EmulatesDevices(Protocol):
 
 
 @contextmanager
-def open_rig(
-    config: RigConfig, clock: Clock | None = None, seed: int = 0, tap: TapFile | None = None
-) -> Iterator[OpenRig]:
+def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> Iterator[OpenRig]:
     """Open every device of the config; on exit the sync source is closed first, then laser, scanner and SPAD.
 
-    clock: None is virtual time for a simulated rig and the host's for a real one.
+    A simulated rig has virtual time, a real one the host's.
     seed: of everything simulated.
     tap: file that records what passes the ports of all devices; of the SPAD, its control traffic.
     Raises UsageError where config or calibration are at fault, DevicesError where devices are; each lists all problems.
     """
     with ExitStack() as stack:
-        yield _open(config, clock, seed, tap, stack)
+        yield _open(config, seed, tap, stack)
 
 
 @contextmanager
 def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
     """Open the gate and the laser alone, without a guard; None, with a line in `trouble`, for one that fails."""
     with ExitStack() as stack:
-        surroundings = _surroundings(config, None, 0, stack)
+        surroundings = _surroundings(config, 0, stack)
         opened: dict[str, Any] = {"sync": None, "laser": None}
         for slot in GUARDED:
             try:
@@ -134,7 +129,7 @@ def check_files(config: RigConfig) -> None:
     problems: list[str] = []
     _load_model(config, problems)
     with ExitStack() as stack:
-        _create_surroundings(config, None, 0, stack, problems)
+        _create_surroundings(config, 0, stack, problems)
     for slot in DEVICES:
         kind = getattr(config, slot)
         check = lookup(slot, kind.kind).check_files
@@ -180,11 +175,11 @@ def prepare(
     return plan, timing
 
 
-def _open(config: RigConfig, clock: Clock | None, seed: int, tap: TapFile | None, stack: ExitStack) -> OpenRig:
+def _open(config: RigConfig, seed: int, tap: TapFile | None, stack: ExitStack) -> OpenRig:
     usage: list[str] = []
     devices: list[str] = []
     model = _load_model(config, usage)
-    surroundings = _create_surroundings(config, clock, seed, stack, usage)
+    surroundings = _create_surroundings(config, seed, stack, usage)
     opened: dict[str, Any] = {}
     guard: Guard | None = None
     if surroundings is not None:
@@ -208,21 +203,19 @@ def _open(config: RigConfig, clock: Clock | None, seed: int, tap: TapFile | None
     return OpenRig(config=config, clock=clock, world=world, model=model, guard=guard, **opened)
 
 
-def _create_surroundings(
-    config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack, problems: list[str]
-) -> Surroundings | None:
+def _create_surroundings(config: RigConfig, seed: int, stack: ExitStack, problems: list[str]) -> Surroundings | None:
     """Clock and world; None where the world cannot be made, with lines in `problems`."""
     try:
-        return _surroundings(config, clock, seed, stack)
+        return _surroundings(config, seed, stack)
     except DeviceError as error:  # a scene that is not there is the config's fault, not a device's
         problems += [f"world: {line}" for line in str(error).splitlines()]
         return None
 
 
-def _surroundings(config: RigConfig, clock: Clock | None, seed: int, stack: ExitStack) -> Surroundings:
+def _surroundings(config: RigConfig, seed: int, stack: ExitStack) -> Surroundings:
     """Clock and world of the config, with the devices that the world plugs in. DeviceError where it cannot be made."""
     virtual = config.world is not None and not config.world.real_time
-    clock = clock or (VirtualClock() if virtual else SystemClock())
+    clock = VirtualClock() if virtual else SystemClock()
     bare = Surroundings(clock, None, seed)
     if config.world is None:
         return bare

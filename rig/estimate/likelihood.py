@@ -15,7 +15,7 @@ from rig.estimate.row.model import RowModel
 from rig.estimate.search.inputs import SearchTables
 from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
 from rig.estimate.search.prepare import judge_of
-from rig.estimate.search.stream import ColumnJudge, SearchedSweep, nominal_exposures, search_volume
+from rig.estimate.search.stream import ColumnJudge, SearchedSweep, search_volume
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
 from rig.threads import RowWorkers
@@ -55,7 +55,7 @@ class Likelihood:
             quiet, lines = sweep.quiet, sweep.lines
         else:
             used = self._lessons.model_for(lambda: first_model(sweep, geometry, self._workers))
-            setting = LearningSetting(used, geometry, nominal_exposures(sweep), sweep.dark_counts is not None)
+            setting = LearningSetting(used, geometry, sweep.exposures, sweep.dark_counts is not None)
             stripes, quiet = search_volume(sweep, geometry, self._lessons.tables(setting, self._workers), self._workers)
             lines = lines_of(sweep, next_lattice(geometry))
         self.used = used

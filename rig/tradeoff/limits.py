@@ -3,19 +3,17 @@
 The ideal is told haze, ambient light, the line's width and how bright the stripe is, and asked only where it is. Where
 stripes are spread evenly over the search, no answer has a smaller mean |error| than the median of the posterior.
 `bayes_errors` draws counts and takes that median: the limit itself, no bound of it, within the noise of the draw, at 5
-ms a row for four numbers of exposures. Chernoff's union bound is 3 to 30 times as large, since it counts every rival
-alone; Cramer-Rao's is too small wherever a rival may win.
+ms a row for four numbers of exposures. Cramer-Rao's bound is too small wherever a rival may win.
 
 Neighbours on one surface say the same: M of them, of equal disparity and equally bright, count as M times the
 exposures. The gain of coupling neighbours is compared with that.
 
-`chernoff_exponent`, `Rivals` and `position_sd_px` say how often at least, and by how much, a row's photons lead to the
-wrong position. B ~ Bernoulli(1 - exp(-flux)) per pixel and exposure, pixels independent, p and q = 1 - p of one
+`chernoff_exponent`, `least_exponent` and `position_sd_px` say how often at least, and by how much, a row's photons lead
+to the wrong position. B ~ Bernoulli(1 - exp(-flux)) per pixel and exposure, pixels independent, p and q = 1 - p of one
 position of the stripe, p' and q' of another:
 
     C = max over t of -sum log(p^t p'^(1-t) + q^t q'^(1-t))     Chernoff, per exposure
-    P(k beats j) <= exp(-K C)                                   a bound at any K; as K grows, the true exponent E|error|
-    <= sum |k - j| exp(-K C(j, k))                     the union bound: loose where many rival
+    P(k beats j) <= exp(-K C)                                   a bound at any K; as K grows, the true exponent
     sd >= 1 / sqrt(K I), I = sum flux'^2 / (exp(flux) - 1)      Cramer-Rao, for answers without bias near the truth
 
 `SceneLimits` puts the limits beside the rows of a trade-off.
@@ -34,36 +32,11 @@ from rig.tradeoff.row_light import FLUX_MIN, Array, RowLight, scene_lights
 from rig.tradeoff.rows import LOCAL_PX, TradeoffRow
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Rivals:
-    """Positions of a row that are whole pixels off the true one: distances and Chernoff exponents, (places,) each.
-
-    reach_px: the farthest that an answer within the search can be off.
-    """
-
-    away_px: Array
-    exponent: Array
-    reach_px: float
-
-    @classmethod
-    def of(cls, light: RowLight) -> "Rivals":
-        """Find the rivals of a row."""
-        places = light.whole_positions()
-        exponent = chernoff_exponent(light.flux(places), light.flux(np.array([light.position])))
-        reach = max(light.position - light.first, light.last - light.position)
-        return cls(np.abs(places - light.position), exponent, reach)
-
-    def least_exponent(self) -> float:
-        """The smallest C to a place more than 1 px off, by which such errors get rarer in the end; inf without one."""
-        return float(self.exponent[self.away_px > 1.5].min(initial=np.inf))
-
-    def bounds(self, exposures: int) -> tuple[float, float]:
-        """Bounds on P(a rival is the likelier one) and on E|error| in px of the likeliest one, after K exposures.
-
-        True at any K, by adding up all rivals as if each erred alone; at most 1, and at most the reach.
-        """
-        likelier = np.exp(-exposures * self.exponent)
-        return min(float(likelier.sum()), 1.0), min(float((self.away_px * likelier).sum()), self.reach_px)
+def least_exponent(light: RowLight) -> float:
+    """The smallest C to a whole-pixel place more than 1 px off, by which such errors get rarer; inf without one."""
+    places = light.whole_positions()
+    exponent = chernoff_exponent(light.flux(places), light.flux(np.array([light.position])))
+    return float(exponent[np.abs(places - light.position) > 1.5].min(initial=np.inf))
 
 
 def position_information(light: RowLight) -> float:
@@ -97,8 +70,8 @@ def position_sd_px(light: RowLight, exposures: float) -> float:
 
 COUPLED_ROWS: Final = 25
 """Rows that an estimator which couples neighbours is assumed to see together: 5 x 5 of equal disparity."""
-BOUNDED_ROWS: Final = 24
-"""Rows of a scene whose exponents and union bounds are computed."""
+EXPONENT_ROWS: Final = 24
+"""Rows of a scene whose exponents are computed."""
 COARSE_PX: Final = 0.5
 """Spacing of positions far from the true one."""
 FINE_SHARE: Final = 8.0
@@ -152,7 +125,6 @@ class StatisticalLimit:
     within_1px: share of those answers within 1 px.
     exponent: median over rows of the least Chernoff exponent per exposure to a position more than 1 px off.
     position_sd_px: median Cramer-Rao bound.
-    error_bound_px: mean union bound on |error| over whole pixels.
     """
 
     exposures: int
@@ -162,7 +134,6 @@ class StatisticalLimit:
     within_1px: float
     exponent: float
     position_sd_px: float
-    error_bound_px: float
 
 
 def limits(
@@ -171,16 +142,15 @@ def limits(
     """Compute the limit of each number of exposures over some rows of a scene; the same seed gives the same limit.
 
     averaged: neighbours of equal disparity that each row may be seen together with; 1 for an estimator of single rows.
-    draws: of each row. 200 rows take a second for four numbers of exposures, and BOUNDED_ROWS of them a second for
-      their exponents and bounds.
+    draws: of each row. 200 rows take a second for four numbers of exposures, and EXPONENT_ROWS of them a second for
+      their exponents.
     """
     if not lights:
         raise ValueError("a limit needs at least one row of light")
     counted = [k * averaged for k in exposures]
     drawn = [bayes_errors(light, counted, draws, np.random.default_rng([seed, i])) for i, light in enumerate(lights)]
     errors = np.stack(drawn, axis=1)
-    rivals = [Rivals.of(light) for light in lights[:: -(-len(lights) // BOUNDED_ROWS)]]
-    exponent = float(np.median([each.least_exponent() for each in rivals]))
+    exponent = float(np.median([least_exponent(light) for light in lights[:: -(-len(lights) // EXPONENT_ROWS)]]))
     found = []
     for k, n, of_k in zip(exposures, counted, errors, strict=True):
         per_row = of_k.mean(1)
@@ -193,7 +163,6 @@ def limits(
                 float((of_k <= 1.0).mean()),
                 exponent,
                 float(np.median([position_sd_px(light, n) for light in lights])),
-                float(np.mean([each.bounds(n)[1] for each in rivals])),
             )
         )
     return found

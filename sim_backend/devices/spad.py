@@ -202,14 +202,12 @@ class SimulatedSpadConfig(KindConfig):
 class SimulatedSpad(SpadArray):
     """Makes frames of the world."""
 
-    def __init__(
-        self, config: SimulatedSpadConfig, world: SimulatedWorld, seed: int, threads: int | None = None
-    ) -> None:
+    def __init__(self, config: SimulatedSpadConfig, world: SimulatedWorld, seed: int) -> None:
         super().__init__("simulated SPAD")
         self._config = config
         self._world = world
         self._seed = seed
-        self._threads = threads or min(MAX_THREADS, os.cpu_count() or 1)
+        self._threads = min(MAX_THREADS, os.cpu_count() or 1)
         self._photons: PhotonSource | None = None
         self._window: WindowTable | None = None
         faults = config.lost_frames, config.loss_probability, config.duplicate_probability

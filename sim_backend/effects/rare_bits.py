@@ -19,7 +19,7 @@ from sim_backend.effects.setting import Words
 from sim_backend.random_numbers import WORD_PX, frame_key
 
 _S11 = np.uint64(11)
-_ONE, _ZERO = np.uint64(1), np.uint64(0)
+_ONE = np.uint64(1)
 _UNIT = 2.0**-53
 
 

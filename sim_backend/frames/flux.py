@@ -73,13 +73,13 @@ class FluxModel:
         for effect in self.laser.values():
             effect.add(sheet, first_row, last_row, rate)
 
-    def flux(self, plane: Array, exposure_s: float, power_w: float, share: float = 1.0) -> Array:
+    def flux(self, plane: Array, exposure_s: float, power_w: float) -> Array:
         """Photons per exposure, float64 (rows, width), with the mirror at the plane (4,) = nx, ny, nz, d."""
         view = self.setting.view
         sheet = view.sheet(plane)
         rate = np.zeros_like(self.steady_per_s)
         self.add_sheet(sheet, 0, view.rows, rate)
-        return exposure_s * (self.steady_per_s + share * power_w * rate)
+        return exposure_s * (self.steady_per_s + power_w * rate)
 
 
 def hold_s(effect: LaserEffect) -> float:

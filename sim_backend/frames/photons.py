@@ -4,7 +4,7 @@ Frames that share light, one mirror position, power and time, form a span: the s
 turned into levels; then each frame is drawn from the levels. Rows are split over threads, each of which goes through
 all spans of a block by itself; every step works row by row, so the split does not matter. What the sensor does to the
 bits acts on whole frames, of which windows are cut afterwards. Measured, 512 x 512, the street in fog: 12 us a frame
-and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms on two (`rig bench --simulator`)."""
+and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms on two (`python -m tests.benchmarks.simulator`)."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait

@@ -107,7 +107,7 @@ class EmulatedWorld(SimulatedWorld):
         self.spad_plug = bus.plug(self.spad)
         self.laser_wire = SerialServer(self.laser, clock=clock).start()
         self.gate_wire = SerialServer(self.sync, clock=clock, baud=USB_BAUD).start()
-        on_bus = Endpoint("usb", emulated=True, usb_backend=bus if isinstance(bus, EmulatedUsb) else None)
+        on_bus = Endpoint("usb", usb_backend=bus if isinstance(bus, EmulatedUsb) else None)
         self.ports: dict[str, Endpoint] = {
             "laser": self.laser_wire.endpoint,
             "gate": self.gate_wire.endpoint,

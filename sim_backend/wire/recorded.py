@@ -192,7 +192,7 @@ class RecordedWorld:
         passed = read_taps(file)
         bus = EmulatedUsb(surroundings.clock)
         bus.plug(_SCANNERS[config.scanner]())
-        self.ports: dict[str, Endpoint] = {"scanner": Endpoint("usb", emulated=True, usb_backend=bus)}
+        self.ports: dict[str, Endpoint] = {"scanner": Endpoint("usb", usb_backend=bus)}
         self.models: dict[str, RecordedModel] = {}
         self._servers: list[SerialServer] = []
         for device in ("laser", "sync"):

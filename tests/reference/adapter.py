@@ -64,6 +64,7 @@ def volume_of(reconstructor: Any, counts: NDArray[np.unsignedinteger], exposures
         dark_counts=None,
         n_dark=0,
         width=reconstructor.geometry.width,
+        exposures=exposures,
     )
 
 

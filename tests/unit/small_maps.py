@@ -37,6 +37,7 @@ def volume_of(counts, geometry: SweepGeometry, exposures, **other) -> CountVolum
         "column": np.where(n_frames > 0, np.arange(columns, dtype=float), np.nan),
         "dark_counts": None,
         "n_dark": 0,
+        "exposures": max(1, int(np.median(n_frames[n_frames > 0]))) if n_frames.any() else 1,
     } | other
     return CountVolume(
         counts=windowed(counts, geometry.x0, geometry.window), x0=geometry.x0, n_frames=n_frames, width=width, **fields

@@ -145,10 +145,21 @@ def test_names_outside_the_word_list_and_names_of_two_things_are_named(tree: Pat
 def test_limits_decide_the_exit_code(tree: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert house.main(["--root", str(tree)]) == 0
     assert house.main(["--root", str(tree), "--limits"]) == 1
-    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("short")] == [
-        "short: median is 5, it should be at least 130"
+    assert [line for line in capsys.readouterr().out.splitlines() if "should be" in line] == [
+        "broken: median is 5, it should be at least 130: short by 125"
     ]
     for name in FILES:
         with (tree / name).open("a") as file:
             file.write("\n" * 130)
     assert house.main(["--root", str(tree), "--limits"]) == 0
+
+
+def test_a_goal_is_told_and_fails_nothing(
+    tree: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    limits = {"lines": ("at most", 10), "tests": ("at most", 2)}
+    monkeypatch.setattr(house, "LIMITS", limits)
+    lines = int(found(tree)["lines"].value)
+    assert house.main(["--root", str(tree), "--limits"]) == 0
+    told = f"goal, no failure: lines is {lines}, it should be at most 10: short by {lines - 10}"
+    assert capsys.readouterr().out.splitlines()[-1] == told

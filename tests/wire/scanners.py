@@ -95,7 +95,7 @@ def plug(model: UsbModel, clock: Clock) -> Plugged:
 
 
 def open_scanner(kind: str, bus: EmulatedUsb, clock: Clock, **config: Any) -> BeamScanner:
-    ports = {"dac": Endpoint("usb", emulated=True, usb_backend=bus)}
+    ports = {"dac": Endpoint("usb", usb_backend=bus)}
     entry = lookup("scanner", kind)
     settings = entry.config.model_validate({"kind": kind, "port": "emulated:dac", **GALVO, **config})
     scanner = entry.create(settings, Surroundings(clock, None, seed=1, ports=ports))

@@ -27,7 +27,7 @@ PULL_HEARTBEAT = "12345 ms"
 
 def opened(reads: str, port: str = "usb", heartbeat: str = "1 s") -> SpbUsb:
     config = SpbUsbConfig.model_validate({"chip": CHIP, "reads": reads, "port": port, "heartbeat": heartbeat})
-    return SpbUsb(config, open_link(config, Endpoint(port, False)))
+    return SpbUsb(config, open_link(config, Endpoint(port)))
 
 
 def queued_reads_bring_every_frame() -> None:

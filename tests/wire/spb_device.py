@@ -86,7 +86,7 @@ def opened(device: SpbUsbModel, **config: Any) -> SpbUsb:
 def on_bus(bus: EmulatedUsb, port: str = "usb", **config: Any) -> SpbUsb:
     """The driver of the device at a port of a bus."""
     made = SpbUsbConfig(port=port, **config)
-    return SpbUsb(made, open_link(made, Endpoint(port, True, bus)))
+    return SpbUsb(made, open_link(made, Endpoint(port, bus)))
 
 
 def take(

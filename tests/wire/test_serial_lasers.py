@@ -91,7 +91,7 @@ def test_no_emulated_port_of_that_name() -> None:
     with wire(CoboltModel()) as (server, surroundings):
         with pytest.raises(DeviceNotFound, match="choose one of: laser"):
             open_cobolt(surroundings, port="emulated:lesar")
-        assert around(surroundings.clock, server).ports == {"laser": Endpoint(server.path, emulated=True)}
+        assert around(surroundings.clock, server).ports == {"laser": Endpoint(server.path)}
 
 
 def test_the_application_pauses_a_laser_found_emitting_and_refuses_the_scan() -> None:

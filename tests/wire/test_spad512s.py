@@ -108,7 +108,7 @@ def test_trap_bits_come_most_significant_first_and_frames_lie_on_their_side() ->
         (b"PU,0", b"ok"),
         (b"I,1,20,2,0,1,0,1\n", bytes(pixels) + b"DONE"),
     )
-    with scripted(*script) as (address, heard), Spad512s(Spad512sConfig(), Endpoint(address, True)) as device:
+    with scripted(*script) as (address, heard), Spad512s(Spad512sConfig(), Endpoint(address)) as device:
         (block,) = take(device, 2)
         assert heard == [turn[0] for turn in script]
     image = np.unpackbits(block.bits, axis=2)
@@ -121,7 +121,7 @@ def test_trap_bits_come_most_significant_first_and_frames_lie_on_their_side() ->
 def test_commands_and_answers_are_tapped_and_pixels_are_not(tmp_path: Path) -> None:
     tap = TapFile.begin(tmp_path / CONTROL_FILE).tap("spad")
     script = ((b"D", INFO), (b"PU,0", b"ok"), (b"I,1,20,2,0,1,0,1\n", bytes(2 * FRAME_BYTES) + b"DONE"))
-    with scripted(*script) as (address, _), Spad512s(Spad512sConfig(), Endpoint(address, True), tap=tap) as device:
+    with scripted(*script) as (address, _), Spad512s(Spad512sConfig(), Endpoint(address), tap=tap) as device:
         take(device, 2)
     tap.flush()
     passed = read_taps(tmp_path / CONTROL_FILE)
@@ -219,7 +219,7 @@ def test_trap_error_at_the_very_end_of_a_run_of_the_right_length() -> None:
             address,
             _,
         ),
-        Spad512s(Spad512sConfig(), Endpoint(address, True)) as device,
+        Spad512s(Spad512sConfig(), Endpoint(address)) as device,
         pytest.raises(DeviceFault, match="too hot ERROR"),
     ):
         take(device, 1)
@@ -229,7 +229,7 @@ def test_something_else_than_done_behind_the_pixels_is_refused() -> None:
     answer = bytes(FRAME_BYTES) + b"DON"
     with (
         scripted((b"D", INFO), (b"PU,0", b"ok"), (b"I,1,20,1,0,1,0,1\n", answer + b"X")) as (address, _),
-        Spad512s(Spad512sConfig(), Endpoint(address, True)) as device,
+        Spad512s(Spad512sConfig(), Endpoint(address)) as device,
         pytest.raises(ProtocolError, match="not DONE"),
     ):
         take(device, 1)
@@ -294,7 +294,7 @@ def test_a_server_that_hangs_up_at_once_is_busy() -> None:
     thread = threading.Thread(target=lambda: listener.accept()[0].close(), daemon=True)
     thread.start()
     with listener, pytest.raises(DeviceBusy, match="it serves one client"):
-        Spad512s(Spad512sConfig(), Endpoint(f"127.0.0.1:{listener.getsockname()[1]}", True))
+        Spad512s(Spad512sConfig(), Endpoint(f"127.0.0.1:{listener.getsockname()[1]}"))
     thread.join(2.0)
 
 
@@ -308,13 +308,13 @@ def test_wrong_addresses_and_wrong_programs_are_one_line_each() -> None:
     ]
     for address, sort, words in cases:
         with pytest.raises(sort, match=words) as refused:
-            Spad512s(Spad512sConfig(), Endpoint(address, False))
+            Spad512s(Spad512sConfig(), Endpoint(address))
         assert "\n" not in str(refused.value)
 
 
 def test_a_silent_program_is_a_timeout() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener, pytest.raises(DeviceTimeout, match="nothing greets"):
-        Spad512s(Spad512sConfig(), Endpoint(f"127.0.0.1:{listener.getsockname()[1]}", True), Deadlines(open_s=0.1))
+        Spad512s(Spad512sConfig(), Endpoint(f"127.0.0.1:{listener.getsockname()[1]}"), Deadlines(open_s=0.1))
 
 
 def test_trap_a_unit_without_intensity_imaging_is_refused() -> None:

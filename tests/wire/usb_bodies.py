@@ -13,7 +13,7 @@ from functools import partial
 import pytest
 
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceFault, DeviceNotFound, DeviceTimeout, ProtocolError
-from drivers.transports.usb_device import UsbDevice, UsbId, attached, open_device
+from drivers.transports.usb_device import UsbDevice, UsbId, attached, open_device, translated
 from tests.wire.bodies import report
 from tests.wire.usb.loopback import DEAF, ECHO_IN, GONE, OVERLONG, STALL_BULK_IN
 
@@ -28,7 +28,8 @@ def opened(backend: object | None) -> UsbDevice:
 
 
 def steer(device: UsbDevice, request: int, value: int = 0) -> None:
-    device.control_out(VENDOR_OUT, request, value, 0, b"", DEADLINE_S)
+    with translated(device.label, 0, DEADLINE_S):
+        device._device.ctrl_transfer(VENDOR_OUT, request, value, 0, b"", round(1e3 * DEADLINE_S))
 
 
 def found_by_numbers_and_by_serial(backend: object | None) -> None:

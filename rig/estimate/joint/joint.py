@@ -33,7 +33,6 @@ from rig.estimate.row.em import learn_again, lines_of, next_lattice
 from rig.estimate.row.inputs import state_of
 from rig.estimate.row.model import RowModel
 from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
-from rig.estimate.search.stream import nominal_exposures
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
 from rig.threads import RowWorkers
@@ -85,7 +84,7 @@ class Joint:
     def estimate(self, sweep: CountVolume, geometry: SweepGeometry) -> StripeTable:
         """Stripe table of one sweep; afterwards `model` is what the next sweep will be estimated with."""
         model = self._lessons.model_for(lambda: self._first_model(sweep, geometry))
-        setting = LearningSetting(model, geometry, nominal_exposures(sweep), sweep.dark_counts is not None)
+        setting = LearningSetting(model, geometry, sweep.exposures, sweep.dark_counts is not None)
         tables = self._lessons.tables(setting, self._workers)
         self._prior.begin(geometry, tables.grid)
         self.used = model if self._prior.before is None else replace(model, before=self._prior.before)
@@ -103,7 +102,7 @@ class Joint:
         """Learn from the first sweep: row by row, then from stripes that all rows together show far better."""
         self._prior.recall(None)  # of maps that taught nothing
         model = first_model(volume, geometry, self._workers)
-        exposures, dark = nominal_exposures(volume), volume.dark_counts is not None
+        exposures, dark = volume.exposures, volume.dark_counts is not None
         for _ in range(FIRST_ROUNDS):
             tables = tables_of(LearningSetting(model, geometry, exposures, dark), self._workers)
             stripes = self._teaching(volume, tables, self._stripes(volume, tables, lesson=True))

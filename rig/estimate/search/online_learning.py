@@ -20,7 +20,7 @@ from rig.estimate.row.em import Expectation, learn_first, learn_next, lines_of, 
 from rig.estimate.row.inputs import Lines
 from rig.estimate.row.model import RowModel
 from rig.estimate.search.prepare import judge_of
-from rig.estimate.search.stream import nominal_exposures, search_volume
+from rig.estimate.search.stream import search_volume
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
 from rig.threads import RowWorkers, yield_to_others
@@ -32,8 +32,6 @@ TEACH_FRAMES = 100_000
 the tables of `joint` twice that."""
 LAG_FRAMES = 50_000
 """Lit frames from a map that teaches to the first one that heeds it: time to learn beside the stream."""
-KEPT = 2
-"""Tables that are kept under one model: passes of a map are looked at with all of their counts and half of them."""
 
 Tables = TypeVar("Tables")
 """Tables that an estimator makes ready under a model, for sweeps of one geometry."""
@@ -66,11 +64,8 @@ class LearningSetting:
 
     def same(self, other: "LearningSetting") -> bool:
         """Whether the other has the same tables."""
-        return self.akin(other) and (self.exposures, self.dark) == (other.exposures, other.dark)
-
-    def akin(self, other: "LearningSetting") -> bool:
-        """Whether the other has the same model and geometry."""
-        return self.model is other.model and self.geometry is other.geometry
+        alike = (self.exposures, self.dark) == (other.exposures, other.dark)
+        return alike and self.model is other.model and self.geometry is other.geometry
 
 
 def _size(rows: int, pixels: int, columns: int) -> str:
@@ -81,8 +76,8 @@ def _size(rows: int, pixels: int, columns: int) -> str:
 class Seen:
     """The part of a sweep that teaches: its tally, ones and exposures behind clear stripes, some lines of counts.
 
-    intensity: of the tally, taken when the map was made: counts may grow by another pass while the lesson is learned.
-    more: input of the estimator's own `learn_more`, see `OnlineLearner`.
+    intensity: of the tally, taken when the map was made. more: input of the estimator's own `learn_more`, see
+    `OnlineLearner`.
     """
 
     tally: FrameTally
@@ -111,8 +106,7 @@ class OnlineLearner(Generic[Tables]):
         self._learn_more = learn_more
         self._learns = learns
         self.model = model
-        self._made: list[tuple[LearningSetting, Tables]] = []
-        """Tables of one model and geometry, the last used last."""
+        self._made: tuple[LearningSetting, Tables] | None = None
         self._taught: Expectation | None = None
         self._lesson: Future[tuple[LearningSetting, Expectation, Tables]] | None = None
         self._tutor = ThreadPoolExecutor(1, thread_name_prefix="learning", initializer=yield_to_others)
@@ -124,12 +118,11 @@ class OnlineLearner(Generic[Tables]):
         return self.model if self.model is not None else first()
 
     def tables(self, setting: LearningSetting, workers: RowWorkers) -> Tables:
-        """Tables for a setting; made once while it, and at most one other that it takes turns with, stay the same."""
-        kept = [made for made in self._made if made[0].akin(setting)]
-        found = next((made for made in kept if made[0].same(setting)), None)
-        self._made = [made for made in kept if made is not found][1 - KEPT :]  # the rest may go before more is made
-        self._made.append(found or (setting, self._make(setting, workers)))
-        return self._made[-1][1]
+        """Tables for a setting; made once while it stays the same."""
+        if self._made is None or not self._made[0].same(setting):
+            self._made = None  # their memory may go before more is made
+            self._made = setting, self._make(setting, workers)
+        return self._made[1]
 
     def attend(self, stripes: StripeTable, used: RowModel, frames: int, see: Callable[[], Seen]) -> None:
         """Note a map of so many lit frames, estimated with `used`; `see` is called only where the map is to teach."""
@@ -140,12 +133,12 @@ class OnlineLearner(Generic[Tables]):
         if self._lesson is None:
             if self._learns and sure and self._frames_since >= TEACH_FRAMES:
                 self._frames_since = 0
-                assert self._made, "a map has been estimated"
-                self._lesson = self._tutor.submit(self._teach, self._made[-1][0], see(), self._taught)
+                assert self._made is not None, "a map has been estimated"
+                self._lesson = self._tutor.submit(self._teach, self._made[0], see(), self._taught)
         elif self._frames_since >= LAG_FRAMES:
             # Waits where the lesson is not over: which map is estimated with what never depends on speed.
             setting, self._taught, tables = self._lesson.result()
-            self.model, self._made = setting.model, [(setting, tables)]
+            self.model, self._made = setting.model, (setting, tables)
             self._lesson = None
 
     def _teach(
@@ -168,7 +161,7 @@ def first_model(volume: CountVolume, geometry: SweepGeometry, workers: RowWorker
     intensity = volume.intensity()
     model = learn_first(volume, geometry, ambient_map(volume, intensity, geometry, None), workers)
     dark = volume.dark_counts is not None
-    judge = judge_of(model, geometry, nominal_exposures(volume), workers, dark=dark)
+    judge = judge_of(model, geometry, volume.exposures, workers, dark=dark)
     _, quiet = search_volume(volume, geometry, judge, workers)
     model = replace(model, ambient=ambient_map(volume, intensity, geometry, quiet))
     return learn_next(lines_of(volume, next_lattice(geometry)), geometry, model, None, workers)[0]

@@ -10,7 +10,6 @@ finished one are read out of the planes into registers, judged, and forgotten. W
 its counters wait in memory. `search_volume` judges the counts of a whole sweep, integers (columns, rows, window).
 """
 
-import math
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -34,7 +33,7 @@ from rig.count.volume import BYTE_FRAMES, CountVolume, FrameTally, SweepLayout, 
 from rig.estimate.row.em import next_lattice
 from rig.estimate.row.inputs import Lines
 from rig.estimate.search.inputs import RowAnswers, SearchPointers, SearchTables, desk_of
-from rig.estimate.search.prepare import FRAMES_OVER_TWICE, clear_found, nothing_found, quiet_of, stripes_of
+from rig.estimate.search.prepare import clear_found, nothing_found, quiet_of, stripes_of
 from rig.estimate.search.rows import halvings, judge_rows, keep_line, table_for
 from rig.estimate.search.tables import BATCH, search_in, search_memory
 from rig.geometry.stripe_table import StripeTable
@@ -394,18 +393,3 @@ def search_volume(
 
     workers.over(geometry.rows, work)
     return stripes_of(found, judge, workers), quiet_of(found, geometry.width)
-
-
-def nominal_exposures(volume: CountVolume) -> int:
-    """Frames nominally taken per column; where only the counts are known, the median of those with any.
-
-    More than that after passes over a small part of the columns: so many that the counts of all but a hundredth of the
-    columns need not be halved.
-    """
-    if volume.exposures is not None:
-        return volume.exposures
-    frames = volume.n_frames[volume.n_frames > 0]
-    if not len(frames):
-        return 1
-    most = float(np.percentile(frames, 99.0, method="lower"))
-    return max(int(np.median(frames)), math.ceil((most - FRAMES_OVER_TWICE) / 2))

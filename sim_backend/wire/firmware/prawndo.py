@@ -96,7 +96,6 @@ class PrawnDoModel:
         self._line = bytearray()
         self._missing = 0  # bytes that `adm` still waits for
         self._binary = bytearray()
-        self._short_words = 0
         self._adding = False
         self._unasked = b""
 
@@ -317,7 +316,6 @@ class PrawnDoModel:
         del self.words[start:]
         self._missing = count * BYTES_PER_WORD
         self._binary.clear()
-        self._short_words = 0
         return _said("ready") if count else _said("ready", "ok")
 
     def _take_words(self, data: bytes) -> bytes:

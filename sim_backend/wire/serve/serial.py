@@ -65,7 +65,7 @@ class SerialServer(WireServer[SerialModel]):
     @property
     def endpoint(self) -> Endpoint:
         """The endpoint of that path for `Surroundings.ports`."""
-        return Endpoint(self.path, emulated=True)
+        return Endpoint(self.path)
 
     def close(self) -> None:
         """Unplug it for good; again: nothing happens."""

@@ -58,7 +58,7 @@ class TcpServer(WireServer[TcpModel]):
     @property
     def endpoint(self) -> Endpoint:
         """The endpoint of that address for `Surroundings.ports`."""
-        return Endpoint(self.address, emulated=True)
+        return Endpoint(self.address)
 
     def plug(self) -> None:
         """The program runs: it listens, on the same port as before."""

@@ -39,6 +39,7 @@ _LIBUSB = {
 }
 """libusb's code and text for an errno, as `libusb_strerror` gives them."""
 
+_BUS = 1
 _SPEED = {"full": 2, "high": 3, "super": 4}
 
 
@@ -50,10 +51,9 @@ class _Handle:
 class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries no types
     """A bus. `plug` and `unplug` at any time, from any thread. Waiting goes through the clock."""
 
-    def __init__(self, clock: Clock, bus: int = 1) -> None:
+    def __init__(self, clock: Clock) -> None:
         super().__init__()
         self._clock = clock
-        self._bus = bus
         self._lock = threading.Lock()
         self._devices: list[AttachedDevice] = []
         self._ports = 0
@@ -62,7 +62,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         """Attach a model at the next free port; plugging in again gives a new address, as on a real bus."""
         with self._lock:
             self._ports += 1
-            device = AttachedDevice(model, self._bus, self._ports, self._now_s)
+            device = AttachedDevice(model, _BUS, self._ports, self._now_s)
             self._devices.append(device)
             return device
 

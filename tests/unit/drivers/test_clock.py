@@ -1,9 +1,8 @@
 """The virtual clock stands still, never runs back and takes no time; ticks become nanoseconds without drift."""
 
 import threading
-from fractions import Fraction
 
-from drivers.clock import Clock, SystemClock, VirtualClock, ticks_to_ns
+from drivers.clock import Clock, SystemClock, VirtualClock
 
 
 def test_both_clocks_are_clocks() -> None:
@@ -47,10 +46,3 @@ def test_threads_that_sleep_on_a_virtual_clock_add_up() -> None:
     for thread in threads:
         thread.join()
     assert clock.now_ns() == 8000
-
-
-def test_ticks_become_nanoseconds_without_drift_over_years() -> None:
-    tick_hz = Fraction(97_700)
-    assert ticks_to_ns(97_700 * 10**9, tick_hz) == 10**18
-    assert ticks_to_ns(1, tick_hz) == 10235
-    assert ticks_to_ns(3, Fraction(100_000_000, 3)) == 90

@@ -200,15 +200,6 @@ def test_a_reader_that_waits_in_vain_says_so() -> None:
         reader.next(0.01)
 
 
-def test_an_overflow_is_remembered() -> None:
-    ring = BlockRing(1, STRIDE)
-    assert not ring.overflowed
-    ring.mark_overflow()
-    put(ring, 0)
-    ring.finish()
-    assert ring.overflowed
-
-
 @pytest.mark.parametrize("on_full", [OnFull.DROP, OnFull.FAIL])
 def test_a_ring_that_does_not_wait_answers_at_once(on_full: OnFull) -> None:
     ring = BlockRing(1, STRIDE, on_full=on_full)
@@ -226,7 +217,7 @@ def test_dropped_blocks_are_counted_and_the_run_goes_on() -> None:
     ring = BlockRing(1, STRIDE, on_full=OnFull.DROP)
     ring.mark_overflow(64)
     ring.mark_overflow(10)
-    assert (ring.dropped_blocks, ring.dropped_frames, ring.overflowed) == (2, 74, True)
+    assert (ring.dropped_blocks, ring.dropped_frames) == (2, 74)
     put(ring, 0)
 
 

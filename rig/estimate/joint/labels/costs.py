@@ -44,7 +44,7 @@ from rig.threads import RowWorkers
 
 SHARP: Final = 8.0
 """Exposures at which a nat is worth half as many units: where rows are sharp, the labels beside the best one must still
-count. In maps taken in passes each column goes by its own exposures."""
+count."""
 BAND_ROWS: Final = 64
 """Rows that share tables."""
 FINEST: Final = 64.0

@@ -332,9 +332,8 @@ def test_the_report_begins_with_whether_this_machine_keeps_up(report, monkeypatc
 
 @pytest.mark.parametrize(
     "options",
-    [["--slow-consumer", "5"], ["--window"], ["--on-overload", "drop"], ["--simulator", "--disk", "."],
-     ["--soak", "1", "--disk", "."], ["--threads", "2", "--disk", "."], ["--threads", "2", "--simulator"]],
-)  # fmt: skip
+    [["--slow-consumer", "5"], ["--window"], ["--on-overload", "drop"]],
+)
 def test_options_without_effect_are_refused_before_a_minute_has_passed(options, monkeypatch, capsys):
     monkeypatch.setattr(speed, "measure_speed", lambda threads, progress: pytest.fail("measured"))
     with pytest.raises(SystemExit) as caught:

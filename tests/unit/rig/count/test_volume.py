@@ -220,7 +220,7 @@ def test_intensity_of_wide_counts_does_not_wrap():
     full = np.full(3, 65_535, np.int32)
     volume = CountVolume(
         counts=counts, x0=np.zeros(3, np.int32), n_frames=full, column=np.arange(3.0), dark_counts=None, n_dark=0,
-        width=50,
+        width=50, exposures=65_535,
     )  # fmt: skip
     assert np.all(volume.intensity() == 3 * 65_535)
     assert volume.intensity().shape == (2, 50)

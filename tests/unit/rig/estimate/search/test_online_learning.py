@@ -102,17 +102,6 @@ def test_tables_are_made_anew_for_another_setting_alone():
     assert made == [setting, *others]
 
 
-def test_two_settings_under_one_model_may_take_turns():
-    made = []
-    school = OnlineLearner(lambda setting, workers: made.append(setting) or len(made), MODEL, learns=True)
-    whole, half = LearningSetting(MODEL, GEOMETRY, 10, False), LearningSetting(MODEL, GEOMETRY, 5, False)
-    assert [school.tables(each, WORKERS) for each in (whole, half, whole, half)] == [1, 2, 1, 2]
-    # A third takes the place of what was used before the last one, another model that of all.
-    assert [school.tables(replace(whole, exposures=k), WORKERS) for k in (7, 5, 10)] == [3, 2, 4]
-    other = replace(whole, model=replace(MODEL))
-    assert [school.tables(each, WORKERS) for each in (other, whole)] == [5, 6]
-
-
 @pytest.mark.parametrize("lacking", ["column_gain", "row_gain", "ambient"])
 def test_a_state_of_another_sweeps_size_is_refused(lacking):
     less = replace(MODEL, **{lacking: getattr(MODEL, lacking)[:-1]})

@@ -15,15 +15,15 @@ from rig.estimate.row.likelihood import mode_of
 from rig.estimate.row.model import RowModel, line_profile, stripe_scale
 from rig.estimate.search import prepare as judging
 from rig.estimate.search.inputs import desk_of
-from rig.estimate.search.prepare import FRAMES_OVER_TWICE, SCORE_LIMIT, judge_of, nothing_found, stripes_of
-from rig.estimate.search.rows import halvings, table_for
+from rig.estimate.search.prepare import SCORE_LIMIT, judge_of, nothing_found, stripes_of
+from rig.estimate.search.rows import table_for
 from rig.estimate.search.scores import START, score_rows
-from rig.estimate.search.stream import nominal_exposures, search_counts, search_volume
+from rig.estimate.search.stream import search_counts, search_volume
 from rig.estimate.search.tables import BATCH, search_in, search_memory
 from rig.simd.memory import read_int16
 from rig.threads import RowWorkers
 from tests.reference.geometry import Geometry
-from tests.unit.small_maps import geometry_of, rows_of, simulated, volume_of
+from tests.unit.small_maps import geometry_of, simulated, volume_of
 
 RIGS = ("left", "right", "turned")
 LIGHTS = ("report", "dense", "clear")
@@ -385,19 +385,3 @@ def test_halved_counts_keep_their_light(exposures):
     judge = judge_of(estimator.used, sweep.geometry, exposures, WORKERS, dark=False)
     ones, lit = search_volume(sweep.volume, sweep.geometry, judge, WORKERS)[1]
     assert ones.sum() / lit.sum() == pytest.approx(-np.expm1(-sweep.point.light.ambient), rel=0.006)
-
-
-def test_after_passes_over_some_columns_their_counts_are_whole() -> None:
-    frames = np.full(200, 4, np.int32)
-    counts = np.zeros((200, 2, 64), np.uint16)
-    frames[40:50] = 36
-    nominal = nominal_exposures(rows_of(counts, frames)[0])
-    assert halvings(36, 2 * nominal + FRAMES_OVER_TWICE) == 0
-    frames[40:50] = 5
-    assert nominal_exposures(rows_of(counts, frames)[0]) == 4
-    frames[0] = 3000  # where a mirror stood still: one column does not say what is usual
-    assert nominal_exposures(rows_of(counts, frames)[0]) == 4
-    few = frames[:60]  # of which one is more than a hundredth
-    assert nominal_exposures(rows_of(counts[:60], few)[0]) == 4
-    assert nominal_exposures(rows_of(counts, 0)[0]) == 1
-    assert nominal_exposures(replace(rows_of(counts, frames)[0], exposures=7)) == 7

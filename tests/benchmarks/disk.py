@@ -1,14 +1,16 @@
-"""The disk's rows of `rig bench --disk FOLDER`: recording and reading beside plain sequential writing and reading.
+"""Recording and reading beside plain sequential writing and reading: python -m tests.benchmarks.disk FOLDER.
 
 The same bytes, on the same disk, in the same run, round after round: `record-plain` and `read-plain` are two threads
 that write and read a file past the page cache (O_DIRECT) and do nothing else, `record` and `read` are what a scan and a
 replay do. CPU is that of the whole process, the system's part in it.
 """
 
+import argparse
 import errno
 import os
 import shutil
 import statistics
+import sys
 import tempfile
 import threading
 import time
@@ -16,20 +18,24 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
 
 from drivers.frames import BlockFlag, FrameBlock
 from drivers.recorded import RunRecording
 from drivers.spb1 import BlockLayout, block_views
 from rig.bench.latency import PERIOD_TICKS, header_of
 from rig.bench.machine import machine
+from rig.cli.progress import progress
+from rig.cli.tables import BENCH_WIDTH, print_machine
 from rig.errors import RecordingError, UsageError
-from rig.progress import Progress, counted
+from rig.progress import counted
 from rig.recording.segment import Staging, paged
 from rig.recording.writer import WRITERS, Recording
 
@@ -56,7 +62,7 @@ class DiskRow:
 
 @dataclass(frozen=True, slots=True)
 class DiskReport:
-    """What `rig bench --disk` found. direct: whether the disk is reached past the page cache."""
+    """All rows. direct: whether the disk is reached past the page cache."""
 
     machine: dict[str, Any]
     folder: str
@@ -64,33 +70,59 @@ class DiskReport:
     direct: bool
     rows: tuple[DiskRow, ...]
 
-    def as_json(self) -> dict[str, Any]:
-        """For programs."""
-        return asdict(self)
+
+def main() -> int:
+    """Print the rows; the exit code, 1 where the folder is of no use."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, help="on the disk to measure; takes some 2 GB, which are removed again")
+    folder = parser.parse_args().folder
+    try:
+        with progress():
+            report = measure_disk(folder)
+    except (UsageError, RecordingError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    disk_table(report)
+    return 0
 
 
-def measure_disk(folder: Path, progress: Progress | None = None) -> DiskReport:
+def disk_table(report: DiskReport) -> None:
+    """Print the rows to stdout."""
+    console = Console(highlight=False, width=BENCH_WIDTH)
+    print_machine(console, report.machine)
+    past = "past the page cache" if report.direct else "through the page cache, which this disk cannot be had without"
+    console.print(f"{report.gigabytes:.1f} GB in {report.folder}; plain: two threads {past}")
+    table = Table(box=None, pad_edge=False)
+    for title in ("row", "MB/s", "CPU s/GB", "of plain"):
+        table.add_column(title, justify="left" if title == "row" else "right")
+    for row in report.rows:
+        of_plain = "" if row.of_plain is None else f"{row.of_plain:.2f}"
+        table.add_row(row.stage, f"{row.mb_per_s:.0f}", f"{row.cpu_s_per_gb:.2f}", of_plain)
+    console.print(table)
+
+
+def measure_disk(folder: Path) -> DiskReport:
     """Measure the disk of `folder`.
 
     UsageError where there is none, or not room for the bytes twice; RecordingError where it does not take them.
     """
     if not folder.is_dir():
-        raise UsageError(f"--disk {folder} is no folder; name one on the disk that scans are recorded to")
+        raise UsageError(f"{folder} is no folder; name one on the disk that scans are recorded to")
     if not hasattr(os, "pwritev"):
-        raise UsageError("--disk needs a system that writes a file at several places at once; this one does not")
+        raise UsageError("the bench needs a system that writes a file at several places at once; this one does not")
     need, free = 2 * GIGABYTES, shutil.disk_usage(folder).free / 1e9
     if need > free:
         raise UsageError(f"the bench needs {need:.3g} GB in {folder}, the disk has {free:.3g} GB free; free some")
     try:
-        return _measured(folder, progress)
+        return _measured(folder)
     except OSError as error:
         raise RecordingError(
-            f"cannot measure the disk of {folder}: {error.strerror or error}; name another folder with --disk"
+            f"cannot measure the disk of {folder}: {error.strerror or error}; name another folder"
         ) from error
 
 
-def _measured(folder: Path, progress: Progress | None) -> DiskReport:
-    told = counted("measuring", "rows", progress)
+def _measured(folder: Path) -> DiskReport:
+    told = counted("measuring", "rows", None)
     source = _Source(round(GIGABYTES * 1e9))
     found: dict[str, list[tuple[float, float]]] = {}
     with tempfile.TemporaryDirectory(prefix="spadrig-disk-", dir=folder) as name:
@@ -268,3 +300,7 @@ def _row(stage: str, found: dict[str, list[tuple[float, float]]], n_bytes: int) 
     if plain is not None:  # each round's quotient: disks have moods
         of_plain = statistics.median(p / w for (p, _), (w, _) in zip(plain, found[stage], strict=True))
     return DiskRow(stage, n_bytes / 1e6 / wall_s, cpu_s / (n_bytes / 1e9), of_plain)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

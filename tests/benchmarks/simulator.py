@@ -1,6 +1,6 @@
-"""The rows of `rig bench --simulator`: how fast frames of simulated scenes are drawn, beside plain numpy, in one run.
+"""How fast frames of simulated scenes are drawn, beside plain numpy: python -m tests.benchmarks.simulator.
 
-Whole frames of the config's camera at its exposure and power. Per scene and number of threads:
+Whole frames of the simulated rig's camera at its exposure and power. Per scene and number of threads:
 
 - `simulator-ready`: the light of one column stands, frame after frame is drawn from it;
 - `simulator-fresh`: as in a scan, K frames to each of the columns of a sweep, whose light is computed anew;
@@ -21,21 +21,28 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
 
 from drivers.frames import packed_row_bytes
-from drivers.interfaces import World
 from rig.bench.frames import read_all
 from rig.bench.machine import machine
+from rig.cli.progress import progress
+from rig.cli.tables import BENCH_WIDTH, print_machine
 from rig.config.models import RigConfig
-from rig.errors import UsageError
+from rig.config.overrides import configure
 from rig.plan.scan_plan import column_command
-from rig.progress import Progress, counted
+from rig.progress import counted
 from rig.tradeoff.effects import open_world
+from sim_backend.effects.setting import FrameTimes
+from sim_backend.frames.photons import PhotonSource
+from sim_backend.world import SimulatedWorld
+from tests.benchmarks.numpy_frames import NumpyFrames
 
 Array = NDArray[np.float64]
 
@@ -51,59 +58,6 @@ COLUMNS = 50
 READ_BYTES = 256 * 2**20
 """Memory that is read for its bandwidth: far more than any cache holds."""
 SEED = 1
-
-
-class FrameSource(Protocol):
-    """Draws frames."""
-
-    def expose(
-        self,
-        first_frame: int,
-        held: Array,
-        power_w: Array,
-        x0: NDArray[np.int32],
-        bits: NDArray[np.uint8],
-        time_s: Array,
-    ) -> None:
-        """Fill bits (n, rows, row bytes) with frames at mirror commands `held` (n,)."""
-        ...
-
-    def close(self) -> None:
-        """End its threads."""
-        ...
-
-
-class PlainFrames(Protocol):
-    """Draws frames in the straightforward way."""
-
-    def probability(self, plane: Array, power_w: float) -> Array:
-        """Detection probability of every pixel."""
-        ...
-
-    def draw(self, p: Array, bits: NDArray[np.uint8]) -> None:
-        """Fill bits (n, rows, row bytes)."""
-        ...
-
-
-@runtime_checkable
-class MakesFrames(World, Protocol):
-    """A world whose frames can be had without devices."""
-
-    model: Any
-    """Its rig model: `planes` of mirror commands."""
-
-    def frame_source(self, exposure_s: float, seed: int, threads: int) -> FrameSource:
-        """What draws its frames."""
-        ...
-
-    def numpy_frames(self, exposure_s: float, seed: int) -> PlainFrames:
-        """The straightforward way to the same."""
-        ...
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Rows and width."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,17 +89,13 @@ class SimulatorRow:
 
 @dataclass(frozen=True, slots=True)
 class SimulatorReport:
-    """What `rig bench --simulator` found."""
+    """All rows. memory_read_gb_per_s: on one thread. size: rows and width of the frames."""
 
     machine: dict[str, Any]
     memory_read_gb_per_s: float
     size: tuple[int, int]
     rows: tuple[SimulatorRow, ...]
     seconds: float
-
-    def as_json(self) -> dict[str, Any]:
-        """For programs."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,33 +108,63 @@ class _Case:
     frames: Callable[[], int]
 
 
-def measure_simulator(
-    configure: Callable[[str], RigConfig], extent: SimulatorExtent | None = None, progress: Progress | None = None
-) -> SimulatorReport:
-    """Measure all scenes. configure: the config with a scene of that name. UsageError where its world draws none."""
+def main() -> None:
+    """Print the rows."""
+    with progress():
+        report = measure_simulator()
+    simulator_table(report)
+
+
+def simulator_table(report: SimulatorReport) -> None:
+    """Print the rows to stdout."""
+    console = Console(highlight=False, width=BENCH_WIDTH)
+    print_machine(console, report.machine)
+    console.print(f"memory read, one thread: {report.memory_read_gb_per_s:.1f} GB/s")
+    rows, width = report.size
+    console.print(f"frames of {rows} x {width}; ready: one column's light stands; fresh: computed for every column")
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("row", "scene", "threads", "K", "kframes/s", "us/frame", "real time", "x numpy"):
+        table.add_column(name, justify="left" if name in ("row", "scene") else "right", no_wrap=True)
+    for row in report.rows:
+        table.add_row(
+            row.stage.removeprefix("simulator-"),
+            row.scene,
+            str(row.threads),
+            str(row.exposures),
+            f"{row.frames_per_s / 1e3:.4g}",
+            f"{row.us_per_frame:.4g}",
+            f"{row.times_real_time:.2g}",
+            "-" if row.times_numpy is None else f"{row.times_numpy:.3g}",
+        )
+    console.print(table)
+    console.print(f"x numpy: of whole-array numpy in the foggy scene, one thread; measured in {report.seconds:.0f} s")
+
+
+def measure_simulator(extent: SimulatorExtent | None = None) -> SimulatorReport:
+    """Measure all scenes."""
     begun, extent = time.perf_counter(), extent or SimulatorExtent()
     numbers = extent.threads or sorted({1, 2, os.cpu_count() or 1})
     with ExitStack() as stack:
         cases: list[_Case] = []
         for scene in extent.scenes:
-            config = configure(scene)
+            config = configure("simulated", scene=scene)
             world, power_w = stack.enter_context(open_world(config))
-            if not isinstance(world, MakesFrames):
-                raise UsageError(f"{config.name}: its world draws no frames; name a config with a simulated one")
+            assert isinstance(world, SimulatedWorld)
             bench = _SceneBench(world, config, power_w)
+            times = FrameTimes(config.scan.exposure_s, config.scan.exposure_s)
             for threads in numbers:
-                source = stack.enter_context(closing(world.frame_source(config.scan.exposure_s, SEED, threads)))
+                source = stack.enter_context(closing(world.photons(times, SEED, threads)))
                 cases += [
                     _Case("simulator-ready", scene, threads, bench.ready(source)),
                     _Case("simulator-fresh", scene, threads, bench.fresh(source)),
                 ]
             if scene in NUMPY_SCENES:
-                plain = world.numpy_frames(config.scan.exposure_s, SEED)
+                plain = NumpyFrames(world.setting, world.flux_model.steady_per_s, config.scan.exposure_s, SEED)
                 cases += [
                     _Case("simulator-numpy-ready", scene, 1, bench.plain(plain, fresh=False)),
                     _Case("simulator-numpy-fresh", scene, 1, bench.plain(plain, fresh=True)),
                 ]
-        memory, speeds = _in_turn(cases, extent, progress)
+        memory, speeds = _in_turn(cases, extent)
     rows = _rows(cases, speeds, bench.exposures)
     return SimulatorReport(machine(), memory / 1e9, bench.size, rows, time.perf_counter() - begun)
 
@@ -192,7 +172,7 @@ def measure_simulator(
 class _SceneBench:
     """What is measured in one scene."""
 
-    def __init__(self, world: MakesFrames, config: RigConfig, power_w: float) -> None:
+    def __init__(self, world: SimulatedWorld, config: RigConfig, power_w: float) -> None:
         scan = config.scan
         self.exposures, self.size = scan.exposures, world.size
         self._planes_of = world.model.planes
@@ -208,12 +188,12 @@ class _SceneBench:
         )
         self._block = 0
 
-    def ready(self, source: FrameSource) -> Callable[[], int]:
+    def ready(self, source: PhotonSource) -> Callable[[], int]:
         """Frames of the middle column."""
         held = np.full(len(self._bits), self._commands[len(self._commands) // 2])
         return lambda: self._exposed(source, held)
 
-    def fresh(self, source: FrameSource) -> Callable[[], int]:
+    def fresh(self, source: PhotonSource) -> Callable[[], int]:
         """Frames of columns that are new each time, spread over the sweep."""
 
         def frames() -> int:
@@ -224,7 +204,7 @@ class _SceneBench:
 
         return frames
 
-    def plain(self, frames: PlainFrames, *, fresh: bool) -> Callable[[], int]:
+    def plain(self, frames: NumpyFrames, *, fresh: bool) -> Callable[[], int]:
         """Frames of the middle column in the straightforward way."""
         plane = self._planes_of(self._commands[len(self._commands) // 2 :][:1])[0]
         bits, ready = self._bits[: self.exposures], frames.probability(plane, self._power_w)
@@ -235,19 +215,19 @@ class _SceneBench:
 
         return some
 
-    def _exposed(self, source: FrameSource, held: Array) -> int:
+    def _exposed(self, source: PhotonSource, held: Array) -> int:
         power_w, x0, bits, time_s = self._rest
         source.expose(self._block * len(bits), held, power_w, x0, bits, time_s)
         return len(bits)
 
 
-def _in_turn(cases: list[_Case], extent: SimulatorExtent, progress: Progress | None) -> tuple[float, Array]:
+def _in_turn(cases: list[_Case], extent: SimulatorExtent) -> tuple[float, Array]:
     """Bytes a second of the memory and frames a second of each case, medians over the rounds."""
     words = np.random.default_rng(0).integers(0, 2**63, extent.read_bytes // 8, np.uint64)
     read_all(words)
     for case in cases:  # compiled code is loaded before anything is timed
         case.frames()
-    told = counted("measuring", "rows", progress)
+    told = counted("measuring", "rows", None)
     memory, speeds = np.zeros(extent.rounds), np.zeros((extent.rounds, len(cases)))
     for done in range(extent.rounds):
         begun = time.perf_counter()
@@ -275,3 +255,7 @@ def _rows(cases: list[_Case], speeds: Array, exposures: int) -> tuple[SimulatorR
         place = case.stage, case.scene, case.threads, exposures
         rows.append(SimulatorRow(*place, float(speed), 1e6 / float(speed), float(speed) / REAL_TIME_HZ, times))
     return tuple(rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,7 +1,6 @@
 """The disk's bench: the same bytes in all four rows, and nothing left on the disk."""
 
 import errno
-import json
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -9,10 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rig import api
-from rig.bench import disk
-from rig.cli import main as cli
-from rig.errors import UsageError
+from rig.errors import RecordingError, UsageError
+from tests.benchmarks import disk
 
 
 def test_rows_are_of_the_same_bytes_and_leave_nothing_behind(
@@ -23,38 +20,33 @@ def test_rows_are_of_the_same_bytes_and_leave_nothing_behind(
     monkeypatch.setattr(disk, "GIGABYTES", 0.05)
     monkeypatch.setattr(disk, "ROUNDS", 1)
     monkeypatch.setattr(disk, "_read", lambda folder: read.append(sum(f.stat().st_size for f in folder.glob("*.spb"))))
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["bench", "--disk", str(tmp_path), "--json"])
-    assert ended.value.code == 0
-    report = json.loads(capsys.readouterr().out)
-    assert [row["stage"] for row in report["rows"]] == ["record-plain", "record", "read-plain", "read"]
-    assert [row["of_plain"] is None for row in report["rows"]] == [True, False, True, False]
-    assert all(row["mb_per_s"] > 0 and row["cpu_s_per_gb"] >= 0 for row in report["rows"])
-    assert read == [round(report["gigabytes"] * 1e9)]
+    report = disk.measure_disk(tmp_path)
+    assert [row.stage for row in report.rows] == ["record-plain", "record", "read-plain", "read"]
+    assert [row.of_plain is None for row in report.rows] == [True, False, True, False]
+    assert all(row.mb_per_s > 0 and row.cpu_s_per_gb >= 0 for row in report.rows)
+    assert read == [round(report.gigabytes * 1e9)]
+    disk.disk_table(report)
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[-4:]] == [row.stage for row in report.rows]
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_disk_that_fills_up_on_the_way_is_said_in_a_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_disk_that_fills_up_on_the_way_is_said_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(disk, "GIGABYTES", 0.05)
     monkeypatch.setattr(disk.os, "pwritev", full)
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["bench", "--disk", str(tmp_path)])
-    assert ended.value.code == 3
-    assert capsys.readouterr().err.splitlines()[-1].startswith("error: cannot measure the disk of ")
+    with pytest.raises(RecordingError, match=r"cannot measure the disk of .*No space left"):
+        disk.measure_disk(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_is_none_or_has_no_room_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UsageError, match="is no folder"):
-        api.bench_disk(tmp_path / "absent")
+        disk.measure_disk(tmp_path / "absent")
     monkeypatch.setattr(disk, "GIGABYTES", 1e9)
     with pytest.raises(UsageError, match="free some"):
-        api.bench_disk(tmp_path)
+        disk.measure_disk(tmp_path)
 
 
 def test_plain_bytes_come_back_as_they_were_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
