@@ -174,12 +174,18 @@ def calibrations(folder: Path) -> Iterator[Task]:
 
 
 def run(tasks: Sequence[Task], jobs: int) -> Results:
-    """Hashes of all tasks, each done in a folder of its own that is removed afterwards."""
+    """Hashes of all tasks, each done in a folder of its own that is removed afterwards.
+
+    Files that cannot be read are a difference like any other, and no reason to lose the other hashes.
+    """
 
     def one(task: Task) -> Hashes:
         name, step, hashed = task
         with tempfile.TemporaryDirectory(prefix="identity-") as scratch:
-            hashes = hashed(Path(scratch))
+            try:
+                hashes = hashed(Path(scratch))
+            except (OSError, ValueError, LookupError) as error:
+                hashes = {"exit code": f"files that cannot be read: {without_folders(repr(error))}"}
         print(f"{name}: {step}", file=sys.stderr, flush=True)
         return hashes
 
@@ -298,8 +304,8 @@ def folder_hashes(folder: Path) -> Hashes:
 
 
 def member_hashes(name: str, array: np.ndarray) -> Hashes:
-    """Hash of an array; of a JSON text, those of its keys."""
-    if array.dtype.kind == "U" and array.ndim == 0:
+    """Hash of an array; of a text that is a JSON object, those of its keys."""
+    if array.dtype.kind == "U" and array.ndim == 0 and str(array).startswith("{"):
         return mapping_hashes(name, json.loads(str(array)))
     return {name: array_hash(array)}
 
