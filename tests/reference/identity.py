@@ -233,13 +233,17 @@ def scanned(*words: object) -> Hashes:
 
 
 def bound_frames(of_frame: Mapping[str, np.ndarray], manifest: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Of arrays with one entry a frame, the frames up to the end of the last sweep of their start of the SPAD."""
+    """The frames up to the end of the last sweep of their start of the SPAD, of arrays with one entry a frame.
+
+    Ticks count from the first frame of the start: the frames behind the last marker put the next one off.
+    """
     sweeps = manifest["sweeps"]
     last = np.cumsum([start["sweeps"] for start in manifest["recording"]["starts"]]) - 1
     ends = np.array([sweeps[min(index, len(sweeps) - 1)]["end_frame"] for index in last])
-    start_of_frame = np.unique(of_frame["run"], return_inverse=True)[1]
+    _, first, start_of_frame = np.unique(of_frame["run"], return_index=True, return_inverse=True)
     kept = of_frame["number"] <= ends[start_of_frame]
-    return {name: column[kept] for name, column in of_frame.items()}
+    timed = {**of_frame, "ticks": of_frame["ticks"] - of_frame["ticks"][first][start_of_frame]}
+    return {name: column[kept] for name, column in timed.items() if name != "time_s"}
 
 
 def exported(recorded: Path, scratch: Path) -> Hashes:
