@@ -174,12 +174,18 @@ def calibrations(folder: Path) -> Iterator[Task]:
 
 
 def run(tasks: Sequence[Task], jobs: int) -> Results:
-    """Hashes of all tasks, each done in a folder of its own that is removed afterwards."""
+    """Hashes of all tasks, each done in a folder of its own that is removed afterwards.
+
+    Files that cannot be read are a difference like any other, and no reason to lose the other hashes.
+    """
 
     def one(task: Task) -> Hashes:
         name, step, hashed = task
         with tempfile.TemporaryDirectory(prefix="identity-") as scratch:
-            hashes = hashed(Path(scratch))
+            try:
+                hashes = hashed(Path(scratch))
+            except (OSError, ValueError, LookupError) as error:
+                hashes = {"exit code": f"files that cannot be read: {without_folders(repr(error))}"}
         print(f"{name}: {step}", file=sys.stderr, flush=True)
         return hashes
 
@@ -227,13 +233,17 @@ def scanned(*words: object) -> Hashes:
 
 
 def bound_frames(of_frame: Mapping[str, np.ndarray], manifest: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Of arrays with one entry a frame, the frames up to the end of the last sweep of their start of the SPAD."""
+    """The frames up to the end of the last sweep of their start of the SPAD, of arrays with one entry a frame.
+
+    Ticks count from the first frame of the start: the frames behind the last marker put the next one off.
+    """
     sweeps = manifest["sweeps"]
     last = np.cumsum([start["sweeps"] for start in manifest["recording"]["starts"]]) - 1
     ends = np.array([sweeps[min(index, len(sweeps) - 1)]["end_frame"] for index in last])
-    start_of_frame = np.unique(of_frame["run"], return_inverse=True)[1]
+    _, first, start_of_frame = np.unique(of_frame["run"], return_index=True, return_inverse=True)
     kept = of_frame["number"] <= ends[start_of_frame]
-    return {name: column[kept] for name, column in of_frame.items()}
+    timed = {**of_frame, "ticks": of_frame["ticks"] - of_frame["ticks"][first][start_of_frame]}
+    return {name: column[kept] for name, column in timed.items() if name != "time_s"}
 
 
 def exported(recorded: Path, scratch: Path) -> Hashes:
@@ -298,8 +308,8 @@ def folder_hashes(folder: Path) -> Hashes:
 
 
 def member_hashes(name: str, array: np.ndarray) -> Hashes:
-    """Hash of an array; of a JSON text, those of its keys."""
-    if array.dtype.kind == "U" and array.ndim == 0:
+    """Hash of an array; of a text that is a JSON object, those of its keys."""
+    if array.dtype.kind == "U" and array.ndim == 0 and str(array).startswith("{"):
         return mapping_hashes(name, json.loads(str(array)))
     return {name: array_hash(array)}
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.reference.identity import Results, differences, folder_hashes
+from tests.reference.identity import Results, bound_frames, differences, folder_hashes, run
 
 DEPTH_M = np.array([[1.5, np.nan], [2.5, 0.0]], np.float32)
 SUMMARY = {"maps": 1, "truth": {"median_abs": 0.1}, "compute_time_s": 3.0, "stages": {"counting_s": 1.0}}
@@ -53,6 +53,44 @@ def test_moments_and_the_bytes_of_containers_do_not_count(tmp_path: Path) -> Non
     assert differences(before, {"fog": {"edge": folder_hashes(folder)}}) == differences(before, now) == []
     again = results(tmp_path / "c", summary=SUMMARY | {"truth": {"median_abs": 0.10000000000000002}})
     assert differences(before, again) == ["fog, edge, summary.json:truth differs"]
+
+
+def test_texts_in_an_archive_count_and_moments_in_them_do_not(tmp_path: Path) -> None:
+    def told(name: str, **members: str) -> Results:
+        return results(tmp_path / name, **{key: np.array(text) for key, text in members.items()})
+
+    before = told("a", about='{"created": "now", "frames": 3}', source="3 views")
+    assert differences(before, told("b", about='{"created": "then", "frames": 3}', source="3 views")) == []
+    assert differences(before, told("c", about='{"created": "now", "frames": 4}', source="4 views")) == [
+        "fog, edge, stripe/000000.npz:about:frames differs",
+        "fog, edge, stripe/000000.npz:source differs",
+    ]
+
+
+def test_files_that_cannot_be_read_are_a_difference_and_lose_no_other_hash() -> None:
+    def torn(scratch: Path) -> dict[str, str]:
+        (scratch / "depth.npy").write_bytes(b"torn")
+        return folder_hashes(scratch)
+
+    found = run([("fog", "edge", torn), ("fog", "joint", lambda scratch: {"a": "1"})], jobs=2)
+    assert found["fog"]["joint"] == {"a": "1"}
+    assert found["fog"]["edge"]["exit code"].startswith("files that cannot be read: ValueError")
+
+
+def test_frames_count_up_to_the_closing_marker_whenever_a_start_was() -> None:
+    def frames(first_tick: int, behind: int) -> dict[str, np.ndarray]:
+        """Two starts with 5 frames of a sweep each and some behind the marker that closes it, which is in frame 5."""
+        number = np.concatenate([np.arange(6 + behind), np.arange(6)])
+        run_id = np.repeat([4, 5], [6 + behind, 6])
+        ticks = 10 * number + np.where(run_id == 5, first_tick, 0)
+        return {"number": number, "run": run_id, "ticks": ticks, "bits": number * 3, "time_s": ticks / 1e6}
+
+    manifest = {"sweeps": [{"end_frame": 5}] * 2, "recording": {"starts": [{"sweeps": 1}, {"sweeps": 1}]}}
+    early, late = (bound_frames(frames(*each), manifest) for each in ((70, 0), (1000, 8)))
+    assert early.keys() == late.keys() == {"number", "run", "ticks", "bits"}
+    assert all(np.array_equal(early[name], late[name]) for name in early)
+    assert early["number"].tolist() == [*range(6), *range(6)]
+    assert early["ticks"].tolist() == [*range(0, 60, 10)] * 2
 
 
 def test_what_is_missing_and_what_is_new_is_said_and_how_commands_ended() -> None:
