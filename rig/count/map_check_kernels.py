@@ -6,7 +6,7 @@ With n ones of a pixel in K frames and r its usual rate, a line of counts k is t
 
 and the light in common with a partner at pixel distance s is sum over j of e_0(j) (sum of e_k over j + s - LAGS_PX to
 j + s + LAGS_PX, less the mean of the same BESIDE_PX to either side). Smoothness is the sum of products of neighbouring
-pixels. Lines are int32 (3, points, window), results float64 (points, 2 + orders).
+pixels. Lines are int32 (3, points, window), results float64 (points, 3 + orders).
 """
 
 from typing import Final
@@ -22,6 +22,9 @@ LAGS_PX: Final = 2
 
 BESIDE_PX: Final = 9
 """Pixels from where the line should be at which light that is still in common is haze."""
+LEAST_SHARED: Final = 0.25
+"""Light that frames of one column have in common at least, over what all frames of two rows have: 1 for a line that
+stands still, 0.4 at two frames a column for one that moves by 5 px in it."""
 
 
 @numba.njit(inline="always")
@@ -48,7 +51,7 @@ def compare_lines(
     last: int,
     out: NDArray[np.float64],
 ) -> None:
-    """Compare points first..last-1; out: (points, 2 + orders).
+    """Compare points first..last-1; out: (points, 3 + orders).
 
     lines: (3, points, window) counts of each point's line and its two partners; exposures, row, column: (3, points).
     shift: (2, points), pixels from a stripe of the line to the partner's. usual: (rows, width), mean ones per exposure
@@ -57,12 +60,15 @@ def compare_lines(
 
     Out come the light in common with each partner and by how much the sum of products of neighbouring pixels grows when
     they are taken in each order. Light in common is a product of line-shaped excess over what is usual for each pixel,
-    in its standard deviations: 0 on average for noise, haze and whatever stands still.
+    in its standard deviations: 0 on average for noise, haze and whatever stands still. Between them comes by how much
+    LEAST_SHARED of what single pixels have in common with the next row is above what their own frames have in common
+    with each other: frames of one column show the same line, so that this is below 0.
     """
     window = lines.shape[2]
     line = np.zeros((3, window))
     total = np.zeros(window + 1)
     pixels = np.zeros((2, window))
+    excesses = np.zeros((2, window))
     for i in range(first, last):
         for k in range(3):
             y, c = row[k, i], column[k, i]
@@ -74,6 +80,8 @@ def compare_lines(
                     rate = usual[y, x0[c] + j]
                     excess = (lines[k, i, j] - exposures[k, i] * rate) / np.sqrt(exposures[k, i] * max(rate, least))
                 total[j + 1] = total[j] + excess
+                if k < 2:
+                    excesses[k, j] = excess
             for j in range(window):
                 line[k, j] = 0.0
                 if low <= j <= high:
@@ -91,6 +99,19 @@ def compare_lines(
                 beside = _around(total, j + to - BESIDE_PX) + _around(total, j + to + BESIDE_PX)
                 common += line[0, j] * (near - 0.5 * beside)
             out[i, k - 1] = common
+        frames, to = exposures[0, i], shift[0, i]
+        shared = 0.0
+        for j in range(BESIDE_PX + abs(to) if frames > 1 else window, window - BESIDE_PX - abs(to)):
+            excess = excesses[0, j]
+            if excess != 0.0:
+                rate = usual[row[0, i], x0[column[0, i]] + j]
+                # Pairs of different frames: a frame's own ones would be in common with themselves.
+                alone = lines[0, i, j] * (1.0 - 2.0 * rate) + frames * rate * rate
+                own = (excess * excess - alone / (frames * max(rate, least))) * frames / (frames - 1.0)
+                own -= 0.5 * excess * (excesses[0, j - BESIDE_PX] + excesses[0, j + BESIDE_PX])
+                other = excesses[1, j + to] - 0.5 * (excesses[1, j + to - BESIDE_PX] + excesses[1, j + to + BESIDE_PX])
+                shared += LEAST_SHARED * excess * other - own
+        out[i, 2] = shared
         for j in range(window):
             pixels[0, j] = lines[0, i, j]
         for order in range(orders.shape[0]):
@@ -99,4 +120,4 @@ def compare_lines(
             grows = 0.0
             for j in range(window - 1):
                 grows += pixels[1, j] * pixels[1, j + 1] - pixels[0, j] * pixels[0, j + 1]
-            out[i, 2 + order] = grows
+            out[i, 3 + order] = grows

@@ -5,6 +5,7 @@ line has moved about six pixels. A stripe is seen in all three, at places that t
 
 - Pixels of a row: light falls on neighbours alike, so that no other order of the pixels is smoother than the right one.
 - Rows: a line of light stands where it stands on the next row.
+- Frames: those of one column show the line in one place, pixel by pixel, as two rows do.
 - Columns: it moves from column to column as the planes do.
 - Answers of estimators that know their confidence: an answer that is sure, 0.9 for one place of some 150, rests on
   seven nats. At most 7 x 7 lines have a say in it, so that each brings a seventh at least, which is a mean of half a
@@ -122,27 +123,30 @@ class MapChecks:
                 f"saturated: {fired:.1%} of the pixels fired in every frame; shorten the exposure, darken the room, or "
                 "check that ones are photons",
             )
-        usual = intensity / np.maximum(counts.exposures_seen(), 1)
+        usual = np.asarray(intensity / np.maximum(counts.exposures_seen(), 1), np.float32)
         usual[self._geometry.defects] = np.nan
-        wrong = self._of_counts(counts, usual.astype(np.float32), stripe)
+        wrong = self._of_counts(counts, usual, DIMMEST * fired, stripe)
         if wrong is None and self._knows:
             wrong = self._of_answers(counts, stripe)
         return () if wrong is None else (wrong,)
 
-    def _of_counts(self, counts: "_Counts", usual: NDArray[np.float32], stripe: StripeTable) -> str | None:
+    def _of_counts(
+        self, counts: "_Counts", usual: NDArray[np.float32], least: float, stripe: StripeTable
+    ) -> str | None:
         lit = np.flatnonzero((counts.exposures > 0).all(axis=0))
         if len(lit) < FEWEST_POINTS:
             return None
         few = lit[:: max(len(lit) // POINTS, 1)]
-        out = self._compared(counts, few, usual)
-        if len(few) < len(lit) and _deviations(out[:, 0] - out[:, 1] / LEAST_FOLLOWING) > -LIMIT:
-            out, few = self._compared(counts, lit, usual), lit  # what few points leave open
+        out = self._compared(counts, few, usual, least)
+        clear = out[:, 1] / LEAST_FOLLOWING - out[:, 0], -out[:, 2]
+        if len(few) < len(lit) and any(each.any() and _deviations(each) < LIMIT for each in clear):
+            out, few = self._compared(counts, lit, usual, least), lit  # what few points leave open
         points = counts.points
         _, of_row = np.unique(points.row[0, few], return_inverse=True)
         if of_row.max() + 1 >= FEWEST_ROWS:
             # Pixels that are always on are the same on every line of a row: rows are what is independent.
-            likeliest = int(out[:, 2:].sum(axis=0).argmax())
-            if _deviations(np.bincount(of_row, out[:, 2 + likeliest]).astype(np.float64)) > LIMIT:
+            likeliest = int(out[:, 3:].sum(axis=0).argmax())
+            if _deviations(np.bincount(of_row, out[:, 3 + likeliest]).astype(np.float64)) > LIMIT:
                 what, expected = list(ORDERS.items())[likeliest]
                 return (
                     f"{what} seem reversed: in that order neighbouring pixels agree better than as they come; frames "
@@ -156,6 +160,11 @@ class MapChecks:
                 "no line: no light that one row shares with the next stands out of the noise; check laser, gate, power "
                 "and depth range, and that frames are height x width with the line across the rows"
             )
+        if _deviations(out[:, 2]) > LIMIT:
+            return (
+                "frames of one column show light in different places; check the order of the frames (all exposures of "
+                "a column, then the next column), and columns and exposures of the plan"
+            )
         if self._calibrated and _deviations(LEAST_FOLLOWING * rows - columns) > LIMIT:
             return (
                 "columns do not follow one another: from column to column the line does not move as the calibration's "
@@ -164,16 +173,18 @@ class MapChecks:
             )
         return None
 
-    def _compared(self, counts: "_Counts", chosen: NDArray[np.int64], usual: NDArray[np.float32]) -> Array:
+    def _compared(
+        self, counts: "_Counts", chosen: NDArray[np.int64], usual: NDArray[np.float32], least: float
+    ) -> Array:
         """Results of `compare_lines` at chosen points."""
         from rig.count.map_check_kernels import compare_lines
 
         geometry, points = self._geometry, counts.points
-        out = np.zeros((len(chosen), 2 + len(self._orders)))
+        out = np.zeros((len(chosen), 3 + len(self._orders)))
         compare_lines(
             counts.lines(chosen), counts.exposures[:, chosen], points.row[:, chosen], points.column[:, chosen],
             points.shift[:, chosen], geometry.x0, geometry.x_lo, geometry.x_hi, usual,
-            DIMMEST * float(np.nanmean(usual)), self._orders, 0, len(chosen), out,
+            least, self._orders, 0, len(chosen), out,
         )  # fmt: skip
         return out
 

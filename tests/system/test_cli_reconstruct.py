@@ -105,6 +105,31 @@ def test_bits_past_the_width_are_no_pixels(rig: Rig, wall: Path) -> None:
     assert Path("cube/stripe/000000.npz").read_bytes() == Path("dirty/stripe/000000.npz").read_bytes()
 
 
+def test_a_cube_that_speaks_against_its_depth_is_doubtful(rig: Rig, wall: Path) -> None:
+    right = frames(2)
+    maps = right.reshape(2, COLUMNS * EXPOSURES, ROWS, -1)
+    np.save(wall / "bits.npy", np.packbits(np.unpackbits(right, axis=-1), axis=-1, bitorder="little"))
+    np.save(wall / "backwards.npy", np.concatenate([maps[0], maps[1, ::-1]]))
+    np.save(wall / "dark.npy", np.zeros_like(right))
+    seen = {
+        "bits": ("columns do not follow one another", [0, 1]),  # of lines a pixel wide no order is smoother
+        "backwards": ("columns do not follow one another", [1]),
+        "dark": ("no light", [0, 1]),
+    }
+    for name, (reason, of) in seen.items():
+        ran = reconstruct(rig, wall, "--estimator", "argmax", "--json", "--out", name, cube=f"{name}.npy")
+        summary = json.loads(ran.out)
+        assert (ran.code, summary["verdict"]) == (1, "doubtful")
+        (doubt,) = summary["verdict_reasons"]
+        assert doubt["reason"].startswith(reason)
+        assert doubt["maps"] == of
+        assert json.loads(Path(name, "manifest.json").read_text())["verdict"] == "doubtful"
+    told = reconstruct(rig, wall, "--estimator", "argmax", "--out", "told", cube="backwards.npy")
+    assert told.code == 1
+    assert "verdict  doubtful: " in told.out
+    assert "because  map 1: columns do not follow one another" in told.out
+
+
 def test_an_interrupt_exits_4(rig: Rig, wall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from rig.depth.reconstruct import Reconstructor
 

@@ -40,8 +40,8 @@ def shuffled(counts):
 
 
 def twice_as_fast(counts):
-    """The planes of half the angle."""
-    return counts[np.minimum(2 * np.arange(len(counts)), len(counts) - 1)]
+    """The planes of half the angle; the line has left the picture for the second half of the columns."""
+    return np.concatenate([counts[::2], np.zeros_like(counts[1::2])])
 
 
 def noise(counts):
@@ -64,10 +64,10 @@ def test_a_right_map_is_not_doubted(light: str, exposures: int, rig: str) -> Non
     ("change", "seen", "lights"),
     [
         (least_significant_first, "the bits of each byte seem reversed", ("clear", "report", "dense")),
-        (exposures_first, "columns do not follow one another", ("clear",)),
+        (exposures_first, "frames of one column show light in different places", ("clear", "report")),
         (lambda counts: counts[::-1], "columns do not follow one another", ("clear", "report")),
         (shuffled, "columns do not follow one another", ("clear", "report", "dense")),
-        (twice_as_fast, "columns do not follow one another", ("clear", "report", "dense")),
+        (twice_as_fast, "columns do not follow one another", ("clear",)),
         (noise, "no line", ("clear",)),
         (pattern, "no line", ("clear",)),
         (np.zeros_like, "no light", ("clear",)),
