@@ -43,6 +43,8 @@ LEAST_FOLLOWING: Final = 0.25
 fences half of it; columns that do not follow one another have none."""
 SATURATED: Final = 0.99
 """Share of ones among all pixels and frames from which on a map is full."""
+LEAST_WIDTH_PX: Final = 32
+"""Width of a sensor below which the line's motion over APART_PX, with the pixels to its sides, does not fit in."""
 DIMMEST: Final = 0.1
 """Least mean rate of a pixel, over that of all, that its noise is reckoned with."""
 SURE: Final = 0.9
@@ -104,6 +106,8 @@ class MapChecks:
     def __init__(self, geometry: SweepGeometry, *, calibrated: bool, knows: bool) -> None:
         self._geometry = geometry
         self._calibrated = calibrated
+        # On a sensor hardly wider than the line, light cannot be seen to move.
+        self._follows = calibrated and geometry.width >= LEAST_WIDTH_PX
         self._knows = knows
         self._points = {most: check_points(geometry, most) for most in (POINTS, VOLUME_POINTS)}
         self._orders = _orders()
@@ -115,7 +119,10 @@ class MapChecks:
         """
         points = self._points[VOLUME_POINTS if isinstance(sweep, CountVolume) else POINTS]
         counts = _Counts(sweep, self._geometry, points)
-        fired = float(intensity.sum()) / max(float(counts.exposures_seen().sum()) * self._geometry.rows, 1.0)
+        seen = counts.exposures_seen()
+        if not seen.any():
+            return ()  # all of its frames were lost, which the gaps say
+        fired = float(intensity.sum()) / (float(seen.sum()) * self._geometry.rows)
         if fired == 0.0:
             return ("no light: not one pixel fired in any frame; check lens cap, laser, gate and the sensor's power",)
         if fired > SATURATED:
@@ -123,7 +130,7 @@ class MapChecks:
                 f"saturated: {fired:.1%} of the pixels fired in every frame; shorten the exposure, darken the room, or "
                 "check that ones are photons",
             )
-        usual = np.asarray(intensity / np.maximum(counts.exposures_seen(), 1), np.float32)
+        usual = np.asarray(intensity / np.maximum(seen, 1), np.float32)
         usual[self._geometry.defects] = np.nan
         wrong = self._of_counts(counts, usual, DIMMEST * fired, stripe)
         if wrong is None and self._knows:
@@ -165,7 +172,7 @@ class MapChecks:
                 "frames of one column show light in different places; check the order of the frames (all exposures of "
                 "a column, then the next column), and columns and exposures of the plan"
             )
-        if self._calibrated and _deviations(LEAST_FOLLOWING * rows - columns) > LIMIT:
+        if self._follows and _deviations(LEAST_FOLLOWING * rows - columns) > LIMIT:
             return (
                 "columns do not follow one another: from column to column the line does not move as the calibration's "
                 "planes do; check the order of the frames (all exposures of a column, then the next column), columns "

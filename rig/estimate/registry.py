@@ -7,10 +7,6 @@ one for each map, and so estimates these maps again bit for bit.
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
-from rig.count.volume import Counter, SweepLayout
-from rig.geometry.stripe_table import StripeTable
-from rig.geometry.windows import SweepGeometry
-
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -71,7 +67,6 @@ class LearnsFromStream(Estimator, Protocol):
 
 def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
     """Estimator of a name in LEARNING that estimates each map with a state out of `learned`, and learns nothing."""
-
     return Recalled(_learning(name, threads, learns=False, temporal_prior=temporal_prior), learned)
 
 
@@ -113,11 +108,11 @@ class Recalled:
         """State of the last map."""
         return self._of.used
 
-    def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
+    def counter(self, layout: "SweepLayout", geometry: "SweepGeometry") -> "Counter":
         """See the estimator."""
         return self._of.counter(layout, geometry)
 
-    def estimate(self, sweep: Any, geometry: SweepGeometry) -> StripeTable:
+    def estimate(self, sweep: Any, geometry: "SweepGeometry") -> "StripeTable":
         """See the estimator."""
         stripes = self._of.estimate(sweep, geometry)
         if self._states:

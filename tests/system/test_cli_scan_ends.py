@@ -44,7 +44,7 @@ def test_frames_dropped_for_a_slow_estimate_are_gaps(rig: Rig, small: Path, monk
     frames, gaps = summary["frames"], manifest["gaps"]
     assert isinstance(frames, dict)
     assert isinstance(gaps, list)
-    assert (ran.code, summary["verdict"], summary["maps"]) == (1, "gaps", 8)
+    assert (ran.code, summary["verdict"], summary["maps"]) == (1, "gaps", 8), summary.get("verdict_reasons")
     assert frames["expected"] == frames["received"] + frames["lost"]
     assert frames["lost"] == sum(last - first + 1 for first, last in gaps) > 0
     assert summary["stages"]["dropped_frames"] >= frames["lost"]  # type: ignore[index]
@@ -118,7 +118,9 @@ def test_an_aborted_run_says_what_of_it_is_kept(rig: Rig, small: Path, monkeypat
     told = [" ".join(ran.out.split()) for ran in (nothing, frames, maps)]
     assert told[0].endswith(f"{before} nothing is kept")
     assert told[1].endswith(f"{before} the recorded frames are kept in {Path('recorded').absolute()}")
-    assert told[2].endswith("verdict aborted: the run ended before its last map; whole maps are kept")
+    assert told[2].endswith(
+        "verdict aborted: the run ended before its last map; whole maps are kept, and with --record every frame that came"
+    )
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
@@ -272,10 +274,11 @@ def test_further_signals_change_nothing_of_how_an_aborted_command_ends(tmp_path:
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "signal.signal(signal.SIGTERM, signal.SIG_DFL)\n"
         "atexit.register(lambda: [os.kill(os.getpid(), number) for number in (signal.SIGINT, signal.SIGTERM)])\n"
-        "from rig import api, cli\n"
+        "from rig import api\n"
+        "from rig.cli.main import main\n"
         "def interrupted(*given, **options): raise KeyboardInterrupt\n"
         "api.effects = interrupted\n"
-        "cli.main()\n"
+        "main()\n"
     )
     ran = subprocess.run([sys.executable, "-c", program, "effects"], capture_output=True, text=True, timeout=60)
     assert (ran.returncode, ran.stderr) == (4, "aborted\n")

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 IDS = sorted(
     {
         (f"{int(vendor, 16):04x}", f"{int(product, 16):04x}")
-        for file in (ROOT / "drivers").glob("*.py")
+        for file in (ROOT / "drivers").rglob("*.py")
         for vendor, product in re.findall(r"UsbId\([^,()]+, 0x(\w{4}), 0x(\w{4})", file.read_text(encoding="utf-8"))
     }
 )

@@ -11,7 +11,7 @@ from drivers.registry import SLOTS, lookup
 from rig.config.bundled import BUNDLED
 from rig.config.models import EstimateConfig, RigConfig, ScanConfig
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 @pytest.mark.parametrize("name", ["lab", "lab-spad512s"])

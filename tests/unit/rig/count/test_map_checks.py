@@ -112,3 +112,10 @@ def test_points_lie_in_the_searched_windows_with_their_partners() -> None:
     assert (geometry.x_lo <= geometry.x_hi)[points.row, points.column].all()
     assert np.array_equal(points.row[1], points.row[0] + 1)
     assert (points.column[2] > points.column[0]).all()
+
+
+def test_a_map_whose_frames_were_all_lost_is_not_called_dark() -> None:
+    sweep = simulated("clear", 3, "left", rows=ROWS, columns=COLUMNS)
+    volume = volume_of(np.zeros_like(sweep.counts), sweep.geometry, 0)
+    checks = MapChecks(sweep.geometry, calibrated=True, knows=False)
+    assert checks.doubts(volume, volume.intensity(), StripeTable.empty(ROWS, COLUMNS)) == ()
