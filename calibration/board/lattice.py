@@ -207,7 +207,8 @@ def _median(values: Array) -> float:
 Gray = NDArray[np.uint8]
 
 FORMS = ((1, 0.0), (2, 0.8), (3, 0.8), (2, 1.5), (4, 1.2))
-"""(enlargement, smoothing in pixels of the picture), in the order they are tried; measured in docs/calibration.md."""
+"""(enlargement, smoothing in pixels of the picture), in the order they are tried; measured in
+docs/how-to/calibration.md."""
 _ENOUGH = 0.9
 """Share of the markers at which no further form is tried."""
 _DARKEST, _BRIGHTEST = 0.5, 99.5

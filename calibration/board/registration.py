@@ -2,7 +2,7 @@
 
 Around a corner the picture is offset + gain * (1 + slopes) * drawn board, shifted by (dx, dy); the shift that fits
 best says where the corner is. All edges around it, those of the markers included, pull together, so that a picture of
-few photons gives a tenth of the error of cv2.cornerSubPix (docs/calibration.md). Weighted least squares by
+few photons gives a tenth of the error of cv2.cornerSubPix (docs/how-to/calibration.md). Weighted least squares by
 Gauss-Newton, the variance proportional to the light as photons have it; pixels far off (an unlisted hot pixel) do not
 count.
 

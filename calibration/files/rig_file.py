@@ -13,8 +13,8 @@ or, instead of `planes`, a scanner with commands of its own:
 
 Optional: source_m, lag_s: {forward, backward}, speed_range_per_s: [low, high], row_delay_s, gate_delay_s,
 colour_skew_s, marker_rising, defects: a bool .npy, dark_rate: a float .npy, covariance: {names, file}, identity,
-provenance: any mapping, two of whose keys are read. Paths are relative to the file's folder; docs/calibration-file.md
-says it all.
+provenance: any mapping, two of whose keys are read. Paths are relative to the file's folder;
+docs/reference/calibration-file.md says it all.
 """
 
 import os

@@ -100,7 +100,7 @@ def _by_column(sweep: SweepCounts) -> tuple[Array, Array]:
     flux = np.zeros((rows, int(sweep.x0.max(initial=0)) + window))
     for k in range(columns):
         n = int(sweep.n_frames[k])
-        # Nearly unbiased and finite where all are lit (docs/physics.md, Counts and flux).
+        # Nearly unbiased and finite where all are lit (docs/explanation/physics.md, Counts and flux).
         inverse = n * np.log((n + 0.5) / (n - np.arange(n + 1) + 0.5))
         flux[:, int(sweep.x0[k]) : int(sweep.x0[k]) + window] += inverse.take(sweep.counts[k])
     return flux[:, : sweep.width], _everything(sweep)[1]

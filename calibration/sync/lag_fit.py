@@ -15,9 +15,9 @@ known from elsewhere counts with what the sweeps tell of it, unless they contrad
 known it is 0.
 
 No sweep tells of a delay of the markers behind the mirror's command that is always the same (the scanner's colour
-outputs trail its mirror outputs by some microseconds, docs/hardware.md): it shortens both lags, which are then as they
-have to be for binding with these very markers; measuring it takes an oscilloscope. A marker of the wrong polarity shows
-in the binding, whose residual it breaks; the gate's delay shows in the frames at its edges (`gate_fit`).
+outputs trail its mirror outputs by some microseconds, docs/reference/hardware.md): it shortens both lags, which are
+then as they have to be for binding with these very markers; measuring it takes an oscilloscope. A marker of the wrong
+polarity shows in the binding, whose residual it breaks; the gate's delay shows in the frames at its edges (`gate_fit`).
 """
 
 from collections.abc import Sequence

@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 SIGN_OF_LIFE_S = 0.05
 """Time between the guard's own signs of life."""
 POLL_S = 1.0
-"""Time between questions to an armed laser about interlock and faults (docs/hardware.md: at 1 Hz or more)."""
+"""Time between questions to an armed laser about interlock and faults (docs/reference/hardware.md: at 1 Hz or more)."""
 CHECK_S = 0.05
 """Time for the gate to say whether its program has ended, before it is taken for still running."""
 END_CHECK_S = 0.2
@@ -348,7 +348,7 @@ FREE_S = 1.0
 _RETRY_S = 0.005
 OFF_TIMES, OFF_GAP_S = 2, 0.11
 """Number of times that `Kind.off` is sent, and their distance: a Cobolt heeds no command within 0.1 s of another
-(docs/hardware.md), and the guard may just have asked something."""
+(docs/reference/hardware.md), and the guard may just have asked something."""
 
 
 class Rescue:

@@ -1,6 +1,6 @@
 """The Cobolt (Huebner) 06-01 line laser, gated by its digital modulation input.
 
-docs/hardware.md; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope `lights/cobolt.py`. The
+docs/reference/hardware.md; from cobolt-lasers/pycobolt 1333e53 (2025-09) and python-microscope `lights/cobolt.py`. The
 laser has no watchdog: where its port is lost it stays as it was, so treat it as on. It judges its temperatures itself:
 fault 1.
 

@@ -1,10 +1,10 @@
 """The Coherent OBIS LX/LS line laser, gated by its digital modulation input (`SOUR:AM:EXT DIG`).
 
-docs/hardware.md; from python-microscope `lights/obis.py` (69625e0), the bit tables of `obis.h`, the operator's
-manual (appendix C) and mmCoreAndDevices PRs 645 and 531. Limits of the base plate's temperature are read by
-`SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not in docs/hardware.md but in `obis.cpp` beside `obis.h` and in
-Micro-Manager's `CoherentOBIS.cpp`. The laser has no watchdog: where its port is lost it stays as it was, so treat it as
-on.
+docs/reference/hardware.md; from python-microscope `lights/obis.py` (69625e0), the bit tables of `obis.h`, the
+operator's manual (appendix C) and mmCoreAndDevices PRs 645 and 531. Limits of the base plate's temperature are read by
+`SOUR:TEMP:PROT:BAS:LOW?` and `HIGH?`, which are not in docs/reference/hardware.md but in `obis.cpp` beside `obis.h` and
+in Micro-Manager's `CoherentOBIS.cpp`. The laser has no watchdog: where its port is lost it stays as it was, so treat it
+as on.
 
 Arming. `AM:STAT ON` during warm-up is deferred, light may come minutes later. So `arm` waits until the laser is ready
 and only then says ON; where the wait ends in any other way it says OFF. With CDRH the emission follows ON by 5 s. Modes
@@ -64,7 +64,7 @@ ERRORS = {
     520: "controller timed out",
     900: "CCB timed out",
 }
-"""Meaning of `ERR-nnn` (docs/hardware.md)."""
+"""Meaning of `ERR-nnn` (docs/reference/hardware.md)."""
 
 
 class ObisFraming:
@@ -119,7 +119,7 @@ CDRH_DELAY = 0x10
 WARM_UP = 0x100
 KEY_OFF = 0x0200_0000
 INTERLOCK = 0x0400_0000
-"""Bits of `SYST:STAT?`; the last two are inferred from samples (docs/hardware.md), less certain."""
+"""Bits of `SYST:STAT?`; the last two are inferred from samples (docs/reference/hardware.md), less certain."""
 
 FAULTS = {
     0x1: "base temperature",

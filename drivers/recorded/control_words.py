@@ -2,7 +2,7 @@
 
 How often a driver asks depends on the host's moment, and so do the tokens that number its questions: neither is
 compared. Commands of the drivers may be sent again where a reply was lost, so that repeats count once. Questions are
-those of the drivers here: Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/hardware.md).
+those of the drivers here: Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
 """
 
 import re

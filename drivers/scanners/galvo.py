@@ -7,7 +7,7 @@ first point, to a stop and to the dump angle:
     brake  constant deceleration from the speed that the mirror has
 
 DACs hand the steps of their input to the galvo as they are: a full-range jump at every point can overheat it
-(docs/hardware.md, Helios), so that nothing ever jumps.
+(docs/reference/hardware.md, Helios), so that nothing ever jumps.
 """
 
 import math

@@ -1,4 +1,5 @@
-"""Scanner kind `helios`: a galvo behind a Helios laser DAC on USB (docs/hardware.md; vendor's firmware v6 and SDK v11).
+"""Scanner kind `helios`: a galvo behind a Helios laser DAC on USB (docs/reference/hardware.md; vendor's firmware v6 and
+SDK v11).
 
     config    kind: helios, port: usb or usb:path=1-2, max_velocity, max_acceleration of the galvo behind it
     outputs   X (or Y): mirror. R: lit, i.e. a waveform is being played. G: line marker. B: scan marker. I: backward

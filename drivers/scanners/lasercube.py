@@ -1,4 +1,4 @@
-"""Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (docs/hardware.md).
+"""Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (docs/reference/hardware.md).
 
     config    kind: lasercube, port: usb or usb:serial=ABC, max_velocity, max_acceleration of its galvo
     outputs   X (or Y): mirror. With `colours: markers` R: backward. G: line marker. B: scan marker. X is not

@@ -1,4 +1,5 @@
-"""The connection to a SPAD512S's vendor program: text commands and their answers, and who answers (docs/hardware.md).
+"""The connection to a SPAD512S's vendor program: text commands and their answers, and who answers
+(docs/reference/hardware.md).
 
 Sources there: `nirrafa/SPAD512S-remote-gui` theoretical_info/piimaging_examples and docs/, `cwseitz/SPAD512`
 SPAD512/instruments/SPAD512S.py. There is no framing, no request number and one client; one command at a time, answers

@@ -1,4 +1,4 @@
-"""A SPAD array on USB that speaks SPB1 (docs/spb1-usb.md): behind a Cypress FX3 or an FT601.
+"""A SPAD array on USB that speaks SPB1 (docs/reference/spb1-usb.md): behind a Cypress FX3 or an FT601.
 
 The protocol is this project's own proposal. Opening checks product string, identity registers and a test pattern. The
 device counts and time-stamps frames itself, follows its window table by the line markers, and drops its gate where no

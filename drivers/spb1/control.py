@@ -1,6 +1,6 @@
-"""The control plane of an SPB1 device: commands, their acknowledgements, registers (docs/spb1-usb.md).
+"""The control plane of an SPB1 device: commands, their acknowledgements, registers (docs/reference/spb1-usb.md).
 
-A command is 16 bytes on a bulk OUT endpoint (docs/spb1-usb.md), several may share a transfer. Every one is
+A command is 16 bytes on a bulk OUT endpoint (docs/reference/spb1-usb.md), several may share a transfer. Every one is
 acknowledged with 16 bytes, in order: on an IN endpoint of their own, or as payload of control blocks in the stream.
 """
 

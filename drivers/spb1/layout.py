@@ -1,4 +1,4 @@
-"""The layout of an SPB1 block (SPB1 1.0 wire layout, docs/spb1.md) and its checksum.
+"""The layout of an SPB1 block (SPB1 1.0 wire layout, docs/reference/spb1.md) and its checksum.
 
 Little-endian: header 96 B, records 16 B per frame, zeros to a multiple of 64, packed pixels, trailer 32 B, zeros to the
 stride. The checksum is CRC-32 as zlib defines it, from ISA-L where that is installed (12 GB/s on a core, zlib's own

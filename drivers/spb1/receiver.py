@@ -1,4 +1,4 @@
-"""The receiving end of a live SPB1 stream (docs/spb1-usb.md): queued reads that point into ring slots.
+"""The receiving end of a live SPB1 stream (docs/reference/spb1-usb.md): queued reads that point into ring slots.
 
 Reads of one stride each are kept in flight, into slots claimed in the order in which they will be published. A block is
 taken where it lies, or refused and counted; after damage the next sound header on a multiple of 1024 bytes tells where

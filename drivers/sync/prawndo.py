@@ -1,7 +1,8 @@
 """PrawnDO, a pulse generator on a Raspberry Pi Pico: sixteen outputs, 10 ns steps, a trigger, text over USB serial.
 
-Facts: docs/hardware.md; from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd (BSD).
-Outputs (docs/hardware.md, Wiring and timing): GPIO0 triggers the SPAD, GPIO1 is the laser's gate, GPIO2 marks records.
+Facts: docs/reference/hardware.md; from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd
+(BSD). Outputs (docs/reference/hardware.md, Wiring and timing): GPIO0 triggers the SPAD, GPIO1 is the laser's gate,
+GPIO2 marks records.
 
 The firmware has no loops and no watchdog. So programs are written out in full and end on two words that hold everything
 low, whatever happens to the host. It cannot read its pins while a program runs, nor tell a wait from play.
@@ -120,7 +121,7 @@ def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -
 _log = logging.getLogger(__name__)
 
 INTERNAL_HZ = 100_000_000
-"""The board's own clock (docs/hardware.md)."""
+"""The board's own clock (docs/reference/hardware.md)."""
 MAX_WORDS = {"board: pico1": 30_000, "board: pico2": 60_000}
 OLDEST_FIRMWARE = (1, 3)
 """Oldest firmware: from here on `adm` takes a start address, and `brd` exists."""

@@ -1,8 +1,8 @@
 """Commands and answers of a PrawnDO on its serial line, and the way to low outputs through whatever is under way.
 
-The firmware frames nothing (docs/hardware.md). So every command goes between two lines of nonsense that differ
-each time and that the firmware repeats in its complaint: an answer can be told from one that came late, twice or never.
-What decides about light is asked twice. Lowering the outputs overtakes all other commands.
+The firmware frames nothing (docs/reference/hardware.md). So every command goes between two lines of nonsense that
+differ each time and that the firmware repeats in its complaint: an answer can be told from one that came late, twice or
+never. What decides about light is asked twice. Lowering the outputs overtakes all other commands.
 """
 
 import logging
@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 STOPPED, STARTING, RUNNING, ABORT_REQUESTED, ABORTING, ABORTED, STOPPING = range(7)
-"""Values of `run-status` (docs/hardware.md)."""
+"""Values of `run-status` (docs/reference/hardware.md)."""
 IDLE = (STOPPED, ABORTED)
 """States in which everything but `sts`, `abt`, `ver` and `brd` is executed."""
 BYTES_PER_WORD = 6

@@ -1,8 +1,8 @@
 """A dialogue with a device that answers one command at a time: paced, checked, and back in step after a lost reply.
 
-Nothing on a laser's line checks or numbers a reply (docs/hardware.md, lasers): one that comes late is taken for
-the answer to the next command. So the input is dropped before each command, and each reply must have the form that its
-command calls for. After one that has not, or none at all, the line is drained and a question asked whose answer is
+Nothing on a laser's line checks or numbers a reply (docs/reference/hardware.md, lasers): one that comes late is taken
+for the answer to the next command. So the input is dropped before each command, and each reply must have the form that
+its command calls for. After one that has not, or none at all, the line is drained and a question asked whose answer is
 known. The form of a make's commands and replies is its `Framing`.
 
 Threads take turns by a `FairLock`: a thread that polls a slow device takes its lock again as soon as it gave it back,

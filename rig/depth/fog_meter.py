@@ -167,7 +167,7 @@ MODEL_SHARE: Final = 0.02
 """Relative error that the model's form brings: bins, gains of rows and columns, two path lengths taken as one."""
 REST_SHARE: Final = 1.0
 """Relative error of the extinction over the share of light scattered more than once. Traced: in isotropic fog the decay
-is flatter by 25 to 40 % where `rest` is 0.35 to 0.45 (Mitsuba rows, docs/fog-meter.md)."""
+is flatter by 25 to 40 % where `rest` is 0.35 to 0.45 (Mitsuba rows, docs/explanation/fog-meter.md)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,7 +77,7 @@ def _transforms(camera: Camera, n_frames: int) -> str:
 
 
 class MapFiles:
-    """The maps of a run as `docs/run-folder.md` describes them; a run that only recorded has none."""
+    """The maps of a run as `docs/reference/run-folder.md` describes them; a run that only recorded has none."""
 
     def __init__(self, run: Path) -> None:
         self._run = run

@@ -1,4 +1,4 @@
-"""Photon cubes: `.npy` uint8 (frames, height, width / 8) of `photoncube` and `visionsim` (docs/hardware.md).
+"""Photon cubes: `.npy` uint8 (frames, height, width / 8) of `photoncube` and `visionsim` (docs/reference/hardware.md).
 
 Packed along the width, most significant bit first (`numpy.packbits(axis=2)`). What the array cannot say, a file beside
 it may: `NAME.json` of `rig export` (width, frame rate, frame numbers) or visionsim's `transforms.json` (width).

@@ -1,4 +1,5 @@
-"""Files of the SPAD512S (Pi Imaging): 1-bit RAW files, dumps of the TCP stream, sparse lists (docs/hardware.md).
+"""Files of the SPAD512S (Pi Imaging): 1-bit RAW files, dumps of the TCP stream, sparse lists
+(docs/reference/hardware.md).
 
 Packed: rows of 64 bytes, most significant bit first, no header; a dump of the stream may end with `DONE`, which pixels
 may read as well: what counts is the length. Sparse: u32 little-endian numbers of the pixels that fired, row by row; the

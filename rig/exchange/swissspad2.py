@@ -1,4 +1,4 @@
-"""`.bin` files of SwissSPAD2: no header, least significant bit first; half or full array (docs/hardware.md).
+"""`.bin` files of SwissSPAD2: no header, least significant bit first; half or full array (docs/reference/hardware.md).
 
 Half array: 256 rows of 512 pixels, 512 frames in the camera's files of 8 MiB. Full array: 512 x 512, 256 frames a file,
 read out as 256 rows of 1024 pixels in 8 zones of 128: a quarter of the upper half's row, the same quarter of the lower

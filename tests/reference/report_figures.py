@@ -3,10 +3,11 @@
     python -m tests.reference.report_figures --out docs/figures
     python -m tests.reference.report_figures --out /tmp/figures --scenes procedural --exposures 1,10
 
-What each figure of the report shows is not known here; docs/tradeoff.md says what ours stand for. Counts come from the
-yardstick's own simulator at the report's working point, five prepared scenes where they are there; errors are of
-stripes on trusted pixels against the continuous truth, a missing answer counts as 10 px. `--measured FILE` keeps what
-figures 7 to 9 are drawn from; what it holds is not measured again. The table for docs/tradeoff.md is printed.
+What each figure of the report shows is not known here; docs/how-to/tradeoff.md says what ours stand for. Counts come
+from the yardstick's own simulator at the report's working point, five prepared scenes where they are there; errors are
+of stripes on trusted pixels against the continuous truth, a missing answer counts as 10 px. `--measured FILE` keeps
+what figures 7 to 9 are drawn from; what it holds is not measured again. The table for docs/how-to/tradeoff.md is
+printed.
 """
 
 from __future__ import annotations

@@ -7,7 +7,8 @@ The fog spreads the stripe on the object into a halo on both sides. Over the str
 photons, tau: extinction times depth; along the row an even sum of two exponentials that reach 1.7 and 6 degrees. Behind
 the object the level of the fog alone does not fall to nothing but to a share of the level just before it, 8-13 % at
 tau = 0.5, 18-32 % at 1, 35-45 % at 2, taken in the middle and let fall with the wider exponential. (Path tracing;
-docs/physics.md, Light scattered more than once. Even weights and the pedestal's fall are this module's own.)
+docs/explanation/physics.md, Light scattered more than once. Even weights and the pedestal's fall are this module's
+own.)
 """
 
 from __future__ import annotations

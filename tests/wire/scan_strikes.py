@@ -68,7 +68,7 @@ def _silence_spad(bench: ScanBench) -> None:
 
 
 def _unplug_gate(bench: ScanBench) -> None:
-    """Its cable is its power: pull-downs hold the outputs low (docs/hardware.md, Wiring and timing)."""
+    """Its cable is its power: pull-downs hold the outputs low (docs/reference/hardware.md, Wiring and timing)."""
     bench.world.gate_wire.unplug()
     with bench.world.gate_wire.lock:
         bench.world.sync.power_cycle(time.monotonic())

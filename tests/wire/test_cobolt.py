@@ -1,4 +1,5 @@
-"""The Cobolt driver through real pyserial against a model of its firmware: bytes of docs/hardware.md, every trap."""
+"""The Cobolt driver through real pyserial against a model of its firmware: bytes of docs/reference/hardware.md, every
+trap."""
 
 import time
 
@@ -38,7 +39,7 @@ def armed_commands(model: CoboltModel) -> list[str]:
         return [command for command in model.commands if not command.endswith("?")]
 
 
-# The bytes themselves, from docs/hardware.md.
+# The bytes themselves, from docs/reference/hardware.md.
 
 
 def test_the_model_answers_as_the_manual_says() -> None:
@@ -95,7 +96,7 @@ def test_06_01_gate_mode_is_set_and_checked_before_the_start() -> None:
     ]
 
 
-# The traps of docs/hardware.md, one test each.
+# The traps of docs/reference/hardware.md, one test each.
 
 
 def test_trap_commands_closer_than_100_ms_are_not_answered() -> None:

@@ -1,4 +1,4 @@
-"""The Helios driver against the firmware model. Golden bytes and traps: docs/hardware.md."""
+"""The Helios driver against the firmware model. Golden bytes and traps: docs/reference/hardware.md."""
 
 import logging
 import re

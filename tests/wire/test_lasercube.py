@@ -1,4 +1,4 @@
-"""The LaserCube driver against the firmware model. Golden bytes: docs/hardware.md."""
+"""The LaserCube driver against the firmware model. Golden bytes: docs/reference/hardware.md."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,5 @@
-"""The OBIS driver through real pyserial against a model of its firmware: bytes of docs/hardware.md, and every trap."""
+"""The OBIS driver through real pyserial against a model of its firmware: bytes of docs/reference/hardware.md, and every
+trap."""
 
 import time
 
@@ -22,7 +23,7 @@ from tests.wire.lasers import arming, bring_up, now_s, open_obis, wire
 HANDSHAKES = (True, False)
 
 
-# The bytes themselves, from docs/hardware.md.
+# The bytes themselves, from docs/reference/hardware.md.
 
 
 def test_the_model_answers_as_the_manual_says() -> None:
@@ -88,7 +89,7 @@ def test_the_gate_is_set_up_while_off_and_on_comes_last(handshake: bool) -> None
         ]
 
 
-# The traps of docs/hardware.md, one test each.
+# The traps of docs/reference/hardware.md, one test each.
 
 
 def test_trap_with_the_handshake_off_sets_answer_nothing_and_are_read_back() -> None:

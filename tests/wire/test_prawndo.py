@@ -1,4 +1,4 @@
-"""The PrawnDO: golden bytes of docs/hardware.md, and a test named after each of its traps."""
+"""The PrawnDO: golden bytes of docs/reference/hardware.md, and a test named after each of its traps."""
 
 import threading
 import time
@@ -21,7 +21,7 @@ from drivers.sync.prawndo import ProgramLimits, compile_program, most_repeats
 from sim_backend.wire.firmware.prawndo import PrawnDoModel, TriggerLine
 from tests.wire.syncs import SWEEP, board
 
-# The emulator, against bytes written by hand from docs/hardware.md
+# The emulator, against bytes written by hand from docs/reference/hardware.md
 
 
 def answers(model: PrawnDoModel, *lines: bytes) -> list[bytes]:
@@ -134,7 +134,7 @@ def test_the_gate_is_low_within_half_a_millisecond_of_the_marker() -> None:
     assert 0.0101 <= changes[2][0] - rises_s <= 0.0101 + HOLD_S
 
 
-# The traps of docs/hardware.md, one test each
+# The traps of docs/reference/hardware.md, one test each
 
 
 def test_trap_the_trigger_is_a_level_so_waits_closer_than_a_scan_marker_are_refused() -> None:

@@ -1,4 +1,4 @@
-"""The SPB1 driver and a damaged stream or a full ring: docs/spb1-usb.md, What the driver does."""
+"""The SPB1 driver and a damaged stream or a full ring: docs/reference/spb1-usb.md, What the driver does."""
 
 import struct
 import threading

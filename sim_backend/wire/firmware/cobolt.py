@@ -1,8 +1,8 @@
 """Model of a Cobolt 06-01 laser's firmware: 06-MLD or the newer SCPI-like language, key, autostart, interlock, faults.
 
-docs/hardware.md (cobolt-lasers/pycobolt 1333e53). Commands end with CR, replies with CRLF. Traps kept: no answer
-to a command sooner than 100 ms after the last reply, key needed after `l0`, `l1` refused while autostart is enabled,
-powers in W (`p`) and mW (`slmp`), `ilk?` 1 = open, junk before replies, silent `!e` and `!d`.
+docs/reference/hardware.md (cobolt-lasers/pycobolt 1333e53). Commands end with CR, replies with CRLF. Traps kept: no
+answer to a command sooner than 100 ms after the last reply, key needed after `l0`, `l1` refused while autostart is
+enabled, powers in W (`p`) and mW (`slmp`), `ilk?` 1 = open, junk before replies, silent `!e` and `!d`.
 """
 
 import re

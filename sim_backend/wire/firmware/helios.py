@@ -1,4 +1,5 @@
-"""A Helios laser DAC as its firmware behaves, traps included (docs/hardware.md; vendor's firmware v6, 0952a2a).
+"""A Helios laser DAC as its firmware behaves, traps included (docs/reference/hardware.md; vendor's firmware v6,
+0952a2a).
 
 Two buffers, one playing and one pending; status polled with 03; a frame of whole packets never completes; a frame that
 is refused is refused in silence; frames within 100 ms of STOP are dropped; a frame without SINGLE repeats for ever.

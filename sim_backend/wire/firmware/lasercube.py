@@ -1,4 +1,4 @@
-"""A LaserCube / LaserDock board as its firmware behaves (docs/hardware.md; vendor's library 51d13bc).
+"""A LaserCube / LaserDock board as its firmware behaves (docs/reference/hardware.md; vendor's library 51d13bc).
 
 One ring of samples, played at the set rate as soon as there are any; commands with replies of 64 bytes. What happens
 when the ring runs empty is not documented: this model holds the last sample or repeats the last ones, as it is told.

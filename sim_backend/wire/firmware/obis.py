@@ -1,15 +1,16 @@
 """Model of a Coherent OBIS laser's firmware: handshake on or off, warm-up, CDRH delay, interlock, key, fault words.
 
-docs/hardware.md (operator's manual, appendix C; `obis.h`; mmCoreAndDevices PR 645). Commands end with CR or LF,
-replies with CRLF. Traps kept: sets are silent with the handshake off, ON during warm-up is deferred, emission follows
-ON by the CDRH delay, modes are refused while it is on (ERR-200), behind a Remote only numbered commands reach it.
+docs/reference/hardware.md (operator's manual, appendix C; `obis.h`; mmCoreAndDevices PR 645). Commands end with CR or
+LF, replies with CRLF. Traps kept: sets are silent with the handshake off, ON during warm-up is deferred, emission
+follows ON by the CDRH delay, modes are refused while it is on (ERR-200), behind a Remote only numbered commands reach
+it.
 """
 
 import re
 from collections.abc import Callable
 
 OFF_BITS = 0xC800_0000
-"""Bits of every sample status in docs/hardware.md."""
+"""Bits of every sample status in docs/reference/hardware.md."""
 _COMMAND = re.compile(r"[^\r\n]+[\r\n]+")
 _ADDRESS = re.compile(r"^(SYST|SOUR)(\d*)(?=:)")
 FORBIDDEN = ("SYST:CDRH OFF",)

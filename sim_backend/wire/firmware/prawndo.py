@@ -1,8 +1,8 @@
 """The PrawnDO firmware 1.3 as a model: its commands, its program player and the levels of its outputs over time.
 
-Facts: docs/hardware.md; from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd (BSD).
-Its traps are here on purpose: a level trigger, short words that become waits, `abt` that leaves the outputs alone,
-`adm` that swallows everything until its last byte has come, an external clock that is taken on trust.
+Facts: docs/reference/hardware.md; from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd
+(BSD). Its traps are here on purpose: a level trigger, short words that become waits, `abt` that leaves the outputs
+alone, `adm` that swallows everything until its last byte has come, an external clock that is taken on trust.
 """
 
 from bisect import bisect_right

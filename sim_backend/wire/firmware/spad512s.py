@@ -1,4 +1,4 @@
-"""The vendor's program of a SPAD512S as seen from its TCP port (docs/hardware.md), traps included.
+"""The vendor's program of a SPAD512S as seen from its TCP port (docs/reference/hardware.md), traps included.
 
 A pure state machine: commands in, text and pixels out, time passed in. It takes frames of 1 bit only; what lies in them
 comes from `frames`, upright, and is turned onto the sensor's side as the real one delivers it.

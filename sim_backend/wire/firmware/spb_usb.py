@@ -1,4 +1,4 @@
-"""An SPB1 device on USB (docs/spb1-usb.md): control plane, states, heartbeat, watchdog.
+"""An SPB1 device on USB (docs/reference/spb1-usb.md): control plane, states, heartbeat, watchdog.
 
 Comes as a Cypress FX3 board (commands on 0x01, stream on 0x81, acknowledgements on 0x82) or behind an FTDI
 FT601 (session commands on 0x01, commands on 0x02, stream on 0x82; acknowledgements on 0x83 where it has a

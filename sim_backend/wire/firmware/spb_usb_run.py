@@ -1,4 +1,4 @@
-"""One run of an emulated SPB1 device, its USB descriptors and its registers (docs/spb1-usb.md).
+"""One run of an emulated SPB1 device, its USB descriptors and its registers (docs/reference/spb1-usb.md).
 
 In a run frames are exposed, the memory may lose some, and the others come in blocks.
 """

@@ -1,4 +1,5 @@
-"""Files as foreign cameras and programs write them, made pixel by pixel from their description (docs/hardware.md)."""
+"""Files as foreign cameras and programs write them, made pixel by pixel from their description
+(docs/reference/hardware.md)."""
 
 import numpy as np
 
