@@ -8,7 +8,9 @@ import json
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drivers.json_text import parse_json
 from rig.errors import DamagedRecordingError, UsageError
@@ -20,6 +22,84 @@ UNFINISHED: Final = "recording"
 MOST_FRAMES: Final = 1 << 48
 """Most frames that a run can have: 80 years at 100 kHz."""
 _PIECE_BYTES: Final = 1 << 20
+
+
+_NEXT: Final = "'rig repair' writes a new one"
+
+Count = Annotated[int, Field(ge=0, lt=MOST_FRAMES)]
+Section = dict[str, Any] | None
+Frames = tuple[int, int, int]
+"""Number of the run, first and last frame."""
+
+
+class _Part(BaseModel):
+    """The keys of a part of the manifest that commands read; others may stand beside them."""
+
+    model_config = ConfigDict(strict=True, extra="ignore")
+
+
+class _Sweep(_Part):
+    first_frame: Count
+    end_frame: Count
+    clock_error: float | None = None
+    residual_columns: float | None = None
+
+
+class _Start(_Part):
+    sweeps: Count
+    segment: Count
+
+
+class _Recording(_Part):
+    blocks: Count | None = None
+    failed: str | None = None
+    starts: list[_Start] | None = None
+
+
+class _Cut(_Part):
+    frames: list[Frames] | None = None
+    maps: tuple[Count, Count] | None = None
+    clock_ratios: list[float] | None = None
+
+
+class _Config(_Part):
+    name: str | None = None
+    world: Section = None
+    spad: Section = None
+    scanner: Section = None
+    laser: Section = None
+    sync: Section = None
+    scan: Section = None
+    estimate: Section = None
+
+
+class _Calibration(_Part):
+    id: str | None = None
+    accepted: list[tuple[str, str]] | None = None
+
+
+class _Rig(_Part):
+    kinds: dict[str, str] | None = None
+    serials: dict[str, str] | None = None
+
+
+class _Manifest(_Part):
+    """The form of the manifest, as far as commands read it. What a device counted is judged by `device_counters`."""
+
+    verdict: str = ""
+    maps: int | None = None
+    config: _Config | None = None
+    calibration: _Calibration | None = None
+    rig: _Rig | None = None
+    devices: dict[str, dict[str, Any]] | None = None
+    versions: dict[str, str] | None = None
+    inputs: dict[str, Count] | None = None
+    counters: Section = None
+    recording: _Recording | None = None
+    sweeps: list[_Sweep] | None = None
+    cut: _Cut | None = None
+    missing: list[Frames] | None = None
+    repaired: list[Any] | None = None
 
 
 def sealed_text(text: str) -> str:
@@ -42,6 +122,12 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
         raise DamagedRecordingError(f"{MANIFEST} is no JSON any more: {str(error).splitlines()[0]}; {_NEXT}") from None
     if not isinstance(content, dict) or content.get(SEAL) != _crc32(content):
         raise DamagedRecordingError(f"{MANIFEST} is not as it was written, its checksum does not fit; {_NEXT}")
+    try:
+        _Manifest.model_validate_json(raw)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise DamagedRecordingError(f"{MANIFEST}: {place} cannot be so: {first['msg']}; {_NEXT}") from None
     del content[SEAL]
     return content
 
@@ -116,9 +202,6 @@ def require_inputs(folder: Path, manifest: Mapping[str, Any]) -> None:
 def _crc32(content: Mapping[str, Any]) -> int:
     bare = {key: value for key, value in content.items() if key != SEAL}
     return zlib.crc32(json.dumps(bare, sort_keys=True, separators=(",", ":")).encode())
-
-
-_NEXT: Final = "'rig repair' writes a new one"
 
 
 def require_plain_sweeps(folder: Path, manifest: Mapping[str, Any]) -> None:

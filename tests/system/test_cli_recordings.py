@@ -1,11 +1,15 @@
 """`rig verify`, `repair`, `info`, `cut` and `compress` on a recorded scan, as a user calls them."""
 
+import copy
 import json
+import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from drivers.recorded import RunRecording
+from rig.run_folder.manifest import read_manifest, sealed_text
 from tests.system.conftest import Rig
 from tests.system.small_rig import config, write_rig
 
@@ -171,3 +175,38 @@ def damage(folder: Path, at: int) -> None:
     data = bytearray(segment.read_bytes())
     data[at] ^= 1
     segment.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "verdict", "maps", "config", "config.scan", "config.spad", "calibration", "calibration.accepted", "rig",
+        "rig.kinds", "inputs", "inputs.plan.yaml", "counters", "counters.delivered", "recording", "recording.starts",
+        "recording.blocks", "sweeps", "sweeps.0", "sweeps.0.first_frame", "sweeps.0.clock_error", "cut", "cut.frames",
+        "cut.maps", "missing", "repaired", "gaps", "devices", "devices.spad", "plan", "versions",
+    ],
+)  # fmt: skip
+def test_a_manifest_of_wrong_types_with_the_right_seal_ends_in_a_line(rig: Rig, run: Path, key: str) -> None:
+    manifest = read_manifest(run)
+    assert manifest is not None
+    for value in (-1, "much", [[]]):
+        changed = copy.deepcopy(manifest)
+        place: Any = changed
+        *parents, last = ["inputs", "plan.yaml"] if key == "inputs.plan.yaml" else key.split(".")
+        for parent in parents:
+            place = place[int(parent)] if isinstance(place, list) else place.setdefault(parent, {})
+        place[int(last) if isinstance(place, list) else last] = value
+        (run / "manifest.json").write_text(sealed_text(json.dumps(changed)))
+        for arguments in (
+            ("info", run),
+            ("verify", run),
+            ("cut", run, "--maps", "0", "--out", f"part-{value}"[:20]),
+            ("reconstruct", run, "--estimator", "argmax", "--out", f"again-{value}"[:20]),
+        ):
+            ran = rig(*arguments)
+            assert ran.code in (0, 1, 2), (value, arguments, ran.err)
+            assert "Traceback" not in ran.err
+            for made in Path().iterdir():
+                shutil.rmtree(made) if made.is_dir() else made.unlink()
+    assert rig("repair", run).code in (0, 1)
+    assert rig("verify", run).code in (0, 1)
