@@ -39,7 +39,8 @@ class Speckle:
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Multiply the light that the stripe brought."""
-        by_u, _, ahead = sheet.inverse[0]
+        # Of a bowed sheet `inverse` changes while rows are drawn, by threads; the plane that it bows from does not.
+        by_u, _, ahead = sheet.inverse[0] if sheet.bowed is None else sheet.bowed.planes[0][:3]
         with np.errstate(divide="ignore", invalid="ignore"):
             place = np.rint(ahead / by_u * self._widths_per_tangent) + 0.0  # no negative zero
         _roughen(self._seed, place.view(np.uint64), self._grains, first_row, last_row, rate)

@@ -1,10 +1,13 @@
 """Speckle: mean 1, the contrast of Goodman's formula, and grains that stay."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sim_backend.effects.speckle import Speckle, gamma_of, grains
 from sim_backend.effects.stripe import Stripe
+from sim_backend.light.line import ONE_LINE
 from sim_backend.light.optics import Line, Optics, Sensor
 from sim_backend.random_numbers import frame_key
 from tests.unit.sim.rigs import Array, rig, setting, wall
@@ -52,3 +55,19 @@ def test_it_stays_for_a_column_and_is_another_one_in_the_next() -> None:
     both = lit & (other_smooth > 0)
     correlation = np.corrcoef(rough[both] / smooth[both], other[both] / other_smooth[both])[0, 1]
     assert abs(correlation) < 5 / np.sqrt(both.sum())
+
+
+def test_on_a_bowed_sheet_it_is_the_same_whichever_rows_are_drawn_first() -> None:
+    model = rig()
+    model = replace(model, scanner=replace(model.scanner, bow_per_rad=0.1))
+    setup = setting(model, wall(model, (0.3, -0.2, 1.0), 2.0), line=Line(speckle=True))
+
+    def drawn(bands: tuple[tuple[int, int], ...]) -> Array:
+        ((sheet,),) = ONE_LINE.sheets(model.sheets, np.array([0.1]), setup.view.rows, [0.0])
+        rate = np.ones((64, 96))
+        for band in bands:
+            setup.view.trace(sheet, *band)
+            Speckle(setup).add(sheet, *band, rate)
+        return rate
+
+    assert np.array_equal(drawn(((0, 20), (20, 64))), drawn(((20, 64), (0, 20))))
