@@ -44,7 +44,8 @@ def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(tmp_path, wo
     assert summary["fog"]["extinction_per_m"] == pytest.approx(TRUE_EXTINCTION_PER_M, abs=0.02)
     assert result.folder == tmp_path / "run"
     ((world, ended_s),) = worlds
-    assert world.light(ended_s - KEPT_S, ended_s)
+    # What is known of the light is forgotten by frames, not by time: a slow machine may estimate for long after them.
+    assert world.light(ended_s - 60 * KEPT_S, ended_s)
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("photons")]
 
 
