@@ -114,7 +114,7 @@ def decode_index(buffer: NDArray[np.uint8]) -> tuple[NDArray[np.void], NDArray[n
 
 PAGE_BYTES: Final = 4096
 """Blocks of a recording begin on multiples of this."""
-MOST_FRAMES: Final = 0xFFFF
+MOST_BLOCK_FRAMES: Final = 0xFFFF
 """Most frames of a block."""
 MOST_COUNTED: Final = 2**63 - 2**32
 """Largest count of frames or ticks, as in a block's header."""
@@ -202,7 +202,7 @@ def _inside(records: Entries, segments: dict[int, SegmentReader], problems: list
     sizes[list(segments)] = [segment.size for segment in segments.values()]
     room = sizes[np.minimum(records["segment"], len(sizes) - 1)]
     inside = records["offset"].astype(np.float64) + records["length"] <= room
-    inside &= (records["offset"] % ALIGN == 0) & (records["length"] > 0) & (records["n_frames"] <= MOST_FRAMES)
+    inside &= (records["offset"] % ALIGN == 0) & (records["length"] > 0) & (records["n_frames"] <= MOST_BLOCK_FRAMES)
     inside &= (records["first_frame"] <= MOST_COUNTED) & (records["t0_ticks"] <= MOST_COUNTED)
     if not inside.all():
         problems.append(f"{INDEX_FILE}: {int((~inside).sum())} blocks lie beyond the end of their segments")

@@ -6,8 +6,8 @@ up with the disk. What is damaged is left out, as frames that were lost, and tol
 
 import logging
 import math
-from collections import deque
-from collections.abc import Iterator
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -189,7 +189,7 @@ class RunRecording:
                 headers.append(read_entry(self._segments[int(entries[at]["segment"])], entries[at]).header)
             if len(headers) == _WITNESSES:
                 break
-        return max(headers, key=lambda one: sum(is_of_run(one, other) for other in headers), default=None)
+        return usual_header(headers) if headers else None
 
     def _add_problem(self, line: str) -> None:
         if line not in self.problems:
@@ -224,10 +224,16 @@ def block_part(block: FrameBlock, first_frame: int, end_frame: int) -> FrameBloc
 
 def is_of_run(header: BlockHeader, other: BlockHeader) -> bool:
     """Whether a block can be of the run that another one is of."""
-    return run_kind(header) == run_kind(other)
+    return _run_kind(header) == _run_kind(other)
 
 
-def run_kind(header: BlockHeader) -> tuple[Any, ...]:
+def usual_header(headers: Sequence[BlockHeader]) -> BlockHeader:
+    """The first of several headers that has the size and clock that most of them have."""
+    kinds = Counter(map(_run_kind, headers))
+    return max(headers, key=lambda header: kinds[_run_kind(header)])
+
+
+def _run_kind(header: BlockHeader) -> tuple[Any, ...]:
     """The values that all blocks of a run share: its id, size and clock."""
     return tuple(getattr(header, name) for name in _OF_A_RUN)
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from rig.count.volume import CountVolume
 from rig.geometry.stripe_table import StripeTable
-from rig.geometry.windows import MARGIN_PX, WORD_PX, SweepGeometry
+from rig.geometry.windows import MARGIN_PX, WORD_PX, SweepGeometry, evenly_spread
 
 Array = NDArray[np.float64]
 
@@ -85,11 +85,8 @@ def check_points(geometry: SweepGeometry, most: int = POINTS) -> Points:
     apart = min(max(round(APART_PX / step_px), 1), max(columns - 1, 1)) if step_px > 0 else 1
     searched = geometry.x_lo <= geometry.x_hi
     y, c = np.nonzero(searched[:-1, : columns - apart] & searched[1:, : columns - apart] & searched[:-1, apart:])
-    if len(y) > most:
-        # Golden-ratio steps cover rows and columns without beating against either.
-        i, each = np.arange(most), len(y) / most
-        pick = np.unique((i * each + (i * 0.6180339887) % 1 * each).astype(np.int64))
-        y, c = y[pick], c[pick]
+    pick = evenly_spread(len(y), most)
+    y, c = y[pick], c[pick]
     here = reference[y, c]
     shift = np.rint([reference[y + 1, c] - here, reference[y, c + apart] - here])
     row, column = np.stack([y, y + 1, y]), np.stack([c, c, c + apart])
@@ -109,7 +106,7 @@ class MapChecks:
         # On a sensor hardly wider than the line, light cannot be seen to move.
         self._follows = calibrated and geometry.width >= LEAST_WIDTH_PX
         self._knows = knows
-        self._points = {most: check_points(geometry, most) for most in (POINTS, VOLUME_POINTS)}
+        self._points: dict[int, Points] = {}
         self._orders = _orders()
 
     def doubts(self, sweep: Any, intensity: NDArray[np.uint32], stripe: StripeTable) -> tuple[str, ...]:
@@ -117,8 +114,10 @@ class MapChecks:
 
         sweep: a `CountVolume`, or one with `checked`, the counts of the POINTS. stripe: the estimator's own answers.
         """
-        points = self._points[VOLUME_POINTS if isinstance(sweep, CountVolume) else POINTS]
-        counts = _Counts(sweep, self._geometry, points)
+        most = VOLUME_POINTS if isinstance(sweep, CountVolume) else POINTS
+        if most not in self._points:
+            self._points[most] = check_points(self._geometry, most)
+        counts = _Counts(sweep, self._geometry, self._points[most])
         seen = counts.exposures_seen()
         if not seen.any():
             return ()  # all of its frames were lost, which the gaps say

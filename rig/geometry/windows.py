@@ -20,6 +20,8 @@ WORD_PX: Final = 64
 """Windows start and end at multiples of one 64-bit word, so that counting runs on whole words."""
 MARGIN_PX = 10
 """Pixels kept on both sides of the search interval: they still say where the haze ends."""
+_GOLDEN: Final = 0.6180339887
+"""Fraction of the golden ratio, whose multiples cover rows and columns without beating against either."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,3 +169,11 @@ def uncalibrated_geometry(rows: int, width: int, columns: int) -> SweepGeometry:
         np.zeros(columns, np.int32), padded, True, (1 / 1.5, 1 / 0.5),
         np.zeros((rows, width), np.bool_),
     )  # fmt: skip
+
+
+def evenly_spread(n: int, most: int) -> NDArray[np.int64]:
+    """Up to `most` of the indices 0 to n - 1, spread evenly in a fixed pattern; all of them where they are no more."""
+    if n <= most:
+        return np.arange(n)
+    i, step = np.arange(most), n / most
+    return np.unique((i * step + (i * _GOLDEN) % 1 * step).astype(np.int64))

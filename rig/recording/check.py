@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frames import BlockHeader
-from drivers.recorded.contents import INDEX_RECORD, MOST_FRAMES, Contents, damage_line, index_of
+from drivers.recorded.contents import INDEX_RECORD, MOST_BLOCK_FRAMES, Contents, damage_line, index_of
 from drivers.recorded.order import Entries, in_order
 from drivers.recorded.segments import SegmentReader
 from drivers.spb1 import HEADER_BYTES, TRAILER_BYTES, BlockLayout, Placed
@@ -81,8 +81,19 @@ def check_segments(segments: Sequence[SegmentReader]) -> tuple[list[SoundBlock],
     return [block for blocks, _ in found for block in blocks], [line for _, lines in found for line in lines]
 
 
-Gap = tuple[int, int, int]
+RunGap = tuple[int, int, int]
 """Number of the run, and first and last frame that are missing."""
+
+
+def merged_gaps(gaps: Iterable[RunGap]) -> list[RunGap]:
+    """The gaps of each run in order; those that overlap or meet are one, and one without a frame is none."""
+    merged: list[RunGap] = []
+    for number, first, last in sorted(gap for gap in gaps if gap[1] <= gap[2]):
+        if merged and merged[-1][0] == number and first <= merged[-1][2] + 1:
+            merged[-1] = number, merged[-1][1], max(last, merged[-1][2])
+        else:
+            merged.append((number, first, last))
+    return merged
 
 
 @dataclass(slots=True)
@@ -93,22 +104,17 @@ class Continuity:
     missing: frames that are not there and of which nothing is said.
     """
 
-    gaps: list[Gap] = field(default_factory=list)
-    missing: list[Gap] = field(default_factory=list)
+    gaps: list[RunGap] = field(default_factory=list)
+    missing: list[RunGap] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
     @property
     def lost(self) -> int:
         """Frames in the gaps, each counted once."""
-        lost, reached = 0, (-1, -1)
-        for number, first, last in sorted(self.gaps):
-            begin = max(first, reached[1] + 1) if reached[0] == number else first
-            lost += max(0, last + 1 - begin)
-            reached = number, max(last, reached[1] if reached[0] == number else -1)
-        return lost
+        return sum(last + 1 - first for _, first, last in merged_gaps(self.gaps))
 
 
-def continuity(runs: Iterable[Sequence[SoundBlock]], *, is_part: bool, known: Collection[Gap] | None) -> Continuity:
+def continuity(runs: Iterable[Sequence[SoundBlock]], *, is_part: bool, known: Collection[RunGap] | None) -> Continuity:
     """Check whether the blocks of each run follow on each other, apart from frames that the device says it lost.
 
     is_part: the recording was cut from another one, so that it need not begin with the first block. known: gaps that a
@@ -134,9 +140,9 @@ def out_of_step(run: Sequence[SoundBlock]) -> list[SoundBlock]:
     votes = [0] * len(run)
     for i, block in enumerate(run):
         for j in range(max(0, i - _NEIGHBOURS), i):
-            votes_each = _go_together(run[j], block)
-            votes[i] += votes_each
-            votes[j] += votes_each
+            agree = _go_together(run[j], block)
+            votes[i] += agree
+            votes[j] += agree
     alone = [block for block, vote in zip(run, votes, strict=True) if not vote]
     return alone if len(run) > 2 and len(alone) * _FEW <= max(len(run), _FEW) else []
 
@@ -211,7 +217,7 @@ def _has_checksum(segment: SegmentReader, placed: Placed) -> bool:
 
 
 def _follow(
-    number: int, run: Sequence[SoundBlock], is_part: bool, known: Collection[Gap] | None, found: Continuity
+    number: int, run: Sequence[SoundBlock], is_part: bool, known: Collection[RunGap] | None, found: Continuity
 ) -> None:
     first = run[0]
     found.gaps += [
@@ -230,7 +236,9 @@ def _follow(
             _repeat(number, *frames, f"within block {block.block_seq}", known, found)
 
 
-def _repeat(number: int, first: int, last: int, where: str, known: Collection[Gap] | None, found: Continuity) -> None:
+def _repeat(
+    number: int, first: int, last: int, where: str, known: Collection[RunGap] | None, found: Continuity
+) -> None:
     """Count frames whose ticks do not rise as lost, although they are there."""
     gap = number, first, last
     if known is not None and gap in known:
@@ -241,7 +249,7 @@ def _repeat(number: int, first: int, last: int, where: str, known: Collection[Ga
 
 
 def _join(
-    number: int, before: tuple[int, int, int], block: SoundBlock, known: Collection[Gap] | None, found: Continuity
+    number: int, before: tuple[int, int, int], block: SoundBlock, known: Collection[RunGap] | None, found: Continuity
 ) -> None:
     """Check whether `block` can follow `before`: (end of the frames, frames lost by then, number of the block).
 
@@ -273,7 +281,7 @@ Run = Sequence[SoundBlock]
 
 def lost_ends(
     contents: Contents, runs: Sequence[Run], joined: Continuity, manifest: dict[str, Any] | None
-) -> list[Gap]:
+) -> list[RunGap]:
     """Frames that are gone at either end of each run; starts of which nothing is left come behind the others.
 
     They show in index records of blocks that are gone, in the range of frames of a part, and in the number of frames
@@ -285,7 +293,7 @@ def lost_ends(
         for run_id, first, end in cut["frames"]:
             began, ended = ranges.get(run_id, (first, end))
             ranges[run_id] = min(began, first), max(ended, end)
-    gaps: list[Gap] = []
+    gaps: list[RunGap] = []
     for number, run in enumerate(runs):
         first, end = ranges.pop(run[0].run_id, (run[0].first_frame, run[-1].end_frame))
         if cut is not None and first < run[0].first_frame:  # of a whole run the first frame is number 0
@@ -325,7 +333,10 @@ def _reaches_beyond(entry: Any, run: Run) -> bool:
     if near is run[0] and first + n_frames > near.first_frame:
         return False
     header = near.header
-    if n_frames > MOST_FRAMES or int(entry["length"]) != BlockLayout(n_frames, header.width, header.height).block_bytes:
+    if (
+        n_frames > MOST_BLOCK_FRAMES
+        or int(entry["length"]) != BlockLayout(n_frames, header.width, header.height).block_bytes
+    ):
         return False
     return in_step(first - near.first_frame, int(entry["t0_ticks"]) - header.t0_ticks, header)
 
@@ -335,7 +346,7 @@ def _blocks_are_gone(manifest: dict[str, Any], runs: Sequence[Run]) -> bool:
     return isinstance(stated, int) and stated > sum(map(len, runs))
 
 
-def _delivered_behind(runs: Sequence[Run], missing: Sequence[Gap], manifest: dict[str, Any] | None) -> list[Gap]:
+def _delivered_behind(runs: Sequence[Run], missing: Sequence[RunGap], manifest: dict[str, Any] | None) -> list[RunGap]:
     """Frames behind the end of the last run that the device delivered and that nothing else mentions."""
     if manifest is None or not runs or ended_early(manifest) is not None:
         return []

@@ -28,6 +28,7 @@ from rig.errors import DamagedRecordingError, UsageError
 from rig.estimate.registry import LEARNING
 from rig.estimate.row.model import RowModel
 from rig.plan.scan_plan import MAX_CLOCK_ERROR
+from rig.recording.check import RunGap
 from rig.run_folder.manifest import MANIFEST, ended_before_last_map, is_cut_short, known_missing, read_manifest
 
 SEGMENTS: Final = "frames-*.spb"
@@ -278,10 +279,6 @@ def _duration_s(run: RecordedRun) -> float:
     return float((int(entries["t0_ticks"][-1]) - int(entries["t0_ticks"][0]) + last) / header.tick_hz)
 
 
-EndGap = tuple[int, int, int]
-"""Number of the start, and first and last frame that is gone."""
-
-
 def end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> FrameBlock | None:
     """The first or the last sound block of a start with a frame in it; None where there is none."""
     entries = run.entries[::-1] if last else run.entries
@@ -296,7 +293,7 @@ def readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int]
     return first.header.first_frame, last.header.first_frame + last.n_frames
 
 
-def end_gaps(recording: RunRecording) -> list[EndGap]:
+def end_gaps(recording: RunRecording) -> list[RunGap]:
     """Gaps that a repair found, and the frames of damaged blocks at the ends of starts."""
     known = known_missing(read_manifest(recording.path)) if recording.path.is_dir() else None
     gaps = list(dict.fromkeys(known or ()))

@@ -27,9 +27,9 @@ from rig.errors import DamagedRecordingError, UsageError
 from rig.estimate.registry import Learned
 from rig.plan.compile import spad_request
 from rig.plan.scan_plan import ScanPlan
+from rig.recording.check import RunGap, merged_gaps
 from rig.recording.inputs import PLAN_FILE, read_plan
 from rig.recording.open import (
-    EndGap,
     end_block,
     end_gaps,
     fitted_ratio,
@@ -194,7 +194,7 @@ class Replayed:
         self._played = [start for start in starts if start.sweeps]
         self._numbers = [start.first_map + i for start in starts for i in range(start.sweeps)]
         spad.leave_out({run.number for run in spad.recording.runs} - {start.number for start in self._played})
-        self._gone = _merged([*end_gaps(spad.recording), *(gap for start in starts for gap in start.gone)])
+        self._gone = merged_gaps([*end_gaps(spad.recording), *(gap for start in starts for gap in start.gone)])
         there = self._there = len(self._numbers)
         if there == 0:
             lost = sum(last + 1 - first for _, first, last in self._gone)
@@ -287,7 +287,7 @@ class RecordedStart:
     begin: SweepStart
     first_map: int
     sweeps: int
-    gone: tuple[EndGap, ...]
+    gone: tuple[RunGap, ...]
 
 
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan) -> list[RecordedStart]:
@@ -340,7 +340,7 @@ def _recorded_start(
     cut_short = is_cut_short(manifest) or ended_before_last_map(manifest)
     if plan.blanking is None or sweeps is None or cut_short or recording.problems:
         whole = max(0, min(maps, _whole_sweeps(recording, run, plan) - begin.sweep))
-    gone: list[EndGap] = []
+    gone: list[RunGap] = []
     if sweeps and not is_cut_short(manifest) and end <= int(sweeps[-1]["end_frame"]):
         gone.append((run.number, end, int(sweeps[-1]["end_frame"])))
     ranges = (manifest.get("cut") or {}).get("frames") or []
@@ -354,17 +354,6 @@ def _recorded_start(
         else:  # of a run that was killed nobody noted them; at a lost end a part lacks one map
             before = maps - whole if end >= part_end else min(1, maps)
     return RecordedStart(run.number, begin, first_map + before, min(whole, maps - before), tuple(gone))
-
-
-def _merged(gaps: Sequence[EndGap]) -> list[EndGap]:
-    """The gaps of each start in order; those that meet become one."""
-    merged: list[EndGap] = []
-    for number, first, last in sorted(gaps):
-        if merged and merged[-1][0] == number and first <= merged[-1][2] + 1:
-            merged[-1] = number, merged[-1][1], max(last, merged[-1][2])
-        else:
-            merged.append((number, first, last))
-    return merged
 
 
 def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[int, list[Gap]]:

@@ -3,7 +3,6 @@
 `verify` gives the verdict, `examine` all that `verify` and `repair` need to know.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -16,14 +15,14 @@ from drivers.errors import DeviceNotFound, ProtocolError
 from drivers.frames import BlockHeader
 from drivers.recorded.contents import INDEX_FILE, INDEX_RECORD, Contents, find_blocks, round_up_to_page
 from drivers.recorded.order import in_order
-from drivers.recorded.reader import is_of_run, run_kind
+from drivers.recorded.reader import is_of_run, usual_header
 from drivers.recorded.segments import SegmentReader, open_segments
 from rig.errors import DamagedRecordingError, UsageError
 from rig.progress import tell_stage
 from rig.recording.check import (
     CHECKING,
     Continuity,
-    Gap,
+    RunGap,
     SoundBlock,
     check_segments,
     continuity,
@@ -71,7 +70,7 @@ class Verification:
     frames: int
     bytes: int
     lost: int
-    gaps: list[Gap]
+    gaps: list[RunGap]
     problems: list[str]
     run: str | None
     ended: str | None
@@ -161,7 +160,10 @@ def examine(folder: Path) -> Examined:
 
 def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) -> list[list[SoundBlock]]:
     """The sound blocks of each run, in order; a problem for each block that should be there and is not."""
-    usual = {run_id: _usual([block.header for block in sound if block.run_id == run_id]) for run_id in _run_ids(sound)}
+    headers: dict[int, list[BlockHeader]] = {}
+    for block in sound:
+        headers.setdefault(block.run_id, []).append(block.header)
+    usual = {run_id: usual_header(of_run) for run_id, of_run in headers.items()}
     by_entry = {}
     for block in sound:
         why = block.objection
@@ -198,17 +200,6 @@ def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) 
 def _left_out(block: SoundBlock, why: str) -> str:
     frames = f"frames {block.first_frame} to {block.end_frame - 1}"
     return f"block {block.block_seq} of run {block.run_id} ({frames}) {why}"
-
-
-def _run_ids(blocks: Sequence[SoundBlock]) -> set[int]:
-    return {block.run_id for block in blocks}
-
-
-def _usual(headers: Sequence[BlockHeader]) -> BlockHeader:
-    """A header of the size and clock that most have; among equally frequent ones the earliest."""
-    kinds = Counter(run_kind(header) for header in headers)
-    most = max(kinds.values())
-    return next(header for header in headers if kinds[run_kind(header)] == most)
 
 
 def _against_manifest(

@@ -19,16 +19,16 @@ MANIFEST: Final = "manifest.json"
 SEAL: Final = "crc32"
 UNFINISHED: Final = "recording"
 """Verdict of a run that is not over, or was killed."""
-MOST_FRAMES: Final = 1 << 48
+MOST_RUN_FRAMES: Final = 1 << 48
 """Most frames that a run can have: 80 years at 100 kHz."""
 _PIECE_BYTES: Final = 1 << 20
 
 
 _NEXT: Final = "'rig repair' writes a new one"
 
-Count = Annotated[int, Field(ge=0, lt=MOST_FRAMES)]
+Count = Annotated[int, Field(ge=0, lt=MOST_RUN_FRAMES)]
 Section = dict[str, Any] | None
-Frames = tuple[int, int, int]
+Frames = Annotated[list[int], Field(min_length=3, max_length=3)]
 """Number of the run, first and last frame."""
 
 
@@ -58,7 +58,7 @@ class _Recording(_Part):
 
 class _Cut(_Part):
     frames: list[Frames] | None = None
-    maps: tuple[Count, Count] | None = None
+    maps: Annotated[list[Count], Field(min_length=2, max_length=2)] | None = None
     clock_ratios: list[float] | None = None
 
 
@@ -75,7 +75,7 @@ class _Config(_Part):
 
 class _Calibration(_Part):
     id: str | None = None
-    accepted: list[tuple[str, str]] | None = None
+    accepted: list[Annotated[list[str], Field(min_length=2, max_length=2)]] | None = None
 
 
 class _Rig(_Part):
@@ -123,7 +123,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     if not isinstance(content, dict) or content.get(SEAL) != _crc32(content):
         raise DamagedRecordingError(f"{MANIFEST} is not as it was written, its checksum does not fit; {_NEXT}")
     try:
-        _Manifest.model_validate_json(raw)
+        _Manifest.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
@@ -164,7 +164,7 @@ def known_missing(manifest: Mapping[str, Any] | None) -> list[tuple[int, int, in
 def device_counters(manifest: Mapping[str, Any]) -> tuple[dict[str, int], list[str]]:
     """The SPAD's own counts of a run's frames that are possible, and a line for each that is not."""
     counters = {key: value for key, value in (manifest.get("counters") or {}).items() if value is not None}
-    sane = {key: value for key, value in counters.items() if isinstance(value, int) and 0 <= value < MOST_FRAMES}
+    sane = {key: value for key, value in counters.items() if isinstance(value, int) and 0 <= value < MOST_RUN_FRAMES}
     return sane, [
         f"{MANIFEST}: the device's count '{key}' is {value}, which cannot be"
         for key, value in counters.items()

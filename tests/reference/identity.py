@@ -57,7 +57,6 @@ PLANS: Mapping[str, tuple[str, ...]] = {
     "as it is": (),
     "K 1": ("--exposures", "1"),
     "K 20": ("--exposures", "20"),
-    "in passes": ("--adaptive",),
 }
 POSES = 6
 ACCURACY = ("--at", "3 m", "--accuracy", "20 mm")

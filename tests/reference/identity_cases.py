@@ -198,17 +198,6 @@ CASES: Mapping[str, Case] = {
         geometry(pivot={"bow_per_rad": 0.02}, row_delay_s=2e-7),
         maps=2,
     ),
-    "in-passes-K12": Case(
-        config(
-            "street-dense-fog",
-            120,
-            12,
-            scan={"adaptive": {"first_exposures": 3, "passes": 3}},
-            estimate={"estimator": "edge"},
-        ),
-        maps=2,
-        options=("--adaptive",),
-    ),
 }
 """Scans that are recorded, by name."""
 

@@ -16,7 +16,7 @@ from rig.estimate.row.em_kernels import learn_rows
 from rig.estimate.row.inputs import Lines, RowState, Sweep, state_of, sweep_of
 from rig.estimate.row.model import AMPLITUDES, BINS, RowModel, fit_haze, stripe_scale
 from rig.geometry.stripe_table import StripeTable
-from rig.geometry.windows import SweepGeometry
+from rig.geometry.windows import SweepGeometry, evenly_spread
 from rig.threads import RowWorkers
 
 LATTICE_LINES = 8192
@@ -75,14 +75,7 @@ class Expectation:
 def lattice(geometry: SweepGeometry, lines: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """About `lines` (row, column) pairs spread evenly over those with a window: a fixed pattern, no chance in it."""
     y, c = np.nonzero(geometry.x_lo <= geometry.x_hi)
-    if len(y) <= lines:
-        return y.astype(np.int32), c.astype(np.int32)
-    # Golden-ratio steps cover rows and columns without beating against either.
-    pick = np.unique(
-        (np.arange(lines) * (len(y) / lines) + (np.arange(lines) * 0.6180339887) % 1 * (len(y) / lines)).astype(
-            np.int64
-        )
-    )
+    pick = evenly_spread(len(y), lines)
     return y[pick].astype(np.int32), c[pick].astype(np.int32)
 
 
