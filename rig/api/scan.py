@@ -117,7 +117,8 @@ def plan_scan(
     needed. Raises DevicesError, one line per device, where real ones are not there.
     """
     from rig.devices.calibration_use import calibration_use
-    from rig.devices.open import open_rig, prepare, require_memory
+    from rig.devices.open import open_rig
+    from rig.devices.prepare import prepare, require_memory
     from rig.recording.segment import Space
     from rig.scan.pipeline import require_policy
     from rig.scan.scan import recorded_bytes

@@ -33,7 +33,8 @@ from rig.config.files import load_config
 from rig.count.volume import Counter, FrameTally, SweepLayout
 from rig.depth.reconstruct import MapResult, Reconstructor
 from rig.depth.warm_up import warm_up
-from rig.devices.open import OpenRig, open_rig, prepare
+from rig.devices.open import OpenRig, open_rig
+from rig.devices.prepare import prepare
 from rig.errors import UsageError
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.writer import Recording

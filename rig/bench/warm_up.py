@@ -12,7 +12,8 @@ from rig.bench.speed import warm_bench
 from rig.config.models import RigConfig
 from rig.depth.reconstruct import Reconstructor
 from rig.depth.warm_up import warm_up
-from rig.devices.open import OpenRig, open_rig, prepare
+from rig.devices.open import OpenRig, open_rig
+from rig.devices.prepare import prepare
 from rig.estimate.registry import ESTIMATORS
 from rig.progress import tell_stage
 from rig.scan.acquisition import Acquisition, ScanProgress, told_of

@@ -37,7 +37,8 @@ from rig.config.models import RigConfig
 from rig.count.sweeps import SweepData
 from rig.count.volume import CountVolume
 from rig.devices.calibration_use import identity_of
-from rig.devices.open import OpenRig, open_rig, prepare, require_simulated_or_armed
+from rig.devices.open import OpenRig, open_rig, require_simulated_or_armed
+from rig.devices.prepare import prepare
 from rig.errors import PlanError, UsageError
 from rig.plan.scan_plan import Leg, ScanPlan
 from rig.progress import tell_stage

@@ -23,7 +23,8 @@ from drivers.transports.usb_device import attached as attached_usb
 from rig.config.models import RigConfig
 from rig.devices.calibration_use import NEXT, identity_of, refusals
 from rig.devices.dark_look import DarkLook, look
-from rig.devices.open import OpenRig, open_light, open_rig, prepare, require_memory
+from rig.devices.open import OpenRig, open_light, open_rig
+from rig.devices.prepare import prepare, require_memory
 from rig.errors import DevicesError, RigError
 from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import ScanPlan

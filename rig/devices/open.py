@@ -1,18 +1,12 @@
 """Opens all devices of a rig together, lists every failure at once, and closes them gate first, whatever happens.
 
-`open_rig` does it and `prepare` compiles the plan of a scan. Here is also who may let light out (a real laser or gate
-needs the user's word, a simulated one none), and how a burst shares a SPAD's memory between the time until the scanner
-has started and the maps.
+Here is also who may let light out: a real laser or gate needs the user's word, a simulated one none.
 """
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
-
-import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
@@ -20,24 +14,18 @@ from calibration.model.rig_model import RigModel
 from drivers.clock import Clock, SystemClock, VirtualClock
 from drivers.errors import DeviceError
 from drivers.guard import Guard
-from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SpadTiming, SyncSource, World
+from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SyncSource, World
 from drivers.registry import KindConfig, Surroundings, lookup
 from drivers.transports.endpoints import EMULATED_PREFIX, Endpoint
 from drivers.transports.tap import TapFile
-from rig.config.models import RigConfig, ScanConfig
-from rig.errors import DevicesError, PlanError, UsageError
-from rig.plan.compile import ColumnWindows, compile_plan, spad_request
-from rig.plan.gate_pulses import sync_program
-from rig.plan.scan_plan import ScanPlan
+from rig.config.models import RigConfig
+from rig.errors import DevicesError, UsageError
 from rig.recording.cube import cube_columns
-from rig.recording.replay import PlaysRecording, replay_plan
 
 GUARDED = ("laser", "sync")
 """Slots whose devices a process of its own owns, since they let light out."""
 DEVICES = ("spad", "scanner", "laser", "sync")
 """Slots of devices, in the order in which they are opened."""
-HOLD_EXPOSURES = 10
-"""Exposures per column from which simulated light is held within columns; with fewer, within parts of columns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,29 +45,11 @@ class OpenRig:
 
 
 @runtime_checkable
-class HoldsColumns(Protocol):
-    """A world that can give all frames of a column the same light, so that it is computed once for them."""
-
-    def hold_columns(self, commands: NDArray[np.float64]) -> None:
-        """Hold the light within columns of these mirror commands (columns,)."""
-        ...
-
-
-@runtime_checkable
 class ProjectsLines(Protocol):
     """A world whose laser can send out several lines at once."""
 
     def project_lines(self, offsets: Sequence[float], *, shared: bool) -> None:
         """Send out a line at each of these offsets, in units of the mirror command."""
-        ...
-
-
-@runtime_checkable
-class PlansEffects(Protocol):
-    """A world that leaves out what makes no difference to a scan."""
-
-    def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
-        """Choose what is simulated, for frames of that exposure, so many to a column, at that power or less."""
         ...
 
 
@@ -140,39 +110,6 @@ def check_files(config: RigConfig) -> None:
             problems += [f"{slot}: {line}" for line in str(error).splitlines()]
     if problems:
         raise UsageError.of(problems)
-
-
-def prepare(
-    rig: OpenRig, scan: ScanConfig | None = None, windows: ColumnWindows | None = None
-) -> tuple[ScanPlan, SpadTiming]:
-    """Configure the SPAD and compile the plan; nothing moves and no light leaves.
-
-    scan: None is the config's. windows: windows of the columns where the scan is a part of another one that was
-    prepared before; None where it is not.
-    """
-    scan = rig.config.scan if scan is None else scan
-    if isinstance(rig.spad, PlaysRecording):  # what was scanned is bound by the plan that it was scanned with
-        return replay_plan(rig.spad, rig.spad.recording, scan, rig.model)
-    most_w = rig.laser.limits.max_power_w
-    if scan.power is not None and scan.power > most_w:
-        raise PlanError(
-            f"scan.power is {scan.power * 1e3:g} mW, the most {rig.laser.name} may give is {most_w * 1e3:g} mW; "
-            "lower scan.power"
-        )
-    if isinstance(rig.world, PlansEffects) and windows is None:
-        rig.world.plan_for(most_w if scan.power is None else scan.power, scan.exposure_s, scan.exposures)
-    info, scanner = rig.spad.info, rig.scanner
-    lines = rig.config.line_offsets
-    nominal = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, None, lines, windows)
-    timing = rig.spad.configure(spad_request(scan, nominal))
-    plan = compile_plan(scan, scanner.limits, scanner.point_clock, rig.model, info, timing, lines, windows)
-    if plan.frame_rate_hz != nominal.frame_rate_hz:  # its windows may be others, its timing is the same again
-        timing = rig.spad.configure(spad_request(scan, plan))
-    if isinstance(rig.world, HoldsColumns):
-        # A frame's light may be held this far from where the mirror is; the mean over a column's frames is right.
-        parts = math.ceil(HOLD_EXPOSURES / plan.exposures)
-        rig.world.hold_columns(plan.command_at((np.arange(plan.places * parts) + 0.5) / parts - 0.5))
-    return plan, timing
 
 
 def _open(config: RigConfig, seed: int, tap: TapFile | None, stack: ExitStack) -> OpenRig:
@@ -294,53 +231,3 @@ def require_simulated_or_armed(config: RigConfig, arm: bool) -> list[str]:
 def _made_here(device: KindConfig) -> bool:
     """Whether a device shines no real light: simulated, or at a port that this process emulates."""
     return not device.real_time or str(getattr(device, "port", "")).startswith(EMULATED_PREFIX)
-
-
-BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
-"""Seconds between the SPAD's start and the first scan marker that a burst must have room for.
-
-The first is for virtual time, the second for a host that starts one device after the other over USB and serial ports.
-"""
-
-SPARE_LEAD_S = 0.35
-"""Further seconds before the first marker, where the memory has room and reading ends with the last scan marker.
-
-A busy host starts its devices late.
-"""
-
-
-def lead_s(rig: OpenRig) -> float:
-    """Seconds of a burst before its first scan marker."""
-    return BURST_LEAD_S if isinstance(rig.clock, VirtualClock) else HOST_LEAD_S
-
-
-def spare_lead_s(rig: OpenRig) -> float:
-    """Further seconds before the first marker that a burst may have room for."""
-    return 0.0 if isinstance(rig.clock, VirtualClock) or not rig.spad.info.markers else SPARE_LEAD_S
-
-
-def most_sweeps(rig: OpenRig, plan: ScanPlan) -> int | None:
-    """The most sweeps of one start that fit a burst's memory and the sync source's program; None: any number.
-
-    At least 1, which either may still refuse.
-    """
-    legs = plan.sweeps_per_period
-    repeats = rig.sync.most_repeats(sync_program(plan, legs)[0])
-    limits = [] if repeats is None else [repeats * legs]
-    if plan.burst_frames is not None:
-        spare = plan.burst_frames - lead_s(rig) * float(plan.frame_rate_hz) - plan.frames_for(0)
-        limits.append(int(spare / float(plan.frames_per_sweep)))
-    return max(1, min(limits)) if limits else None
-
-
-def require_memory(rig: OpenRig, plan: ScanPlan) -> None:
-    """Raise PlanError where the SPAD's memory would be full before one map is whole."""
-    if plan.burst_frames is None:
-        return
-    need = math.ceil(plan.frames_for(1) + lead_s(rig) * float(plan.frame_rate_hz))
-    if need > plan.burst_frames:
-        raise PlanError(
-            f"a burst of one map takes {need} frames, with the {lead_s(rig):g} s until the scanner has started; "
-            f"the memory of {rig.spad.name} holds {plan.burst_frames}; lower scan.exposures, scan.columns or "
-            "scan.frame_rate"
-        )

@@ -1,7 +1,6 @@
 """Compiles a scan: checks it against scanner, SPAD and calibration, all together, before anything moves.
 
-`compile_plan` makes the `ScanPlan` for the nominal frame rate, `spad_request` asks the SPAD for it; with the exact
-timing that the SPAD answers the plan is compiled once more.
+`compile_plan` makes the `ScanPlan`, `spad_request` asks the SPAD for its frames.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibration.model.rig_model import Lag, RigModel
 from drivers.errors import LimitExceeded
-from drivers.interfaces import BurstMode, ScannerLimits, SpadInfo, SpadRequest, SpadTiming
+from drivers.interfaces import BurstMode, ScannerLimits, SpadInfo, SpadRequest
 from drivers.interfaces.scanner import check_waveform
 from rig.config.models import ScanConfig
 from rig.errors import PlanError, UsageError
@@ -22,7 +21,7 @@ from rig.plan.calibration_reach import model_problems
 from rig.plan.describe import beyond_link, beyond_sensor
 from rig.plan.gate_pulses import unseen_pattern
 from rig.plan.mirror_path import PathDemand, SweepPath, find_path, remedy
-from rig.plan.scan_plan import MARGIN_FRAMES, MAX_CLOCK_ERROR, Blanking, ScanPlan, blanking_for, column_command
+from rig.plan.scan_plan import MARGIN_FRAMES, MAX_CLOCK_ERROR, ScanPlan, blanking_for, column_command
 from rig.plan.waveform import legs_of, line_markers, moving_windows, waveform_of
 
 CLOCK_TOLERANCE = 2e-4
@@ -37,8 +36,6 @@ Each block costs Python some 0.3 ms, part of it on every thread; an estimate wai
 BLOCK_BYTES = 16 << 20
 """Most bytes of a block's frames: 512 whole frames of 512 x 512 pixels."""
 
-ColumnWindows = tuple[NDArray[np.int32], int]
-"""First pixel of each column's window (columns,), and their width."""
 PointClock = Callable[[float], Fraction]
 
 
@@ -59,22 +56,18 @@ def compile_plan(
     point_clock: PointClock,
     model: RigModel | None,
     info: SpadInfo,
-    timing: SpadTiming | None = None,
     line_offsets: Sequence[float] = (0.0,),
-    windows: ColumnWindows | None = None,
 ) -> ScanPlan:
     """Compile the plan of a scan and check it.
 
     point_clock: the scanner's exact clock for a requested rate (`BeamScanner.point_clock`).
     model: None where the rig is not calibrated; there is then no lag and the window is the whole row.
-    timing: answer of the SPAD to `spad_request`; None uses its nominal rate.
     line_offsets: of the rig, which fit the scan.
-    windows: of the columns, where they are given; None makes them as narrow as the depth range allows.
     Raises PlanError with one line per problem.
     """
 
     def draft(scan: ScanConfig) -> tuple[ScanPlan | None, list[str]]:
-        return _draft(scan, limits, point_clock, model, info, timing, line_offsets, windows)
+        return _draft(scan, limits, point_clock, model, info, line_offsets)
 
     plan, problems = draft(scan)
     too_fast = [*beyond_sensor(scan, info)]
@@ -99,18 +92,14 @@ def _draft(
     point_clock: PointClock,
     model: RigModel | None,
     info: SpadInfo,
-    timing: SpadTiming | None,
     line_offsets: Sequence[float],
-    windows: ColumnWindows | None,
 ) -> tuple[ScanPlan | None, list[str]]:
     """The plan, where there is a mirror path for it, and all problems with scanner and calibration."""
     places, lines = scan.columns // len(line_offsets), None
     commands = column_command(np.arange(scan.columns), scan.command_range, scan.columns)
     if len(line_offsets) > 1:
         lines, commands = line_grid(line_offsets, scan.columns, scan.command_range)
-    frame_rate = scan.frame_rate if timing is None else timing.tick_hz / timing.frame_period_ticks
-    blanking = None if info.markers else blanking_for(places, scan.exposures, frame_rate)
-    demand = path_demand(scan, places, frame_rate, model, markers=info.markers)
+    demand = path_demand(scan, places, model, markers=info.markers)
     wrong_model = model_problems(scan, model, info, demand.speed_per_s, line_offsets)
     found = find_path(demand, limits, point_clock)
     advice = remedy(demand, scan.exposures, limits, point_clock) if found.problems else ""
@@ -120,7 +109,7 @@ def _draft(
     if found.path is None or problems:
         return None, problems
     try:
-        plan = _plan(scan, found.path, found.rate_hz, demand, model, info, timing, blanking, commands, lines, windows)
+        plan = _plan(scan, found.path, found.rate_hz, demand, model, info, commands, lines)
         check_waveform(plan.waveform, limits, plan.point_rate_hz, seamless=True)
     except LimitExceeded as error:
         return None, [f"scan: {error}"]
@@ -129,10 +118,9 @@ def _draft(
     return plan, unseen_pattern(plan, model)
 
 
-def path_demand(
-    scan: ScanConfig, places: int, frame_rate: Fraction, model: RigModel | None, *, markers: bool
-) -> PathDemand:
+def path_demand(scan: ScanConfig, places: int, model: RigModel | None, *, markers: bool) -> PathDemand:
     """The demand of a scan of so many line positions on the mirror. markers: whether the SPAD has any."""
+    frame_rate = scan.frame_rate
     blanking = None if markers else blanking_for(places, scan.exposures, frame_rate)
     return PathDemand(
         edges=scan.command_range,
@@ -156,21 +144,19 @@ def _plan(
     demand: PathDemand,
     model: RigModel | None,
     info: SpadInfo,
-    timing: SpadTiming | None,
-    blanking: Blanking | None,
     commands: NDArray[np.float64],
     lines: LineGrid | None,
-    windows: ColumnWindows | None,
 ) -> ScanPlan:
     """The plan along a mirror path, without judging whether the SPAD's link carries it."""
     legs = legs_of(path, scan, model.lag_s if model is not None else Lag(), demand.gate_margin_s, rate)
     step, markers = line_markers(path, demand.columns, scan.exposures)
-    x0, window, lines = (*windows, lines) if windows is not None else _windows(model, commands, scan, info, lines)
+    x0, window, lines = _windows(model, commands, scan, info, lines)
+    blanking = None if info.markers else blanking_for(demand.columns, scan.exposures, scan.frame_rate)
     plan = ScanPlan(
         columns=scan.columns,
         exposures=scan.exposures,
-        frame_rate_hz=1 / demand.frame_s,
-        exposure_s=scan.exposure_s if timing is None else float(timing.exposure_ticks / timing.tick_hz),
+        frame_rate_hz=scan.frame_rate,
+        exposure_s=scan.exposure_s,
         point_rate_hz=rate,
         sweep_points=path.points,
         legs=legs,

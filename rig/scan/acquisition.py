@@ -18,7 +18,8 @@ from drivers.transports.endpoints import EMULATED_PREFIX
 from rig.count.sweeps import SweepAssembler, SweepData, SweepStart
 from rig.count.volume import SweepLayout
 from rig.depth.fog_meter import FogEstimate
-from rig.devices.open import OpenRig, lead_s, most_sweeps, require_memory, spare_lead_s
+from rig.devices.open import OpenRig
+from rig.devices.prepare import lead_s, most_sweeps, require_memory, spare_lead_s
 from rig.errors import DevicesError
 from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import ScanPlan
@@ -79,7 +80,7 @@ def told_of(live: Callable[[ScanProgress], None] | None) -> Callable[[ScanProgre
 
 
 class Acquisition:
-    """A scan of `maps` maps with an open rig, a plan and the SPAD's timing from `rig.devices.open.prepare`.
+    """A scan of `maps` maps with an open rig, a plan and the SPAD's timing from `rig.devices.prepare`.
 
     Iterate once over `run()`.
 

@@ -16,7 +16,8 @@ from rig.count.sweeps import SweepAccount, SweepData
 from rig.depth.reconstruct import Reconstructor
 from rig.depth.warm_up import warm_binding, warm_up
 from rig.devices.calibration_use import accepted_by, calibration_use, identity_of, rig_content
-from rig.devices.open import OpenRig, lead_s, most_sweeps, prepare, spare_lead_s
+from rig.devices.open import OpenRig
+from rig.devices.prepare import lead_s, most_sweeps, prepare, spare_lead_s
 from rig.errors import RigError
 from rig.estimate.registry import LEARNING, Learned
 from rig.plan.compile import spad_request

@@ -19,7 +19,8 @@ from rig.config.models import RigConfig
 from rig.count.volume import Counter, FrameTally, SweepLayout, SweepTally
 from rig.depth.reconstruct import MapResult, Reconstructor
 from rig.depth.warm_up import warm_binding, warm_up
-from rig.devices.open import OpenRig, open_rig, prepare
+from rig.devices.open import OpenRig, open_rig
+from rig.devices.prepare import prepare
 from rig.errors import UsageError
 from rig.estimate.registry import LEARNING
 from rig.geometry.stripe_table import StripeTable

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from rig.api import configure, plan_scan, scan
-from rig.devices.open import open_rig, prepare
+from rig.devices.open import open_rig
+from rig.devices.prepare import prepare
 from tests.system.conftest import Rig
 from tests.system.small_rig import config, write_rig
 

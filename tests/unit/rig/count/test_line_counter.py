@@ -28,7 +28,7 @@ OFFSETS = (-0.3, -0.1, 0.1, 0.3)
 
 
 def plan_with(offsets, lag=NO_LAG, **changes):
-    return compile_plan(scan(**changes), scanner_limits(), timer_clock, rig_model(lag), SPAD, None, offsets)
+    return compile_plan(scan(**changes), scanner_limits(), timer_clock, rig_model(lag), SPAD, offsets)
 
 
 @settings(max_examples=60, deadline=None)
@@ -86,9 +86,7 @@ def test_several_lines_use_whole_rows_of_a_sensor_whose_windows_would_move():
     wide = dataclasses.replace(SPAD, width=512)
     camera = dataclasses.replace(rig_model().camera, width=512)
     model = dataclasses.replace(rig_model(), camera=camera)
-    plan = compile_plan(
-        scan(command_range=[-0.1, 0.1]), scanner_limits(), timer_clock, model, wide, None, OFFSETS
-    )  # fmt: skip
+    plan = compile_plan(scan(command_range=[-0.1, 0.1]), scanner_limits(), timer_clock, model, wide, OFFSETS)
     assert plan.windows is None
     assert plan.used_px is None
 

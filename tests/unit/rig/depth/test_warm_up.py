@@ -3,7 +3,8 @@
 from rig.config.files import load_config
 from rig.count import bind_kernels as binding_kernels
 from rig.depth.warm_up import warm_binding
-from rig.devices.open import open_rig, prepare
+from rig.devices.open import open_rig
+from rig.devices.prepare import prepare
 
 
 def test_binding_compiles_nothing_more_behind_it():

@@ -10,7 +10,8 @@ from drivers.interfaces import LaserStatus
 from drivers.registry import Kind, KindConfig
 from rig.config.files import load_config
 from rig.devices import open as session
-from rig.devices.open import HOLD_EXPOSURES, open_rig, prepare
+from rig.devices.open import open_rig
+from rig.devices.prepare import HOLD_EXPOSURES, prepare
 from rig.errors import DevicesError, UsageError
 from rig.scan.acquisition import Acquisition
 from tests.unit.rig.scan.fakes import FakeMaker
@@ -131,6 +132,12 @@ def test_lost_frames_of_the_simulated_spad_are_gaps():
     assert sweep.gaps == ((150, 151), (160, 160))
     assert sweep.frames.lost == 3
     assert sweep.frames.received + 3 == sweep.frames.expected == sweep.end_frame - sweep.first_frame
+
+
+def test_the_plan_has_the_exposure_that_the_spad_answered():
+    with open_rig(load_config("simulated", {**SMALL, "scan.exposure": "1.004 us"})) as rig:
+        plan, timing = prepare(rig)
+    assert (timing.exposure_ticks, timing.tick_hz, plan.exposure_s) == (100, 10**8, 1e-6)
 
 
 @pytest.mark.parametrize("exposures", [1, 3, 10, 40])

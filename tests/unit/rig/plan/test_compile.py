@@ -14,7 +14,6 @@ from drivers.interfaces import (
     MARKER_SCAN,
     OUT_GATE,
     BurstMode,
-    SpadTiming,
     StreamMode,
     slices,
 )
@@ -147,14 +146,6 @@ def test_times_of_any_sweep_are_exact():
     plan = plan_of(scan(frame_rate="97.7 kHz"))
     assert plan.column_s == Fraction(4, 97_700)
     assert plan.sweep_s * plan.point_rate_hz == plan.sweep_points
-
-
-def test_the_plan_follows_the_exact_timing_that_the_spad_answered():
-    timing = SpadTiming(Fraction(100_000_000), 1024, 1000, 4096)
-    plan = compile_plan(scan(), scanner_limits(), timer_clock, rig_model(), SPAD, timing)
-    assert plan.frame_rate_hz == Fraction(100_000_000, 1024)
-    assert plan.exposure_s == 1e-5
-    assert plan.column_s == Fraction(4 * 1024, 100_000_000)
 
 
 @pytest.mark.parametrize(("bidirectional", "maps"), [(False, 3), (True, 4), (True, 3), (True, 1)])

@@ -19,7 +19,8 @@ from rig.config.files import load_config
 from rig.count.bind import FrameBinder
 from rig.count.sweeps import SweepAssembler
 from rig.count.volume import BIN_DARK, BIN_UNUSABLE
-from rig.devices.open import open_rig, prepare
+from rig.devices.open import open_rig
+from rig.devices.prepare import prepare
 from rig.errors import PlanError
 from rig.plan.compile import compile_plan, spad_request
 from rig.plan.describe import plan_text
