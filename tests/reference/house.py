@@ -28,6 +28,7 @@ LIMITS: Mapping[str, tuple[str, int]] = {
     "median": ("at least", 130),
     "folder": ("at most", 12),
     "circles": ("at most", 0),
+    "missing": ("at most", 0),
     "tests": ("at most", 38_000),
 }
 GOALS = ("lines", "tests")
@@ -121,8 +122,11 @@ def figures(root: Path, field_words: set[str]) -> Iterator[Figure]:
     clauses = sorted(f"{place}: {text}" for module in modules for place, text in clause_docstrings(module))
     yield Figure("docstrings", len(clauses), f"{len(clauses)} docstrings begin with a relative clause", clauses)
     yield word_figure(modules, field_words)
-    tests = sum(module.lines for module in read_modules(root, ("tests",)))
+    of_tests = read_modules(root, ("tests",))
+    tests = sum(module.lines for module in of_tests)
     yield Figure("tests", tests, f"{tests} lines of tests")
+    missing = missing_imports([*modules, *of_tests])
+    yield Figure("missing", len(missing), f"{len(missing)} imports of ours, tests' among them, name nothing", missing)
     stems = shared_names((module.path.stem, module.name) for module in modules if not module.path.stem.startswith("__"))
     yield Figure("same-modules", len(stems), f"{len(stems)} module names are used for two or more things", stems)
     classes = shared_names(
@@ -173,7 +177,9 @@ def import_graphs(modules: Sequence[Module]) -> tuple[Graph, Graph]:
     all_imports: Graph = {name: set() for name in names}
     for module in modules:
         for node, deferred in _imports(module.tree):
-            targets = {target for target in _targets(module, node, names) if target != module.name}
+            named = _imported(node)
+            targets = {f"{base}.{name}" if f"{base}.{name}" in names else base for base, name in named}
+            targets = targets & names - {module.name}
             all_imports[module.name] |= targets
             if not deferred:
                 loads[module.name] |= targets
@@ -192,22 +198,39 @@ def _imports(tree: ast.AST, deferred: bool = False) -> Iterator[tuple[ast.Import
             yield from _imports(node, deferred or isinstance(node, Function | ast.Lambda))
 
 
-def _targets(module: Module, node: ast.Import | ast.ImportFrom, names: set[str]) -> Iterator[str]:
-    """Modules that a statement names; a package only for what is its own."""
+def _imported(node: ast.Import | ast.ImportFrom) -> list[tuple[str, str]]:
+    """Modules that a statement names, each with the name that it takes from it, '' where it takes the module."""
     if isinstance(node, ast.Import):
-        yield from (alias.name for alias in node.names if alias.name in names)
-        return
-    base = node.module or ""
-    if node.level:
-        parts = module.name.split(".")
-        kept = parts[: len(parts) - node.level + module.is_package]
-        base = ".".join([*kept, *([node.module] if node.module else [])])
-    for alias in node.names:
-        inner = f"{base}.{alias.name}"
-        if inner in names:
-            yield inner
-        elif base in names:
-            yield base
+        return [(alias.name, "") for alias in node.names]
+    return [(node.module or "", alias.name) for alias in node.names]
+
+
+def missing_imports(modules: Sequence[Module]) -> list[str]:
+    """Imports of our packages, those in functions among them, of a module or a name in one that there is not."""
+    names = {module.name: {*bound_names(module.tree)} for module in modules}
+    packages = {name.rsplit(".", depth)[0] for name in names for depth in range(name.count(".") + 1)}
+    ours = {package for package in packages if "." not in package}
+    lines = []
+    for module in modules:
+        for node, _ in _imports(module.tree):
+            for base, name in _imported(node):
+                known = base in packages and (not name or name in names.get(base, ()) or f"{base}.{name}" in packages)
+                if base.split(".")[0] in ours and not known:
+                    lines.append(f"{module.path.as_posix()}:{node.lineno}: {base} {name}".rstrip())
+    return lines
+
+
+def bound_names(tree: ast.AST) -> Iterator[str]:
+    """Names that a module has when it is loaded."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, Definition):
+            yield node.name
+        elif isinstance(node, ast.alias):
+            yield node.asname or node.name
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id
+        else:
+            yield from bound_names(node)
 
 
 def lone_importers(imports: Graph) -> list[str]:

@@ -118,6 +118,18 @@ def test_modules_with_a_single_importer_are_named_with_it(tree: Path) -> None:
     assert found(tree)["single"].value == 4
 
 
+def test_imports_that_name_nothing_are_found_wherever_they_stand(tree: Path) -> None:
+    assert found(tree)["missing"].value == 0
+    (tree / "tests" / "test_scan.py").write_text(
+        "import rig.scam\nimport os\nfrom rig import laser, taser\nfrom rig.scan import Scan, add, desk\n"
+        "def test():\n    from drivers.gone import Laser\n"
+    )
+    assert found(tree)["missing"].items == [
+        "tests/test_scan.py:1: rig.scam", "tests/test_scan.py:3: rig taser", "tests/test_scan.py:4: rig.scan desk",
+        "tests/test_scan.py:6: drivers.gone Laser",
+    ]  # fmt: skip
+
+
 def test_functions_of_many_parameters_are_told_apart(tree: Path) -> None:
     parameters = found(tree)["parameters"]
     assert parameters.items == [
